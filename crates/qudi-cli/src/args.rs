@@ -1,0 +1,284 @@
+//! The command line: every sentence of `--help` is here.
+
+use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
+use clap_complete::Shell;
+use qudi_sim::Size;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+const EXIT_CODES: &str = "Exit codes:
+  0    success
+  1    it worked, but a bar that was set has been missed
+  2    error: usage, configuration, input, output
+  130  interrupted
+
+Settings come from built-in defaults, then --config FILE, then QUDI_* variables, then --set
+KEY=VALUE, then flags; the later one wins. `qudi config show` tells which one did.";
+
+/// Simulate, restore and measure video from single-photon cameras.
+///
+/// Not related to the laboratory-control suite Qudi (Ulm-IQO/qudi).
+#[derive(Debug, Parser)]
+#[command(name = "qudi", version, propagate_version = true, after_help = EXIT_CODES)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    pub(crate) global: Global,
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+/// Options of every command.
+#[derive(Clone, Debug, ClapArgs)]
+#[command(next_help_heading = "Global options")]
+pub(crate) struct Global {
+    /// Settings file (TOML); see `qudi config docs`
+    #[arg(short, long, global = true, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) config: Option<PathBuf>,
+    /// Set one key, as in --set sensor.read_noise=0.5
+    #[arg(long, global = true, value_name = "KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// Threads to use [default: all cores]
+    #[arg(short = 'j', long, global = true, value_name = "N")]
+    pub(crate) threads: Option<NonZeroUsize>,
+    /// Print one JSON document instead of text
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    /// Print errors only
+    #[arg(short, long, global = true)]
+    pub(crate) quiet: bool,
+    /// Say more; twice for details
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub(crate) verbose: u8,
+    /// Colours in messages
+    #[arg(long, global = true, value_name = "WHEN", default_value = "auto")]
+    pub(crate) color: Color,
+    /// Overwrite existing outputs
+    #[arg(short, long, global = true)]
+    pub(crate) force: bool,
+}
+
+/// When to colour messages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Color {
+    /// On a terminal, unless `NO_COLOR` is set
+    Auto,
+    /// Always
+    Always,
+    /// Never
+    Never,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    Simulate(Box<Simulate>),
+    Demo(Demo),
+    Light(Light),
+    Info(Info),
+    Config(Config),
+    Completions(Completions),
+    #[command(hide = true)]
+    Man(Man),
+}
+
+/// Turn video, images or synthetic scenes into photon counts
+///
+/// INPUT is a folder of PNG, JPEG or TIFF frames, a GIF, Y4M or .npy file, any video (decoded by
+/// ffmpeg), one image to set in motion, a procedural scene (scene:dead-leaves, scene:text,
+/// scene:gratings, scene:chart), or - for Y4M on standard input.
+///
+/// OUT is an .npy file (binary frames are packed, 8 pixels to the byte), a multi-page .tif, a
+/// folder of PNG (no extension), or - for .npy on standard output. A record that makes the burst
+/// again is written beside it: OUT.json, or burst.json in the folder.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Simulate {
+    /// What to expose
+    #[arg(required_unless_present = "from", conflicts_with = "from", value_hint = ValueHint::AnyPath)]
+    pub(crate) input: Option<String>,
+    /// Where the burst goes
+    #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
+    pub(crate) output: String,
+    /// Make the burst of this record again; only outputs may be given beside it
+    #[arg(long, value_name = "RECORD", value_hint = ValueHint::FilePath)]
+    pub(crate) from: Option<PathBuf>,
+
+    /// Sensor: a name (`qudi info --sensors`) or a .toml file [default: qudi-paper]
+    #[arg(long, value_name = "NAME|FILE", help_heading = "Sensor")]
+    pub(crate) sensor: Option<String>,
+    /// Sum this many binary frames into one (7 for 3 bits)
+    #[arg(long, value_name = "N", help_heading = "Sensor")]
+    pub(crate) sum: Option<u32>,
+    /// Bits per sample of a linear sensor
+    #[arg(long, value_name = "N", help_heading = "Sensor")]
+    pub(crate) bits: Option<u8>,
+    /// Quantum efficiency, fill factor included
+    #[arg(long, value_name = "0..1", help_heading = "Sensor")]
+    pub(crate) qe: Option<f64>,
+    /// Dark electrons per pixel and frame, or per second as in 7.5/s
+    #[arg(long, value_name = "RATE", help_heading = "Sensor")]
+    pub(crate) dark: Option<String>,
+    /// Read noise in electrons rms
+    #[arg(long, value_name = "E-", help_heading = "Sensor")]
+    pub(crate) read_noise: Option<f64>,
+    /// Full-well capacity in electrons, or `unlimited`
+    #[arg(long, value_name = "E-", help_heading = "Sensor")]
+    pub(crate) full_well: Option<String>,
+    /// DN per electron, or a rule: quiver, unit, fwc, auto
+    #[arg(long, value_name = "GAIN", help_heading = "Sensor")]
+    pub(crate) gain: Option<String>,
+
+    /// Photons per pixel and frame [default: 3.25]
+    #[arg(long, value_name = "PPP", help_heading = "Light")]
+    pub(crate) ppp: Option<f64>,
+    /// What PPP counts: incident photons, detected electrons, or dn (mean output value)
+    #[arg(long, value_name = "MEANING", help_heading = "Light")]
+    pub(crate) ppp_def: Option<String>,
+    /// Image value that receives PPP photons [default: the clip's mean]
+    #[arg(long, value_name = "VALUE", help_heading = "Light")]
+    pub(crate) exposure: Option<f64>,
+    /// What file values mean: as-is, or srgb (decoded to linear light)
+    #[arg(long, value_name = "CURVE", help_heading = "Light")]
+    pub(crate) transfer: Option<String>,
+    /// File value of white in .npy inputs [default: full scale of the type]
+    #[arg(long, value_name = "VALUE", help_heading = "Light")]
+    pub(crate) white: Option<f64>,
+
+    /// Output frames at most [default: all; 11 for synthetic scenes]
+    #[arg(long, value_name = "N", help_heading = "Scene")]
+    pub(crate) frames: Option<u64>,
+    /// Instants per exposure: input frames (or renderings) that one output frame integrates
+    #[arg(long, value_name = "N", help_heading = "Scene")]
+    pub(crate) instants: Option<usize>,
+    /// Motion of a still, as in pan:2,0.5+rotate:0.3+zoom:1.01+layers:3
+    #[arg(long, value_name = "MOTION", allow_hyphen_values = true, help_heading = "Scene")]
+    pub(crate) motion: Option<String>,
+    /// Frame size of synthetic scenes [default: the image's; 256x256]
+    #[arg(long, value_name = "HxW", help_heading = "Scene")]
+    pub(crate) size: Option<Size>,
+    /// Fastest motion of procedural scenes in pixels per frame [default: 2]
+    #[arg(long, value_name = "PX", help_heading = "Scene")]
+    pub(crate) speed: Option<f64>,
+    /// Seed of the layout of synthetic scenes [default: 1]
+    #[arg(long, value_name = "N", help_heading = "Scene")]
+    pub(crate) scene_seed: Option<u64>,
+
+    /// Seed of photons and noise [default: drawn and printed]
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
+    /// Write binary .npy bursts with one byte per pixel
+    #[arg(long, help_heading = "Outputs")]
+    pub(crate) unpacked: bool,
+    /// Write the true frames: .npy (float32) or a folder of 16-bit PNG
+    #[arg(long, value_name = "PATH", help_heading = "Outputs", value_hint = ValueHint::AnyPath)]
+    pub(crate) truth: Option<PathBuf>,
+    /// Write the true flow of a synthetic scene: .npy (float32), [frames-1][dx, dy, visible][H][W]
+    #[arg(long, value_name = "FILE", help_heading = "Outputs", value_hint = ValueHint::FilePath)]
+    pub(crate) flow: Option<PathBuf>,
+    /// Write an animated GIF of the counts
+    #[arg(long, value_name = "FILE", help_heading = "Outputs", value_hint = ValueHint::FilePath)]
+    pub(crate) preview: Option<PathBuf>,
+    /// Write transforms.json beside a packed burst, so that visionsim opens it
+    #[arg(long, help_heading = "Outputs")]
+    pub(crate) visionsim: bool,
+}
+
+/// See what the camera sees: a built-in scene, simulated, averaged, measured, in one picture
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Demo {
+    /// Picture to write [default: qudi-demo.png, overwritten]
+    #[arg(short, long, value_name = "PNG", value_hint = ValueHint::FilePath)]
+    pub(crate) output: Option<PathBuf>,
+    /// Sensor: a name or a .toml file
+    #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
+    pub(crate) sensor: String,
+    /// Photons per pixel and frame
+    #[arg(long, value_name = "PPP", default_value_t = 3.25)]
+    pub(crate) ppp: f64,
+    /// Seed of photons and noise
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+}
+
+/// Convert between lux and photons per pixel for a sensor
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Light {
+    /// Illuminance on the sensor plane in lux
+    #[arg(long, value_name = "LX", required_unless_present_any = ["ppp", "scene_lux"], conflicts_with_all = ["ppp", "scene_lux"])]
+    pub(crate) lux: Option<f64>,
+    /// Incident photons per pixel and frame
+    #[arg(long, value_name = "PPP", conflicts_with = "scene_lux")]
+    pub(crate) ppp: Option<f64>,
+    /// Illuminance on a diffuse scene in lux, seen through a lens
+    #[arg(long, value_name = "LX")]
+    pub(crate) scene_lux: Option<f64>,
+    /// Sensor: a name or a .toml file
+    #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
+    pub(crate) sensor: String,
+    /// Exposure time in seconds [default: one frame of the sensor]
+    #[arg(long, value_name = "S")]
+    pub(crate) exposure_time: Option<f64>,
+    /// Pixel pitch in micrometres [default: the sensor's]
+    #[arg(long, value_name = "UM")]
+    pub(crate) pitch: Option<f64>,
+    /// Light of one wavelength in nanometres
+    #[arg(long, value_name = "NM", default_value_t = 555.0, conflicts_with = "daylight")]
+    pub(crate) wavelength: f64,
+    /// Daylight, 395 to 718 nm
+    #[arg(long)]
+    pub(crate) daylight: bool,
+    /// Reflectance of the scene, for --scene-lux
+    #[arg(long, value_name = "0..1", default_value_t = 0.18)]
+    pub(crate) reflectance: f64,
+    /// Transmission of the lens, for --scene-lux
+    #[arg(long, value_name = "0..1", default_value_t = 0.9)]
+    pub(crate) transmission: f64,
+    /// f-number of the lens, for --scene-lux
+    #[arg(long, value_name = "N", default_value_t = 2.8)]
+    pub(crate) f_number: f64,
+    /// Magnification of the lens, for --scene-lux
+    #[arg(long, value_name = "M", default_value_t = 0.0)]
+    pub(crate) magnification: f64,
+}
+
+/// Describe sensors, compute devices, and bursts that this program wrote
+#[derive(Debug, ClapArgs)]
+#[group(required = true, multiple = false)]
+pub(crate) struct Info {
+    /// A sensor's name or .toml file, a burst, or its record
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) subject: Option<String>,
+    /// List the built-in sensors
+    #[arg(long)]
+    pub(crate) sensors: bool,
+    /// List the compute devices of this machine
+    #[arg(long)]
+    pub(crate) devices: bool,
+}
+
+/// Show settings and where they come from
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Config {
+    #[command(subcommand)]
+    pub(crate) action: ConfigAction,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ConfigAction {
+    /// Every key with its value and origin
+    Show,
+    /// Every key with its meaning, as Markdown
+    Docs,
+}
+
+/// Print a completion script for a shell
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Completions {
+    /// Which shell
+    pub(crate) shell: Shell,
+}
+
+/// Write the manual pages
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Man {
+    /// Folder for the pages [default: the main page on standard output]
+    pub(crate) folder: Option<PathBuf>,
+}

@@ -1,0 +1,58 @@
+//! Errors of the command line: what happened, where, what to do.
+
+use qudi_sim::SimError;
+use std::fmt::Display;
+use std::io;
+
+pub(crate) type Result<T, E = Fault> = std::result::Result<T, E>;
+
+/// Anything that ends a command early.
+#[derive(Debug)]
+pub(crate) enum Fault {
+    /// Three parts for the user.
+    Error { what: String, place: Option<String>, help: Option<String> },
+    /// Ctrl-C.
+    Interrupted,
+    /// The reader of our output has gone.
+    BrokenPipe,
+}
+
+impl Fault {
+    pub(crate) fn new(what: impl Display, place: impl Display, help: impl Display) -> Self {
+        Self::Error {
+            what: what.to_string(),
+            place: Some(place.to_string()),
+            help: Some(help.to_string()),
+        }
+    }
+}
+
+impl From<SimError> for Fault {
+    fn from(e: SimError) -> Self {
+        match &e {
+            SimError::Interrupted => Self::Interrupted,
+            SimError::Io { source, .. } if source.kind() == io::ErrorKind::BrokenPipe => {
+                Self::BrokenPipe
+            }
+            _ => Self::Error { what: e.to_string(), place: e.place(), help: e.help() },
+        }
+    }
+}
+
+impl From<rayon::ThreadPoolBuildError> for Fault {
+    fn from(e: rayon::ThreadPoolBuildError) -> Self {
+        Self::new(format!("cannot start threads: {e}"), "--threads", "ask for fewer threads")
+    }
+}
+
+/// Errors of writing results to standard output.
+pub(crate) fn stdout_fault(e: io::Error) -> Fault {
+    match e.kind() {
+        io::ErrorKind::BrokenPipe => Fault::BrokenPipe,
+        _ => Fault::new(
+            format!("cannot write the result: {e}"),
+            "standard output",
+            "check where it is redirected to",
+        ),
+    }
+}

@@ -1,0 +1,149 @@
+//! The only file that prints: results to standard output, everything else to standard error.
+#![allow(clippy::print_stdout, clippy::print_stderr)]
+
+use crate::args::{Color, Global};
+use crate::error::{Fault, Result, stdout_fault};
+use crate::interrupt;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::{IsTerminal, Write};
+use std::process::ExitCode;
+use tracing_subscriber::EnvFilter;
+
+/// How this run talks.
+#[derive(Debug)]
+pub(crate) struct Report {
+    json: bool,
+    quiet: bool,
+    verbose: bool,
+    color: bool,
+}
+
+impl Report {
+    pub(crate) fn new(global: &Global) -> Self {
+        let color = match global.color {
+            Color::Always => true,
+            Color::Never => false,
+            Color::Auto => {
+                std::io::stderr().is_terminal()
+                    && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+            }
+        };
+        let level = match (global.quiet, global.verbose) {
+            (true, _) => "error",
+            (false, 0) => "warn",
+            (false, 1) => "info",
+            (false, _) => "debug",
+        };
+        let filter = EnvFilter::try_from_env("QUDI_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+        // Setting it twice can only happen in tests, and then the first one serves.
+        let _ = tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(std::io::stderr)
+            .with_ansi(color)
+            .without_time()
+            .with_target(false)
+            .try_init();
+        Self { json: global.json, quiet: global.quiet, verbose: global.verbose > 0, color }
+    }
+
+    pub(crate) fn json(&self) -> bool {
+        self.json
+    }
+
+    /// Prints a result: the JSON document if asked for, else the text unless quiet.
+    pub(crate) fn result(
+        &self,
+        text: &str,
+        json: impl FnOnce() -> serde_json::Value,
+    ) -> Result<()> {
+        if self.json {
+            let document = serde_json::to_string_pretty(&json()).unwrap_or_else(|e| e.to_string());
+            return self.print(&document);
+        }
+        if self.quiet { Ok(()) } else { self.print(text) }
+    }
+
+    /// Prints text that was asked for by name, also when quiet.
+    pub(crate) fn print(&self, text: &str) -> Result<()> {
+        let mut out = std::io::stdout().lock();
+        let end = if text.ends_with('\n') { "" } else { "\n" };
+        write!(out, "{text}{end}").and_then(|()| out.flush()).map_err(stdout_fault)
+    }
+
+    /// A remark beside the result.
+    pub(crate) fn remark(&self, text: &str) {
+        if !self.quiet {
+            eprintln!("{text}");
+        }
+    }
+
+    /// A bar that vanishes off a terminal, under --json and under --quiet; with --verbose, log
+    /// lines take its place.
+    pub(crate) fn bar(&self) -> Bar {
+        let shown = !self.json && !self.quiet && !self.verbose && std::io::stderr().is_terminal();
+        let target =
+            if shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+        let bar = ProgressBar::with_draw_target(None, target);
+        let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {per_sec} {eta}");
+        bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        Bar { bar, tenth: 0 }
+    }
+
+    /// Says what went wrong, and with which exit code the program ends.
+    pub(crate) fn fault(&self, fault: &Fault) -> ExitCode {
+        match fault {
+            Fault::BrokenPipe => ExitCode::SUCCESS,
+            Fault::Interrupted => {
+                self.remark("interrupted: nothing was written");
+                ExitCode::from(interrupt::EXIT_CODE)
+            }
+            Fault::Error { what, place, help } => {
+                let (red, bold, plain) =
+                    if self.color { ("\x1b[1;31m", "\x1b[1m", "\x1b[0m") } else { ("", "", "") };
+                let mut text = format!("{red}error:{plain} {what}\n");
+                if let Some(place) = place {
+                    text += &format!("  {bold}where:{plain} {place}\n");
+                }
+                if let Some(help) = help {
+                    text += &format!("  {bold}help:{plain} {help}\n");
+                }
+                // Nothing can be done if standard error is gone as well.
+                let _ = std::io::stderr().write_all(text.as_bytes());
+                ExitCode::from(2)
+            }
+        }
+    }
+}
+
+/// Progress of one command.
+#[derive(Debug)]
+pub(crate) struct Bar {
+    bar: ProgressBar,
+    tenth: u64,
+}
+
+impl Bar {
+    pub(crate) fn update(&mut self, what: &'static str, done: u64, total: Option<u64>) {
+        if self.bar.message() != what {
+            self.bar.set_message(what);
+            self.bar.reset();
+            self.tenth = 0;
+        }
+        if let Some(total) = total {
+            self.bar.set_length(total);
+        }
+        self.bar.set_position(done);
+        let tenth = total.map_or(done / 100, |total| 10 * done / total.max(1));
+        if tenth > self.tenth {
+            self.tenth = tenth;
+            let total = total.map_or("?".to_owned(), |total| total.to_string());
+            tracing::info!("{what}: {done}/{total} frames");
+        }
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}

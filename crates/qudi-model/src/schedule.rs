@@ -1,0 +1,106 @@
+//! The noise schedule of the diffusion, in f64 on the CPU.
+//!
+//! Cosine schedule of Nichol and Dhariwal (2021), eq. 17: `alpha_bar(t) = f(t) / f(0)`,
+//! `f(t) = cos^2((t / T + s) / (1 + s) * pi / 2)`, each step's `beta` at most 0.999.
+
+/// Offset that keeps the first steps from being too small (Nichol and Dhariwal, section 3.2).
+const OFFSET: f64 = 0.008;
+
+/// Largest noise share of one step.
+const MAX_BETA: f64 = 0.999;
+
+/// Noise levels of the diffusion times `0..len`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NoiseSchedule {
+    alpha_bar: Vec<f64>,
+}
+
+impl NoiseSchedule {
+    /// The cosine schedule over `times` steps.
+    pub fn cosine(times: usize) -> Self {
+        let f = |t: usize| {
+            let angle =
+                (t as f64 / times as f64 + OFFSET) / (1.0 + OFFSET) * std::f64::consts::FRAC_PI_2;
+            angle.cos().powi(2)
+        };
+        let mut product = 1.0;
+        let alpha_bar = (0..times)
+            .map(|t| {
+                let beta = (1.0 - f(t + 1) / f(t)).min(MAX_BETA);
+                product *= 1.0 - beta;
+                product
+            })
+            .collect();
+        Self { alpha_bar }
+    }
+
+    /// Number of diffusion times.
+    pub fn len(&self) -> usize {
+        self.alpha_bar.len()
+    }
+
+    /// Whether there are no times at all.
+    pub fn is_empty(&self) -> bool {
+        self.alpha_bar.is_empty()
+    }
+
+    /// Share of signal power left at time `t`; 1 before the first time (`None`).
+    pub fn alpha_bar(&self, t: Option<usize>) -> f64 {
+        t.map_or(1.0, |t| self.alpha_bar[t])
+    }
+
+    /// The times that a sampler with `steps` steps visits, last first, and `None` (clean) at the
+    /// end: `linspace(-1, T - 1, steps + 1)` reversed and rounded half to even, as in DDIM
+    /// samplers. `steps` is taken into `1..=T`.
+    pub fn sampling_times(&self, steps: usize) -> Vec<Option<usize>> {
+        let steps = steps.clamp(1, self.len());
+        (0..=steps)
+            .rev()
+            .map(|i| {
+                let t = -1.0 + self.len() as f64 * i as f64 / steps as f64;
+                let t = t.round_ties_even();
+                (t >= 0.0).then_some(t as usize)
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// scripts/reference/schedule.py
+    #[test]
+    #[allow(clippy::excessive_precision)]
+    fn alpha_bar_is_that_of_the_numpy_reference() {
+        let schedule = NoiseSchedule::cosine(1000);
+        for (t, expected) in include!("../../../tests/golden/cosine_schedule.in") {
+            let got = schedule.alpha_bar(Some(t));
+            assert!(
+                (got / expected - 1.0).abs() < 1e-9,
+                "alpha_bar({t}) = {got}, reference {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn noise_only_grows() {
+        let schedule = NoiseSchedule::cosine(1000);
+        let levels: Vec<f64> = (0..1000).map(|t| schedule.alpha_bar(Some(t))).collect();
+        assert!(levels.windows(2).all(|pair| pair[1] < pair[0]));
+        assert!(levels[0] > 0.999 && levels[999] < 1e-4);
+    }
+
+    #[test]
+    fn ten_steps_visit_the_papers_times() {
+        let schedule = NoiseSchedule::cosine(1000);
+        let expected: Vec<_> = [999, 899, 799, 699, 599, 499, 399, 299, 199, 99]
+            .map(Some)
+            .into_iter()
+            .chain([None])
+            .collect();
+        assert_eq!(schedule.sampling_times(10), expected);
+        assert_eq!(schedule.sampling_times(1), [Some(999), None]);
+        assert_eq!(schedule.sampling_times(5000).len(), 1001);
+    }
+}

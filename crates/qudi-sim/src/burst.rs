@@ -1,0 +1,9 @@
+//! Bursts on disk: packed bits, counts in `.npy`, TIFF stacks, PNG folders.
+
+mod bits;
+mod png_folder;
+mod tiff_stack;
+mod writer;
+
+pub use bits::{pack_row, unpack_row};
+pub use writer::{BurstFormat, BurstWriter, write_npy_stream};

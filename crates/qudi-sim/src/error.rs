@@ -1,0 +1,105 @@
+//! What can go wrong, in three parts: what happened, where, and what to do about it.
+
+use std::fmt::Display;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Shorthand for results of this crate.
+pub type Result<T, E = SimError> = std::result::Result<T, E>;
+
+/// Every error of this crate. [`SimError::place`] says where, [`SimError::help`] what to do.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SimError {
+    /// The operating system refused.
+    #[error("cannot {action}: {source}")]
+    Io {
+        /// What was tried, as in "read the header".
+        action: String,
+        /// The file or folder.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A file does not hold what it should.
+    #[error("{what}")]
+    Data {
+        /// What is wrong, with both numbers.
+        what: String,
+        /// The file.
+        path: PathBuf,
+        /// The way out.
+        help: String,
+    },
+    /// A sensor that cannot exist.
+    #[error("impossible sensor: {what}")]
+    Sensor {
+        /// Which parameter, its value, and the range.
+        what: String,
+        /// The sensor's name or file.
+        place: String,
+        /// The way out.
+        help: String,
+    },
+    /// A request that contradicts itself or the data.
+    #[error("{what}")]
+    Request {
+        /// What does not fit.
+        what: String,
+        /// The option or the input it concerns.
+        place: String,
+        /// The way out.
+        help: String,
+    },
+    /// The caller asked to stop.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+impl SimError {
+    /// An operating-system error with the action in words.
+    pub fn io(action: impl Into<String>, path: &Path, source: io::Error) -> Self {
+        Self::Io { action: action.into(), path: path.to_owned(), source }
+    }
+
+    /// A malformed or unsuitable file.
+    pub fn data(what: impl Into<String>, path: &Path, help: impl Into<String>) -> Self {
+        Self::Data { what: what.into(), path: path.to_owned(), help: help.into() }
+    }
+
+    /// A request that cannot be met.
+    pub fn request(what: impl Into<String>, place: impl Display, help: impl Into<String>) -> Self {
+        Self::Request { what: what.into(), place: place.to_string(), help: help.into() }
+    }
+
+    /// The file, sensor or option that the error concerns.
+    pub fn place(&self) -> Option<String> {
+        match self {
+            Self::Io { path, .. } | Self::Data { path, .. } => Some(path.display().to_string()),
+            Self::Sensor { place, .. } | Self::Request { place, .. } => Some(place.clone()),
+            Self::Interrupted => None,
+        }
+    }
+
+    /// The way out.
+    pub fn help(&self) -> Option<String> {
+        match self {
+            Self::Io { source, .. } => Some(io_help(source.kind()).to_owned()),
+            Self::Data { help, .. } | Self::Sensor { help, .. } | Self::Request { help, .. } => {
+                Some(help.clone())
+            }
+            Self::Interrupted => None,
+        }
+    }
+}
+
+fn io_help(kind: io::ErrorKind) -> &'static str {
+    match kind {
+        io::ErrorKind::NotFound => "check the name; relative paths start at the current folder",
+        io::ErrorKind::PermissionDenied => "check the permissions of the file and of its folder",
+        io::ErrorKind::StorageFull => "free some space, or write to another disk with -o",
+        io::ErrorKind::IsADirectory => "name a file, not a folder",
+        io::ErrorKind::UnexpectedEof => "the file ends too early: copy or export it again",
+        _ => "the system gave this reason; check the path and the device it is on",
+    }
+}

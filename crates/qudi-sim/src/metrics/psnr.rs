@@ -1,0 +1,57 @@
+//! Peak signal-to-noise ratio in dB, for values in [0, 1].
+
+use crate::frame::Frame;
+
+/// PSNR of `estimate` against `truth`, both clipped to [0, 1]; infinite if they are equal.
+pub fn psnr(estimate: &Frame, truth: &Frame) -> f64 {
+    scaled_psnr(estimate, truth, 1.0)
+}
+
+/// PSNR after the best global gain: photon counts fix an image only up to its exposure.
+pub fn gain_aligned_psnr(estimate: &Frame, truth: &Frame) -> f64 {
+    scaled_psnr(estimate, truth, best_gain(estimate, truth))
+}
+
+/// The factor on `estimate` that leaves the least squared error; 1 for a black estimate.
+pub fn best_gain(estimate: &Frame, truth: &Frame) -> f64 {
+    let (mut cross, mut square) = (0.0, 0.0);
+    for (&e, &t) in estimate.data.iter().zip(&truth.data) {
+        cross += f64::from(e) * f64::from(t);
+        square += f64::from(e) * f64::from(e);
+    }
+    if square > 0.0 { cross / square } else { 1.0 }
+}
+
+fn scaled_psnr(estimate: &Frame, truth: &Frame, gain: f64) -> f64 {
+    let error = estimate.data.iter().zip(&truth.data).map(|(&e, &t)| {
+        let difference = (f64::from(e) * gain).clamp(0.0, 1.0) - f64::from(t).clamp(0.0, 1.0);
+        difference * difference
+    });
+    let mean = error.sum::<f64>() / estimate.data.len() as f64;
+    -10.0 * mean.log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::Size;
+
+    #[test]
+    fn a_known_error_has_a_known_psnr() {
+        let size = Size { height: 4, width: 5 };
+        let truth = Frame::filled(size, 0.5);
+        assert!((psnr(&Frame::filled(size, 0.6), &truth) - 20.0).abs() < 1e-5);
+        assert!(psnr(&truth, &truth).is_infinite());
+    }
+
+    #[test]
+    fn gain_alignment_forgives_exposure_only() {
+        let size = Size { height: 8, width: 8 };
+        let truth = Frame::from_fn(size, |x, y| 0.1 + 0.01 * (x * y) as f32);
+        let mut darker = truth.clone();
+        darker.data.iter_mut().for_each(|v| *v *= 0.4);
+        assert!((best_gain(&darker, &truth) - 2.5).abs() < 1e-6);
+        assert!(gain_aligned_psnr(&darker, &truth) > 100.0);
+        assert!(psnr(&darker, &truth) < 20.0);
+    }
+}

@@ -1,0 +1,302 @@
+//! NumPy `.npy` files: a strict header reader and a streaming writer.
+//!
+//! Nothing is allocated from a header before the sizes it claims are checked against the file.
+
+use crate::error::{Result, SimError};
+use crate::frame::{Frame, Size};
+use std::fs::File;
+use std::io::{BufReader, Read, Write};
+use std::path::Path;
+
+/// Sample types that images and counts come in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sample {
+    /// `|b1`
+    Bool,
+    /// `|u1`
+    U8,
+    /// `<u2` or `>u2`
+    U16 {
+        /// Most significant byte first.
+        big_endian: bool,
+    },
+    /// `<f4` or `>f4`
+    F32 {
+        /// Most significant byte first.
+        big_endian: bool,
+    },
+    /// `<f8` or `>f8`
+    F64 {
+        /// Most significant byte first.
+        big_endian: bool,
+    },
+}
+
+impl Sample {
+    /// Bytes per sample.
+    pub fn bytes(self) -> usize {
+        match self {
+            Self::Bool | Self::U8 => 1,
+            Self::U16 { .. } => 2,
+            Self::F32 { .. } => 4,
+            Self::F64 { .. } => 8,
+        }
+    }
+
+    fn from_descr(descr: &str) -> Option<Self> {
+        let big_endian = descr.starts_with('>');
+        Some(match descr.trim_start_matches(['<', '>', '|', '=']) {
+            "b1" => Self::Bool,
+            "u1" => Self::U8,
+            "u2" => Self::U16 { big_endian },
+            "f4" => Self::F32 { big_endian },
+            "f8" => Self::F64 { big_endian },
+            _ => return None,
+        })
+    }
+
+    /// The value of full scale: 1 for booleans and floats.
+    pub fn full_scale(self) -> f32 {
+        match self {
+            Self::U8 => 255.0,
+            Self::U16 { .. } => 65535.0,
+            _ => 1.0,
+        }
+    }
+
+    /// The sample in `bytes`, which holds exactly one.
+    pub fn decode(self, bytes: &[u8]) -> f32 {
+        let mut word = [0u8; 8];
+        word[..bytes.len()].copy_from_slice(bytes);
+        if matches!(
+            self,
+            Self::U16 { big_endian: true }
+                | Self::F32 { big_endian: true }
+                | Self::F64 { big_endian: true }
+        ) {
+            word[..bytes.len()].reverse();
+        }
+        let four = [word[0], word[1], word[2], word[3]];
+        match self {
+            Self::Bool => f32::from(word[0] != 0),
+            Self::U8 => f32::from(word[0]),
+            Self::U16 { .. } => f32::from(u16::from_le_bytes([word[0], word[1]])),
+            Self::F32 { .. } => f32::from_le_bytes(four),
+            Self::F64 { .. } => f64::from_le_bytes(word) as f32,
+        }
+    }
+}
+
+/// What a `.npy` header says.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Header {
+    /// Sample type.
+    pub sample: Sample,
+    /// Extent of each axis, slowest first.
+    pub shape: Vec<usize>,
+    /// Bytes before the data.
+    pub data_start: u64,
+}
+
+/// The longest header worth reading; NumPy itself writes about 100 bytes.
+const MAX_HEADER: usize = 1 << 16;
+
+impl Header {
+    /// Reads a header from `reader`; `path` is for messages.
+    ///
+    /// # Errors
+    /// [`SimError::Data`] if it is no `.npy` of a supported type in C order.
+    pub fn read(reader: &mut impl Read, path: &Path) -> Result<Self> {
+        let fault = |what: &str| {
+            SimError::data(
+                what,
+                path,
+                "write it with numpy.save, in C order, as bool, uint8, uint16, float32 or float64",
+            )
+        };
+        let ended = |e: std::io::Error| match e.kind() {
+            std::io::ErrorKind::UnexpectedEof => fault("the file ends inside its .npy header"),
+            _ => SimError::io("read the .npy header", path, e),
+        };
+        let mut start = [0u8; 10];
+        reader.read_exact(&mut start).map_err(ended)?;
+        if &start[..6] != b"\x93NUMPY" {
+            return Err(fault("not a .npy file"));
+        }
+        let (length, prefix) = match start[6] {
+            1 => (usize::from(u16::from_le_bytes([start[8], start[9]])), 10),
+            2 | 3 => {
+                let mut rest = [0u8; 2];
+                reader.read_exact(&mut rest).map_err(ended)?;
+                (u32::from_le_bytes([start[8], start[9], rest[0], rest[1]]) as usize, 12)
+            }
+            version => return Err(fault(&format!("a .npy file of unknown version {version}"))),
+        };
+        if length > MAX_HEADER {
+            return Err(fault(&format!("a .npy header of {length} bytes")));
+        }
+        let mut text = vec![0u8; length];
+        reader.read_exact(&mut text).map_err(ended)?;
+        let text = String::from_utf8(text).map_err(|_| fault("the .npy header is not text"))?;
+        let (descr, fortran, shape) =
+            parse_dictionary(&text).ok_or_else(|| fault("the .npy header is malformed"))?;
+        if fortran && shape.len() > 1 {
+            return Err(fault("the array is in Fortran order"));
+        }
+        let sample = Sample::from_descr(&descr)
+            .ok_or_else(|| fault(&format!("samples of type `{descr}` are not images or counts")))?;
+        Ok(Self { sample, shape, data_start: (prefix + length) as u64 })
+    }
+
+    /// Bytes of data that the header promises, if that is a possible number.
+    pub fn data_bytes(&self) -> Option<u64> {
+        let samples = self.shape.iter().try_fold(1u64, |n, &d| n.checked_mul(d as u64))?;
+        samples.checked_mul(self.sample.bytes() as u64)
+    }
+
+    /// Opens a file and checks that it holds all the data its header promises.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read, is malformed, or is too short.
+    pub fn open(path: &Path) -> Result<(Self, BufReader<File>)> {
+        let io = |e| SimError::io("open the file", path, e);
+        let file = File::open(path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let mut reader = BufReader::with_capacity(1 << 16, file);
+        let header = Self::read(&mut reader, path)?;
+        let there = length - header.data_start.min(length);
+        match header.data_bytes() {
+            Some(promised) if promised <= there => Ok((header, reader)),
+            Some(promised) => Err(SimError::data(
+                format!(
+                    "the file is truncated: its header promises {promised} bytes of data, it holds {there}"
+                ),
+                path,
+                "copy or export it again",
+            )),
+            None => Err(SimError::data(
+                format!("its header claims an impossible shape, {:?}", header.shape),
+                path,
+                "the file is damaged: export it again",
+            )),
+        }
+    }
+}
+
+/// Parses `{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }`.
+fn parse_dictionary(text: &str) -> Option<(String, bool, Vec<usize>)> {
+    let after = |key: &str| {
+        let at = text.find(&format!("'{key}'"))? + key.len() + 2;
+        text[at..].trim_start().strip_prefix(':').map(str::trim_start)
+    };
+    let descr = after("descr")?.strip_prefix('\'')?;
+    let descr = descr[..descr.find('\'')?].to_owned();
+    let order = after("fortran_order")?;
+    let fortran = order.starts_with("True");
+    if !fortran && !order.starts_with("False") {
+        return None;
+    }
+    let shape = after("shape")?.strip_prefix('(')?;
+    let shape = shape[..shape.find(')')?]
+        .split(',')
+        .map(str::trim)
+        .filter(|d| !d.is_empty())
+        .map(|d| d.parse().ok())
+        .collect::<Option<Vec<usize>>>()?;
+    Some((descr, fortran, shape))
+}
+
+/// A `.npy` header, version 1.0, padded to 64 bytes as NumPy does.
+///
+/// `descr` is NumPy's type string, as in `|u1`, `<u2`, `<f4`.
+pub fn write_header(out: &mut impl Write, descr: &str, shape: &[usize]) -> std::io::Result<()> {
+    let mut dims = String::new();
+    for (i, d) in shape.iter().enumerate() {
+        dims += &format!("{}{d}", if i > 0 { ", " } else { "" });
+    }
+    if shape.len() == 1 {
+        dims.push(',');
+    }
+    let mut text = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({dims}), }}");
+    let padding = (64 - (10 + text.len() + 1) % 64) % 64;
+    text.push_str(&" ".repeat(padding));
+    text.push('\n');
+    out.write_all(b"\x93NUMPY\x01\x00")?;
+    out.write_all(&(text.len() as u16).to_le_bytes())?;
+    out.write_all(text.as_bytes())
+}
+
+/// Reads a two-dimensional `.npy`, values as they are.
+///
+/// # Errors
+/// [`SimError`] if it cannot be read or has another number of dimensions.
+pub fn read_image(path: &Path) -> Result<Frame> {
+    let (header, mut reader) = Header::open(path)?;
+    let &[height, width] = header.shape.as_slice() else {
+        return Err(SimError::data(
+            format!("an array of shape {:?} where one image is expected", header.shape),
+            path,
+            "save an array of shape (height, width)",
+        ));
+    };
+    let size = Size::new(height, width, &path.display().to_string())?;
+    let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
+    reader.read_exact(&mut bytes).map_err(|e| SimError::io("read the data", path, e))?;
+    let data = bytes.chunks_exact(header.sample.bytes()).map(|b| header.sample.decode(b)).collect();
+    Ok(Frame { size, data })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header_bytes(descr: &str, shape: &[usize]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        write_header(&mut bytes, descr, shape).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn headers_are_aligned_and_come_back() {
+        for shape in [vec![5], vec![3, 4], vec![100_000, 256, 64]] {
+            let bytes = header_bytes("<u2", &shape);
+            assert_eq!(bytes.len() % 64, 0);
+            let header = Header::read(&mut bytes.as_slice(), Path::new("x.npy")).unwrap();
+            assert_eq!(header.shape, shape);
+            assert_eq!(header.sample, Sample::U16 { big_endian: false });
+            assert_eq!(header.data_start, bytes.len() as u64);
+        }
+    }
+
+    #[test]
+    fn numpys_own_header_is_read() {
+        let text = b"\x93NUMPY\x01\x00v\x00{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4), }                                                          \n";
+        let header = Header::read(&mut text.as_slice(), Path::new("x.npy")).unwrap();
+        assert_eq!((header.sample, header.shape), (Sample::U8, vec![2, 3, 4]));
+    }
+
+    #[test]
+    fn hostile_headers_are_errors() {
+        let path = Path::new("x.npy");
+        for bytes in [
+            b"".to_vec(),
+            b"\x93NUMPY".to_vec(),
+            b"\x93NUMPY\x02\x00\xff\xff\xff\xff".to_vec(),
+            b"\x93NUMPY\x07\x00\x10\x00".to_vec(),
+            b"\x93NUMPY\x01\x00\x03\x00abc".to_vec(),
+            header_bytes("<c8", &[3]),
+        ] {
+            assert!(Header::read(&mut bytes.as_slice(), path).is_err(), "{bytes:?}");
+        }
+        let huge = Header { sample: Sample::U8, shape: vec![usize::MAX, 3], data_start: 0 };
+        assert_eq!(huge.data_bytes(), None);
+    }
+
+    #[test]
+    fn both_byte_orders_decode() {
+        assert_eq!(Sample::U16 { big_endian: true }.decode(&[1, 2]), 258.0);
+        assert_eq!(Sample::U16 { big_endian: false }.decode(&[2, 1]), 258.0);
+        assert_eq!(Sample::F32 { big_endian: true }.decode(&1.5f32.to_be_bytes()), 1.5);
+        assert_eq!(Sample::F64 { big_endian: false }.decode(&2.25f64.to_le_bytes()), 2.25);
+    }
+}

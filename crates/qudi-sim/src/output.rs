@@ -1,0 +1,13 @@
+//! Files written whole or not at all: under a temporary name, renamed when complete.
+
+mod array;
+mod frames;
+mod gif_preview;
+mod pending;
+mod picture;
+
+pub use array::ArrayWriter;
+pub use frames::FramesWriter;
+pub use gif_preview::GifPreview;
+pub use pending::{Overwrite, PendingFile, PendingFolder};
+pub use picture::Picture;

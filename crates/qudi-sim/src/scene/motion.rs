@@ -1,0 +1,69 @@
+//! Similarity motion: translation, rotation and zoom about a centre.
+
+/// Motion of a layer: at time t, a local point q is at
+/// `shift + centre + t * velocity + zoom^t * R(t * rotation) (q - centre)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// Pixels per frame.
+    pub velocity: [f64; 2],
+    /// Radians per frame, clockwise on the screen.
+    pub rotation: f64,
+    /// Magnification per frame; 1 for none.
+    pub zoom: f64,
+    /// Fixed point of rotation and zoom, in local coordinates.
+    pub centre: [f64; 2],
+    /// Where the local origin lies in the frame at time 0, before rotation and zoom.
+    pub shift: [f64; 2],
+}
+
+impl Motion {
+    /// Translation only.
+    pub fn pan(velocity: [f64; 2]) -> Self {
+        Self { velocity, rotation: 0.0, zoom: 1.0, centre: [0.0; 2], shift: [0.0; 2] }
+    }
+
+    /// Magnification since time 0.
+    pub fn scale(&self, t: f64) -> f64 {
+        self.zoom.powf(t)
+    }
+
+    /// Where the local point `q` is at time `t`.
+    pub fn to_scene(&self, t: f64, q: [f64; 2]) -> [f64; 2] {
+        let (sin, cos) = (self.rotation * t).sin_cos();
+        let scale = self.scale(t);
+        let (dx, dy) = (scale * (q[0] - self.centre[0]), scale * (q[1] - self.centre[1]));
+        [
+            self.shift[0] + self.centre[0] + t * self.velocity[0] + cos * dx - sin * dy,
+            self.shift[1] + self.centre[1] + t * self.velocity[1] + sin * dx + cos * dy,
+        ]
+    }
+
+    /// Which local point is at `p` at time `t`.
+    pub fn to_local(&self, t: f64, p: [f64; 2]) -> [f64; 2] {
+        let (sin, cos) = (self.rotation * t).sin_cos();
+        let scale = 1.0 / self.scale(t);
+        let dx = scale * (p[0] - self.shift[0] - self.centre[0] - t * self.velocity[0]);
+        let dy = scale * (p[1] - self.shift[1] - self.centre[1] - t * self.velocity[1]);
+        [self.centre[0] + cos * dx + sin * dy, self.centre[1] - sin * dx + cos * dy]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_two_directions_are_inverse() {
+        let motion = Motion {
+            velocity: [1.5, -2.0],
+            rotation: 0.1,
+            zoom: 1.02,
+            centre: [30.0, 20.0],
+            shift: [4.0, -3.0],
+        };
+        for t in [0.0, 0.4, 7.0] {
+            let p = motion.to_scene(t, motion.to_local(t, [12.0, 34.0]));
+            assert!((p[0] - 12.0).abs() < 1e-9 && (p[1] - 34.0).abs() < 1e-9);
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! Sensor files: TOML, alone or on top of a preset (`base = "swissspad2"`).
+
+use super::{PRESETS, Sensor, preset};
+use crate::error::{Result, SimError};
+use serde_json::Value;
+use std::path::Path;
+
+/// Sensor files are a page long; anything much larger is something else.
+const MAX_FILE: u64 = 1 << 20;
+
+impl Sensor {
+    /// A preset by name, or a TOML file by path.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is no such preset or file, or if it describes no possible sensor.
+    pub fn load(name_or_path: &str) -> Result<Self> {
+        Self::from_document(load_document(name_or_path)?, name_or_path)
+    }
+
+    /// A sensor from its document, checked.
+    ///
+    /// # Errors
+    /// [`SimError::Sensor`] for unknown keys, missing keys, wrong types and impossible values.
+    pub fn from_document(document: Value, place: &str) -> Result<Self> {
+        let sensor: Self = serde_json::from_value(document).map_err(|e| SimError::Sensor {
+            what: e.to_string(),
+            place: place.to_owned(),
+            help: "`qudi info SENSOR` shows every key; `base = \"qudi-paper\"` fills in the rest"
+                .to_owned(),
+        })?;
+        sensor.validate()?;
+        Ok(sensor)
+    }
+}
+
+/// The document of a preset or a TOML file, its `base` filled in, ready for overrides.
+///
+/// # Errors
+/// [`SimError`] if it cannot be found, read or parsed.
+pub fn load_document(name_or_path: &str) -> Result<Value> {
+    if let Some(preset) = preset(name_or_path) {
+        return parse(preset.toml, name_or_path);
+    }
+    let path = Path::new(name_or_path);
+    if path.extension().is_none_or(|e| e != "toml") {
+        let names: Vec<_> = PRESETS.iter().map(|p| p.name).collect();
+        let nearest = crate::nearest::nearest(name_or_path, &names);
+        let hint = nearest.map_or(String::new(), |n| format!("did you mean `{n}`?  "));
+        return Err(SimError::request(
+            format!("no sensor named `{name_or_path}`"),
+            "--sensor",
+            format!("{hint}list them with `qudi info --sensors`, or pass a .toml file"),
+        ));
+    }
+    let size =
+        std::fs::metadata(path).map_err(|e| SimError::io("read the sensor file", path, e))?.len();
+    if size > MAX_FILE {
+        return Err(SimError::data(
+            format!("a sensor file of {size} bytes is over the limit of {MAX_FILE}"),
+            path,
+            "pass the sensor's TOML file",
+        ));
+    }
+    let text =
+        std::fs::read_to_string(path).map_err(|e| SimError::io("read the sensor file", path, e))?;
+    let mut document = parse(&text, name_or_path)?;
+    if let Some(base) = document.as_object_mut().and_then(|d| d.shift_remove("base")) {
+        let base = base.as_str().map(str::to_owned).unwrap_or_default();
+        let Some(preset) = preset(&base) else {
+            return Err(SimError::data(
+                format!("no preset named `{base}` to start from"),
+                path,
+                "list the presets with `qudi info --sensors`",
+            ));
+        };
+        let mut merged = parse(preset.toml, preset.name)?;
+        merge_documents(&mut merged, document);
+        document = merged;
+    }
+    // A map is named from where the sensor file lies.
+    if let Some(map) = document.pointer_mut("/defects/dark_map")
+        && let Some(name) = map.as_str()
+        && let Some(folder) = path.parent()
+    {
+        *map = Value::String(folder.join(name).to_string_lossy().into_owned());
+    }
+    Ok(document)
+}
+
+fn parse(text: &str, place: &str) -> Result<Value> {
+    toml::from_str(text).map_err(|e: toml::de::Error| SimError::Sensor {
+        what: format!("not a TOML document: {}", e.message()),
+        place: match e.span() {
+            Some(span) => {
+                format!("{place}, line {}", text[..span.start].lines().count().max(1))
+            }
+            None => place.to_owned(),
+        },
+        help: "see configs/sensors for examples".to_owned(),
+    })
+}
+
+/// Lays `upper` over `lower`, table by table.
+pub fn merge_documents(lower: &mut Value, upper: Value) {
+    match (lower, upper) {
+        (Value::Object(lower), Value::Object(upper)) => {
+            for (key, value) in upper {
+                merge_documents(lower.entry(key).or_insert(Value::Null), value);
+            }
+        }
+        (lower, upper) => *lower = upper,
+    }
+}

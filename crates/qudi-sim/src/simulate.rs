@@ -1,0 +1,192 @@
+//! From scenes to photons: one pass to measure the clip's light, one to expose it.
+//!
+//! Memory holds one exposure at a time, however long the clip.
+
+use crate::camera::Camera;
+use crate::error::{Result, SimError};
+use crate::frame::{Frame, Size};
+use crate::light::{ClipStatistics, Light, PppDefinition, resolve_light};
+use crate::scene::Flow;
+use crate::sensor::{PixelMaps, Sensor};
+use crate::source::{Input, Sampling};
+use serde::{Deserialize, Serialize};
+use std::ops::ControlFlow;
+
+/// A simulation, complete: the same value gives the same photons.
+#[derive(Debug, Serialize, Deserialize)]
+pub struct Simulation {
+    /// Where the scene comes from.
+    pub input: Input,
+    /// How frames are taken from it.
+    pub sampling: Sampling,
+    /// The sensor, gain rule included.
+    pub sensor: Sensor,
+    /// Photons per pixel, in the sense of `ppp_def`.
+    pub ppp: f64,
+    /// What `ppp` counts.
+    pub ppp_def: PppDefinition,
+    /// Image value that receives `ppp` photons; the clip's mean if absent.
+    pub exposure: Option<f64>,
+    /// Seed of photons and noise.
+    pub seed: u64,
+}
+
+/// How far a simulation is.
+#[derive(Clone, Copy, Debug)]
+pub struct Progress {
+    /// Which of the two passes.
+    pub stage: Stage,
+    /// Frames done in it.
+    pub done: u64,
+    /// Frames in all, if known.
+    pub total: Option<u64>,
+}
+
+/// The two passes over a clip.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Measuring the clip's light.
+    Measuring,
+    /// Exposing it.
+    Exposing,
+}
+
+/// What is known before the first exposure.
+#[derive(Clone, Copy, Debug)]
+pub struct Start {
+    /// Frame size.
+    pub size: Size,
+    /// Number of exposures.
+    pub frames: u64,
+}
+
+/// One exposed frame and what is known about it.
+#[derive(Debug)]
+pub struct Exposed<'a> {
+    /// Its number.
+    pub index: u64,
+    /// The counts, `[height * width]`.
+    pub counts: &'a [u16],
+    /// The scene in the middle of the exposure.
+    pub truth: &'a Frame,
+}
+
+/// Where exposed frames go.
+pub trait Sink {
+    /// Called once, before the first frame.
+    fn start(&mut self, start: Start) -> Result<()>;
+
+    /// One frame; `flow` computes the true motion to the next frame of a synthetic scene (none for
+    /// recorded clips and after the last frame).
+    fn frame(&mut self, exposed: Exposed<'_>, flow: &dyn Fn() -> Option<Flow>) -> Result<()>;
+}
+
+/// What a simulation found and did.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Frame size.
+    pub size: Size,
+    /// Frames exposed.
+    pub frames: u64,
+    /// The light.
+    pub light: Light,
+    /// Gain in DN/e-.
+    pub gain: f64,
+    /// Mean image value of the clip.
+    pub clip_mean: f64,
+    /// CRC-32 of the clip's values.
+    pub clip_crc32: u32,
+    /// Mean count per pixel.
+    pub mean_count: f64,
+    /// Share of pixels at full scale.
+    pub saturated: f64,
+    /// Hot and dead pixels of the array.
+    pub hot_and_dead: (usize, usize),
+}
+
+/// Runs a simulation. `on` hears of every frame and may end it.
+///
+/// # Errors
+/// [`SimError`] of the input, the sensor, the light or the sink; [`SimError::Interrupted`] if `on`
+/// breaks.
+pub fn simulate(
+    simulation: &Simulation,
+    sink: &mut dyn Sink,
+    on: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+) -> Result<Summary> {
+    let mut progress = |stage, done, total| match on(Progress { stage, done, total }) {
+        ControlFlow::Continue(()) => Ok(()),
+        ControlFlow::Break(()) => Err(SimError::Interrupted),
+    };
+    let Simulation { input, sampling, sensor, .. } = simulation;
+    sensor.validate()?;
+
+    let mut source = input.open(sampling)?;
+    let info = source.info();
+    let mut clip = ClipStatistics::default();
+    let mut frames = 0;
+    while let Some(exposure) = source.next()? {
+        exposure.instants.iter().for_each(|frame| clip.add(&frame.data));
+        frames += 1;
+        progress(Stage::Measuring, frames, info.frames)?;
+    }
+    if frames == 0 {
+        return Err(SimError::request(
+            format!("the clip is too short for one exposure of {} frames", sampling.instants),
+            input.place(),
+            "lower --instants, or check --frames",
+        ));
+    }
+
+    let mean_dark = PixelMaps::draw(sensor, info.size)?.mean_dark(sensor)?;
+    let light = resolve_light(
+        sensor,
+        simulation.ppp_def,
+        simulation.ppp,
+        simulation.exposure,
+        &clip,
+        mean_dark,
+    )?;
+    let mut camera = Camera::new(sensor, info.size, light, simulation.seed)?;
+    sink.start(Start { size: info.size, frames })?;
+
+    let mut source = input.open(sampling)?;
+    let (mut sum, mut saturated) = (0u64, 0u64);
+    let mut again = ClipStatistics::default();
+    for index in 0..frames {
+        let Some(exposure) = source.next()? else {
+            return Err(changed(input));
+        };
+        exposure.instants.iter().for_each(|frame| again.add(&frame.data));
+        let instants: Vec<&Frame> = exposure.instants.iter().collect();
+        let counts = camera.expose(index, &instants)?;
+        sum += counts.iter().map(|&c| u64::from(c)).sum::<u64>();
+        saturated += counts.iter().filter(|&&c| c == sensor.max_count()).count() as u64;
+        let flow = || if index + 1 < frames { source.flow(index) } else { None };
+        sink.frame(Exposed { index, counts: &counts, truth: exposure.truth() }, &flow)?;
+        progress(Stage::Exposing, index + 1, Some(frames))?;
+    }
+    if again.crc32 != clip.crc32 {
+        return Err(changed(input));
+    }
+    let pixels = (frames * info.size.pixels() as u64) as f64;
+    Ok(Summary {
+        size: info.size,
+        frames,
+        light,
+        gain: camera.gain(),
+        clip_mean: clip.mean(),
+        clip_crc32: clip.crc32,
+        mean_count: sum as f64 / pixels,
+        saturated: saturated as f64 / pixels,
+        hot_and_dead: (camera.maps().hot.len(), camera.maps().dead.len()),
+    })
+}
+
+fn changed(input: &Input) -> SimError {
+    SimError::request(
+        "the clip changed between the measuring and the exposing pass",
+        input.place(),
+        "let nothing write to the input, then run again",
+    )
+}

@@ -1,0 +1,112 @@
+//! A folder of image files, in the order of the numbers in their names.
+
+use super::FrameReader;
+use super::image_file::{EXTENSIONS, read_still};
+use crate::error::{Result, SimError};
+use crate::frame::{Frame, Size};
+use crate::transfer::Transfer;
+use std::cmp::Ordering;
+use std::path::{Path, PathBuf};
+
+pub(super) struct ImageFolder {
+    files: std::vec::IntoIter<PathBuf>,
+    total: u64,
+    first: Option<Frame>,
+    size: Size,
+    transfer: Transfer,
+}
+
+impl ImageFolder {
+    pub(super) fn open(folder: &Path, transfer: Transfer) -> Result<Self> {
+        let read = |e| SimError::io("list the folder", folder, e);
+        let mut files = Vec::new();
+        for entry in std::fs::read_dir(folder).map_err(read)? {
+            let path = entry.map_err(read)?.path();
+            let is_image = path
+                .extension()
+                .is_some_and(|e| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known)));
+            if is_image && path.is_file() {
+                files.push(path);
+            }
+        }
+        files.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
+        let Some(name) = files.first() else {
+            return Err(SimError::data(
+                "the folder holds no images",
+                folder,
+                format!("put frames into it as {}", EXTENSIONS.join(", ")),
+            ));
+        };
+        let first = read_still(name, transfer)?;
+        let total = files.len() as u64;
+        let size = first.size;
+        let mut files = files.into_iter();
+        files.next();
+        Ok(Self { files, total, size, first: Some(first), transfer })
+    }
+}
+
+impl FrameReader for ImageFolder {
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn len(&self) -> Option<u64> {
+        Some(self.total)
+    }
+
+    fn next(&mut self) -> Result<Option<Frame>> {
+        if let Some(first) = self.first.take() {
+            return Ok(Some(first));
+        }
+        let Some(path) = self.files.next() else { return Ok(None) };
+        let frame = read_still(&path, self.transfer)?;
+        if frame.size != self.size {
+            return Err(SimError::data(
+                format!("an image of {} among images of {}", frame.size, self.size),
+                &path,
+                "frames of one clip have one size: resize it, or move it to another folder",
+            ));
+        }
+        Ok(Some(frame))
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Compares names with runs of digits as numbers: `frame2` before `frame10`.
+fn natural_order(a: &str, b: &str) -> Ordering {
+    let (mut a, mut b) = (a, b);
+    loop {
+        let digits = |s: &str| s.len() - s.trim_start_matches(|c: char| c.is_ascii_digit()).len();
+        let (da, db) = (digits(a), digits(b));
+        let order = if da > 0 && db > 0 {
+            let (na, nb) = (a[..da].trim_start_matches('0'), b[..db].trim_start_matches('0'));
+            let order = na.len().cmp(&nb.len()).then_with(|| na.cmp(nb)).then_with(|| da.cmp(&db));
+            (a, b) = (&a[da..], &b[db..]);
+            order
+        } else {
+            let (ca, cb) = (a.chars().next(), b.chars().next());
+            let (Some(ca), Some(cb)) = (ca, cb) else { return ca.cmp(&cb) };
+            (a, b) = (&a[ca.len_utf8()..], &b[cb.len_utf8()..]);
+            ca.cmp(&cb)
+        };
+        if order != Ordering::Equal {
+            return order;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_sort_as_numbers() {
+        let mut names = ["f10.png", "f9.png", "f1.png", "f01.png", "e100.png", "f.png"];
+        names.sort_by(|a, b| natural_order(a, b));
+        assert_eq!(names, ["e100.png", "f.png", "f1.png", "f01.png", "f9.png", "f10.png"]);
+    }
+}

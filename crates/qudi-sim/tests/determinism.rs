@@ -1,0 +1,58 @@
+//! Same seed, same photons: whatever the threads, the length of the clip, the way they are drawn.
+
+use proptest::prelude::*;
+use qudi_sim::sensor::{DarkRate, Sensor};
+use qudi_sim::{Camera, Frame, Light, Size};
+
+fn expose(sensor: &Sensor, size: Size, seed: u64, threads: usize, frames: u64) -> Vec<Vec<u16>> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    pool.install(|| {
+        let light = Light { ppp: 3.25, exposure: 0.45 };
+        let mut camera = Camera::new(sensor, size, light, seed).unwrap();
+        let scene = Frame::from_fn(size, |x, y| ((x * 7 + y * 13) % 100) as f32 / 100.0);
+        (0..frames).map(|t| camera.expose(t, &[&scene]).unwrap()).collect()
+    })
+}
+
+/// Every way through the camera: tables, direct draws, single binary frames, echoes.
+fn sensors() -> Vec<Sensor> {
+    let mut uneven = Sensor::load("qudi-paper").unwrap();
+    uneven.defects.dark_spread = 0.7;
+    uneven.defects.hot_fraction = 0.01;
+    uneven.defects.hot_dark = DarkRate::PerFrame(500.0);
+    let mut deep = Sensor::load("qis16-gj").unwrap();
+    deep.defects.crosstalk = 0.02;
+    let mut echoing = Sensor::load("swissspad2").unwrap();
+    echoing.frames_summed = 7;
+    echoing.quantum_efficiency = 0.5;
+    echoing.defects.afterpulse = 0.05;
+    echoing.defects.crosstalk = 0.01;
+    echoing.defects.dead_fraction = 0.01;
+    let plain = ["qudi-paper", "cis-phone", "spad512s"].map(|name| Sensor::load(name).unwrap());
+    plain.into_iter().chain([uneven, deep, echoing]).collect()
+}
+
+#[test]
+fn one_and_eight_threads_see_the_same_photons() {
+    let size = Size { height: 67, width: 91 };
+    for sensor in sensors() {
+        let alone = expose(&sensor, size, 7, 1, 3);
+        assert_eq!(alone, expose(&sensor, size, 7, 8, 3), "{}", sensor.name);
+        assert_ne!(alone, expose(&sensor, size, 8, 1, 3), "{}: the seed matters", sensor.name);
+        assert_ne!(alone[0], alone[1], "{}: frames differ", sensor.name);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn any_size_and_seed_is_reproducible(
+        height in 1usize..40, width in 1usize..70, seed: u64, threads in 1usize..9, which in 0usize..6,
+    ) {
+        let size = Size { height, width };
+        let sensor = &sensors()[which];
+        let alone = expose(sensor, size, seed, 1, 2);
+        prop_assert_eq!(&alone, &expose(sensor, size, seed, threads, 2));
+        prop_assert!(alone.iter().flatten().all(|&c| c <= sensor.max_count()));
+    }
+}

@@ -1,0 +1,33 @@
+# Recipes; `just` lists them.
+
+default:
+    @just --list
+
+# Everything CI runs
+ci:
+    .ci/run
+
+# The test suite
+test:
+    cargo test --workspace
+
+# Formatting and lints
+lint:
+    cargo fmt --all --check
+    cargo clippy --workspace --all-targets -- -D warnings
+
+# API documentation
+doc:
+    cargo doc --workspace --no-deps --open
+
+# Nanoseconds per pixel of the camera
+bench:
+    cargo bench -p qudi-sim
+
+# The picture of the README
+picture:
+    cargo run --release -- demo -o docs/images/demo.png --force
+
+# The settings reference, from the program itself
+config-docs:
+    cargo run -- config docs > configs/README.md

@@ -1,0 +1,40 @@
+//! The program as a user meets it. `README.md` and `tests/cmd/*.md` are run as they stand.
+
+use std::path::{Path, PathBuf};
+
+#[path = "cli/bad_input.rs"]
+mod bad_input;
+#[path = "cli/outputs.rs"]
+mod outputs;
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
+}
+
+/// Every console block of the README and of tests/cmd, in an empty folder each.
+#[test]
+fn console_blocks_run_as_documented() {
+    let cases = Path::new(env!("CARGO_TARGET_TMPDIR")).join("console");
+    let _ = std::fs::remove_dir_all(&cases);
+    let mut pages = vec![root().join("README.md")];
+    let folder = std::fs::read_dir(root().join("tests/cmd")).unwrap();
+    pages.extend(folder.map(|entry| entry.unwrap().path()));
+    for page in pages {
+        let stem = page.file_stem().unwrap().to_str().unwrap();
+        // An `.out` folder beside a case makes its commands share a sandbox.
+        std::fs::create_dir_all(cases.join(format!("{stem}.in"))).unwrap();
+        std::fs::create_dir_all(cases.join(format!("{stem}.out"))).unwrap();
+        std::fs::copy(&page, cases.join(format!("{stem}.md"))).unwrap();
+    }
+    trycmd::TestCases::new().env("NO_COLOR", "1").case(cases.join("*.md")).run();
+}
+
+#[test]
+fn the_settings_reference_is_up_to_date() {
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_qudi"))
+        .args(["config", "docs"])
+        .output()
+        .unwrap();
+    let committed = std::fs::read_to_string(root().join("configs/README.md")).unwrap();
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), committed, "run `just config-docs`");
+}
