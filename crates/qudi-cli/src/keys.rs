@@ -47,7 +47,7 @@ pub(crate) const KEYS: &[Key] = &[
         "",
         "motion of a still, as in `pan:2,0.5+rotate:0.3+zoom:1.01+layers:3` (pixels, degrees and magnification per frame; number of cut-outs)",
     ),
-    key("simulate.size", "", "frame size of synthetic scenes, `HEIGHTxWIDTH`"),
+    key("simulate.size", "", "frame size of synthetic scenes, `HxW` (height first)"),
     key("simulate.speed", "2.0", "fastest motion of procedural scenes, in pixels per frame"),
     key("simulate.scene_seed", "1", "seed of the layout of synthetic scenes"),
     key(

@@ -172,10 +172,11 @@ fn unknown_key(name: &str, names: &[&str], origin: &str) -> Fault {
 
 /// A value in TOML notation; anything else is a string.
 fn parse_value(text: &str) -> Value {
-    toml::from_str::<Value>(&format!("v = {text}"))
-        .ok()
-        .and_then(|mut document| document.as_object_mut()?.remove("v"))
-        .unwrap_or_else(|| Value::String(text.to_owned()))
+    let document = toml::from_str::<Value>(&format!("v = {text}"));
+    match document.as_ref().ok().and_then(Value::as_object) {
+        Some(document) if document.len() == 1 => document["v"].clone(),
+        _ => Value::String(text.to_owned()),
+    }
 }
 
 /// Leaves of a document by dotted name.

@@ -39,7 +39,7 @@ fn both_backends_differentiate_alike() {
         let x = counts_to_tensor(&counts, 1, size, 7, &device.autodiff()).unwrap().require_grad();
         let loss = (x.clone().powi_scalar(2) * 3.0).mean();
         let gradients = loss.backward();
-        x.grad(&gradients).unwrap().into_data().into_vec::<f32>().unwrap()
+        x.grad(&gradients).unwrap().into_data().try_into_vec::<f32>().unwrap()
     };
     let [flex, ndarray] = devices().map(gradient);
     for ((a, b), &count) in flex.iter().zip(&ndarray).zip(&counts) {

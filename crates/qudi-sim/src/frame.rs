@@ -49,7 +49,7 @@ impl std::str::FromStr for Size {
         let parts: Vec<_> = text.split('x').map(|p| p.trim().parse::<usize>()).collect();
         match parts.as_slice() {
             [Ok(height), Ok(width)] => Self::new(*height, *width, text).map_err(|e| e.to_string()),
-            _ => Err("expected HEIGHTxWIDTH, as in 256x512".to_owned()),
+            _ => Err("expected height x width, as in 256x512".to_owned()),
         }
     }
 }
