@@ -1,4 +1,5 @@
 //! The program as a user meets it. `README.md` and `tests/cmd/*.md` are run as they stand.
+#![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
 

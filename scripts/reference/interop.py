@@ -50,7 +50,7 @@ def main() -> None:
     simulate(qudi, folder, "128x208", "-o", "cube.npy")
     simulate(qudi, folder, "128x208", "-o", "cube-plain.npy", "--unpacked")
     plain = np.load(folder / "cube-plain.npy")
-    assert PhotonCube.open(str(folder / "cube.npy")).shape == [40, 128, 208], "photoncube's shape"
+    assert PhotonCube.open(str(folder / "cube.npy")).shape == (40, 128, 26), "photoncube's shape"
     pngs = folder / "png"
     pngs.mkdir()
     command = ["photoncube", "preview", "-i", str(folder / "cube.npy"), "--img-dir", str(pngs)]

@@ -115,14 +115,14 @@ fn unsuitable_inputs_and_outputs_are_refused() {
         (vec![scene, "-o", "out.npy", "--instants", "0"], "0 instants"),
         (vec![scene, "-o", "out.npy", "--instants", "999999999999"], "instants"),
         (vec![scene, "-o", "out.npy", "--ppp", "-1"], "-1 photons"),
-        (vec![scene, "-o", "out.npy", "--ppp", "nan"], "NaN"),
+        (vec![scene, "-o", "out.npy", "--ppp", "nan"], "`simulate.ppp` is not a finite number"),
         (vec![scene, "-o", "out.npy", "--ppp", "1e300"], "photons per pixel"),
         (vec![scene, "-o", "out.npy", "--ppp", "0"], "gain rule"),
         (vec![scene, "-o", "out.npy", "--exposure", "0"], "exposure of 0"),
         (vec![scene, "-o", "out.npy", "--exposure", "1e-30"], "electrons in a white pixel"),
         (vec![scene, "-o", "out.npy", "--ppp-def", "dn"], "gain rule `quiver`"),
         (vec![scene, "-o", "out.npy", "--ppp-def", "photons"], "photons"),
-        (vec![scene, "-o", "out.npy", "--speed", "nan"], "speed"),
+        (vec![scene, "-o", "out.npy", "--speed", "-2"], "a speed of -2"),
     ] {
         let args = [vec!["simulate"], args].concat();
         let said = refused(&folder, &args);
@@ -139,7 +139,7 @@ fn impossible_sensors_are_refused() {
         ("qe.toml", "base = \"ideal\"\nquantum_efficiency = 1.2", "quantum_efficiency is 1.2"),
         ("bits.toml", "base = \"ideal\"\nbits = 0", "bits is 0"),
         ("deep.toml", "base = \"ideal\"\nbits = 17", "bits is 17"),
-        ("nan.toml", "base = \"ideal\"\nread_noise = nan", "read_noise"),
+        ("nan.toml", "base = \"ideal\"\nread_noise = nan", "read_noise is not a finite number"),
         ("well.toml", "base = \"ideal\"\nfull_well = 0", "full_well is 0"),
         ("gain.toml", "base = \"ideal\"\ngain = \"high\"", "`high` is no gain"),
         ("key.toml", "base = \"ideal\"\nread_nois = 1", "read_nois"),

@@ -111,35 +111,35 @@ pub(crate) struct Simulate {
     #[arg(long, value_name = "N", help_heading = "Sensor")]
     pub(crate) bits: Option<u8>,
     /// Quantum efficiency, fill factor included
-    #[arg(long, value_name = "0..1", help_heading = "Sensor")]
+    #[arg(long, value_name = "0..1", allow_negative_numbers = true, help_heading = "Sensor")]
     pub(crate) qe: Option<f64>,
     /// Dark electrons per pixel and frame, or per second as in 7.5/s
     #[arg(long, value_name = "RATE", help_heading = "Sensor")]
     pub(crate) dark: Option<String>,
     /// Read noise in electrons rms
-    #[arg(long, value_name = "E-", help_heading = "Sensor")]
+    #[arg(long, value_name = "E-", allow_negative_numbers = true, help_heading = "Sensor")]
     pub(crate) read_noise: Option<f64>,
     /// Full-well capacity in electrons, or `unlimited`
-    #[arg(long, value_name = "E-", help_heading = "Sensor")]
+    #[arg(long, value_name = "E-", allow_negative_numbers = true, help_heading = "Sensor")]
     pub(crate) full_well: Option<String>,
     /// DN per electron, or a rule: quiver, unit, fwc, auto
     #[arg(long, value_name = "GAIN", help_heading = "Sensor")]
     pub(crate) gain: Option<String>,
 
     /// Photons per pixel and frame [default: 3.25]
-    #[arg(long, value_name = "PPP", help_heading = "Light")]
+    #[arg(long, value_name = "PPP", allow_negative_numbers = true, help_heading = "Light")]
     pub(crate) ppp: Option<f64>,
     /// What PPP counts: incident photons, detected electrons, or dn (mean output value)
     #[arg(long, value_name = "MEANING", help_heading = "Light")]
     pub(crate) ppp_def: Option<String>,
     /// Image value that receives PPP photons [default: the clip's mean]
-    #[arg(long, value_name = "VALUE", help_heading = "Light")]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, help_heading = "Light")]
     pub(crate) exposure: Option<f64>,
     /// What file values mean: as-is, or srgb (decoded to linear light)
     #[arg(long, value_name = "CURVE", help_heading = "Light")]
     pub(crate) transfer: Option<String>,
     /// File value of white in .npy inputs [default: full scale of the type]
-    #[arg(long, value_name = "VALUE", help_heading = "Light")]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, help_heading = "Light")]
     pub(crate) white: Option<f64>,
 
     /// Output frames at most [default: all; 11 for synthetic scenes]
@@ -155,7 +155,7 @@ pub(crate) struct Simulate {
     #[arg(long, value_name = "HxW", help_heading = "Scene")]
     pub(crate) size: Option<Size>,
     /// Fastest motion of procedural scenes in pixels per frame [default: 2]
-    #[arg(long, value_name = "PX", help_heading = "Scene")]
+    #[arg(long, value_name = "PX", allow_negative_numbers = true, help_heading = "Scene")]
     pub(crate) speed: Option<f64>,
     /// Seed of the layout of synthetic scenes [default: 1]
     #[arg(long, value_name = "N", help_heading = "Scene")]
@@ -170,7 +170,7 @@ pub(crate) struct Simulate {
     /// Write the true frames: .npy (float32) or a folder of 16-bit PNG
     #[arg(long, value_name = "PATH", help_heading = "Outputs", value_hint = ValueHint::AnyPath)]
     pub(crate) truth: Option<PathBuf>,
-    /// Write the true flow of a synthetic scene: .npy (float32), [frames-1][dx, dy, visible][H][W]
+    /// Write the true flow of a synthetic scene: .npy (float32), frames-1 x (dx, dy, visible) x H x W
     #[arg(long, value_name = "FILE", help_heading = "Outputs", value_hint = ValueHint::FilePath)]
     pub(crate) flow: Option<PathBuf>,
     /// Write an animated GIF of the counts
@@ -191,7 +191,7 @@ pub(crate) struct Demo {
     #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
     pub(crate) sensor: String,
     /// Photons per pixel and frame
-    #[arg(long, value_name = "PPP", default_value_t = 3.25)]
+    #[arg(long, value_name = "PPP", allow_negative_numbers = true, default_value_t = 3.25)]
     pub(crate) ppp: f64,
     /// Seed of photons and noise
     #[arg(long, value_name = "N", default_value_t = 1)]
@@ -202,13 +202,13 @@ pub(crate) struct Demo {
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Light {
     /// Illuminance on the sensor plane in lux
-    #[arg(long, value_name = "LX", required_unless_present_any = ["ppp", "scene_lux"], conflicts_with_all = ["ppp", "scene_lux"])]
+    #[arg(long, value_name = "LX", allow_negative_numbers = true, required_unless_present_any = ["ppp", "scene_lux"], conflicts_with_all = ["ppp", "scene_lux"])]
     pub(crate) lux: Option<f64>,
     /// Incident photons per pixel and frame
-    #[arg(long, value_name = "PPP", conflicts_with = "scene_lux")]
+    #[arg(long, value_name = "PPP", allow_negative_numbers = true, conflicts_with = "scene_lux")]
     pub(crate) ppp: Option<f64>,
     /// Illuminance on a diffuse scene in lux, seen through a lens
-    #[arg(long, value_name = "LX")]
+    #[arg(long, value_name = "LX", allow_negative_numbers = true)]
     pub(crate) scene_lux: Option<f64>,
     /// Sensor: a name or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
@@ -226,10 +226,10 @@ pub(crate) struct Light {
     #[arg(long)]
     pub(crate) daylight: bool,
     /// Reflectance of the scene, for --scene-lux
-    #[arg(long, value_name = "0..1", default_value_t = 0.18)]
+    #[arg(long, value_name = "0..1", allow_negative_numbers = true, default_value_t = 0.18)]
     pub(crate) reflectance: f64,
     /// Transmission of the lens, for --scene-lux
-    #[arg(long, value_name = "0..1", default_value_t = 0.9)]
+    #[arg(long, value_name = "0..1", allow_negative_numbers = true, default_value_t = 0.9)]
     pub(crate) transmission: f64,
     /// f-number of the lens, for --scene-lux
     #[arg(long, value_name = "N", default_value_t = 2.8)]

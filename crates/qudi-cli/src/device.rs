@@ -36,7 +36,7 @@ fn add_cards(backend: &str, kind: DeviceType, add: &mut impl FnMut(String, Strin
         let cards = Device::enumerate(kind).into_vec();
         cards
             .into_iter()
-            .map(|card| card.identity().map_or_else(|| format!("{card:?}"), |i| format!("{i:?}")))
+            .map(|card| card.identity().map_or_else(|| format!("{card:?}"), |i| i.name))
             .collect::<Vec<_>>()
     });
     std::panic::set_hook(quiet);

@@ -33,7 +33,7 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Light(light) => cmd::light::run(light, &args.global, report),
         Command::Info(info) => cmd::info::run(info, report),
         Command::Config(config) => cmd::config::run(config, &args.global, report),
-        Command::Completions(completions) => cmd::completions::run(completions, report),
-        Command::Man(man) => cmd::completions::man(man, report),
+        Command::Completions(completions) => cmd::completions::run(completions),
+        Command::Man(man) => cmd::completions::man(man),
     }
 }

@@ -13,9 +13,16 @@ use tracing_subscriber::EnvFilter;
 #[derive(Debug)]
 pub(crate) struct Report {
     json: bool,
-    quiet: bool,
-    verbose: bool,
+    volume: Volume,
     color: bool,
+}
+
+/// How much this run says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Volume {
+    Quiet,
+    Normal,
+    Verbose,
 }
 
 impl Report {
@@ -28,11 +35,11 @@ impl Report {
                     && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
             }
         };
-        let level = match (global.quiet, global.verbose) {
-            (true, _) => "error",
-            (false, 0) => "warn",
-            (false, 1) => "info",
-            (false, _) => "debug",
+        let (volume, level) = match (global.quiet, global.verbose) {
+            (true, _) => (Volume::Quiet, "error"),
+            (false, 0) => (Volume::Normal, "warn"),
+            (false, 1) => (Volume::Verbose, "info"),
+            (false, _) => (Volume::Verbose, "debug"),
         };
         let filter = EnvFilter::try_from_env("QUDI_LOG").unwrap_or_else(|_| EnvFilter::new(level));
         // Setting it twice can only happen in tests, and then the first one serves.
@@ -43,7 +50,7 @@ impl Report {
             .without_time()
             .with_target(false)
             .try_init();
-        Self { json: global.json, quiet: global.quiet, verbose: global.verbose > 0, color }
+        Self { json: global.json, volume, color }
     }
 
     pub(crate) fn json(&self) -> bool {
@@ -58,21 +65,14 @@ impl Report {
     ) -> Result<()> {
         if self.json {
             let document = serde_json::to_string_pretty(&json()).unwrap_or_else(|e| e.to_string());
-            return self.print(&document);
+            return print(&document);
         }
-        if self.quiet { Ok(()) } else { self.print(text) }
-    }
-
-    /// Prints text that was asked for by name, also when quiet.
-    pub(crate) fn print(&self, text: &str) -> Result<()> {
-        let mut out = std::io::stdout().lock();
-        let end = if text.ends_with('\n') { "" } else { "\n" };
-        write!(out, "{text}{end}").and_then(|()| out.flush()).map_err(stdout_fault)
+        if self.volume == Volume::Quiet { Ok(()) } else { print(text) }
     }
 
     /// A remark beside the result.
     pub(crate) fn remark(&self, text: &str) {
-        if !self.quiet {
+        if self.volume != Volume::Quiet {
             eprintln!("{text}");
         }
     }
@@ -80,7 +80,7 @@ impl Report {
     /// A bar that vanishes off a terminal, under --json and under --quiet; with --verbose, log
     /// lines take its place.
     pub(crate) fn bar(&self) -> Bar {
-        let shown = !self.json && !self.quiet && !self.verbose && std::io::stderr().is_terminal();
+        let shown = !self.json && self.volume == Volume::Normal && std::io::stderr().is_terminal();
         let target =
             if shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(None, target);
@@ -113,6 +113,13 @@ impl Report {
             }
         }
     }
+}
+
+/// Prints text that was asked for by name, also when quiet.
+pub(crate) fn print(text: &str) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    let end = if text.ends_with('\n') { "" } else { "\n" };
+    write!(out, "{text}{end}").and_then(|()| out.flush()).map_err(stdout_fault)
 }
 
 /// Progress of one command.

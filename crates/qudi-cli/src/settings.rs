@@ -98,6 +98,14 @@ impl Settings {
             let names: Vec<_> = KEYS.iter().map(|key| key.name).collect();
             return Err(unknown_key(name, &names, origin));
         };
+        // JSON has no NaN and no infinity: both arrive as null.
+        if value.is_null() {
+            return Err(Fault::new(
+                format!("`{name}` is not a finite number"),
+                origin,
+                "leave it out to keep the default",
+            ));
+        }
         self.values[at] = (value, origin.to_owned());
         Ok(())
     }

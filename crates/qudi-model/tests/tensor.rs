@@ -1,4 +1,5 @@
 //! The bridge to tensors, on every CPU backend.
+#![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
 use qudi_model::tensor::{counts_to_tensor, tensor_to_frames};

@@ -113,8 +113,8 @@ impl Scene {
         labels
     }
 
-    /// Layers with the circle (centre and radius, in the frame) that holds them; none if unbounded.
-    fn placed(&self, t: f64) -> Vec<(&Layer, Option<([f64; 2], f64)>)> {
+    /// Layers with their reach in the frame.
+    fn placed(&self, t: f64) -> Vec<(&Layer, Reach)> {
         let place = |layer: &Layer| {
             let (centre, radius) = layer.shape.bounds()?;
             Some((layer.motion.to_scene(t, centre), radius * layer.motion.scale(t) + 1.0))
@@ -123,8 +123,11 @@ impl Scene {
     }
 }
 
+/// The circle, centre and radius, that holds a layer; none if it is unbounded.
+type Reach = Option<([f64; 2], f64)>;
+
 /// Columns of row `y` that a circle reaches.
-fn columns(reach: Option<([f64; 2], f64)>, y: usize, width: usize) -> std::ops::Range<usize> {
+fn columns(reach: Reach, y: usize, width: usize) -> std::ops::Range<usize> {
     let Some(([cx, cy], radius)) = reach else { return 0..width };
     let dy = y as f64 - cy;
     if dy.abs() > radius {

@@ -243,7 +243,7 @@ impl Sensor {
             return Ok(());
         }
         let (low, high) = (range.start(), range.end());
-        let help = if *high == f64::MAX {
+        let help = if *high >= f64::MAX {
             format!("`{key}` is a finite number of at least {low}")
         } else {
             format!("`{key}` lies between {low} and {high}")

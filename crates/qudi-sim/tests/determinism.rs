@@ -1,4 +1,5 @@
 //! Same seed, same photons: whatever the threads, the length of the clip, the way they are drawn.
+#![allow(clippy::unwrap_used)]
 
 use proptest::prelude::*;
 use qudi_sim::sensor::{DarkRate, Sensor};

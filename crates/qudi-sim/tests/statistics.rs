@@ -1,5 +1,6 @@
 //! The camera against closed forms: every sensor kind, every light level, every defect.
 //! Seeds are fixed, so these tests either always pass or always fail.
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_sim::sensor::{CountLaw, DarkRate, FullWell, Gain, Sensor};
 use qudi_sim::{Camera, Frame, Light, Size};

@@ -2,16 +2,16 @@
 
 use crate::args::{Args, Completions, Man};
 use crate::error::{Fault, Result};
-use crate::report::Report;
+use crate::report::print;
 use clap::CommandFactory;
 
-pub(crate) fn run(completions: &Completions, report: &Report) -> Result<()> {
+pub(crate) fn run(completions: &Completions) -> Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(completions.shell, &mut Args::command(), "qudi", &mut script);
-    report.print(&String::from_utf8_lossy(&script))
+    print(&String::from_utf8_lossy(&script))
 }
 
-pub(crate) fn man(man: &Man, report: &Report) -> Result<()> {
+pub(crate) fn man(man: &Man) -> Result<()> {
     let write = |e: std::io::Error| {
         Fault::new(format!("cannot write the manual: {e}"), "man", "check the folder")
     };
@@ -21,5 +21,5 @@ pub(crate) fn man(man: &Man, report: &Report) -> Result<()> {
     }
     let mut page = Vec::new();
     clap_mangen::Man::new(Args::command()).render(&mut page).map_err(write)?;
-    report.print(&String::from_utf8_lossy(&page))
+    print(&String::from_utf8_lossy(&page))
 }

@@ -3,7 +3,7 @@
 use crate::args::{Config, ConfigAction, Global};
 use crate::error::Result;
 use crate::keys::KEYS;
-use crate::report::Report;
+use crate::report::{Report, print};
 use crate::settings::Settings;
 use serde_json::{Value, json};
 use std::fmt::Write;
@@ -11,7 +11,7 @@ use std::fmt::Write;
 pub(crate) fn run(config: &Config, global: &Global, report: &Report) -> Result<()> {
     match config.action {
         ConfigAction::Show => show(&Settings::load(global, Vec::new())?, report),
-        ConfigAction::Docs => report.print(&docs()),
+        ConfigAction::Docs => print(&docs()),
     }
 }
 

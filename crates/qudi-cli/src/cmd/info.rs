@@ -26,7 +26,11 @@ pub(crate) fn run(info: &Info, report: &Report) -> Result<()> {
     .find(|path| path.extension().is_some_and(|e| e == "json") && path.is_file());
     match record {
         Some(path) => burst(&path, report),
-        None if preset(subject).is_some() || subject.ends_with(".toml") => sensor(subject, report),
+        None if preset(subject).is_some()
+            || Path::new(subject).extension().is_some_and(|e| e == "toml") =>
+        {
+            sensor(subject, report)
+        }
         None if Path::new(subject).exists() => Err(Fault::new(
             "no record lies beside it, so nothing is known about it",
             subject,

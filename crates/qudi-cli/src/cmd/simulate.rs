@@ -146,6 +146,9 @@ fn simulation(args: &Simulate, global: &Global) -> Result<Simulation> {
     })
 }
 
+/// Counts of a frame as the bytes of a stream.
+type FrameEncoder = Box<dyn Fn(&[u16]) -> Vec<u8>>;
+
 /// Where the frames of one simulation go.
 struct Outputs<'a> {
     args: &'a Simulate,
@@ -154,7 +157,7 @@ struct Outputs<'a> {
     format: BurstFormat,
     start: Option<Start>,
     burst: Option<BurstWriter>,
-    stream: Option<Box<dyn Fn(&[u16]) -> Vec<u8>>>,
+    stream: Option<FrameEncoder>,
     truth: Option<FramesWriter>,
     flow: Option<ArrayWriter>,
     preview: Option<GifPreview>,

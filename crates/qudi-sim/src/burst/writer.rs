@@ -130,14 +130,12 @@ impl BurstWriter {
 
     /// Where the record of the burst goes: beside a file, inside a folder.
     pub fn record_path(&self) -> PathBuf {
-        match self.target {
-            Target::Png(_) => self.path.join(PngFolder::RECORD),
-            _ => {
-                let mut name = self.path.clone().into_os_string();
-                name.push(".json");
-                name.into()
-            }
+        if let Target::Png(_) = self.target {
+            return self.path.join(PngFolder::RECORD);
         }
+        let mut name = self.path.clone().into_os_string();
+        name.push(".json");
+        name.into()
     }
 
     /// Adds one frame.

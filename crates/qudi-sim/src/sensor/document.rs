@@ -88,16 +88,30 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
 }
 
 fn parse(text: &str, place: &str) -> Result<Value> {
-    toml::from_str(text).map_err(|e: toml::de::Error| SimError::Sensor {
-        what: format!("not a TOML document: {}", e.message()),
-        place: match e.span() {
-            Some(span) => {
-                format!("{place}, line {}", text[..span.start].lines().count().max(1))
-            }
-            None => place.to_owned(),
-        },
+    let fault = |what: String, place: String| SimError::Sensor {
+        what,
+        place,
         help: "see configs/sensors for examples".to_owned(),
-    })
+    };
+    let document: toml::Value = toml::from_str(text).map_err(|e: toml::de::Error| {
+        let line = e.span().map(|span| text[..span.start].lines().count().max(1));
+        let line = line.map_or(String::new(), |line| format!(", line {line}"));
+        fault(format!("not a TOML document: {}", e.message()), format!("{place}{line}"))
+    })?;
+    if let Some(key) = not_finite("", &document) {
+        return Err(fault(format!("{key} is not a finite number"), place.to_owned()));
+    }
+    serde_json::to_value(document).map_err(|e| fault(e.to_string(), place.to_owned()))
+}
+
+/// The first key whose value is NaN or infinite, which JSON could not hold.
+fn not_finite(key: &str, value: &toml::Value) -> Option<String> {
+    match value {
+        toml::Value::Float(v) => (!v.is_finite()).then(|| key.to_owned()),
+        toml::Value::Table(table) => table.iter().find_map(|(name, value)| not_finite(name, value)),
+        toml::Value::Array(items) => items.iter().find_map(|value| not_finite(key, value)),
+        _ => None,
+    }
 }
 
 /// Lays `upper` over `lower`, table by table.

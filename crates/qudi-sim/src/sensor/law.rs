@@ -68,7 +68,9 @@ impl CountLaw {
             }
         });
         // At strong light the logarithms behind the terms cost a few digits of their sum.
-        tails.iter_mut().for_each(|tail| *tail = (*tail / total).min(1.0));
+        for tail in &mut tails {
+            *tail = (*tail / total).min(1.0);
+        }
         tails
     }
 
