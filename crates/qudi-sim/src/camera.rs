@@ -7,9 +7,8 @@ use crate::frame::{Frame, Size};
 use crate::light::Light;
 use crate::random::{Domain, Streams, uniform};
 use crate::sensor::{
-    CountLaw, CountTable, PixelMaps, Response, Sensor, binomial, counted, poisson,
+    CountLaw, CountTable, PixelMaps, Response, RowScratch, Sensor, binomial, counted, poisson,
 };
-use rand::Rng;
 use rayon::prelude::*;
 
 /// Expected detections above this would overflow counters and make no sense.
@@ -150,7 +149,8 @@ impl Camera {
             if frame.size != self.size {
                 return fault(format!("a frame of {} in a clip of {}", frame.size, self.size));
             }
-            if !frame.data.iter().all(|v| (0.0..=1e6).contains(v)) {
+            // No early exit, so that the compiler can look at many values at once.
+            if !frame.data.iter().fold(true, |fine, v| fine & (0.0..=1e6).contains(v)) {
                 return fault("a negative, infinite or missing value".into());
             }
         }
@@ -172,24 +172,26 @@ impl Camera {
         let mut counts = vec![0u16; self.size.pixels()];
         let dark = self.dark as f32 * dark_times;
         counts.par_chunks_mut(width).with_min_len(ROWS_PER_TASK).enumerate().for_each_init(
-            || vec![0u8; 4 * width],
-            |random, (y, row)| {
+            RowScratch::default,
+            |scratch, (y, row)| {
                 let mut rng = self.streams.row(Domain::Photons, index, y);
-                let map = self.maps.dark.as_ref().map(|m| &m[y * width..(y + 1) * width]);
-                let dark_at = |x: usize| map.map_or(dark, |m| m[x] * dark_times);
-                let Some(table) = table else {
-                    for (x, (count, &value)) in row.iter_mut().zip(scene.row(y)).enumerate() {
-                        *count = law.draw(f64::from(scale * value + dark_at(x)), &mut rng);
+                let lit = scene.row(y).iter().map(|&value| scale * value);
+                scratch.detections.clear();
+                match &self.maps.dark {
+                    None => scratch.detections.extend(lit.map(|light| light + dark)),
+                    Some(map) => {
+                        let map = &map[y * width..(y + 1) * width];
+                        scratch
+                            .detections
+                            .extend(lit.zip(map).map(|(light, d)| light + d * dark_times));
                     }
+                }
+                if let Some(table) = table {
+                    table.draw_row(scratch, row, &mut rng);
                     return;
-                };
-                rng.fill_bytes(random);
-                let bits =
-                    random.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-                for (x, ((count, &value), bits)) in
-                    row.iter_mut().zip(scene.row(y)).zip(bits).enumerate()
-                {
-                    *count = table.draw(scale * value + dark_at(x), bits, &mut rng);
+                }
+                for (count, &detections) in row.iter_mut().zip(&scratch.detections) {
+                    *count = law.draw(f64::from(detections), &mut rng);
                 }
             },
         );

@@ -20,7 +20,7 @@ pub use document::{load_document, merge_documents};
 pub(crate) use draw::{binomial, counted, poisson};
 pub use law::CountLaw;
 pub use presets::{PRESETS, Preset, preset};
-pub(crate) use table::CountTable;
+pub(crate) use table::{CountTable, RowScratch};
 pub use units::{DarkRate, FullWell, Gain};
 
 use crate::error::{Result, SimError};

@@ -160,7 +160,8 @@ impl Procedural {
         let first = (uniform(rng) * LINES.len() as f64) as usize;
         for row in 0..rows {
             let text = LINES[(first + row) % LINES.len()];
-            let dot = (side / 128.0).max(0.5) * (1.0 + 2.5 * uniform(rng));
+            // Strokes thinner than a pixel would alias.
+            let dot = (side / 128.0).max(1.0) * (1.0 + 2.5 * uniform(rng));
             let dark = uniform(rng) < 0.5;
             let speed = self.speed * (2.0 * uniform(rng) - 1.0);
             layers.push(Layer {

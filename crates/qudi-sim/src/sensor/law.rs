@@ -107,7 +107,7 @@ impl CountLaw {
     }
 
     /// `P(y > j | k electrons)`.
-    fn exceeds(&self, j: usize, k: f64) -> f64 {
+    pub(super) fn exceeds(&self, j: usize, k: f64) -> f64 {
         let k = k.min(self.full_well);
         if self.read_noise == 0.0 {
             return f64::from(u8::from((self.gain * k).round_ties_even() > j as f64));
@@ -165,7 +165,7 @@ fn counted_at_least(k: u32, mean: f64, dead_time: f64) -> f64 {
 }
 
 /// Calls `f(k, pmf)` for the Poisson law over its support down to 1e-30 of the mode.
-fn for_each_poisson(mean: f64, mut f: impl FnMut(f64, f64)) {
+pub(super) fn for_each_poisson(mean: f64, mut f: impl FnMut(f64, f64)) {
     if mean <= 0.0 {
         return f(0.0, 1.0);
     }
