@@ -14,11 +14,26 @@ use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    if let Err(fault) = check_arguments() {
+        return report::Report::plain().fault(&fault);
+    }
     let args = Args::parse();
     let report = report::Report::new(&args.global);
     match run(&args, &report) {
         Ok(()) => ExitCode::SUCCESS,
         Err(fault) => report.fault(&fault),
+    }
+}
+
+/// Names that are no text could not be written into records.
+fn check_arguments() -> error::Result<()> {
+    match std::env::args_os().find(|argument| argument.to_str().is_none()) {
+        None => Ok(()),
+        Some(argument) => Err(error::Fault::new(
+            "an argument is not UTF-8, so no record could name it",
+            argument.display(),
+            "rename the file or folder",
+        )),
     }
 }
 

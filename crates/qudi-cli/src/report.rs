@@ -53,6 +53,11 @@ impl Report {
         Self { json: global.json, volume, color }
     }
 
+    /// For what goes wrong before the options are known.
+    pub(crate) fn plain() -> Self {
+        Self { json: false, volume: Volume::Normal, color: false }
+    }
+
     pub(crate) fn json(&self) -> bool {
         self.json
     }

@@ -9,5 +9,5 @@ mod picture;
 pub use array::ArrayWriter;
 pub use frames::FramesWriter;
 pub use gif_preview::GifPreview;
-pub use pending::{Overwrite, PendingFile, PendingFolder};
+pub use pending::{Overwrite, PendingFile, PendingFolder, refuse_taken};
 pub use picture::Picture;

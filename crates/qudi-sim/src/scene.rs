@@ -11,7 +11,7 @@ mod shape;
 mod still;
 
 pub use font::{GLYPH_HEIGHT, GLYPH_WIDTH, draw_text};
-pub use motion::Motion;
+pub use motion::{Motion, Placement};
 pub use paint::Paint;
 pub use procedural::{PROCEDURAL, Procedural, ProceduralScene};
 pub use shape::Shape;
@@ -59,13 +59,12 @@ impl Scene {
         let mut frame = Frame::filled(self.size, 0.0);
         let placed = self.placed(t);
         frame.data.par_chunks_mut(self.size.width).enumerate().for_each(|(y, row)| {
-            for (layer, reach) in &placed {
+            for Placed { layer, placement, reach } in &placed {
                 for x in columns(*reach, y, self.size.width) {
-                    let local = layer.motion.to_local(t, [x as f64, y as f64]);
-                    let scale = layer.motion.scale(t);
-                    let alpha = layer.shape.coverage(local, scale);
+                    let local = placement.to_local([x as f64, y as f64]);
+                    let alpha = layer.shape.coverage(local, placement.scale);
                     if alpha > 0.0 {
-                        row[x] += alpha * (layer.paint.value(local, scale) - row[x]);
+                        row[x] += alpha * (layer.paint.value(local, placement.scale) - row[x]);
                     }
                 }
             }
@@ -77,6 +76,9 @@ impl Scene {
     pub fn flow(&self, from: f64, to: f64) -> Flow {
         let Size { height, width } = self.size;
         let (seen, later) = (self.labels(from), self.labels(to));
+        let places =
+            |t: f64| self.layers.iter().map(|layer| layer.motion.at(t)).collect::<Vec<_>>();
+        let (before, after) = (places(from), places(to));
         let mut flow = Flow {
             size: self.size,
             dx: vec![0.0; self.size.pixels()],
@@ -85,8 +87,7 @@ impl Scene {
         };
         for (i, &label) in seen.iter().enumerate() {
             let here = [(i % width) as f64, (i / width) as f64];
-            let motion = &self.layers[label as usize].motion;
-            let there = motion.to_scene(to, motion.to_local(from, here));
+            let there = after[label as usize].to_scene(before[label as usize].to_local(here));
             flow.dx[i] = (there[0] - here[0]) as f32;
             flow.dy[i] = (there[1] - here[1]) as f32;
             let (x, y) = (there[0].round(), there[1].round());
@@ -101,10 +102,10 @@ impl Scene {
         let placed = self.placed(t);
         let mut labels = vec![0u32; self.size.pixels()];
         labels.par_chunks_mut(self.size.width).enumerate().for_each(|(y, row)| {
-            for (index, (layer, reach)) in placed.iter().enumerate() {
+            for (index, Placed { layer, placement, reach }) in placed.iter().enumerate() {
                 for x in columns(*reach, y, self.size.width) {
-                    let local = layer.motion.to_local(t, [x as f64, y as f64]);
-                    if layer.shape.coverage(local, layer.motion.scale(t)) >= 0.5 {
+                    let local = placement.to_local([x as f64, y as f64]);
+                    if layer.shape.coverage(local, placement.scale) >= 0.5 {
                         row[x] = index as u32;
                     }
                 }
@@ -113,14 +114,24 @@ impl Scene {
         labels
     }
 
-    /// Layers with their reach in the frame.
-    fn placed(&self, t: f64) -> Vec<(&Layer, Reach)> {
-        let place = |layer: &Layer| {
-            let (centre, radius) = layer.shape.bounds()?;
-            Some((layer.motion.to_scene(t, centre), radius * layer.motion.scale(t) + 1.0))
+    fn placed(&self, t: f64) -> Vec<Placed<'_>> {
+        let place = |layer| {
+            let Layer { motion, shape, .. } = layer;
+            let placement = motion.at(t);
+            let reach = shape.bounds().map(|(centre, radius)| {
+                (placement.to_scene(centre), radius * placement.scale + 1.0)
+            });
+            Placed { layer, placement, reach }
         };
-        self.layers.iter().map(|layer| (layer, place(layer))).collect()
+        self.layers.iter().map(place).collect()
     }
+}
+
+/// A layer at one time.
+struct Placed<'a> {
+    layer: &'a Layer,
+    placement: Placement,
+    reach: Reach,
 }
 
 /// The circle, centre and radius, that holds a layer; none if it is unbounded.

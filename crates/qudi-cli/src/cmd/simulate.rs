@@ -6,7 +6,9 @@ use crate::interrupt;
 use crate::report::Report;
 use crate::settings::{Flag, Settings};
 use qudi_sim::burst::{BurstFormat, BurstWriter, write_npy_stream};
-use qudi_sim::output::{ArrayWriter, FramesWriter, GifPreview, Overwrite, PendingFile};
+use qudi_sim::output::{
+    ArrayWriter, FramesWriter, GifPreview, Overwrite, PendingFile, refuse_taken,
+};
 use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
 use qudi_sim::scene::Flow;
 use qudi_sim::sensor::Sensor;
@@ -38,6 +40,13 @@ pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<(
     simulation.input.spool(&mut std::io::stdin().lock(), &mut interrupt::check)?;
 
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    if args.flow.is_some() && !simulation.input.is_synthetic() {
+        return Err(Fault::new(
+            "a recorded clip has no known flow",
+            "--flow",
+            "leave it out, or use a still in motion or a procedural scene",
+        ));
+    }
     let mut outputs = Outputs::new(args, &simulation.sensor, overwrite)?;
     let mut bar = report.bar();
     let summary = simulate(&simulation, &mut outputs, &mut |progress| {
@@ -155,7 +164,6 @@ struct Outputs<'a> {
     overwrite: Overwrite,
     max_count: u16,
     format: BurstFormat,
-    start: Option<Start>,
     burst: Option<BurstWriter>,
     stream: Option<FrameEncoder>,
     truth: Option<FramesWriter>,
@@ -179,12 +187,19 @@ impl<'a> Outputs<'a> {
                 "use a binary sensor (--sensor swissspad2), no --sum, and -o NAME.npy",
             ));
         }
+        // Refused here, before the clip is measured.
+        let path = PathBuf::from(&args.output);
+        let burst =
+            [format.record_path(&path), path].map(|path| (args.output != "-").then_some(path));
+        let beside = [&args.truth, &args.flow, &args.preview].map(Clone::clone);
+        for path in burst.into_iter().chain(beside).flatten() {
+            refuse_taken(&path, overwrite)?;
+        }
         Ok(Self {
             args,
             overwrite,
             max_count,
             format,
-            start: None,
             burst: None,
             stream: None,
             truth: None,
@@ -222,7 +237,7 @@ impl<'a> Outputs<'a> {
         if let Some(burst) = self.burst {
             let json = serde_json::to_vec_pretty(record)
                 .map_err(|e| Fault::new(e, &self.args.output, "report this as a bug"))?;
-            let record_path = burst.record_path();
+            let record_path = self.format.record_path(&path);
             burst.finish(&json, self.overwrite)?;
             written.splice(0..0, [path, record_path]);
         }
@@ -232,7 +247,6 @@ impl<'a> Outputs<'a> {
 
 impl Sink for Outputs<'_> {
     fn start(&mut self, start: Start) -> qudi_sim::Result<()> {
-        self.start = Some(start);
         let (args, overwrite) = (self.args, self.overwrite);
         if args.output == "-" {
             let stream = write_npy_stream(
@@ -285,20 +299,9 @@ impl Sink for Outputs<'_> {
             preview.push(exposed.counts)?;
         }
         let Some(array) = &mut self.flow else { return Ok(()) };
-        let last = self.start.is_some_and(|start| exposed.index + 1 == start.frames);
-        match flow() {
-            Some(flow) => {
-                let visible = flow.visible.iter().map(|&v| f32::from(u8::from(v)));
-                array
-                    .push_f32(flow.dx.iter().copied().chain(flow.dy.iter().copied()).chain(visible))
-            }
-            None if last => Ok(()),
-            None => Err(SimError::request(
-                "a recorded clip has no known flow",
-                "--flow",
-                "leave it out, or use a still in motion or a procedural scene",
-            )),
-        }
+        let Some(flow) = flow() else { return Ok(()) };
+        let visible = flow.visible.iter().map(|&v| f32::from(u8::from(v)));
+        array.push_f32(flow.dx.iter().copied().chain(flow.dy.iter().copied()).chain(visible))
     }
 }
 

@@ -56,6 +56,16 @@ impl BurstFormat {
         }
     }
 
+    /// Where the record of a burst at `path` goes: beside a file, inside a folder.
+    pub fn record_path(self, path: &Path) -> PathBuf {
+        if self == Self::Png {
+            return path.join(PngFolder::RECORD);
+        }
+        let mut name = path.as_os_str().to_owned();
+        name.push(".json");
+        name.into()
+    }
+
     /// NumPy type and shape of one frame.
     fn item(self, size: Size) -> (&'static str, [usize; 2]) {
         match self {
@@ -128,16 +138,6 @@ impl BurstWriter {
         Ok(Self { format, size, path: path.to_owned(), target })
     }
 
-    /// Where the record of the burst goes: beside a file, inside a folder.
-    pub fn record_path(&self) -> PathBuf {
-        if let Target::Png(_) = self.target {
-            return self.path.join(PngFolder::RECORD);
-        }
-        let mut name = self.path.clone().into_os_string();
-        name.push(".json");
-        name.into()
-    }
-
     /// Adds one frame.
     ///
     /// # Errors
@@ -155,7 +155,7 @@ impl BurstWriter {
     /// # Errors
     /// [`SimError::Io`] if the disk is full.
     pub fn finish(self, record: &[u8], overwrite: Overwrite) -> Result<()> {
-        let record_path = self.record_path();
+        let record_path = self.format.record_path(&self.path);
         if let Target::Png(folder) = self.target {
             return folder.finish(record);
         }

@@ -27,7 +27,11 @@ fn parent(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
+/// Refuses a name that is taken, before any work is done for it.
+///
+/// # Errors
+/// [`SimError::Data`] if it exists and may not be overwritten.
+pub fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
     if overwrite == Overwrite::No && path.symlink_metadata().is_ok() {
         return Err(SimError::data(
             "the output exists already",

@@ -22,29 +22,51 @@ impl Motion {
         Self { velocity, rotation: 0.0, zoom: 1.0, centre: [0.0; 2], shift: [0.0; 2] }
     }
 
-    /// Magnification since time 0.
-    pub fn scale(&self, t: f64) -> f64 {
-        self.zoom.powf(t)
-    }
-
-    /// Where the local point `q` is at time `t`.
-    pub fn to_scene(&self, t: f64, q: [f64; 2]) -> [f64; 2] {
+    /// Where everything is at time `t`.
+    pub fn at(&self, t: f64) -> Placement {
         let (sin, cos) = (self.rotation * t).sin_cos();
-        let scale = self.scale(t);
-        let (dx, dy) = (scale * (q[0] - self.centre[0]), scale * (q[1] - self.centre[1]));
+        Placement {
+            sin,
+            cos,
+            scale: self.zoom.powf(t),
+            centre: self.centre,
+            origin: [
+                self.shift[0] + self.centre[0] + t * self.velocity[0],
+                self.shift[1] + self.centre[1] + t * self.velocity[1],
+            ],
+        }
+    }
+}
+
+/// A motion at one time: a similarity between local coordinates and the frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    sin: f64,
+    cos: f64,
+    /// Magnification since time 0.
+    pub scale: f64,
+    centre: [f64; 2],
+    /// Where the centre is in the frame.
+    origin: [f64; 2],
+}
+
+impl Placement {
+    /// Where the local point `q` is.
+    pub fn to_scene(&self, q: [f64; 2]) -> [f64; 2] {
+        let (dx, dy) = (self.scale * (q[0] - self.centre[0]), self.scale * (q[1] - self.centre[1]));
         [
-            self.shift[0] + self.centre[0] + t * self.velocity[0] + cos * dx - sin * dy,
-            self.shift[1] + self.centre[1] + t * self.velocity[1] + sin * dx + cos * dy,
+            self.origin[0] + self.cos * dx - self.sin * dy,
+            self.origin[1] + self.sin * dx + self.cos * dy,
         ]
     }
 
-    /// Which local point is at `p` at time `t`.
-    pub fn to_local(&self, t: f64, p: [f64; 2]) -> [f64; 2] {
-        let (sin, cos) = (self.rotation * t).sin_cos();
-        let scale = 1.0 / self.scale(t);
-        let dx = scale * (p[0] - self.shift[0] - self.centre[0] - t * self.velocity[0]);
-        let dy = scale * (p[1] - self.shift[1] - self.centre[1] - t * self.velocity[1]);
-        [self.centre[0] + cos * dx + sin * dy, self.centre[1] - sin * dx + cos * dy]
+    /// Which local point is at `p`.
+    pub fn to_local(&self, p: [f64; 2]) -> [f64; 2] {
+        let (dx, dy) = ((p[0] - self.origin[0]) / self.scale, (p[1] - self.origin[1]) / self.scale);
+        [
+            self.centre[0] + self.cos * dx + self.sin * dy,
+            self.centre[1] - self.sin * dx + self.cos * dy,
+        ]
     }
 }
 
@@ -62,7 +84,8 @@ mod tests {
             shift: [4.0, -3.0],
         };
         for t in [0.0, 0.4, 7.0] {
-            let p = motion.to_scene(t, motion.to_local(t, [12.0, 34.0]));
+            let placement = motion.at(t);
+            let p = placement.to_scene(placement.to_local([12.0, 34.0]));
             assert!((p[0] - 12.0).abs() < 1e-9 && (p[1] - 34.0).abs() < 1e-9);
         }
     }

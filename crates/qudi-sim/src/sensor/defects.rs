@@ -49,6 +49,12 @@ impl Defects {
                 "the two fractions add up to at most 1",
             ));
         }
+        if self.hot_fraction > 0.0 && self.hot_dark.value() == 0.0 {
+            return Err(sensor.fault(
+                format!("hot_fraction is {}, but hot pixels have no dark rate", self.hot_fraction),
+                "set `defects.hot_dark`, as in \"5000/s\"",
+            ));
+        }
         if self.afterpulse > 0.0 && sensor.response == Response::Linear {
             return Err(sensor.fault(
                 format!("afterpulse is {} on a linear sensor", self.afterpulse),

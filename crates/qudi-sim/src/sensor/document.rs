@@ -82,7 +82,9 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         && let Some(name) = map.as_str()
         && let Some(folder) = path.parent()
     {
-        *map = Value::String(folder.join(name).to_string_lossy().into_owned());
+        let map_path = std::path::absolute(folder.join(name))
+            .map_err(|e| SimError::io("find the dark map", Path::new(name), e))?;
+        *map = Value::String(map_path.to_string_lossy().into_owned());
     }
     Ok(document)
 }

@@ -122,7 +122,9 @@ impl Input {
         if text == "-" {
             return Ok(Self::Pipe { spool: None });
         }
-        let path = PathBuf::from(text);
+        // Absolute, so that a record works from any folder.
+        let path = std::path::absolute(text)
+            .map_err(|e| SimError::io("find the input", Path::new(text), e))?;
         let about =
             std::fs::metadata(&path).map_err(|e| SimError::io("find the input", &path, e))?;
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
@@ -248,6 +250,11 @@ impl Input {
             }
         };
         Ok(Box::new(Recorded::new(reader, sampling.instants, sampling.frames)))
+    }
+
+    /// Whether it is a synthetic scene, whose flow is known.
+    pub fn is_synthetic(&self) -> bool {
+        matches!(self, Self::Still { .. } | Self::Procedural(_))
     }
 
     /// The file or folder behind it, for messages.
