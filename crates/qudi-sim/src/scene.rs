@@ -114,8 +114,8 @@ impl Scene {
         labels
     }
 
-    fn placed(&self, t: f64) -> Vec<Placed<'_>> {
-        let place = |layer| {
+    fn placed<'a>(&'a self, t: f64) -> Vec<Placed<'a>> {
+        let place = |layer: &'a Layer| {
             let Layer { motion, shape, .. } = layer;
             let placement = motion.at(t);
             let reach = shape.bounds().map(|(centre, radius)| {

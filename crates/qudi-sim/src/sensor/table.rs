@@ -136,7 +136,7 @@ impl CountTable {
         }
         for (chunk, counts) in counts.chunks_mut(SCAN).enumerate() {
             // Without a branch per count; most chunks hold no open one.
-            if !counts.iter().fold(false, |open, &count| open | (count == OPEN)) {
+            if counts.iter().map(|&count| u16::from(count == OPEN)).sum::<u16>() == 0 {
                 continue;
             }
             for (i, count) in counts.iter_mut().enumerate().filter(|(_, count)| **count == OPEN) {
