@@ -1,5 +1,6 @@
 //! The compute devices of this build and this machine.
 
+#[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
 use burn::tensor::{Device, DeviceType};
 
 /// A device that `--device` can name.
@@ -22,12 +23,16 @@ pub(crate) fn list() -> Vec<Listed> {
     }
     #[cfg(feature = "wgpu")]
     add_cards("wgpu", DeviceType::Wgpu, &mut add);
+    #[cfg(feature = "vulkan")]
+    add_cards("vulkan", DeviceType::Vulkan, &mut add);
+    #[cfg(feature = "metal")]
+    add_cards("metal", DeviceType::Metal, &mut add);
     #[cfg(feature = "cuda")]
     add_cards("cuda", DeviceType::Cuda, &mut add);
     devices
 }
 
-#[cfg(any(feature = "wgpu", feature = "cuda"))]
+#[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
 fn add_cards(backend: &str, kind: DeviceType, add: &mut impl FnMut(String, String)) {
     // Drivers that are missing or broken make some backends panic; then there is no such device.
     let quiet = std::panic::take_hook();

@@ -14,6 +14,9 @@ use rayon::prelude::*;
 /// Expected detections above this would overflow counters and make no sense.
 const MAX_DETECTIONS: f64 = 1e9;
 
+/// Counters with a dead time are simulated arrival by arrival; more would take minutes a frame.
+const MAX_ARRIVALS: f64 = 1e5;
+
 /// Rows handed to a thread at a time.
 const ROWS_PER_TASK: usize = 8;
 
@@ -57,6 +60,15 @@ impl Camera {
             ));
         }
         let law = CountLaw::new(sensor, gain);
+        if law.dead_time() > 0.0 && electrons_per_value > MAX_ARRIVALS {
+            return Err(SimError::request(
+                format!("{electrons_per_value:e} arrivals in a white pixel with a dead time"),
+                "--ppp and `defects.dead_time_ns`",
+                format!(
+                    "such counters are followed arrival by arrival: stay below {MAX_ARRIVALS:e}"
+                ),
+            ));
+        }
         let n = f64::from(sensor.frames_summed);
         // Up to white and twice the ordinary dark rate; what lies above is drawn directly.
         let brightest = electrons_per_value + 2.0 * dark * n;
