@@ -237,6 +237,85 @@ fn a_still_moves_as_told() {
 }
 
 #[test]
+fn a_dark_map_beside_the_sensor_file_is_used() {
+    let folder = scratch("dark-map");
+    std::fs::create_dir(folder.join("lab")).unwrap();
+    let mut map = b"\x93NUMPY\x01\x00".to_vec();
+    let header =
+        format!("{:<117}\n", "{'descr': '<f4', 'fortran_order': False, 'shape': (40, 50), }");
+    map.extend((header.len() as u16).to_le_bytes());
+    map.extend(header.as_bytes());
+    // Three dark electrons in the left half, none in the right.
+    map.extend((0..2000).flat_map(|i| if i % 50 < 25 { 3.0f32 } else { 0.0 }.to_le_bytes()));
+    std::fs::write(folder.join("lab/dcr.npy"), map).unwrap();
+    std::fs::write(
+        folder.join("lab/s.toml"),
+        "base = \"ideal\"\nbits = 8\n[defects]\ndark_map = \"dcr.npy\"\n",
+    )
+    .unwrap();
+    simulate(
+        &folder,
+        "scene:text --size 40x50 --frames 40 --sensor lab/s.toml --ppp 0 --seed 1 -o dark.npy",
+    );
+    let (_, counts) = npy(&folder.join("dark.npy"));
+    let sums = counts.chunks(50).fold([0u64; 2], |[left, right], row| {
+        let sum = |half: &[u8]| half.iter().map(|&c| u64::from(c)).sum::<u64>();
+        [left + sum(&row[..25]), right + sum(&row[25..])]
+    });
+    // Poisson sum of 40,000 pixels of mean 3, within five deviations.
+    assert!(sums[0].abs_diff(120_000) < 1733 && sums[1] == 0, "{sums:?}");
+    let refused = qudi(&folder)
+        .args("simulate scene:text --size 40x51 --sensor lab/s.toml -o x.npy".split(' '))
+        .assert()
+        .code(2);
+    assert!(
+        String::from_utf8_lossy(&refused.get_output().stderr)
+            .contains("a dark map of 40 x 50 for frames of 40 x 51")
+    );
+}
+
+/// A stand-in for ffmpeg on PATH delivers frames, or fails half-way.
+#[cfg(unix)]
+#[test]
+fn videos_come_through_ffmpeg() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = scratch("video");
+    let mut frames = Vec::new();
+    for t in 0..3u8 {
+        frames.extend(b"P6\n16 8\n255\n");
+        frames.extend((0..16 * 8 * 3).map(|i| (i as u8).wrapping_mul(t + 1)));
+    }
+    std::fs::write(folder.join("frames.ppm"), &frames).unwrap();
+    std::fs::write(folder.join("clip.mp4"), "stands for a video").unwrap();
+    let program = folder.join("ffmpeg");
+    let run = |script: &str, output: &str| {
+        std::fs::write(&program, format!("#!/bin/sh\n{script}\n")).unwrap();
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let path = format!("{}:/usr/bin:/bin", folder.display());
+        qudi(&folder)
+            .args(["simulate", "clip.mp4", "--seed", "1", "-o", output])
+            .env("PATH", path)
+            .output()
+            .unwrap()
+    };
+    let output = run("cat frames.ppm", "out.npy");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let (header, _) = npy(&folder.join("out.npy"));
+    assert!(header.contains("(3, 8, 16)"), "{header}");
+    for (script, reason) in [
+        ("cat frames.ppm; echo 'moov atom not found' >&2; exit 1", "moov atom not found"),
+        ("head -c 500 frames.ppm", "ends inside a frame"),
+        ("exit 0", "no video frames in it"),
+    ] {
+        let output = run(script, "bad.npy");
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains(reason), "{said}");
+        assert!(!folder.join("bad.npy").exists());
+    }
+}
+
+#[test]
 fn settings_come_in_layers() {
     let folder = scratch("layers");
     std::fs::write(

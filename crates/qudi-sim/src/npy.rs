@@ -249,6 +249,23 @@ pub fn read_image(path: &Path) -> Result<Frame> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Headers come from strangers: anything but a panic.
+        #[test]
+        fn no_header_panics(mut bytes in prop::collection::vec(any::<u8>(), 0..300), magic: bool) {
+            if magic && bytes.len() > 8 {
+                bytes[..8].copy_from_slice(b"\x93NUMPY\x01\x00");
+            }
+            let _ = Header::read(&mut bytes.as_slice(), Path::new("x.npy"));
+        }
+
+        #[test]
+        fn no_dictionary_panics(text in "\\{('descr'|'shape'|'fortran_order'|[ ,:()'<f4u1|0-9]|True|False){0,20}") {
+            let _ = parse_dictionary(&text);
+        }
+    }
 
     fn header_bytes(descr: &str, shape: &[usize]) -> Vec<u8> {
         let mut bytes = Vec::new();

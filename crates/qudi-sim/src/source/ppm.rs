@@ -96,6 +96,18 @@ impl<R: BufRead> FrameReader for PpmStream<R> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn no_stream_panics(bytes in prop::collection::vec(any::<u8>(), 0..200), magic: bool) {
+            let start: &[u8] = if magic { b"P6\n2 2\n255\n" } else { b"" };
+            let bytes = [start, &bytes].concat();
+            if let Ok(Some(mut stream)) = open(&bytes) {
+                while let Ok(Some(_)) = stream.next() {}
+            }
+        }
+    }
 
     fn open(bytes: &[u8]) -> Result<Option<PpmStream<&[u8]>>> {
         PpmStream::open(bytes, Path::new("x.mp4"), Transfer::AsIs)
