@@ -104,6 +104,21 @@ fn every_format_holds_the_same_counts() {
 }
 
 #[test]
+fn force_replaces_files_and_folders_of_our_own() {
+    let folder = scratch("force");
+    for output in ["a.npy", "a"] {
+        simulate(&folder, &format!("scene:text --size 16x16 --frames 5 --seed 1 -o {output}"));
+        simulate(
+            &folder,
+            &format!("scene:text --size 16x16 --frames 2 --seed 1 -o {output} --force"),
+        );
+    }
+    assert_eq!(listing(&folder), ["a", "a.npy", "a.npy.json"]);
+    assert_eq!(listing(&folder.join("a")), ["burst.json", "frame_000000.png", "frame_000001.png"]);
+    assert!(npy(&folder.join("a.npy")).0.contains("(2, 16, 16)"));
+}
+
+#[test]
 fn a_record_makes_its_burst_again_from_anywhere() {
     let folder = scratch("record");
     simulate(

@@ -3,7 +3,7 @@
 use crate::burst::BurstFormat;
 use crate::error::{Result, SimError};
 use crate::frame::Size;
-use crate::light::{Light, PppDefinition};
+use crate::light::Light;
 use crate::sensor::Sensor;
 use crate::simulate::Simulation;
 use serde::{Deserialize, Serialize};
@@ -83,8 +83,6 @@ pub struct ClipDigest {
     pub mean: f64,
     /// CRC-32 of all image values.
     pub crc32: u32,
-    /// What PPP means in this record.
-    pub ppp_def: PppDefinition,
 }
 
 impl Record {

@@ -17,7 +17,7 @@ use qudi_sim::{Exposed, SimError, Simulation, Sink, Stage, Start, Summary, simul
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::hash::{BuildHasher, RandomState};
-use std::io::{Write, stdout};
+use std::io::{IsTerminal, Write, stdout};
 use std::path::{Path, PathBuf};
 
 pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<()> {
@@ -37,6 +37,13 @@ pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<(
         }
         None => (simulation(args, global)?, None),
     };
+    if matches!(simulation.input, Input::Pipe { .. }) && std::io::stdin().is_terminal() {
+        return Err(Fault::new(
+            "nothing is piped in",
+            "standard input",
+            "pipe a clip in, as in `ffmpeg -i VIDEO -f yuv4mpegpipe - | qudi simulate - -o OUT`",
+        ));
+    }
     simulation.input.spool(&mut std::io::stdin().lock(), &mut interrupt::check)?;
 
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
@@ -312,11 +319,7 @@ fn record_of(simulation: Simulation, summary: &Summary, format: BurstFormat) -> 
         burst: BurstLayout::new(format, summary.frames, summary.size, &simulation.sensor),
         light: summary.light,
         gain: summary.gain,
-        clip: ClipDigest {
-            mean: summary.clip_mean,
-            crc32: summary.clip_crc32,
-            ppp_def: simulation.ppp_def,
-        },
+        clip: ClipDigest { mean: summary.clip_mean, crc32: summary.clip_crc32 },
         simulation,
     }
 }

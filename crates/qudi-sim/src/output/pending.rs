@@ -20,6 +20,7 @@ pub enum Overwrite {
 pub struct PendingFile {
     writer: BufWriter<NamedTempFile>,
     path: PathBuf,
+    overwrite: Overwrite,
 }
 
 /// The folder of `path`, `.` for a bare name.
@@ -60,7 +61,11 @@ impl PendingFile {
         let file = builder
             .tempfile_in(parent(path))
             .map_err(|e| SimError::io("write into the folder of", path, e))?;
-        Ok(Self { writer: BufWriter::with_capacity(1 << 18, file), path: path.to_owned() })
+        Ok(Self {
+            writer: BufWriter::with_capacity(1 << 18, file),
+            path: path.to_owned(),
+            overwrite,
+        })
     }
 
     /// The name it will have.
@@ -88,8 +93,12 @@ impl PendingFile {
         let fault = |e: std::io::Error| SimError::io("write", &path, e);
         let file = self.writer.into_inner().map_err(|e| fault(e.into_error()))?;
         file.as_file().sync_all().map_err(fault)?;
-        file.persist(&path).map_err(|e| fault(e.error))?;
-        Ok(())
+        // Whoever took the name since the start keeps it.
+        let named = match self.overwrite {
+            Overwrite::Yes => file.persist(&path),
+            Overwrite::No => file.persist_noclobber(&path),
+        };
+        named.map(drop).map_err(|e| fault(e.error))
     }
 }
 
@@ -162,9 +171,17 @@ impl PendingFolder {
     pub fn finish(self) -> Result<()> {
         let fault = |e| SimError::io("rename the finished folder to", &self.path, e);
         if self.overwrite == Overwrite::Yes && self.path.is_dir() {
-            std::fs::remove_dir_all(&self.path).map_err(fault)?;
+            // The old folder steps aside first, and comes back if the new one cannot take its place.
+            let aside = self.folder.path().with_extension("old");
+            std::fs::rename(&self.path, &aside).map_err(fault)?;
+            if let Err(e) = std::fs::rename(self.folder.path(), &self.path) {
+                let _ = std::fs::rename(&aside, &self.path);
+                return Err(fault(e));
+            }
+            std::fs::remove_dir_all(&aside).map_err(fault)?;
+        } else {
+            std::fs::rename(self.folder.path(), &self.path).map_err(fault)?;
         }
-        std::fs::rename(self.folder.path(), &self.path).map_err(fault)?;
         // The temporary name is gone; there is nothing left to clean up.
         let _ = self.folder.keep();
         Ok(())
