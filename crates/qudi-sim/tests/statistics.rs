@@ -81,9 +81,12 @@ fn binary(frames_summed: u32) -> Sensor {
 fn counts_follow_the_exact_law_at_every_light_level_and_depth() {
     for lambda in [0.0, 1e-9, 0.01, 0.1, 1.0, 4.2, 11.9, 12.1, 50.0, 210.0] {
         for bits in [1, 3, 8, 12] {
-            for (gain, read_noise, full_well) in
-                [(1.0, 0.0, f64::INFINITY), (1.0, 0.2, 200.0), (0.37, 0.35, f64::INFINITY)]
-            {
+            for (gain, read_noise, full_well) in [
+                (1.0, 0.0, f64::INFINITY),
+                (1.0, 0.2, 200.0),
+                (0.37, 0.35, f64::INFINITY),
+                (0.5, 0.0, f64::INFINITY),
+            ] {
                 let sensor = linear(bits, gain, read_noise, full_well);
                 let law = CountLaw::new(&sensor, gain);
                 let seen = histogram(&expose_flat(&sensor, lambda, 4), sensor.max_count());
