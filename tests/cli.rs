@@ -39,3 +39,15 @@ fn the_settings_reference_is_up_to_date() {
     let committed = std::fs::read_to_string(root().join("configs/README.md")).unwrap();
     assert_eq!(String::from_utf8(output.stdout).unwrap(), committed, "run `just config-docs`");
 }
+
+#[test]
+fn the_example_settings_are_accepted() {
+    let folder = outputs::scratch("example-settings");
+    let settings = root().join("configs/simulate.toml");
+    outputs::qudi(&folder)
+        .args("simulate scene:text --size 32x32 --frames 3 -o out.npy --config".split(' '))
+        .arg(settings)
+        .assert()
+        .success();
+    assert_eq!(outputs::listing(&folder), ["out.npy", "out.npy.json"]);
+}
