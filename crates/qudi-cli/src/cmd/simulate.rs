@@ -196,8 +196,8 @@ impl<'a> Outputs<'a> {
         }
         // Refused here, before the clip is measured.
         let path = PathBuf::from(&args.output);
-        let burst =
-            [format.record_path(&path), path].map(|path| (args.output != "-").then_some(path));
+        let record = format.record_path(&path);
+        let burst = [path, record].map(|path| (args.output != "-").then_some(path));
         let beside = [&args.truth, &args.flow, &args.preview].map(Clone::clone);
         for path in burst.into_iter().chain(beside).flatten() {
             refuse_taken(&path, overwrite)?;
