@@ -71,7 +71,7 @@ mod tests {
 
     /// scripts/reference/schedule.py
     #[test]
-    #[allow(clippy::excessive_precision)]
+    #[allow(clippy::excessive_precision, clippy::unreadable_literal)]
     fn alpha_bar_is_that_of_the_numpy_reference() {
         let schedule = NoiseSchedule::cosine(1000);
         for (t, expected) in include!("../../../tests/golden/cosine_schedule.in") {
