@@ -74,7 +74,13 @@ fn sensors(report: &Report) -> Result<()> {
 
 fn sensor(name: &str, report: &Report) -> Result<()> {
     let sensor = Sensor::load(name)?;
-    let text = toml::to_string(&sensor).map_err(|e| Fault::new(e, name, "report this as a bug"))?;
+    // A preset as it was written, with the remarks on its numbers.
+    let text = match preset(name) {
+        Some(preset) => preset.toml.to_owned(),
+        None => {
+            toml::to_string(&sensor).map_err(|e| Fault::new(e, name, "report this as a bug"))?
+        }
+    };
     report.result(&text, || json!(sensor))
 }
 

@@ -60,7 +60,7 @@ impl PendingFile {
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
         let file = builder
             .tempfile_in(parent(path))
-            .map_err(|e| SimError::io("write into the folder of", path, e))?;
+            .map_err(|e| SimError::io("create the output", path, e))?;
         Ok(Self {
             writer: BufWriter::with_capacity(1 << 18, file),
             path: path.to_owned(),
@@ -150,7 +150,7 @@ impl PendingFolder {
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
         let folder = builder
             .tempdir_in(parent(path))
-            .map_err(|e| SimError::io("make a folder beside", path, e))?;
+            .map_err(|e| SimError::io("create the output", path, e))?;
         Ok(Self { folder, path: path.to_owned(), overwrite })
     }
 
