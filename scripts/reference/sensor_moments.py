@@ -4,7 +4,7 @@
 # ///
 """The paper's sensor in NumPy: moments of a flat scene, and the time per pixel.
 
-Independent of qudi: written from the equations (DESIGN of the forward model: Poisson detections,
+Independent of qudi, written from the equations of the forward model (Poisson detections,
 full well, Gaussian read noise, gain, rounding, clipping).
 
     python scripts/reference/sensor_moments.py
