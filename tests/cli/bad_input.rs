@@ -287,8 +287,8 @@ fn an_interrupt_leaves_nothing_behind() {
         assert!(started.elapsed().as_secs() < 120, "no output was begun");
         std::thread::sleep(std::time::Duration::from_millis(10));
     }
-    let killed = std::process::Command::new("kill")
-        .args(["-INT", &child.id().to_string()])
+    let killed = std::process::Command::new("sh")
+        .args(["-c", &format!("kill -INT {}", child.id())])
         .status()
         .unwrap();
     assert!(killed.success());

@@ -293,7 +293,6 @@ fn a_dark_map_beside_the_sensor_file_is_used() {
 #[cfg(unix)]
 #[test]
 fn videos_come_through_ffmpeg() {
-    use std::os::unix::fs::PermissionsExt;
     let folder = scratch("video");
     let mut frames = Vec::new();
     for t in 0..3u8 {
@@ -302,10 +301,15 @@ fn videos_come_through_ffmpeg() {
     }
     std::fs::write(folder.join("frames.ppm"), &frames).unwrap();
     std::fs::write(folder.join("clip.mp4"), "stands for a video").unwrap();
-    let program = folder.join("ffmpeg");
     let run = |script: &str, output: &str| {
-        std::fs::write(&program, format!("#!/bin/sh\n{script}\n")).unwrap();
-        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        // Written by another process: a file that this one has open for writing may still be open in
+        // the children of other tests, and could then not be run.
+        Command::new("sh")
+            .args(["-c", "cat > ffmpeg && chmod 755 ffmpeg"])
+            .current_dir(&folder)
+            .write_stdin(format!("#!/bin/sh\n{script}\n"))
+            .assert()
+            .success();
         let path = format!("{}:/usr/bin:/bin", folder.display());
         qudi(&folder)
             .args(["simulate", "clip.mp4", "--seed", "1", "-o", output])
