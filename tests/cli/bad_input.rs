@@ -1,6 +1,6 @@
 //! Bad input: a three-part error, exit code 2, nothing half-written, no panic.
 
-use super::outputs::{listing, qudi, scratch};
+use super::outputs::{listing, npy_bytes, qudi, scratch};
 use std::path::Path;
 
 /// Runs `qudi` and checks the manners of its refusal; returns what it said.
@@ -15,18 +15,6 @@ fn refused(folder: &Path, args: &[&str]) -> String {
     assert!(output.stdout.is_empty(), "{args:?}");
     assert_eq!(before, listing(folder), "{args:?} left something behind");
     said
-}
-
-fn npy_bytes(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
-    let text = format!(
-        "{:<117}\n",
-        format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}")
-    );
-    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-    bytes.extend((text.len() as u16).to_le_bytes());
-    bytes.extend(text.as_bytes());
-    bytes.extend(data);
-    bytes
 }
 
 #[test]
@@ -96,12 +84,17 @@ fn unsuitable_inputs_and_outputs_are_refused() {
             .unwrap();
     }
     std::fs::write(folder.join("taken.npy"), "mine").unwrap();
+    std::fs::write(folder.join("transforms.json"), "mine").unwrap();
     let scene = "scene:text";
     for (args, reason) in [
         (vec!["missing", "-o", "out.npy"], "cannot find the input"),
         (vec!["nothing", "-o", "out.npy"], "holds no images"),
         (vec!["mixed", "-o", "out.npy"], "8 x 9 among images of 8 x 8"),
         (vec!["mixed", "-o", "out", "--truth", "truth"], "8 x 9"),
+        (
+            vec![scene, "-o", "out.npy", "--sensor", "spad512s", "--visionsim", "--truth", "t"],
+            "transforms.json",
+        ),
         (vec!["mixed", "-o", "out.npy", "--flow", "flow.npy"], "no known flow"),
         (vec!["scene:nowhere", "-o", "out.npy"], "no procedural scene named `nowhere`"),
         (vec!["mixed", "--motion", "pan:1,1", "-o", "out.npy"], "recorded clip"),

@@ -35,6 +35,19 @@ fn npy(path: &Path) -> (String, Vec<u8>) {
     (String::from_utf8(bytes[10..start].to_vec()).unwrap(), bytes[start..].to_vec())
 }
 
+/// A `.npy` file as NumPy would write it.
+pub(crate) fn npy_bytes(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
+    let text = format!(
+        "{:<117}\n",
+        format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}")
+    );
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((text.len() as u16).to_le_bytes());
+    bytes.extend(text.as_bytes());
+    bytes.extend(data);
+    bytes
+}
+
 fn simulate(folder: &Path, args: &str) {
     qudi(folder).arg("simulate").args(args.split_whitespace()).assert().success();
 }
@@ -189,24 +202,20 @@ fn every_input_format_shows_the_same_scene() {
         frames.push(frame);
     }
     let mut y4m = b"YUV4MPEG2 W32 H24 F30:1 Cmono XCOLORRANGE=FULL\n".to_vec();
-    let mut npy = b"\x93NUMPY\x01\x00".to_vec();
-    let header =
-        format!("{:<117}\n", "{'descr': '|u1', 'fortran_order': False, 'shape': (3, 24, 32), }");
-    npy.extend((header.len() as u16).to_le_bytes());
-    npy.extend(header.as_bytes());
+    let mut samples = Vec::new();
     let gif = std::fs::File::create(folder.join("clip.gif")).unwrap();
     let palette: Vec<u8> = (0..=255).flat_map(|v| [v, v, v]).collect();
     let mut gif = gif::Encoder::new(gif, 32, 24, &palette).unwrap();
     for frame in &frames {
         y4m.extend(b"FRAME\n");
         y4m.extend(frame.as_raw());
-        npy.extend(frame.as_raw());
+        samples.extend(frame.as_raw());
         gif.write_frame(&gif::Frame::from_indexed_pixels(32, 24, frame.as_raw().clone(), None))
             .unwrap();
     }
     drop(gif);
     std::fs::write(folder.join("clip.y4m"), &y4m).unwrap();
-    std::fs::write(folder.join("clip.npy"), &npy).unwrap();
+    std::fs::write(folder.join("clip.npy"), npy_bytes("|u1", "(3, 24, 32)", &samples)).unwrap();
 
     let crc = |output: &str| {
         let record: serde_json::Value =
@@ -255,13 +264,10 @@ fn a_still_moves_as_told() {
 fn a_dark_map_beside_the_sensor_file_is_used() {
     let folder = scratch("dark-map");
     std::fs::create_dir(folder.join("lab")).unwrap();
-    let mut map = b"\x93NUMPY\x01\x00".to_vec();
-    let header =
-        format!("{:<117}\n", "{'descr': '<f4', 'fortran_order': False, 'shape': (40, 50), }");
-    map.extend((header.len() as u16).to_le_bytes());
-    map.extend(header.as_bytes());
     // Three dark electrons in the left half, none in the right.
-    map.extend((0..2000).flat_map(|i| if i % 50 < 25 { 3.0f32 } else { 0.0 }.to_le_bytes()));
+    let rates: Vec<u8> =
+        (0..2000).flat_map(|i| if i % 50 < 25 { 3.0f32 } else { 0.0 }.to_le_bytes()).collect();
+    let map = npy_bytes("<f4", "(40, 50)", &rates);
     std::fs::write(folder.join("lab/dcr.npy"), map).unwrap();
     std::fs::write(
         folder.join("lab/s.toml"),

@@ -47,9 +47,19 @@ impl Camera {
     /// # Errors
     /// [`SimError`] for an impossible sensor, an unreadable dark map, or light beyond all bounds.
     pub fn new(sensor: &Sensor, size: Size, light: Light, seed: u64) -> Result<Self> {
+        Self::with_maps(sensor, PixelMaps::draw(sensor, size)?, size, light, seed)
+    }
+
+    /// A camera whose pixel pattern, `maps` of `sensor` for frames of `size`, is drawn already.
+    pub(crate) fn with_maps(
+        sensor: &Sensor,
+        maps: PixelMaps,
+        size: Size,
+        light: Light,
+        seed: u64,
+    ) -> Result<Self> {
         sensor.validate()?;
         let gain = sensor.gain_at(light.ppp)?;
-        let maps = PixelMaps::draw(sensor, size)?;
         let electrons_per_value = sensor.quantum_efficiency * light.ppp / light.exposure;
         let dark = sensor.dark_per_frame()? / f64::from(sensor.frames_summed);
         if !electrons_per_value.is_finite() || electrons_per_value > MAX_DETECTIONS {

@@ -26,14 +26,27 @@ pub struct Light {
     pub exposure: f64,
 }
 
-/// Mean and histogram of a clip's values in [0, 1].
+/// CRC-32 of a clip's values, little-endian, in order.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Checksum(crc32fast::Hasher);
+
+impl Checksum {
+    /// Adds one frame.
+    pub(crate) fn add(&mut self, values: &[f32]) {
+        let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        self.0.update(&bytes);
+    }
+
+    /// The sum so far.
+    pub(crate) fn crc32(&self) -> u32 {
+        self.0.clone().finalize()
+    }
+}
+
+/// Mean, histogram and checksum of a clip's values in [0, 1].
 #[derive(Clone, Debug)]
 pub struct ClipStatistics {
-    /// Frames seen.
-    pub frames: u64,
-    /// CRC-32 of all values, little-endian, in order.
-    pub crc32: u32,
-    hasher: crc32fast::Hasher,
+    checksum: Checksum,
     /// Count and sum of the values in each of 4096 equal bins.
     bins: Vec<(u64, f64)>,
 }
@@ -42,23 +55,24 @@ const BINS: usize = 4096;
 
 impl Default for ClipStatistics {
     fn default() -> Self {
-        Self { frames: 0, crc32: 0, hasher: crc32fast::Hasher::new(), bins: vec![(0, 0.0); BINS] }
+        Self { checksum: Checksum::default(), bins: vec![(0, 0.0); BINS] }
     }
 }
 
 impl ClipStatistics {
     /// Adds one frame of values in [0, 1].
     pub fn add(&mut self, values: &[f32]) {
-        let mut bytes = Vec::with_capacity(values.len() * 4);
         for &value in values {
             let bin = &mut self.bins[((value * BINS as f32) as usize).min(BINS - 1)];
             bin.0 += 1;
             bin.1 += f64::from(value);
-            bytes.extend_from_slice(&value.to_le_bytes());
         }
-        self.hasher.update(&bytes);
-        self.crc32 = self.hasher.clone().finalize();
-        self.frames += 1;
+        self.checksum.add(values);
+    }
+
+    /// CRC-32 of all values so far.
+    pub fn crc32(&self) -> u32 {
+        self.checksum.crc32()
     }
 
     /// Mean value of the clip; 0 for none.

@@ -5,7 +5,7 @@
 use crate::camera::Camera;
 use crate::error::{Result, SimError};
 use crate::frame::{Frame, Size};
-use crate::light::{ClipStatistics, Light, PppDefinition, resolve_light};
+use crate::light::{Checksum, ClipStatistics, Light, PppDefinition, resolve_light};
 use crate::scene::Flow;
 use crate::sensor::{PixelMaps, Sensor};
 use crate::source::{Input, Sampling};
@@ -138,7 +138,8 @@ pub fn simulate(
         ));
     }
 
-    let mean_dark = PixelMaps::draw(sensor, info.size)?.mean_dark(sensor)?;
+    let maps = PixelMaps::draw(sensor, info.size)?;
+    let mean_dark = maps.mean_dark(sensor)?;
     let light = resolve_light(
         sensor,
         simulation.ppp_def,
@@ -147,12 +148,12 @@ pub fn simulate(
         &clip,
         mean_dark,
     )?;
-    let mut camera = Camera::new(sensor, info.size, light, simulation.seed)?;
+    let mut camera = Camera::with_maps(sensor, maps, info.size, light, simulation.seed)?;
     sink.start(Start { size: info.size, frames })?;
 
     let mut source = input.open(sampling)?;
     let (mut sum, mut saturated) = (0u64, 0u64);
-    let mut again = ClipStatistics::default();
+    let mut again = Checksum::default();
     for index in 0..frames {
         let Some(exposure) = source.next()? else {
             return Err(changed(input));
@@ -166,7 +167,7 @@ pub fn simulate(
         sink.frame(Exposed { index, counts: &counts, truth: exposure.truth() }, &flow)?;
         progress(Stage::Exposing, index + 1, Some(frames))?;
     }
-    if again.crc32 != clip.crc32 {
+    if again.crc32() != clip.crc32() {
         return Err(changed(input));
     }
     let pixels = (frames * info.size.pixels() as u64) as f64;
@@ -176,7 +177,7 @@ pub fn simulate(
         light,
         gain: camera.gain(),
         clip_mean: clip.mean(),
-        clip_crc32: clip.crc32,
+        clip_crc32: clip.crc32(),
         mean_count: sum as f64 / pixels,
         saturated: saturated as f64 / pixels,
         hot_and_dead: (camera.maps().hot.len(), camera.maps().dead.len()),

@@ -11,7 +11,7 @@ use qudi_sim::sensor::{CountLaw, Sensor};
 use qudi_sim::{Camera, ClipStatistics, Frame, PppDefinition, SimError, Size, resolve_light};
 use serde_json::json;
 use std::fmt::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Frames of the paper's window, and the one in its middle.
 const FRAMES: usize = 11;
@@ -108,10 +108,7 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
         demo.ppp,
         demo.seed
     );
-    report.result(
-        &text,
-        || json!({"picture": picture_path(&path), "seed": demo.seed, "figures": figures}),
-    )
+    report.result(&text, || json!({"picture": path, "seed": demo.seed, "figures": figures}))
 }
 
 /// A turning and panning chart behind two lines of text that pass it in opposite directions.
@@ -120,10 +117,6 @@ fn built_in_scene() -> Scene {
     let mut chart = scene(ProceduralScene::Chart, 4.0);
     chart.layers.extend(scene(ProceduralScene::Text, 3.0).layers.into_iter().skip(1).step_by(2));
     chart
-}
-
-fn picture_path(path: &Path) -> String {
-    path.display().to_string()
 }
 
 /// Inverts the mean response of the sensor, dark counts subtracted.

@@ -1,6 +1,6 @@
 //! `qudi light`: how many photons a lux is, with every assumption printed.
 
-use crate::args::{Global, Light};
+use crate::args::Light;
 use crate::error::{Fault, Result};
 use crate::report::Report;
 use qudi_sim::sensor::Sensor;
@@ -8,7 +8,7 @@ use qudi_sim::{Spectrum, ppp_from_lux, sensor_lux};
 use serde_json::json;
 use std::fmt::Write;
 
-pub(crate) fn run(light: &Light, _: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(light: &Light, report: &Report) -> Result<()> {
     let sensor = Sensor::load(&light.sensor)?;
     let missing = |what: &str, flag: &str| {
         Fault::new(

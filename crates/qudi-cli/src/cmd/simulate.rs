@@ -44,8 +44,6 @@ pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<(
             "pipe a clip in, as in `ffmpeg -i VIDEO -f yuv4mpegpipe - | qudi simulate - -o OUT`",
         ));
     }
-    simulation.input.spool(&mut std::io::stdin().lock(), &mut interrupt::check)?;
-
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
     if args.flow.is_some() && !simulation.input.is_synthetic() {
         return Err(Fault::new(
@@ -55,6 +53,7 @@ pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<(
         ));
     }
     let mut outputs = Outputs::new(args, &simulation.sensor, overwrite)?;
+    simulation.input.spool(&mut std::io::stdin().lock(), &mut interrupt::check)?;
     let mut bar = report.bar();
     let summary = simulate(&simulation, &mut outputs, &mut |progress| {
         let what = match progress.stage {
@@ -194,12 +193,13 @@ impl<'a> Outputs<'a> {
                 "use a binary sensor (--sensor swissspad2), no --sum, and -o NAME.npy",
             ));
         }
-        // Refused here, before the clip is measured.
+        // Refused here, before the clip is read.
         let path = PathBuf::from(&args.output);
         let record = format.record_path(&path);
         let burst = [path, record].map(|path| (args.output != "-").then_some(path));
         let beside = [&args.truth, &args.flow, &args.preview].map(Clone::clone);
-        for path in burst.into_iter().chain(beside).flatten() {
+        let transforms = args.visionsim.then(|| transforms_path(args));
+        for path in burst.into_iter().chain(beside).chain([transforms]).flatten() {
             refuse_taken(&path, overwrite)?;
         }
         Ok(Self {
@@ -232,7 +232,7 @@ impl<'a> Outputs<'a> {
         }
         let path = PathBuf::from(&self.args.output);
         if self.args.visionsim {
-            let transforms = path.with_file_name("transforms.json");
+            let transforms = transforms_path(self.args);
             let mut file = PendingFile::create(&transforms, self.overwrite)?;
             let document = serde_json::to_vec(&visionsim_transforms(record, &path));
             let document = document
@@ -322,6 +322,11 @@ fn record_of(simulation: Simulation, summary: &Summary, format: BurstFormat) -> 
         clip: ClipDigest { mean: summary.clip_mean, crc32: summary.clip_crc32 },
         simulation,
     }
+}
+
+/// The file beside the burst that visionsim looks for.
+fn transforms_path(args: &Simulate) -> PathBuf {
+    Path::new(&args.output).with_file_name("transforms.json")
 }
 
 /// What visionsim needs to unpack the burst; a camera without pose.
