@@ -1,8 +1,11 @@
 //! The command line: every sentence of `--help` is here.
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
 use clap_complete::Shell;
 use qudi_sim::Size;
+use qudi_sim::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+use serde::de::DeserializeOwned;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
@@ -71,9 +74,11 @@ pub(crate) enum Color {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     Simulate(Box<Simulate>),
+    Convert(Box<Convert>),
+    Calibrate(Box<Calibrate>),
     Demo(Demo),
     Light(Light),
-    Info(Info),
+    Info(Box<Info>),
     Config(Config),
     Completions(Completions),
     #[command(hide = true)]
@@ -239,19 +244,184 @@ pub(crate) struct Light {
     pub(crate) magnification: f64,
 }
 
-/// Describe sensors, compute devices, and bursts that this program wrote
+/// Describe anything: captures in any format, bursts, sensors, devices
 #[derive(Debug, ClapArgs)]
 #[group(required = true, multiple = false)]
 pub(crate) struct Info {
-    /// A sensor's name or .toml file, a burst, or its record
+    /// A capture (file or folder), a burst or its record, a sensor's name or .toml file
     #[arg(value_hint = ValueHint::AnyPath)]
     pub(crate) subject: Option<String>,
     /// List the built-in sensors
     #[arg(long)]
     pub(crate) sensors: bool,
+    /// List the formats that captures are read from
+    #[arg(long)]
+    pub(crate) formats: bool,
     /// List the compute devices of this machine
     #[arg(long)]
     pub(crate) devices: bool,
+    #[command(flatten)]
+    pub(crate) look: Look,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}
+
+/// How a capture is looked at.
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Captures")]
+pub(crate) struct Look {
+    /// Sensor that took it: a name or a .toml file [default: known from record or format]
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) sensor: Option<String>,
+    /// Write the mean picture as PNG: response inverted, bad pixels repaired
+    #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
+    pub(crate) preview: Option<PathBuf>,
+}
+
+/// Copy a capture from any format into one that everything reads
+///
+/// Pixels stay as they are unless --mask or --dcr ask for repair. With --sum N, N frames are
+/// summed into each output frame. OUT is an .npy file (binary frames are packed as photoncube and
+/// visionsim do), a multi-page .tif, or a folder of PNG (no extension), with a record beside it.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Convert {
+    /// The capture: a file or a folder
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) capture: PathBuf,
+    /// Where it goes
+    #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
+    pub(crate) output: PathBuf,
+    /// Write binary .npy bursts with one byte per pixel
+    #[arg(long)]
+    pub(crate) unpacked: bool,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}
+
+/// Measure dark rates, hot pixels and read noise from a capture with the shutter closed
+///
+/// Writes a sensor file and two maps beside it (NAME.dark.npy, NAME.bad.npy), used from then on by
+/// --sensor NAME.toml or --dcr NAME.toml.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Calibrate {
+    /// The dark capture
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) capture: PathBuf,
+    /// The sensor file to write
+    #[arg(short, long, value_name = "TOML", value_hint = ValueHint::FilePath)]
+    pub(crate) output: PathBuf,
+    /// Sensor to start from: a name or a .toml file [default: known from record or format]
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) sensor: Option<String>,
+    /// Gain of this capture in DN per electron, for sensors whose gain follows the light
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
+    pub(crate) gain: Option<f64>,
+    /// Dark rate beyond which a pixel is hot: per frame, or per second as in 100/s [default: 10 x the median]
+    #[arg(long, value_name = "RATE")]
+    pub(crate) hot: Option<String>,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}
+
+/// What the user says about a capture that its file does not.
+#[derive(Clone, Debug, ClapArgs)]
+#[command(next_help_heading = "Reading captures")]
+pub(crate) struct Reading {
+    /// Format by name (`qudi info --formats`) [default: recognised]
+    #[arg(long, value_name = "NAME")]
+    format: Option<String>,
+    /// Which bit of a byte is the first pixel
+    #[arg(long, value_name = "ORDER", value_parser = words::<BitOrder>(&["msb", "lsb"]))]
+    bitorder: Option<BitOrder>,
+    /// Axis along which 8 pixels share a byte
+    #[arg(long, value_name = "AXIS", value_parser = words::<PackAxis>(&["width", "height", "none"]))]
+    pack_axis: Option<PackAxis>,
+    /// Frame size, height first: for raw files, and packed rows whose width is no multiple of 8
+    #[arg(long, value_name = "HxW")]
+    size: Option<Size>,
+    /// Turn frames; vendor: as the camera's own software shows them
+    #[arg(long, value_name = "TURN", value_parser = words::<Orientation>(&["raw", "vendor", "rot90", "rot180", "rot270", "flip-h", "flip-v", "transpose"]))]
+    orient: Option<Orientation>,
+    /// Order of an array's axes (time, height, width), slowest first
+    #[arg(long, value_name = "AXES", value_parser = words::<Axes>(&["thw", "twh", "hwt", "wht", "htw", "wth"]))]
+    axes: Option<Axes>,
+    /// Colour channel to read as gray, from 0
+    #[arg(long, value_name = "N")]
+    channel: Option<usize>,
+    /// Array (variable, data set) in a file that holds several
+    #[arg(long, value_name = "NAME")]
+    array: Option<String>,
+    /// Values are means of N binary frames, full scale for all ones
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    levels: Option<u16>,
+    /// Bytes before the first frame of each raw file
+    #[arg(long, value_name = "BYTES")]
+    header: Option<u64>,
+    /// Bytes after the last frame of each raw file
+    #[arg(long, value_name = "BYTES")]
+    trailer: Option<u64>,
+    /// Frames in each raw file but the last
+    #[arg(long, value_name = "N")]
+    frames_per_file: Option<u64>,
+    /// First frame, from 0
+    #[arg(long, value_name = "N")]
+    start: Option<u64>,
+    /// One past the last frame
+    #[arg(long, value_name = "N")]
+    end: Option<u64>,
+    /// Rows and columns to keep after turning, as in 2:256,0:496
+    #[arg(long, value_name = "Y0:Y1,X0:X1")]
+    crop: Option<Crop>,
+    /// Sum N frames into one (7 binary frames make 3 bits)
+    #[arg(long, value_name = "N")]
+    sum: Option<u32>,
+    /// Pixels to repair: a .npy or image nonzero at bad ones, auto (found in the capture), or none
+    #[arg(long, value_name = "FILE|auto|none")]
+    mask: Option<MaskChoice>,
+    /// Dark rates: a .npy or .mat map in counts per second, or a calibrated sensor file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    dcr: Option<PathBuf>,
+    /// Drop an incomplete last frame instead of refusing the file
+    #[arg(long)]
+    lenient: bool,
+}
+
+impl Reading {
+    /// The options; without --mask, pixels are treated as `mask` says.
+    pub(crate) fn options(&self, mask: MaskChoice) -> ReadOptions {
+        let given = self.clone();
+        // A dark map names its hot pixels; asking for it asks for their repair.
+        let mask = if given.dcr.is_some() { MaskChoice::Auto } else { mask };
+        ReadOptions {
+            format: given.format,
+            bit_order: given.bitorder,
+            pack_axis: given.pack_axis,
+            size: given.size,
+            orient: given.orient,
+            axes: given.axes,
+            channel: given.channel,
+            array: given.array,
+            levels: given.levels,
+            header: given.header,
+            trailer: given.trailer,
+            frames_per_file: given.frames_per_file,
+            start: given.start,
+            end: given.end,
+            crop: given.crop,
+            sum: given.sum,
+            mask: given.mask.unwrap_or(mask),
+            dcr: given.dcr,
+            lenient: given.lenient,
+        }
+    }
+}
+
+/// One of some words, read as the type that serde names so.
+fn words<T: DeserializeOwned + Clone + Send + Sync + 'static>(
+    all: &'static [&'static str],
+) -> impl TypedValueParser<Value = T> {
+    PossibleValuesParser::new(all)
+        .try_map(|word| serde_json::from_value::<T>(serde_json::Value::String(word)))
 }
 
 /// Show settings and where they come from

@@ -1,7 +1,10 @@
 //! One verb per file.
 
+pub(crate) mod calibrate;
+mod capture_info;
 pub(crate) mod completions;
 pub(crate) mod config;
+pub(crate) mod convert;
 pub(crate) mod demo;
 pub(crate) mod info;
 pub(crate) mod light;

@@ -87,6 +87,11 @@ pub(crate) const KEYS: &[Key] = &[
         "",
         "`.npy` of [height][width] dark rates in e- per pixel and native frame",
     ),
+    key(
+        "sensor.defects.bad_pixels",
+        "",
+        "`.npy` of [height][width], nonzero where captures are repaired",
+    ),
     key("sensor.defects.hot_fraction", "", "fraction of hot pixels"),
     key("sensor.defects.hot_dark", "", "dark rate of a hot pixel, as `dark`"),
     key("sensor.defects.dead_fraction", "", "fraction of dead pixels, which read 0"),

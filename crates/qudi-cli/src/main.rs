@@ -44,9 +44,11 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
     }
     match &args.command {
         Command::Simulate(simulate) => cmd::simulate::run(simulate, &args.global, report),
+        Command::Convert(convert) => cmd::convert::run(convert, &args.global, report),
+        Command::Calibrate(calibrate) => cmd::calibrate::run(calibrate, &args.global, report),
         Command::Demo(demo) => cmd::demo::run(demo, &args.global, report),
         Command::Light(light) => cmd::light::run(light, report),
-        Command::Info(info) => cmd::info::run(info, report),
+        Command::Info(info) => cmd::info::run(info, &args.global, report),
         Command::Config(config) => cmd::config::run(config, &args.global, report),
         Command::Completions(completions) => cmd::completions::run(completions),
         Command::Man(man) => cmd::completions::man(man),

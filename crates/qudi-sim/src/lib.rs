@@ -20,10 +20,12 @@
 
 pub mod burst;
 mod camera;
+pub mod capture;
 pub mod error;
 mod frame;
 mod light;
 pub mod metrics;
+mod natural_order;
 pub mod nearest;
 pub mod npy;
 pub mod output;

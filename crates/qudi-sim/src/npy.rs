@@ -20,6 +20,15 @@ pub enum Sample {
         /// Most significant byte first.
         big_endian: bool,
     },
+    /// `|i1`, and two, four and eight bytes signed or unsigned
+    Integer {
+        /// 1, 2, 4 or 8.
+        bytes: u8,
+        /// Two's complement.
+        signed: bool,
+        /// Most significant byte first.
+        big_endian: bool,
+    },
     /// `<f4` or `>f4`
     F32 {
         /// Most significant byte first.
@@ -38,6 +47,7 @@ impl Sample {
         match self {
             Self::Bool | Self::U8 => 1,
             Self::U16 { .. } => 2,
+            Self::Integer { bytes, .. } => usize::from(bytes),
             Self::F32 { .. } => 4,
             Self::F64 { .. } => 8,
         }
@@ -51,16 +61,33 @@ impl Sample {
             "u2" => Self::U16 { big_endian },
             "f4" => Self::F32 { big_endian },
             "f8" => Self::F64 { big_endian },
+            "i1" => Self::Integer { bytes: 1, signed: true, big_endian },
+            "i2" => Self::Integer { bytes: 2, signed: true, big_endian },
+            "i4" => Self::Integer { bytes: 4, signed: true, big_endian },
+            "i8" => Self::Integer { bytes: 8, signed: true, big_endian },
+            "u4" => Self::Integer { bytes: 4, signed: false, big_endian },
+            "u8" => Self::Integer { bytes: 8, signed: false, big_endian },
             _ => return None,
         })
     }
 
-    /// The value of full scale: 1 for booleans and floats.
-    pub fn full_scale(self) -> f32 {
+    /// The value of full scale, 1 for booleans and floats; wide integers have no customary one.
+    pub fn full_scale(self) -> Option<f32> {
         match self {
-            Self::U8 => 255.0,
-            Self::U16 { .. } => 65535.0,
-            _ => 1.0,
+            Self::U8 => Some(255.0),
+            Self::U16 { .. } => Some(65535.0),
+            Self::Integer { .. } => None,
+            _ => Some(1.0),
+        }
+    }
+
+    fn big_endian(self) -> bool {
+        match self {
+            Self::Bool | Self::U8 => false,
+            Self::U16 { big_endian }
+            | Self::F32 { big_endian }
+            | Self::F64 { big_endian }
+            | Self::Integer { big_endian, .. } => big_endian,
         }
     }
 
@@ -68,12 +95,7 @@ impl Sample {
     pub fn decode(self, bytes: &[u8]) -> f32 {
         let mut word = [0u8; 8];
         word[..bytes.len()].copy_from_slice(bytes);
-        if matches!(
-            self,
-            Self::U16 { big_endian: true }
-                | Self::F32 { big_endian: true }
-                | Self::F64 { big_endian: true }
-        ) {
+        if self.big_endian() {
             word[..bytes.len()].reverse();
         }
         let four = [word[0], word[1], word[2], word[3]];
@@ -81,6 +103,11 @@ impl Sample {
             Self::Bool => f32::from(word[0] != 0),
             Self::U8 => f32::from(word[0]),
             Self::U16 { .. } => f32::from(u16::from_le_bytes([word[0], word[1]])),
+            Self::Integer { bytes, signed, .. } => {
+                let word = u64::from_le_bytes(word);
+                let unused = 64 - 8 * u32::from(bytes);
+                if signed { (((word << unused) as i64) >> unused) as f32 } else { word as f32 }
+            }
             Self::F32 { .. } => f32::from_le_bytes(four),
             Self::F64 { .. } => f64::from_le_bytes(word) as f32,
         }
@@ -92,8 +119,10 @@ impl Sample {
 pub struct Header {
     /// Sample type.
     pub sample: Sample,
-    /// Extent of each axis, slowest first.
+    /// Extent of each axis, as NumPy prints it.
     pub shape: Vec<usize>,
+    /// Whether the *first* axis is the fastest in memory.
+    pub fortran: bool,
     /// Bytes before the data.
     pub data_start: u64,
 }
@@ -105,13 +134,13 @@ impl Header {
     /// Reads a header from `reader`; `path` is for messages.
     ///
     /// # Errors
-    /// [`SimError::Data`] if it is no `.npy` of a supported type in C order.
+    /// [`SimError::Data`] if it is no `.npy` of a supported type.
     pub fn read(reader: &mut impl Read, path: &Path) -> Result<Self> {
         let fault = |what: &str| {
             SimError::data(
                 what,
                 path,
-                "write it with numpy.save, in C order, as bool, uint8, uint16, float32 or float64",
+                "write it with numpy.save, as booleans, integers, float32 or float64",
             )
         };
         let ended = |e: std::io::Error| match e.kind() {
@@ -140,12 +169,25 @@ impl Header {
         let text = String::from_utf8(text).map_err(|_| fault("the .npy header is not text"))?;
         let (descr, fortran, shape) =
             parse_dictionary(&text).ok_or_else(|| fault("the .npy header is malformed"))?;
-        if fortran && shape.len() > 1 {
-            return Err(fault("the array is in Fortran order"));
-        }
         let sample = Sample::from_descr(&descr)
             .ok_or_else(|| fault(&format!("samples of type `{descr}` are not images or counts")))?;
-        Ok(Self { sample, shape, data_start: (prefix + length) as u64 })
+        let fortran = fortran && shape.len() > 1;
+        Ok(Self { sample, shape, fortran, data_start: (prefix + length) as u64 })
+    }
+
+    /// Refuses arrays whose first axis is the fastest.
+    ///
+    /// # Errors
+    /// [`SimError::Data`] naming `path`.
+    pub fn require_c_order(&self, path: &Path) -> Result<()> {
+        if !self.fortran {
+            return Ok(());
+        }
+        Err(SimError::data(
+            "the array is in Fortran order",
+            path,
+            "save it as numpy.save(NAME, numpy.ascontiguousarray(array))",
+        ))
     }
 
     /// Bytes of data that the header promises, if that is a possible number.
@@ -232,6 +274,7 @@ pub fn write_header(out: &mut impl Write, descr: &str, shape: &[usize]) -> std::
 /// [`SimError`] if it cannot be read or has another number of dimensions.
 pub fn read_image(path: &Path) -> Result<Frame> {
     let (header, mut reader) = Header::open(path)?;
+    header.require_c_order(path)?;
     let &[height, width] = header.shape.as_slice() else {
         return Err(SimError::data(
             format!("an array of shape {:?} where one image is expected", header.shape),
@@ -305,7 +348,12 @@ mod tests {
         ] {
             assert!(Header::read(&mut bytes.as_slice(), path).is_err(), "{bytes:?}");
         }
-        let huge = Header { sample: Sample::U8, shape: vec![usize::MAX, 3], data_start: 0 };
+        let huge = Header {
+            sample: Sample::U8,
+            shape: vec![usize::MAX, 3],
+            fortran: false,
+            data_start: 0,
+        };
         assert_eq!(huge.data_bytes(), None);
     }
 
@@ -314,6 +362,10 @@ mod tests {
         assert_eq!(Sample::U16 { big_endian: true }.decode(&[1, 2]), 258.0);
         assert_eq!(Sample::U16 { big_endian: false }.decode(&[2, 1]), 258.0);
         assert_eq!(Sample::F32 { big_endian: true }.decode(&1.5f32.to_be_bytes()), 1.5);
+        let signed = Sample::Integer { bytes: 2, signed: true, big_endian: true };
+        assert_eq!(signed.decode(&(-2i16).to_be_bytes()), -2.0);
+        let wide = Sample::Integer { bytes: 8, signed: true, big_endian: false };
+        assert_eq!(wide.decode(&7i64.to_le_bytes()), 7.0);
         assert_eq!(Sample::F64 { big_endian: false }.decode(&2.25f64.to_le_bytes()), 2.25);
     }
 }

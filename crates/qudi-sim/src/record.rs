@@ -1,13 +1,14 @@
 //! The record beside every burst: what is needed to read it, and to make it again.
 
 use crate::burst::BurstFormat;
+use crate::capture::ReadOptions;
 use crate::error::{Result, SimError};
 use crate::frame::Size;
 use crate::light::Light;
 use crate::sensor::Sensor;
 use crate::simulate::Simulation;
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Version of this layout.
 pub const VERSION: u32 = 1;
@@ -61,14 +62,26 @@ pub struct BurstLayout {
 impl BurstLayout {
     /// The layout of a burst of `sensor`.
     pub fn new(format: BurstFormat, frames: u64, size: Size, sensor: &Sensor) -> Self {
+        let fps = sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed));
+        Self::of_counts(format, frames, size, sensor.max_count(), fps)
+    }
+
+    /// The layout of a burst of counts up to `max_count`.
+    pub fn of_counts(
+        format: BurstFormat,
+        frames: u64,
+        size: Size,
+        max_count: u16,
+        fps: Option<f64>,
+    ) -> Self {
         let packed = format == BurstFormat::NpyPacked;
         Self {
             format,
             frames,
             size,
-            max_count: sensor.max_count(),
-            bits: sensor.output_bits(),
-            fps: sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed)),
+            max_count,
+            bits: (16 - max_count.leading_zeros()) as u8,
+            fps,
             bitpack: packed,
             bitpack_dim: packed.then_some(2),
             bitorder: packed.then(|| "msb".to_owned()),
@@ -85,37 +98,96 @@ pub struct ClipDigest {
     pub crc32: u32,
 }
 
+/// The record of a converted capture.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Conversion {
+    /// Layout of this document.
+    pub version: u32,
+    /// Program that wrote it.
+    pub program: String,
+    /// How the burst lies on disk.
+    pub burst: BurstLayout,
+    /// Whether counts are sums of `max_count` binary frames.
+    pub binary: bool,
+    /// The camera preset that the capture's format belongs to.
+    pub preset: Option<String>,
+    /// The capture.
+    pub capture: PathBuf,
+    /// Its format.
+    pub format: String,
+    /// How it was read.
+    pub read: ReadOptions,
+}
+
+/// What any record says about its burst; enough to read it.
+#[derive(Debug)]
+pub(crate) enum Described {
+    Simulated(Box<Record>),
+    Converted(Box<Conversion>),
+}
+
+impl Described {
+    /// Reads a record of either kind.
+    pub(crate) fn load(path: &Path) -> Result<Self> {
+        let document: serde_json::Value = parse(&read_file(path)?, path)?;
+        if document.get("capture").is_none() {
+            return Ok(Self::Simulated(Box::new(Record::load(path)?)));
+        }
+        let conversion: Conversion = serde_json::from_value(document).map_err(|e| {
+            SimError::data(
+                format!("not the record of a converted capture: {e}"),
+                path,
+                "convert the capture again",
+            )
+        })?;
+        check_version(conversion.version, path)?;
+        Ok(Self::Converted(Box::new(conversion)))
+    }
+}
+
 impl Record {
     /// Reads a record.
     ///
     /// # Errors
     /// [`SimError`] if it cannot be read, is no record, or describes an impossible sensor.
     pub fn load(path: &Path) -> Result<Self> {
-        let read = |e| SimError::io("read the record", path, e);
-        let length = std::fs::metadata(path).map_err(read)?.len();
-        if length > MAX_FILE {
-            return Err(SimError::data(
-                format!("a record of {length} bytes"),
-                path,
-                "name the .json beside a burst",
-            ));
-        }
-        let bytes = std::fs::read(path).map_err(read)?;
-        let record: Self = serde_json::from_slice(&bytes).map_err(|e| {
-            SimError::data(
-                format!("not the record of a burst: {e}"),
-                path,
-                "name the .json that `qudi simulate` wrote beside a burst",
-            )
-        })?;
-        if record.version != VERSION {
-            return Err(SimError::data(
-                format!("a record of version {}, this program reads {VERSION}", record.version),
-                path,
-                "use the version of qudi that wrote it",
-            ));
-        }
+        let record: Self = parse(&read_file(path)?, path)?;
+        check_version(record.version, path)?;
         record.simulation.sensor.validate()?;
         Ok(record)
     }
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>> {
+    let read = |e| SimError::io("read the record", path, e);
+    let length = std::fs::metadata(path).map_err(read)?.len();
+    if length > MAX_FILE {
+        return Err(SimError::data(
+            format!("a record of {length} bytes"),
+            path,
+            "name the .json beside a burst",
+        ));
+    }
+    std::fs::read(path).map_err(read)
+}
+
+fn parse<T: serde::de::DeserializeOwned>(bytes: &[u8], path: &Path) -> Result<T> {
+    serde_json::from_slice(bytes).map_err(|e| {
+        SimError::data(
+            format!("not the record of a burst: {e}"),
+            path,
+            "name the .json that `qudi simulate` wrote beside a burst",
+        )
+    })
+}
+
+fn check_version(version: u32, path: &Path) -> Result<()> {
+    if version == VERSION {
+        return Ok(());
+    }
+    Err(SimError::data(
+        format!("a record of version {version}, this program reads {VERSION}"),
+        path,
+        "use the version of qudi that wrote it",
+    ))
 }

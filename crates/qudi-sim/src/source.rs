@@ -16,6 +16,7 @@ mod y4m;
 
 pub use image_file::read_still;
 pub use input::{Input, Sampling};
+pub(crate) use video::Video;
 
 use crate::error::Result;
 use crate::frame::{Frame, Size};

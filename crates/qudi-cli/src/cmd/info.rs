@@ -1,6 +1,7 @@
-//! `qudi info`: sensors, devices, and bursts that this program wrote.
+//! `qudi info`: captures, bursts, sensors, devices.
 
-use crate::args::Info;
+use crate::args::{Global, Info};
+use crate::cmd::{capture_info, convert};
 use crate::error::{Fault, Result};
 use crate::report::Report;
 use qudi_sim::record::Record;
@@ -9,39 +10,44 @@ use serde_json::json;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-pub(crate) fn run(info: &Info, report: &Report) -> Result<()> {
+pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
     if info.sensors {
         return sensors(report);
+    }
+    if info.formats {
+        return convert::formats(report);
     }
     if info.devices {
         return devices(report);
     }
     let subject = info.subject.as_deref().unwrap_or_default();
-    let record = [
-        PathBuf::from(subject),
-        PathBuf::from(format!("{subject}.json")),
-        Path::new(subject).join("burst.json"),
-    ]
-    .into_iter()
-    .find(|path| path.extension().is_some_and(|e| e == "json") && path.is_file());
-    match record {
-        Some(path) => burst(&path, report),
-        None if preset(subject).is_some()
-            || Path::new(subject).extension().is_some_and(|e| e == "toml") =>
-        {
-            sensor(subject, report)
+    let path = Path::new(subject);
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let transforms = path.file_name().is_some_and(|name| name == "transforms.json");
+    match extension.as_deref() {
+        Some("toml") => sensor(subject, report),
+        Some("json") if path.is_file() && !transforms => burst(path, report),
+        _ if path.exists() => {
+            capture_info::run(path, info, global, report)?;
+            let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
+            match beside.iter().find(|record| record.is_file()).map(|path| Record::load(path)) {
+                Some(Ok(record)) if !report.json() => simulated(&record, &beside, report),
+                _ => Ok(()),
+            }
         }
-        None if Path::new(subject).exists() => Err(Fault::new(
-            "no record lies beside it, so nothing is known about it",
-            subject,
-            "give a burst made by `qudi simulate`, its .json, or a sensor",
-        )),
-        None => Err(Fault::new(
+        _ if preset(subject).is_some() => sensor(subject, report),
+        _ => Err(Fault::new(
             format!("there is no file and no sensor named `{subject}`"),
             subject,
             "list sensors with `qudi info --sensors`",
         )),
     }
+}
+
+/// What the record of a simulated burst adds to what can be seen in it.
+fn simulated(record: &Record, beside: &[PathBuf; 2], report: &Report) -> Result<()> {
+    let path = beside.iter().find(|record| record.is_file()).unwrap_or(&beside[0]);
+    report.result(&origin(record, path), || json!(record))
 }
 
 fn sensors(report: &Report) -> Result<()> {
@@ -84,37 +90,40 @@ fn sensor(name: &str, report: &Report) -> Result<()> {
     report.result(&text, || json!(sensor))
 }
 
+/// A record, without its burst.
 fn burst(path: &Path, report: &Report) -> Result<()> {
     let record = Record::load(path)?;
-    let (burst, simulation) = (&record.burst, &record.simulation);
-    let mut text = String::new();
-    let _ = writeln!(
-        text,
-        "burst     {} frames of {}, {} bit, counts up to {}",
-        burst.frames, burst.size, burst.bits, burst.max_count
+    let burst = &record.burst;
+    let mut text = format!(
+        "{:<11}{} of {}, {} bit, counts up to {}\n",
+        "frames", burst.frames, burst.size, burst.bits, burst.max_count
     );
-    let packing =
-        if burst.bitpack { ", 8 pixels per byte, first pixel in the highest bit" } else { "" };
-    let _ =
-        writeln!(text, "layout    {}{packing}", json!(burst.format).as_str().unwrap_or_default());
     if let Some(fps) = burst.fps {
-        let _ = writeln!(text, "rate      {fps} frames per second");
+        let _ = writeln!(text, "{:<11}{fps} frames per second", "rate");
     }
-    let _ = writeln!(text, "sensor    {}, gain {:.4} DN/e-", simulation.sensor.name, record.gain);
-    let _ = writeln!(
-        text,
-        "light     {:.4} incident photons/pixel/frame, exposure {:.4}",
-        record.light.ppp, record.light.exposure
+    report.result(&(text + &origin(&record, path)), || json!(record))
+}
+
+/// Where a simulated burst comes from.
+fn origin(record: &Record, path: &Path) -> String {
+    let simulation = &record.simulation;
+    let mut text = String::new();
+    let mut line = |key: &str, value: String| {
+        let _ = writeln!(text, "{key:<11}{value}");
+    };
+    line("simulated", format!("sensor {}, gain {:.4} DN/e-", simulation.sensor.name, record.gain));
+    line(
+        "",
+        format!(
+            "{:.4} incident photons/pixel/frame, exposure {:.4}",
+            record.light.ppp, record.light.exposure
+        ),
     );
-    let _ = writeln!(text, "scene     {}", simulation.input.place());
-    let _ = writeln!(text, "seed      {}", simulation.seed);
-    let _ = writeln!(
-        text,
-        "made by   {}; again: qudi simulate --from {} -o OUT",
-        record.program,
-        path.display()
-    );
-    report.result(&text, || json!(record))
+    line("scene", simulation.input.place());
+    line("seed", simulation.seed.to_string());
+    line("made by", record.program.clone());
+    line("again", format!("qudi simulate --from {} -o OUT", path.display()));
+    text
 }
 
 fn devices(report: &Report) -> Result<()> {

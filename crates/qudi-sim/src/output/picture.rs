@@ -29,6 +29,11 @@ impl Picture {
         Self { canvas: Frame::filled(size, 0.13), cell, lines }
     }
 
+    /// One frame alone, without margin or labels.
+    pub fn single(frame: &Frame) -> Self {
+        Self { canvas: frame.clone(), cell: frame.size, lines: 0 }
+    }
+
     /// Puts a frame with its labels into a cell.
     pub fn place(&mut self, row: usize, column: usize, labels: &[&str], frame: &Frame) {
         let x = MARGIN + column * (self.cell.width + MARGIN);

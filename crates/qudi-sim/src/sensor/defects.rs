@@ -20,6 +20,10 @@ pub struct Defects {
     /// A `.npy` of `[height][width]` dark rates in e-/pixel/native frame, instead of drawn ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dark_map: Option<String>,
+    /// A `.npy` of `[height][width]`, nonzero where a capture's pixels are to be repaired. The
+    /// simulator does not need it: hot pixels are hot in `dark_map`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bad_pixels: Option<String>,
     /// Fraction of hot pixels.
     pub hot_fraction: f64,
     /// Dark rate of a hot pixel.

@@ -77,14 +77,16 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         merge_documents(&mut merged, document);
         document = merged;
     }
-    // A map is named from where the sensor file lies.
-    if let Some(map) = document.pointer_mut("/defects/dark_map")
-        && let Some(name) = map.as_str()
-        && let Some(folder) = path.parent()
-    {
-        let map_path = std::path::absolute(folder.join(name))
-            .map_err(|e| SimError::io("find the dark map", Path::new(name), e))?;
-        *map = Value::String(map_path.to_string_lossy().into_owned());
+    // Maps are named from where the sensor file lies.
+    for key in ["/defects/dark_map", "/defects/bad_pixels"] {
+        if let Some(map) = document.pointer_mut(key)
+            && let Some(name) = map.as_str()
+            && let Some(folder) = path.parent()
+        {
+            let map_path = std::path::absolute(folder.join(name))
+                .map_err(|e| SimError::io("find the map", Path::new(name), e))?;
+            *map = Value::String(map_path.to_string_lossy().into_owned());
+        }
     }
     Ok(document)
 }

@@ -25,6 +25,14 @@ pub(super) struct NpyFrames {
 impl NpyFrames {
     pub(super) fn open(path: &Path, transfer: Transfer, white: Option<f32>) -> Result<Self> {
         let (header, reader) = Header::open(path)?;
+        header.require_c_order(path)?;
+        let Some(white) = white.or(header.sample.full_scale()) else {
+            return Err(SimError::data(
+                "an array of wide integers, whose value of white is unknown",
+                path,
+                "give the value of white, as in --white 255",
+            ));
+        };
         let (frames, height, width, channels) = match *header.shape.as_slice() {
             [h, w] => (1, h, w, 1),
             [t, h, w] => (t, h, w, 1),
@@ -53,7 +61,7 @@ impl NpyFrames {
             total: frames as u64,
             path: path.to_owned(),
             transfer,
-            white: white.unwrap_or_else(|| header.sample.full_scale()),
+            white,
         })
     }
 }

@@ -10,7 +10,7 @@ use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
 
-pub(super) struct Video {
+pub(crate) struct Video {
     child: Child,
     /// What ffmpeg says; a file, since a full pipe would stop it.
     words: File,
@@ -19,7 +19,7 @@ pub(super) struct Video {
 }
 
 impl Video {
-    pub(super) fn open(path: &Path, transfer: Transfer) -> Result<Self> {
+    pub(crate) fn open(path: &Path, transfer: Transfer) -> Result<Self> {
         // Opened here first, so that a missing file is not reported by ffmpeg.
         File::open(path).map_err(|e| SimError::io("open the video", path, e))?;
         let scratch = |e| SimError::io("make a temporary file for ffmpeg's messages", path, e);

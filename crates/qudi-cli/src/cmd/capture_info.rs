@@ -1,0 +1,196 @@
+//! `qudi info CAPTURE`: what it is, how sure that is, and what is in it.
+
+use crate::args::{Global, Info};
+use crate::error::{Fault, Result};
+use crate::report::Report;
+use qudi_sim::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
+use qudi_sim::output::{Overwrite, Picture, refuse_taken};
+use qudi_sim::sensor::Sensor;
+use qudi_sim::{Frame, linear_to_srgb};
+use serde_json::{Value, json};
+use std::fmt::Write;
+use std::path::Path;
+
+/// Columns of the histogram's bars.
+const BAR: usize = 40;
+
+/// Counts shown in the histogram; more are grouped.
+const BINS: usize = 8;
+
+pub(crate) fn run(path: &Path, info: &Info, global: &Global, report: &Report) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    if let Some(preview) = &info.look.preview {
+        refuse_taken(preview, overwrite)?;
+    }
+    let named = info.look.sensor.as_deref().map(Sensor::load).transpose()?;
+    let options = info.reading.options(MaskChoice::Auto);
+    let mut capture = Capture::open(path, &options, named.as_ref())?;
+    let sensor = match named {
+        Some(sensor) => Some(sensor),
+        None => known_sensor(&capture)?,
+    };
+    let gain = capture.about().gain;
+    let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
+    if let Some(preview) = &info.look.preview {
+        let mut picture = summary.picture(&capture);
+        for value in &mut picture.data {
+            *value = linear_to_srgb(*value);
+        }
+        save(&picture, preview, overwrite)?;
+    }
+    let text = describe(&capture, &summary, sensor.as_ref());
+    report.result(&text, || document(&capture, &summary, sensor.as_ref()))
+}
+
+/// The sensor that a record names, or the camera that the format belongs to.
+pub(crate) fn known_sensor(capture: &Capture) -> Result<Option<Sensor>> {
+    let about = capture.about();
+    match (&about.sensor, about.preset) {
+        (Some(sensor), _) => Ok(Some(sensor.clone())),
+        (None, Some(preset)) => {
+            let mut sensor = Sensor::load(preset)?;
+            // The rate of this capture, where the file knows it.
+            sensor.fps = about.fps.or(sensor.fps);
+            Ok(Some(sensor))
+        }
+        (None, None) => Ok(None),
+    }
+}
+
+/// Says on standard error what the user should know about a capture.
+pub(crate) fn remarks(capture: &Capture, report: &Report) {
+    for remark in &capture.about().remarks {
+        report.remark(&format!("note: {remark}"));
+    }
+}
+
+fn save(picture: &Frame, path: &Path, overwrite: Overwrite) -> Result<()> {
+    if path.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png")) {
+        return Err(Fault::new("previews are PNG", path.display(), "use a name that ends in .png"));
+    }
+    Ok(Picture::single(picture).save(path, overwrite)?)
+}
+
+fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> String {
+    let about = capture.about();
+    let mut text = String::new();
+    let mut line = |key: &str, value: String| {
+        let _ = writeln!(text, "{key:<11}{value}");
+    };
+    let evidence = about.evidence.join(", ");
+    line(
+        "format",
+        format!("{}: {} ({}: {evidence})", about.format, about.title, about.certainty.name()),
+    );
+    let depth = match capture.max_count() {
+        Some(max) => format!("{} bit, counts up to {max}", 16 - max.leading_zeros()),
+        None => "depth unknown".to_owned(),
+    };
+    let summed = match capture.summed() {
+        1 => String::new(),
+        n => format!(", sums of {n}"),
+    };
+    line("frames", format!("{} of {}, {depth}{summed}", capture.frames(), capture.size()));
+    if let Some(packing) = about.packing {
+        line("packing", describe_packing(packing, summary.bit_order));
+    }
+    if about.orient != qudi_sim::capture::Orientation::Raw {
+        line("turned", about.orient.name().to_owned());
+    }
+    if let Some(fps) = capture.fps() {
+        line("rate", format!("{fps} frames per second"));
+    }
+    let sensor_fps = sensor.and_then(|s| s.fps).filter(|_| capture.fps().is_none());
+    if let (Some(sensor), Some(fps)) = (sensor, sensor_fps) {
+        line(
+            "rate",
+            format!("not in the file; `{}` takes up to {fps} frames per second", sensor.name),
+        );
+    }
+    line("looked at", format!("{} frames", summary.looks));
+    let ppp = &summary.ppp;
+    let photons = |value: Option<f64>| value.map_or("unknown".to_owned(), |v| format!("{v:.4}"));
+    let by = sensor
+        .map_or("no sensor known: --sensor NAME".to_owned(), |s| format!("sensor {}", s.name));
+    line(
+        "light",
+        format!(
+            "dn {:.4}, detected {}, incident {} per pixel and frame ({by})",
+            ppp.dn,
+            photons(ppp.detected),
+            photons(ppp.incident)
+        ),
+    );
+    match summary.saturated {
+        Some(_) if capture.max_count() == Some(1) => {
+            line("ones", format!("{:.3} % of all bits", 100.0 * summary.mean));
+        }
+        Some(saturated) => line("saturated", format!("{:.3} % of samples", 100.0 * saturated)),
+        None => line("largest", format!("{}", summary.histogram.len() - 1)),
+    }
+    line("pixels", capture.bad_pixels().describe(capture.size()));
+    histogram(&mut text, &summary.histogram);
+    for remark in &about.remarks {
+        let _ = writeln!(text, "note       {remark}");
+    }
+    text
+}
+
+fn describe_packing(packing: Packing, check: Option<BitOrderCheck>) -> String {
+    let axis = match packing.axis {
+        qudi_sim::capture::PackAxis::Height => "height",
+        _ => "width",
+    };
+    let order = packing.order;
+    let judged = match check {
+        Some(BitOrderCheck { seen: Some(seen), evidence }) if seen == order => {
+            format!("the picture agrees, {evidence:.0} standard errors")
+        }
+        Some(BitOrderCheck { seen: Some(seen), evidence }) => {
+            format!("but the picture says {seen}, {:.0} standard errors: see --bitorder", -evidence)
+        }
+        Some(BitOrderCheck { seen: None, evidence }) => {
+            format!("unsure from the picture, {evidence:.1} standard errors")
+        }
+        None => return format!("8 pixels per byte along the {axis}, {order}"),
+    };
+    format!("8 pixels per byte along the {axis}, {order} ({judged})")
+}
+
+fn histogram(text: &mut String, histogram: &[u64]) {
+    let total: u64 = histogram.iter().sum();
+    let width = histogram.len().div_ceil(BINS);
+    let bins: Vec<u64> = histogram.chunks(width).map(|bin| bin.iter().sum()).collect();
+    let most = bins.iter().copied().max().unwrap_or(1).max(1);
+    for (i, &bin) in bins.iter().enumerate() {
+        let (low, high) = (i * width, ((i + 1) * width - 1).min(histogram.len() - 1));
+        let label = if low == high { format!("{low}") } else { format!("{low}-{high}") };
+        let key = if i == 0 { "counts" } else { "" };
+        let bar = "#".repeat((bin as f64 / most as f64 * BAR as f64).round() as usize);
+        let percent = 100.0 * bin as f64 / total.max(1) as f64;
+        let _ = writeln!(text, "{key:<11}{label:>11} {percent:>7.3} % {bar}");
+    }
+}
+
+fn document(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> Value {
+    let bad = capture.bad_pixels();
+    json!({
+        "path": capture.path(),
+        "about": capture.about(),
+        "frames": capture.frames(),
+        "height": capture.size().height,
+        "width": capture.size().width,
+        "max_count": capture.max_count(),
+        "summed": capture.summed(),
+        "fps": capture.fps(),
+        "looked_at": summary.looks,
+        "ppp": summary.ppp,
+        "sensor": sensor.map(|sensor| &sensor.name),
+        "mean": summary.mean,
+        "saturated": summary.saturated,
+        "histogram": summary.histogram,
+        "bit_order": summary.bit_order,
+        "hot": bad.hot.len(),
+        "dead": bad.dead.len(),
+    })
+}

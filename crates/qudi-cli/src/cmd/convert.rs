@@ -1,0 +1,115 @@
+//! `qudi convert`: any capture into a format that everything reads.
+
+use crate::args::{Convert, Global};
+use crate::cmd::capture_info::remarks;
+use crate::error::{Fault, Result};
+use crate::interrupt;
+use crate::report::Report;
+use qudi_sim::SimError;
+use qudi_sim::burst::{BurstFormat, BurstWriter};
+use qudi_sim::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_sim::output::{Overwrite, refuse_taken};
+use qudi_sim::record::{BurstLayout, Conversion, VERSION};
+use serde_json::{Value, json};
+use std::path::Path;
+
+pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let options = args.reading.options(MaskChoice::None);
+    refuse_taken(&args.output, overwrite)?;
+    let mut capture = Capture::open(&args.capture, &options, None)?;
+    let max_count = largest_count(&mut capture)?;
+    let format = BurstFormat::for_path(&args.output, max_count, !args.unpacked)?;
+    refuse_taken(&format.record_path(&args.output), overwrite)?;
+    let size = capture.size();
+    let mut writer = BurstWriter::create(&args.output, format, size, max_count, overwrite)?;
+    let mut counts = vec![0u16; size.pixels()];
+    let frames = capture.frames();
+    let mut bar = report.bar();
+    for frame in 0..frames {
+        if interrupt::check().is_break() {
+            return Err(Fault::Interrupted);
+        }
+        bar.update("converting", frame, Some(frames));
+        capture.read(frame, &mut counts)?;
+        if let Some(&count) = counts.iter().find(|&&count| count > max_count) {
+            return Err(SimError::data(
+                format!(
+                    "frame {frame} counts {count}, beyond the {max_count} that its format allows"
+                ),
+                &args.capture,
+                "check --format and --levels",
+            )
+            .into());
+        }
+        writer.push(&counts)?;
+    }
+    drop(bar);
+    let layout = BurstLayout::of_counts(format, frames, size, max_count, capture.fps());
+    let record = conversion(args, &options, &capture, layout)?;
+    let bytes = serde_json::to_vec_pretty(&record)
+        .map_err(|e| Fault::new(e, args.output.display(), "report this as a bug"))?;
+    writer.finish(&bytes, overwrite)?;
+    remarks(&capture, report);
+    let text = format!(
+        "{}   {frames} frames of {size}, {} bit, from {}",
+        args.output.display(),
+        record.burst.bits,
+        capture.about().title
+    );
+    report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
+}
+
+fn conversion(
+    args: &Convert,
+    options: &ReadOptions,
+    capture: &Capture,
+    burst: BurstLayout,
+) -> Result<Conversion> {
+    let about = capture.about();
+    let absolute = |path: &Path| {
+        std::path::absolute(path).map_err(|e| SimError::io("find the capture", path, e))
+    };
+    Ok(Conversion {
+        version: VERSION,
+        program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
+        burst,
+        binary: about.binary,
+        preset: about.preset.map(str::to_owned),
+        capture: absolute(&args.capture)?,
+        format: about.format.to_owned(),
+        read: options.clone(),
+    })
+}
+
+/// The largest count that can appear: known, or that of the sample type needed for what is there.
+fn largest_count(capture: &mut Capture) -> Result<u16> {
+    if let Some(max) = capture.max_count() {
+        return Ok(max);
+    }
+    // Unknown depth: every frame decides.
+    let mut counts = vec![0u16; capture.size().pixels()];
+    let mut largest = 1;
+    for frame in 0..capture.frames() {
+        if interrupt::check().is_break() {
+            return Err(Fault::Interrupted);
+        }
+        capture.read(frame, &mut counts)?;
+        largest = largest.max(counts.iter().copied().max().unwrap_or(0));
+    }
+    let bits = 16 - largest.leading_zeros();
+    Ok(((1u32 << bits) - 1) as u16)
+}
+
+/// The formats that captures are read from.
+pub(crate) fn formats(report: &Report) -> Result<()> {
+    use qudi_sim::capture::FORMATS;
+    let width = FORMATS.iter().map(|format| format.name.len()).max().unwrap_or(0) + 2;
+    let lines: Vec<String> =
+        FORMATS.iter().map(|f| format!("{:width$}{}\n", f.name, f.title)).collect();
+    let text =
+        format!("{}\nlayouts and how they are recognised: docs/formats.md\n", lines.concat());
+    report.result(&text, || {
+        FORMATS.iter().map(|f| json!({"name": f.name, "title": f.title})).collect()
+    })
+}

@@ -1,0 +1,256 @@
+//! Captures of real (and simulated) single-photon cameras, in every format of the field.
+//!
+//! The way of the data: a path is recognised ([`FORMATS`]) and opened as native frames
+//! ([`CountFrames`]); a [`Capture`] turns and crops them, sums them, and repairs bad pixels, so that
+//! nothing downstream sees a raw file. Memory holds a few frames, however long the capture is.
+
+mod about;
+mod bad_pixels;
+mod bit_order;
+mod bit_sums;
+mod byte_kind;
+mod chain;
+mod count_frames;
+mod dark;
+mod formats;
+mod frame_bytes;
+mod levels;
+mod options;
+mod packed;
+mod pixel_map;
+mod probe;
+mod raw_look;
+mod samples;
+mod summary;
+mod view;
+
+pub use about::{About, Certainty, Packing};
+pub use bad_pixels::BadPixels;
+pub use bit_order::{SURE, bit_order_evidence};
+pub use count_frames::CountFrames;
+pub use dark::{Calibration, calibrate};
+pub use formats::{FORMATS, Format};
+pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+pub use summary::{BitOrderCheck, Summary};
+
+use crate::error::{Result, SimError};
+use crate::frame::Size;
+use crate::sensor::Sensor;
+use bad_pixels::Repair;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use view::View;
+
+/// Frames looked at for statistics at most.
+pub const MOST_LOOKS: u64 = 1000;
+
+/// A capture, read as output frames: turned, cropped, summed, repaired.
+pub struct Capture {
+    path: PathBuf,
+    about: About,
+    native: Box<dyn CountFrames>,
+    view: View,
+    /// Native frames in use.
+    range: Range<u64>,
+    sum: u32,
+    repair: Repair,
+    bad: BadPixels,
+    /// Dark electrons per native frame and pixel of the view, if known.
+    dark: Option<Vec<f32>>,
+    stored: Vec<u16>,
+    stored_sums: Vec<u32>,
+}
+
+impl std::fmt::Debug for Capture {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Capture")
+            .field("path", &self.path)
+            .field("about", &self.about)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Capture {
+    /// Opens the capture at `path`. `sensor` is asked for its dark map and its bad pixels, if
+    /// `options` name none.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read, is of no known format, or an option does not fit.
+    pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
+        let (native, mut about) = formats::open(path, options)?;
+        about.binary |= about.max_count == Some(1);
+        if let Some(orient) = options.orient {
+            about.orient = orient;
+        }
+        let stored = native.size();
+        let view = View::new(stored, about.orient, about.vendor, options.crop)?;
+        let frames = native.frames();
+        let range = options.start.unwrap_or(0)..options.end.unwrap_or(frames);
+        if range.start >= range.end || range.end > frames {
+            return Err(SimError::request(
+                format!("frames {} to {} of {frames}", range.start, range.end),
+                "--start, --end",
+                format!("frames count from 0; --end is one past the last, at most {frames}"),
+            ));
+        }
+        let sum = options.sum.unwrap_or(1);
+        if sum == 0 || u64::from(sum) > range.end - range.start {
+            return Err(SimError::request(
+                format!("{sum} frames summed into one, of {}", range.end - range.start),
+                "--sum",
+                "sum between 1 and all frames",
+            ));
+        }
+        if about.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX))
+        {
+            return Err(SimError::request(
+                format!("sums of {sum} frames do not fit into 16 bits"),
+                "--sum",
+                "counts go up to 65535: sum fewer frames",
+            ));
+        }
+        let mut capture = Self {
+            path: path.to_owned(),
+            about,
+            view,
+            range,
+            sum,
+            repair: Repair::default(),
+            bad: BadPixels::default(),
+            dark: None,
+            stored: vec![0; stored.pixels()],
+            stored_sums: Vec::new(),
+            native,
+        };
+        let left_over = capture.native_frames() % u64::from(sum);
+        if left_over > 0 {
+            capture.about.remarks.push(format!("the last {left_over} frames fill no sum of {sum}"));
+        }
+        pixel_map::plan(&mut capture, options, sensor)?;
+        Ok(capture)
+    }
+
+    /// What is known about it.
+    pub fn about(&self) -> &About {
+        &self.about
+    }
+
+    /// Where it lies.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Size of the turned and cropped frames.
+    pub fn size(&self) -> Size {
+        self.view.size
+    }
+
+    /// Output frames.
+    pub fn frames(&self) -> u64 {
+        self.native_frames() / u64::from(self.sum)
+    }
+
+    /// Native frames in use.
+    pub fn native_frames(&self) -> u64 {
+        self.range.end - self.range.start
+    }
+
+    /// Native frames summed into each output frame.
+    pub fn summed(&self) -> u32 {
+        self.sum
+    }
+
+    /// Largest possible count of an output frame, if known.
+    pub fn max_count(&self) -> Option<u16> {
+        self.about.max_count.map(|max| (u32::from(max) * self.sum) as u16)
+    }
+
+    /// Output frames per second, if known.
+    pub fn fps(&self) -> Option<f64> {
+        self.about.fps.map(|fps| fps / f64::from(self.sum))
+    }
+
+    /// Dark electrons per native frame of every pixel, if a map is known.
+    pub fn dark(&self) -> Option<&[f32]> {
+        self.dark.as_deref()
+    }
+
+    /// Pixels that are repaired: named ones, or found ones.
+    pub fn bad_pixels(&self) -> &BadPixels {
+        &self.bad
+    }
+
+    /// Whether going back means to start over.
+    pub fn forward_only(&self) -> bool {
+        self.native.forward_only()
+    }
+
+    /// Reads output frame `frame`, bad pixels repaired.
+    ///
+    /// # Errors
+    /// [`SimError`] if the file cannot be read, or a sum does not fit into 16 bits.
+    pub fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        self.check(frame..frame + 1)?;
+        if self.sum == 1 {
+            self.native.read(self.range.start + frame, &mut self.stored)?;
+            self.view.apply(&self.stored, counts);
+        } else {
+            let mut sums = vec![0; self.size().pixels()];
+            self.stored_total(frame..frame + 1, &mut sums)?;
+            for (count, sum) in counts.iter_mut().zip(sums) {
+                *count = u16::try_from(sum).map_err(|_| {
+                    SimError::request(
+                        format!("frame {frame} sums to {sum}, which does not fit into 16 bits"),
+                        "--sum",
+                        "sum fewer frames",
+                    )
+                })?;
+            }
+        }
+        self.repair.frame(frame, counts);
+        Ok(())
+    }
+
+    /// Sums output frames, bad pixels repaired.
+    ///
+    /// # Errors
+    /// [`SimError`] if the file cannot be read.
+    pub fn total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
+        self.stored_total(frames, sums)?;
+        self.repair.sums(sums);
+        Ok(())
+    }
+
+    /// Sums as they are, turned and cropped only.
+    fn stored_total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
+        self.check(frames.clone())?;
+        let native = |frame: u64| self.range.start + frame * u64::from(self.sum);
+        let range = native(frames.start)..native(frames.end);
+        self.stored_sums.clear();
+        self.stored_sums.resize(self.stored.len(), 0);
+        self.native.add(range, &mut self.stored_sums)?;
+        self.view.apply(&self.stored_sums, sums);
+        Ok(())
+    }
+
+    fn check(&self, frames: Range<u64>) -> Result<()> {
+        if frames.start <= frames.end && frames.end <= self.frames() {
+            return Ok(());
+        }
+        Err(SimError::request(
+            format!("frames {} to {} of {}", frames.start, frames.end, self.frames()),
+            self.path.display(),
+            "ask for frames of the capture",
+        ))
+    }
+
+    /// Output frames to look at for statistics: evenly spread, or the first ones where going
+    /// through the whole file would take long.
+    pub fn looks(&self) -> Vec<u64> {
+        let looks = self.frames().min(MOST_LOOKS);
+        if self.forward_only() {
+            return (0..looks).collect();
+        }
+        (0..looks).map(|i| i * self.frames() / looks).collect()
+    }
+}

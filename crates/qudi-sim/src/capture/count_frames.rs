@@ -1,0 +1,40 @@
+//! Frames of photon counts that can be asked for by number.
+
+use crate::error::Result;
+use crate::frame::Size;
+use std::ops::Range;
+
+/// A stack of count images, `[frames][height][width]`.
+pub trait CountFrames: Send {
+    /// Number of frames.
+    fn frames(&self) -> u64;
+
+    /// Size of every frame.
+    fn size(&self) -> Size;
+
+    /// Reads frame `frame` into `counts`, row-major.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the file cannot be read or holds no counts.
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()>;
+
+    /// Adds the counts of `frames` to `sums`.
+    ///
+    /// # Errors
+    /// As [`CountFrames::read`].
+    fn add(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
+        let mut counts = vec![0; self.size().pixels()];
+        for frame in frames {
+            self.read(frame, &mut counts)?;
+            for (sum, &count) in sums.iter_mut().zip(&counts) {
+                *sum += u32::from(count);
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether going back means to start over, as in a compressed file.
+    fn forward_only(&self) -> bool {
+        false
+    }
+}

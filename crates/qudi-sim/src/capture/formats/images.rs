@@ -1,0 +1,176 @@
+//! A folder of gray images, one per frame, or a single one.
+
+use super::npy::beside;
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty};
+use crate::capture::count_frames::CountFrames;
+use crate::capture::levels::infer_levels;
+use crate::capture::options::ReadOptions;
+use crate::capture::probe::Probe;
+use crate::capture::samples::{Scale, no_count};
+use crate::error::{Result, SimError};
+use crate::frame::Size;
+use image::{DynamicImage, ImageError, ImageReader};
+use std::path::{Path, PathBuf};
+
+pub(super) const FORMAT: Format = Format {
+    name: "images",
+    title: "folder of images",
+    probe: |probe| {
+        if probe.path.join("burst.json").is_file() {
+            return Ok(Some(Match::new(Certainty::Certain, &["burst.json in the folder"])));
+        }
+        let found = !files(probe)?.is_empty() && (probe.is_folder || probe.has_extension(SINGLE));
+        Ok(found.then(|| Match::new(Certainty::Likely, &["image files"])))
+    },
+    open,
+};
+
+const EXTENSIONS: &[&str] = &["png", "tif", "tiff", "jpg", "jpeg"];
+/// A single TIFF is a stack.
+const SINGLE: &[&str] = &["png", "jpg", "jpeg"];
+
+/// The images themselves; not those in folders below, which are captures of their own.
+fn files(probe: &Probe) -> Result<Vec<PathBuf>> {
+    let mut files = probe.files(EXTENSIONS)?;
+    if probe.is_folder {
+        files.retain(|file| file.parent() == Some(&probe.path));
+    }
+    Ok(files)
+}
+
+pub(super) struct Images {
+    files: Vec<PathBuf>,
+    size: Size,
+    scale: Scale,
+}
+
+fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+    let files = files(probe)?;
+    let recorded = beside(&probe.path.join("burst.json"), about)?.is_some();
+    open_files(files, &probe.path, recorded, options, about)
+}
+
+/// Opens images as frames, in this order.
+pub(super) fn open_files(
+    files: Vec<PathBuf>,
+    place: &Path,
+    recorded: bool,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<Box<dyn CountFrames>> {
+    let Some(first) = files.first() else {
+        return Err(SimError::data(
+            "the folder holds no images",
+            place,
+            "put frames into it as PNG or TIFF",
+        ));
+    };
+    let (size, samples, full) = gray(first)?;
+    if lossy(first) {
+        about.remarks.push("JPEG is lossy: its values are not photon counts".to_owned());
+    }
+    let mut images = Images { files, size, scale: Scale::Counts };
+    if let Some(levels) = options.levels {
+        about.max_count = Some(levels);
+        images.scale = Scale::Means { levels, full: f32::from(full) };
+    } else if !recorded {
+        let mut values = samples;
+        for i in spread(images.files.len()) {
+            values.extend(gray(&images.files[i])?.1);
+            values.sort_unstable();
+            values.dedup();
+        }
+        if let Some(levels) = infer_levels(&values, full) {
+            about.max_count = Some(levels);
+            about.remarks.push(format!(
+                "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
+            ));
+            images.scale = Scale::Means { levels, full: f32::from(full) };
+        }
+    }
+    Ok(Box::new(images))
+}
+
+/// A few frames spread over the capture.
+fn spread(frames: usize) -> impl Iterator<Item = usize> {
+    let looks = frames.min(8);
+    (0..looks).map(move |i| i * frames / looks)
+}
+
+fn lossy(path: &Path) -> bool {
+    path.extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
+}
+
+/// Gray samples of an image, its size, and full scale.
+fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
+    let open = |e| SimError::io("open the image", path, e);
+    let decoded =
+        ImageReader::open(path).map_err(open)?.with_guessed_format().map_err(open)?.decode();
+    let image = decoded.map_err(|e| match e {
+        ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
+            SimError::io("read the image", path, e)
+        }
+        other => SimError::data(
+            format!("not a readable image: {other}"),
+            path,
+            "open it in a viewer to see whether it is damaged, and save it again as PNG",
+        ),
+    })?;
+    let size =
+        Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
+    let channels = usize::from(image.color().channel_count());
+    let alpha = image.color().has_alpha();
+    let (samples, full): (Vec<u16>, u16) = match image {
+        DynamicImage::ImageLuma16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageLumaA16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageRgb16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageRgba16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_) => {
+            return Err(SimError::data(
+                "a floating-point colour image",
+                path,
+                "save counts as 8- or 16-bit gray",
+            ));
+        }
+        other => (other.into_bytes().into_iter().map(u16::from).collect(), 255),
+    };
+    let colours = channels - usize::from(alpha);
+    let coloured = samples.chunks_exact(channels).any(|p| p[..colours].iter().any(|&v| v != p[0]));
+    if coloured {
+        return Err(SimError::data(
+            "a colour image",
+            path,
+            "colour is not supported yet; frames of counts are gray",
+        ));
+    }
+    Ok((size, samples.into_iter().step_by(channels).collect(), full))
+}
+
+impl CountFrames for Images {
+    fn frames(&self) -> u64 {
+        self.files.len() as u64
+    }
+
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        let path = &self.files[frame as usize];
+        let (size, samples, _) = gray(path)?;
+        if size != self.size {
+            return Err(SimError::data(
+                format!("an image of {size} among images of {}", self.size),
+                path,
+                "frames of one capture have one size",
+            ));
+        }
+        for (count, &value) in counts.iter_mut().zip(&samples) {
+            let value = f32::from(value);
+            *count = self.scale.count(value).ok_or_else(|| no_count(value, frame, path))?;
+        }
+        Ok(())
+    }
+}

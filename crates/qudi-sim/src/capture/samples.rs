@@ -1,0 +1,122 @@
+//! Frames with one sample per pixel.
+
+use super::count_frames::CountFrames;
+use super::frame_bytes::FrameBytes;
+use crate::error::{Result, SimError};
+use crate::frame::Size;
+use crate::npy::Sample;
+use std::path::{Path, PathBuf};
+
+/// How stored values become counts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Scale {
+    /// They are counts.
+    Counts,
+    /// They are means of `levels` binary frames, `full` standing for all ones.
+    Means { levels: u16, full: f32 },
+}
+
+impl Scale {
+    /// The count that a stored value stands for; `None` if there is none.
+    pub(super) fn count(self, value: f32) -> Option<u16> {
+        let count = match self {
+            Self::Counts => value,
+            Self::Means { levels, full } => {
+                let exact = value * f32::from(levels) / full;
+                let count = exact.round_ties_even();
+                // Integer files round the mean, or cut it off.
+                let slack = if full > 1.0 { f32::from(levels) / full } else { 0.0 };
+                if (exact - count).abs() > slack + 1e-3 {
+                    return None;
+                }
+                count
+            }
+        };
+        let whole = count as u16;
+        (f32::from(whole) == count).then_some(whole)
+    }
+}
+
+/// Colour channels stored with each pixel, and the one that is read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Channel {
+    pub(super) of: usize,
+    pub(super) index: usize,
+}
+
+pub(super) const MONO: Channel = Channel { of: 1, index: 0 };
+
+pub(super) struct SampleFrames {
+    bytes: FrameBytes,
+    sample: Sample,
+    size: Size,
+    transposed: bool,
+    channel: Channel,
+    scale: Scale,
+    path: PathBuf,
+    buffer: Vec<u8>,
+}
+
+impl SampleFrames {
+    /// Frames of `[height][width][channels]` samples, or `[width][height]` if `transposed`.
+    pub(super) fn new(
+        bytes: FrameBytes,
+        sample: Sample,
+        size: Size,
+        transposed: bool,
+        channel: Channel,
+        scale: Scale,
+        path: &Path,
+    ) -> Self {
+        debug_assert_eq!(bytes.frame_bytes(), size.pixels() * channel.of * sample.bytes());
+        let path = path.to_owned();
+        Self { bytes, sample, size, transposed, channel, scale, path, buffer: Vec::new() }
+    }
+}
+
+impl CountFrames for SampleFrames {
+    fn frames(&self) -> u64 {
+        self.bytes.frames()
+    }
+
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        self.buffer.resize(self.bytes.frame_bytes(), 0);
+        self.bytes.read(frame, &mut self.buffer)?;
+        let bytes = self.sample.bytes();
+        let pixel = bytes * self.channel.of;
+        let stored =
+            self.buffer.chunks_exact(pixel).map(|p| &p[self.channel.index * bytes..][..bytes]);
+        let Size { height, width } = self.size;
+        let place = |i: usize| if self.transposed { i % height * width + i / height } else { i };
+        if self.scale == Scale::Counts && matches!(self.sample, Sample::U8 | Sample::Bool) {
+            for (i, value) in stored.enumerate() {
+                counts[place(i)] =
+                    u16::from(if self.sample == Sample::Bool { value[0].min(1) } else { value[0] });
+            }
+            return Ok(());
+        }
+        for (i, value) in stored.enumerate() {
+            let value = self.sample.decode(value);
+            counts[place(i)] =
+                self.scale.count(value).ok_or_else(|| no_count(value, frame, &self.path))?;
+        }
+        Ok(())
+    }
+
+    fn forward_only(&self) -> bool {
+        self.bytes.forward_only()
+    }
+}
+
+/// A value that no photon counter gives.
+pub(super) fn no_count(value: f32, frame: u64, path: &Path) -> SimError {
+    SimError::data(
+        format!("frame {frame} holds {value}, and photon counts are whole numbers from 0 to 65535"),
+        path,
+        "means of N binary frames are read with --levels N; an image without photon counts is not a capture",
+    )
+}

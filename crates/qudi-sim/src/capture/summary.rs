@@ -1,0 +1,215 @@
+//! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
+
+use super::Capture;
+use super::bit_order::{SURE, bit_order_evidence};
+use super::options::{BitOrder, PackAxis};
+use crate::error::Result;
+use crate::frame::{Frame, Size};
+use crate::light::PppDefinition;
+use crate::sensor::{CountLaw, Response, Sensor};
+use serde::Serialize;
+
+/// Statistics of at most [`MOST_LOOKS`](super::MOST_LOOKS) output frames.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Frames looked at.
+    pub looks: u64,
+    /// Mean count per pixel and output frame, bad pixels repaired.
+    pub mean: f64,
+    /// Samples of each count; the last entry counts the largest seen.
+    pub histogram: Vec<u64>,
+    /// Fraction of samples at the largest possible count, if that is known.
+    pub saturated: Option<f64>,
+    /// Photons per pixel and output frame: incident, detected, DN. Absent without a known sensor.
+    pub ppp: Ppp,
+    /// Whether the picture agrees with the bit order in use; packed captures only.
+    pub bit_order: Option<BitOrderCheck>,
+    /// Sum of the frames looked at, repaired.
+    pub sums: Vec<u32>,
+}
+
+/// Photons per pixel and output frame in their three meanings.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Ppp {
+    /// Photons that fell on a pixel.
+    pub incident: Option<f64>,
+    /// Electrons or avalanches, dark ones included, also those that saturation hid.
+    pub detected: Option<f64>,
+    /// Mean output value.
+    pub dn: f64,
+}
+
+impl Ppp {
+    /// One of them.
+    pub fn get(&self, definition: PppDefinition) -> Option<f64> {
+        match definition {
+            PppDefinition::Incident => self.incident,
+            PppDefinition::Detected => self.detected,
+            PppDefinition::Dn => Some(self.dn),
+        }
+    }
+}
+
+/// What the picture says about the order of bits.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct BitOrderCheck {
+    /// Evidence for the order in use, in standard errors; negative: against it.
+    pub evidence: f64,
+    /// The order that the picture shows, if it shows one.
+    pub seen: Option<BitOrder>,
+}
+
+impl Summary {
+    /// Looks at `capture`. `sensor` turns counts into photons; `gain` is its gain in DN/e-, for
+    /// sensors whose own rule follows the light.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the file cannot be read.
+    pub fn measure(
+        capture: &mut Capture,
+        sensor: Option<&Sensor>,
+        gain: Option<f64>,
+    ) -> Result<Self> {
+        let size = capture.size();
+        let looks = capture.looks();
+        let mut sums = vec![0u32; size.pixels()];
+        let mut counts = vec![0u16; size.pixels()];
+        let mut histogram = vec![0u64; 1 << 16];
+        for &frame in &looks {
+            capture.read(frame, &mut counts)?;
+            for (sum, &count) in sums.iter_mut().zip(&counts) {
+                *sum += u32::from(count);
+                histogram[usize::from(count)] += 1;
+            }
+        }
+        let largest = histogram.iter().rposition(|&n| n > 0).unwrap_or(0);
+        histogram.truncate(largest + 1);
+        let samples = looks.len() as f64 * size.pixels() as f64;
+        let total: f64 = sums.iter().map(|&sum| f64::from(sum)).sum();
+        let saturated = capture
+            .max_count()
+            .map(|max| histogram.get(usize::from(max)).map_or(0.0, |&n| n as f64 / samples));
+        let looked = looks.len() as u64;
+        let bit_order = check_bit_order(capture, &looks)?;
+        let ppp = ppp(capture, &sums, looked, sensor, gain)?;
+        Ok(Self {
+            looks: looked,
+            mean: total / samples,
+            histogram,
+            saturated,
+            ppp,
+            bit_order,
+            sums,
+        })
+    }
+
+    /// The mean picture in linear light, white at the 99.5th percentile.
+    pub fn picture(&self, capture: &Capture) -> Frame {
+        let size = capture.size();
+        let trials = self.looks as f64 * f64::from(capture.summed());
+        let binary = capture.about().binary;
+        let trials =
+            trials * f64::from(if binary { capture.about().max_count.unwrap_or(1) } else { 1 });
+        let light = |&sum: &u32| {
+            let mean = f64::from(sum) / trials;
+            let light = if binary { -(-mean.min(1.0 - 0.5 / trials)).ln_1p() } else { mean };
+            light as f32
+        };
+        let mut data: Vec<f32> = self.sums.iter().map(light).collect();
+        let mut sorted = data.clone();
+        sorted.sort_by(f32::total_cmp);
+        let white = sorted[(sorted.len() - 1) * 995 / 1000].max(f32::MIN_POSITIVE);
+        for value in &mut data {
+            *value = (*value / white).min(1.0);
+        }
+        Frame { size, data }
+    }
+}
+
+/// Compares pixels across byte boundaries, in the frames as they are stored.
+fn check_bit_order(capture: &mut Capture, looks: &[u64]) -> Result<Option<BitOrderCheck>> {
+    let Some(packing) = capture.about.packing else { return Ok(None) };
+    let stored = capture.native.size();
+    let mut sums = vec![0u32; stored.pixels()];
+    for &look in looks {
+        let first = capture.range.start + look * u64::from(capture.sum);
+        capture.native.add(first..first + u64::from(capture.sum), &mut sums)?;
+    }
+    let evidence = match packing.axis {
+        PackAxis::Height => {
+            let turned = Size { height: stored.width, width: stored.height };
+            let columns: Vec<u32> = (0..stored.pixels())
+                .map(|i| sums[i % stored.height * stored.width + i / stored.height])
+                .collect();
+            bit_order_evidence(&columns, turned)
+        }
+        _ => bit_order_evidence(&sums, stored),
+    };
+    let seen = match evidence {
+        e if e > SURE => Some(packing.order),
+        e if e < -SURE => Some(packing.order.reversed()),
+        _ => None,
+    };
+    Ok(Some(BitOrderCheck { evidence, seen }))
+}
+
+/// Photons per pixel and output frame.
+fn ppp(
+    capture: &Capture,
+    sums: &[u32],
+    looks: u64,
+    sensor: Option<&Sensor>,
+    gain: Option<f64>,
+) -> Result<Ppp> {
+    let looks = looks as f64;
+    let pixels = sums.len() as f64;
+    let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / pixels / looks;
+    // Binary frames in one native frame, if it is made of them.
+    let native = match sensor {
+        _ if capture.about.binary => capture.about.max_count.map(u32::from),
+        Some(sensor) if sensor.response == Response::Binary => {
+            capture.about.max_count.map(u32::from).or(Some(sensor.frames_summed))
+        }
+        _ => None,
+    };
+    let detected = if let Some(native) = native {
+        let n = f64::from(native) * f64::from(capture.sum);
+        let trials = n * looks;
+        // Pixel by pixel: the mean of a curve is not the curve of the mean.
+        let light = |&sum: &u32| -n * (-f64::from(sum).min(trials - 0.5) / trials).ln_1p();
+        Some(sums.iter().map(light).sum::<f64>() / pixels)
+    } else if let Some(sensor) = sensor {
+        linear_detections(sensor, gain, dn / f64::from(capture.sum))
+            .map(|native| native * f64::from(capture.sum))
+    } else {
+        None
+    };
+    let dark = match (sensor, &capture.dark) {
+        (Some(_), Some(map)) => {
+            let mean = map.iter().map(|&d| f64::from(d)).sum::<f64>() / map.len() as f64;
+            Some(mean * f64::from(capture.sum) * f64::from(native.unwrap_or(1)))
+        }
+        (Some(sensor), None) => {
+            let per_native = sensor.per_native_frame(sensor.dark, "dark")?;
+            Some(per_native * f64::from(capture.sum) * f64::from(native.unwrap_or(1)))
+        }
+        (None, _) => None,
+    };
+    let incident = match (detected, dark, sensor) {
+        (Some(detected), Some(dark), Some(sensor)) => {
+            Some(((detected - dark) / sensor.quantum_efficiency).max(0.0))
+        }
+        _ => None,
+    };
+    Ok(Ppp { incident, detected, dn })
+}
+
+/// Detections behind a mean output value; `None` if the gain follows the light.
+fn linear_detections(sensor: &Sensor, gain: Option<f64>, dn: f64) -> Option<f64> {
+    use crate::sensor::Gain;
+    let gain = gain.or(match sensor.gain {
+        Gain::Fixed(_) | Gain::Unit | Gain::Fwc => sensor.gain_at(1.0).ok(),
+        Gain::Quiver | Gain::Auto => None,
+    })?;
+    Some(CountLaw::new(sensor, gain).detections_for_mean(dn))
+}
