@@ -1,7 +1,7 @@
 //! The command line: every sentence of `--help` is here.
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
+use clap::{ArgGroup, Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
 use clap_complete::Shell;
 use qudi_sim::Size;
 use qudi_sim::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
@@ -246,19 +246,20 @@ pub(crate) struct Light {
 
 /// Describe anything: captures in any format, bursts, sensors, devices
 #[derive(Debug, ClapArgs)]
-#[group(required = true, multiple = false)]
+#[group(skip)]
+#[command(group(ArgGroup::new("what").required(true)))]
 pub(crate) struct Info {
     /// A capture (file or folder), a burst or its record, a sensor's name or .toml file
-    #[arg(value_hint = ValueHint::AnyPath)]
+    #[arg(group = "what", value_hint = ValueHint::AnyPath)]
     pub(crate) subject: Option<String>,
     /// List the built-in sensors
-    #[arg(long)]
+    #[arg(long, group = "what")]
     pub(crate) sensors: bool,
     /// List the formats that captures are read from
-    #[arg(long)]
+    #[arg(long, group = "what")]
     pub(crate) formats: bool,
     /// List the compute devices of this machine
-    #[arg(long)]
+    #[arg(long, group = "what")]
     pub(crate) devices: bool,
     #[command(flatten)]
     pub(crate) look: Look,
@@ -268,6 +269,7 @@ pub(crate) struct Info {
 
 /// How a capture is looked at.
 #[derive(Debug, ClapArgs)]
+#[group(skip)]
 #[command(next_help_heading = "Captures")]
 pub(crate) struct Look {
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
@@ -325,6 +327,7 @@ pub(crate) struct Calibrate {
 
 /// What the user says about a capture that its file does not.
 #[derive(Clone, Debug, ClapArgs)]
+#[group(skip)]
 #[command(next_help_heading = "Reading captures")]
 pub(crate) struct Reading {
     /// Format by name (`qudi info --formats`) [default: recognised]
@@ -354,6 +357,9 @@ pub(crate) struct Reading {
     /// Values are means of N binary frames, full scale for all ones
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     levels: Option<u16>,
+    /// Bits of a count, where the file does not say
+    #[arg(long, value_name = "N")]
+    bits: Option<u8>,
     /// Bytes before the first frame of each raw file
     #[arg(long, value_name = "BYTES")]
     header: Option<u64>,
@@ -402,6 +408,7 @@ impl Reading {
             channel: given.channel,
             array: given.array,
             levels: given.levels,
+            bits: given.bits,
             header: given.header,
             trailer: given.trailer,
             frames_per_file: given.frames_per_file,

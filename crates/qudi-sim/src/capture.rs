@@ -70,6 +70,29 @@ impl std::fmt::Debug for Capture {
     }
 }
 
+/// What the user says of the depth, unless the file knows better.
+fn state_depth(about: &mut About, bits: u8) -> Result<()> {
+    if !(1..=16).contains(&bits) {
+        return Err(SimError::request(
+            format!("{bits} bits"),
+            "--bits",
+            "counts have 1 to 16 bits",
+        ));
+    }
+    let max = ((1u32 << bits) - 1) as u16;
+    match about.max_count {
+        Some(known) if known != max => Err(SimError::request(
+            format!("{bits} bits, where the file has counts up to {known}"),
+            "--bits",
+            "leave it out: the file knows its depth",
+        )),
+        _ => {
+            about.max_count = Some(max);
+            Ok(())
+        }
+    }
+}
+
 impl Capture {
     /// Opens the capture at `path`. `sensor` is asked for its dark map and its bad pixels, if
     /// `options` name none.
@@ -78,6 +101,9 @@ impl Capture {
     /// [`SimError`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
         let (native, mut about) = formats::open(path, options)?;
+        if let Some(bits) = options.bits {
+            state_depth(&mut about, bits)?;
+        }
         about.binary |= about.max_count == Some(1);
         if let Some(orient) = options.orient {
             about.orient = orient;

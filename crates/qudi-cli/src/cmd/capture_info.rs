@@ -126,7 +126,11 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
             line("ones", format!("{:.3} % of all bits", 100.0 * summary.mean));
         }
         Some(saturated) => line("saturated", format!("{:.3} % of samples", 100.0 * saturated)),
-        None => line("largest", format!("{}", summary.histogram.len() - 1)),
+        None => {
+            let largest = summary.histogram.len() - 1;
+            let bits = usize::BITS - largest.leading_zeros();
+            line("largest", format!("{largest}; if counts have {bits} bits, say --bits {bits}"));
+        }
     }
     line("pixels", capture.bad_pixels().describe(capture.size()));
     histogram(&mut text, &summary.histogram);

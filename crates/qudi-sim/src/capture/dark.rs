@@ -92,19 +92,19 @@ pub fn calibrate(
     finish(capture, size, frames, &rates, trials, hot, Some(read_noise))
 }
 
-/// Detections of each mean, by interpolation in a table: the inverse is costly.
+/// Detections of each mean, by interpolation in a table of means.
 fn invert(law: &CountLaw, means: &[f64]) -> Vec<f64> {
-    const STEPS: usize = 4096;
+    const STEPS: usize = 2048;
     let highest = means.iter().copied().fold(0.0, f64::max);
-    let table: Vec<f64> =
-        (0..=STEPS).map(|i| law.detections_for_mean(highest * i as f64 / STEPS as f64)).collect();
+    let most = law.detections_for_mean(highest).max(1e-6);
+    // Finer where it is dark: most pixels are there.
+    let detections = |i: usize| most * (i as f64 / STEPS as f64).powi(2);
+    let table: Vec<f64> = (0..=STEPS).map(|i| law.mean(detections(i))).collect();
     let interpolate = |&mean: &f64| {
-        if highest == 0.0 {
-            return table[0];
-        }
-        let at = mean / highest * STEPS as f64;
-        let i = (at as usize).min(STEPS - 1);
-        table[i] + (table[i + 1] - table[i]) * (at - i as f64)
+        let above = table.partition_point(|&m| m < mean).clamp(1, STEPS);
+        let (low, high) = (table[above - 1], table[above]);
+        let part = if high > low { ((mean - low) / (high - low)).clamp(0.0, 1.0) } else { 0.0 };
+        detections(above - 1) + part * (detections(above) - detections(above - 1))
     };
     means.iter().map(interpolate).collect()
 }

@@ -157,9 +157,10 @@ fn inside(probe: &Probe) -> Option<String> {
 fn ambiguous(probe: &Probe, found: &[(&Format, Match)]) -> SimError {
     let candidates: Vec<String> = found
         .iter()
-        .map(|(format, fit)| match fit.evidence.is_empty() {
-            true => format.name.to_owned(),
-            false => format!("{} ({})", format.name, fit.evidence.join(", ")),
+        .map(|(format, fit)| {
+            let evidence = fit.evidence.join(", ");
+            let why = if evidence.is_empty() { evidence } else { format!(" ({evidence})") };
+            format!("{}{why}", format.name)
         })
         .collect();
     SimError::data(
@@ -170,7 +171,7 @@ fn ambiguous(probe: &Probe, found: &[(&Format, Match)]) -> SimError {
 }
 
 /// The map `name` of a MATLAB file, or the only array of two dimensions in it.
-pub(super) fn read_mat_map(path: &std::path::PathBuf, name: &str) -> Result<crate::frame::Frame> {
+pub(super) fn read_mat_map(path: &Path, name: &str) -> Result<crate::frame::Frame> {
     let arrays = mat_file::arrays(path)?;
     let mut maps = arrays.iter().filter(|a| a.dims.len() == 2 && a.dims.iter().all(|&d| d > 1));
     let found =

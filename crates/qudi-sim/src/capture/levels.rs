@@ -15,7 +15,7 @@ pub(super) fn infer_levels(values: &[u16], full: u16) -> Option<u16> {
             (f64::from(v) - exact).abs() <= 0.5 || f64::from(v) == exact.floor()
         })
     };
-    let most = MOST.min(full / 4);
+    let most = MOST.min(full.div_ceil(4));
     // A single level is full scale, that is, binary; several must fill the ladder.
     (1..=most)
         .filter(|&n| f64::from(smallest) > 0.9 * f64::from(full) / f64::from(n))
@@ -39,6 +39,7 @@ mod tests {
         assert_eq!(infer_levels(&ladder(15, 15, 255), 255), Some(15));
         assert_eq!(infer_levels(&ladder(16, 12, 255), 255), Some(16));
         assert_eq!(infer_levels(&ladder(64, 36, 65535), 65535), Some(64));
+        assert_eq!(infer_levels(&ladder(64, 36, 255), 255), Some(64));
     }
 
     #[test]

@@ -27,6 +27,8 @@ pub struct ReadOptions {
     pub array: Option<String>,
     /// Pixel values are means of so many binary frames: `count = round(value * levels / full scale)`.
     pub levels: Option<u16>,
+    /// Bits of a native count, where the file does not say.
+    pub bits: Option<u8>,
     /// Bytes before the first frame of every raw file.
     pub header: Option<u64>,
     /// Bytes after the last frame of every raw file.
@@ -61,6 +63,7 @@ pub enum BitOrder {
 
 impl BitOrder {
     /// The other one.
+    #[must_use]
     pub fn reversed(self) -> Self {
         match self {
             Self::Msb => Self::Lsb,

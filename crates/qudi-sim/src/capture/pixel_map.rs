@@ -10,7 +10,7 @@ use crate::npy::read_image;
 use crate::sensor::Sensor;
 use crate::source::read_still;
 use crate::transfer::Transfer;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Pixels darker than this are called hot where a map says no more (Ma et al. 2020 use 50 to 100).
 const HOT_PER_SECOND: f32 = 100.0;
@@ -114,7 +114,7 @@ fn read(path: &Path) -> Result<Frame> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match extension.as_str() {
         "npy" => read_image(path),
-        "mat" => read_mat_map(&PathBuf::from(path), "dcr"),
+        "mat" => read_mat_map(path, "dcr"),
         "png" | "tif" | "tiff" => read_still(path, Transfer::AsIs),
         _ => Err(SimError::data(
             "not a map of pixels",

@@ -1,7 +1,9 @@
 //! Frames with one sample per pixel.
 
+use super::about::About;
 use super::count_frames::CountFrames;
 use super::frame_bytes::FrameBytes;
+use super::levels::infer_levels;
 use crate::error::{Result, SimError};
 use crate::frame::Size;
 use crate::npy::Sample;
@@ -17,6 +19,26 @@ pub(super) enum Scale {
 }
 
 impl Scale {
+    /// What `--levels` asks for; `full` is the value that stands for all ones.
+    pub(super) fn asked(levels: Option<u16>, full: f32, about: &mut About) -> Option<Self> {
+        let levels = levels?;
+        about.max_count = Some(levels);
+        about.binary = true;
+        Some(Self::Means { levels, full })
+    }
+
+    /// What some values (in any order) show.
+    pub(super) fn seen(mut values: Vec<u16>, full: u16, about: &mut About) -> Self {
+        values.sort_unstable();
+        values.dedup();
+        let Some(levels) = infer_levels(&values, full) else { return Self::Counts };
+        about.max_count = Some(levels);
+        about.remarks.push(format!(
+            "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
+        ));
+        Self::Means { levels, full: f32::from(full) }
+    }
+
     /// The count that a stored value stands for; `None` if there is none.
     pub(super) fn count(self, value: f32) -> Option<u16> {
         let count = match self {

@@ -162,8 +162,7 @@ fn ppp(
     gain: Option<f64>,
 ) -> Result<Ppp> {
     let looks = looks as f64;
-    let pixels = sums.len() as f64;
-    let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / pixels / looks;
+    let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / sums.len() as f64 / looks;
     // Binary frames in one native frame, if it is made of them.
     let native = match sensor {
         _ if capture.about.binary => capture.about.max_count.map(u32::from),
@@ -175,9 +174,8 @@ fn ppp(
     let detected = if let Some(native) = native {
         let n = f64::from(native) * f64::from(capture.sum);
         let trials = n * looks;
-        // Pixel by pixel: the mean of a curve is not the curve of the mean.
-        let light = |&sum: &u32| -n * (-f64::from(sum).min(trials - 0.5) / trials).ln_1p();
-        Some(sums.iter().map(light).sum::<f64>() / pixels)
+        let light = |mean: f64| -n * (-(mean * looks).min(trials - 0.5) / trials).ln_1p();
+        Some(light_of_blocks(sums, capture.size(), looks, light))
     } else if let Some(sensor) = sensor {
         linear_detections(sensor, gain, dn / f64::from(capture.sum))
             .map(|native| native * f64::from(capture.sum))
@@ -202,6 +200,20 @@ fn ppp(
         _ => None,
     };
     Ok(Ppp { incident, detected, dn })
+}
+
+/// Mean light over the picture: the response of binary pixels bends, so that bright and dark parts
+/// are unbent apart; block by block, since single pixels have counted too little.
+fn light_of_blocks(sums: &[u32], size: Size, looks: f64, light: impl Fn(f64) -> f64) -> f64 {
+    const BLOCK: usize = 8;
+    let (down, across) = (size.height.div_ceil(BLOCK), size.width.div_ceil(BLOCK));
+    let mut blocks = vec![(0u64, 0u32); down * across];
+    for (i, &sum) in sums.iter().enumerate() {
+        let block = &mut blocks[i / size.width / BLOCK * across + i % size.width / BLOCK];
+        *block = (block.0 + u64::from(sum), block.1 + 1);
+    }
+    let total = |&(sum, n): &(u64, u32)| light(sum as f64 / f64::from(n) / looks) * f64::from(n);
+    blocks.iter().map(total).sum::<f64>() / size.pixels() as f64
 }
 
 /// Detections behind a mean output value; `None` if the gain follows the light.

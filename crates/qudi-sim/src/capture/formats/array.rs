@@ -4,7 +4,6 @@ use crate::capture::about::{About, Packing};
 use crate::capture::byte_kind::ByteKind;
 use crate::capture::count_frames::CountFrames;
 use crate::capture::frame_bytes::{Fetch, FrameBytes, Opener, Segment, strewn};
-use crate::capture::levels::infer_levels;
 use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::packed::{PackedFrames, Placement, stored_bytes};
 use crate::capture::samples::{Channel, MONO, SampleFrames, Scale};
@@ -42,10 +41,27 @@ pub(super) struct Array {
 /// What a record beside the array says about it.
 #[derive(Default)]
 pub(super) struct Hints {
-    /// Packed how; `Some(None)`: not at all.
-    pub(super) packing: Option<Option<Packing>>,
+    pub(super) stored: Stored,
     /// True frame size.
     pub(super) size: Option<Size>,
+}
+
+/// What samples are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) enum Stored {
+    /// Nobody says.
+    #[default]
+    Unsaid,
+    /// Counts.
+    Counts,
+    /// Eight pixels each.
+    Bits(Packing),
+}
+
+impl From<Option<Packing>> for Stored {
+    fn from(packing: Option<Packing>) -> Self {
+        packing.map_or(Self::Counts, Self::Bits)
+    }
 }
 
 /// Bytes looked at to tell packed bits from counts.
@@ -78,9 +94,9 @@ impl Array {
         let stored = Size::new(rows, columns, &self.path.display().to_string())?;
         let frame_bytes = stored.pixels() * channel.of * self.sample.bytes();
         let sample_bytes = self.look(frames as u64, frame_bytes)?;
-        let packing = self.packing(options, hints, channel, &sample_bytes)?;
+        let packing = self.packing(options, hints, channel, stored, &sample_bytes)?;
         let size = self.true_size(stored, packing, options.size.or(hints.size))?;
-        let scale = if hints.packing.is_some() && options.levels.is_none() {
+        let scale = if hints.stored != Stored::Unsaid && options.levels.is_none() {
             Scale::Counts
         } else {
             self.scale(options, about, &sample_bytes)?
@@ -95,6 +111,12 @@ impl Array {
         }
         if sample == Sample::Bool {
             about.max_count = Some(1);
+            if frames == 1 {
+                about.remarks.push(
+                    "a single boolean image: if it is a map of bad pixels, it belongs to --mask"
+                        .to_owned(),
+                );
+            }
         }
         let transposed = axes.transposed();
         let frames = SampleFrames::new(bytes, sample, size, transposed, channel, scale, &path);
@@ -144,15 +166,29 @@ impl Array {
         options: &ReadOptions,
         hints: &Hints,
         channel: Channel,
+        stored: Size,
         looked: &[u8],
     ) -> Result<Option<Packing>> {
         let order = options.bit_order.unwrap_or(BitOrder::Msb);
         let packing = match options.pack_axis {
             Some(PackAxis::None) => None,
             Some(axis) => Some(Packing { axis, order }),
-            None => match hints.packing {
-                Some(packing) => packing.map(|p| Packing { order: options.bit_order.unwrap_or(p.order), ..p }),
-                None if self.sample == Sample::U8 && options.levels.is_none() => {
+            None => match hints.stored {
+                Stored::Bits(packing) => {
+                    let order = options.bit_order.unwrap_or(packing.order);
+                    Some(Packing { order, ..packing })
+                }
+                Stored::Unsaid if self.sample == Sample::U8 && options.levels.is_none() => {
+                    // A size that fits only if eight pixels share a byte says that they do.
+                    let implied = [PackAxis::Width, PackAxis::Height].into_iter().find(|&axis| {
+                        options.size.is_some_and(|size| {
+                            size != stored
+                                && stored_bytes(size, axis) == (stored.height, stored.width)
+                        })
+                    });
+                    if let Some(axis) = implied {
+                        return Ok(Some(Packing { axis, order }));
+                    }
                     match ByteKind::of(looked) {
                         ByteKind::Packed if looked.iter().all(|&byte| byte == 0 || byte == 255) => None,
                         ByteKind::Packed => Some(Packing { axis: PackAxis::Width, order }),
@@ -163,7 +199,7 @@ impl Array {
                         )),
                     }
                 }
-                None => None,
+                Stored::Counts | Stored::Unsaid => None,
             },
         };
         if packing.is_some() && (self.sample != Sample::U8 || channel.of != 1) {
@@ -207,31 +243,21 @@ impl Array {
 
     fn scale(&self, options: &ReadOptions, about: &mut About, looked: &[u8]) -> Result<Scale> {
         let full = self.sample.full_scale();
-        if let Some(levels) = options.levels {
-            let Some(full) = full else {
-                return Err(self.fault(
-                    "--levels on wide integers, which have no full scale",
-                    "leave --levels out, or save the means as float",
-                ));
-            };
-            about.max_count = Some(levels);
-            return Ok(Scale::Means { levels, full });
+        match (self.sample, full) {
+            (_, Some(full)) if options.levels.is_some() => {
+                Ok(Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts))
+            }
+            (_, None) if options.levels.is_some() => Err(self.fault(
+                "--levels on wide integers, which have no full scale",
+                "leave --levels out, or save the means as float",
+            )),
+            (Sample::U8 | Sample::U16 { .. }, Some(full)) => {
+                let samples = looked.chunks_exact(self.sample.bytes());
+                let values = samples.map(|bytes| self.sample.decode(bytes) as u16).collect();
+                Ok(Scale::seen(values, full as u16, about))
+            }
+            _ => Ok(Scale::Counts),
         }
-        let (Sample::U8 | Sample::U16 { .. }, Some(full)) = (self.sample, full) else {
-            return Ok(Scale::Counts);
-        };
-        let mut values: Vec<u16> = looked
-            .chunks_exact(self.sample.bytes())
-            .map(|bytes| self.sample.decode(bytes) as u16)
-            .collect();
-        values.sort_unstable();
-        values.dedup();
-        let Some(levels) = infer_levels(&values, full as u16) else { return Ok(Scale::Counts) };
-        about.max_count = Some(levels);
-        about.remarks.push(format!(
-            "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels 1 to 65535 says otherwise"
-        ));
-        Ok(Scale::Means { levels, full })
     }
 
     /// Some bytes of the data: from the middle where that is possible.
@@ -247,13 +273,16 @@ impl Array {
                 file.take(there).read_to_end(&mut bytes).map_err(io)?;
             }
             Place::Stream(opener) => {
-                opener()?.take(LOOK as u64).read_to_end(&mut bytes).map_err(|e| {
-                    SimError::data(
+                let read = opener()?.take(LOOK as u64).read_to_end(&mut bytes);
+                // What is damaged further on shows when it is read.
+                if let Err(e) = read
+                    && bytes.is_empty()
+                {
+                    return Err(self.fault(
                         format!("the compressed data are damaged: {e}"),
-                        &self.path,
                         "copy or export the file again",
-                    )
-                })?;
+                    ));
+                }
             }
             Place::Fetch { fetch, .. } => {
                 let count = (LOOK / frame_bytes).clamp(1, frames as usize) as u64;

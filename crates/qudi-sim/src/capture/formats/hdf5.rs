@@ -41,7 +41,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     file.walk(&mut |name, dataset| {
         if let (Ok(datatype), Ok(shape)) = (dataset.datatype(), dataset.shape())
             && let Some(sample) = sample(&datatype)
-            && shape.iter().all(|&d| d > 0 && d <= usize::MAX as u64)
+            && shape.iter().all(|&d| d > 0 && usize::try_from(d).is_ok())
         {
             let shape = shape.iter().map(|&d| d as usize).collect();
             found.push((Candidate { path: name, sample, shape }, dataset));

@@ -47,7 +47,7 @@ pub(super) struct Images {
 
 fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
     let files = files(probe)?;
-    let recorded = beside(&probe.path.join("burst.json"), about)?.is_some();
+    let recorded = beside(&probe.path.join("burst.json"), about).is_some();
     open_files(files, &probe.path, recorded, options, about)
 }
 
@@ -71,25 +71,51 @@ pub(super) fn open_files(
         about.remarks.push("JPEG is lossy: its values are not photon counts".to_owned());
     }
     let mut images = Images { files, size, scale: Scale::Counts };
-    if let Some(levels) = options.levels {
-        about.max_count = Some(levels);
-        images.scale = Scale::Means { levels, full: f32::from(full) };
+    if let Some(scale) = Scale::asked(options.levels, f32::from(full), about) {
+        images.scale = scale;
     } else if !recorded {
-        let mut values = samples;
-        for i in spread(images.files.len()) {
-            values.extend(gray(&images.files[i])?.1);
-            values.sort_unstable();
-            values.dedup();
-        }
-        if let Some(levels) = infer_levels(&values, full) {
-            about.max_count = Some(levels);
-            about.remarks.push(format!(
-                "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
-            ));
-            images.scale = Scale::Means { levels, full: f32::from(full) };
-        }
+        images.infer_scale(samples, full, place, about)?;
     }
     Ok(Box::new(images))
+}
+
+impl Images {
+    /// Whether values are multiples of a step, by a look at a few images.
+    fn infer_scale(
+        &mut self,
+        first: Vec<u16>,
+        full: u16,
+        place: &Path,
+        about: &mut About,
+    ) -> Result<()> {
+        let distinct = |mut values: Vec<u16>| {
+            values.sort_unstable();
+            values.dedup();
+            values
+        };
+        let mut values = distinct(first);
+        let mut ladders = vec![infer_levels(&values, full)];
+        for i in spread(self.files.len()) {
+            let more = distinct(gray(&self.files[i])?.1);
+            ladders.push(infer_levels(&more, full));
+            values.extend(more);
+            values = distinct(values);
+        }
+        self.scale = Scale::seen(values, full, about);
+        if self.scale == Scale::Counts
+            && let Some(levels) = ladders[0].filter(|&n| n > 1)
+            && ladders.iter().all(Option::is_some)
+        {
+            return Err(SimError::data(
+                format!(
+                    "images of different scale: {full}/{levels} in the first, another step in others"
+                ),
+                place,
+                "they were stretched one by one, and are no frames of one capture: name a single image",
+            ));
+        }
+        Ok(())
+    }
 }
 
 /// A few frames spread over the capture.

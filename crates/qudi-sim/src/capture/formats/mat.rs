@@ -1,8 +1,7 @@
 //! MATLAB captures: `part_1.mat`, `part_2.mat`, ... with `info.json`, or one file.
 
-use super::array::{Array, Hints, Place};
+use super::array::{Array, Hints, Place, Stored};
 use super::mat_file::{MatArray, arrays, is_level_5};
-use super::npy::MOST_COMPRESSION;
 use super::{Format, Match};
 use crate::capture::about::{About, Certainty};
 use crate::capture::chain::Chain;
@@ -18,10 +17,9 @@ pub(super) const FORMAT: Format = Format {
     probe: |probe| {
         if probe.is_folder {
             let parts = !parts(probe)?.is_empty();
-            let evidence: &[&str] = match probe.path.join("info.json").is_file() {
-                true => &["part_<N>.mat", "info.json"],
-                false => &["part_<N>.mat"],
-            };
+            let info = probe.path.join("info.json").is_file();
+            let evidence: &[&str] =
+                if info { &["part_<N>.mat", "info.json"] } else { &["part_<N>.mat"] };
             return Ok(parts.then(|| Match::new(Certainty::Certain, evidence)));
         }
         let found = is_level_5(&probe.head);
@@ -35,7 +33,7 @@ const CUSTOMARY: &str = "OUTPUT";
 
 fn parts(probe: &Probe) -> Result<Vec<PathBuf>> {
     let mut files = probe.files(&["mat"])?;
-    files.retain(|file| stem(file).starts_with("part_"));
+    files.retain(|file| stem(file).starts_with("part_") && file.parent() == Some(&probe.path));
     Ok(files)
 }
 
@@ -143,19 +141,11 @@ fn frames(
     options: &ReadOptions,
     about: &mut About,
 ) -> Result<Box<dyn CountFrames>> {
-    let place = match array.in_place() {
-        Some((start, available)) => Place::File { start, available },
-        None => {
-            let bytes: u64 = array.dims.iter().map(|&d| d as u64).product();
-            if bytes > array.stored().saturating_mul(MOST_COMPRESSION) {
-                return Err(SimError::data(
-                    format!("`{}` promises more than its compressed bytes can hold", array.name),
-                    path,
-                    "the file is damaged: save it again from MATLAB",
-                ));
-            }
-            Place::Stream(array.opener(path))
-        }
+    let place = if let Some((start, available)) = array.in_place() {
+        Place::File { start, available }
+    } else {
+        array.refuse_bomb(path)?;
+        Place::Stream(array.opener(path))
     };
     let array = Array {
         path: path.to_owned(),
@@ -166,6 +156,6 @@ fn frames(
         place,
     };
     // Samples of MATLAB arrays are never packed.
-    let hints = Hints { packing: Some(None), size: None };
+    let hints = Hints { stored: Stored::Counts, size: None };
     array.open(options, &hints, about)
 }

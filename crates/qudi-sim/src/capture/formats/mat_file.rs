@@ -10,7 +10,7 @@ use crate::npy::Sample;
 use flate2::read::ZlibDecoder;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 const MATRIX: u32 = 14;
 const COMPRESSED: u32 = 15;
@@ -43,9 +43,15 @@ impl MatArray {
         (!self.compressed).then_some((self.element.0 + self.data, self.bytes))
     }
 
-    /// Bytes in the file.
-    pub(super) fn stored(&self) -> u64 {
-        self.element.1
+    /// Refuses an array that its bytes in the file cannot hold, however well compressed.
+    pub(super) fn refuse_bomb(&self, path: &Path) -> Result<()> {
+        if self.bytes <= self.element.1.saturating_mul(super::npy::MOST_COMPRESSION) {
+            return Ok(());
+        }
+        Err(damaged(
+            format!("`{}` promises more than its compressed bytes can hold", self.name),
+            path,
+        ))
     }
 
     /// Opens the samples of a compressed array.
@@ -116,8 +122,7 @@ pub(super) fn arrays(path: &Path) -> Result<Vec<MatArray>> {
             ));
         }
         let element = match kind {
-            MATRIX => Some((start, bytes)),
-            COMPRESSED => Some((start, bytes)),
+            MATRIX | COMPRESSED => Some((start, bytes)),
             _ => None,
         };
         if let Some(element) = element {
@@ -245,14 +250,12 @@ fn sample(kind: u32, big_endian: bool) -> Option<Sample> {
 }
 
 /// Reads a two-dimensional array whole, row-major: a map of the pixels.
-pub(super) fn read_map(array: &MatArray, path: &PathBuf) -> Result<crate::frame::Frame> {
+pub(super) fn read_map(array: &MatArray, path: &Path) -> Result<crate::frame::Frame> {
     let &[height, width] = array.dims.as_slice() else {
         return Err(damaged(format!("`{}` has extents {:?}", array.name, array.dims), path));
     };
     let size = crate::frame::Size::new(height, width, &path.display().to_string())?;
-    if array.bytes > array.stored().saturating_mul(super::npy::MOST_COMPRESSION) {
-        return Err(damaged(format!("`{}` is larger than its file", array.name), path));
-    }
+    array.refuse_bomb(path)?;
     let mut bytes = vec![0u8; array.bytes as usize];
     array.opener(path)()?
         .read_exact(&mut bytes)

@@ -26,7 +26,7 @@ pub(super) const FORMAT: Format = Format {
     },
     open: |probe, options, about| {
         let array = open_array(&probe.path)?;
-        let hints = hints(&probe.path, about)?;
+        let hints = hints(&probe.path, about);
         array.open(options, &hints, about)
     },
 };
@@ -35,7 +35,8 @@ pub(super) const COMPRESSED: Format = Format {
     name: "npy-gz",
     title: "gzipped NumPy array",
     probe: |probe| {
-        let found = probe.head.starts_with(&[0x1f, 0x8b]) && probe.stem().ends_with(".npy");
+        let found =
+            probe.head.starts_with(&[0x1f, 0x8b]) && probe.stem().to_lowercase().ends_with(".npy");
         Ok(found.then(|| Match::new(Certainty::Certain, &["gzip's magic number", "the name"])))
     },
     open: |probe, options, about| open_gzip(probe, options, about),
@@ -108,26 +109,26 @@ pub(super) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Resu
 }
 
 /// What lies beside an array and describes it: our own record.
-fn hints(path: &Path, about: &mut About) -> Result<Hints> {
+fn hints(path: &Path, about: &mut About) -> Hints {
     let mut name = path.as_os_str().to_owned();
     name.push(".json");
-    let Some(layout) = beside(&PathBuf::from(name), about)? else { return Ok(Hints::default()) };
+    let Some(layout) = beside(&PathBuf::from(name), about) else { return Hints::default() };
     let packed = layout.format == BurstFormat::NpyPacked;
     let packing = packed.then_some(Packing { axis: PackAxis::Width, order: BitOrder::Msb });
-    Ok(Hints { packing: Some(packing), size: Some(layout.size) })
+    Hints { stored: packing.into(), size: Some(layout.size) }
 }
 
 /// What our record at `path` says of its burst, if it exists; what it says about the camera goes
 /// to `about`.
-pub(super) fn beside(path: &Path, about: &mut About) -> Result<Option<BurstLayout>> {
+pub(super) fn beside(path: &Path, about: &mut About) -> Option<BurstLayout> {
     if !path.is_file() {
-        return Ok(None);
+        return None;
     }
     let described = match Described::load(path) {
         Ok(described) => described,
         Err(e) => {
             about.remarks.push(format!("{} is ignored: {e}", path.display()));
-            return Ok(None);
+            return None;
         }
     };
     about.evidence.push("the record beside it".to_owned());
@@ -147,5 +148,5 @@ pub(super) fn beside(path: &Path, about: &mut About) -> Result<Option<BurstLayou
     };
     about.max_count = Some(layout.max_count);
     about.fps = layout.fps;
-    Ok(Some(layout))
+    Some(layout)
 }

@@ -79,13 +79,8 @@ fn samples(
 ) -> Result<Box<dyn CountFrames>> {
     let size = size(options)?;
     let bytes = frame_files(&files(probe)?, size.pixels() * sample.bytes(), 0, options, about)?;
-    let scale = match (options.levels, sample.full_scale()) {
-        (Some(levels), Some(full)) => {
-            about.max_count = Some(levels);
-            Scale::Means { levels, full }
-        }
-        _ => Scale::Counts,
-    };
+    let full = sample.full_scale().unwrap_or(1.0);
+    let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
     let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
     Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, &probe.path)))
 }

@@ -43,7 +43,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     }
     let mut name = path.as_os_str().to_owned();
     name.push(".json");
-    let recorded = beside(&PathBuf::from(name), about)?.is_some();
+    let recorded = beside(&PathBuf::from(name), about).is_some();
     let Some(block) = block(probe)? else {
         let pages = TiffPages::open(path, options, recorded, about)?;
         return Ok(Box::new(pages));
@@ -66,13 +66,8 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     }
     let segment = Segment { path: path.clone(), start: block.start, frames: whole };
     let bytes = FrameBytes::files(vec![segment], frame_bytes as usize);
-    let scale = match (options.levels, block.sample.full_scale()) {
-        (Some(levels), Some(full)) => {
-            about.max_count = Some(levels);
-            Scale::Means { levels, full }
-        }
-        _ => Scale::Counts,
-    };
+    let full = block.sample.full_scale().unwrap_or(1.0);
+    let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
     let frames = SampleFrames::new(bytes, block.sample, block.size, false, MONO, scale, path);
     Ok(Box::new(frames))
 }

@@ -2,7 +2,6 @@
 
 use crate::capture::about::About;
 use crate::capture::count_frames::CountFrames;
-use crate::capture::levels::infer_levels;
 use crate::capture::options::ReadOptions;
 use crate::capture::samples::{Scale, no_count};
 use crate::error::{Result, SimError};
@@ -102,10 +101,8 @@ impl TiffPages {
         about: &mut About,
     ) -> Result<Scale> {
         let full = if bits <= 8 { 255u16 } else { 65535 };
-        let means = |levels| Scale::Means { levels, full: f32::from(full) };
-        if let Some(levels) = options.levels {
-            about.max_count = Some(levels);
-            return Ok(means(levels));
+        if let Some(scale) = Scale::asked(options.levels, f32::from(full), about) {
+            return Ok(scale);
         }
         if bits == 1 {
             about.max_count = Some(1);
@@ -120,15 +117,8 @@ impl TiffPages {
                 DecodingResult::U16(v) => values.extend(v),
                 _ => return Ok(Scale::Counts),
             }
-            values.sort_unstable();
-            values.dedup();
         }
-        let Some(levels) = infer_levels(&values, full) else { return Ok(Scale::Counts) };
-        about.max_count = Some(levels);
-        about.remarks.push(format!(
-            "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
-        ));
-        Ok(means(levels))
+        Ok(Scale::seen(values, full, about))
     }
 
     fn page(&mut self, frame: u64) -> Result<DecodingResult> {

@@ -41,13 +41,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
         "video is stored with loss: its values are not photon counts, and no figure made from them means much"
             .to_owned(),
     );
-    let scale = match options.levels {
-        Some(levels) => {
-            about.max_count = Some(levels);
-            Scale::Means { levels, full: 255.0 }
-        }
-        None => Scale::Counts,
-    };
+    let scale = Scale::asked(options.levels, 255.0, about).unwrap_or(Scale::Counts);
     let segment = Segment { path: path.clone(), start: 0, frames };
     let bytes = FrameBytes::spool(segment, file, size.pixels());
     Ok(Box::new(SampleFrames::new(bytes, Sample::U8, size, false, MONO, scale, path)))

@@ -1,6 +1,6 @@
 //! visionsim datasets: `transforms.json` beside `frames.npy` or a list of images.
 
-use super::array::Hints;
+use super::array::{Hints, Stored};
 use super::images::open_files;
 use super::npy::open_array;
 use super::{Format, Match};
@@ -113,6 +113,6 @@ impl Transforms {
         };
         let packed = axis != PackAxis::None;
         let packing = packed.then_some(Packing { axis, order: BitOrder::Msb });
-        Ok(Hints { packing: Some(packing), size })
+        Ok(Hints { stored: Stored::from(packing), size })
     }
 }
