@@ -64,6 +64,27 @@ def main() -> None:
         image = np.asarray(Image.open(file).convert("L"))
         assert ((image > 127) == (plain[t] > 0)).all(), t
     print("photoncube  40 previews equal, 128 x 208")
+    convert_swissspad2(qudi, folder)
+
+
+def convert_swissspad2(qudi: str, folder: Path) -> None:
+    """Files of 8 MiB through both converters: half and full array, byte by byte."""
+    rng = np.random.default_rng(9)
+    photoncube = str(Path(sys.executable).parent / "photoncube")
+    for name, more, own in (("half", [], "swissspad2"), ("full", ["--full-array"], "swissspad2-full")):
+        raw = folder / name
+        raw.mkdir()
+        for k in range(2):
+            # About a quarter of the bits set: the product of two random bytes.
+            bits = rng.integers(0, 256, (2, 8 << 20), dtype=np.uint8)
+            (bits[0] & bits[1]).tofile(raw / f"filename{k}.bin")
+        theirs, ours = folder / f"{name}-photoncube.npy", folder / f"{name}-qudi.npy"
+        subprocess.run([photoncube, "convert", "-i", raw, "-o", theirs, *more], check=True, capture_output=True)
+        command = [qudi, "convert", raw, "-o", ours, "--format", own, "--quiet"]
+        subprocess.run(command, check=True)
+        expected = np.load(theirs)
+        assert (np.load(ours) == expected).all(), name
+        print(f"photoncube  SwissSPAD2 {name} array converted alike, {expected.shape} bytes")
 
 
 if __name__ == "__main__":

@@ -81,8 +81,17 @@ pub(super) fn add_packed(frames: &[u8], frame_bytes: usize, order: BitOrder, sum
 
 /// A cache line, or what is left of a frame at its end.
 fn load(bytes: &[u8]) -> Block {
-    let mut line = [0u8; WORDS * 8];
-    line[..bytes.len()].copy_from_slice(bytes);
+    match <&[u8; WORDS * 8]>::try_from(bytes) {
+        Ok(line) => words(line),
+        Err(_) => {
+            let mut line = [0u8; WORDS * 8];
+            line[..bytes.len()].copy_from_slice(bytes);
+            words(&line)
+        }
+    }
+}
+
+fn words(line: &[u8; WORDS * 8]) -> Block {
     let mut block = [0; WORDS];
     for (word, bytes) in block.iter_mut().zip(line.chunks_exact(8)) {
         *word = u64::from_le_bytes(bytes.try_into().expect("8 bytes"));

@@ -1,0 +1,3 @@
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| qudi_fuzz::read("a.npy.gz", &qudi_fuzz::format("npy-gz"), bytes));

@@ -1,0 +1,37 @@
+//! What every target does: write the bytes to a file, open it as a capture, read some frames.
+//!
+//! Any result is fine, except a panic, a hang, or memory beyond libFuzzer's limit.
+
+use qudi_sim::capture::{Capture, ReadOptions};
+
+/// Frames read from each file.
+const FRAMES: u64 = 4;
+
+/// Opens `bytes` as a capture called `name`, with `options`, strictly and leniently.
+pub fn read(name: &str, options: &ReadOptions, bytes: &[u8]) {
+    let Ok(folder) = tempfile::tempdir_in(if cfg!(target_os = "linux") { "/dev/shm" } else { "." })
+    else {
+        return;
+    };
+    let path = folder.path().join(name);
+    std::fs::write(&path, bytes).expect("a temporary file");
+    for lenient in [false, true] {
+        let options = ReadOptions { lenient, ..options.clone() };
+        let Ok(mut capture) = Capture::open(&path, &options, None) else { continue };
+        let pixels = capture.size().pixels();
+        if pixels > 1 << 22 {
+            continue;
+        }
+        let mut counts = vec![0; pixels];
+        for frame in 0..capture.frames().min(FRAMES) {
+            let _ = capture.read(frame, &mut counts);
+        }
+        let mut sums = vec![0; pixels];
+        let _ = capture.total(0..capture.frames().min(FRAMES), &mut sums);
+    }
+}
+
+/// Options that name a format.
+pub fn format(name: &str) -> ReadOptions {
+    ReadOptions { format: Some(name.into()), ..ReadOptions::default() }
+}
