@@ -270,13 +270,15 @@ impl Capture {
         ))
     }
 
-    /// Output frames to look at for statistics: evenly spread, or the first ones where going
-    /// through the whole file would take long.
+    /// Output frames to look at for statistics: one from each of equally long stretches, not all at
+    /// the same place in theirs, since lamps flicker; or the first frames, where going through the
+    /// whole file would take long.
     pub fn looks(&self) -> Vec<u64> {
         let looks = self.frames().min(MOST_LOOKS);
         if self.forward_only() {
             return (0..looks).collect();
         }
-        (0..looks).map(|i| i * self.frames() / looks).collect()
+        let start = |i: u64| (u128::from(i) * u128::from(self.frames()) / u128::from(looks)) as u64;
+        (0..looks).map(|i| start(i) + bad_pixels::scramble(i) % (start(i + 1) - start(i))).collect()
     }
 }

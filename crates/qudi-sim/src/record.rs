@@ -119,16 +119,21 @@ pub struct Conversion {
     pub read: ReadOptions,
 }
 
-/// What any record says about its burst; enough to read it.
+/// A record of either kind.
 #[derive(Debug)]
-pub(crate) enum Described {
+pub enum Described {
+    /// Written by `qudi simulate`.
     Simulated(Box<Record>),
+    /// Written by `qudi convert`.
     Converted(Box<Conversion>),
 }
 
 impl Described {
     /// Reads a record of either kind.
-    pub(crate) fn load(path: &Path) -> Result<Self> {
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read or is no record.
+    pub fn load(path: &Path) -> Result<Self> {
         let document: serde_json::Value = parse(&read_file(path)?, path)?;
         if document.get("capture").is_none() {
             return Ok(Self::Simulated(Box::new(Record::load(path)?)));

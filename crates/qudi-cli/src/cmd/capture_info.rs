@@ -1,15 +1,17 @@
 //! `qudi info CAPTURE`: what it is, how sure that is, and what is in it.
 
 use crate::args::{Global, Info};
+use crate::cmd::info::{origin, record_document};
 use crate::error::{Fault, Result};
 use crate::report::Report;
 use qudi_sim::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
 use qudi_sim::output::{Overwrite, Picture, refuse_taken};
+use qudi_sim::record::Described;
 use qudi_sim::sensor::Sensor;
 use qudi_sim::{Frame, linear_to_srgb};
 use serde_json::{Value, json};
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Columns of the histogram's bars.
 const BAR: usize = 40;
@@ -17,7 +19,14 @@ const BAR: usize = 40;
 /// Counts shown in the histogram; more are grouped.
 const BINS: usize = 8;
 
-pub(crate) fn run(path: &Path, info: &Info, global: &Global, report: &Report) -> Result<()> {
+/// `record` is the record beside it, and where that lies.
+pub(crate) fn run(
+    path: &Path,
+    record: Option<&(Described, PathBuf)>,
+    info: &Info,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
     if let Some(preview) = &info.look.preview {
         refuse_taken(preview, overwrite)?;
@@ -32,14 +41,21 @@ pub(crate) fn run(path: &Path, info: &Info, global: &Global, report: &Report) ->
     let gain = capture.about().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.look.preview {
-        let mut picture = summary.picture(&capture);
+        let mut picture = summary.picture(&capture, sensor.as_ref(), gain);
         for value in &mut picture.data {
             *value = linear_to_srgb(*value);
         }
         save(&picture, preview, overwrite)?;
     }
-    let text = describe(&capture, &summary, sensor.as_ref());
-    report.result(&text, || document(&capture, &summary, sensor.as_ref()))
+    let mut text = describe(&capture, &summary, sensor.as_ref());
+    if let Some((record, path)) = record {
+        text += &origin(record, path);
+    }
+    report.result(&text, || {
+        let mut document = document(&capture, &summary, sensor.as_ref());
+        document["record"] = record.map_or(Value::Null, |(record, _)| record_document(record));
+        document
+    })
 }
 
 /// The sensor that a record names, or the camera that the format belongs to.

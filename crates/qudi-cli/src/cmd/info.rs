@@ -4,9 +4,9 @@ use crate::args::{Global, Info};
 use crate::cmd::{capture_info, convert};
 use crate::error::{Fault, Result};
 use crate::report::Report;
-use qudi_sim::record::Record;
+use qudi_sim::record::Described;
 use qudi_sim::sensor::{PRESETS, Response, Sensor, preset};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -28,12 +28,11 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
         Some("toml") => sensor(subject, report),
         Some("json") if path.is_file() && !transforms => burst(path, report),
         _ if path.exists() => {
-            capture_info::run(path, info, global, report)?;
             let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
-            match beside.iter().find(|record| record.is_file()).map(|path| Record::load(path)) {
-                Some(Ok(record)) if !report.json() => simulated(&record, &beside, report),
-                _ => Ok(()),
-            }
+            // A record that cannot be read is remarked upon when the capture is opened.
+            let record = beside.into_iter().find(|record| record.is_file());
+            let record = record.and_then(|path| Some((Described::load(&path).ok()?, path)));
+            capture_info::run(path, record.as_ref(), info, global, report)
         }
         _ if preset(subject).is_some() => sensor(subject, report),
         _ => Err(Fault::new(
@@ -42,12 +41,6 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
             "list sensors with `qudi info --sensors`",
         )),
     }
-}
-
-/// What the record of a simulated burst adds to what can be seen in it.
-fn simulated(record: &Record, beside: &[PathBuf; 2], report: &Report) -> Result<()> {
-    let path = beside.iter().find(|record| record.is_file()).unwrap_or(&beside[0]);
-    report.result(&origin(record, path), || json!(record))
 }
 
 fn sensors(report: &Report) -> Result<()> {
@@ -92,8 +85,11 @@ fn sensor(name: &str, report: &Report) -> Result<()> {
 
 /// A record, without its burst.
 fn burst(path: &Path, report: &Report) -> Result<()> {
-    let record = Record::load(path)?;
-    let burst = &record.burst;
+    let record = Described::load(path)?;
+    let burst = match &record {
+        Described::Simulated(record) => &record.burst,
+        Described::Converted(conversion) => &conversion.burst,
+    };
     let mut text = format!(
         "{:<11}{} of {}, {} bit, counts up to {}\n",
         "frames", burst.frames, burst.size, burst.bits, burst.max_count
@@ -101,28 +97,39 @@ fn burst(path: &Path, report: &Report) -> Result<()> {
     if let Some(fps) = burst.fps {
         let _ = writeln!(text, "{:<11}{fps} frames per second", "rate");
     }
-    report.result(&(text + &origin(&record, path)), || json!(record))
+    report.result(&(text + &origin(&record, path)), || record_document(&record))
 }
 
-/// Where a simulated burst comes from.
-fn origin(record: &Record, path: &Path) -> String {
-    let simulation = &record.simulation;
+pub(crate) fn record_document(record: &Described) -> Value {
+    match record {
+        Described::Simulated(record) => json!(record),
+        Described::Converted(conversion) => json!(conversion),
+    }
+}
+
+/// Where a burst comes from, and how to make it again.
+pub(crate) fn origin(record: &Described, path: &Path) -> String {
     let mut text = String::new();
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "{key:<11}{value}");
     };
-    line("simulated", format!("sensor {}, gain {:.4} DN/e-", simulation.sensor.name, record.gain));
-    line(
-        "",
-        format!(
-            "{:.4} incident photons/pixel/frame, exposure {:.4}",
-            record.light.ppp, record.light.exposure
-        ),
-    );
-    line("scene", simulation.input.place());
-    line("seed", simulation.seed.to_string());
-    line("made by", record.program.clone());
-    line("again", format!("qudi simulate --from {} -o OUT", path.display()));
+    match record {
+        Described::Simulated(record) => {
+            let (simulation, light) = (&record.simulation, record.light);
+            let sensor = &simulation.sensor.name;
+            line("simulated", format!("sensor {sensor}, gain {:.4} DN/e-", record.gain));
+            let (ppp, exposure) = (light.ppp, light.exposure);
+            line("", format!("{ppp:.4} incident photons/pixel/frame, exposure {exposure:.4}"));
+            line("scene", simulation.input.place());
+            line("seed", simulation.seed.to_string());
+            line("made by", record.program.clone());
+            line("again", format!("qudi simulate --from {} -o OUT", path.display()));
+        }
+        Described::Converted(conversion) => {
+            line("converted", format!("from {}", conversion.capture.display()));
+            line("made by", conversion.program.clone());
+        }
+    }
     text
 }
 

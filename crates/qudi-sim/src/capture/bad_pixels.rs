@@ -9,8 +9,8 @@ const HOT_FACTOR: f64 = 2.0;
 /// ... and by this many standard deviations of their counts.
 const HOT_SIGMAS: f64 = 8.0;
 
-/// A dead pixel is silent where its neighbours let this many detections expect: chance does that
-/// once in e^18 pixels.
+/// A dead pixel is silent where all its neighbours but two count more than this: chance does that
+/// once in e^18 pixels, and black parts of a scene are larger.
 const DEAD_EXPECTED: f64 = 18.0;
 
 /// Pixels of a neighbourhood, 5 x 5 around the pixel.
@@ -50,13 +50,12 @@ impl BadPixels {
             if n >= 5 {
                 // The very brightest may be a defect itself.
                 let bright = around[n - 2];
-                let median = around[n / 2];
                 let noise = (bright + 1.0).sqrt();
                 if detections[i] > HOT_FACTOR * bright
                     && detections[i] > bright + HOT_SIGMAS * noise
                 {
                     bad.hot.push(i);
-                } else if sums[i] == 0 && around[n / 4].min(median) > DEAD_EXPECTED {
+                } else if sums[i] == 0 && around[2] > DEAD_EXPECTED {
                     bad.dead.push(i);
                 }
             }
@@ -161,7 +160,7 @@ impl Repair {
 }
 
 /// A fixed choice that looks random (SplitMix64's finaliser, Steele et al. 2014).
-fn scramble(mut z: u64) -> u64 {
+pub(super) fn scramble(mut z: u64) -> u64 {
     z = z.wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);

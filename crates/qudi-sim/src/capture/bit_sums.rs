@@ -81,14 +81,12 @@ pub(super) fn add_packed(frames: &[u8], frame_bytes: usize, order: BitOrder, sum
 
 /// A cache line, or what is left of a frame at its end.
 fn load(bytes: &[u8]) -> Block {
-    match <&[u8; WORDS * 8]>::try_from(bytes) {
-        Ok(line) => words(line),
-        Err(_) => {
-            let mut line = [0u8; WORDS * 8];
-            line[..bytes.len()].copy_from_slice(bytes);
-            words(&line)
-        }
+    if let Ok(line) = <&[u8; WORDS * 8]>::try_from(bytes) {
+        return words(line);
     }
+    let mut line = [0u8; WORDS * 8];
+    line[..bytes.len()].copy_from_slice(bytes);
+    words(&line)
 }
 
 fn words(line: &[u8; WORDS * 8]) -> Block {

@@ -6,7 +6,7 @@ use super::options::{BitOrder, PackAxis};
 use crate::error::Result;
 use crate::frame::{Frame, Size};
 use crate::light::PppDefinition;
-use crate::sensor::{CountLaw, Response, Sensor};
+use crate::sensor::{CountLaw, DarkRate, Gain, Response, Sensor};
 use serde::Serialize;
 
 /// Statistics of at most [`MOST_LOOKS`](super::MOST_LOOKS) output frames.
@@ -103,19 +103,24 @@ impl Summary {
         })
     }
 
-    /// The mean picture in linear light, white at the 99.5th percentile.
-    pub fn picture(&self, capture: &Capture) -> Frame {
+    /// The mean picture in linear light, response inverted and dark counts subtracted where
+    /// `sensor` is known; white is the 99.5th percentile.
+    pub fn picture(&self, capture: &Capture, sensor: Option<&Sensor>, gain: Option<f64>) -> Frame {
         let size = capture.size();
-        let trials = self.looks as f64 * f64::from(capture.summed());
-        let binary = capture.about().binary;
-        let trials =
-            trials * f64::from(if binary { capture.about().max_count.unwrap_or(1) } else { 1 });
-        let light = |&sum: &u32| {
-            let mean = f64::from(sum) / trials;
-            let light = if binary { -(-mean.min(1.0 - 0.5 / trials)).ln_1p() } else { mean };
-            light as f32
+        let frames = self.looks as u32 * capture.sum;
+        let mut data = match native_sensor(capture, sensor) {
+            Some(sensor) => {
+                let gain = fixed_gain(&sensor, gain).unwrap_or(1.0);
+                let dark = sensor.dark_per_frame().unwrap_or(0.0);
+                let summed = f64::from(sensor.frames_summed);
+                let light = |(i, &sum): (usize, &u32)| {
+                    let dark = capture.dark.as_ref().map_or(dark, |map| f64::from(map[i]) * summed);
+                    sensor.estimate_flux(f64::from(sum), frames, gain, dark) as f32
+                };
+                self.sums.iter().enumerate().map(light).collect()
+            }
+            None => self.sums.iter().map(|&sum| sum as f32).collect::<Vec<_>>(),
         };
-        let mut data: Vec<f32> = self.sums.iter().map(light).collect();
         let mut sorted = data.clone();
         sorted.sort_by(f32::total_cmp);
         let white = sorted[(sorted.len() - 1) * 995 / 1000].max(f32::MIN_POSITIVE);
@@ -124,6 +129,33 @@ impl Summary {
         }
         Frame { size, data }
     }
+}
+
+/// The sensor of native frames: `sensor`, or an ideal binary one if no more is known; summing as
+/// many binary frames as the capture's counts do.
+fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
+    let about = &capture.about;
+    let known = match sensor {
+        Some(sensor) => sensor.clone(),
+        None if about.binary => {
+            let mut ideal = Sensor::load("swissspad2").ok()?;
+            (ideal.dark, ideal.quantum_efficiency) = (DarkRate::PerFrame(0.0), 1.0);
+            ideal
+        }
+        None => return None,
+    };
+    match (known.response, about.max_count) {
+        (Response::Binary, Some(max)) => Some(Sensor { frames_summed: u32::from(max), ..known }),
+        _ => Some(known),
+    }
+}
+
+/// The gain in DN/e-, unless it follows a light that is not known.
+fn fixed_gain(sensor: &Sensor, gain: Option<f64>) -> Option<f64> {
+    gain.or(match sensor.gain {
+        Gain::Fixed(_) | Gain::Unit | Gain::Fwc => sensor.gain_at(1.0).ok(),
+        Gain::Quiver | Gain::Auto => None,
+    })
 }
 
 /// Compares pixels across byte boundaries, in the frames as they are stored.
@@ -163,42 +195,30 @@ fn ppp(
 ) -> Result<Ppp> {
     let looks = looks as f64;
     let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / sums.len() as f64 / looks;
-    // Binary frames in one native frame, if it is made of them.
-    let native = match sensor {
-        _ if capture.about.binary => capture.about.max_count.map(u32::from),
-        Some(sensor) if sensor.response == Response::Binary => {
-            capture.about.max_count.map(u32::from).or(Some(sensor.frames_summed))
-        }
-        _ => None,
+    let Some(native) = native_sensor(capture, sensor) else {
+        return Ok(Ppp { incident: None, detected: None, dn });
     };
-    let detected = if let Some(native) = native {
-        let n = f64::from(native) * f64::from(capture.sum);
+    let per_frame = f64::from(capture.sum);
+    let detected = if native.response == Response::Binary {
+        let n = f64::from(native.frames_summed) * per_frame;
         let trials = n * looks;
         let light = |mean: f64| -n * (-(mean * looks).min(trials - 0.5) / trials).ln_1p();
         Some(light_of_blocks(sums, capture.size(), looks, light))
-    } else if let Some(sensor) = sensor {
-        linear_detections(sensor, gain, dn / f64::from(capture.sum))
-            .map(|native| native * f64::from(capture.sum))
     } else {
-        None
+        fixed_gain(&native, gain).map(|gain| {
+            CountLaw::new(&native, gain).detections_for_mean(dn / per_frame) * per_frame
+        })
     };
-    let dark = match (sensor, &capture.dark) {
-        (Some(_), Some(map)) => {
+    let dark = match &capture.dark {
+        Some(map) => {
             let mean = map.iter().map(|&d| f64::from(d)).sum::<f64>() / map.len() as f64;
-            Some(mean * f64::from(capture.sum) * f64::from(native.unwrap_or(1)))
+            mean * f64::from(native.frames_summed)
         }
-        (Some(sensor), None) => {
-            let per_native = sensor.per_native_frame(sensor.dark, "dark")?;
-            Some(per_native * f64::from(capture.sum) * f64::from(native.unwrap_or(1)))
-        }
-        (None, _) => None,
+        None => native.dark_per_frame()?,
     };
-    let incident = match (detected, dark, sensor) {
-        (Some(detected), Some(dark), Some(sensor)) => {
-            Some(((detected - dark) / sensor.quantum_efficiency).max(0.0))
-        }
-        _ => None,
-    };
+    let incident = detected
+        .filter(|_| sensor.is_some())
+        .map(|detected| ((detected - dark * per_frame) / native.quantum_efficiency).max(0.0));
     Ok(Ppp { incident, detected, dn })
 }
 
@@ -214,14 +234,4 @@ fn light_of_blocks(sums: &[u32], size: Size, looks: f64, light: impl Fn(f64) -> 
     }
     let total = |&(sum, n): &(u64, u32)| light(sum as f64 / f64::from(n) / looks) * f64::from(n);
     blocks.iter().map(total).sum::<f64>() / size.pixels() as f64
-}
-
-/// Detections behind a mean output value; `None` if the gain follows the light.
-fn linear_detections(sensor: &Sensor, gain: Option<f64>, dn: f64) -> Option<f64> {
-    use crate::sensor::Gain;
-    let gain = gain.or(match sensor.gain {
-        Gain::Fixed(_) | Gain::Unit | Gain::Fwc => sensor.gain_at(1.0).ok(),
-        Gain::Quiver | Gain::Auto => None,
-    })?;
-    Some(CountLaw::new(sensor, gain).detections_for_mean(dn))
 }
