@@ -237,6 +237,22 @@ impl Capture {
         Ok(())
     }
 
+    /// Copies packed frames as they are, from `first` on: rows of whole bytes, the first pixel in the
+    /// highest bit. `false` if they have to be read one by one: turned, summed, repaired, or stored
+    /// otherwise.
+    ///
+    /// # Errors
+    /// [`SimError`] if the file cannot be read.
+    pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
+        let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.len() == 0;
+        if !untouched || self.about.packing.is_none() {
+            return Ok(false);
+        }
+        let frame_bytes = self.size().height * self.size().width.div_ceil(8);
+        self.check(first..first + (bytes.len() / frame_bytes) as u64)?;
+        self.native.copy_packed(self.range.start + first, bytes)
+    }
+
     /// Sums output frames, bad pixels repaired.
     ///
     /// # Errors

@@ -4,7 +4,7 @@ use crate::args::{Convert, Global};
 use crate::cmd::capture_info::remarks;
 use crate::error::{Fault, Result};
 use crate::interrupt;
-use crate::report::Report;
+use crate::report::{Bar, Report};
 use qudi_sim::SimError;
 use qudi_sim::burst::{BurstFormat, BurstWriter};
 use qudi_sim::capture::{Capture, MaskChoice, ReadOptions};
@@ -26,16 +26,18 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     let mut counts = vec![0u16; size.pixels()];
     let frames = capture.frames();
     let mut bar = report.bar();
-    for frame in 0..frames {
+    let mut frame = copy_packed(&mut capture, format, &mut writer, &mut bar)?;
+    while frame < frames {
         if interrupt::check().is_break() {
             return Err(Fault::Interrupted);
         }
         bar.update("converting", frame, Some(frames));
         capture.read(frame, &mut counts)?;
-        if let Some(&count) = counts.iter().find(|&&count| count > max_count) {
+        let largest = counts.iter().copied().max().unwrap_or(0);
+        if largest > max_count {
             return Err(SimError::data(
                 format!(
-                    "frame {frame} counts {count}, beyond the {max_count} that its format allows"
+                    "frame {frame} counts {largest}, beyond the {max_count} that its format allows"
                 ),
                 &args.capture,
                 "check --format and --levels",
@@ -43,6 +45,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
             .into());
         }
         writer.push(&counts)?;
+        frame += 1;
     }
     drop(bar);
     let layout = BurstLayout::of_counts(format, frames, size, max_count, capture.fps());
@@ -58,6 +61,38 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
         capture.about().title
     );
     report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
+}
+
+/// Frames copied without unpacking them: all, or none.
+fn copy_packed(
+    capture: &mut Capture,
+    format: BurstFormat,
+    writer: &mut BurstWriter,
+    bar: &mut Bar,
+) -> Result<u64> {
+    /// Bytes copied at once.
+    const PIECE: usize = 1 << 20;
+    if format != BurstFormat::NpyPacked {
+        return Ok(0);
+    }
+    let frame_bytes = capture.size().height * capture.size().width.div_ceil(8);
+    let at_once = (PIECE / frame_bytes).max(1) as u64;
+    let mut bytes = Vec::new();
+    let mut frame = 0;
+    while frame < capture.frames() {
+        if interrupt::check().is_break() {
+            return Err(Fault::Interrupted);
+        }
+        bar.update("converting", frame, Some(capture.frames()));
+        let n = at_once.min(capture.frames() - frame);
+        bytes.resize(n as usize * frame_bytes, 0);
+        if !capture.copy_packed(frame, &mut bytes)? {
+            return Ok(0);
+        }
+        writer.push_packed(&bytes)?;
+        frame += n;
+    }
+    Ok(frame)
 }
 
 fn conversion(

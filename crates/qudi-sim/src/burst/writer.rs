@@ -150,6 +150,21 @@ impl BurstWriter {
         }
     }
 
+    /// Adds packed frames as they are; `false` if the format is not packed `.npy`.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full.
+    pub fn push_packed(&mut self, frames: &[u8]) -> Result<bool> {
+        match &mut self.target {
+            Target::Array(array) if self.format == BurstFormat::NpyPacked => {
+                let frame_bytes = self.size.height * self.size.width.div_ceil(8);
+                frames.chunks_exact(frame_bytes).try_for_each(|frame| array.push(frame))?;
+                Ok(true)
+            }
+            _ => Ok(false),
+        }
+    }
+
     /// Gives the burst its name, and its record beside or inside it.
     ///
     /// # Errors

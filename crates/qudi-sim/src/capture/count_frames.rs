@@ -33,6 +33,15 @@ pub trait CountFrames: Send {
         Ok(())
     }
 
+    /// Fills `bytes` with frames from `first` on, rows of whole bytes, 8 pixels each, the first in
+    /// the highest bit; `false` if frames are not stored so nearly like that that copying is all.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the file cannot be read.
+    fn copy_packed(&mut self, _first: u64, _bytes: &mut [u8]) -> Result<bool> {
+        Ok(false)
+    }
+
     /// Whether going back means to start over, as in a compressed file.
     fn forward_only(&self) -> bool {
         false

@@ -18,6 +18,8 @@ const CHUNK_BYTES: usize = 1 << 20;
 pub(super) enum Placement {
     /// Bit after bit, row after row, no padding.
     Straight,
+    /// The place of each stored byte among the bytes of the image, whose rows are whole bytes.
+    Bytes(Vec<u32>),
     /// The pixel of each stored bit, or [`NOWHERE`].
     Map(Vec<u32>),
 }
@@ -95,6 +97,14 @@ impl CountFrames for PackedFrames {
                     }
                 }
             }
+            Placement::Bytes(map) => {
+                for (&place, eight) in map.iter().zip(eights) {
+                    let pixels = &mut counts[place as usize * 8..][..8];
+                    for (pixel, bit) in pixels.iter_mut().zip(eight) {
+                        *pixel = u16::from(bit);
+                    }
+                }
+            }
             Placement::Map(map) => {
                 for (places, eight) in map.chunks_exact(8).zip(eights) {
                     for (&place, bit) in places.iter().zip(eight) {
@@ -113,7 +123,7 @@ impl CountFrames for PackedFrames {
         let at_once = (CHUNK_BYTES / frame_bytes).clamp(15, MOST_FRAMES) / 15 * 15;
         let mut stored = match self.placement {
             Placement::Straight => Vec::new(),
-            Placement::Map(_) => vec![0; frame_bytes * 8],
+            Placement::Bytes(_) | Placement::Map(_) => vec![0; frame_bytes * 8],
         };
         let mut first = frames.start;
         while first < frames.end {
@@ -124,14 +134,48 @@ impl CountFrames for PackedFrames {
             add_packed(&self.buffer, frame_bytes, self.order, to);
             first += n;
         }
-        if let Placement::Map(map) = &self.placement {
-            for (&place, sum) in map.iter().zip(&stored) {
-                if place != NOWHERE {
-                    sums[place as usize] += sum;
+        match &self.placement {
+            Placement::Straight => {}
+            Placement::Bytes(map) => {
+                for (&place, stored) in map.iter().zip(stored.chunks_exact(8)) {
+                    for (sum, stored) in sums[place as usize * 8..].iter_mut().zip(stored) {
+                        *sum += stored;
+                    }
+                }
+            }
+            Placement::Map(map) => {
+                for (&place, sum) in map.iter().zip(&stored) {
+                    if place != NOWHERE {
+                        sums[place as usize] += sum;
+                    }
                 }
             }
         }
         Ok(())
+    }
+
+    fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
+        match &self.placement {
+            Placement::Straight => self.bytes.read(first, bytes)?,
+            Placement::Bytes(map) => {
+                self.buffer.resize(bytes.len(), 0);
+                self.bytes.read(first, &mut self.buffer)?;
+                let frame = map.len();
+                for (to, from) in bytes.chunks_exact_mut(frame).zip(self.buffer.chunks_exact(frame))
+                {
+                    for (&place, &byte) in map.iter().zip(from) {
+                        to[place as usize] = byte;
+                    }
+                }
+            }
+            Placement::Map(_) => return Ok(false),
+        }
+        if self.order == BitOrder::Lsb {
+            for byte in bytes {
+                *byte = byte.reverse_bits();
+            }
+        }
+        Ok(true)
     }
 
     fn forward_only(&self) -> bool {

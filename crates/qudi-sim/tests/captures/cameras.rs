@@ -55,6 +55,17 @@ fn swissspad2_full_arrays_are_zones_with_the_bottom_upside_down() {
         capture.read(frame, &mut one).unwrap();
         assert_eq!(one, frames[frame as usize]);
     }
+    let mut sums = vec![0; 512 * 512];
+    capture.total(3..9, &mut sums).unwrap();
+    assert!(
+        (0..512 * 512).all(|i| sums[i] == (3..9).map(|f| u32::from(frames[f][i])).sum::<u32>())
+    );
+    // Copied without unpacking: rows of whole bytes, highest bit first.
+    let mut packed = vec![0; 2 * 32_768];
+    assert!(capture.copy_packed(254, &mut packed).unwrap());
+    assert_eq!(packed, [pack(&frames[254], 512, false), pack(&frames[255], 512, false)].concat());
+    let turned = ReadOptions { orient: Some(Orientation::Rot90), ..plain() };
+    assert!(!open(&path, &turned).unwrap().copy_packed(0, &mut packed).unwrap());
 }
 
 #[test]

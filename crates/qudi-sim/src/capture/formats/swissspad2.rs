@@ -31,7 +31,7 @@ pub(super) const FULL: Format = Format {
     probe: |probe| recognise(probe, true),
     open: |probe, options, about| {
         let size = Size { height: 512, width: 512 };
-        open(probe, options, about, size, Placement::Map(zones()))
+        open(probe, options, about, size, Placement::Bytes(zones()))
     },
 };
 
@@ -85,12 +85,12 @@ fn open(
     Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
 }
 
-/// Image pixel of every stored bit of a full-array frame.
+/// Image byte of every stored byte of a full-array frame.
 fn zones() -> Vec<u32> {
-    let pixel = |i: u32| {
-        let (row, zone, x) = (i / 1024, i / 128 % 8, i % 128);
+    let byte = |i: u32| {
+        let (row, zone, x) = (i / 128, i / 16 % 8, i % 16);
         let y = if zone % 2 == 0 { row } else { 511 - row };
-        y * 512 + zone / 2 * 128 + x
+        y * 64 + zone / 2 * 16 + x
     };
-    (0..512 * 512).map(pixel).collect()
+    (0..512 * 64).map(byte).collect()
 }
