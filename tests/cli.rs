@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 mod bad_input;
 #[path = "cli/outputs.rs"]
 mod outputs;
+#[path = "cli/restore.rs"]
+mod restore;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")

@@ -8,4 +8,6 @@ pub(crate) mod convert;
 pub(crate) mod demo;
 pub(crate) mod info;
 pub(crate) mod light;
+pub(crate) mod restore;
+mod restore_output;
 pub(crate) mod simulate;

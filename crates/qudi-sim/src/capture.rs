@@ -35,7 +35,7 @@ pub use summary::{BitOrderCheck, Summary};
 
 use crate::error::{Result, SimError};
 use crate::frame::Size;
-use crate::sensor::Sensor;
+use crate::sensor::{Response, Sensor};
 use bad_pixels::Repair;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -189,6 +189,47 @@ impl Capture {
     /// Largest possible count of an output frame, if known.
     pub fn max_count(&self) -> Option<u16> {
         self.about.max_count.map(|max| (u32::from(max) * self.sum) as u16)
+    }
+
+    /// The sensor whose output frames these are: `sensor`, summing as many binary frames as one
+    /// count does here.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] if the depth is unknown or is not that sensor's, or if frames of a
+    /// linear sensor are summed, which no sensor does.
+    pub fn output_sensor(&self, sensor: &Sensor) -> Result<Sensor> {
+        let place = self.path.display();
+        let linear = sensor.response == Response::Linear;
+        if linear && self.sum > 1 {
+            return Err(SimError::request(
+                format!("sums of {} frames of `{}`, a linear sensor", self.sum, sensor.name),
+                "--sum",
+                "only binary frames are summed: leave it out",
+            ));
+        }
+        match self.max_count() {
+            _ if linear && self.about.binary => Err(SimError::request(
+                format!("binary frames, and `{}` is a linear sensor", sensor.name),
+                place,
+                "name the sensor that took them, as in --sensor swissspad2",
+            )),
+            Some(max) if linear && max != sensor.max_count() => Err(SimError::request(
+                format!(
+                    "counts up to {max}, and those of `{}` reach {}",
+                    sensor.name,
+                    sensor.max_count()
+                ),
+                place,
+                "name the sensor that took them, or the depth with --bits",
+            )),
+            Some(max) if !linear => Ok(Sensor { frames_summed: u32::from(max), ..sensor.clone() }),
+            None if !linear => Err(SimError::request(
+                "how many binary frames a count sums is not known",
+                place,
+                "say the depth of counts with --bits (3 for sums of 7), or --levels for scaled means",
+            )),
+            _ => Ok(sensor.clone()),
+        }
     }
 
     /// Output frames per second, if known.

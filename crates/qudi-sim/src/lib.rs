@@ -31,6 +31,7 @@ pub mod npy;
 pub mod output;
 mod random;
 pub mod record;
+pub mod restore;
 pub mod scene;
 pub mod sensor;
 mod simulate;

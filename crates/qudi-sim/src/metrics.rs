@@ -1,5 +1,7 @@
-//! How close a restored frame is to the truth.
+//! How close an estimate is to the truth.
 
 mod psnr;
+mod ssim;
 
 pub use psnr::{best_gain, gain_aligned_psnr, psnr};
+pub use ssim::{gaussian_ssim, ssim};

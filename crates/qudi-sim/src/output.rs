@@ -8,6 +8,7 @@ mod picture;
 
 pub use array::ArrayWriter;
 pub use frames::FramesWriter;
+pub(crate) use frames::save_png16;
 pub use gif_preview::GifPreview;
 pub use pending::{Overwrite, PendingFile, PendingFolder, refuse_taken};
 pub use picture::Picture;

@@ -185,6 +185,20 @@ impl BurstWriter {
     }
 }
 
+impl BurstWriter {
+    /// Gives the burst its name, without a record.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full.
+    pub fn finish_alone(self) -> Result<()> {
+        match self.target {
+            Target::Array(array) => array.finish(),
+            Target::Tiff(stack) => stack.finish(),
+            Target::Png(folder) => folder.finish(b"{}"),
+        }
+    }
+}
+
 /// Writes the `.npy` header of a burst of known length to a pipe, and gives the encoder of frames.
 ///
 /// # Errors

@@ -55,6 +55,8 @@ pub struct About {
     pub sensor: Option<Sensor>,
     /// Its gain in DN/e-, if a record says.
     pub gain: Option<f64>,
+    /// Incident photons per pixel and native frame, if a record says.
+    pub ppp: Option<f64>,
     /// The camera preset that this format belongs to.
     pub preset: Option<&'static str>,
     /// What the user should know.
@@ -86,6 +88,7 @@ impl About {
             orient: Orientation::Raw,
             sensor: None,
             gain: None,
+            ppp: None,
             preset: None,
             remarks: Vec::new(),
         }

@@ -1,7 +1,9 @@
-//! Frames in [0, 1] on disk: `.npy` of float32, or a folder of 16-bit PNG.
+//! Frames in [0, 1] on disk: `.npy` of float32, 16-bit TIFF, GIF, or a folder of 16-bit PNG.
 
 use super::array::ArrayWriter;
+use super::gif_preview::GifPreview;
 use super::pending::{Overwrite, PendingFolder};
+use crate::burst::{BurstFormat, BurstWriter};
 use crate::error::{Result, SimError};
 use crate::frame::{Frame, Size};
 use image::{ImageBuffer, Luma};
@@ -15,6 +17,10 @@ const FIRST: &str = "frame_000000.png";
 pub enum FramesWriter {
     /// `.npy`, `[frames][height][width]` float32.
     Array(ArrayWriter),
+    /// Multi-page TIFF of 16-bit samples; 65535 is 1.
+    Tiff(Box<BurstWriter>),
+    /// Animated GIF, the first frames of a long clip.
+    Gif(GifPreview),
     /// Folder of 16-bit PNG; 65535 is 1.
     Folder {
         /// The folder.
@@ -25,7 +31,8 @@ pub enum FramesWriter {
 }
 
 impl FramesWriter {
-    /// Starts a clip of frames of `size`: a `.npy`, or a folder if the name has no extension.
+    /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, or a folder if the name has no
+    /// extension.
     ///
     /// # Errors
     /// [`SimError`] for other extensions, or if the name is taken or the folder cannot be written.
@@ -33,6 +40,12 @@ impl FramesWriter {
         match path.extension().map(|e| e.to_string_lossy().to_lowercase()).as_deref() {
             Some("npy") => ArrayWriter::create(path, overwrite, "<f4", &[size.height, size.width])
                 .map(Self::Array),
+            Some("tif" | "tiff") => {
+                let writer =
+                    BurstWriter::create(path, BurstFormat::Tiff, size, u16::MAX, overwrite)?;
+                Ok(Self::Tiff(Box::new(writer)))
+            }
+            Some("gif") => GifPreview::create(path, overwrite, size, u16::MAX).map(Self::Gif),
             None => {
                 let folder = PendingFolder::create(path, overwrite, FIRST)?;
                 Ok(Self::Folder { folder, frames: 0 })
@@ -40,7 +53,7 @@ impl FramesWriter {
             Some(other) => Err(SimError::data(
                 format!("frames are not written as .{other}"),
                 path,
-                "use .npy, or a name without extension for a folder of 16-bit PNG",
+                "use .npy, .tif, .gif, or a name without extension for a folder of 16-bit PNG",
             )),
         }
     }
@@ -52,6 +65,8 @@ impl FramesWriter {
     pub fn push(&mut self, frame: &Frame) -> Result<()> {
         match self {
             Self::Array(array) => array.push_f32(frame.data.iter().copied()),
+            Self::Tiff(writer) => writer.push(&sixteen_bits(frame)),
+            Self::Gif(gif) => gif.push(&sixteen_bits(frame)),
             Self::Folder { folder, frames } => {
                 let file = folder.file(&format!("frame_{frames:06}.png"));
                 *frames += 1;
@@ -68,18 +83,25 @@ impl FramesWriter {
     pub fn finish(self) -> Result<()> {
         match self {
             Self::Array(array) => array.finish(),
+            Self::Tiff(writer) => writer.finish_alone(),
+            Self::Gif(gif) => gif.finish(),
             Self::Folder { folder, .. } => folder.finish(),
         }
     }
 }
 
-fn save_png16(frame: &Frame, path: &Path) -> std::io::Result<()> {
-    let samples: Vec<u16> =
-        frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect();
+/// Writes a frame as 16-bit gray PNG; 65535 is 1.
+pub(crate) fn save_png16(frame: &Frame, path: &Path) -> std::io::Result<()> {
+    let samples = sixteen_bits(frame);
     let image = ImageBuffer::<Luma<u16>, _>::from_raw(
         frame.size.width as u32,
         frame.size.height as u32,
         samples,
     );
-    image.expect("a frame holds all its pixels").save(path).map_err(std::io::Error::other)
+    let image = image.expect("a frame holds all its pixels");
+    image.save_with_format(path, image::ImageFormat::Png).map_err(std::io::Error::other)
+}
+
+fn sixteen_bits(frame: &Frame) -> Vec<u16> {
+    frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect()
 }

@@ -136,6 +136,7 @@ pub(super) fn beside(path: &Path, about: &mut About) -> Option<BurstLayout> {
         Described::Simulated(record) => {
             about.binary = record.simulation.sensor.response == Response::Binary;
             about.gain = Some(record.gain);
+            about.ppp = Some(record.light.ppp);
             about.sensor = Some(record.simulation.sensor);
             record.burst
         }

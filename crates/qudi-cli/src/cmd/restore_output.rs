@@ -1,0 +1,158 @@
+//! Where restored frames go, and how well they explain the photons.
+
+use crate::error::{Fault, Result};
+use qudi_sim::capture::Capture;
+use qudi_sim::output::{FramesWriter, Overwrite, refuse_taken};
+use qudi_sim::restore::{Consistency, Context, FrameFolder, RestoreSink};
+use qudi_sim::{Frame, SimError, Size};
+use serde_json::Value;
+use std::io::Write;
+use std::ops::Range;
+use std::path::Path;
+
+/// One place for frames.
+pub(crate) enum Output {
+    /// Frames appear one by one; an interrupted run goes on.
+    Folder(FrameFolder),
+    /// One file, whole or not at all.
+    File(Option<FramesWriter>),
+    /// Y4M on standard output.
+    Pipe,
+}
+
+impl Output {
+    /// Refuses a taken name before any work is done. Folders may be gone on with.
+    pub(crate) fn refuse_taken(name: &str, sharded: bool, overwrite: Overwrite) -> Result<()> {
+        let folder = Path::new(name).extension().is_none() && name != "-";
+        if sharded && !folder {
+            return Err(Fault::new(
+                "parts of the work can only meet in a folder",
+                "--shard",
+                "give a name without extension",
+            ));
+        }
+        if !folder && name != "-" {
+            refuse_taken(Path::new(name), overwrite)?;
+        }
+        Ok(())
+    }
+
+    pub(crate) fn open(
+        name: &str,
+        capture: &Capture,
+        settings: &Value,
+        overwrite: Overwrite,
+    ) -> Result<Self> {
+        let (path, size) = (Path::new(name), capture.size());
+        if name == "-" {
+            write_y4m_header(size, capture.fps())?;
+            return Ok(Self::Pipe);
+        }
+        if path.extension().is_none() {
+            return Ok(Self::Folder(FrameFolder::open(path, size, settings.clone(), overwrite)?));
+        }
+        Ok(Self::File(Some(FramesWriter::create(path, size, overwrite)?)))
+    }
+
+    /// Frames from the start of `range` on that an earlier run finished.
+    pub(crate) fn finished(&self, range: Range<u64>) -> u64 {
+        match self {
+            Self::Folder(folder) => folder.finished(range),
+            _ => 0,
+        }
+    }
+
+    pub(crate) fn sink<'a>(&'a mut self, misfit: &'a mut Misfit) -> Sink<'a> {
+        Sink { output: self, misfit }
+    }
+
+    /// Gives a file its name, or notes in the folder's manifest that it is complete.
+    pub(crate) fn finish(&mut self, results: &Value, complete: bool) -> Result<()> {
+        match self {
+            Self::Folder(folder) if complete => Ok(folder.finish(results)?),
+            Self::Folder(_) | Self::Pipe => Ok(()),
+            Self::File(writer) => Ok(writer.take().map_or(Ok(()), FramesWriter::finish)?),
+        }
+    }
+}
+
+pub(crate) struct Sink<'a> {
+    output: &'a mut Output,
+    misfit: &'a mut Misfit,
+}
+
+impl RestoreSink for Sink<'_> {
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
+        match &mut *self.output {
+            Output::Folder(folder) => {
+                // What a reader of the file will see is what is judged.
+                let seen = folder.push(number, restored)?;
+                self.misfit.add(&seen, counts)
+            }
+            Output::File(writer) => {
+                if let Some(writer) = writer {
+                    writer.push(restored)?;
+                }
+                self.misfit.add(restored, counts)
+            }
+            Output::Pipe => {
+                write_y4m_frame(restored)
+                    .map_err(|e| SimError::io("write to", Path::new("standard output"), e))?;
+                self.misfit.add(restored, counts)
+            }
+        }
+    }
+}
+
+/// Chi-square of the counts given the result.
+pub(crate) struct Misfit {
+    consistency: Consistency,
+    context: Context,
+}
+
+impl Misfit {
+    pub(crate) fn new(capture: &Capture, context: &Context) -> Self {
+        Self { consistency: Consistency::new(capture.size(), context), context: context.clone() }
+    }
+
+    fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
+        self.consistency.add(restored, counts, &self.context)
+    }
+
+    /// Takes in frames that an earlier run finished.
+    pub(crate) fn read_finished(
+        &mut self,
+        output: &Output,
+        capture: &mut Capture,
+        frames: Range<u64>,
+    ) -> Result<()> {
+        let Output::Folder(folder) = output else { return Ok(()) };
+        let mut counts = vec![0; capture.size().pixels()];
+        for frame in frames {
+            capture.read(frame, &mut counts)?;
+            self.add(&folder.read(frame)?, &counts)?;
+        }
+        Ok(())
+    }
+
+    pub(crate) fn chi_square(&self) -> Option<f64> {
+        self.consistency.chi_square()
+    }
+
+    pub(crate) fn map(&self) -> Frame {
+        self.consistency.map()
+    }
+}
+
+fn write_y4m_header(size: Size, fps: Option<f64>) -> Result<()> {
+    // Frame rates of thousands confuse players; without one, 25 is customary.
+    let fps = fps.map_or(25, |fps| fps.round().max(1.0) as u64);
+    let header = format!("YUV4MPEG2 W{} H{} F{fps}:1 Ip A1:1 Cmono\n", size.width, size.height);
+    std::io::stdout().write_all(header.as_bytes()).map_err(crate::error::stdout_fault)
+}
+
+fn write_y4m_frame(frame: &Frame) -> std::io::Result<()> {
+    let mut bytes = b"FRAME\n".to_vec();
+    bytes.extend(frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8));
+    std::io::stdout().lock().write_all(&bytes)
+}

@@ -1,0 +1,72 @@
+//! Runs a method over a capture of any length: windows, cross-fade, frames out in order.
+
+use super::{BurstView, Context, CrossFade, Restorer, Windows};
+use crate::capture::Capture;
+use crate::error::{Result, SimError};
+use crate::frame::Frame;
+use std::collections::VecDeque;
+use std::ops::{ControlFlow, Range};
+
+/// What becomes of restored frames.
+pub trait RestoreSink {
+    /// Takes frame `number`, restored, with its counts. Frames come in order.
+    ///
+    /// # Errors
+    /// The sink's own; the run ends with it.
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()>;
+}
+
+/// Restores the frames `wanted` of `capture` and hands them to `sink`. A window is computed if it
+/// holds a wanted frame; what a frame looks like does not depend on which others are wanted. Memory
+/// holds one window and one overlap.
+///
+/// # Errors
+/// [`SimError`] if the capture cannot be read or the method or the sink fails;
+/// [`SimError::Interrupted`] if `on`, told how many wanted frames are done, says so.
+pub fn run(
+    restorer: &mut dyn Restorer,
+    capture: &mut Capture,
+    windows: &Windows,
+    wanted: Range<u64>,
+    context: &Context,
+    sink: &mut dyn RestoreSink,
+    on: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
+) -> Result<()> {
+    let size = capture.size();
+    let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
+    let mut first_held = 0;
+    let mut fade = CrossFade::default();
+    for number in windows.first_with(wanted.start)..windows.count() {
+        let range = windows.range(number);
+        if range.start >= wanted.end {
+            break;
+        }
+        if on(range.start.saturating_sub(wanted.start), wanted.end - wanted.start).is_break() {
+            return Err(SimError::Interrupted);
+        }
+        if counts.is_empty() {
+            first_held = range.start;
+        }
+        while first_held < range.start {
+            counts.pop_front();
+            first_held += 1;
+        }
+        while first_held + (counts.len() as u64) < range.end {
+            let mut frame = vec![0; size.pixels()];
+            capture.read(first_held + counts.len() as u64, &mut frame)?;
+            counts.push_back(frame);
+        }
+        let context = Context { first_frame: range.start, ..context.clone() };
+        let burst = BurstView { size, frames: counts.make_contiguous() };
+        let restored = restorer.restore(burst, &context)?;
+        fade.push(range.start, restored.frames);
+        let last = number + 1 == windows.count();
+        let until = if last { range.end } else { windows.range(number + 1).start };
+        while let Some((frame, image)) = fade.pop(until) {
+            if wanted.contains(&frame) {
+                sink.frame(frame, &image, &counts[(frame - first_held) as usize])?;
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,129 @@
+//! `qudi restore`: outputs agree, interrupted runs go on, parts meet, settings do not mix.
+
+use crate::outputs::{listing, qudi, scratch};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+fn burst(name: &str, frames: u32) -> PathBuf {
+    let folder = scratch(name);
+    qudi(&folder)
+        .args("simulate scene:dead-leaves --size 64x80 --ppp 9.75 --seed 3 -o b.npy -q".split(' '))
+        .args(["--frames", &frames.to_string()])
+        .assert()
+        .success();
+    folder
+}
+
+fn restore(folder: &Path, args: &str) {
+    qudi(folder).arg("restore").args(args.split_whitespace()).assert().success();
+}
+
+/// Name and content of every file of a folder.
+fn contents(folder: &Path) -> Vec<(String, Vec<u8>)> {
+    listing(folder)
+        .into_iter()
+        .map(|name| (name.clone(), std::fs::read(folder.join(name)).unwrap()))
+        .collect()
+}
+
+#[test]
+fn every_output_holds_the_same_frames() {
+    let folder = burst("restore-outputs", 14);
+    for output in ["png", "a.npy", "a.tif", "a.gif"] {
+        restore(&folder, &format!("b.npy -o {output}"));
+    }
+    let array = std::fs::read(folder.join("a.npy")).unwrap();
+    let values: Vec<f32> = array[128..]
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+        .collect();
+    assert_eq!(values.len(), 14 * 64 * 80);
+    for frame in 0..14 {
+        let png =
+            image::open(folder.join(format!("png/frame_{frame:06}.png"))).unwrap().into_luma16();
+        for (value, &stored) in values[frame * 64 * 80..].iter().zip(png.as_raw()) {
+            assert_eq!((value.clamp(0.0, 1.0) * 65535.0).round() as u16, stored);
+        }
+    }
+    let mut tiff =
+        tiff::decoder::Decoder::new(std::fs::File::open(folder.join("a.tif")).unwrap()).unwrap();
+    let first = image::open(folder.join("png/frame_000000.png")).unwrap().into_luma16();
+    let tiff::decoder::DecodingResult::U16(page) = tiff.read_image().unwrap() else {
+        panic!("16-bit pages")
+    };
+    assert_eq!(&page, first.as_raw());
+    let piped = qudi(&folder).args("restore b.npy -o -".split(' ')).output().unwrap().stdout;
+    assert!(piped.starts_with(b"YUV4MPEG2 W80 H64 F2000:1"));
+    assert_eq!(
+        piped.iter().position(|&b| b == b'\n').unwrap() + 1 + 14 * (6 + 64 * 80),
+        piped.len()
+    );
+}
+
+#[test]
+fn a_run_killed_ten_times_ends_like_an_undisturbed_one() {
+    let folder = burst("restore-kill", 600);
+    restore(&folder, "b.npy -o whole --chi-map whole.npy");
+    let finished = || {
+        let files = std::fs::read_dir(folder.join("killed")).into_iter().flatten().flatten();
+        files.filter(|file| file.file_name().to_string_lossy().starts_with("frame_")).count()
+    };
+    for round in 0..10 {
+        let before = finished();
+        let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
+            .current_dir(&folder)
+            .args("restore b.npy -o killed -q".split(' '))
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        // Killed as soon as it has written a few more frames, at once in the first round.
+        while round > 0
+            && finished() < before + 1 + round % 4
+            && child.try_wait().unwrap().is_none()
+        {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let _ = child.kill();
+        child.wait().unwrap();
+        assert!(finished() >= before, "finished frames are kept");
+    }
+    assert!(finished() < 600, "killed before the end: {}", finished());
+    restore(&folder, "b.npy -o killed --chi-map killed.npy");
+    let frames: Vec<_> = contents(&folder.join("killed"))
+        .into_iter()
+        .filter(|(name, _)| !name.starts_with('.'))
+        .collect();
+    assert!(frames == contents(&folder.join("whole")), "frames and manifest are the same");
+    let map = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    assert!(map("whole.npy") == map("killed.npy"), "and so is the misfit");
+}
+
+#[test]
+fn parts_of_the_work_meet_in_one_folder() {
+    let folder = burst("restore-shards", 45);
+    restore(&folder, "b.npy -o whole");
+    for part in ["2/3", "1/3", "3/3"] {
+        restore(&folder, &format!("b.npy -o parts --shard {part}"));
+    }
+    // A last look completes the manifest with the misfit of all frames.
+    restore(&folder, "b.npy -o parts");
+    assert!(contents(&folder.join("whole")) == contents(&folder.join("parts")));
+    qudi(&folder).args("restore b.npy -o x.npy --shard 1/2".split(' ')).assert().code(2);
+    qudi(&folder).args("restore b.npy -o x --shard 3/2".split(' ')).assert().code(2);
+}
+
+#[test]
+fn short_captures_and_long_overlaps_work() {
+    let folder = burst("restore-short", 14);
+    for end in [1, 2, 10, 11, 12, 13] {
+        restore(&folder, &format!("b.npy --end {end} -o short{end}"));
+        assert_eq!(listing(&folder.join(format!("short{end}"))).len(), end + 1);
+    }
+    restore(&folder, "b.npy --overlap 10 --method average -o dense");
+    let refused =
+        qudi(&folder).args("restore b.npy --overlap 11 -o no".split(' ')).assert().code(2);
+    let words = String::from_utf8_lossy(&refused.get_output().stderr).into_owned();
+    assert!(words.contains("windows are longer than their overlap"), "{words}");
+    assert!(!folder.join("no").exists());
+}
