@@ -11,6 +11,8 @@ pub(crate) type Result<T, E = Fault> = std::result::Result<T, E>;
 pub(crate) enum Fault {
     /// Three parts for the user.
     Error { what: String, place: Option<String>, help: Option<String> },
+    /// It worked, but a bar that was set has been missed; the results are out already.
+    Missed(String),
     /// Ctrl-C.
     Interrupted,
     /// The reader of our output has gone.

@@ -102,6 +102,10 @@ impl Report {
                 self.remark("interrupted: nothing was written");
                 ExitCode::from(interrupt::EXIT_CODE)
             }
+            Fault::Missed(what) => {
+                self.remark(what);
+                ExitCode::from(1)
+            }
             Fault::Error { what, place, help } => {
                 let (red, bold, plain) =
                     if self.color { ("\x1b[1;31m", "\x1b[1m", "\x1b[0m") } else { ("", "", "") };

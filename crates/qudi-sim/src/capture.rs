@@ -15,6 +15,7 @@ mod dark;
 mod formats;
 mod frame_bytes;
 mod levels;
+mod memory;
 mod options;
 mod packed;
 mod pixel_map;
@@ -154,6 +155,43 @@ impl Capture {
         }
         pixel_map::plan(&mut capture, options, sensor)?;
         Ok(capture)
+    }
+
+    /// Output frames of `sensor` that are in memory already, `[frames][height * width]`.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] if there are none, or one has another size.
+    pub fn in_memory(
+        name: &str,
+        size: Size,
+        frames: Vec<Vec<u16>>,
+        sensor: &Sensor,
+    ) -> Result<Self> {
+        let place = Path::new(name);
+        if frames.is_empty() || frames.iter().any(|frame| frame.len() != size.pixels()) {
+            return Err(SimError::request(
+                format!("{} frames, not all of {size}", frames.len()),
+                place.display(),
+                "give at least one frame, all of one size",
+            ));
+        }
+        let mut about = About::new("memory", "counts in memory");
+        about.max_count = Some(sensor.max_count());
+        about.binary = sensor.response == Response::Binary;
+        about.sensor = Some(sensor.clone());
+        Ok(Self {
+            path: place.to_owned(),
+            about,
+            view: View { size, from: None },
+            range: 0..frames.len() as u64,
+            sum: 1,
+            repair: Repair::default(),
+            bad: BadPixels::default(),
+            dark: None,
+            stored: vec![0; size.pixels()],
+            stored_sums: Vec::new(),
+            native: Box::new(memory::MemoryFrames { size, frames }),
+        })
     }
 
     /// What is known about it.

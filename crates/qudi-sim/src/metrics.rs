@@ -2,6 +2,8 @@
 
 mod psnr;
 mod ssim;
+mod statistics;
 
 pub use psnr::{best_gain, gain_aligned_psnr, psnr};
 pub use ssim::{gaussian_ssim, ssim};
+pub use statistics::Statistics;

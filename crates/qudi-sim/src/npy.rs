@@ -289,6 +289,45 @@ pub fn read_image(path: &Path) -> Result<Frame> {
     Ok(Frame { size, data })
 }
 
+/// Reads a three-dimensional `.npy` of at most `most` frames: floats as they are, which may lie
+/// outside [0, 1]; bytes and words relative to full scale.
+///
+/// # Errors
+/// [`SimError`] if it cannot be read, has other axes, or holds values that are not finite.
+pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
+    let (header, mut reader) = Header::open(path)?;
+    header.require_c_order(path)?;
+    let (&[frames, height, width], Some(full)) =
+        (header.shape.as_slice(), header.sample.full_scale())
+    else {
+        return Err(SimError::data(
+            format!(
+                "an array of shape {:?}, or of wide integers, where a clip is expected",
+                header.shape
+            ),
+            path,
+            "save an array of shape (frames, height, width) as float32",
+        ));
+    };
+    let size = Size::new(height, width, &path.display().to_string())?;
+    let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
+    let mut clip = Vec::new();
+    for _ in 0..frames.min(most) {
+        reader.read_exact(&mut bytes).map_err(|e| SimError::io("read a frame", path, e))?;
+        let samples = bytes.chunks_exact(header.sample.bytes());
+        let data: Vec<f32> = samples.map(|b| header.sample.decode(b) / full).collect();
+        if let Some(bad) = data.iter().find(|v| !v.is_finite()) {
+            return Err(SimError::data(
+                format!("a value of {bad}"),
+                path,
+                "replace missing values",
+            ));
+        }
+        clip.push(Frame { size, data });
+    }
+    Ok(clip)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

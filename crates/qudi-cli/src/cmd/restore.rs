@@ -2,6 +2,7 @@
 
 use crate::args::{Global, Restore};
 use crate::cmd::capture_info::{known_sensor, remarks};
+use crate::cmd::methods::method;
 use crate::cmd::restore_output::{Misfit, Output};
 use crate::error::{Fault, Result};
 use crate::interrupt;
@@ -9,16 +10,13 @@ use crate::report::Report;
 use qudi_sim::SimError;
 use qudi_sim::capture::{Capture, MaskChoice, Summary};
 use qudi_sim::output::{ArrayWriter, Overwrite, Picture, refuse_taken};
-use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer, Windows, run as run_method};
+use qudi_sim::restore::{Context, Restorer, Windows, run as run_method};
 use qudi_sim::sensor::Sensor;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::ops::Range;
 use std::path::Path;
 use std::time::Instant;
-
-/// Windows of a clip that a method's settings are chosen on.
-const SAMPLES: u64 = 4;
 
 pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()> {
     if args.output == "-" && report.json() {
@@ -230,47 +228,6 @@ fn context(
         dark,
     };
     Ok((context, source))
-}
-
-/// The method by name, and what it chose for this clip.
-fn method(
-    name: &str,
-    capture: &mut Capture,
-    context: &Context,
-) -> Result<(Box<dyn Restorer>, String)> {
-    match name {
-        "average" => Ok((Box::new(Average), String::new())),
-        "mle" => {
-            let samples = sample_windows(capture)?;
-            let size = capture.size();
-            let views: Vec<_> = samples.iter().map(|frames| BurstView { size, frames }).collect();
-            let mle = Mle::choose(&views, context);
-            Ok((Box::new(mle), format!(" over {} frames", mle.length())))
-        }
-        other => Err(Fault::new(
-            format!("no method named `{other}`"),
-            "--method",
-            "there are average and mle",
-        )),
-    }
-}
-
-/// A few windows spread over the capture; the first ones of a file that only goes forward.
-fn sample_windows(capture: &mut Capture) -> Result<Vec<Vec<Vec<u16>>>> {
-    let length = capture.frames().min(11);
-    let last = capture.frames() - length;
-    let spread = if capture.forward_only() { last.min(SAMPLES * length) } else { last };
-    let windows = SAMPLES.min(spread / length + 1);
-    let mut samples = Vec::new();
-    for n in 0..windows {
-        let first = spread * n / (windows - 1).max(1);
-        let mut frames = vec![vec![0; capture.size().pixels()]; length as usize];
-        for (frame, counts) in (first..).zip(&mut frames) {
-            capture.read(frame, counts)?;
-        }
-        samples.push(frames);
-    }
-    Ok(samples)
 }
 
 /// The chi-square map: values in `.npy`, or a picture in which 2 is white.

@@ -1,0 +1,266 @@
+//! One clip, exposed once, scored for every method.
+
+use crate::args::{Eval, External};
+use crate::cmd::methods::method;
+use crate::error::{Fault, Result};
+use crate::interrupt;
+use qudi_sim::burst::{BurstFormat, BurstWriter};
+use qudi_sim::capture::Capture;
+use qudi_sim::metrics::{gain_aligned_psnr, gaussian_ssim, psnr, ssim};
+use qudi_sim::npy::read_clip;
+use qudi_sim::output::Overwrite;
+use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
+use qudi_sim::restore::{Consistency, Context, RestoreSink, Windows, run as run_method};
+use qudi_sim::scene::Flow;
+use qudi_sim::sensor::Sensor;
+use qudi_sim::source::{Input, Sampling};
+use qudi_sim::{Exposed, Frame, PppDefinition, SimError, Simulation, Sink, Size, Start, simulate};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// A clip by name, and what to give [`Input::parse`].
+pub(crate) struct Clip {
+    name: String,
+    place: String,
+}
+
+/// Figures of one frame.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(crate) struct FrameScore {
+    pub(crate) psnr_a: f64,
+    pub(crate) psnr: f64,
+    pub(crate) ssim: f64,
+    pub(crate) ssim_g: f64,
+}
+
+/// Figures of one method on one clip.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct Score {
+    pub(crate) clip: String,
+    pub(crate) frames: Vec<FrameScore>,
+    pub(crate) chi_square: Option<f64>,
+    pub(crate) seconds_per_frame: Option<f64>,
+}
+
+impl Clip {
+    /// The clips of `data`: itself, or what lies in the folder.
+    pub(crate) fn find(data: &str) -> Result<Vec<Self>> {
+        let path = Path::new(data);
+        if !path.is_dir() {
+            let name = match data.strip_prefix("scene:") {
+                Some(name) => name.to_owned(),
+                None => stem(path),
+            };
+            return Ok(vec![Self { name, place: data.to_owned() }]);
+        }
+        let io = |e| SimError::io("list the folder", path, e);
+        let mut inside = Vec::new();
+        for entry in std::fs::read_dir(path).map_err(io)? {
+            inside.push(entry.map_err(io)?.path());
+        }
+        inside.sort();
+        let is_clip = |path: &PathBuf| {
+            let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+            path.is_dir()
+                || ["gif", "y4m", "npy", "mp4", "mkv", "avi", "mov", "webm"]
+                    .contains(&extension.as_str())
+        };
+        let clips: Vec<_> = inside.into_iter().filter(is_clip).collect();
+        let clips = if clips.is_empty() { vec![path.to_owned()] } else { clips };
+        let named = |path: PathBuf| Self { name: stem(&path), place: path.display().to_string() };
+        Ok(clips.into_iter().map(named).collect())
+    }
+
+    /// Exposes the clip; the same photons for the same seed, name, sensor and light.
+    pub(crate) fn expose(
+        &self,
+        args: &Eval,
+        sensor: &Sensor,
+        ppp: f64,
+        overwrite: Overwrite,
+    ) -> Result<ExposedClip> {
+        let seed = args.seed.wrapping_add(u64::from(name_digest(&self.name)) << 20);
+        let simulation = Simulation {
+            input: Input::parse(&self.place, None, None, 1, 2.0)?,
+            sampling: Sampling { frames: Some(args.frames), ..Sampling::default() },
+            sensor: sensor.clone(),
+            ppp,
+            ppp_def: PppDefinition::Incident,
+            exposure: None,
+            seed,
+        };
+        let mut kept = Kept::default();
+        let summary = simulate(&simulation, &mut kept, &mut |_| interrupt::check())?;
+        let size = summary.size;
+        if let Some(folder) = &args.export_photons {
+            let format = BurstFormat::npy(sensor.max_count(), true);
+            let path = folder.join(format!("{}.npy", burst_name(&self.name, ppp)));
+            let mut writer =
+                BurstWriter::create(&path, format, size, sensor.max_count(), overwrite)?;
+            kept.counts.iter().try_for_each(|counts| writer.push(counts))?;
+            let record = Record {
+                version: VERSION,
+                program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
+                burst: BurstLayout::new(format, summary.frames, size, sensor),
+                light: summary.light,
+                gain: summary.gain,
+                clip: ClipDigest { mean: summary.clip_mean, crc32: summary.clip_crc32 },
+                simulation,
+            };
+            let bytes = serde_json::to_vec_pretty(&record)
+                .map_err(|e| Fault::new(e, path.display(), "report this as a bug"))?;
+            writer.finish(&bytes, overwrite)?;
+        }
+        let context = Context {
+            seed: args.seed,
+            first_frame: 0,
+            ppp: summary.light.ppp,
+            exposure: args.exposure,
+            sensor: sensor.clone(),
+            gain: summary.gain,
+            dark: None,
+        };
+        Ok(ExposedClip { name: self.name.clone(), size, ppp, kept, context })
+    }
+}
+
+/// Name of a clip at a light level, as in `dog-ppp9_75`: no dot, so that a folder may have it.
+fn burst_name(clip: &str, ppp: f64) -> String {
+    format!("{clip}-ppp{}", ppp.to_string().replace('.', "_"))
+}
+
+fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// FNV-1a: the seed of a clip must not depend on what else lies beside it.
+fn name_digest(name: &str) -> u32 {
+    name.bytes().fold(0x811c_9dc5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+}
+
+/// Photons and truth of a clip.
+#[derive(Default)]
+struct Kept {
+    counts: Vec<Vec<u16>>,
+    truth: Vec<Frame>,
+}
+
+impl Sink for Kept {
+    fn start(&mut self, _: Start) -> qudi_sim::Result<()> {
+        Ok(())
+    }
+
+    fn frame(
+        &mut self,
+        exposed: Exposed<'_>,
+        _: &dyn Fn() -> Option<Flow>,
+    ) -> qudi_sim::Result<()> {
+        self.counts.push(exposed.counts.to_vec());
+        self.truth.push(exposed.truth.clone());
+        Ok(())
+    }
+}
+
+/// A clip exposed at one light level.
+pub(crate) struct ExposedClip {
+    name: String,
+    size: Size,
+    ppp: f64,
+    kept: Kept,
+    context: Context,
+}
+
+impl ExposedClip {
+    pub(crate) fn score_method(&self, name: &str, args: &Eval) -> Result<Score> {
+        let sensor = &self.context.sensor;
+        let mut capture =
+            Capture::in_memory(&self.name, self.size, self.kept.counts.clone(), sensor)?;
+        let start = Instant::now();
+        let (mut restorer, _) = method(name, &mut capture, &self.context)?;
+        let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
+        let mut sink = Collected::default();
+        let all = 0..capture.frames();
+        run_method(
+            restorer.as_mut(),
+            &mut capture,
+            &windows,
+            all,
+            &self.context,
+            &mut sink,
+            &mut |_, _| interrupt::check(),
+        )?;
+        let seconds = start.elapsed().as_secs_f64() / sink.0.len() as f64;
+        self.score(&sink.0, Some(seconds))
+    }
+
+    /// Frames that another program made of the exported photons.
+    pub(crate) fn score_external(&self, external: &External) -> Result<Score> {
+        let name = burst_name(&self.name, self.ppp);
+        let array = external.folder.join(format!("{name}.npy"));
+        let (place, frames) = if array.is_file() {
+            let frames = read_clip(&array, usize::MAX)?;
+            (array, frames)
+        } else {
+            let place = external.folder.join(name);
+            let input = Input::parse(&place.display().to_string(), None, None, 1, 0.0)?;
+            let mut source = input.open(&Sampling::default())?;
+            let mut frames = Vec::new();
+            while let Some(exposure) = source.next()? {
+                frames.push(exposure.truth().clone());
+            }
+            (place, frames)
+        };
+        let expected = self.kept.truth.len();
+        if frames.len() != expected || frames.iter().any(|frame| frame.size != self.size) {
+            return Err(Fault::new(
+                format!(
+                    "{} frames, where {expected} of {} are to be scored",
+                    frames.len(),
+                    self.size
+                ),
+                place.display(),
+                "restore every frame of the burst that --export-photons wrote",
+            ));
+        }
+        self.score(&frames, None)
+    }
+
+    fn score(&self, restored: &[Frame], seconds_per_frame: Option<f64>) -> Result<Score> {
+        let mut consistency = Consistency::new(self.size, &self.context);
+        let mut frames = Vec::with_capacity(restored.len());
+        for ((image, truth), counts) in restored.iter().zip(&self.kept.truth).zip(&self.kept.counts)
+        {
+            consistency.add(image, counts, &self.context)?;
+            let small = || {
+                Fault::new(
+                    format!("frames of {} are smaller than SSIM's window of 11 x 11", self.size),
+                    &self.name,
+                    "use larger frames",
+                )
+            };
+            frames.push(FrameScore {
+                psnr_a: gain_aligned_psnr(image, truth),
+                psnr: psnr(image, truth),
+                ssim: ssim(image, truth).ok_or_else(small)?,
+                ssim_g: gaussian_ssim(image, truth).ok_or_else(small)?,
+            });
+        }
+        Ok(Score {
+            clip: self.name.clone(),
+            frames,
+            chi_square: consistency.chi_square(),
+            seconds_per_frame,
+        })
+    }
+}
+
+#[derive(Default)]
+struct Collected(Vec<Frame>);
+
+impl RestoreSink for Collected {
+    fn frame(&mut self, _: u64, restored: &Frame, _: &[u16]) -> qudi_sim::Result<()> {
+        self.0.push(restored.clone());
+        Ok(())
+    }
+}
