@@ -37,10 +37,16 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     let frames = job.capture.frames();
     let part = args.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut misfit = Misfit::new(&job.capture, &job.context);
-    // Frames of an interrupted run count as if they had just been made.
     let done = output.finished(part.clone());
-    misfit.read_finished(&output, &mut job.capture, part.start..part.start + done)?;
-    job.run(part.start + done..part.end, &mut output, &mut misfit, report)?;
+    let rest = part.start + done..part.end;
+    if done == 0 {
+        job.run(rest, &mut output, Some(&mut misfit), report)?;
+    } else {
+        // Frames of an interrupted run are judged with the others, in the same order; but after
+        // the rest is made, so that a run that keeps being killed still gets on.
+        job.run(rest, &mut output, None, report)?;
+        misfit.read_finished(&output, &mut job.capture, part.clone())?;
+    }
     let results = json!({"chi_square": misfit.chi_square()});
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
@@ -123,7 +129,7 @@ impl Job {
         &mut self,
         wanted: Range<u64>,
         output: &mut Output,
-        misfit: &mut Misfit,
+        misfit: Option<&mut Misfit>,
         report: &Report,
     ) -> Result<()> {
         if wanted.is_empty() {

@@ -62,7 +62,7 @@ impl Output {
         }
     }
 
-    pub(crate) fn sink<'a>(&'a mut self, misfit: &'a mut Misfit) -> Sink<'a> {
+    pub(crate) fn sink<'a>(&'a mut self, misfit: Option<&'a mut Misfit>) -> Sink<'a> {
         Sink { output: self, misfit }
     }
 
@@ -78,28 +78,27 @@ impl Output {
 
 pub(crate) struct Sink<'a> {
     output: &'a mut Output,
-    misfit: &'a mut Misfit,
+    misfit: Option<&'a mut Misfit>,
 }
 
 impl RestoreSink for Sink<'_> {
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
-        match &mut *self.output {
-            Output::Folder(folder) => {
-                // What a reader of the file will see is what is judged.
-                let seen = folder.push(number, restored)?;
-                self.misfit.add(&seen, counts)
-            }
+        // What a reader of the file will see is what is judged.
+        let seen = match &mut *self.output {
+            Output::Folder(folder) => Some(folder.push(number, restored)?),
             Output::File(writer) => {
-                if let Some(writer) = writer {
-                    writer.push(restored)?;
-                }
-                self.misfit.add(restored, counts)
+                writer.as_mut().map_or(Ok(()), |writer| writer.push(restored))?;
+                None
             }
             Output::Pipe => {
                 write_y4m_frame(restored)
                     .map_err(|e| SimError::io("write to", Path::new("standard output"), e))?;
-                self.misfit.add(restored, counts)
+                None
             }
+        };
+        match &mut self.misfit {
+            Some(misfit) => misfit.add(seen.as_ref().unwrap_or(restored), counts),
+            None => Ok(()),
         }
     }
 }
