@@ -77,3 +77,20 @@ fn more_light_is_better_and_bars_are_kept() {
     command("90").code(1);
     qudi(&folder).args("eval scene:text --method best".split(' ')).assert().code(2);
 }
+
+#[test]
+fn the_report_is_one_file_that_fetches_nothing() {
+    let folder = scratch("eval-html");
+    eval(&folder, "scene:dead-leaves --ppp 3.25,26 --frames 11 --html report.html");
+    let page = std::fs::read_to_string(folder.join("report.html")).unwrap();
+    for part in ["<table>", "<svg", "polyline", "dead-leaves", "type=\"range\"", "mle: error"] {
+        assert!(page.contains(part), "{part}");
+    }
+    for fetched in ["http://", "https://", "src=\"/", "url("] {
+        assert!(!page.contains(fetched), "{fetched}");
+    }
+    // Synthetic scenes have a true flow, and so a figure for flicker.
+    let found = eval(&folder, "scene:dead-leaves --ppp 26 --frames 11");
+    let flicker = |row: usize| found["rows"][row]["flicker"].as_f64().unwrap();
+    assert!(flicker(0) > 0.0 && flicker(1) > flicker(0), "a shorter mean is noisier: {found}");
+}

@@ -76,6 +76,7 @@ pub(crate) enum Command {
     Simulate(Box<Simulate>),
     Restore(Box<Restore>),
     Eval(Eval),
+    Bench(Bench),
     Convert(Box<Convert>),
     Calibrate(Box<Calibrate>),
     Demo(Demo),
@@ -369,9 +370,35 @@ pub(crate) struct Eval {
     /// Write the table in Markdown
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) markdown: Option<PathBuf>,
+    /// Write a report with plot and pictures as one HTML file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) html: Option<PathBuf>,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true)]
     pub(crate) min_psnr: Option<f64>,
+}
+
+/// Measure speed and memory of methods
+///
+/// Restores one window of a simulated burst over and over: one round to warm up, then medians. Keep the
+/// results with --json, and compare with them later.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Bench {
+    /// Methods to measure
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
+    pub(crate) method: Vec<String>,
+    /// Frame size, height first
+    #[arg(long, value_name = "HxW", default_value = "256x256")]
+    pub(crate) size: Size,
+    /// Frames of the window
+    #[arg(long, value_name = "N", default_value_t = 11)]
+    pub(crate) frames: usize,
+    /// Measured rounds
+    #[arg(long, value_name = "N", default_value_t = 7)]
+    pub(crate) rounds: usize,
+    /// Results of an earlier run (--json) to compare with
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) compare: Option<PathBuf>,
 }
 
 /// Frames of another program.

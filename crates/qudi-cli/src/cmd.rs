@@ -1,5 +1,6 @@
 //! One verb per file.
 
+pub(crate) mod bench;
 pub(crate) mod calibrate;
 mod capture_info;
 pub(crate) mod completions;
@@ -8,6 +9,7 @@ pub(crate) mod convert;
 pub(crate) mod demo;
 pub(crate) mod eval;
 mod eval_clip;
+mod eval_html;
 mod eval_table;
 pub(crate) mod info;
 pub(crate) mod light;

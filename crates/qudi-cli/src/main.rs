@@ -6,6 +6,7 @@ mod device;
 mod error;
 mod interrupt;
 mod keys;
+mod memory;
 mod report;
 mod settings;
 
@@ -46,6 +47,7 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Simulate(simulate) => cmd::simulate::run(simulate, &args.global, report),
         Command::Restore(restore) => cmd::restore::run(restore, &args.global, report),
         Command::Eval(eval) => cmd::eval::run(eval, &args.global, report),
+        Command::Bench(bench) => cmd::bench::run(bench, &args.global, report),
         Command::Convert(convert) => cmd::convert::run(convert, &args.global, report),
         Command::Calibrate(calibrate) => cmd::calibrate::run(calibrate, &args.global, report),
         Command::Demo(demo) => cmd::demo::run(demo, &args.global, report),

@@ -2,7 +2,8 @@
 
 use crate::args::{Eval, Global};
 use crate::cmd::eval_clip::{Clip, Score};
-use crate::cmd::eval_table::{csv, markdown, table};
+use crate::cmd::eval_html::html;
+use crate::cmd::eval_table::{about, csv, markdown, table};
 use crate::cmd::methods::METHODS;
 use crate::error::{Fault, Result};
 use crate::interrupt;
@@ -58,7 +59,8 @@ impl Row {
 
 pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
-    for path in [&args.csv, &args.markdown, &args.export_photons].into_iter().flatten() {
+    for path in [&args.csv, &args.markdown, &args.html, &args.export_photons].into_iter().flatten()
+    {
         refuse_taken(path, overwrite)?;
     }
     if let Some(unknown) = args.method.iter().find(|name| !METHODS.contains(&name.as_str())) {
@@ -84,6 +86,7 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
             scores: Vec::new(),
         }));
     }
+    let mut pictures = Vec::new();
     let mut bar = report.bar();
     let total = (clips.len() * args.ppp.len()) as u64;
     for (i, clip) in clips.iter().enumerate() {
@@ -93,6 +96,9 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
                 return Err(Fault::Interrupted);
             }
             let exposed = clip.expose(args, &sensor, ppp, overwrite)?;
+            if args.html.is_some() {
+                pictures.push(exposed.pictures());
+            }
             for (k, name) in names.iter().enumerate() {
                 let external = k.checked_sub(args.method.len()).map(|k| &args.external[k]);
                 let score = match external {
@@ -105,6 +111,10 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     }
     drop(bar);
     write(args.csv.as_deref(), &csv(&rows), overwrite)?;
+    if args.html.is_some() {
+        let page = html(&rows, &pictures, &about(args, clips.len()));
+        write(args.html.as_deref(), &page, overwrite)?;
+    }
     write(args.markdown.as_deref(), &markdown(&rows), overwrite)?;
     report.result(&table(&rows, args, clips.len()), || document(args, &sensor, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
@@ -139,6 +149,7 @@ fn document(args: &Eval, sensor: &Sensor, rows: &[Row]) -> Value {
             "ssim": {"centre": row.centre(|f| f.ssim), "all": row.over_clips(|f| f.ssim)},
             "ssim_g": {"centre": row.centre(|f| f.ssim_g), "all": row.over_clips(|f| f.ssim_g)},
             "chi_square": row.mean(|s| s.chi_square),
+            "flicker": row.mean(|s| s.flicker),
             "seconds_per_frame": row.mean(|s| s.seconds_per_frame),
             "clips": row.scores,
         })

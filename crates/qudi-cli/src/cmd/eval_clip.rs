@@ -1,12 +1,13 @@
 //! One clip, exposed once, scored for every method.
 
 use crate::args::{Eval, External};
+use crate::cmd::eval_html::Pictures;
 use crate::cmd::methods::method;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use qudi_sim::burst::{BurstFormat, BurstWriter};
 use qudi_sim::capture::Capture;
-use qudi_sim::metrics::{gain_aligned_psnr, gaussian_ssim, psnr, ssim};
+use qudi_sim::metrics::{best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim, warping_error};
 use qudi_sim::npy::read_clip;
 use qudi_sim::output::Overwrite;
 use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
@@ -40,7 +41,13 @@ pub(crate) struct Score {
     pub(crate) clip: String,
     pub(crate) frames: Vec<FrameScore>,
     pub(crate) chi_square: Option<f64>,
+    /// Root mean square flicker along the true flow beyond the truth's own, after the best gain;
+    /// synthetic scenes only.
+    pub(crate) flicker: Option<f64>,
     pub(crate) seconds_per_frame: Option<f64>,
+    /// The middle frame after the best gain.
+    #[serde(skip)]
+    pub(crate) picture: Frame,
 }
 
 impl Clip {
@@ -144,6 +151,8 @@ fn name_digest(name: &str) -> u32 {
 struct Kept {
     counts: Vec<Vec<u16>>,
     truth: Vec<Frame>,
+    /// From each frame to the next, where the scene is synthetic.
+    flow: Vec<Flow>,
 }
 
 impl Sink for Kept {
@@ -154,10 +163,11 @@ impl Sink for Kept {
     fn frame(
         &mut self,
         exposed: Exposed<'_>,
-        _: &dyn Fn() -> Option<Flow>,
+        flow: &dyn Fn() -> Option<Flow>,
     ) -> qudi_sim::Result<()> {
         self.counts.push(exposed.counts.to_vec());
         self.truth.push(exposed.truth.clone());
+        self.flow.extend(flow());
         Ok(())
     }
 }
@@ -250,8 +260,49 @@ impl ExposedClip {
             clip: self.name.clone(),
             frames,
             chi_square: consistency.chi_square(),
+            flicker: self.flicker(restored),
             seconds_per_frame,
+            picture: self.aligned(restored.len() / 2, restored),
         })
+    }
+}
+
+impl ExposedClip {
+    /// What the middle frame looks like, and what was seen of it.
+    pub(crate) fn pictures(&self) -> Pictures {
+        let middle = self.kept.truth.len() / 2;
+        let full = f32::from(self.context.sensor.max_count());
+        let counts = self.kept.counts[middle].iter().map(|&count| f32::from(count) / full);
+        Pictures {
+            clip: self.name.clone(),
+            ppp: self.ppp,
+            counts: Frame { size: self.size, data: counts.collect() },
+            truth: self.kept.truth[middle].clone(),
+        }
+    }
+
+    fn aligned(&self, frame: usize, restored: &[Frame]) -> Frame {
+        let gain = best_gain(&restored[frame], &self.kept.truth[frame]) as f32;
+        let data = restored[frame].data.iter().map(|v| (v * gain).clamp(0.0, 1.0)).collect();
+        Frame { size: self.size, data }
+    }
+
+    fn flicker(&self, restored: &[Frame]) -> Option<f64> {
+        let mut excess = Vec::new();
+        for (t, flow) in self.kept.flow.iter().enumerate() {
+            let truth = &self.kept.truth;
+            // One gain for both frames: flicker of brightness counts.
+            let gain = best_gain(&restored[t], &truth[t]) as f32;
+            let scaled = |frame: &Frame| Frame {
+                size: frame.size,
+                data: frame.data.iter().map(|v| (v * gain).clamp(0.0, 1.0)).collect(),
+            };
+            let own = warping_error(&truth[t], &truth[t + 1], flow)?;
+            excess
+                .push(warping_error(&scaled(&restored[t]), &scaled(&restored[t + 1]), flow)? - own);
+        }
+        let n = excess.len() as f64;
+        (n > 0.0).then(|| (excess.iter().sum::<f64>() / n).max(0.0).sqrt())
     }
 }
 

@@ -6,7 +6,7 @@ use qudi_sim::metrics::Statistics;
 use std::fmt::Write;
 
 /// Column titles, in order.
-const TITLES: [&str; 10] = [
+pub(crate) const TITLES: [&str; 11] = [
     "method",
     "PPP",
     "psnr-a centre",
@@ -16,10 +16,12 @@ const TITLES: [&str; 10] = [
     "ssim all",
     "ssim-g all",
     "chi-square",
+    "flicker",
     "s/frame",
 ];
 
-fn cells(row: &Row) -> [String; 10] {
+/// One row, in the order of [`TITLES`].
+pub(crate) fn cells(row: &Row) -> [String; 11] {
     let interval = |statistics: Option<Statistics>, digits: usize| match statistics {
         Some(Statistics { mean, ci95: Some(ci95), .. }) => {
             format!("{mean:.digits$} ± {ci95:.digits$}")
@@ -40,13 +42,14 @@ fn cells(row: &Row) -> [String; 10] {
         interval(row.over_clips(|f| f.ssim), 3),
         interval(row.over_clips(|f| f.ssim_g), 3),
         known(row.mean(|s| s.chi_square)),
+        known(row.mean(|s| s.flicker)),
         row.mean(|s| s.seconds_per_frame).map_or("-".to_owned(), |v| format!("{v:.4}")),
     ]
 }
 
 /// An aligned table for people.
 pub(crate) fn table(rows: &[Row], args: &Eval, clips: usize) -> String {
-    let lines: Vec<[String; 10]> =
+    let lines: Vec<[String; 11]> =
         std::iter::once(TITLES.map(str::to_owned)).chain(rows.iter().map(cells)).collect();
     let width = |i: usize| lines.iter().map(|line| line[i].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..TITLES.len()).map(width).collect();
@@ -61,12 +64,16 @@ pub(crate) fn table(rows: &[Row], args: &Eval, clips: usize) -> String {
         }
         text.push('\n');
     }
-    let _ = writeln!(
-        text,
-        "\n{clips} clips, {}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames",
-        args.sensor, args.seed
-    );
+    let _ = writeln!(text, "\n{}", about(args, clips));
     text
+}
+
+/// What the figures are.
+pub(crate) fn about(args: &Eval, clips: usize) -> String {
+    format!(
+        "{clips} clips, {}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames; flicker: rms along the true flow beyond the truth's",
+        args.sensor, args.seed
+    )
 }
 
 pub(crate) fn markdown(rows: &[Row]) -> String {

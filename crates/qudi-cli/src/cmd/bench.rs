@@ -1,0 +1,166 @@
+//! `qudi bench`: speed and memory of methods, medians after a warm-up.
+
+use crate::args::{Bench, Global};
+use crate::cmd::methods::method;
+use crate::error::{Fault, Result};
+use crate::interrupt;
+use crate::memory::Peak;
+use crate::report::Report;
+use qudi_sim::capture::Capture;
+use qudi_sim::restore::{BurstView, Context};
+use qudi_sim::scene::{Procedural, ProceduralScene};
+use qudi_sim::sensor::Sensor;
+use qudi_sim::{Camera, Light, SimError};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use std::fmt::Write;
+use std::path::Path;
+use std::time::Instant;
+
+/// The clip's mean image value, close enough for a benchmark.
+const EXPOSURE: f64 = 0.45;
+
+/// Results files are short.
+const MAX_FILE: u64 = 1 << 24;
+
+/// Figures of one method.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Measured {
+    method: String,
+    /// Median seconds per window of frames.
+    seconds: f64,
+    /// The fastest round.
+    fastest: f64,
+    /// Peak resident memory above what the process held before, in MiB, where the system tells.
+    peak_mib: Option<f64>,
+}
+
+/// A run, as `--json` prints it and `--compare` reads it.
+#[derive(Debug, Serialize, Deserialize)]
+struct Results {
+    program: String,
+    height: usize,
+    width: usize,
+    frames: usize,
+    rounds: usize,
+    threads: usize,
+    methods: Vec<Measured>,
+}
+
+pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
+    let old = args.compare.as_deref().map(load).transpose()?;
+    if args.rounds == 0 || args.frames == 0 {
+        return Err(Fault::new("nothing to measure", "--rounds, --frames", "ask for at least 1"));
+    }
+    let sensor = Sensor::load("qudi-paper")?;
+    let light = Light { ppp: 3.25, exposure: EXPOSURE };
+    let scene =
+        Procedural { kind: ProceduralScene::DeadLeaves, size: args.size, seed: 1, speed: 2.0 };
+    let scene = scene.scene();
+    let mut camera = Camera::new(&sensor, args.size, light, 1)?;
+    let gain = camera.gain();
+    let mut counts = Vec::with_capacity(args.frames);
+    for t in 0..args.frames {
+        counts.push(camera.expose(t as u64, &[&scene.render(t as f64)])?);
+    }
+    let context = Context {
+        seed: 1,
+        first_frame: 0,
+        ppp: light.ppp,
+        exposure: EXPOSURE,
+        sensor: sensor.clone(),
+        gain,
+        dark: None,
+    };
+    let mut measured = Vec::new();
+    let mut bar = report.bar();
+    for name in &args.method {
+        let mut capture = Capture::in_memory("bench", args.size, counts.clone(), &sensor)?;
+        let (mut restorer, _) = method(name, &mut capture, &context)?;
+        let burst = BurstView { size: args.size, frames: &counts };
+        let peak = Peak::start();
+        // The first round warms caches up, and compiles kernels where there are any.
+        restorer.restore(burst, &context)?;
+        let mut times = Vec::with_capacity(args.rounds);
+        for round in 0..args.rounds {
+            bar.update("measuring", round as u64, Some(args.rounds as u64));
+            if interrupt::check().is_break() {
+                return Err(Fault::Interrupted);
+            }
+            let start = Instant::now();
+            restorer.restore(burst, &context)?;
+            times.push(start.elapsed().as_secs_f64());
+        }
+        times.sort_by(f64::total_cmp);
+        measured.push(Measured {
+            method: name.clone(),
+            seconds: times[times.len() / 2],
+            fastest: times[0],
+            peak_mib: peak.grown_mib(),
+        });
+    }
+    drop(bar);
+    let results = Results {
+        program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
+        height: args.size.height,
+        width: args.size.width,
+        frames: args.frames,
+        rounds: args.rounds,
+        threads: rayon::current_num_threads(),
+        methods: measured,
+    };
+    report.result(&describe(&results, old.as_ref()), || json!(results))
+}
+
+fn load(path: &Path) -> Result<Results> {
+    let read = |e| SimError::io("read the old results", path, e);
+    if std::fs::metadata(path).map_err(read)?.len() > MAX_FILE {
+        return Err(Fault::new("a file of more than 16 MiB", path.display(), "name old results"));
+    }
+    let text = std::fs::read(path).map_err(read)?;
+    serde_json::from_slice(&text).map_err(|e| {
+        Fault::new(
+            format!("not the results of a benchmark: {e}"),
+            path.display(),
+            "make them with `qudi bench --json > old.json`",
+        )
+    })
+}
+
+fn describe(results: &Results, old: Option<&Results>) -> String {
+    let mut text = format!("{:<12}{:>12}{:>12}{:>12}", "method", "ms/frame", "fastest", "peak MiB");
+    if old.is_some() {
+        let _ = write!(text, "{:>12}", "old/new");
+    }
+    text.push('\n');
+    for m in &results.methods {
+        let per_frame = |seconds: f64| 1e3 * seconds / results.frames as f64;
+        let peak = m.peak_mib.map_or("-".to_owned(), |mib| format!("{mib:.1}"));
+        let _ = write!(
+            text,
+            "{:<12}{:>12.3}{:>12.3}{:>12}",
+            m.method,
+            per_frame(m.seconds),
+            per_frame(m.fastest),
+            peak
+        );
+        let before = old.and_then(|old| {
+            let same = old.methods.iter().find(|o| o.method == m.method)?;
+            Some(same.seconds / old.frames as f64 * results.frames as f64 / m.seconds)
+        });
+        if let Some(ratio) = before {
+            let _ = write!(text, "{ratio:>11.2}x");
+        }
+        text.push('\n');
+    }
+    let _ = writeln!(
+        text,
+        "\n{} frames of {} x {}, {} threads; medians of {} rounds after one of warm-up",
+        results.frames, results.height, results.width, results.threads, results.rounds
+    );
+    let differs = old.is_some_and(|old| (old.height, old.width) != (results.height, results.width));
+    if differs {
+        text += "the old results are of another frame size: ratios mean little\n";
+    }
+    text
+}
