@@ -94,3 +94,22 @@ fn the_report_is_one_file_that_fetches_nothing() {
     let flicker = |row: usize| found["rows"][row]["flicker"].as_f64().unwrap();
     assert!(flicker(0) > 0.0 && flicker(1) > flicker(0), "a shorter mean is noisier: {found}");
 }
+
+#[test]
+fn the_quiver_protocol_judges_the_middle_of_every_window() {
+    let folder = scratch("eval-quiver");
+    let quiver = |seed: u32| {
+        eval(&folder, &format!("scene:text --ppp 9.75 --frames 14 --protocol quiver --seed {seed}"))
+    };
+    let first = quiver(1);
+    assert_eq!(first["protocol"], "quiver");
+    let frames = &first["rows"][0]["clips"][0]["frames"];
+    assert_eq!(frames.as_array().unwrap().len(), 14 - 11 + 1);
+    assert_eq!(frames, &quiver(1)["rows"][0]["clips"][0]["frames"], "seeded, unlike the original");
+    assert_ne!(frames, &quiver(2)["rows"][0]["clips"][0]["frames"]);
+    qudi(&folder)
+        .args("eval scene:text --protocol quiver --export-photons p".split(' '))
+        .assert()
+        .code(2);
+    qudi(&folder).args("eval scene:text --protocol quiver --frames 10".split(' ')).assert().code(2);
+}

@@ -286,7 +286,7 @@ pub(crate) struct Look {
 /// Restore video from a capture
 ///
 /// OUT is a folder (no extension) of 16-bit PNG with manifest.json: killed, it goes on where it
-/// stopped. Or one file: .npy (float32), .tif (16 bit), .gif, or - for Y4M on standard output. White
+/// stopped. Or one file: .npy (float32), .tif (16 bit), .gif, .mp4 (through ffmpeg), or - for Y4M on standard output. White
 /// is 1 = full scale; the scene's mean lands at --exposure.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Restore {
@@ -349,6 +349,10 @@ pub(crate) struct Eval {
     /// Frames of each clip at most
     #[arg(long, value_name = "N", default_value_t = 33)]
     pub(crate) frames: u64,
+    /// How photons are drawn: strict (once per clip) or quiver (anew for every window of 11, light
+    /// normalised by the window, middle frames judged)
+    #[arg(long, value_name = "NAME", default_value = "strict")]
+    pub(crate) protocol: Protocol,
     /// Seed; each clip gets one made from it and its name
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
@@ -399,6 +403,16 @@ pub(crate) struct Bench {
     /// Results of an earlier run (--json) to compare with
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) compare: Option<PathBuf>,
+}
+
+/// How a clip becomes photons, and which frames count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Protocol {
+    /// One noise realisation per clip, light normalised by the clip, every frame judged
+    Strict,
+    /// The public code of QUIVER, seeded: overlapping windows share no photon
+    Quiver,
 }
 
 /// Frames of another program.

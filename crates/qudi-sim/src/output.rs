@@ -3,6 +3,7 @@
 mod array;
 mod frames;
 mod gif_preview;
+mod mp4;
 mod pending;
 mod picture;
 
@@ -10,5 +11,6 @@ pub use array::ArrayWriter;
 pub use frames::FramesWriter;
 pub(crate) use frames::save_png16;
 pub use gif_preview::GifPreview;
+pub use mp4::Mp4;
 pub use pending::{Overwrite, PendingFile, PendingFolder, refuse_taken};
 pub use picture::Picture;

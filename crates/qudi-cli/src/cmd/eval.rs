@@ -1,6 +1,6 @@
 //! `qudi eval`: methods against known truth, on the same photons.
 
-use crate::args::{Eval, Global};
+use crate::args::{Eval, Global, Protocol};
 use crate::cmd::eval_clip::{Clip, Score};
 use crate::cmd::eval_html::html;
 use crate::cmd::eval_table::{about, csv, markdown, table};
@@ -70,6 +70,15 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
             format!("there are {}", METHODS.join(" and ")),
         ));
     }
+    if args.protocol == Protocol::Quiver
+        && (args.export_photons.is_some() || !args.external.is_empty())
+    {
+        return Err(Fault::new(
+            "the quiver protocol draws new photons for every window",
+            "--protocol",
+            "other programs are compared under the strict protocol",
+        ));
+    }
     let sensor = Sensor::load(&args.sensor)?;
     let clips = Clip::find(&args.data)?;
     if let Some(folder) = &args.export_photons {
@@ -101,9 +110,10 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
             }
             for (k, name) in names.iter().enumerate() {
                 let external = k.checked_sub(args.method.len()).map(|k| &args.external[k]);
-                let score = match external {
-                    None => exposed.score_method(name, args)?,
-                    Some(external) => exposed.score_external(external)?,
+                let score = match (external, args.protocol) {
+                    (Some(external), _) => exposed.score_external(external)?,
+                    (None, Protocol::Strict) => exposed.score_method(name, args)?,
+                    (None, Protocol::Quiver) => exposed.score_windows(name)?,
                 };
                 rows[j * names.len() + k].scores.push(score);
             }
@@ -155,7 +165,7 @@ fn document(args: &Eval, sensor: &Sensor, rows: &[Row]) -> Value {
         })
     };
     json!({
-        "protocol": "strict",
+        "protocol": args.protocol,
         "data": args.data,
         "sensor": sensor,
         "seed": args.seed,

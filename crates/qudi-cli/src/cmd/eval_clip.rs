@@ -11,11 +11,13 @@ use qudi_sim::metrics::{best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim,
 use qudi_sim::npy::read_clip;
 use qudi_sim::output::Overwrite;
 use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
-use qudi_sim::restore::{Consistency, Context, RestoreSink, Windows, run as run_method};
+use qudi_sim::restore::{BurstView, Consistency, Context, RestoreSink, Windows, run as run_method};
 use qudi_sim::scene::Flow;
 use qudi_sim::sensor::Sensor;
 use qudi_sim::source::{Input, Sampling};
-use qudi_sim::{Exposed, Frame, PppDefinition, SimError, Simulation, Sink, Size, Start, simulate};
+use qudi_sim::{
+    Camera, Exposed, Frame, Light, PppDefinition, SimError, Simulation, Sink, Size, Start, simulate,
+};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -128,7 +130,7 @@ impl Clip {
             gain: summary.gain,
             dark: None,
         };
-        Ok(ExposedClip { name: self.name.clone(), size, ppp, kept, context })
+        Ok(ExposedClip { name: self.name.clone(), size, ppp, seed, kept, context })
     }
 }
 
@@ -177,6 +179,7 @@ pub(crate) struct ExposedClip {
     name: String,
     size: Size,
     ppp: f64,
+    seed: u64,
     kept: Kept,
     context: Context,
 }
@@ -202,6 +205,73 @@ impl ExposedClip {
         )?;
         let seconds = start.elapsed().as_secs_f64() / sink.0.len() as f64;
         self.score(&sink.0, Some(seconds))
+    }
+
+    /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
+    /// exposed anew with its own mean at `ppp`, and its middle frame judged.
+    pub(crate) fn score_windows(&self, name: &str) -> Result<Score> {
+        const WINDOW: usize = 11;
+        let truth = &self.kept.truth;
+        if truth.len() < WINDOW {
+            return Err(Fault::new(
+                format!("{} frames, where a window has {WINDOW}", truth.len()),
+                &self.name,
+                "use longer clips, or --protocol strict",
+            ));
+        }
+        let sensor = &self.context.sensor;
+        let (mut frames, mut middles, mut seconds) = (Vec::new(), Vec::new(), 0.0);
+        let windows = truth.len() - WINDOW + 1;
+        for first in 0..windows {
+            if interrupt::check().is_break() {
+                return Err(Fault::Interrupted);
+            }
+            let scene = &truth[first..first + WINDOW];
+            let mean = scene.iter().map(Frame::mean).sum::<f64>() / WINDOW as f64;
+            let light = Light { ppp: self.ppp, exposure: mean.max(1e-4) };
+            let seed = self.seed.wrapping_add(first as u64);
+            let mut camera = Camera::new(sensor, self.size, light, seed)?;
+            let mut counts = Vec::with_capacity(WINDOW);
+            for (t, frame) in scene.iter().enumerate() {
+                counts.push(camera.expose(t as u64, &[frame])?);
+            }
+            let context = Context { gain: camera.gain(), ppp: self.ppp, ..self.context.clone() };
+            let start = Instant::now();
+            let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
+            let (mut restorer, _) = method(name, &mut capture, &context)?;
+            let burst = BurstView { size: self.size, frames: &counts };
+            let restored = restorer.restore(burst, &context)?.frames.swap_remove(WINDOW / 2);
+            seconds += start.elapsed().as_secs_f64();
+            frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
+            middles.push(restored);
+        }
+        let middle = windows / 2;
+        let gain = best_gain(&middles[middle], &truth[middle + WINDOW / 2]) as f32;
+        let data = middles[middle].data.iter().map(|v| (v * gain).clamp(0.0, 1.0)).collect();
+        Ok(Score {
+            clip: self.name.clone(),
+            frames,
+            chi_square: None,
+            flicker: None,
+            seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
+            picture: Frame { size: self.size, data },
+        })
+    }
+
+    fn score_frame(&self, image: &Frame, truth: &Frame) -> Result<FrameScore> {
+        let small = || {
+            Fault::new(
+                format!("frames of {} are smaller than SSIM's window of 11 x 11", self.size),
+                &self.name,
+                "use larger frames",
+            )
+        };
+        Ok(FrameScore {
+            psnr_a: gain_aligned_psnr(image, truth),
+            psnr: psnr(image, truth),
+            ssim: ssim(image, truth).ok_or_else(small)?,
+            ssim_g: gaussian_ssim(image, truth).ok_or_else(small)?,
+        })
     }
 
     /// Frames that another program made of the exported photons.
@@ -242,19 +312,7 @@ impl ExposedClip {
         for ((image, truth), counts) in restored.iter().zip(&self.kept.truth).zip(&self.kept.counts)
         {
             consistency.add(image, counts, &self.context)?;
-            let small = || {
-                Fault::new(
-                    format!("frames of {} are smaller than SSIM's window of 11 x 11", self.size),
-                    &self.name,
-                    "use larger frames",
-                )
-            };
-            frames.push(FrameScore {
-                psnr_a: gain_aligned_psnr(image, truth),
-                psnr: psnr(image, truth),
-                ssim: ssim(image, truth).ok_or_else(small)?,
-                ssim_g: gaussian_ssim(image, truth).ok_or_else(small)?,
-            });
+            frames.push(self.score_frame(image, truth)?);
         }
         Ok(Score {
             clip: self.name.clone(),

@@ -1,6 +1,6 @@
 //! The figures of `qudi eval` as text, Markdown and CSV.
 
-use crate::args::Eval;
+use crate::args::{Eval, Protocol};
 use crate::cmd::eval::Row;
 use qudi_sim::metrics::Statistics;
 use std::fmt::Write;
@@ -70,9 +70,13 @@ pub(crate) fn table(rows: &[Row], args: &Eval, clips: usize) -> String {
 
 /// What the figures are.
 pub(crate) fn about(args: &Eval, clips: usize) -> String {
+    let protocol = match args.protocol {
+        Protocol::Strict => "strict",
+        Protocol::Quiver => "quiver",
+    };
     format!(
-        "{clips} clips, {}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames; flicker: rms along the true flow beyond the truth's",
-        args.sensor, args.seed
+        "{clips} clips, {}, protocol {}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames; flicker: rms along the true flow beyond the truth's",
+        args.sensor, protocol, args.seed
     )
 }
 

@@ -1,7 +1,8 @@
-//! Frames in [0, 1] on disk: `.npy` of float32, 16-bit TIFF, GIF, or a folder of 16-bit PNG.
+//! Frames in [0, 1] on disk: `.npy` of float32, 16-bit TIFF, GIF, MP4, or a folder of 16-bit PNG.
 
 use super::array::ArrayWriter;
 use super::gif_preview::GifPreview;
+use super::mp4::Mp4;
 use super::pending::{Overwrite, PendingFolder};
 use crate::burst::{BurstFormat, BurstWriter};
 use crate::error::{Result, SimError};
@@ -21,6 +22,8 @@ pub enum FramesWriter {
     Tiff(Box<BurstWriter>),
     /// Animated GIF, the first frames of a long clip.
     Gif(GifPreview),
+    /// MP4, for looking at.
+    Mp4(Mp4),
     /// Folder of 16-bit PNG; 65535 is 1.
     Folder {
         /// The folder.
@@ -31,7 +34,7 @@ pub enum FramesWriter {
 }
 
 impl FramesWriter {
-    /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, or a folder if the name has no
+    /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
     /// extension.
     ///
     /// # Errors
@@ -46,6 +49,7 @@ impl FramesWriter {
                 Ok(Self::Tiff(Box::new(writer)))
             }
             Some("gif") => GifPreview::create(path, overwrite, size, u16::MAX).map(Self::Gif),
+            Some("mp4") => Mp4::create(path, size, overwrite).map(Self::Mp4),
             None => {
                 let folder = PendingFolder::create(path, overwrite, FIRST)?;
                 Ok(Self::Folder { folder, frames: 0 })
@@ -53,7 +57,7 @@ impl FramesWriter {
             Some(other) => Err(SimError::data(
                 format!("frames are not written as .{other}"),
                 path,
-                "use .npy, .tif, .gif, or a name without extension for a folder of 16-bit PNG",
+                "use .npy, .tif, .gif, .mp4, or a name without extension for a folder of 16-bit PNG",
             )),
         }
     }
@@ -67,6 +71,7 @@ impl FramesWriter {
             Self::Array(array) => array.push_f32(frame.data.iter().copied()),
             Self::Tiff(writer) => writer.push(&sixteen_bits(frame)),
             Self::Gif(gif) => gif.push(&sixteen_bits(frame)),
+            Self::Mp4(film) => film.push(frame),
             Self::Folder { folder, frames } => {
                 let file = folder.file(&format!("frame_{frames:06}.png"));
                 *frames += 1;
@@ -85,6 +90,7 @@ impl FramesWriter {
             Self::Array(array) => array.finish(),
             Self::Tiff(writer) => writer.finish_alone(),
             Self::Gif(gif) => gif.finish(),
+            Self::Mp4(film) => film.finish(),
             Self::Folder { folder, .. } => folder.finish(),
         }
     }
