@@ -64,7 +64,7 @@ fn every_output_holds_the_same_frames() {
 #[test]
 fn a_run_killed_ten_times_ends_like_an_undisturbed_one() {
     let folder = burst("restore-kill", 600);
-    restore(&folder, "b.npy -o whole --chi-map whole.npy");
+    restore(&folder, "b.npy -o whole --chi-map whole.npy --side-by-side whole.png");
     let finished = || {
         let files = std::fs::read_dir(folder.join("killed")).into_iter().flatten().flatten();
         files.filter(|file| file.file_name().to_string_lossy().starts_with("frame_")).count()
@@ -89,14 +89,16 @@ fn a_run_killed_ten_times_ends_like_an_undisturbed_one() {
         assert!(finished() >= before, "finished frames are kept");
     }
     assert!(finished() < 600, "killed before the end: {}", finished());
-    restore(&folder, "b.npy -o killed --chi-map killed.npy");
+    restore(&folder, "b.npy -o killed --chi-map killed.npy --side-by-side killed.png");
     let frames: Vec<_> = contents(&folder.join("killed"))
         .into_iter()
         .filter(|(name, _)| !name.starts_with('.'))
         .collect();
     assert!(frames == contents(&folder.join("whole")), "frames and manifest are the same");
-    let map = |name: &str| std::fs::read(folder.join(name)).unwrap();
-    assert!(map("whole.npy") == map("killed.npy"), "and so is the misfit");
+    for output in ["npy", "png"] {
+        let read = |name: &str| std::fs::read(folder.join(format!("{name}.{output}"))).unwrap();
+        assert!(read("whole") == read("killed"), "and so is what is said of them: {output}");
+    }
 }
 
 #[test]

@@ -323,6 +323,9 @@ pub(crate) struct Restore {
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) chi_map: Option<PathBuf>,
+    /// Write a picture of the first, middle and last frame: counts above, restored below
+    #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
+    pub(crate) side_by_side: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) reading: Reading,
 }

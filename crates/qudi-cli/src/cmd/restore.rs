@@ -27,8 +27,15 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
         ));
     }
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
-    if let Some(map) = &args.chi_map {
-        refuse_taken(map, overwrite)?;
+    for path in [&args.chi_map, &args.side_by_side].into_iter().flatten() {
+        refuse_taken(path, overwrite)?;
+    }
+    if args.shard.is_some() && args.side_by_side.is_some() {
+        return Err(Fault::new(
+            "a part of the work has not all the frames to show",
+            "--side-by-side",
+            "ask for it when all parts are done: the same command without --shard",
+        ));
     }
     Output::refuse_taken(&args.output, args.shard.is_some(), overwrite)?;
     let mut job = Job::prepare(args)?;
@@ -52,6 +59,9 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     output.finish(&results, complete)?;
     if let Some(path) = &args.chi_map {
         save_map(&misfit, path, overwrite)?;
+    }
+    if let (Some(path), Some(picture)) = (&args.side_by_side, misfit.side_by_side()) {
+        picture.save(path, overwrite)?;
     }
     remarks(&job.capture, report);
     let made = part.end - part.start - done;

@@ -2,7 +2,7 @@
 
 use crate::error::{Fault, Result};
 use qudi_sim::capture::Capture;
-use qudi_sim::output::{FramesWriter, Overwrite, refuse_taken};
+use qudi_sim::output::{FramesWriter, Overwrite, Picture, refuse_taken};
 use qudi_sim::restore::{Consistency, Context, FrameFolder, RestoreSink};
 use qudi_sim::{Frame, SimError, Size};
 use serde_json::Value;
@@ -103,18 +103,37 @@ impl RestoreSink for Sink<'_> {
     }
 }
 
-/// Chi-square of the counts given the result.
+/// What is seen of the result: chi-square of all frames, and three of them beside their counts.
 pub(crate) struct Misfit {
     consistency: Consistency,
     context: Context,
+    shown: Vec<u64>,
+    pictures: Vec<[Frame; 2]>,
+    judged: u64,
 }
 
 impl Misfit {
     pub(crate) fn new(capture: &Capture, context: &Context) -> Self {
-        Self { consistency: Consistency::new(capture.size(), context), context: context.clone() }
+        let last = capture.frames() - 1;
+        let mut shown = vec![0, last / 2, last];
+        shown.dedup();
+        Self {
+            consistency: Consistency::new(capture.size(), context),
+            context: context.clone(),
+            shown,
+            pictures: Vec::new(),
+            judged: 0,
+        }
     }
 
     fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
+        if self.shown.contains(&self.judged) {
+            let full = f32::from(self.context.sensor.max_count());
+            let data = counts.iter().map(|&count| f32::from(count) / full).collect();
+            let counts = Frame { size: restored.size, data };
+            self.pictures.push([counts, restored.clone()]);
+        }
+        self.judged += 1;
         self.consistency.add(restored, counts, &self.context)
     }
 
@@ -136,6 +155,17 @@ impl Misfit {
 
     pub(crate) fn chi_square(&self) -> Option<f64> {
         self.consistency.chi_square()
+    }
+
+    /// Counts above, restored frames below: the first, the middle and the last.
+    pub(crate) fn side_by_side(&self) -> Option<Picture> {
+        let size = self.pictures.first()?[0].size;
+        let mut picture = Picture::new(size, 2, self.pictures.len(), 1);
+        for (column, (pair, frame)) in self.pictures.iter().zip(&self.shown).enumerate() {
+            picture.place(0, column, &[&format!("COUNTS {frame}")], &pair[0]);
+            picture.place(1, column, &[&format!("RESTORED {frame}")], &pair[1]);
+        }
+        Some(picture)
     }
 
     pub(crate) fn map(&self) -> Frame {
