@@ -1,0 +1,50 @@
+//! Options of `qudi convert` and `qudi calibrate`.
+
+use super::Reading;
+use clap::{Args as ClapArgs, ValueHint};
+use std::path::PathBuf;
+
+/// Copy a capture from any format into one that everything reads
+///
+/// Pixels stay as they are unless --mask or --dcr ask for repair. With --sum N, N frames are
+/// summed into each output frame. OUT is an .npy file (binary frames are packed as photoncube and
+/// visionsim do), a multi-page .tif, or a folder of PNG (no extension), with a record beside it.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Convert {
+    /// The capture: a file or a folder
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) capture: PathBuf,
+    /// Where it goes
+    #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
+    pub(crate) output: PathBuf,
+    /// Write binary .npy bursts with one byte per pixel
+    #[arg(long)]
+    pub(crate) unpacked: bool,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}
+
+/// Measure dark rates, hot pixels and read noise from a capture with the shutter closed
+///
+/// Writes a sensor file and two maps beside it (NAME.dark.npy, NAME.bad.npy), used from then on by
+/// --sensor NAME.toml or --dcr NAME.toml.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Calibrate {
+    /// The dark capture
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) capture: PathBuf,
+    /// The sensor file to write
+    #[arg(short, long, value_name = "TOML", value_hint = ValueHint::FilePath)]
+    pub(crate) output: PathBuf,
+    /// Sensor to start from: a name or a .toml file [default: known from record or format]
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) sensor: Option<String>,
+    /// Gain of this capture in DN per electron, for sensors whose gain follows the light
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
+    pub(crate) gain: Option<f64>,
+    /// Dark rate beyond which a pixel is hot: per frame, or per second as in 100/s [default: 10 x the median]
+    #[arg(long, value_name = "RATE")]
+    pub(crate) hot: Option<String>,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}

@@ -1,0 +1,113 @@
+//! Options of `qudi eval` and `qudi bench`.
+
+use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_sim::Size;
+use std::path::PathBuf;
+
+/// Compare methods on clips whose truth is known: the same photons and frames for all
+///
+/// DATA is a clip, or a folder of clips: folders of images, videos, GIF, Y4M, .npy, or scene:NAME.
+/// Each clip is exposed once per light level, with a seed of its own. Figures lead with PSNR after the
+/// best gain (psnr-a): counts do not fix the brightness of a picture, and no method is told.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Eval {
+    /// A clip, or a folder of clips
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) data: String,
+    /// Methods to compare
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
+    pub(crate) method: Vec<String>,
+    /// Incident photons per pixel and frame
+    #[arg(long, value_name = "PPP,...", value_delimiter = ',', default_values_t = [3.25, 9.75, 26.0])]
+    pub(crate) ppp: Vec<f64>,
+    /// Sensor: a name or a .toml file
+    #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
+    pub(crate) sensor: String,
+    /// Frames of each clip at most
+    #[arg(long, value_name = "N", default_value_t = 33)]
+    pub(crate) frames: u64,
+    /// How photons are drawn: strict (once per clip) or quiver (anew for every window of 11, light
+    /// normalised by the window, middle frames judged)
+    #[arg(long, value_name = "NAME", default_value = "strict")]
+    pub(crate) protocol: Protocol,
+    /// Seed; each clip gets one made from it and its name
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Mean image value that methods are told
+    #[arg(long, value_name = "VALUE", default_value_t = 0.45)]
+    pub(crate) exposure: f64,
+    /// Frames that neighbouring windows share, blended
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    pub(crate) overlap: u64,
+    /// Write the exact bursts here, for programs of any kind
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub(crate) export_photons: Option<PathBuf>,
+    /// Score frames that another program made of them: DIR/dog-ppp9_75.npy, or a folder of that name
+    #[arg(long, value_name = "NAME=DIR")]
+    pub(crate) external: Vec<External>,
+    /// Write every figure of every frame
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) csv: Option<PathBuf>,
+    /// Write the table in Markdown
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) markdown: Option<PathBuf>,
+    /// Write a report with plot and pictures as one HTML file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) html: Option<PathBuf>,
+    /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
+    #[arg(long, value_name = "DB", allow_negative_numbers = true)]
+    pub(crate) min_psnr: Option<f64>,
+}
+
+/// Measure speed and memory of methods
+///
+/// Restores one window of a simulated burst over and over: one round to warm up, then medians. Keep the
+/// results with --json, and compare with them later.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Bench {
+    /// Methods to measure
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
+    pub(crate) method: Vec<String>,
+    /// Frame size, height first
+    #[arg(long, value_name = "HxW", default_value = "256x256")]
+    pub(crate) size: Size,
+    /// Frames of the window
+    #[arg(long, value_name = "N", default_value_t = 11)]
+    pub(crate) frames: usize,
+    /// Measured rounds
+    #[arg(long, value_name = "N", default_value_t = 7)]
+    pub(crate) rounds: usize,
+    /// Results of an earlier run (--json) to compare with
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) compare: Option<PathBuf>,
+}
+
+/// How a clip becomes photons, and which frames count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Protocol {
+    /// One noise realisation per clip, light normalised by the clip, every frame judged
+    Strict,
+    /// The public code of QUIVER, seeded: overlapping windows share no photon
+    Quiver,
+}
+
+/// Frames of another program.
+#[derive(Clone, Debug)]
+pub(crate) struct External {
+    pub(crate) name: String,
+    pub(crate) folder: PathBuf,
+}
+
+impl std::str::FromStr for External {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.split_once('=') {
+            Some((name, folder)) if !name.is_empty() && !folder.is_empty() => {
+                Ok(Self { name: name.to_owned(), folder: folder.into() })
+            }
+            _ => Err("expected NAME=DIR".to_owned()),
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! How captures are read: the same options for every command that reads one.
+
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Args as ClapArgs, ValueHint};
+use qudi_sim::Size;
+use qudi_sim::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+use serde::de::DeserializeOwned;
+use std::path::PathBuf;
+
+/// What the user says about a capture that its file does not.
+#[derive(Clone, Debug, ClapArgs)]
+#[group(skip)]
+#[command(next_help_heading = "Reading captures")]
+pub(crate) struct Reading {
+    /// Format by name (`qudi info --formats`) [default: recognised]
+    #[arg(long, value_name = "NAME")]
+    format: Option<String>,
+    /// Which bit of a byte is the first pixel
+    #[arg(long, value_name = "ORDER", value_parser = words::<BitOrder>(&["msb", "lsb"]))]
+    bitorder: Option<BitOrder>,
+    /// Axis along which 8 pixels share a byte
+    #[arg(long, value_name = "AXIS", value_parser = words::<PackAxis>(&["width", "height", "none"]))]
+    pack_axis: Option<PackAxis>,
+    /// Frame size, height first: for raw files, and packed rows whose width is no multiple of 8
+    #[arg(long, value_name = "HxW")]
+    size: Option<Size>,
+    /// Turn frames; vendor: as the camera's own software shows them
+    #[arg(long, value_name = "TURN", value_parser = words::<Orientation>(&["raw", "vendor", "rot90", "rot180", "rot270", "flip-h", "flip-v", "transpose"]))]
+    orient: Option<Orientation>,
+    /// Order of an array's axes (time, height, width), slowest first
+    #[arg(long, value_name = "AXES", value_parser = words::<Axes>(&["thw", "twh", "hwt", "wht", "htw", "wth"]))]
+    axes: Option<Axes>,
+    /// Colour channel to read as gray, from 0
+    #[arg(long, value_name = "N")]
+    channel: Option<usize>,
+    /// Array (variable, data set) in a file that holds several
+    #[arg(long, value_name = "NAME")]
+    array: Option<String>,
+    /// Values are means of N binary frames, full scale for all ones
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    levels: Option<u16>,
+    /// Bits of a count, where the file does not say
+    #[arg(long, value_name = "N")]
+    bits: Option<u8>,
+    /// Bytes before the first frame of each raw file
+    #[arg(long, value_name = "BYTES")]
+    header: Option<u64>,
+    /// Bytes after the last frame of each raw file
+    #[arg(long, value_name = "BYTES")]
+    trailer: Option<u64>,
+    /// Frames in each raw file but the last
+    #[arg(long, value_name = "N")]
+    frames_per_file: Option<u64>,
+    /// First frame, from 0
+    #[arg(long, value_name = "N")]
+    start: Option<u64>,
+    /// One past the last frame
+    #[arg(long, value_name = "N")]
+    end: Option<u64>,
+    /// Rows and columns to keep after turning, as in 2:256,0:496
+    #[arg(long, value_name = "Y0:Y1,X0:X1")]
+    crop: Option<Crop>,
+    /// Sum N frames into one (7 binary frames make 3 bits)
+    #[arg(long, value_name = "N")]
+    sum: Option<u32>,
+    /// Pixels to repair: a .npy or image nonzero at bad ones, auto (found in the capture), or none
+    #[arg(long, value_name = "FILE|auto|none")]
+    mask: Option<MaskChoice>,
+    /// Dark rates: a .npy or .mat map in counts per second, or a calibrated sensor file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    dcr: Option<PathBuf>,
+    /// Drop an incomplete last frame instead of refusing the file
+    #[arg(long)]
+    lenient: bool,
+}
+
+impl Reading {
+    /// The options; without --mask, pixels are treated as `mask` says.
+    pub(crate) fn options(&self, mask: MaskChoice) -> ReadOptions {
+        let given = self.clone();
+        // A dark map names its hot pixels; asking for it asks for their repair.
+        let mask = if given.dcr.is_some() { MaskChoice::Auto } else { mask };
+        ReadOptions {
+            format: given.format,
+            bit_order: given.bitorder,
+            pack_axis: given.pack_axis,
+            size: given.size,
+            orient: given.orient,
+            axes: given.axes,
+            channel: given.channel,
+            array: given.array,
+            levels: given.levels,
+            bits: given.bits,
+            header: given.header,
+            trailer: given.trailer,
+            frames_per_file: given.frames_per_file,
+            start: given.start,
+            end: given.end,
+            crop: given.crop,
+            sum: given.sum,
+            mask: given.mask.unwrap_or(mask),
+            dcr: given.dcr,
+            lenient: given.lenient,
+        }
+    }
+}
+
+/// One of some words, read as the type that serde names so.
+fn words<T: DeserializeOwned + Clone + Send + Sync + 'static>(
+    all: &'static [&'static str],
+) -> impl TypedValueParser<Value = T> {
+    PossibleValuesParser::new(all)
+        .try_map(|word| serde_json::from_value::<T>(serde_json::Value::String(word)))
+}

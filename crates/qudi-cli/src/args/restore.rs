@@ -1,0 +1,80 @@
+//! Options of `qudi restore`.
+
+use super::Reading;
+use clap::{Args as ClapArgs, ValueHint};
+use std::path::PathBuf;
+
+/// Restore video from a capture
+///
+/// OUT is a folder (no extension) of 16-bit PNG with manifest.json: killed, it goes on where it
+/// stopped. Or one file: .npy (float32), .tif (16 bit), .gif, .mp4 (through ffmpeg), or - for Y4M on standard output. White
+/// is 1 = full scale; the scene's mean lands at --exposure.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Restore {
+    /// The capture: a file or a folder in any format
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub(crate) capture: PathBuf,
+    /// Where the frames go
+    #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
+    pub(crate) output: String,
+    /// How: average (11 frames), or mle (response inverted, dark counts subtracted, length chosen)
+    #[arg(long, value_name = "NAME", default_value = "mle")]
+    pub(crate) method: String,
+    /// Sensor that took it: a name or a .toml file [default: known from record or format]
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) sensor: Option<String>,
+    /// Incident photons per pixel and frame [default: from the record, or estimated]
+    #[arg(long, value_name = "PPP", allow_negative_numbers = true)]
+    pub(crate) ppp: Option<f64>,
+    /// Gain in DN per electron, for sensors whose gain follows the light [default: from the record]
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
+    pub(crate) gain: Option<f64>,
+    /// Image value that PPP photons become: counts do not fix the brightness of a picture
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, default_value_t = 0.45)]
+    pub(crate) exposure: f64,
+    /// Seed of methods that draw
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Frames that neighbouring windows share, blended
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    pub(crate) overlap: u64,
+    /// Do part I of N (from 1), into the same folder as the other parts
+    #[arg(long, value_name = "I/N")]
+    pub(crate) shard: Option<Shard>,
+    /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) chi_map: Option<PathBuf>,
+    /// Write a picture of the first, middle and last frame: counts above, restored below
+    #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
+    pub(crate) side_by_side: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
+}
+
+/// One of several equal parts of the work.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Shard {
+    number: u64,
+    of: u64,
+}
+
+impl Shard {
+    /// Its part of `frames`.
+    pub(crate) fn range(self, frames: u64) -> std::ops::Range<u64> {
+        let start = |n: u64| (u128::from(frames) * u128::from(n) / u128::from(self.of)) as u64;
+        start(self.number - 1)..start(self.number)
+    }
+}
+
+impl std::str::FromStr for Shard {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts =
+            text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+        match parts {
+            Some((number, of)) if (1..=of).contains(&number) => Ok(Self { number, of }),
+            _ => Err("expected I/N with I from 1 to N, as in 3/8".to_owned()),
+        }
+    }
+}
