@@ -21,8 +21,8 @@ pub(crate) type Opener = Box<dyn Fn() -> Result<Box<dyn Read + Send>> + Send>;
 
 /// Where the bytes of frames come from.
 pub(crate) enum FrameBytes {
-    /// Files read in place. Reading beats mapping here: it copies at memory speed, keeps the
-    /// resident memory flat, and a file that shrinks meanwhile is an error instead of a signal.
+    /// Files read in place, not mapped: resident memory stays flat, and a file that shrinks
+    /// meanwhile is an error instead of a signal.
     Files(Files),
     /// A stream that can only go forward.
     Stream(Stream),
