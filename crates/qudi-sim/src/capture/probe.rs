@@ -133,7 +133,8 @@ fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
             if depth > 1 {
                 list(&path, depth - 1, files)?;
             }
-        } else {
+        } else if path.is_file() {
+            // A named pipe would keep the reader waiting for ever.
             files.push(path);
         }
         if files.len() > MOST_FILES {

@@ -154,3 +154,14 @@ fn files_cut_anywhere_do_not_panic() {
         }
     }
 }
+
+/// A named pipe among the files would keep a reader waiting for ever.
+#[cfg(unix)]
+#[test]
+fn pipes_in_a_folder_are_left_alone() {
+    let folder = crate::scratch();
+    let made =
+        std::process::Command::new("mkfifo").arg(folder.path().join("filename0.bin")).status();
+    assert!(made.unwrap().success());
+    assert!(refusal(open(folder.path(), &plain())).contains("no capture in a known format"));
+}
