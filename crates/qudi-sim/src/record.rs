@@ -16,6 +16,13 @@ pub const VERSION: u32 = 1;
 /// Records are a few pages of JSON; anything much larger is something else.
 const MAX_FILE: u64 = 1 << 24;
 
+/// Where the record of the file at `path` lies: `NAME.npy.json` beside `NAME.npy`.
+pub(crate) fn beside(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".json");
+    name.into()
+}
+
 /// The record of a simulated burst, `NAME.npy.json`.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Record {

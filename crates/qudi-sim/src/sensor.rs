@@ -155,6 +155,14 @@ impl Sensor {
         ))
     }
 
+    /// Gain in DN/e-, unless its rule follows the light.
+    pub fn fixed_gain(&self) -> Option<f64> {
+        match self.gain {
+            Gain::Fixed(_) | Gain::Unit | Gain::Fwc => self.gain_at(1.0).ok(),
+            Gain::Quiver | Gain::Auto => None,
+        }
+    }
+
     /// Linear estimate of the incident photons per pixel and output frame from counts: the sum of
     /// `frames` output frames of one pixel, dark counts subtracted, never negative. A saturated
     /// binary pixel is taken as one detection short of saturation (Ma et al. 2020, eq. 4).

@@ -14,6 +14,7 @@ mod synthetic;
 mod video;
 mod y4m;
 
+pub(crate) use image_file::decode_image;
 pub use image_file::read_still;
 pub use input::{Input, Sampling};
 pub(crate) use video::Video;

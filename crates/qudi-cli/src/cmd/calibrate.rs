@@ -1,7 +1,7 @@
 //! `qudi calibrate`: a dark capture into a sensor file with maps.
 
 use crate::args::{Calibrate, Global};
-use crate::cmd::capture_info::{known_sensor, remarks};
+use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
@@ -29,7 +29,7 @@ pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<
     }
     let mut capture = Capture::open(&args.capture, &args.reading.options(MaskChoice::None), None)?;
     let (base, sensor) = base_sensor(args, &capture)?;
-    let gain = gain(args, &sensor);
+    let gain = args.gain.or(sensor.fixed_gain());
     let fps = capture.about().fps.or(sensor.fps);
     let hot = args.hot.as_deref().map(|text| threshold(text, fps)).transpose()?;
     let mut bar = report.bar();
@@ -98,21 +98,8 @@ fn base_sensor(args: &Calibrate, capture: &Capture) -> Result<(String, Sensor)> 
     if let Some(name) = &args.sensor {
         return Ok((name.clone(), Sensor::load(name)?));
     }
-    match known_sensor(capture)? {
-        Some(sensor) => Ok((sensor.name.clone(), sensor)),
-        None => Err(Fault::new(
-            "the file does not say which camera took it",
-            args.capture.display(),
-            "name its sensor, as in --sensor swissspad2",
-        )),
-    }
-}
-
-fn gain(args: &Calibrate, sensor: &Sensor) -> Option<f64> {
-    args.gain.or(match sensor.gain {
-        Gain::Fixed(_) | Gain::Unit | Gain::Fwc => sensor.gain_at(1.0).ok(),
-        Gain::Quiver | Gain::Auto => None,
-    })
+    let sensor = required_sensor(capture)?;
+    Ok((sensor.name.clone(), sensor))
 }
 
 fn threshold(text: &str, fps: Option<f64>) -> Result<f64> {

@@ -73,6 +73,17 @@ pub(crate) fn known_sensor(capture: &Capture) -> Result<Option<Sensor>> {
     }
 }
 
+/// The sensor that is known, where there has to be one.
+pub(crate) fn required_sensor(capture: &Capture) -> Result<Sensor> {
+    known_sensor(capture)?.ok_or_else(|| {
+        Fault::new(
+            "the file does not say which camera took it",
+            capture.path().display(),
+            "name its sensor, as in --sensor swissspad2 (`qudi info --sensors`)",
+        )
+    })
+}
+
 /// Says on standard error what the user should know about a capture.
 pub(crate) fn remarks(capture: &Capture, report: &Report) {
     for remark in &capture.about().remarks {

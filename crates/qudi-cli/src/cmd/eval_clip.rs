@@ -246,15 +246,14 @@ impl ExposedClip {
             middles.push(restored);
         }
         let middle = windows / 2;
-        let gain = best_gain(&middles[middle], &truth[middle + WINDOW / 2]) as f32;
-        let data = middles[middle].data.iter().map(|v| (v * gain).clamp(0.0, 1.0)).collect();
+        let picture = aligned(&middles[middle], &truth[middle + WINDOW / 2]);
         Ok(Score {
             clip: self.name.clone(),
             frames,
             chi_square: None,
             flicker: None,
             seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
-            picture: Frame { size: self.size, data },
+            picture,
         })
     }
 
@@ -320,7 +319,7 @@ impl ExposedClip {
             chi_square: consistency.chi_square(),
             flicker: self.flicker(restored),
             seconds_per_frame,
-            picture: self.aligned(restored.len() / 2, restored),
+            picture: aligned(&restored[restored.len() / 2], &self.kept.truth[restored.len() / 2]),
         })
     }
 }
@@ -339,25 +338,17 @@ impl ExposedClip {
         }
     }
 
-    fn aligned(&self, frame: usize, restored: &[Frame]) -> Frame {
-        let gain = best_gain(&restored[frame], &self.kept.truth[frame]) as f32;
-        let data = restored[frame].data.iter().map(|v| (v * gain).clamp(0.0, 1.0)).collect();
-        Frame { size: self.size, data }
-    }
-
     fn flicker(&self, restored: &[Frame]) -> Option<f64> {
         let mut excess = Vec::new();
         for (t, flow) in self.kept.flow.iter().enumerate() {
             let truth = &self.kept.truth;
             // One gain for both frames: flicker of brightness counts.
-            let gain = best_gain(&restored[t], &truth[t]) as f32;
-            let scaled = |frame: &Frame| Frame {
-                size: frame.size,
-                data: frame.data.iter().map(|v| (v * gain).clamp(0.0, 1.0)).collect(),
-            };
+            let gain = best_gain(&restored[t], &truth[t]);
             let own = warping_error(&truth[t], &truth[t + 1], flow)?;
-            excess
-                .push(warping_error(&scaled(&restored[t]), &scaled(&restored[t + 1]), flow)? - own);
+            excess.push(
+                warping_error(&scaled(&restored[t], gain), &scaled(&restored[t + 1], gain), flow)?
+                    - own,
+            );
         }
         let n = excess.len() as f64;
         (n > 0.0).then(|| (excess.iter().sum::<f64>() / n).max(0.0).sqrt())
@@ -372,4 +363,14 @@ impl RestoreSink for Collected {
         self.0.push(restored.clone());
         Ok(())
     }
+}
+
+/// A restored frame after the gain that brings it closest to the truth.
+fn aligned(image: &Frame, truth: &Frame) -> Frame {
+    scaled(image, best_gain(image, truth))
+}
+
+fn scaled(image: &Frame, gain: f64) -> Frame {
+    let data = image.data.iter().map(|v| (v * gain as f32).clamp(0.0, 1.0)).collect();
+    Frame { size: image.size, data }
 }

@@ -1,7 +1,7 @@
 //! `qudi restore`: a capture through a method into frames.
 
 use crate::args::{Global, Restore};
-use crate::cmd::capture_info::{known_sensor, remarks};
+use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::cmd::methods::method;
 use crate::cmd::restore_output::{Misfit, Output};
 use crate::error::{Fault, Result};
@@ -103,13 +103,7 @@ impl Job {
         let mut capture = Capture::open(&args.capture, &options, named.as_ref())?;
         let sensor = match named {
             Some(sensor) => sensor,
-            None => known_sensor(&capture)?.ok_or_else(|| {
-                Fault::new(
-                    "the file does not say which camera took it",
-                    args.capture.display(),
-                    "name its sensor, as in --sensor swissspad2 (`qudi info --sensors`)",
-                )
-            })?,
+            None => required_sensor(&capture)?,
         };
         let (context, source) = context(args, &mut capture, &sensor)?;
         let (restorer, choice) = method(&args.method, &mut capture, &context)?;

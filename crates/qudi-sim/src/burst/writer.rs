@@ -61,9 +61,7 @@ impl BurstFormat {
         if self == Self::Png {
             return path.join(PngFolder::RECORD);
         }
-        let mut name = path.as_os_str().to_owned();
-        name.push(".json");
-        name.into()
+        crate::record::beside(path)
     }
 
     /// NumPy type and shape of one frame.

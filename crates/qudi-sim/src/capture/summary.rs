@@ -6,7 +6,7 @@ use super::options::{BitOrder, PackAxis};
 use crate::error::Result;
 use crate::frame::{Frame, Size};
 use crate::light::PppDefinition;
-use crate::sensor::{CountLaw, DarkRate, Gain, Response, Sensor};
+use crate::sensor::{CountLaw, DarkRate, Response, Sensor};
 use serde::Serialize;
 
 /// Statistics of at most [`MOST_LOOKS`](super::MOST_LOOKS) output frames.
@@ -110,7 +110,7 @@ impl Summary {
         let frames = self.looks as u32 * capture.sum;
         let mut data = match native_sensor(capture, sensor) {
             Some(sensor) => {
-                let gain = fixed_gain(&sensor, gain).unwrap_or(1.0);
+                let gain = gain.or(sensor.fixed_gain()).unwrap_or(1.0);
                 let dark = sensor.dark_per_frame().unwrap_or(0.0);
                 let summed = f64::from(sensor.frames_summed);
                 let light = |(i, &sum): (usize, &u32)| {
@@ -148,14 +148,6 @@ fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
         (Response::Binary, Some(max)) => Some(Sensor { frames_summed: u32::from(max), ..known }),
         _ => Some(known),
     }
-}
-
-/// The gain in DN/e-, unless it follows a light that is not known.
-fn fixed_gain(sensor: &Sensor, gain: Option<f64>) -> Option<f64> {
-    gain.or(match sensor.gain {
-        Gain::Fixed(_) | Gain::Unit | Gain::Fwc => sensor.gain_at(1.0).ok(),
-        Gain::Quiver | Gain::Auto => None,
-    })
 }
 
 /// Compares pixels across byte boundaries, in the frames as they are stored.
@@ -205,7 +197,7 @@ fn ppp(
         let light = |mean: f64| -n * (-(mean * looks).min(trials - 0.5) / trials).ln_1p();
         Some(light_of_blocks(sums, capture.size(), looks, light))
     } else {
-        fixed_gain(&native, gain).map(|gain| {
+        gain.or(native.fixed_gain()).map(|gain| {
             CountLaw::new(&native, gain).detections_for_mean(dn / per_frame) * per_frame
         })
     };

@@ -14,10 +14,18 @@ pub(super) const EXTENSIONS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
 /// # Errors
 /// [`SimError`] if it cannot be read, is damaged, or is too large.
 pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
+    to_gray(decode_image(path)?, path, transfer)
+}
+
+/// Decodes one image as it is stored.
+///
+/// # Errors
+/// [`SimError`] if it cannot be read, is damaged, or is too large.
+pub(crate) fn decode_image(path: &Path) -> Result<DynamicImage> {
     let open = |e| SimError::io("open the image", path, e);
     let decoded =
         ImageReader::open(path).map_err(open)?.with_guessed_format().map_err(open)?.decode();
-    let image = decoded.map_err(|e| match e {
+    decoded.map_err(|e| match e {
         ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
             SimError::io("read the image", path, e)
         }
@@ -26,8 +34,7 @@ pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
             path,
             "open it in a viewer to see whether it is damaged, and save it again as PNG",
         ),
-    })?;
-    to_gray(image, path, transfer)
+    })
 }
 
 fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame> {

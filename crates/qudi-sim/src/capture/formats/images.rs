@@ -1,6 +1,6 @@
 //! A folder of gray images, one per frame, or a single one.
 
-use super::npy::beside;
+use super::npy::described;
 use super::{Format, Match};
 use crate::capture::about::{About, Certainty};
 use crate::capture::count_frames::CountFrames;
@@ -10,7 +10,8 @@ use crate::capture::probe::Probe;
 use crate::capture::samples::{Scale, no_count};
 use crate::error::{Result, SimError};
 use crate::frame::Size;
-use image::{DynamicImage, ImageError, ImageReader};
+use crate::source::decode_image;
+use image::DynamicImage;
 use std::path::{Path, PathBuf};
 
 pub(super) const FORMAT: Format = Format {
@@ -47,7 +48,7 @@ pub(super) struct Images {
 
 fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
     let files = files(probe)?;
-    let recorded = beside(&probe.path.join("burst.json"), about).is_some();
+    let recorded = described(&probe.path.join("burst.json"), about).is_some();
     open_files(files, &probe.path, recorded, options, about)
 }
 
@@ -131,19 +132,7 @@ fn lossy(path: &Path) -> bool {
 
 /// Gray samples of an image, its size, and full scale.
 fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
-    let open = |e| SimError::io("open the image", path, e);
-    let decoded =
-        ImageReader::open(path).map_err(open)?.with_guessed_format().map_err(open)?.decode();
-    let image = decoded.map_err(|e| match e {
-        ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
-            SimError::io("read the image", path, e)
-        }
-        other => SimError::data(
-            format!("not a readable image: {other}"),
-            path,
-            "open it in a viewer to see whether it is damaged, and save it again as PNG",
-        ),
-    })?;
+    let image = decode_image(path)?;
     let size =
         Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
     let channels = usize::from(image.color().channel_count());

@@ -10,12 +10,12 @@ use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::error::{Result, SimError};
 use crate::npy::Header;
-use crate::record::{BurstLayout, Described};
+use crate::record::{self, BurstLayout, Described};
 use crate::sensor::{Response, preset};
 use flate2::read::MultiGzDecoder;
 use std::fs::File;
 use std::io::{BufReader, Read};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 pub(super) const FORMAT: Format = Format {
     name: "npy",
@@ -110,9 +110,7 @@ pub(super) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Resu
 
 /// What lies beside an array and describes it: our own record.
 fn hints(path: &Path, about: &mut About) -> Hints {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".json");
-    let Some(layout) = beside(&PathBuf::from(name), about) else { return Hints::default() };
+    let Some(layout) = described(&record::beside(path), about) else { return Hints::default() };
     let packed = layout.format == BurstFormat::NpyPacked;
     let packing = packed.then_some(Packing { axis: PackAxis::Width, order: BitOrder::Msb });
     Hints { stored: packing.into(), size: Some(layout.size) }
@@ -120,19 +118,19 @@ fn hints(path: &Path, about: &mut About) -> Hints {
 
 /// What our record at `path` says of its burst, if it exists; what it says about the camera goes
 /// to `about`.
-pub(super) fn beside(path: &Path, about: &mut About) -> Option<BurstLayout> {
+pub(super) fn described(path: &Path, about: &mut About) -> Option<BurstLayout> {
     if !path.is_file() {
         return None;
     }
-    let described = match Described::load(path) {
-        Ok(described) => described,
+    let record = match Described::load(path) {
+        Ok(record) => record,
         Err(e) => {
             about.remarks.push(format!("{} is ignored: {e}", path.display()));
             return None;
         }
     };
     about.evidence.push("the record beside it".to_owned());
-    let layout = match described {
+    let layout = match record {
         Described::Simulated(record) => {
             about.binary = record.simulation.sensor.response == Response::Binary;
             about.gain = Some(record.gain);

@@ -1,7 +1,7 @@
 //! TIFF stacks: one image file directory per frame, or ImageJ's single directory before one block
 //! of frames (which is how it goes beyond 4 GiB).
 
-use super::npy::beside;
+use super::npy::described;
 use super::tiff_pages::{TiffPages, decoder, fault};
 use super::{Format, Match};
 use crate::capture::about::{About, Certainty};
@@ -13,7 +13,7 @@ use crate::capture::samples::{MONO, SampleFrames, Scale};
 use crate::error::{Result, SimError};
 use crate::frame::Size;
 use crate::npy::Sample;
-use std::path::PathBuf;
+use crate::record;
 use tiff::ColorType;
 use tiff::tags::{ByteOrder, Tag};
 
@@ -41,9 +41,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     if probe.is_folder {
         return Err(SimError::data("a folder", path, "use --format images, or name one file"));
     }
-    let mut name = path.as_os_str().to_owned();
-    name.push(".json");
-    let recorded = beside(&PathBuf::from(name), about).is_some();
+    let recorded = described(&record::beside(path), about).is_some();
     let Some(block) = block(probe)? else {
         let pages = TiffPages::open(path, options, recorded, about)?;
         return Ok(Box::new(pages));
