@@ -1,0 +1,574 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy", "torch"]
+# ///
+"""The network of docs/network.md in PyTorch, written from that page alone, and the sampling loop around it.
+
+Modules are named as on the page, so the keys of `state_dict()` are the names of weight files.
+
+    python scripts/reference/network.py info small
+"""
+
+import math
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from schedule import alpha_bar
+from torch import Tensor, nn
+
+Flows = tuple[Tensor, Tensor]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def load(preset: str) -> dict:
+    """The [network] table of a preset."""
+    return tomllib.loads((ROOT / "configs" / f"{preset}.toml").read_text())["network"]
+
+
+def multiple(config: dict) -> int:
+    """Frame sizes are multiples of this: features have three levels, whatever the U-Net has."""
+    levels = max(3, len(config["unet"]["multipliers"]))
+    return math.lcm(config["fold"] << levels - 1, config["flow"]["scale"] << config["flow"]["levels"] - 1)
+
+
+# Operations
+
+
+def conv(a: int, b: int, kernel: int, stride: int = 1, bias: bool = True) -> nn.Conv2d:
+    return nn.Conv2d(a, b, kernel, stride, kernel // 2, bias=bias)
+
+
+def conv3d(a: int, b: int, stride: int = 1, bias: bool = True) -> nn.Conv3d:
+    return nn.Conv3d(a, b, 5, (1, stride, stride), 2, bias=bias)
+
+
+def gn(channels: int) -> nn.GroupNorm:
+    groups = max(g for g in range(1, 9) if channels % g == 0)
+    return nn.GroupNorm(groups, channels, eps=1e-5)
+
+
+def warp(x: Tensor, flow: Tensor) -> Tensor:
+    """x at (column + flow_x, row + flow_y), flow in pixels of x's own grid."""
+    height, width = x.shape[2:]
+    columns = torch.arange(width, dtype=x.dtype, device=x.device) + flow[:, 0]
+    rows = torch.arange(height, dtype=x.dtype, device=x.device)[:, None] + flow[:, 1]
+    # A grid of one cell has nothing to scale by; any coordinate is clamped to 0 there.
+    grid = torch.stack([columns * 2 / max(width - 1, 1) - 1, rows * 2 / max(height - 1, 1) - 1], dim=3)
+    return F.grid_sample(x, grid, mode="bilinear", padding_mode="border", align_corners=True)
+
+
+def up2(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+def resize_flow(flow: Tensor, scale: int, target: int) -> Tensor:
+    """Flow of `scale` full-resolution pixels per cell, for a grid of `target`."""
+    while scale > target:
+        flow, scale = up2(flow) * 2, scale // 2
+    while scale < target:
+        flow, scale = F.avg_pool2d(flow, 2) / 2, scale * 2
+    return flow
+
+
+def bursts(x: Tensor, frames: int) -> Tensor:
+    """[B*N, ...] to [B, N, ...]."""
+    return x.unflatten(0, (-1, frames))
+
+
+def volume(x: Tensor, frames: int) -> Tensor:
+    """[B*N, C, h, w] to [B, C, N, h, w], as 3-D convolutions want it."""
+    return bursts(x, frames).transpose(1, 2)
+
+
+def planes(x: Tensor) -> Tensor:
+    """The reverse of `volume`."""
+    return x.transpose(1, 2).flatten(0, 1)
+
+
+# Blocks
+
+
+class DenseBlock(nn.Module):
+    """Residual dense block of three layers."""
+
+    def __init__(self, width: int, growth: int):
+        super().__init__()
+        self.layers = nn.ModuleList(conv(width + j * growth, growth, 3) for j in range(3))
+        self.fuse = conv(width + 3 * growth, width, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        seen = x
+        for layer in self.layers:
+            seen = torch.cat([seen, F.relu(layer(seen))], 1)
+        return x + self.fuse(seen)
+
+
+class PreDenoiser(nn.Module):
+    def __init__(self, config: dict):
+        super().__init__()
+        self.fold = config["fold"]
+        cells, pre = self.fold**2, config["pre"]
+        width = pre["width"]
+        self.static_in = conv(2 * cells, width, 3)
+        self.simulated_in = conv(2 * cells + 1, width, 3, bias=False)
+        self.blocks = nn.ModuleList(DenseBlock(width, pre["growth"]) for _ in range(pre["blocks"]))
+        self.gather = conv(pre["blocks"] * width, width, 1)
+        self.spread = conv(width, width, 3)
+        self.out = conv(width, cells, 3)
+
+    def forward(self, y: Tensor, u: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor) -> tuple[Tensor, Tensor]:
+        static = F.pixel_unshuffle(torch.cat([y, u], 1), self.fold)
+        simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
+        frames = len(y) // len(flag)
+        plane = flag.to(y).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *static.shape[2:])
+        s = self.static_in(static) + self.simulated_in(torch.cat([simulated, plane], 1))
+        x, outputs = s, []
+        for block in self.blocks:
+            x = block(x)
+            outputs.append(x)
+        g = self.spread(self.gather(torch.cat(outputs, 1))) + s
+        return u + F.pixel_shuffle(self.out(g), self.fold), g
+
+
+class Features(nn.Module):
+    """The two strided layers; the first differs."""
+
+    def __init__(self, a: int, b: int, c: int):
+        super().__init__()
+        self.half = conv3d(a, b, 2)
+        self.quarter = conv3d(b, c, 2)
+
+    def rest(self, first: Tensor) -> list[Tensor]:
+        # `self.half` would be nn.Module's own method.
+        second = F.relu(self._modules["half"](first))
+        return [planes(x) for x in (first, second, F.relu(self.quarter(second)))]
+
+
+class Low(Features):
+    """Features of what was measured and of the pre-denoised frames."""
+
+    def __init__(self, config: dict):
+        widths = config["features"]["low"]
+        super().__init__(*widths)
+        self.fold = config["fold"]
+        self.static_in = conv3d(self.fold**2, widths[0])
+        self.moving_in = conv3d(2 * self.fold**2, widths[0], bias=False)
+
+    def forward(self, u: Tensor, u_sim: Tensor, d: Tensor, frames: int) -> list[Tensor]:
+        static = volume(F.pixel_unshuffle(u, self.fold), frames)
+        moving = volume(F.pixel_unshuffle(torch.cat([u_sim, d], 1), self.fold), frames)
+        return self.rest(F.relu(self.static_in(static) + self.moving_in(moving)))
+
+
+class High(Features):
+    """Features of the diffusion's own images."""
+
+    def __init__(self, config: dict):
+        widths = config["features"]["high"]
+        super().__init__(*widths)
+        self.fold = config["fold"]
+        self.first = conv3d(2 * self.fold**2, widths[0])
+
+    def forward(self, x_t: Tensor, x0_prev: Tensor, frames: int) -> list[Tensor]:
+        moving = F.pixel_unshuffle(torch.cat([x_t, x0_prev], 1), self.fold)
+        return self.rest(F.relu(self.first(volume(moving, frames))))
+
+
+class FlowLevel(nn.Module):
+    def __init__(self, widths: list[int]):
+        super().__init__()
+        sizes = [4, *widths, 2]
+        self.layers = nn.ModuleList(conv(a, b, 7) for a, b in zip(sizes, sizes[1:]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.layers[:-1]:
+            x = F.relu(layer(x))
+        return self.layers[-1](x)
+
+
+class Flow(nn.Module):
+    def __init__(self, config: dict):
+        super().__init__()
+        flow = config["flow"]
+        self.scale = flow["scale"]
+        self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["levels"]))
+
+    def forward(self, d: Tensor, frames: int) -> Flows:
+        """to_next and to_prev, [B*N, 2, H/scale, W/scale] each."""
+        pyramid = [F.avg_pool2d(d, self.scale)]
+        for _ in self.levels[1:]:
+            pyramid.append(F.avg_pool2d(pyramid[-1], 2))
+        flow = None
+        for net, image in zip(reversed(self.levels), reversed(pyramid)):
+            x = bursts(image, frames)
+            # Both directions in one batch: frames 0..N-1 look ahead, frames 1..N look back.
+            reference = torch.cat([x[:, :-1], x[:, 1:]], 1).flatten(0, 1)
+            neighbour = torch.cat([x[:, 1:], x[:, :-1]], 1).flatten(0, 1)
+            if flow is None:
+                flow = reference.new_zeros(len(reference), 2, *reference.shape[2:])
+            else:
+                flow = up2(flow) * 2
+                neighbour = warp(neighbour, flow)
+            flow = flow + net(torch.cat([reference, neighbour, flow], 1))
+        ahead, back = bursts(flow, 2 * (frames - 1)).chunk(2, 1)
+        nothing = torch.zeros_like(ahead[:, :1])
+        return torch.cat([ahead, nothing], 1).flatten(0, 1), torch.cat([nothing, back], 1).flatten(0, 1)
+
+
+class Cell(nn.Module):
+    """One set of weights for both sweeps over the frames."""
+
+    def __init__(self, width: int, growth: int):
+        super().__init__()
+        self.join = conv(2 * width, width, 1)
+        self.block = DenseBlock(width, growth)
+        self.leave = conv(3 * width, width, 1)
+
+    def step(self, e: Tensor, h: Tensor) -> Tensor:
+        return self.block(F.relu(self.join(torch.cat([e, h], 1))))
+
+    def forward(self, e: Tensor, to_next: Tensor, to_prev: Tensor, frames: int) -> Tensor:
+        x, ahead, back = (bursts(z, frames) for z in (e, to_next, to_prev))
+        forward: list[Tensor] = []
+        for i in range(frames):
+            before = warp(forward[-1], back[:, i]) if forward else torch.zeros_like(x[:, 0])
+            forward.append(self.step(x[:, i], before))
+        backward: list[Tensor] = []
+        for i in reversed(range(frames)):
+            after = warp(backward[-1], ahead[:, i]) if backward else torch.zeros_like(x[:, 0])
+            backward.append(self.step(x[:, i], after))
+        both = [torch.stack(h, 1).flatten(0, 1) for h in (forward, backward[::-1])]
+        return F.relu(self.leave(torch.cat([*both, e], 1)))
+
+
+class Fusion(nn.Module):
+    def __init__(self, config: dict):
+        super().__init__()
+        fusion, features = config["fusion"], config["features"]
+        self.fold, self.scale, self.level = config["fold"], config["flow"]["scale"], fusion["level"]
+        widths = fusion["widths"]
+        inputs = [a + b for a, b in zip(features["low"], features["high"])]
+        inputs[0] += config["pre"]["width"]
+        for k in range(self.level + 1, 3):
+            inputs[k] += widths[k - 1]
+        self.enter = nn.ModuleList(conv(a, b, 1) for a, b in zip(inputs, widths))
+        self.align = nn.ModuleList(conv(3 * widths[k], widths[k], 3) for k in range(self.level))
+        self.cell = Cell(widths[self.level], fusion["growth"])
+
+    def forward(self, low: list[Tensor], high: list[Tensor], g: Tensor, flows: Flows, frames: int) -> list[Tensor]:
+        fused: list[Tensor] = []
+        for k, enter in enumerate(self.enter):
+            inputs = [low[k], high[k]]
+            if k == 0:
+                inputs.append(g)
+            if k > self.level:
+                inputs.append(F.avg_pool2d(fused[-1], 2))
+            e = F.relu(enter(torch.cat(inputs, 1)))
+            if k <= self.level:
+                to_next, to_prev = (resize_flow(flow, self.scale, self.fold << k) for flow in flows)
+                join = self.cell if k == self.level else partial(self.aligned, k)
+                e = join(e, to_next, to_prev, frames)
+            fused.append(e)
+        return fused
+
+    def aligned(self, k: int, e: Tensor, to_next: Tensor, to_prev: Tensor, frames: int) -> Tensor:
+        x = bursts(e, frames)
+        # Past the ends the neighbour is the frame itself; its flow is zero there.
+        after = torch.cat([x[:, 1:], x[:, -1:]], 1).flatten(0, 1)
+        before = torch.cat([x[:, :1], x[:, :-1]], 1).flatten(0, 1)
+        return F.relu(self.align[k](torch.cat([e, warp(after, to_next), warp(before, to_prev)], 1)))
+
+
+def sinusoids(t: Tensor, size: int, dtype: torch.dtype) -> Tensor:
+    """[B, size]; angles in float64, for at t near 1000 float32 angles are off by 3e-5."""
+    j = torch.arange(size // 2, dtype=torch.float64, device=t.device)
+    angles = t.double()[:, None] * 10000 ** (-j / (size // 2 - 1))
+    return torch.cat([angles.sin(), angles.cos()], 1).to(dtype)
+
+
+class ResidualBlock(nn.Module):
+    def __init__(self, a: int, b: int, embedding: int):
+        super().__init__()
+        self.norm1 = gn(a)
+        self.conv1 = conv(a, b, 3)
+        self.film = nn.Linear(embedding, 2 * b)
+        self.norm2 = gn(b)
+        self.conv2 = conv(b, b, 3)
+        self.skip = conv(a, b, 1) if a != b else nn.Identity()
+
+    def forward(self, x: Tensor, emb: Tensor) -> Tensor:
+        """`emb` [B*N, M]: one row per frame."""
+        h = self.conv1(F.silu(self.norm1(x)))
+        scale, shift = self.film(F.silu(emb))[:, :, None, None].chunk(2, 1)
+        h = self.conv2(F.silu(self.norm2(h) * (1 + scale) + shift))
+        return self.skip(x) + h
+
+
+class Attention(nn.Module):
+    """One head over the cells of a frame."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.norm = gn(channels)
+        self.qkv = conv(channels, 3 * channels, 1)
+        self.project = conv(channels, channels, 1)
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        q, k, v = (z.flatten(2).transpose(1, 2) for z in self.qkv(self.norm(x)).chunk(3, 1))
+        mixed = F.scaled_dot_product_attention(q, k, v)
+        return x + self.project(mixed.transpose(1, 2).reshape(x.shape))
+
+
+class TemporalAttention(Attention):
+    """The same over the frames of a cell; the norm stays frame by frame."""
+
+    def forward(self, x: Tensor, frames: int) -> Tensor:
+        # [B*N, C, h, w] to [B, h, w, N, C].
+        q, k, v = (bursts(z, frames).permute(0, 3, 4, 1, 2) for z in self.qkv(self.norm(x)).chunk(3, 1))
+        mixed = F.scaled_dot_product_attention(q, k, v)
+        return x + self.project(mixed.permute(0, 3, 4, 1, 2).flatten(0, 1))
+
+
+class Level(nn.Module):
+    """Residual blocks of one level of one side; attention j follows block j."""
+
+    def __init__(self, sizes: list[tuple[int, int]], embedding: int, attention: bool):
+        super().__init__()
+        self.blocks = nn.ModuleList(ResidualBlock(a, b, embedding) for a, b in sizes)
+        self.attention = nn.ModuleList(Attention(b) for _, b in sizes if attention)
+
+    def step(self, j: int, x: Tensor, emb: Tensor, frames: int) -> Tensor:
+        x = self.blocks[j](x, emb)
+        return self.attention[j](x, frames) if self.attention else x
+
+
+class Middle(nn.Module):
+    def __init__(self, channels: int, embedding: int, temporal: bool):
+        super().__init__()
+        self.first = ResidualBlock(channels, channels, embedding)
+        self.attention = Attention(channels)
+        self.temporal = TemporalAttention(channels) if temporal else None
+        self.second = ResidualBlock(channels, channels, embedding)
+
+    def forward(self, x: Tensor, emb: Tensor, frames: int) -> Tensor:
+        x = self.attention(self.first(x, emb), frames)
+        if self.temporal is not None:
+            x = self.temporal(x, frames)
+        return self.second(x, emb)
+
+
+class UNet(nn.Module):
+    def __init__(self, config: dict):
+        super().__init__()
+        unet, self.fold = config["unet"], config["fold"]
+        self.size = size = unet["embedding"]
+        self.time_in, self.time_out = nn.Linear(size, size), nn.Linear(size, size)
+        self.sensor_in, self.sensor_out = nn.Linear(9, size), nn.Linear(size, size)
+
+        widths = [unet["width"] * m for m in unet["multipliers"]]
+        levels, blocks = len(widths), unet["blocks"]
+        before = [widths[0], *widths[:-1]]
+        self.inp = conv(4 * self.fold**2, widths[0], 3)
+        self.merge = nn.ModuleList(
+            conv(x + fused, x, 1) for x, fused in zip(before, config["fusion"]["widths"])
+        )
+        self.encoder = nn.ModuleList(
+            Level([(a, b)] + [(b, b)] * (blocks - 1), size, k in unet["attention"])
+            for k, (a, b) in enumerate(zip(before, widths))
+        )
+        self.down = nn.ModuleList(conv(c, c, 3, stride=2) for c in widths[:-1])
+        self.middle = Middle(widths[-1], size, unet["temporal"])
+        self.decoder = nn.ModuleList(
+            Level([(2 * c, c)] * blocks, size, k in unet["attention"]) for k, c in enumerate(widths)
+        )
+        self.up = nn.ModuleDict({str(k): conv(widths[k], widths[k - 1], 3) for k in range(1, levels)})
+        self.norm = gn(widths[0])
+        self.out = conv(widths[0], self.fold**2, 3)
+
+    def embed(self, t: Tensor, sensor: Tensor) -> Tensor:
+        time = self.time_out(F.silu(self.time_in(sinusoids(t, self.size, sensor.dtype))))
+        return time + self.sensor_out(F.silu(self.sensor_in(sensor)))
+
+    def forward(
+        self,
+        x_t: Tensor,
+        x0_prev: Tensor,
+        u: Tensor,
+        d: Tensor,
+        fused: list[Tensor],
+        t: Tensor,
+        sensor: Tensor,
+        frames: int,
+    ) -> Tensor:
+        emb = self.embed(t, sensor).repeat_interleave(frames, 0)
+        x = self.inp(F.pixel_unshuffle(torch.cat([x_t, x0_prev, 2 * u - 1, 2 * d - 1], 1), self.fold))
+        skips: list[Tensor] = []
+        for k, level in enumerate(self.encoder):
+            if k < len(self.merge):
+                x = self.merge[k](torch.cat([x, fused[k]], 1))
+            for j in range(len(level.blocks)):
+                x = level.step(j, x, emb, frames)
+                skips.append(x)
+            if k < len(self.down):
+                x = self.down[k](x)
+        x = self.middle(x, emb, frames)
+        for k, level in reversed(list(enumerate(self.decoder))):
+            for j in range(len(level.blocks)):
+                x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
+            if k > 0:
+                x = self.up[str(k)](F.interpolate(x, scale_factor=2, mode="nearest"))
+        return 2 * d - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
+
+
+class Qudi(nn.Module):
+    def __init__(self, config: dict):
+        super().__init__()
+        self.pre = PreDenoiser(config)
+        self.low = Low(config)
+        self.high = High(config)
+        self.flow = Flow(config)
+        self.fusion = Fusion(config)
+        self.unet = UNet(config)
+
+    def forward(
+        self,
+        y: Tensor,
+        u: Tensor,
+        y_sim: Tensor,
+        u_sim: Tensor,
+        flag: Tensor,
+        x_t: Tensor,
+        x0_prev: Tensor,
+        t: Tensor,
+        sensor: Tensor,
+        frames: int,
+        flows: Flows | None = None,
+    ) -> tuple[Tensor, Tensor, Flows]:
+        """x0 in [-1, 1] (not clipped), d in image units, and the flows, new unless given."""
+        d, g = self.pre(y, u, y_sim, u_sim, flag)
+        low = self.low(u, u_sim, d, frames)
+        high = self.high(x_t, x0_prev, frames)
+        if flows is None:
+            flows = self.flow(d, frames)
+        fused = self.fusion(low, high, g, flows, frames)
+        return self.unet(x_t, x0_prev, u, d, fused, t, sensor, frames), d, flows
+
+
+# The loss (without the perceptual term)
+
+
+def fidelity(p: Tensor, q: Tensor, tv: float = 0.01) -> Tensor:
+    """Mean square plus tv times (mean |horizontal| + mean |vertical| forward differences of p - q)."""
+    e = p - q
+    across, down = e[..., 1:] - e[..., :-1], e[..., 1:, :] - e[..., :-1, :]
+    return (e**2).mean() + tv * (across.abs().mean() + down.abs().mean())
+
+
+def loss(x0: Tensor, d: Tensor, truth: Tensor) -> Tensor:
+    """On [0, 1]; neither estimate is clipped."""
+    return fidelity((x0 + 1) / 2, truth) + 0.2 * fidelity(d, truth)
+
+
+# The sampling loop
+
+
+def steps(count: int) -> list[tuple[int, int]]:
+    """(t, next t) of every reverse step; next t = -1 is the finished image."""
+    times = [int(t) for t in np.linspace(-1, 999, count + 1)[::-1]]
+    return list(zip(times, times[1:]))
+
+
+def coefficients(t: int, after: int, ancestral: bool) -> tuple[float, float, float]:
+    """The step is x <- c0 x0 + cx x + sigma noise; ancestral draws from q(x_after | x_t, x0)."""
+    bars = alpha_bar()
+    a, b = bars[t], bars[after] if after >= 0 else 1.0
+    if not ancestral:
+        cx = math.sqrt(1 - b) / math.sqrt(1 - a)
+        return math.sqrt(b) - cx * math.sqrt(a), cx, 0.0
+    alpha = a / b
+    sigma = math.sqrt((1 - b) / (1 - a) * (1 - alpha))
+    return math.sqrt(b) * (1 - alpha) / (1 - a), math.sqrt(alpha) * (1 - b) / (1 - a), sigma
+
+
+# configs/sensors/qudi-paper.toml: 3-bit counts.
+QE, DARK, READ, FULL_WELL, FULL_SCALE = 0.8, 1.6, 0.2, 200, 7
+
+
+def gain(ppp: float) -> float:
+    return 0.5 * FULL_SCALE / ppp
+
+
+def light(ppp: float, t: int) -> float:
+    """PPP of the simulated measurement at time t."""
+    return ppp * 10 ** (1 - t / 1000)
+
+
+def expose(rng: np.random.Generator, image: np.ndarray, ppp: float, exposure: float) -> np.ndarray:
+    """Counts of an image in [0, 1]. The gain rule makes the gain follow the light."""
+    electrons = np.minimum(rng.poisson(QE * image.astype(np.float64) * ppp / exposure + DARK), FULL_WELL)
+    volts = electrons + rng.normal(0, READ, image.shape)
+    return np.clip(np.rint(gain(ppp) * volts), 0, FULL_SCALE).astype(np.uint8)
+
+
+def linear(ppp: float, exposure: float) -> np.ndarray:
+    """Linear estimate of every count 0..7, in image units."""
+    counts = np.arange(FULL_SCALE + 1)
+    return np.clip((counts / gain(ppp) - DARK) / QE * exposure / ppp, 0, 2).astype(np.float32)
+
+
+def sensor_numbers(ppp: float, exposure: float) -> list[float]:
+    return [math.log10(ppp), exposure, QE, DARK, READ, math.log10(gain(ppp)), math.log2(FULL_SCALE + 1) / 8, 0.0, 0.0]
+
+
+def sample(
+    model: Qudi,
+    y: Tensor,
+    u: Tensor,
+    sensor: Tensor,
+    frames: int,
+    flow_steps: list[int],
+    noise: Callable[[int], Tensor],
+    measure: Callable[[int, int, Tensor], tuple[Tensor, Tensor]],
+    count: int = 10,
+    ancestral: bool = False,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """x and the clipped x0 after every step.
+
+    `noise(0)` is x_T and `noise(k)` that of step k, the first being 1; `measure(k, t, x0)` gives
+    y_sim and u_sim for step k from the estimate of step k - 1.
+    """
+    x, flows = noise(0), None
+    estimate = y_sim = u_sim = torch.zeros_like(x)
+    for k, (t, after) in enumerate(steps(count), 1):
+        if k > 1:
+            y_sim, u_sim = measure(k, t, estimate)
+        flag = torch.full((len(sensor),), float(k > 1), dtype=x.dtype)
+        time = torch.full((len(sensor),), t)
+        known = None if k in flow_steps else flows
+        x0, _, flows = model(y, u, y_sim, u_sim, flag, x, estimate, time, sensor, frames, known)
+        estimate = x0.clamp(-1, 1)
+        c0, cx, sigma = coefficients(t, after, ancestral)
+        x = c0 * estimate + cx * x
+        if sigma > 0:
+            x = x + sigma * noise(k)
+        yield x, estimate
+
+
+def main() -> None:
+    if len(sys.argv) != 3 or sys.argv[1] != "info":
+        sys.exit("usage: network.py info PRESET")
+    config = load(sys.argv[2])
+    model = Qudi(config)
+    for name, block in [*model.named_children(), ("all", model)]:
+        print(f"{name:8}{sum(p.numel() for p in block.parameters()):12,}")
+    print(f"frame sizes are multiples of {multiple(config)}")
+
+
+if __name__ == "__main__":
+    main()

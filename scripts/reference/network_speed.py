@@ -1,0 +1,141 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy", "torch"]
+# ///
+"""Time and memory of the PyTorch network on the processor, as JSON, for comparison with the Rust one.
+
+    python scripts/reference/network_speed.py small --threads 2             # one reverse step
+    python scripts/reference/network_speed.py small --backward              # and its gradients, 128x128
+    python scripts/reference/network_speed.py small --per-block
+    python scripts/reference/network_speed.py small --mode steps            # the ten-step loop
+
+Times are seconds, medians after a warm-up; `cpu` is the sum over threads (on a shared machine the
+wall clock says little, PyTorch's threads wait for each other). `loop` times the network's calls and the simulated
+measurements (NumPy) of ten steps, flows estimated at the steps of the preset. Weights are
+PyTorch's random ones. `peak_mib` is the largest resident size of the whole program;
+`base_mib` what it held before the first call, mostly PyTorch itself.
+"""
+
+import argparse
+import json
+import resource
+import statistics
+import time
+from collections.abc import Callable
+
+import network
+import numpy as np
+import torch
+from torch import Tensor
+
+PPP, EXPOSURE = 3.25, 0.45
+
+
+def peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def times(run: Callable[[], object], rounds: int, warm: int = 1) -> dict:
+    seconds, cpu = [], []
+    for i in range(warm + rounds):
+        start, cpu_start = time.perf_counter(), time.process_time()
+        run()
+        if i >= warm:
+            seconds.append(time.perf_counter() - start)
+            cpu.append(time.process_time() - cpu_start)
+    fastest = min(seconds)
+    return {"median": statistics.median(seconds), "fastest": fastest, "cpu": statistics.median(cpu), "rounds": rounds}
+
+
+def inputs(frames: int, size: int) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    shape = (frames, 1, size, size)
+    rand = lambda: torch.rand(shape, generator=generator)
+    x = {name: rand() for name in ("y", "u", "y_sim", "u_sim")}
+    x |= {"flag": torch.ones(1), "x_t": torch.randn(shape, generator=generator), "x0_prev": 2 * rand() - 1}
+    return x | {"t": torch.tensor([500]), "sensor": torch.tensor([network.sensor_numbers(PPP, EXPOSURE)])}
+
+
+def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: int) -> dict[str, dict]:
+    measured = [x[name] for name in ("y", "u", "y_sim", "u_sim", "flag")]
+    d, g = model.pre(*measured)
+    low, high = model.low(x["u"], x["u_sim"], d, frames), model.high(x["x_t"], x["x0_prev"], frames)
+    flows = model.flow(d, frames)
+    fused = model.fusion(low, high, g, flows, frames)
+    blocks = {
+        "pre": lambda: model.pre(*measured),
+        "low": lambda: model.low(x["u"], x["u_sim"], d, frames),
+        "high": lambda: model.high(x["x_t"], x["x0_prev"], frames),
+        "flow": lambda: model.flow(d, frames),
+        "fusion": lambda: model.fusion(low, high, g, flows, frames),
+        "unet": lambda: model.unet(x["x_t"], x["x0_prev"], x["u"], d, fused, x["t"], x["sensor"], frames),
+    }
+    return {name: times(run, rounds) for name, run in blocks.items()}
+
+
+def backward(model: network.Qudi, x: dict[str, Tensor], frames: int) -> None:
+    model.zero_grad()
+    x0, d, _ = model(**x, frames=frames)
+    network.loss(x0, d, x["u"]).backward()
+
+
+def loop(model: network.Qudi, x: dict[str, Tensor], frames: int, flow_steps: list[int], ancestral: bool) -> dict:
+    rng = np.random.default_rng(1)
+    generator = torch.Generator().manual_seed(2)
+    simulating = 0.0
+
+    def measure(k: int, t: int, estimate: Tensor) -> tuple[Tensor, Tensor]:
+        nonlocal simulating
+        start = time.perf_counter()
+        ppp = network.light(PPP, t)
+        counts = network.expose(rng, ((estimate + 1) / 2).numpy(), ppp, EXPOSURE)
+        y = torch.from_numpy(counts.astype(np.float32) / network.FULL_SCALE)
+        u = torch.from_numpy(network.linear(ppp, EXPOSURE)[counts])
+        simulating += time.perf_counter() - start
+        return y, u
+
+    noise = lambda k: torch.randn(x["y"].shape, generator=generator)
+    start = time.perf_counter()
+    run = network.sample(model, x["y"], x["u"], x["sensor"], frames, flow_steps, noise, measure, ancestral=ancestral)
+    steps = len(list(run))
+    return {"seconds": time.perf_counter() - start, "simulating": simulating, "steps": steps}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Times the PyTorch network.")
+    parser.add_argument("preset")
+    parser.add_argument("--mode", choices=["step", "steps"], default="step")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--size", type=int, help="256, with --backward 128")
+    parser.add_argument("--frames", type=int, default=11)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--backward", action="store_true", help="time forward and backward together")
+    parser.add_argument("--per-block", action="store_true")
+    parser.add_argument("--ancestral", action="store_true", help="sampler of --mode steps")
+    args = parser.parse_args()
+
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(0)
+    size = args.size or (128 if args.backward else 256)
+    config = network.load(args.preset)
+    model = network.Qudi(config)
+    x = inputs(args.frames, size)
+    result = {"preset": args.preset, "threads": args.threads, "size": size, "frames": args.frames}
+    result |= {"torch": torch.__version__, "parameters": sum(p.numel() for p in model.parameters())}
+    result["base_mib"] = peak_mib()
+    if args.backward:
+        result["forward_backward"] = times(lambda: backward(model, x, args.frames), args.rounds)
+    else:
+        with torch.inference_mode():
+            if args.mode == "steps":
+                result["loop"] = loop(model, x, args.frames, config["flow"]["steps"], args.ancestral)
+            elif args.per_block:
+                result["blocks"] = per_block(model, x, args.frames, args.rounds)
+            else:
+                result["forward"] = times(lambda: model(**x, frames=args.frames), args.rounds)
+    result["peak_mib"] = peak_mib()
+    print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()
