@@ -1,0 +1,185 @@
+//! Convolutions over frames, in two and three dimensions, with their gradients.
+//!
+//! Frames are folded into the batch, `[bursts * frames, channels, height, width]`; a kernel that spans
+//! several frames reads the neighbours from there. On the flex backend the work is done here, directly
+//! on the planes: a tile of all input planes is copied to scratch memory with its borders, and blocks of
+//! output channels and pixels run over all taps in registers. Against unfolding into a matrix (im2col) this
+//! copies each value once instead of once a tap, which matters with few channels. Other backends use
+//! Burn's convolutions.
+
+mod extension;
+mod geometry;
+#[cfg(feature = "flex")]
+mod micro;
+#[cfg(feature = "flex")]
+mod native;
+#[cfg(feature = "flex")]
+mod pass;
+#[cfg(feature = "flex")]
+mod run;
+#[cfg(feature = "flex")]
+mod source;
+#[cfg(feature = "flex")]
+mod weight_gradient;
+
+pub use geometry::Geometry;
+
+use crate::backend::is_native;
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+use burn::tensor::activation::relu;
+use burn::tensor::module::{conv2d, conv3d};
+use burn::tensor::ops::ConvOptions;
+use extension::{ConvBackend, INPUTS};
+
+/// What one call does besides the sum over the taps.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Step of the output's grid in rows and columns: 1 or 2.
+    pub stride: usize,
+    /// Added to the result, of its shape.
+    pub addend: Option<Tensor<4>>,
+    /// What follows.
+    pub activation: Activation,
+}
+
+/// What follows the sum.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activation {
+    /// Nothing.
+    None,
+    /// Negative values become zero.
+    Relu,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { stride: 1, addend: None, activation: Activation::None }
+    }
+}
+
+/// Convolves `inputs`, joined by channel, frame by frame.
+///
+/// # Shapes
+/// `inputs`: `[images, channels, height, width]` each; `weight`: `[outputs, channels, rows,
+/// columns]`, odd kernel; `bias`: `[outputs]`. Result: `[images, outputs, ceil(height / stride), ceil(width /
+/// stride)]`: padding is half the kernel.
+pub fn conv_2d(
+    inputs: &[Tensor<4>],
+    weight: Tensor<4>,
+    bias: Tensor<1>,
+    options: Options,
+) -> Tensor<4> {
+    let [outputs, channels, rows, columns] = weight.dims();
+    if is_native(&inputs[0]) {
+        let weight = weight.reshape([outputs, channels, 1, rows, columns]);
+        return native(inputs, weight, bias, 1, options);
+    }
+    let stride = [options.stride, options.stride];
+    let padding = [rows / 2, columns / 2];
+    let stock = ConvOptions::new(stride, padding, [1, 1], 1);
+    finish(conv2d(joined(inputs), weight, Some(bias), stock), options)
+}
+
+/// Convolves `inputs`, joined by channel, over the frames of every burst.
+///
+/// # Shapes
+/// `inputs`: `[bursts * frames, channels, height, width]` each; `weight`: `[outputs, channels,
+/// frames, rows, columns]`, odd kernel; `bias`: `[outputs]`. Result: `[bursts * frames, outputs, ceil(height /
+/// stride), ceil(width / stride)]`: padding is half the kernel, zeros past the ends of the burst.
+pub fn conv_3d(
+    inputs: &[Tensor<4>],
+    weight: Tensor<5>,
+    bias: Tensor<1>,
+    frames: usize,
+    options: Options,
+) -> Tensor<4> {
+    if is_native(&inputs[0]) {
+        return native(inputs, weight, bias, frames, options);
+    }
+    let [outputs, _, depth, rows, columns] = weight.dims();
+    let joined = joined(inputs);
+    let [images, channels, height, width] = joined.dims();
+    let bursts = joined.reshape([images / frames, frames, channels, height, width]);
+    let padding = [depth / 2, rows / 2, columns / 2];
+    let stride = [1, options.stride, options.stride];
+    let stock = ConvOptions::new(stride, padding, [1, 1, 1], 1);
+    let output = conv3d(bursts.swap_dims(1, 2), weight, Some(bias), stock); // [B, O, N, h, w]
+    let [_, _, _, height, width] = output.dims();
+    finish(output.swap_dims(1, 2).reshape([images, outputs, height, width]), options)
+}
+
+fn joined(inputs: &[Tensor<4>]) -> Tensor<4> {
+    if let [input] = inputs { input.clone() } else { Tensor::cat(inputs.to_vec(), 1) }
+}
+
+fn finish(mut output: Tensor<4>, options: Options) -> Tensor<4> {
+    if let Some(addend) = options.addend {
+        output = output + addend;
+    }
+    match options.activation {
+        Activation::None => output,
+        Activation::Relu => relu(output),
+    }
+}
+
+fn native(
+    inputs: &[Tensor<4>],
+    weight: Tensor<5>,
+    bias: Tensor<1>,
+    frames: usize,
+    options: Options,
+) -> Tensor<4> {
+    if inputs.len() > INPUTS {
+        return native(&[joined(inputs)], weight, bias, frames, options);
+    }
+    let [images, _, height, width] = inputs[0].dims();
+    let [outputs, _, depth, rows, columns] = weight.dims();
+    let geometry = Geometry {
+        images,
+        frames,
+        channels: inputs.iter().map(|input| input.dims()[1]).collect(),
+        height,
+        width,
+        outputs,
+        kernel: [depth, rows, columns],
+        stride: options.stride,
+        addend: options.addend.is_some(),
+        relu: options.activation == Activation::Relu,
+    };
+    geometry.check(inputs, &weight, &bias, options.addend.as_ref());
+    let unused = Tensor::<1>::zeros([1], &bias.device()).into_dispatch();
+    let mut list = inputs.iter().map(|input| input.clone().into_dispatch());
+    let [a, b, c, d, e]: [_; INPUTS] =
+        std::array::from_fn(|_| list.next().unwrap_or_else(|| unused.clone()));
+    let addend = options.addend.map_or(unused, Tensor::into_dispatch);
+    let (weight, bias) = (weight.into_dispatch(), bias.into_dispatch());
+    Tensor::from_dispatch(Dispatch::conv_frames(a, b, c, d, e, addend, weight, bias, geometry))
+}
+
+impl Geometry {
+    /// The loops of `native` rely on these; a wrong shape is a broken invariant of the caller, as in
+    /// Burn's own operations.
+    fn check(
+        &self,
+        inputs: &[Tensor<4>],
+        weight: &Tensor<5>,
+        bias: &Tensor<1>,
+        addend: Option<&Tensor<4>>,
+    ) {
+        for (input, &channels) in inputs.iter().zip(&self.channels) {
+            let expected = [self.images, channels, self.height, self.width];
+            assert_eq!(input.dims(), expected, "inputs of one convolution");
+        }
+        assert_eq!(weight.dims()[1], self.all_channels(), "channels of weight and inputs");
+        assert_eq!(bias.dims(), [self.outputs], "one bias for every output channel");
+        assert!(self.kernel.iter().all(|size| size % 2 == 1), "odd kernels only");
+        assert!(matches!(self.stride, 1 | 2), "stride 1 or 2");
+        assert_eq!(self.images % self.frames, 0, "whole bursts");
+        if let Some(addend) = addend {
+            let [rows, columns] = self.output_grid();
+            let expected = [self.images, self.outputs, rows, columns];
+            assert_eq!(addend.dims(), expected, "an addend of the output's shape");
+        }
+    }
+}

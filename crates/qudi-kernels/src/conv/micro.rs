@@ -1,0 +1,118 @@
+//! The innermost loops: a block of output channels times a few vectors of neighbouring pixels,
+//! kept in registers while one runs over all taps.
+//!
+//! A tap is an offset into scratch memory, so the same loops serve every kernel size, stride and
+//! direction.
+#![allow(unsafe_code)]
+
+use pulp::{Arch, Simd, WithSimd};
+
+/// Channels and vectors of a block; 12 accumulators fit the 16 registers of AVX2.
+pub(super) const WIDE: (usize, usize) = (4, 3);
+/// The same for channel counts that divide by six.
+pub(super) const TALL: (usize, usize) = (6, 2);
+
+/// Longest run of pixels of a block on this machine.
+pub(super) fn longest_run() -> usize {
+    struct Run;
+    impl WithSimd for Run {
+        type Output = usize;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, _: S) -> usize {
+            WIDE.1.max(TALL.1) * S::F32_LANES
+        }
+    }
+    Arch::new().dispatch(Run)
+}
+
+/// `sums[m][v] += sum over k of weights[k * M + m] * x[offsets[k] + v * lanes ..]`.
+///
+/// # Safety
+/// `x` must be valid for reads of `V * S::F32_LANES` values from every one of the `offsets`, and
+/// `weights` for `offsets.len() * M` values.
+#[inline(always)]
+pub(super) unsafe fn accumulate<S: Simd, const M: usize, const V: usize>(
+    simd: S,
+    x: *const f32,
+    offsets: &[u32],
+    weights: *const f32,
+    sums: &mut [[S::f32s; V]; M],
+) {
+    let mut acc = *sums;
+    let mut weight = weights;
+    for &offset in offsets {
+        // SAFETY: the caller's promise; vectors are read unaligned.
+        unsafe {
+            let at = x.add(offset as usize);
+            let mut pixels = [simd.splat_f32s(0.0); V];
+            for v in 0..V {
+                pixels[v] = at.add(v * S::F32_LANES).cast::<S::f32s>().read_unaligned();
+            }
+            for m in 0..M {
+                let factor = simd.splat_f32s(*weight.add(m));
+                for v in 0..V {
+                    acc[m][v] = simd.mul_add_e_f32s(factor, pixels[v], acc[m][v]);
+                }
+            }
+            weight = weight.add(M);
+        }
+    }
+    *sums = acc;
+}
+
+/// `sums[m][k] += sum over the pixels p < length of dy[m][p] * x[offsets[k] + p]`, lane by lane.
+///
+/// # Safety
+/// Each `dy` must be valid for `length` values and `x` for `length` values from each of the
+/// `offsets`; `length` is a multiple of the lanes.
+#[inline(always)]
+pub(super) unsafe fn correlate<S: Simd, const M: usize, const K: usize>(
+    simd: S,
+    dy: [*const f32; M],
+    x: *const f32,
+    offsets: [usize; K],
+    length: usize,
+    sums: &mut [[S::f32s; K]; M],
+) {
+    let mut acc = *sums;
+    let mut p = 0;
+    while p < length {
+        // SAFETY: the caller's promise; vectors are read unaligned.
+        unsafe {
+            let mut taps = [simd.splat_f32s(0.0); K];
+            for k in 0..K {
+                taps[k] = x.add(offsets[k] + p).cast::<S::f32s>().read_unaligned();
+            }
+            for m in 0..M {
+                let gradient = dy[m].add(p).cast::<S::f32s>().read_unaligned();
+                for k in 0..K {
+                    acc[m][k] = simd.mul_add_e_f32s(gradient, taps[k], acc[m][k]);
+                }
+            }
+        }
+        p += S::F32_LANES;
+    }
+    *sums = acc;
+}
+
+/// Writes the first `count` values of a run.
+///
+/// # Safety
+/// `to` must be valid for writes of `count` values, `count <= V * S::F32_LANES`.
+#[inline(always)]
+pub(super) unsafe fn store<S: Simd, const V: usize>(
+    run: [S::f32s; V],
+    to: *mut f32,
+    count: usize,
+) {
+    if count == V * S::F32_LANES {
+        for (v, vector) in run.into_iter().enumerate() {
+            // SAFETY: the whole run is within `count`.
+            unsafe { to.add(v * S::F32_LANES).cast::<S::f32s>().write_unaligned(vector) };
+        }
+    } else {
+        let values: &[f32] = pulp::bytemuck::cast_slice(&run);
+        // SAFETY: the caller's promise; `run` is no part of the output.
+        unsafe { std::ptr::copy_nonoverlapping(values.as_ptr(), to, count) };
+    }
+}

@@ -1,0 +1,284 @@
+//! Runs a pass: fills scratch, calls the innermost loops, writes results.
+#![allow(unsafe_code)]
+
+use super::micro::{self, TALL, WIDE};
+use super::pass::{Pass, Tiling};
+use super::source::Source;
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+use std::cell::RefCell;
+
+thread_local! {
+    /// Scratch memory of a thread, kept between calls.
+    pub(super) static SCRATCH: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
+
+/// Results of a convolution: parts joined by channel, `[images, channels, height, width]` each.
+#[derive(Clone, Debug)]
+pub(super) struct Target {
+    /// First value and channels of every part.
+    parts: Vec<(*mut f32, usize)>,
+    height: usize,
+    width: usize,
+}
+
+// SAFETY: tiles of a pass, and passes of a gradient, write to disjoint places (see `run`).
+unsafe impl Send for Target {}
+// SAFETY: as above.
+unsafe impl Sync for Target {}
+
+impl Target {
+    /// The spare capacity of `parts`, each of which holds `images * channels * height * width` values.
+    pub(super) fn new(
+        parts: &mut [(Vec<f32>, usize)],
+        images: usize,
+        height: usize,
+        width: usize,
+    ) -> Self {
+        for (part, channels) in parts.iter_mut() {
+            part.clear();
+            part.reserve_exact(images * *channels * height * width);
+        }
+        let parts = parts.iter_mut().map(|(part, channels)| (part.as_mut_ptr(), *channels));
+        Self { parts: parts.collect(), height, width }
+    }
+
+    /// First value of a plane.
+    ///
+    /// # Safety
+    /// The image must exist.
+    unsafe fn plane(&self, image: usize, mut channel: usize) -> *mut f32 {
+        for &(start, channels) in &self.parts {
+            if channel < channels {
+                let number = image * channels + channel;
+                // SAFETY: within the part's capacity, which `new` reserved.
+                return unsafe { start.add(number * self.height * self.width) };
+            }
+            channel -= channels;
+        }
+        unreachable!("no such channel")
+    }
+}
+
+/// Weights in the order of the innermost loops: `[block][plane][tap][channel of the block]`.
+#[derive(Clone, Debug)]
+pub(super) struct Packed {
+    values: Vec<f32>,
+    /// Channels of a block.
+    block: usize,
+    outputs: usize,
+}
+
+impl Packed {
+    /// `weight(output, plane, tap)` of a pass.
+    pub(super) fn new(
+        outputs: usize,
+        planes: usize,
+        taps: usize,
+        weight: impl Fn(usize, usize, usize) -> f32,
+    ) -> Self {
+        let block = if outputs.is_multiple_of(TALL.0) { TALL.0 } else { WIDE.0 };
+        let mut values = Vec::with_capacity(outputs.next_multiple_of(block) * planes * taps);
+        for first in (0..outputs).step_by(block) {
+            for plane in 0..planes {
+                for tap in 0..taps {
+                    for output in first..first + block {
+                        let inside = output < outputs;
+                        values.push(if inside { weight(output, plane, tap) } else { 0.0 });
+                    }
+                }
+            }
+        }
+        Self { values, block, outputs }
+    }
+}
+
+/// Results start from these and may be cut at zero.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Finish<'a> {
+    /// One value per output channel; zero if there is none.
+    pub(super) bias: Option<&'a [f32]>,
+    /// A value for every result, of the shape of a target of one part.
+    pub(super) addend: Option<&'a [f32]>,
+    pub(super) relu: bool,
+}
+
+/// Correlates `source` with `weights` over `images` images. Every result of the pass's grid is written
+/// once by one thread, and its sum runs in the same order whatever the tiles.
+pub(super) fn run(
+    source: Source<'_>,
+    planes: usize,
+    images: usize,
+    pass: &Pass,
+    weights: &Packed,
+    finish: Finish<'_>,
+    target: &Target,
+) {
+    let tiling = pass.tiling(planes, micro::longest_run());
+    let offsets = tiling.offsets(pass, tiling.planes);
+    let arch = Arch::new();
+    (0..images * tiling.count()).into_par_iter().for_each(|task| {
+        let (image, number) = (task / tiling.count(), task % tiling.count());
+        let (at, size) = tiling.tile(number, pass.grid);
+        SCRATCH.with_borrow_mut(|scratch| {
+            let needed = tiling.planes * tiling.plane();
+            if scratch.len() < needed {
+                scratch.resize(needed, 0.0);
+            }
+            let mut first = 0;
+            while first < planes {
+                let end = (first + tiling.planes).min(planes);
+                source.fill(image, first..end, pass, &tiling, at, scratch);
+                let tile = Tile {
+                    scratch,
+                    offsets: &offsets[..(end - first) * pass.taps.len()],
+                    planes: (first, end, planes),
+                    pass,
+                    tiling: &tiling,
+                    weights,
+                    finish,
+                    target,
+                    image,
+                    at,
+                    size,
+                };
+                arch.dispatch(tile);
+                first = end;
+            }
+        });
+    });
+}
+
+/// The work on one filled tile.
+struct Tile<'a> {
+    scratch: &'a [f32],
+    offsets: &'a [u32],
+    /// First, end and number of the planes in scratch.
+    planes: (usize, usize, usize),
+    pass: &'a Pass,
+    tiling: &'a Tiling,
+    weights: &'a Packed,
+    finish: Finish<'a>,
+    target: &'a Target,
+    image: usize,
+    at: [usize; 2],
+    size: [usize; 2],
+}
+
+impl WithSimd for Tile<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        if self.weights.block == TALL.0 {
+            self.blocks::<S, { TALL.0 }, { TALL.1 }>(simd);
+        } else {
+            self.blocks::<S, { WIDE.0 }, { WIDE.1 }>(simd);
+        }
+    }
+}
+
+impl Tile<'_> {
+    #[inline(always)]
+    fn blocks<S: Simd, const M: usize, const V: usize>(&self, simd: S) {
+        let run = V * S::F32_LANES;
+        let taps = self.pass.taps.len();
+        for first in (0..self.weights.outputs).step_by(M) {
+            let start = (first * self.planes.2 + self.planes.0 * M) * taps;
+            let weights = &self.weights.values[start..start + self.offsets.len() * M];
+            for row in 0..self.size[0] {
+                for column in (0..self.size[1]).step_by(run) {
+                    let base = self.pass.stride * row * self.tiling.row + column;
+                    let count = run.min(self.size[1] - column);
+                    let mut sums = self.start::<S, M, V>(simd, first, row, column, count);
+                    // SAFETY: a scratch row holds whole runs past the tile's last column, and the
+                    // offsets stay within the planes that were filled (`Pass::tiling`).
+                    unsafe {
+                        micro::accumulate(
+                            simd,
+                            self.scratch.as_ptr().add(base),
+                            self.offsets,
+                            weights.as_ptr(),
+                            &mut sums,
+                        );
+                    }
+                    self.write::<S, M, V>(simd, first, row, column, count, sums);
+                }
+            }
+        }
+    }
+
+    /// First value of a run of results of one channel.
+    #[inline(always)]
+    fn place(&self, channel: usize, row: usize, column: usize) -> *mut f32 {
+        let [y, x] = self.pass.place;
+        let y = y + self.pass.step * (self.at[0] + row);
+        let x = x + self.pass.step * (self.at[1] + column);
+        // SAFETY: the pass's grid lies within the target.
+        unsafe { self.target.plane(self.image, channel).add(y * self.target.width + x) }
+    }
+
+    /// The bias, or what the planes before these have added up to.
+    #[inline(always)]
+    fn start<S: Simd, const M: usize, const V: usize>(
+        &self,
+        simd: S,
+        first: usize,
+        row: usize,
+        column: usize,
+        count: usize,
+    ) -> [[S::f32s; V]; M] {
+        let mut sums = [[simd.splat_f32s(0.0); V]; M];
+        for (m, sum) in sums.iter_mut().enumerate().take(self.weights.outputs - first) {
+            if self.planes.0 > 0 {
+                let from = self.place(first + m, row, column);
+                let values: &mut [f32] = pulp::bytemuck::cast_slice_mut(sum);
+                for (p, value) in values.iter_mut().enumerate().take(count) {
+                    // SAFETY: this thread wrote it for the planes before.
+                    *value = unsafe { *from.add(p * self.pass.step) };
+                }
+            } else if let Some(bias) = self.finish.bias {
+                *sum = [simd.splat_f32s(bias[first + m]); V];
+                if let Some(addend) = self.finish.addend {
+                    let channel = self.image * self.weights.outputs + first + m;
+                    let line = channel * self.target.height + self.at[0] + row;
+                    let from = line * self.target.width + self.at[1] + column;
+                    let values: &mut [f32] = pulp::bytemuck::cast_slice_mut(sum);
+                    for (value, addend) in values.iter_mut().zip(&addend[from..from + count]) {
+                        *value += addend;
+                    }
+                }
+            }
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn write<S: Simd, const M: usize, const V: usize>(
+        &self,
+        simd: S,
+        first: usize,
+        row: usize,
+        column: usize,
+        count: usize,
+        sums: [[S::f32s; V]; M],
+    ) {
+        let cut = self.finish.relu && self.planes.1 == self.planes.2;
+        for (m, mut sum) in sums.into_iter().enumerate().take(self.weights.outputs - first) {
+            if cut {
+                sum = sum.map(|vector| simd.max_f32s(vector, simd.splat_f32s(0.0)));
+            }
+            let to = self.place(first + m, row, column);
+            if self.pass.step == 1 {
+                // SAFETY: `count` results lie next to each other from there.
+                unsafe { micro::store::<S, V>(sum, to, count) };
+            } else {
+                let values: &[f32] = pulp::bytemuck::cast_slice(&sum);
+                for (p, &value) in values.iter().enumerate().take(count) {
+                    // SAFETY: results lie `step` apart from there.
+                    unsafe { to.add(p * self.pass.step).write(value) };
+                }
+            }
+        }
+    }
+}

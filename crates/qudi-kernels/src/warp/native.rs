@@ -1,0 +1,125 @@
+//! Warping and its gradients on plain memory.
+
+use crate::uninitialised::fill;
+use rayon::prelude::*;
+
+/// Planes that share one computation of where pixels come from.
+const SHARE: usize = 8;
+
+/// Where one pixel of the result comes from.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    /// Numbers of the pixels above left, above right, below left, below right.
+    corners: [u32; 4],
+    /// Shares of the right and of the lower pixels.
+    right: f32,
+    below: f32,
+    /// Whether x and y were not clamped.
+    free: [bool; 2],
+}
+
+/// Places of all pixels; `flow` is `[2, height, width]`.
+fn places(flow: &[f32], height: usize, width: usize) -> Vec<Place> {
+    let (x_flow, y_flow) = flow.split_at(height * width);
+    let mut places = Vec::with_capacity(height * width);
+    for row in 0..height {
+        for column in 0..width {
+            let at = row * width + column;
+            let (left, x_next, right, x_free) = split(column as f32 + x_flow[at], width);
+            let (above, y_next, below, y_free) = split(row as f32 + y_flow[at], height);
+            let corner = |y: usize, x: usize| (y * width + x) as u32;
+            places.push(Place {
+                corners: [
+                    corner(above, left),
+                    corner(above, x_next),
+                    corner(y_next, left),
+                    corner(y_next, x_next),
+                ],
+                right,
+                below,
+                free: [x_free, y_free],
+            });
+        }
+    }
+    places
+}
+
+/// The two neighbours of a clamped coordinate, the share of the second, and whether it was free.
+/// A coordinate that is no number counts as the first.
+fn split(coordinate: f32, size: usize) -> (usize, usize, f32, bool) {
+    let last = (size - 1) as f32;
+    let clamped = coordinate.max(0.0).min(last);
+    let first = clamped as usize;
+    (first, (first + 1).min(size - 1), clamped - first as f32, coordinate > 0.0 && coordinate < last)
+}
+
+/// See [`warp`](super::warp).
+pub(super) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
+    let [_, channels, height, width] = shape;
+    let plane = height * width;
+    let shares = channels.div_ceil(SHARE);
+    fill(x.len(), |result| {
+        // Each task takes a few planes of one image.
+        let images = result.chunks_mut(channels * plane).zip(x.chunks(channels * plane));
+        let tasks: Vec<_> = images
+            .zip(flow.chunks(2 * plane))
+            .flat_map(|((result, x), flow)| {
+                let parts = result.chunks_mut(SHARE * plane).zip(x.chunks(SHARE * plane));
+                parts.map(move |(result, x)| (result, x, flow))
+            })
+            .collect();
+        debug_assert_eq!(tasks.len(), shape[0] * shares);
+        tasks.into_par_iter().for_each(|(result, x, flow)| {
+            let places = places(flow, height, width);
+            for (result, x) in result.chunks_mut(plane).zip(x.chunks(plane)) {
+                for (result, place) in result.iter_mut().zip(&places) {
+                    let [a, b, c, d] = place.corners.map(|corner| x[corner as usize]);
+                    let above = (b - a) * place.right + a;
+                    let below = (d - c) * place.right + c;
+                    result.write((below - above) * place.below + above);
+                }
+            }
+        });
+    })
+}
+
+/// Gradients for `x` and `flow`.
+pub(super) fn gradients(
+    shape: [usize; 4],
+    x: &[f32],
+    flow: &[f32],
+    gradient: &[f32],
+) -> (Vec<f32>, Vec<f32>) {
+    let [_, channels, height, width] = shape;
+    let plane = height * width;
+    let mut dx = vec![0.0; x.len()];
+    let mut dflow = vec![0.0; flow.len()];
+    let images = dx.par_chunks_mut(channels * plane).zip(dflow.par_chunks_mut(2 * plane));
+    let images = images.zip(x.par_chunks(channels * plane)).zip(flow.par_chunks(2 * plane));
+    images.zip(gradient.par_chunks(channels * plane)).for_each(
+        |((((dx, dflow), x), flow), gradient)| {
+            let places = places(flow, height, width);
+            let (x_flow, y_flow) = dflow.split_at_mut(plane);
+            let planes = dx.chunks_mut(plane).zip(x.chunks(plane)).zip(gradient.chunks(plane));
+            for ((dx, x), gradient) in planes {
+                for (at, (place, &gradient)) in places.iter().zip(gradient).enumerate() {
+                    let [a, b, c, d] = place.corners.map(|corner| corner as usize);
+                    let (right, below) = (place.right, place.below);
+                    dx[a] += gradient * (1.0 - right) * (1.0 - below);
+                    dx[b] += gradient * right * (1.0 - below);
+                    dx[c] += gradient * (1.0 - right) * below;
+                    dx[d] += gradient * right * below;
+                    if place.free[0] {
+                        let slope = (x[b] - x[a]) * (1.0 - below) + (x[d] - x[c]) * below;
+                        x_flow[at] += gradient * slope;
+                    }
+                    if place.free[1] {
+                        let slope = (x[c] - x[a]) * (1.0 - right) + (x[d] - x[b]) * right;
+                        y_flow[at] += gradient * slope;
+                    }
+                }
+            }
+        },
+    );
+    (dx, dflow)
+}
