@@ -7,6 +7,7 @@
 //! copies each value once instead of once a tap, which matters with few channels. Other backends use
 //! Burn's convolutions.
 
+#[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
 mod geometry;
 #[cfg(feature = "flex")]

@@ -1,6 +1,7 @@
 //! Group normalisation (Wu and He 2018) with weights that may differ between images, and SiLU, in one
 //! pass each way.
 
+#[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
 #[cfg(feature = "flex")]
 mod native;

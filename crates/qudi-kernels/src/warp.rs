@@ -1,5 +1,6 @@
 //! Backward warping by optical flow.
 
+#[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
 #[cfg(feature = "flex")]
 mod native;

@@ -100,11 +100,7 @@ pub(super) unsafe fn correlate<S: Simd, const M: usize, const K: usize>(
 /// # Safety
 /// `to` must be valid for writes of `count` values, `count <= V * S::F32_LANES`.
 #[inline(always)]
-pub(super) unsafe fn store<S: Simd, const V: usize>(
-    run: [S::f32s; V],
-    to: *mut f32,
-    count: usize,
-) {
+pub(super) unsafe fn store<S: Simd, const V: usize>(run: [S::f32s; V], to: *mut f32, count: usize) {
     if count == V * S::F32_LANES {
         for (v, vector) in run.into_iter().enumerate() {
             // SAFETY: the whole run is within `count`.

@@ -69,8 +69,7 @@ mod flex {
             let shape = x.shape().dims::<4>();
             let rows = weight.shape().dims::<2>();
             let (weight, bias) = (values(&weight), values(&bias));
-            let sums =
-                native::gradients(shape, norm, values(&x), weight, bias, values(&gradient));
+            let sums = native::gradients(shape, norm, values(&x), weight, bias, values(&gradient));
             [tensor(sums.x, shape), tensor(sums.weight, rows), tensor(sums.bias, rows)]
         }
     }

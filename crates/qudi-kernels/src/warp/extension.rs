@@ -43,7 +43,11 @@ mod flex {
     }
 
     impl WarpGradients for Flex {
-        fn warp_gradients(x: FlexTensor, flow: FlexTensor, gradient: FlexTensor) -> [FlexTensor; 2] {
+        fn warp_gradients(
+            x: FlexTensor,
+            flow: FlexTensor,
+            gradient: FlexTensor,
+        ) -> [FlexTensor; 2] {
             let (x, flow, gradient) = (contiguous(x), contiguous(flow), contiguous(gradient));
             let shape = x.shape().dims::<4>();
             let (dx, dflow) =

@@ -50,7 +50,12 @@ fn split(coordinate: f32, size: usize) -> (usize, usize, f32, bool) {
     let last = (size - 1) as f32;
     let clamped = coordinate.max(0.0).min(last);
     let first = clamped as usize;
-    (first, (first + 1).min(size - 1), clamped - first as f32, coordinate > 0.0 && coordinate < last)
+    (
+        first,
+        (first + 1).min(size - 1),
+        clamped - first as f32,
+        coordinate > 0.0 && coordinate < last,
+    )
 }
 
 /// See [`warp`](super::warp).
