@@ -387,7 +387,7 @@ class UNet(nn.Module):
         self.decoder = nn.ModuleList(
             Level([(2 * c, c)] * blocks, size, k in unet["attention"]) for k, c in enumerate(widths)
         )
-        self.up = nn.ModuleDict({str(k): conv(widths[k], widths[k - 1], 3) for k in range(1, levels)})
+        self.up = nn.ModuleList(conv(widths[k], widths[k - 1], 3) for k in range(1, levels))
         self.norm = gn(widths[0])
         self.out = conv(widths[0], self.fold**2, 3)
 
@@ -422,7 +422,7 @@ class UNet(nn.Module):
             for j in range(len(level.blocks)):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
-                x = self.up[str(k)](F.interpolate(x, scale_factor=2, mode="nearest"))
+                x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
         return 2 * d - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
 
 

@@ -1,9 +1,15 @@
 //! Quanta Diffusion on Burn: from photon counts to clean video.
 //!
-//! The network follows in the order of the data; so far there are its two ends: counts become
-//! tensors ([`tensor`]), and the diffusion's noise follows a [`schedule`]. The device a tensor
-//! lives on decides the backend; this crate chooses none.
+//! In the order of the data: counts become tensors ([`tensor`]); the [`network`], whose sizes are a
+//! [`config`], predicts clean frames from them and from a noisy image. The device a tensor lives on decides
+//! the backend; this crate chooses none.
 #![warn(missing_docs)]
 
+pub mod config;
+mod error;
+pub mod network;
+pub mod objective;
 pub mod schedule;
 pub mod tensor;
+
+pub use error::{ModelError, Result};

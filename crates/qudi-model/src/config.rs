@@ -1,0 +1,192 @@
+//! Sizes of the network, read from TOML; the presets.
+
+use crate::error::{ModelError, Result};
+use serde::{Deserialize, Serialize};
+
+/// Sizes of the whole network (docs/network.md).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NetworkConfig {
+    /// Pixels of a side that become channels before the network and pixels again after it.
+    pub fold: usize,
+    /// Pre-denoiser.
+    pub pre: PreConfig,
+    /// Spatio-temporal features.
+    pub features: FeaturesConfig,
+    /// Optical flow.
+    pub flow: FlowConfig,
+    /// Temporal fusion.
+    pub fusion: FusionConfig,
+    /// U-Net.
+    pub unet: UNetConfig,
+}
+
+/// Sizes of the pre-denoiser.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PreConfig {
+    /// Channels.
+    pub width: usize,
+    /// Residual dense blocks.
+    pub blocks: usize,
+    /// Channels that each layer of a block adds.
+    pub growth: usize,
+}
+
+/// Channels of the spatio-temporal features on three levels.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FeaturesConfig {
+    /// Of the measurements.
+    pub low: [usize; 3],
+    /// Of the noisy image.
+    pub high: [usize; 3],
+}
+
+/// Sizes of the flow network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FlowConfig {
+    /// Pixels of a side of one cell of the finest flow.
+    pub scale: usize,
+    /// Levels of the pyramid.
+    pub levels: usize,
+    /// Channels of the layers of a level's network but the last.
+    pub widths: [usize; 4],
+    /// Reverse steps, from 1, that estimate the flow anew; others keep the last one.
+    pub steps: Vec<usize>,
+}
+
+/// Sizes of the fusion.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FusionConfig {
+    /// Level of the recurrent state.
+    pub level: usize,
+    /// Channels of the fused features on three levels.
+    pub widths: [usize; 3],
+    /// Channels that each layer of the recurrent cell adds.
+    pub growth: usize,
+}
+
+/// Sizes of the U-Net.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UNetConfig {
+    /// Channels of the first level.
+    pub width: usize,
+    /// Channels of every level in terms of `width`.
+    pub multipliers: Vec<usize>,
+    /// Residual blocks of a level, in the encoder and in the decoder.
+    pub blocks: usize,
+    /// Levels with attention besides the middle.
+    pub attention: Vec<usize>,
+    /// Whether the middle also attends over the frames of every cell.
+    pub temporal: bool,
+    /// Size of the embedding of time and sensor.
+    pub embedding: usize,
+}
+
+/// A preset's file.
+#[derive(Deserialize)]
+struct Document {
+    network: NetworkConfig,
+}
+
+/// Names and texts of the presets, smallest first.
+pub const PRESETS: &[(&str, &str)] = &[
+    ("tiny", include_str!("../../../configs/tiny.toml")),
+    ("small", include_str!("../../../configs/small.toml")),
+    ("base", include_str!("../../../configs/base.toml")),
+    ("paper", include_str!("../../../configs/paper.toml")),
+];
+
+impl NetworkConfig {
+    /// A preset by name.
+    ///
+    /// # Errors
+    /// [`ModelError::Preset`] if there is none of that name.
+    pub fn preset(name: &str) -> Result<Self> {
+        let (_, text) = PRESETS
+            .iter()
+            .find(|preset| preset.0 == name)
+            .ok_or_else(|| ModelError::Preset(name.into()))?;
+        let document: Document = toml::from_str(text)
+            .map_err(|e| ModelError::Config { key: "network".into(), problem: e.to_string() })?;
+        document.network.checked()
+    }
+
+    /// Height and width of the frames are multiples of this.
+    pub fn multiple(&self) -> usize {
+        let network = self.fold << (self.unet.multipliers.len().max(3) - 1);
+        network.max(self.flow.scale << (self.flow.levels - 1))
+    }
+
+    /// The sizes, if a network can be built from them.
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] with the key that is wrong. Sizes come from weight files, too: nothing may be
+    /// allocated from them before this.
+    pub fn checked(self) -> Result<Self> {
+        let levels = self.unet.multipliers.len();
+        let widths = |widths: &[usize]| widths.iter().all(|&width| (1..=4096).contains(&width));
+        let channels = self.unet.multipliers.iter().map(|m| m.saturating_mul(self.unet.width));
+        let rules = [
+            ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
+            ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
+            ("pre.blocks", (1..=64).contains(&self.pre.blocks), "must be from 1 to 64"),
+            ("features", widths(&[self.features.low, self.features.high].concat()), SIZES),
+            ("flow.scale", matches!(self.flow.scale, 1 | 2 | 4 | 8), "must be 1, 2, 4 or 8"),
+            ("flow.levels", (1..=6).contains(&self.flow.levels), "must be from 1 to 6"),
+            ("flow.widths", widths(&self.flow.widths), SIZES),
+            ("flow.steps", self.flow.steps.contains(&1), "must contain the first step, 1"),
+            ("fusion.level", self.fusion.level < 3, "must be 0, 1 or 2"),
+            ("fusion.widths", widths(&self.fusion.widths), SIZES),
+            ("fusion.growth", widths(&[self.fusion.growth]), SIZES),
+            ("unet.multipliers", (1..=6).contains(&levels), "must be one to six numbers"),
+            ("unet.width", channels.into_iter().all(|width| widths(&[width])), SIZES),
+            ("unet.blocks", (1..=16).contains(&self.unet.blocks), "must be from 1 to 16"),
+            (
+                "unet.attention",
+                self.unet.attention.iter().all(|&level| level < levels),
+                "must name levels of the network, from 0",
+            ),
+            (
+                "unet.embedding",
+                (4..=4096).contains(&self.unet.embedding) && self.unet.embedding.is_multiple_of(2),
+                "must be an even number from 4 to 4096",
+            ),
+        ];
+        for (key, good, problem) in rules {
+            if !good {
+                return Err(ModelError::Config { key: key.into(), problem: problem.into() });
+            }
+        }
+        Ok(self)
+    }
+}
+
+const SIZES: &str = "must be from 1 to 4096";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_read_and_good() {
+        let multiples: Vec<usize> = PRESETS
+            .iter()
+            .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
+            .collect();
+        assert_eq!(multiples, [8, 16, 16, 16]);
+    }
+
+    #[test]
+    fn wrong_sizes_name_their_key() {
+        let mut config = NetworkConfig::preset("tiny").unwrap();
+        config.unet.embedding = 7;
+        let error = config.checked().unwrap_err();
+        assert!(error.to_string().contains("unet.embedding"), "{error}");
+        assert!(NetworkConfig::preset("huge").unwrap_err().to_string().contains("huge"));
+    }
+}

@@ -1,0 +1,24 @@
+//! The network: photon counts and the noisy image in, the clean image out (docs/network.md).
+
+mod attention;
+mod embedding;
+mod features;
+mod flow;
+mod fusion;
+#[cfg(test)]
+mod golden_tests;
+mod layers;
+mod pre;
+mod qudi;
+mod resample;
+mod unet;
+mod weights;
+
+pub use embedding::SENSOR_NUMBERS;
+pub use features::{HighFeatures, LowFeatures, Pyramid};
+pub use flow::{Flow, Flows};
+pub use fusion::Fusion;
+pub use pre::PreDenoiser;
+pub use qudi::{Measured, Prediction, Prepared, Qudi, Simulated, State};
+pub use unet::UNet;
+pub use weights::{fill, parameters};

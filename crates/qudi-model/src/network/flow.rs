@@ -1,0 +1,132 @@
+//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017).
+
+use super::layers::{Bias, Conv2d};
+use super::resample::{double, halve, rescale_flow, shrink};
+use crate::config::FlowConfig;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_kernels::warp;
+
+/// Flows of every frame to its neighbours, `[bursts * frames, 2, height / scale, width / scale]`, x before y, in
+/// cells of their grid; zero past the ends of a burst.
+#[derive(Clone, Debug)]
+pub struct Flows {
+    /// `warp(x[i + 1], to_next[i])` resembles `x[i]`.
+    pub to_next: Tensor<4>,
+    /// `warp(x[i - 1], to_prev[i])` resembles `x[i]`.
+    pub to_prev: Tensor<4>,
+    /// Pixels of a side of a cell.
+    pub scale: usize,
+}
+
+/// The network of one pyramid level.
+#[derive(Module, Debug)]
+struct Level {
+    layers: Vec<Conv2d>,
+}
+
+/// See the module.
+#[derive(Module, Debug)]
+pub struct Flow {
+    /// Finest first.
+    levels: Vec<Level>,
+    scale: usize,
+}
+
+impl FlowConfig {
+    /// The flow network, weights zero.
+    pub fn init(&self, device: &Device) -> Flow {
+        let [a, b, c, d] = self.widths;
+        let sizes = [[4, a], [a, b], [b, c], [c, d], [d, 2]];
+        let layer = |sizes| Conv2d::zeros(sizes, 7, Bias::Yes, device);
+        let level = |_| Level { layers: sizes.map(layer).into() };
+        Flow { levels: (0..self.levels).map(level).collect(), scale: self.scale }
+    }
+}
+
+impl Flow {
+    /// Flows between the pre-denoised frames `d`, `[bursts * frames, 1, height, width]`.
+    pub fn forward(&self, d: Tensor<4>, frames: usize) -> Flows {
+        let [images, _, height, width] = d.dims();
+        let finest = shrink(d, self.scale);
+        let grid = [height / self.scale, width / self.scale];
+        if frames < 2 {
+            let none = Tensor::zeros([images, 2, grid[0], grid[1]], &finest.device());
+            return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
+        }
+        // Both directions of every pair of neighbours at once.
+        let mut references = both(finest, frames);
+        let mut pyramid = Vec::with_capacity(self.levels.len());
+        for _ in 1..self.levels.len() {
+            let coarser = (halve(references.0.clone()), halve(references.1.clone()));
+            pyramid.push(std::mem::replace(&mut references, coarser));
+        }
+        pyramid.push(references);
+        let mut flow: Option<Tensor<4>> = None;
+        for (level, (reference, neighbour)) in self.levels.iter().zip(pyramid).rev() {
+            flow = Some(level.refine(reference, neighbour, flow));
+        }
+        let flow = flow.expect("at least one level");
+        let pairs = images / frames * (frames - 1);
+        let part = |first| spread(flow.clone().narrow(0, first, pairs), frames - 1);
+        let pad = |flow: Tensor<5>, before: usize| {
+            let [bursts, _, _, h, w] = flow.dims();
+            let none = Tensor::zeros([bursts, 1, 2, h, w], &flow.device());
+            let list = if before == 1 { vec![none, flow] } else { vec![flow, none] };
+            Tensor::cat(list, 1).reshape([images, 2, h, w])
+        };
+        Flows { to_next: pad(part(0), 0), to_prev: pad(part(pairs), 1), scale: self.scale }
+    }
+}
+
+impl Level {
+    /// The flow on this level's grid from that of the next coarser one.
+    fn refine(
+        &self,
+        reference: Tensor<4>,
+        neighbour: Tensor<4>,
+        coarse: Option<Tensor<4>>,
+    ) -> Tensor<4> {
+        let [pairs, _, h, w] = reference.dims();
+        let (flow, warped) = match coarse {
+            None => (Tensor::zeros([pairs, 2, h, w], &reference.device()), neighbour),
+            Some(coarse) => {
+                let flow = double(coarse) * 2.0;
+                (flow.clone(), warp(neighbour, flow))
+            }
+        };
+        let (last, first) = self.layers.split_last().expect("five layers");
+        let mut inputs = vec![reference, warped, flow.clone()];
+        for layer in first {
+            inputs = vec![layer.relu(&inputs)];
+        }
+        last.add(&inputs, flow)
+    }
+}
+
+impl Flows {
+    /// The same flows on a grid of another scale.
+    #[must_use]
+    pub fn at(&self, scale: usize) -> Self {
+        let to = |flow: &Tensor<4>| rescale_flow(flow.clone(), self.scale, scale);
+        Self { to_next: to(&self.to_next), to_prev: to(&self.to_prev), scale }
+    }
+}
+
+/// `[bursts * frames, c, h, w]` as `[bursts, frames, c, h, w]`.
+fn spread(x: Tensor<4>, frames: usize) -> Tensor<5> {
+    let [images, c, h, w] = x.dims();
+    x.reshape([images / frames, frames, c, h, w])
+}
+
+/// References and neighbours: first every frame but the last with the next one, then every frame but the first
+/// with the one before.
+fn both(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
+    let [images, c, h, w] = x.dims();
+    let pairs = images / frames * (frames - 1);
+    let part =
+        |first| spread(x.clone(), frames).narrow(1, first, frames - 1).reshape([pairs, c, h, w]);
+    let (early, late) = (part(0), part(1));
+    let references = Tensor::cat(vec![early.clone(), late.clone()], 0);
+    (references, Tensor::cat(vec![late, early], 0))
+}

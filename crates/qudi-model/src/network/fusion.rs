@@ -1,0 +1,159 @@
+//! Temporal fusion: aligned neighbours on the fine levels, a bidirectional recurrence on a coarser one.
+
+use super::features::Pyramid;
+use super::flow::Flows;
+use super::layers::{Bias, Conv2d};
+use super::pre::DenseBlock;
+use super::resample::halve;
+use crate::config::{FeaturesConfig, FusionConfig};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_kernels::warp;
+
+/// The recurrent cell; its weights serve both directions.
+#[derive(Module, Debug)]
+struct Cell {
+    join: Conv2d,
+    block: DenseBlock,
+    leave: Conv2d,
+}
+
+/// See the module.
+#[derive(Module, Debug)]
+pub struct Fusion {
+    enter: Vec<Conv2d>,
+    align: Vec<Conv2d>,
+    cell: Cell,
+    /// Scale of level 0.
+    fold: usize,
+}
+
+impl FusionConfig {
+    /// The fusion of features of these widths and of `pre` features of the pre-denoiser, weights zero.
+    pub fn init(
+        &self,
+        features: &FeaturesConfig,
+        pre: usize,
+        fold: usize,
+        device: &Device,
+    ) -> Fusion {
+        let conv = |sizes, kernel| Conv2d::zeros(sizes, kernel, Bias::Yes, device);
+        let enter = |k: usize| {
+            let before = match k {
+                0 => pre,
+                k if k > self.level => self.widths[k - 1],
+                _ => 0,
+            };
+            conv([features.low[k] + features.high[k] + before, self.widths[k]], 1)
+        };
+        let align = |k: usize| conv([3 * self.widths[k], self.widths[k]], 3);
+        let width = self.widths[self.level];
+        Fusion {
+            enter: (0..3).map(enter).collect(),
+            align: (0..self.level).map(align).collect(),
+            cell: Cell {
+                join: conv([2 * width, width], 1),
+                block: DenseBlock::zeros(width, self.growth, device),
+                leave: conv([3 * width, width], 1),
+            },
+            fold,
+        }
+    }
+}
+
+impl Fusion {
+    /// Fused features on three levels from those of measurements, noisy image and pre-denoiser (level 0).
+    pub fn forward(
+        &self,
+        low: Pyramid,
+        high: Pyramid,
+        pre: Tensor<4>,
+        flows: &Flows,
+        frames: usize,
+    ) -> Pyramid {
+        let level = self.align.len();
+        let mut fused: Vec<Tensor<4>> = Vec::with_capacity(3);
+        for (k, (low, high)) in low.into_iter().zip(high).enumerate() {
+            let mut inputs = vec![low, high];
+            if k == 0 {
+                inputs.push(pre.clone());
+            }
+            if k > level {
+                inputs.push(halve(fused[k - 1].clone()));
+            }
+            let x = self.enter[k].relu(&inputs);
+            fused.push(if k > level {
+                x
+            } else {
+                let flows = flows.at(self.fold << k);
+                if k < level {
+                    self.aligned(k, x, &flows, frames)
+                } else {
+                    self.cell.forward(x, &flows, frames)
+                }
+            });
+        }
+        fused.try_into().expect("three levels")
+    }
+
+    /// Every frame with its warped neighbours.
+    fn aligned(&self, k: usize, x: Tensor<4>, flows: &Flows, frames: usize) -> Tensor<4> {
+        // Past the ends the flow is zero and the neighbour the frame itself: warping changes nothing there.
+        let next = warp(shifted(x.clone(), frames, true), flows.to_next.clone());
+        let prev = warp(shifted(x.clone(), frames, false), flows.to_prev.clone());
+        self.align[k].relu(&[x, next, prev])
+    }
+}
+
+/// The next frame of every frame, or the one before; at the ends the frame itself.
+fn shifted(x: Tensor<4>, frames: usize, next: bool) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let x = x.reshape([images / frames, frames, c, h, w]);
+    let part = |first, count| x.clone().narrow(1, first, count);
+    let parts = if next {
+        vec![part(1, frames - 1), part(frames - 1, 1)]
+    } else {
+        vec![part(0, 1), part(0, frames - 1)]
+    };
+    Tensor::cat(parts, 1).reshape([images, c, h, w])
+}
+
+impl Cell {
+    fn forward(&self, x: Tensor<4>, flows: &Flows, frames: usize) -> Tensor<4> {
+        let [images, c, h, w] = x.dims();
+        let bursts = images / frames;
+        let by_frame = |x: &Tensor<4>| {
+            let [_, c, h, w] = x.dims();
+            x.clone().reshape([bursts, frames, c, h, w])
+        };
+        let (inputs, to_next, to_prev) =
+            (by_frame(&x), by_frame(&flows.to_next), by_frame(&flows.to_prev));
+        let frame = |x: &Tensor<5>, i: usize| {
+            let [bursts, _, c, h, w] = x.dims();
+            x.clone().narrow(1, i, 1).reshape([bursts, c, h, w])
+        };
+        // Both sweeps run at once: frame i forward beside frame N - 1 - i backward.
+        let mut state: Option<Tensor<4>> = None;
+        let (mut forward, mut backward) = (Vec::new(), Vec::new());
+        for i in 0..frames {
+            let j = frames - 1 - i;
+            let input = Tensor::cat(vec![frame(&inputs, i), frame(&inputs, j)], 0);
+            let warped = match state {
+                None => input.zeros_like(),
+                Some(state) => {
+                    let flow = Tensor::cat(vec![frame(&to_prev, i), frame(&to_next, j)], 0);
+                    warp(state, flow)
+                }
+            };
+            let h = self.block.forward(self.join.relu(&[input, warped]));
+            forward.push(h.clone().narrow(0, 0, bursts));
+            backward.push(h.clone().narrow(0, bursts, bursts));
+            state = Some(h);
+        }
+        backward.reverse();
+        let joined = |list: Vec<Tensor<4>>| {
+            Tensor::stack::<5>(list, 1).reshape([images, c, h, w]) // [B, N, ..] to [B * N, ..]
+        };
+        self.leave.relu(&[joined(forward), joined(backward), x])
+    }
+}

@@ -1,0 +1,324 @@
+//! Every block, and the whole network, against PyTorch, forward and backward, on both CPU backends.
+#![allow(clippy::unwrap_used)]
+
+#[path = "../../../../tests/golden/cases.rs"]
+mod cases;
+
+use super::attention::Attention;
+use super::flow::Flows;
+use super::pre::DenseBlock;
+use super::unet::ResidualBlock;
+use super::{Measured, Pyramid, Simulated, State, fill, resample};
+use crate::config::NetworkConfig;
+use crate::objective::reconstruction;
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::tensor::activation::silu;
+use burn::tensor::{Device, Gradients, Tensor};
+use cases::{Case, File, parameter};
+
+fn devices() -> [Device; 2] {
+    #[allow(deprecated)] // asked for by name
+    let ndarray = Device::ndarray();
+    [Device::flex().autodiff(), ndarray.autodiff()]
+}
+
+/// The large cases: minutes on ndarray.
+fn flex() -> Device {
+    Device::flex().autodiff()
+}
+
+fn config(case: &Case<'_>) -> NetworkConfig {
+    let config: NetworkConfig = serde_json::from_value(case.about["config"].clone()).unwrap();
+    config.checked().unwrap()
+}
+
+/// The module with the reference's weights.
+fn weighted<M: Module>(module: M, prefix: &str) -> M {
+    fill(module, |name, shape| parameter(&format!("{prefix}.{name}"), shape))
+}
+
+/// Compares the gradients of all parameters; none may be missing.
+struct Compare<'a> {
+    case: &'a Case<'a>,
+    grads: &'a Gradients,
+    path: Vec<String>,
+}
+
+impl ModuleVisitor for Compare<'_> {
+    fn enter_module(&mut self, name: &str, _container: &str) {
+        self.path.push(name.into());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let name = self.path.join(".");
+        let grad = param.val().grad(self.grads).unwrap_or_else(|| panic!("{name}: no gradient"));
+        self.case.check_gradient(&name, grad);
+    }
+}
+
+fn compare<M: Module>(case: &Case<'_>, grads: &Gradients, module: &M, prefix: &str) {
+    let path = if prefix.is_empty() { vec![] } else { vec![prefix.to_string()] };
+    module.visit(&mut Compare { case, grads, path });
+}
+
+/// Checks outputs, then gradients of the sum of outputs times cotangents.
+fn check<M: Module>(
+    case: &Case<'_>,
+    outputs: &[(&str, Tensor<4>)],
+    inputs: &[(&str, &Tensor<4>)],
+    module: &M,
+    prefix: &str,
+) {
+    let mut sum = None;
+    for (name, output) in outputs {
+        case.check_output(name, output.clone().inner());
+        let part = (output.clone() * case.cotangent(name, &output.device())).sum();
+        sum = Some(sum.map_or_else(|| part.clone(), |sum| sum + part.clone()));
+    }
+    let grads = sum.unwrap().backward();
+    for (name, input) in inputs {
+        case.check_gradient(name, input.grad(&grads).unwrap());
+    }
+    compare(case, &grads, module, prefix);
+}
+
+#[test]
+fn resampling() {
+    let file = File::open("resample");
+    for device in devices() {
+        for case in file.cases() {
+            let x: Tensor<4> = case.input("x", &device).require_grad();
+            let y = match case.name {
+                "up2" => resample::double(x.clone()),
+                "pool2" => resample::halve(x.clone()),
+                "repeat2" => resample::repeat(x.clone()),
+                "fold" => resample::fold(x.clone(), 2),
+                "unfold" => resample::unfold(x.clone(), 2),
+                "flow_4_1" => resample::rescale_flow(x.clone(), 4, 1),
+                "flow_2_8" => resample::rescale_flow(x.clone(), 2, 8),
+                other => panic!("unknown case {other}"),
+            };
+            case.check_output("y", y.clone().inner());
+            let grads = (y * case.cotangent("y", &device)).sum().backward();
+            case.check_gradient("x", x.grad(&grads).unwrap());
+        }
+    }
+}
+
+#[test]
+fn small_blocks() {
+    let file = File::open("blocks");
+    for device in devices() {
+        let input = |case: &Case<'_>| -> Tensor<4> { case.input("x", &device).require_grad() };
+        let case = file.case("dense");
+        let block = weighted(DenseBlock::zeros(6, 4, &device), "dense");
+        let x = input(&case);
+        check(&case, &[("y", block.forward(x.clone()))], &[("x", &x)], &block, "dense");
+        for name in ["residual_12_12", "residual_12_20"] {
+            let case = file.case(name);
+            let sizes = [case.number("from"), case.number("to")];
+            let block = ResidualBlock::zeros(sizes, case.number("embedding"), &device);
+            let block = weighted(block, "residual");
+            let x = input(&case);
+            let embedding: Tensor<2> = case.input("emb", &device).require_grad();
+            let y = block.forward(x.clone(), silu(embedding.clone()));
+            let grads = (y.clone() * case.cotangent("y", &device)).sum().backward();
+            case.check_gradient("emb", embedding.grad(&grads).unwrap());
+            let y = block.forward(x.clone(), silu(embedding.clone()));
+            check(&case, &[("y", y)], &[("x", &x)], &block, "residual");
+        }
+        let case = file.case("attention");
+        let block = weighted(Attention::zeros(12, &device), "attention");
+        let x = input(&case);
+        check(&case, &[("y", block.spatial(x.clone()))], &[("x", &x)], &block, "attention");
+        let case = file.case("temporal");
+        let block = weighted(Attention::zeros(12, &device), "temporal");
+        let x = input(&case);
+        let y = block.temporal(x.clone(), case.number("frames"));
+        check(&case, &[("y", y)], &[("x", &x)], &block, "temporal");
+    }
+    let case = file.case("sinusoids");
+    let times: Vec<usize> = case.values("t").iter().map(|&t| t as usize).collect();
+    case.close("output.y", &super::embedding::sinusoids(&times, case.number("size")), 1e-6);
+}
+
+#[test]
+fn pre_denoiser() {
+    let file = File::open("pre");
+    for device in devices() {
+        for case in file.cases() {
+            let config = config(&case);
+            let pre = weighted(config.pre.init(config.fold, &device), "pre");
+            let [y, u, y_sim, u_sim] = ["y", "u", "y_sim", "u_sim"]
+                .map(|name| -> Tensor<4> { case.input(name, &device).require_grad() });
+            let frames = y.dims()[0] / 2;
+            let flag: Tensor<1> = case.input("flag", &device);
+            let flag = flag.reshape([2, 1, 1, 1]).repeat_dim(1, frames);
+            let flag = flag.reshape([2 * frames, 1, 1, 1]);
+            let both = Tensor::cat(vec![y_sim.clone(), u_sim.clone()], 1);
+            let prepared = pre.prepare(y.clone(), u.clone());
+            let (d, g) = pre.forward(prepared, u.clone(), both, flag);
+            let mut inputs = vec![("y", &y), ("u", &u)];
+            if case.name != "without" {
+                inputs.extend([("y_sim", &y_sim), ("u_sim", &u_sim)]);
+            }
+            check(&case, &[("d", d), ("g", g)], &inputs, &pre, "pre");
+        }
+    }
+}
+
+fn pyramid(name: &str, levels: Pyramid) -> Vec<(String, Tensor<4>)> {
+    (0..).zip(levels).map(|(k, level)| (format!("{name}_{k}"), level)).collect()
+}
+
+fn named(list: &[(String, Tensor<4>)]) -> Vec<(&str, Tensor<4>)> {
+    list.iter().map(|(name, tensor)| (name.as_str(), tensor.clone())).collect()
+}
+
+#[test]
+fn features() {
+    let file = File::open("features");
+    for device in devices() {
+        let input =
+            |case: &Case<'_>, name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
+        let case = file.case("low");
+        let (sizes, frames) = (config(&case), case.number("frames"));
+        let low = weighted(sizes.features.init_low(sizes.fold, &device), "low");
+        let [u, u_sim, d] = ["u", "u_sim", "d"].map(|name| input(&case, name));
+        let prepared = low.prepare(u.clone(), frames);
+        let levels = pyramid("low", low.forward(prepared, u_sim.clone(), d.clone(), frames));
+        let inputs = [("u", &u), ("u_sim", &u_sim), ("d", &d)];
+        check(&case, &named(&levels), &inputs, &low, "low");
+        let case = file.case("high");
+        let high = weighted(sizes.features.init_high(sizes.fold, &device), "high");
+        let [x_t, x0_prev] = ["x_t", "x0_prev"].map(|name| input(&case, name));
+        let levels = pyramid("high", high.forward(x_t.clone(), x0_prev.clone(), frames));
+        check(&case, &named(&levels), &[("x_t", &x_t), ("x0_prev", &x0_prev)], &high, "high");
+    }
+}
+
+#[test]
+fn flow() {
+    let file = File::open("flow");
+    for device in devices() {
+        for case in file.cases() {
+            let flow = weighted(config(&case).flow.init(&device), "flow");
+            let d: Tensor<4> = case.input("d", &device).require_grad();
+            let flows = flow.forward(d.clone(), case.number("frames"));
+            let outputs = [("to_next", flows.to_next), ("to_prev", flows.to_prev)];
+            check(&case, &outputs, &[("d", &d)], &flow, "flow");
+        }
+    }
+}
+
+#[test]
+fn fusion() {
+    let file = File::open("fusion");
+    for device in devices() {
+        for case in file.cases() {
+            let sizes = config(&case);
+            let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
+            let fusion = sizes.fusion.init(&sizes.features, sizes.pre.width, sizes.fold, &device);
+            let fusion = weighted(fusion, "fusion");
+            let low = ["low_0", "low_1", "low_2"].map(input);
+            let high = ["high_0", "high_1", "high_2"].map(input);
+            let [g, to_next, to_prev] = ["g", "to_next", "to_prev"].map(input);
+            let scale = sizes.flow.scale;
+            let flows = Flows { to_next: to_next.clone(), to_prev: to_prev.clone(), scale };
+            let frames = case.number("frames");
+            let fused = fusion.forward(low.clone(), high.clone(), g.clone(), &flows, frames);
+            let outputs = pyramid("fused", fused);
+            let inputs = [
+                ("low_0", &low[0]),
+                ("low_1", &low[1]),
+                ("low_2", &low[2]),
+                ("high_0", &high[0]),
+                ("high_1", &high[1]),
+                ("high_2", &high[2]),
+                ("g", &g),
+                ("to_next", &to_next),
+                ("to_prev", &to_prev),
+            ];
+            check(&case, &named(&outputs), &inputs, &fusion, "fusion");
+        }
+    }
+}
+
+#[test]
+fn u_net() {
+    let file = File::open("unet");
+    for device in [flex()] {
+        for case in file.cases() {
+            let sizes = config(&case);
+            let unet = weighted(sizes.unet.init(&sizes.fusion, sizes.fold, &device), "unet");
+            let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
+            let [x_t, x0_prev, u, d] = ["x_t", "x0_prev", "u", "d"].map(input);
+            let fused = ["fused_0", "fused_1", "fused_2"].map(input);
+            let times: Vec<usize> = case.values("t").iter().map(|&t| t as usize).collect();
+            let sensor: Tensor<2> = case.input("sensor", &device);
+            let signed = |image: &Tensor<4>| image.clone() * 2.0 - 1.0;
+            let planes = [x_t.clone(), x0_prev.clone(), signed(&u), signed(&d)];
+            let frames = case.number("frames");
+            let x0 = unet.forward(planes, fused.clone(), &times, unet.prepare(sensor), frames);
+            let inputs = [
+                ("x_t", &x_t),
+                ("x0_prev", &x0_prev),
+                ("u", &u),
+                ("d", &d),
+                ("fused_0", &fused[0]),
+                ("fused_1", &fused[1]),
+                ("fused_2", &fused[2]),
+            ];
+            check(&case, &[("x0", x0)], &inputs, &unet, "unet");
+        }
+    }
+}
+
+#[test]
+fn whole_network() {
+    let file = File::open("network");
+    for device in [flex()] {
+        let case = file.case("tiny");
+        let network = fill(config(&case).init(0, &device), parameter);
+        let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
+        let [y, u, y_sim, u_sim, x_t, x0_prev] =
+            ["y", "u", "y_sim", "u_sim", "x_t", "x0_prev"].map(input);
+        let measured = Measured {
+            y: y.clone(),
+            u: u.clone(),
+            sensor: case.input("sensor", &device),
+            frames: case.number("frames"),
+        };
+        let exists = case.values("flag").iter().map(|&flag| flag > 0.0).collect();
+        let simulated = Simulated { y: y_sim.clone(), u: u_sim.clone(), exists };
+        let times = case.values("t").iter().map(|&t| t as usize).collect();
+        let state = State { x_t: x_t.clone(), x0_prev: x0_prev.clone(), times };
+        let prepared = network.prepare(&measured);
+        let prediction = network.forward(&prepared, Some(&simulated), &state, None);
+        case.check_output("x0", prediction.x0.clone().inner());
+        case.check_output("d", prediction.d.clone().inner());
+        case.check_output("to_next", prediction.flows.to_next.clone().inner());
+        case.check_output("to_prev", prediction.flows.to_prev.clone().inner());
+        let truth: Tensor<4> = case.input("truth", &device);
+        let image = (prediction.x0 + 1.0) * 0.5;
+        let loss = reconstruction(image, truth.clone()) + reconstruction(prediction.d, truth) * 0.2;
+        case.check_output("loss", loss.clone().inner());
+        let grads = loss.backward();
+        let inputs = [
+            ("y", &y),
+            ("u", &u),
+            ("y_sim", &y_sim),
+            ("u_sim", &u_sim),
+            ("x_t", &x_t),
+            ("x0_prev", &x0_prev),
+        ];
+        for (name, tensor) in inputs {
+            case.check_gradient(name, tensor.grad(&grads).unwrap());
+        }
+        compare(&case, &grads, &network, "");
+    }
+}

@@ -1,0 +1,184 @@
+//! Layers that several blocks use.
+
+use burn::module::{Module, Param};
+use burn::tensor::{Device, Tensor};
+use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
+use qudi_kernels::group_norm::{self, Norm, group_norm};
+
+/// A convolution of frames one by one.
+#[derive(Module, Debug)]
+pub(super) struct Conv2d {
+    /// `[outputs, inputs, rows, columns]`
+    weight: Param<Tensor<4>>,
+    /// `[outputs]`
+    bias: Option<Param<Tensor<1>>>,
+}
+
+/// A convolution over the frames of bursts.
+#[derive(Module, Debug)]
+pub(super) struct Conv3d {
+    /// `[outputs, inputs, frames, rows, columns]`
+    weight: Param<Tensor<5>>,
+    /// `[outputs]`
+    bias: Option<Param<Tensor<1>>>,
+}
+
+/// A matrix and a bias.
+#[derive(Module, Debug)]
+pub(super) struct Linear {
+    /// `[outputs, inputs]`
+    weight: Param<Tensor<2>>,
+    /// `[outputs]`
+    bias: Param<Tensor<1>>,
+}
+
+/// Group normalisation.
+#[derive(Module, Debug)]
+pub(super) struct GroupNorm {
+    /// `[channels]`
+    weight: Param<Tensor<1>>,
+    /// `[channels]`
+    bias: Param<Tensor<1>>,
+}
+
+/// Whether a layer has a bias.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Bias {
+    Yes,
+    No,
+}
+
+fn zeros<const D: usize>(shape: [usize; D], device: &Device) -> Param<Tensor<D>> {
+    Param::from_tensor(Tensor::zeros(shape, device))
+}
+
+impl Conv2d {
+    /// A layer of zeros; [`super::fill`] gives weights their values by name.
+    pub(super) fn zeros(
+        [inputs, outputs]: [usize; 2],
+        kernel: usize,
+        bias: Bias,
+        device: &Device,
+    ) -> Self {
+        Self {
+            weight: zeros([outputs, inputs, kernel, kernel], device),
+            bias: (bias == Bias::Yes).then(|| zeros([outputs], device)),
+        }
+    }
+
+    /// The sum alone. `inputs` are joined by channel, `[images, channels, height, width]`.
+    pub(super) fn linear(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        self.call(inputs, Options::default())
+    }
+
+    /// The sum and an addend.
+    pub(super) fn add(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
+        self.call(inputs, Options { addend: Some(addend), ..Options::default() })
+    }
+
+    /// The sum, cut at zero.
+    pub(super) fn relu(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        self.call(inputs, Options { activation: Activation::Relu, ..Options::default() })
+    }
+
+    /// The sum at every second row and column.
+    pub(super) fn halve(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        self.call(inputs, Options { stride: 2, ..Options::default() })
+    }
+
+    fn call(&self, inputs: &[Tensor<4>], options: Options) -> Tensor<4> {
+        let weight = self.weight.val();
+        let bias = self
+            .bias
+            .as_ref()
+            .map_or_else(|| Tensor::zeros([weight.dims()[0]], &inputs[0].device()), Param::val);
+        conv_2d(inputs, weight, bias, options)
+    }
+}
+
+impl Conv3d {
+    /// A layer of zeros with kernel 5 x 5 x 5.
+    pub(super) fn zeros([inputs, outputs]: [usize; 2], bias: Bias, device: &Device) -> Self {
+        Self {
+            weight: zeros([outputs, inputs, 5, 5, 5], device),
+            bias: (bias == Bias::Yes).then(|| zeros([outputs], device)),
+        }
+    }
+
+    /// The sum. `x`: `[bursts * frames, channels, height, width]`.
+    pub(super) fn linear(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.call(x, frames, Options::default())
+    }
+
+    /// The sum and an addend, cut at zero.
+    pub(super) fn add_relu(&self, x: Tensor<4>, frames: usize, addend: Tensor<4>) -> Tensor<4> {
+        let activation = Activation::Relu;
+        self.call(x, frames, Options { addend: Some(addend), activation, ..Options::default() })
+    }
+
+    /// The sum over several inputs joined by channel, cut at zero.
+    pub(super) fn relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.call(x, frames, Options { activation: Activation::Relu, ..Options::default() })
+    }
+
+    /// The sum at every second row and column, cut at zero.
+    pub(super) fn halve_relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        let activation = Activation::Relu;
+        self.call(x, frames, Options { stride: 2, activation, ..Options::default() })
+    }
+
+    fn call(&self, x: Tensor<4>, frames: usize, options: Options) -> Tensor<4> {
+        let weight = self.weight.val();
+        let bias = self
+            .bias
+            .as_ref()
+            .map_or_else(|| Tensor::zeros([weight.dims()[0]], &x.device()), Param::val);
+        conv_3d(&[x], weight, bias, frames, options)
+    }
+}
+
+impl Linear {
+    pub(super) fn zeros([inputs, outputs]: [usize; 2], device: &Device) -> Self {
+        Self { weight: zeros([outputs, inputs], device), bias: zeros([outputs], device) }
+    }
+
+    /// `x`: `[rows, inputs]`; result `[rows, outputs]`.
+    pub(super) fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        x.matmul(self.weight.val().transpose()) + self.bias.val().unsqueeze()
+    }
+}
+
+impl GroupNorm {
+    pub(super) fn zeros(channels: usize, device: &Device) -> Self {
+        Self { weight: zeros([channels], device), bias: zeros([channels], device) }
+    }
+
+    /// The norm alone. `x`: `[images, channels, height, width]`.
+    pub(super) fn plain(&self, x: Tensor<4>) -> Tensor<4> {
+        self.call(x, group_norm::Activation::None)
+    }
+
+    /// The norm and SiLU.
+    pub(super) fn silu(&self, x: Tensor<4>) -> Tensor<4> {
+        self.call(x, group_norm::Activation::Silu)
+    }
+
+    /// The norm, `scale` and `shift` of every burst, and SiLU. `scale`, `shift`: `[bursts, channels]`.
+    pub(super) fn film_silu(&self, x: Tensor<4>, scale: Tensor<2>, shift: Tensor<2>) -> Tensor<4> {
+        let slope = scale + 1.0;
+        let weight = slope.clone() * self.weight.val().unsqueeze();
+        let bias = slope * self.bias.val().unsqueeze() + shift;
+        let norm = Norm { groups: groups(x.dims()[1]), activation: group_norm::Activation::Silu };
+        group_norm(x, weight, bias, norm)
+    }
+
+    fn call(&self, x: Tensor<4>, activation: group_norm::Activation) -> Tensor<4> {
+        let norm = Norm { groups: groups(x.dims()[1]), activation };
+        group_norm(x, self.weight.val().unsqueeze(), self.bias.val().unsqueeze(), norm)
+    }
+}
+
+/// The largest divisor of the channels that is at most eight.
+fn groups(channels: usize) -> usize {
+    (1..=8).rev().find(|&groups| channels.is_multiple_of(groups)).unwrap_or(1)
+}

@@ -1,0 +1,98 @@
+//! The pre-denoiser: a residual dense network (Zhang et al. 2018), frame by frame.
+
+use super::layers::{Bias, Conv2d};
+use super::resample::{fold, unfold};
+use crate::config::PreConfig;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+
+/// Dense layers of a block.
+const LAYERS: usize = 3;
+
+/// Layers that each see all layers before, and a residual.
+#[derive(Module, Debug)]
+pub(super) struct DenseBlock {
+    layers: Vec<Conv2d>,
+    fuse: Conv2d,
+}
+
+impl DenseBlock {
+    pub(super) fn zeros(width: usize, growth: usize, device: &Device) -> Self {
+        let layer = |l| Conv2d::zeros([width + l * growth, growth], 3, Bias::Yes, device);
+        let all = width + LAYERS * growth;
+        Self {
+            layers: (0..LAYERS).map(layer).collect(),
+            fuse: Conv2d::zeros([all, width], 1, Bias::Yes, device),
+        }
+    }
+
+    /// `x` and result: `[images, width, h, w]`.
+    pub(super) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let mut parts = vec![x.clone()];
+        for layer in &self.layers {
+            parts.push(layer.relu(&parts));
+        }
+        self.fuse.add(&parts, x)
+    }
+}
+
+/// See the module.
+#[derive(Module, Debug)]
+pub struct PreDenoiser {
+    static_in: Conv2d,
+    simulated_in: Conv2d,
+    blocks: Vec<DenseBlock>,
+    gather: Conv2d,
+    spread: Conv2d,
+    out: Conv2d,
+    fold: usize,
+}
+
+impl PreConfig {
+    /// The pre-denoiser on folded planes, weights zero.
+    pub fn init(&self, fold: usize, device: &Device) -> PreDenoiser {
+        let (width, planes) = (self.width, fold * fold);
+        let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
+        let block = |_| DenseBlock::zeros(width, self.growth, device);
+        PreDenoiser {
+            static_in: conv([2 * planes, width], 3, Bias::Yes),
+            simulated_in: conv([2 * planes + 1, width], 3, Bias::No),
+            blocks: (0..self.blocks).map(block).collect(),
+            gather: conv([self.blocks * width, width], 1, Bias::Yes),
+            spread: conv([width, width], 3, Bias::Yes),
+            out: conv([width, planes], 3, Bias::Yes),
+            fold,
+        }
+    }
+}
+
+impl PreDenoiser {
+    /// What does not depend on the step: `[images, width, h, w]` of `y` and `u`, `[images, 1, H, W]`.
+    pub fn prepare(&self, y: Tensor<4>, u: Tensor<4>) -> Tensor<4> {
+        self.static_in.linear(&[fold(Tensor::cat(vec![y, u], 1), self.fold)])
+    }
+
+    /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.
+    /// `prepared` as from [`Self::prepare`]; `simulated` are `y_sim` and `u_sim`, `flag` says of every image
+    /// whether they exist, `[images, 1, 1, 1]`.
+    pub fn forward(
+        &self,
+        prepared: Tensor<4>,
+        u: Tensor<4>,
+        simulated: Tensor<4>,
+        flag: Tensor<4>,
+    ) -> (Tensor<4>, Tensor<4>) {
+        let [images, _, h, w] = prepared.dims();
+        let inputs = [fold(simulated, self.fold), flag.expand([images, 1, h, w])];
+        let shallow = self.simulated_in.add(&inputs, prepared);
+        let mut x = shallow.clone();
+        let mut outputs = Vec::with_capacity(self.blocks.len());
+        for block in &self.blocks {
+            x = block.forward(x);
+            outputs.push(x.clone());
+        }
+        let features = self.spread.add(&[self.gather.linear(&outputs)], shallow);
+        let correction = unfold(self.out.linear(&[features.clone()]), self.fold);
+        (u + correction, features)
+    }
+}

@@ -1,0 +1,142 @@
+//! The whole network: pre-denoiser, features, flow, fusion, U-Net.
+
+use super::features::{HighFeatures, LowFeatures};
+use super::flow::{Flow, Flows};
+use super::fusion::Fusion;
+use super::pre::PreDenoiser;
+use super::unet::UNet;
+use crate::config::NetworkConfig;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// What was measured, `[bursts * frames, 1, height, width]`.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// Counts over full scale.
+    pub y: Tensor<4>,
+    /// The linear estimate in image units.
+    pub u: Tensor<4>,
+    /// Numbers of sensor and light, `[bursts, 9]`.
+    pub sensor: Tensor<2>,
+    /// Frames of a burst.
+    pub frames: usize,
+}
+
+/// The simulated measurement of the last estimate.
+#[derive(Clone, Debug)]
+pub struct Simulated {
+    /// Counts over full scale.
+    pub y: Tensor<4>,
+    /// Their linear estimate in image units.
+    pub u: Tensor<4>,
+    /// For every burst, whether it has one; both are zero where not.
+    pub exists: Vec<bool>,
+}
+
+/// Where the diffusion stands.
+#[derive(Clone, Debug)]
+pub struct State {
+    /// The noisy image, `[bursts * frames, 1, height, width]`.
+    pub x_t: Tensor<4>,
+    /// The previous estimate of the clean image, in [-1, 1]; zero at first.
+    pub x0_prev: Tensor<4>,
+    /// Diffusion time of every burst.
+    pub times: Vec<usize>,
+}
+
+/// What the network makes of a burst's measurement alone, the same in every step.
+#[derive(Clone, Debug)]
+pub struct Prepared {
+    pre: Tensor<4>,
+    low: Tensor<4>,
+    sensor: Tensor<2>,
+    u: Tensor<4>,
+    frames: usize,
+}
+
+/// What the network says.
+#[derive(Clone, Debug)]
+pub struct Prediction {
+    /// The clean image, about in [-1, 1].
+    pub x0: Tensor<4>,
+    /// The pre-denoised frames, in image units.
+    pub d: Tensor<4>,
+    /// The flows that were used.
+    pub flows: Flows,
+}
+
+/// See the module.
+#[derive(Module, Debug)]
+pub struct Qudi {
+    pre: PreDenoiser,
+    low: LowFeatures,
+    high: HighFeatures,
+    flow: Flow,
+    fusion: Fusion,
+    unet: UNet,
+}
+
+impl NetworkConfig {
+    /// The network with initial weights of `seed`, the same on every device. The sizes must be
+    /// [checked](Self::checked).
+    pub fn init(&self, seed: u64, device: &Device) -> Qudi {
+        let zeros = Qudi {
+            pre: self.pre.init(self.fold, device),
+            low: self.features.init_low(self.fold, device),
+            high: self.features.init_high(self.fold, device),
+            flow: self.flow.init(device),
+            fusion: self.fusion.init(&self.features, self.pre.width, self.fold, device),
+            unet: self.unet.init(&self.fusion, self.fold, device),
+        };
+        super::fill(zeros, |name, shape| super::weights::initial(seed, name, shape))
+    }
+}
+
+impl Qudi {
+    /// Computes what does not depend on the step.
+    pub fn prepare(&self, measured: &Measured) -> Prepared {
+        let (y, u) = (measured.y.clone(), measured.u.clone());
+        Prepared {
+            pre: self.pre.prepare(y, u.clone()),
+            low: self.low.prepare(u.clone(), measured.frames),
+            sensor: self.unet.prepare(measured.sensor.clone()),
+            u,
+            frames: measured.frames,
+        }
+    }
+
+    /// Predicts the clean frames. `flows` are those of an earlier step; estimated if there are none.
+    pub fn forward(
+        &self,
+        prepared: &Prepared,
+        simulated: Option<&Simulated>,
+        state: &State,
+        flows: Option<Flows>,
+    ) -> Prediction {
+        let frames = prepared.frames;
+        let u = prepared.u.clone();
+        let device = u.device();
+        let bursts = u.dims()[0] / frames;
+        let (y_sim, u_sim, flags) = match simulated {
+            Some(simulated) => {
+                let flags = simulated.exists.iter().map(|&exists| f32::from(u8::from(exists)));
+                (simulated.y.clone(), simulated.u.clone(), flags.collect())
+            }
+            None => (u.zeros_like(), u.zeros_like(), vec![0.0; bursts]),
+        };
+        let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
+        let flag = Tensor::<4>::from_data(flags, &device).repeat_dim(1, frames);
+        let flag = flag.reshape([bursts * frames, 1, 1, 1]);
+        let both = Tensor::cat(vec![y_sim, u_sim.clone()], 1);
+        let (d, features) = self.pre.forward(prepared.pre.clone(), u.clone(), both, flag);
+        let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
+        let high = self.high.forward(state.x_t.clone(), state.x0_prev.clone(), frames);
+        let flows = flows.unwrap_or_else(|| self.flow.forward(d.clone(), frames));
+        let fused = self.fusion.forward(low, high, features, &flows, frames);
+        let signed = |image: Tensor<4>| image * 2.0 - 1.0;
+        let planes = [state.x_t.clone(), state.x0_prev.clone(), signed(u), signed(d.clone())];
+        let sensor = prepared.sensor.clone();
+        let x0 = self.unet.forward(planes, fused, &state.times, sensor, frames);
+        Prediction { x0, d, flows }
+    }
+}

@@ -1,0 +1,92 @@
+//! Grids: folding pixels into channels, flows from one scale to another.
+
+use burn::tensor::Tensor;
+use burn::tensor::module::avg_pool2d;
+use burn::tensor::ops::{AvgPoolOptions, PadMode};
+
+/// Squares of `fold` pixels become channels: `[images, c, h * fold, w * fold]` to `[images, c * fold * fold, h, w]`.
+pub(super) fn fold(x: Tensor<4>, fold: usize) -> Tensor<4> {
+    if fold == 1 {
+        return x;
+    }
+    let [images, channels, height, width] = x.dims();
+    let [h, w] = [height / fold, width / fold];
+    x.reshape([images, channels, h, fold, w, fold]).permute([0, 1, 3, 5, 2, 4]).reshape([
+        images,
+        channels * fold * fold,
+        h,
+        w,
+    ])
+}
+
+/// The inverse of [`fold`].
+pub(super) fn unfold(x: Tensor<4>, fold: usize) -> Tensor<4> {
+    if fold == 1 {
+        return x;
+    }
+    let [images, channels, h, w] = x.dims();
+    let planes = channels / (fold * fold);
+    x.reshape([images, planes, fold, fold, h, w]).permute([0, 1, 4, 2, 5, 3]).reshape([
+        images,
+        planes,
+        h * fold,
+        w * fold,
+    ])
+}
+
+/// Means of 2 x 2 pixels.
+pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
+    avg_pool2d(x, AvgPoolOptions::new([2, 2]))
+}
+
+/// Means of `scale` x `scale` pixels, `scale` a power of two.
+pub(super) fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
+    for _ in 0..scale.ilog2() {
+        x = halve(x);
+    }
+    x
+}
+
+/// Twice the size, bilinear with half-pixel centres, edges repeated. Composed: Burn's own has no gradient
+/// on GPUs.
+pub(super) fn double(x: Tensor<4>) -> Tensor<4> {
+    double_axis(double_axis(x, 2), 3)
+}
+
+fn double_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
+    let size = x.dims()[axis];
+    let mut pads = [(0, 0); 4];
+    pads[axis] = (1, 1);
+    let padded = x.clone().pad(pads, PadMode::Edge);
+    let near = x * 0.75;
+    let before = near.clone() + padded.clone().narrow(axis, 0, size) * 0.25;
+    let after = near + padded.narrow(axis, 2, size) * 0.25;
+    let mut shape = before.dims();
+    shape[axis] *= 2;
+    Tensor::stack::<5>(vec![before, after], axis + 1).reshape(shape)
+}
+
+/// Each pixel twice in both directions.
+pub(super) fn repeat(x: Tensor<4>) -> Tensor<4> {
+    let [images, channels, height, width] = x.dims();
+    x.reshape([images, channels, height, 1, width, 1]).repeat(&[1, 1, 1, 2, 1, 2]).reshape([
+        images,
+        channels,
+        height * 2,
+        width * 2,
+    ])
+}
+
+/// A flow of one scale on another; both powers of two.
+pub(super) fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
+    let mut scale = from;
+    while scale > to {
+        flow = double(flow) * 2.0;
+        scale /= 2;
+    }
+    while scale < to {
+        flow = halve(flow) * 0.5;
+        scale *= 2;
+    }
+    flow
+}
