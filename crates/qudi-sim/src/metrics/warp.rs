@@ -1,4 +1,4 @@
-//! Flicker: how much a clip changes along the true motion (Lai et al. 2018, with true flow).
+//! Flicker: how much a clip changes along the motion of its truth (Lai et al. 2018).
 
 use crate::frame::Frame;
 use crate::scene::Flow;
