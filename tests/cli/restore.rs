@@ -53,6 +53,18 @@ fn every_output_holds_the_same_frames() {
         panic!("16-bit pages")
     };
     assert_eq!(&page, first.as_raw());
+    restore(&folder, "b.npy -o f.tif --float");
+    let mut floats =
+        tiff::decoder::Decoder::new(std::fs::File::open(folder.join("f.tif")).unwrap()).unwrap();
+    for frame in values.chunks(64 * 80) {
+        let tiff::decoder::DecodingResult::F32(page) = floats.read_image().unwrap() else {
+            panic!("float pages")
+        };
+        assert_eq!(page, frame, "nothing clipped or rounded");
+        let _ = floats.more_images().then(|| floats.next_image().unwrap());
+    }
+    assert!(!floats.more_images());
+    qudi(&folder).args("restore b.npy -o g.npy --float".split(' ')).assert().code(2);
     let piped = qudi(&folder).args("restore b.npy -o -".split(' ')).output().unwrap().stdout;
     assert!(piped.starts_with(b"YUV4MPEG2 W80 H64 F2000:1"));
     assert_eq!(
@@ -128,4 +140,107 @@ fn short_captures_and_long_overlaps_work() {
     let words = String::from_utf8_lossy(&refused.get_output().stderr).into_owned();
     assert!(words.contains("windows are longer than their overlap"), "{words}");
     assert!(!folder.join("no").exists());
+}
+
+/// What the pipe tells nobody is said by hand.
+const KNOWN: &str = "--sensor qudi-paper --ppp 9.75";
+
+fn piped(folder: &Path, args: &str, input: &[u8]) -> std::process::Output {
+    let mut command = qudi(folder);
+    command.arg("restore").args(args.split_whitespace()).args(KNOWN.split(' '));
+    command.write_stdin(input).output().unwrap()
+}
+
+#[test]
+fn a_pipe_restores_to_the_frames_of_a_file() {
+    let folder = burst("restore-pipe", 43);
+    restore(&folder, &format!("b.npy -o file.npy --method average {KNOWN}"));
+    let expected = std::fs::read(folder.join("file.npy")).unwrap();
+    let array = std::fs::read(folder.join("b.npy")).unwrap();
+    let raw = &array[128..];
+    let raw_options = "--format raw-u8 --size 64x80";
+    for (name, options, input) in [("npy", "", &array[..]), ("raw", raw_options, raw)] {
+        let args = format!("- -o {name}.npy --method average --side-by-side {name}.png {options}");
+        assert!(piped(&folder, &args, input).status.success());
+        let found = std::fs::read(folder.join(format!("{name}.npy"))).unwrap();
+        assert!(found == expected, "{name}");
+        assert!(folder.join(format!("{name}.png")).is_file());
+    }
+    let args = format!("- -o frames --method average {raw_options}");
+    assert!(piped(&folder, &args, raw).status.success());
+    assert_eq!(listing(&folder.join("frames")).len(), 43 + 1);
+    let again = piped(&folder, &args, raw);
+    assert_eq!(again.status.code(), Some(2), "a pipe is not gone on with");
+    assert!(String::from_utf8_lossy(&again.stderr).contains("--force"));
+    assert!(piped(&folder, &format!("{args} --force"), &raw[..20 * 5120]).status.success());
+    assert_eq!(listing(&folder.join("frames")).len(), 20 + 1, "nothing of the old run is left");
+}
+
+/// Frames come out while the pipe still runs: a camera does not end.
+#[test]
+fn a_running_pipe_is_restored_as_it_comes() {
+    use std::io::{Read, Write};
+    let folder = burst("restore-live", 27);
+    let array = std::fs::read(folder.join("b.npy")).unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
+        .current_dir(&folder)
+        .args("restore - -o - -q --format raw-u8 --size 64x80 --method average".split(' '))
+        .args(KNOWN.split(' '))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let (mut camera, mut screen) = (child.stdin.take().unwrap(), child.stdout.take().unwrap());
+    // One window, and as much as the next one adds.
+    camera.write_all(&array[128..128 + 19 * 5120]).unwrap();
+    camera.flush().unwrap();
+    let header = b"YUV4MPEG2 W80 H64 F25:1 Ip A1:1 Cmono\n";
+    let mut first = vec![0; header.len() + 8 * (6 + 5120)];
+    screen.read_exact(&mut first).unwrap();
+    assert!(first.starts_with(header));
+    camera.write_all(&array[128 + 19 * 5120..]).unwrap();
+    drop(camera);
+    let mut rest = Vec::new();
+    screen.read_to_end(&mut rest).unwrap();
+    assert_eq!(rest.len(), (27 - 8) * (6 + 5120));
+    assert!(child.wait().unwrap().success());
+    // Whoever looks may leave early.
+    let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
+        .current_dir(&folder)
+        .args("restore b.npy -o - -q".split(' '))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+}
+
+#[test]
+fn broken_pipes_are_refused_with_a_way_out() {
+    let folder = burst("restore-broken", 30);
+    let array = std::fs::read(folder.join("b.npy")).unwrap();
+    let raw = "--format raw-u8 --size 64x80";
+    let cases: [(&str, &[u8], &str); 8] = [
+        ("-o a.npy", b"", "nothing came through the pipe"),
+        ("-o a.npy", b"YUV4MPEG2 W8 H8 F25:1\n", "pictures, not photon counts"),
+        ("-o a.npy", &array[..200], "0 whole ones came"),
+        ("-o a.npy", &array[..128 + 25 * 5120], "promises 30 frames, 25 whole ones came"),
+        ("-o a.npy --format raw-u8 --size 63x80", &array[128..], "inside a frame"),
+        ("-o a.npy --format raw-u8", &array[128..], "how large a frame is"),
+        ("-o a.npy --format tiff", &array, "cannot be read from a pipe"),
+        ("-o a --shard 1/2", &array, "comes once and whole"),
+    ];
+    for (args, input, reason) in cases {
+        let output = piped(&folder, &format!("- {args}"), input);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{args}: {said}");
+        assert!(said.contains(reason), "{args}: {said}");
+        assert!(said.contains("\n  where: ") && said.contains("\n  help: "), "{said}");
+        assert_eq!(listing(&folder), ["b.npy", "b.npy.json"], "{args} left something behind");
+    }
+    let cut = piped(&folder, &format!("- -o a.npy --lenient {raw}"), &array[128..128 + 100_000]);
+    assert!(cut.status.success());
+    assert!(String::from_utf8_lossy(&cut.stderr).contains("2720 of 5120 bytes came after 19"));
 }

@@ -3,6 +3,7 @@
 pub(crate) mod bench;
 pub(crate) mod calibrate;
 mod capture_info;
+mod capture_light;
 pub(crate) mod completions;
 pub(crate) mod config;
 pub(crate) mod convert;
@@ -17,3 +18,4 @@ mod methods;
 pub(crate) mod restore;
 mod restore_output;
 pub(crate) mod simulate;
+mod tiff_samples;

@@ -2,7 +2,6 @@
 
 mod bits;
 mod png_folder;
-mod tiff_stack;
 mod writer;
 
 pub use bits::{pack_row, unpack_row};

@@ -18,6 +18,7 @@ mod levels;
 mod memory;
 mod options;
 mod packed;
+mod pipe;
 mod pixel_map;
 mod probe;
 mod raw_look;
@@ -38,6 +39,8 @@ use crate::error::{Result, SimError};
 use crate::frame::Size;
 use crate::sensor::{Response, Sensor};
 use bad_pixels::Repair;
+use pipe::{FIRST_WINDOW, STDIN};
+use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use view::View;
@@ -51,8 +54,12 @@ pub struct Capture {
     about: About,
     native: Box<dyn CountFrames>,
     view: View,
-    /// Native frames in use.
+    /// Native frames in use; of a pipe, those that have arrived.
     range: Range<u64>,
+    /// One past the last native frame asked for.
+    end: Option<u64>,
+    /// Whether no more frames come.
+    complete: bool,
     sum: u32,
     repair: Repair,
     bad: BadPixels,
@@ -101,7 +108,31 @@ impl Capture {
     /// # Errors
     /// [`SimError`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
-        let (native, mut about) = formats::open(path, options)?;
+        let (native, about) = formats::open(path, options)?;
+        Self::assemble(path, native, about, options, sensor)
+    }
+
+    /// The capture that comes out of `reader`: a `.npy`, or raw frames that `options` name. Each frame
+    /// comes once: [`Capture::reach`] waits for more, and statistics see the first window.
+    ///
+    /// # Errors
+    /// As [`Capture::open`].
+    pub fn from_pipe(
+        reader: impl Read + Send + 'static,
+        options: &ReadOptions,
+        sensor: Option<&Sensor>,
+    ) -> Result<Self> {
+        let (native, about) = formats::open_pipe(Box::new(reader), options)?;
+        Self::assemble(Path::new(STDIN), native, about, options, sensor)
+    }
+
+    fn assemble(
+        path: &Path,
+        mut native: Box<dyn CountFrames>,
+        mut about: About,
+        options: &ReadOptions,
+        sensor: Option<&Sensor>,
+    ) -> Result<Self> {
         if let Some(bits) = options.bits {
             state_depth(&mut about, bits)?;
         }
@@ -111,16 +142,21 @@ impl Capture {
         }
         let stored = native.size();
         let view = View::new(stored, about.orient, about.vendor, options.crop)?;
-        let frames = native.frames();
-        let range = options.start.unwrap_or(0)..options.end.unwrap_or(frames);
-        if range.start >= range.end || range.end > frames {
+        let sum = options.sum.unwrap_or(1);
+        let start = options.start.unwrap_or(0);
+        native.release(start);
+        let window = start.saturating_add(FIRST_WINDOW.saturating_mul(sum.max(1).into()));
+        let there = native.reach(window.min(options.end.unwrap_or(window)), &mut about.remarks)?;
+        let frames = native.length().unwrap_or(u64::MAX);
+        let range = start..options.end.unwrap_or(frames).min(there);
+        if range.start >= range.end || options.end.is_some_and(|end| end > frames) {
+            let range = start..options.end.unwrap_or(frames);
             return Err(SimError::request(
                 format!("frames {} to {} of {frames}", range.start, range.end),
                 "--start, --end",
                 format!("frames count from 0; --end is one past the last, at most {frames}"),
             ));
         }
-        let sum = options.sum.unwrap_or(1);
         if sum == 0 || u64::from(sum) > range.end - range.start {
             return Err(SimError::request(
                 format!("{sum} frames summed into one, of {}", range.end - range.start),
@@ -141,6 +177,8 @@ impl Capture {
             about,
             view,
             range,
+            end: options.end,
+            complete: false,
             sum,
             repair: Repair::default(),
             bad: BadPixels::default(),
@@ -149,10 +187,7 @@ impl Capture {
             stored_sums: Vec::new(),
             native,
         };
-        let left_over = capture.native_frames() % u64::from(sum);
-        if left_over > 0 {
-            capture.about.remarks.push(format!("the last {left_over} frames fill no sum of {sum}"));
-        }
+        capture.note_end();
         pixel_map::plan(&mut capture, options, sensor)?;
         Ok(capture)
     }
@@ -184,6 +219,8 @@ impl Capture {
             about,
             view: View { size, from: None },
             range: 0..frames.len() as u64,
+            end: None,
+            complete: true,
             sum: 1,
             repair: Repair::default(),
             bad: BadPixels::default(),
@@ -209,9 +246,57 @@ impl Capture {
         self.view.size
     }
 
-    /// Output frames.
+    /// Output frames; of a pipe, those that have arrived.
     pub fn frames(&self) -> u64 {
         self.native_frames() / u64::from(self.sum)
+    }
+
+    /// Output frames in all; `None` as long as a pipe has not told.
+    pub fn length(&self) -> Option<u64> {
+        let end = match (self.native.length(), self.end) {
+            (Some(length), Some(end)) => length.min(end),
+            (length, _) => length?,
+        };
+        Some((end - self.range.start) / u64::from(self.sum))
+    }
+
+    /// Waits until there are `frames` output frames, or no more come; gives how many there are.
+    ///
+    /// # Errors
+    /// [`SimError`] if a pipe fails, or ends inside a frame.
+    pub fn reach(&mut self, frames: u64) -> Result<u64> {
+        if !self.complete {
+            let native = frames.saturating_mul(self.sum.into()).saturating_add(self.range.start);
+            let native = native.min(self.end.unwrap_or(native));
+            let there = self.native.reach(native, &mut self.about.remarks)?;
+            self.range.end = there.min(self.end.unwrap_or(there));
+            self.note_end();
+        }
+        Ok(self.frames())
+    }
+
+    /// Says that no output frame before `frame` is read again, so that a pipe need not keep it.
+    pub fn release(&mut self, frame: u64) {
+        self.native.release(self.range.start + frame * u64::from(self.sum));
+    }
+
+    /// Notes whether the end has come, and what is to be said of it.
+    fn note_end(&mut self) {
+        let ended = self.native.length() == Some(self.range.end);
+        self.complete = ended || self.end == Some(self.range.end);
+        if !self.complete {
+            return;
+        }
+        if let Some(end) = self.end.filter(|&end| end > self.range.end) {
+            let text =
+                format!("the pipe ended after {} frames, before --end {end}", self.range.end);
+            self.about.remarks.push(text);
+        }
+        let left_over = self.native_frames() % u64::from(self.sum);
+        if left_over > 0 {
+            let text = format!("the last {left_over} frames fill no sum of {}", self.sum);
+            self.about.remarks.push(text);
+        }
     }
 
     /// Native frames in use.
@@ -285,7 +370,7 @@ impl Capture {
         &self.bad
     }
 
-    /// Whether going back means to start over.
+    /// Whether going back means to start over, or is impossible.
     pub fn forward_only(&self) -> bool {
         self.native.forward_only()
     }

@@ -6,6 +6,7 @@ mod gif_preview;
 mod mp4;
 mod pending;
 mod picture;
+mod tiff_stack;
 
 pub use array::ArrayWriter;
 pub use frames::FramesWriter;
@@ -14,3 +15,5 @@ pub use gif_preview::GifPreview;
 pub use mp4::Mp4;
 pub use pending::{Overwrite, PendingFile, PendingFolder, refuse_taken};
 pub use picture::Picture;
+pub use tiff_stack::TiffSamples;
+pub(crate) use tiff_stack::TiffStack;

@@ -9,6 +9,8 @@ mod bit_order;
 mod cameras;
 #[path = "captures/foreign.rs"]
 mod foreign;
+#[path = "captures/pipes.rs"]
+mod pipes;
 #[path = "captures/pixels.rs"]
 mod pixels;
 

@@ -7,11 +7,11 @@ use std::path::PathBuf;
 /// Restore video from a capture
 ///
 /// OUT is a folder (no extension) of 16-bit PNG with manifest.json: killed, it goes on where it
-/// stopped. Or one file: .npy (float32), .tif (16 bit), .gif, .mp4 (through ffmpeg), or - for Y4M on standard output. White
-/// is 1 = full scale; the scene's mean lands at --exposure.
+/// stopped. Or one file: .npy (float32), .tif (16 bit, or --float), .gif, .mp4 (through ffmpeg), or - for Y4M on standard
+/// output. White is 1 = full scale; the scene's mean lands at --exposure.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Restore {
-    /// The capture: a file or a folder in any format
+    /// The capture: a file or a folder in any format, or - for a pipe of .npy or raw frames (--format raw-u8 --size HxW)
     #[arg(value_hint = ValueHint::AnyPath)]
     pub(crate) capture: PathBuf,
     /// Where the frames go
@@ -41,6 +41,9 @@ pub(crate) struct Restore {
     /// Do part I of N (from 1), into the same folder as the other parts
     #[arg(long, value_name = "I/N")]
     pub(crate) shard: Option<Shard>,
+    /// Write .tif with 32-bit float samples, nothing clipped, instead of 16-bit ones
+    #[arg(long)]
+    pub(crate) float: bool,
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) chi_map: Option<PathBuf>,

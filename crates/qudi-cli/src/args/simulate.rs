@@ -91,9 +91,12 @@ pub(crate) struct Simulate {
     /// Write binary .npy bursts with one byte per pixel
     #[arg(long, help_heading = "Outputs")]
     pub(crate) unpacked: bool,
-    /// Write the true frames: .npy (float32) or a folder of 16-bit PNG
+    /// Write the true frames: .npy (float32), .tif, or a folder of 16-bit PNG
     #[arg(long, value_name = "PATH", help_heading = "Outputs", value_hint = ValueHint::AnyPath)]
     pub(crate) truth: Option<PathBuf>,
+    /// Write the true frames' .tif with 32-bit float samples instead of 16-bit ones
+    #[arg(long, requires = "truth", help_heading = "Outputs")]
+    pub(crate) float: bool,
     /// Write the true flow of a synthetic scene: .npy (float32), frames-1 x (dx, dy, visible) x H x W
     #[arg(long, value_name = "FILE", help_heading = "Outputs", value_hint = ValueHint::FilePath)]
     pub(crate) flow: Option<PathBuf>,

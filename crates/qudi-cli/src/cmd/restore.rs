@@ -2,18 +2,21 @@
 
 use crate::args::{Global, Restore};
 use crate::cmd::capture_info::{remarks, required_sensor};
+use crate::cmd::capture_light::{Stated, context};
 use crate::cmd::methods::method;
 use crate::cmd::restore_output::{Misfit, Output};
+use crate::cmd::tiff_samples::tiff_samples;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
 use qudi_sim::SimError;
-use qudi_sim::capture::{Capture, MaskChoice, Summary};
+use qudi_sim::capture::{Capture, MaskChoice};
 use qudi_sim::output::{ArrayWriter, Overwrite, Picture, refuse_taken};
 use qudi_sim::restore::{Context, Restorer, Windows, run as run_method};
 use qudi_sim::sensor::Sensor;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
+use std::io::IsTerminal;
 use std::ops::Range;
 use std::path::Path;
 use std::time::Instant;
@@ -37,11 +40,16 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
             "ask for it when all parts are done: the same command without --shard",
         ));
     }
+    let tiff = tiff_samples(args.float, Path::new(&args.output))?;
     Output::refuse_taken(&args.output, args.shard.is_some(), overwrite)?;
+    if is_pipe(args) {
+        refuse_for_pipes(args, overwrite)?;
+    }
     let mut job = Job::prepare(args)?;
-    let mut output = Output::open(&args.output, &job.capture, &job.settings, overwrite)?;
+    let mut output = Output::open(&args.output, &job.capture, &job.settings, tiff, overwrite)?;
     let start = Instant::now();
-    let frames = job.capture.frames();
+    // A pipe may not have told how many frames come.
+    let frames = job.capture.length().unwrap_or(u64::MAX);
     let part = args.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut misfit = Misfit::new(&job.capture, &job.context);
     let done = output.finished(part.clone());
@@ -54,6 +62,8 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
         job.run(rest, &mut output, None, report)?;
         misfit.read_finished(&output, &mut job.capture, part.clone())?;
     }
+    let frames = job.capture.frames();
+    let part = part.start..part.end.min(frames);
     let results = json!({"chi_square": misfit.chi_square()});
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
@@ -83,6 +93,34 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     })
 }
 
+/// Whether the capture comes through standard input.
+fn is_pipe(args: &Restore) -> bool {
+    args.capture.as_os_str() == "-"
+}
+
+/// What takes a capture that can be asked for again.
+fn refuse_for_pipes(args: &Restore, overwrite: Overwrite) -> Result<()> {
+    if std::io::stdin().is_terminal() {
+        return Err(Fault::new(
+            "standard input is a terminal, and a capture comes through a pipe",
+            "-",
+            "pipe one in, as in `cat burst.npy | qudi restore - -o out`, or name a file",
+        ));
+    }
+    if args.shard.is_some() {
+        return Err(Fault::new(
+            "a pipe comes once and whole",
+            "--shard",
+            "store the capture in a file to share the work",
+        ));
+    }
+    if args.output != "-" {
+        // Nobody knows whether the same frames come again, so that a folder is not gone on with.
+        refuse_taken(Path::new(&args.output), overwrite)?;
+    }
+    Ok(())
+}
+
 /// Everything that a run needs.
 struct Job {
     capture: Capture,
@@ -100,19 +138,30 @@ impl Job {
     fn prepare(args: &Restore) -> Result<Self> {
         let named = args.sensor.as_deref().map(Sensor::load).transpose()?;
         let options = args.reading.options(MaskChoice::Auto);
-        let mut capture = Capture::open(&args.capture, &options, named.as_ref())?;
+        let mut capture = if is_pipe(args) {
+            Capture::from_pipe(std::io::stdin(), &options, named.as_ref())?
+        } else {
+            Capture::open(&args.capture, &options, named.as_ref())?
+        };
         let sensor = match named {
             Some(sensor) => sensor,
             None => required_sensor(&capture)?,
         };
-        let (context, source) = context(args, &mut capture, &sensor)?;
+        let stated =
+            Stated { ppp: args.ppp, gain: args.gain, exposure: args.exposure, seed: args.seed };
+        let (context, source) = context(&stated, &mut capture, &sensor)?;
         let (restorer, choice) = method(&args.method, &mut capture, &context)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
+        let place = if is_pipe(args) {
+            capture.path().to_owned()
+        } else {
+            std::path::absolute(&args.capture).unwrap_or_else(|_| args.capture.clone())
+        };
         let settings = json!({
-            "capture": std::path::absolute(&args.capture).unwrap_or_else(|_| args.capture.clone()),
+            "capture": place,
             "format": capture.about().format,
             "read": options,
-            "frames": capture.frames(),
+            "frames": capture.length(),
             "height": capture.size().height,
             "width": capture.size().width,
             "method": restorer.name(),
@@ -140,8 +189,8 @@ impl Job {
             return Ok(());
         }
         let mut bar = report.bar();
-        let mut progress = |done: u64, total: u64| {
-            bar.update("restoring", done, Some(total));
+        let mut progress = |done: u64, total: Option<u64>| {
+            bar.update("restoring", done, total);
             interrupt::check()
         };
         let mut sink = output.sink(misfit);
@@ -179,65 +228,6 @@ fn describe(
         line("time", format!("{seconds:.4} s per frame"));
     }
     text
-}
-
-/// What is known of light and sensor, and where the light comes from.
-fn context(
-    args: &Restore,
-    capture: &mut Capture,
-    sensor: &Sensor,
-) -> Result<(Context, &'static str)> {
-    if !(args.exposure.is_finite() && args.exposure > 0.0) {
-        return Err(Fault::new(
-            format!("an exposure of {}", args.exposure),
-            "--exposure",
-            "give the mean image value, between 0 and 1",
-        ));
-    }
-    let of_frames = capture.output_sensor(sensor)?;
-    let recorded = capture.about().ppp.map(|ppp| ppp * f64::from(capture.summed()));
-    let known_gain = args.gain.or(capture.about().gain);
-    let (ppp, source) = match (args.ppp, recorded) {
-        (Some(ppp), _) => (ppp, "given"),
-        (None, Some(ppp)) => (ppp, "from the record"),
-        (None, None) => {
-            let summary = Summary::measure(capture, Some(sensor), known_gain)?;
-            let ppp = summary.ppp.incident.ok_or_else(|| {
-                Fault::new(
-                    format!(
-                        "the light cannot be estimated: the gain of `{}` follows it",
-                        sensor.name
-                    ),
-                    "--ppp",
-                    "give the photons per pixel and frame, or the gain with --gain",
-                )
-            })?;
-            (ppp, "estimated")
-        }
-    };
-    if !(ppp.is_finite() && ppp > 0.0) {
-        return Err(Fault::new(
-            format!("{ppp} photons per pixel and frame"),
-            "--ppp",
-            "the capture is dark, or the sensor's dark rate too high: give the light, or another --sensor",
-        ));
-    }
-    let gain = match known_gain {
-        Some(gain) => gain,
-        None => of_frames.gain_at(ppp)?,
-    };
-    let summed = of_frames.frames_summed as f32;
-    let dark = capture.dark().map(|map| map.iter().map(|dark| dark * summed).collect());
-    let context = Context {
-        seed: args.seed,
-        first_frame: 0,
-        ppp,
-        exposure: args.exposure,
-        sensor: of_frames,
-        gain,
-        dark,
-    };
-    Ok((context, source))
 }
 
 /// The chi-square map: values in `.npy`, or a picture in which 2 is white.

@@ -2,7 +2,7 @@
 
 use crate::error::{Fault, Result};
 use qudi_sim::capture::Capture;
-use qudi_sim::output::{FramesWriter, Overwrite, Picture, refuse_taken};
+use qudi_sim::output::{FramesWriter, Overwrite, Picture, TiffSamples, refuse_taken};
 use qudi_sim::restore::{Consistency, Context, FrameFolder, RestoreSink};
 use qudi_sim::{Frame, SimError, Size};
 use serde_json::Value;
@@ -41,6 +41,7 @@ impl Output {
         name: &str,
         capture: &Capture,
         settings: &Value,
+        tiff: TiffSamples,
         overwrite: Overwrite,
     ) -> Result<Self> {
         let (path, size) = (Path::new(name), capture.size());
@@ -51,7 +52,7 @@ impl Output {
         if path.extension().is_none() {
             return Ok(Self::Folder(FrameFolder::open(path, size, settings.clone(), overwrite)?));
         }
-        Ok(Self::File(Some(FramesWriter::create(path, size, overwrite)?)))
+        Ok(Self::File(Some(FramesWriter::create(path, size, tiff, overwrite)?)))
     }
 
     /// Frames from the start of `range` on that an earlier run finished.
@@ -107,34 +108,43 @@ impl RestoreSink for Sink<'_> {
 pub(crate) struct Misfit {
     consistency: Consistency,
     context: Context,
+    /// Frames to show; of a pipe that has not told its length, the first.
     shown: Vec<u64>,
-    pictures: Vec<[Frame; 2]>,
+    /// Frames that are shown: number, counts, restored.
+    pictures: Vec<(u64, [Frame; 2])>,
+    /// Whether the latest frame is kept, which may turn out to be the last.
+    keep_latest: bool,
     judged: u64,
 }
 
 impl Misfit {
     pub(crate) fn new(capture: &Capture, context: &Context) -> Self {
-        let last = capture.frames() - 1;
-        let mut shown = vec![0, last / 2, last];
+        let length = capture.length();
+        let mut shown = vec![0];
+        shown.extend(length.into_iter().flat_map(|n| [(n - 1) / 2, n - 1]));
         shown.dedup();
         Self {
             consistency: Consistency::new(capture.size(), context),
             context: context.clone(),
             shown,
             pictures: Vec::new(),
+            keep_latest: length.is_none(),
             judged: 0,
         }
     }
 
     fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
-        if self.shown.contains(&self.judged) {
+        if self.keep_latest || self.shown.contains(&self.judged) {
+            if self.keep_latest {
+                self.pictures.truncate(self.shown.len());
+            }
             let full = f32::from(self.context.sensor.max_count());
             let data = counts.iter().map(|&count| f32::from(count) / full).collect();
             let counts = Frame { size: restored.size, data };
-            self.pictures.push([counts, restored.clone()]);
+            self.pictures.push((self.judged, [counts, restored.clone()]));
         }
         self.judged += 1;
-        self.consistency.add(restored, counts, &self.context)
+        self.consistency.add(restored, counts, &self.context).map(drop)
     }
 
     /// Takes in frames that an earlier run finished.
@@ -157,11 +167,12 @@ impl Misfit {
         self.consistency.chi_square()
     }
 
-    /// Counts above, restored frames below: the first, the middle and the last.
+    /// Counts above, restored frames below: the first, the middle (not of a pipe without length) and
+    /// the last.
     pub(crate) fn side_by_side(&self) -> Option<Picture> {
-        let size = self.pictures.first()?[0].size;
+        let size = self.pictures.first()?.1[0].size;
         let mut picture = Picture::new(size, 2, self.pictures.len(), 1);
-        for (column, (pair, frame)) in self.pictures.iter().zip(&self.shown).enumerate() {
+        for (column, (frame, pair)) in self.pictures.iter().enumerate() {
             picture.place(0, column, &[&format!("COUNTS {frame}")], &pair[0]);
             picture.place(1, column, &[&format!("RESTORED {frame}")], &pair[1]);
         }
@@ -183,5 +194,7 @@ fn write_y4m_header(size: Size, fps: Option<f64>) -> Result<()> {
 fn write_y4m_frame(frame: &Frame) -> std::io::Result<()> {
     let mut bytes = b"FRAME\n".to_vec();
     bytes.extend(frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8));
-    std::io::stdout().lock().write_all(&bytes)
+    let mut out = std::io::stdout().lock();
+    // A live picture must not wait for the next one.
+    out.write_all(&bytes).and_then(|()| out.flush())
 }

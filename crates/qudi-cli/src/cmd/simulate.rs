@@ -1,13 +1,14 @@
 //! `qudi simulate`: settings to simulation, exposed frames to files.
 
 use crate::args::{Global, Simulate};
+use crate::cmd::tiff_samples::tiff_samples;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
 use crate::settings::{Flag, Settings};
 use qudi_sim::burst::{BurstFormat, BurstWriter, write_npy_stream};
 use qudi_sim::output::{
-    ArrayWriter, FramesWriter, GifPreview, Overwrite, PendingFile, refuse_taken,
+    ArrayWriter, FramesWriter, GifPreview, Overwrite, PendingFile, TiffSamples, refuse_taken,
 };
 use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
 use qudi_sim::scene::Flow;
@@ -173,6 +174,7 @@ struct Outputs<'a> {
     burst: Option<BurstWriter>,
     stream: Option<FrameEncoder>,
     truth: Option<FramesWriter>,
+    tiff: TiffSamples,
     flow: Option<ArrayWriter>,
     preview: Option<GifPreview>,
 }
@@ -210,6 +212,10 @@ impl<'a> Outputs<'a> {
             burst: None,
             stream: None,
             truth: None,
+            tiff: args
+                .truth
+                .as_ref()
+                .map_or(Ok(TiffSamples::U16), |p| tiff_samples(args.float, p))?,
             flow: None,
             preview: None,
         })
@@ -275,7 +281,7 @@ impl Sink for Outputs<'_> {
                 overwrite,
             )?);
         }
-        let create = |path: &PathBuf| FramesWriter::create(path, start.size, overwrite);
+        let create = |path: &PathBuf| FramesWriter::create(path, start.size, self.tiff, overwrite);
         self.truth = args.truth.as_ref().map(create).transpose()?;
         let create = |path: &PathBuf| {
             ArrayWriter::create(path, overwrite, "<f4", &[3, start.size.height, start.size.width])

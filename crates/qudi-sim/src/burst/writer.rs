@@ -2,11 +2,10 @@
 
 use super::bits::pack_row;
 use super::png_folder::PngFolder;
-use super::tiff_stack::TiffStack;
 use crate::error::{Result, SimError};
 use crate::frame::Size;
 use crate::npy::write_header;
-use crate::output::{ArrayWriter, Overwrite};
+use crate::output::{ArrayWriter, Overwrite, TiffStack};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -90,9 +89,16 @@ impl BurstFormat {
     }
 }
 
+/// Bits of a count.
+enum Depth {
+    Eight,
+    Sixteen,
+}
+
 enum Target {
     Array(ArrayWriter),
-    Tiff(TiffStack),
+    /// The stack, and the bits of its counts.
+    Tiff(TiffStack, Depth),
     Png(PngFolder),
 }
 
@@ -126,7 +132,10 @@ impl BurstWriter {
         overwrite: Overwrite,
     ) -> Result<Self> {
         let target = match format {
-            BurstFormat::Tiff => Target::Tiff(TiffStack::create(path, size, max_count, overwrite)?),
+            BurstFormat::Tiff => {
+                let depth = if max_count > 255 { Depth::Sixteen } else { Depth::Eight };
+                Target::Tiff(TiffStack::create(path, size, overwrite)?, depth)
+            }
             BurstFormat::Png => Target::Png(PngFolder::create(path, size, max_count, overwrite)?),
             _ => {
                 let (descr, item) = format.item(size);
@@ -143,7 +152,11 @@ impl BurstWriter {
     pub fn push(&mut self, counts: &[u16]) -> Result<()> {
         match &mut self.target {
             Target::Array(array) => array.push(&self.format.encode(self.size, counts)),
-            Target::Tiff(stack) => stack.push(counts),
+            Target::Tiff(stack, Depth::Sixteen) => stack.push_u16(counts),
+            Target::Tiff(stack, Depth::Eight) => {
+                let bytes: Vec<u8> = counts.iter().map(|&c| c as u8).collect();
+                stack.push_u8(&bytes)
+            }
             Target::Png(folder) => folder.push(counts),
         }
     }
@@ -176,24 +189,10 @@ impl BurstWriter {
         file.write_all(record).map_err(|e| file.fault(e))?;
         match self.target {
             Target::Array(array) => array.finish()?,
-            Target::Tiff(stack) => stack.finish()?,
+            Target::Tiff(stack, _) => stack.finish()?,
             Target::Png(_) => {}
         }
         file.finish()
-    }
-}
-
-impl BurstWriter {
-    /// Gives the burst its name, without a record.
-    ///
-    /// # Errors
-    /// [`SimError::Io`] if the disk is full.
-    pub fn finish_alone(self) -> Result<()> {
-        match self.target {
-            Target::Array(array) => array.finish(),
-            Target::Tiff(stack) => stack.finish(),
-            Target::Png(folder) => folder.finish(b"{}"),
-        }
     }
 }
 

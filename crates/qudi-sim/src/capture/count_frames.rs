@@ -6,8 +6,25 @@ use std::ops::Range;
 
 /// A stack of count images, `[frames][height][width]`.
 pub trait CountFrames: Send {
-    /// Number of frames.
+    /// Number of frames; of a pipe, those that have arrived.
     fn frames(&self) -> u64;
+
+    /// Number of frames in all; `None` as long as a pipe has not told.
+    fn length(&self) -> Option<u64> {
+        Some(self.frames())
+    }
+
+    /// Waits until there are `frames` frames, or no more come; gives how many there are. What the
+    /// user should know of the end goes to `remarks`.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the pipe ends inside a frame.
+    fn reach(&mut self, _frames: u64, _remarks: &mut Vec<String>) -> Result<u64> {
+        Ok(self.frames())
+    }
+
+    /// Says that no frame before `frame` is asked for again.
+    fn release(&mut self, _frame: u64) {}
 
     /// Size of every frame.
     fn size(&self) -> Size;
@@ -42,7 +59,7 @@ pub trait CountFrames: Send {
         Ok(false)
     }
 
-    /// Whether going back means to start over, as in a compressed file.
+    /// Whether going back means to start over, as in a compressed file, or is impossible.
     fn forward_only(&self) -> bool {
         false
     }

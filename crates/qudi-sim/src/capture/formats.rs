@@ -10,6 +10,7 @@ mod mat;
 mod mat_file;
 mod npy;
 mod npz;
+mod piped;
 mod qvga;
 mod raw;
 mod raw_files;
@@ -21,6 +22,8 @@ mod tiff;
 mod tiff_pages;
 mod video;
 mod visionsim;
+
+pub(super) use piped::open_pipe;
 
 use super::about::{About, Certainty};
 use super::count_frames::CountFrames;

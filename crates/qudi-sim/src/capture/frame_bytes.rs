@@ -1,6 +1,7 @@
 //! The stored bytes of frames: in files, in a compressed stream, or strewn across an array whose
 //! frame axis is not the slowest. Memory is bounded by a few frames.
 
+use super::pipe::Pipe;
 use crate::error::{Result, SimError};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -29,6 +30,8 @@ pub(crate) enum FrameBytes {
     /// Whatever is cheaper by the batch: compressed chunks, an array whose frame axis is not the
     /// slowest.
     Batched(Batched),
+    /// Frames that come once.
+    Pipe(Pipe),
 }
 
 impl FrameBytes {
@@ -71,6 +74,7 @@ impl FrameBytes {
             Self::Files(files) => files.total,
             Self::Stream(stream) => stream.frames,
             Self::Batched(batched) => batched.frames,
+            Self::Pipe(pipe) => pipe.arrived(),
         }
     }
 
@@ -79,11 +83,35 @@ impl FrameBytes {
             Self::Files(files) => files.frame_bytes,
             Self::Stream(stream) => stream.frame_bytes,
             Self::Batched(batched) => batched.frame_bytes,
+            Self::Pipe(pipe) => pipe.frame_bytes(),
         }
     }
 
     pub(crate) fn forward_only(&self) -> bool {
-        matches!(self, Self::Stream(_))
+        matches!(self, Self::Stream(_) | Self::Pipe(_))
+    }
+
+    /// Frames in all, if that is known.
+    pub(crate) fn length(&self) -> Option<u64> {
+        match self {
+            Self::Pipe(pipe) => pipe.length(),
+            _ => Some(self.frames()),
+        }
+    }
+
+    /// Waits for `frames` frames; gives how many there are.
+    pub(crate) fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
+        match self {
+            Self::Pipe(pipe) => pipe.reach(frames, remarks),
+            _ => Ok(self.frames()),
+        }
+    }
+
+    /// No frame before `frame` is asked for again.
+    pub(crate) fn release(&mut self, frame: u64) {
+        if let Self::Pipe(pipe) = self {
+            pipe.release(frame);
+        }
     }
 
     /// Fills `bytes`, a whole number of frames, from frame `first` on.
@@ -94,6 +122,7 @@ impl FrameBytes {
             Self::Files(files) => files.read(first, bytes),
             Self::Stream(stream) => stream.read(first, bytes),
             Self::Batched(batched) => batched.read(first, bytes),
+            Self::Pipe(pipe) => pipe.read(first, bytes),
         }
     }
 }

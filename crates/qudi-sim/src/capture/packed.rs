@@ -181,4 +181,16 @@ impl CountFrames for PackedFrames {
     fn forward_only(&self) -> bool {
         self.bytes.forward_only()
     }
+
+    fn length(&self) -> Option<u64> {
+        self.bytes.length()
+    }
+
+    fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
+        self.bytes.reach(frames, remarks)
+    }
+
+    fn release(&mut self, frame: u64) {
+        self.bytes.release(frame);
+    }
 }

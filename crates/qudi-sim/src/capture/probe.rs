@@ -54,7 +54,7 @@ impl Probe {
             return Err(SimError::data(
                 "neither a file nor a folder",
                 path,
-                "store the capture in a file first; it is read more than once",
+                "store the capture in a file first, or pipe it into `qudi restore -`",
             ));
         }
         Ok(Self {

@@ -1,10 +1,10 @@
-//! Frames in [0, 1] on disk: `.npy` of float32, 16-bit TIFF, GIF, MP4, or a folder of 16-bit PNG.
+//! Frames in [0, 1] on disk: `.npy` of float32, 16-bit or float TIFF, GIF, MP4, or a folder of 16-bit PNG.
 
 use super::array::ArrayWriter;
 use super::gif_preview::GifPreview;
 use super::mp4::Mp4;
 use super::pending::{Overwrite, PendingFolder};
-use crate::burst::{BurstFormat, BurstWriter};
+use super::tiff_stack::{TiffSamples, TiffStack};
 use crate::error::{Result, SimError};
 use crate::frame::{Frame, Size};
 use image::{ImageBuffer, Luma};
@@ -13,13 +13,25 @@ use std::path::Path;
 /// The first file of a folder; it also marks the folder as ours.
 const FIRST: &str = "frame_000000.png";
 
+/// A clip of images as a TIFF stack.
+pub struct TiffWriter {
+    stack: TiffStack,
+    samples: TiffSamples,
+}
+
+impl std::fmt::Debug for TiffWriter {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("TiffWriter").field("samples", &self.samples).finish_non_exhaustive()
+    }
+}
+
 /// A clip being written, frame by frame.
 #[derive(Debug)]
 pub enum FramesWriter {
     /// `.npy`, `[frames][height][width]` float32.
     Array(ArrayWriter),
-    /// Multi-page TIFF of 16-bit samples; 65535 is 1.
-    Tiff(Box<BurstWriter>),
+    /// Multi-page TIFF.
+    Tiff(TiffWriter),
     /// Animated GIF, the first frames of a long clip.
     Gif(GifPreview),
     /// MP4, for looking at.
@@ -35,18 +47,22 @@ pub enum FramesWriter {
 
 impl FramesWriter {
     /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
-    /// extension.
+    /// extension. `tiff` says what the samples of a `.tif` are.
     ///
     /// # Errors
     /// [`SimError`] for other extensions, or if the name is taken or the folder cannot be written.
-    pub fn create(path: &Path, size: Size, overwrite: Overwrite) -> Result<Self> {
+    pub fn create(
+        path: &Path,
+        size: Size,
+        tiff: TiffSamples,
+        overwrite: Overwrite,
+    ) -> Result<Self> {
         match path.extension().map(|e| e.to_string_lossy().to_lowercase()).as_deref() {
             Some("npy") => ArrayWriter::create(path, overwrite, "<f4", &[size.height, size.width])
                 .map(Self::Array),
             Some("tif" | "tiff") => {
-                let writer =
-                    BurstWriter::create(path, BurstFormat::Tiff, size, u16::MAX, overwrite)?;
-                Ok(Self::Tiff(Box::new(writer)))
+                let stack = TiffStack::create(path, size, overwrite)?;
+                Ok(Self::Tiff(TiffWriter { stack, samples: tiff }))
             }
             Some("gif") => GifPreview::create(path, overwrite, size, u16::MAX).map(Self::Gif),
             Some("mp4") => Mp4::create(path, size, overwrite).map(Self::Mp4),
@@ -69,7 +85,12 @@ impl FramesWriter {
     pub fn push(&mut self, frame: &Frame) -> Result<()> {
         match self {
             Self::Array(array) => array.push_f32(frame.data.iter().copied()),
-            Self::Tiff(writer) => writer.push(&sixteen_bits(frame)),
+            Self::Tiff(TiffWriter { stack, samples: TiffSamples::U16 }) => {
+                stack.push_u16(&sixteen_bits(frame))
+            }
+            Self::Tiff(TiffWriter { stack, samples: TiffSamples::F32 }) => {
+                stack.push_f32(&frame.data)
+            }
             Self::Gif(gif) => gif.push(&sixteen_bits(frame)),
             Self::Mp4(film) => film.push(frame),
             Self::Folder { folder, frames } => {
@@ -88,7 +109,7 @@ impl FramesWriter {
     pub fn finish(self) -> Result<()> {
         match self {
             Self::Array(array) => array.finish(),
-            Self::Tiff(writer) => writer.finish_alone(),
+            Self::Tiff(writer) => writer.stack.finish(),
             Self::Gif(gif) => gif.finish(),
             Self::Mp4(film) => film.finish(),
             Self::Folder { folder, .. } => folder.finish(),

@@ -27,22 +27,25 @@ impl Consistency {
         Self { moments, size, map: vec![0.0; size.pixels()], frames: 0 }
     }
 
-    /// Compares one frame with its counts.
+    /// Compares one frame with its counts, and gives its own mean.
     ///
     /// # Errors
     /// [`SimError`](crate::SimError) if the sensor's dark rate is unknown.
-    pub fn add(&mut self, restored: &Frame, counts: &[u16], context: &Context) -> Result<()> {
+    pub fn add(&mut self, restored: &Frame, counts: &[u16], context: &Context) -> Result<f64> {
         let ordinary = context.sensor.dark_per_frame()?;
         let photons = context.photons_per_unit() * context.sensor.quantum_efficiency;
+        let mut total = 0.0;
         for (i, (&image, &count)) in restored.data.iter().zip(counts).enumerate() {
             let detections = f64::from(image).max(0.0) * photons + context.dark_of(i, ordinary);
             let (mean, variance) = self.moments.at(detections);
             if variance > LEAST_VARIANCE {
-                self.map[i] += (f64::from(count) - mean).powi(2) / variance;
+                let misfit = (f64::from(count) - mean).powi(2) / variance;
+                self.map[i] += misfit;
+                total += misfit;
             }
         }
         self.frames += 1;
-        Ok(())
+        Ok(total / self.map.len() as f64)
     }
 
     /// Mean over all pixels and frames; `None` before the first frame.

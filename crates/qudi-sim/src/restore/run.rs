@@ -17,12 +17,13 @@ pub trait RestoreSink {
 }
 
 /// Restores the frames `wanted` of `capture` and hands them to `sink`. A window is computed if it
-/// holds a wanted frame; what a frame looks like does not depend on which others are wanted. Memory
-/// holds one window and one overlap.
+/// holds a wanted frame; what a frame looks like does not depend on which others are wanted, nor on
+/// whether it came from a file or a pipe. Memory holds two windows at most.
 ///
 /// # Errors
 /// [`SimError`] if the capture cannot be read or the method or the sink fails;
-/// [`SimError::Interrupted`] if `on`, told how many wanted frames are done, says so.
+/// [`SimError::Interrupted`] if `on`, told how many wanted frames are done of how many (if that is
+/// known), says so.
 pub fn run(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
@@ -30,18 +31,22 @@ pub fn run(
     wanted: Range<u64>,
     context: &Context,
     sink: &mut dyn RestoreSink,
-    on: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
+    on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
     let size = capture.size();
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
     let mut first_held = 0;
     let mut fade = CrossFade::default();
-    for number in windows.first_with(wanted.start)..windows.count() {
-        let range = windows.range(number);
-        if range.start >= wanted.end {
+    for number in windows.first_with(wanted.start).. {
+        // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
+        // the next one is whole, or no more frames come.
+        let windows = windows.over(capture.reach(windows.nominal_end(number + 1))?);
+        if number >= windows.count() || windows.range(number).start >= wanted.end {
             break;
         }
-        if on(range.start.saturating_sub(wanted.start), wanted.end - wanted.start).is_break() {
+        let range = windows.range(number);
+        let total = capture.length().map(|length| wanted.end.min(length) - wanted.start);
+        if on(range.start.saturating_sub(wanted.start), total).is_break() {
             return Err(SimError::Interrupted);
         }
         if counts.is_empty() {
@@ -56,6 +61,7 @@ pub fn run(
             capture.read(first_held + counts.len() as u64, &mut frame)?;
             counts.push_back(frame);
         }
+        capture.release(range.end);
         let context = Context { first_frame: range.start, ..context.clone() };
         let burst = BurstView { size, frames: counts.make_contiguous() };
         let restored = restorer.restore(burst, &context)?;

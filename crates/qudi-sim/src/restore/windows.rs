@@ -26,18 +26,34 @@ impl Windows {
                 "windows are longer than their overlap",
             ));
         }
-        Ok(Self { frames, length: length.min(frames), stride: length - overlap })
+        Ok(Self { frames, length, stride: length - overlap })
+    }
+
+    /// The same windows over another number of frames.
+    #[must_use]
+    pub fn over(self, frames: u64) -> Self {
+        Self { frames, ..self }
     }
 
     /// Number of windows.
     pub fn count(&self) -> u64 {
-        (self.frames - self.length).div_ceil(self.stride) + 1
+        (self.frames - self.held()).div_ceil(self.stride) + 1
     }
 
     /// Frames of window `number`.
     pub fn range(&self, number: u64) -> Range<u64> {
-        let start = (number * self.stride).min(self.frames - self.length);
-        start..start + self.length
+        let start = (number * self.stride).min(self.frames - self.held());
+        start..start + self.held()
+    }
+
+    /// One past the last frame of window `number`, if there are that many.
+    pub fn nominal_end(&self, number: u64) -> u64 {
+        number.saturating_mul(self.stride).saturating_add(self.length)
+    }
+
+    /// Frames of every window.
+    fn held(&self) -> u64 {
+        self.length.min(self.frames)
     }
 
     /// The first window that holds `frame`.

@@ -6,6 +6,7 @@ use crate::capture::count_frames::CountFrames;
 use crate::capture::frame_bytes::{Fetch, FrameBytes, Opener, Segment, strewn};
 use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::packed::{PackedFrames, Placement, stored_bytes};
+use crate::capture::pipe::{FIRST_WINDOW, Pipe};
 use crate::capture::samples::{Channel, MONO, SampleFrames, Scale};
 use crate::error::{Result, SimError};
 use crate::frame::Size;
@@ -23,6 +24,8 @@ pub(super) enum Place {
     /// Fetched in groups of frames.
     #[cfg_attr(not(feature = "hdf5"), expect(dead_code, reason = "only HDF5 is read so"))]
     Fetch { fetch: Fetch, group: u64 },
+    /// Through a pipe, at the first byte of the data.
+    Pipe(Pipe),
 }
 
 /// An array found in a file.
@@ -288,6 +291,10 @@ impl Array {
                 let count = (LOOK / frame_bytes).clamp(1, frames as usize) as u64;
                 bytes = fetch((frames - count) / 2, count)?;
             }
+            Place::Pipe(pipe) => {
+                pipe.reach(frames.min(FIRST_WINDOW), &mut Vec::new())?;
+                bytes = pipe.look();
+            }
         }
         Ok(bytes)
     }
@@ -311,7 +318,8 @@ impl Array {
                 let _ = std::io::copy(&mut opener()?.take(promised.unwrap_or(0)), &mut counted);
                 counted.0
             }
-            Place::Stream(_) | Place::Fetch { .. } => promised.unwrap_or(0),
+            // Of a pipe, nobody knows before its end.
+            Place::Stream(_) | Place::Fetch { .. } | Place::Pipe(_) => promised.unwrap_or(0),
         };
         let whole = (available / frame_bytes as u64).min(frames);
         if promised.is_none_or(|promised| promised > available) {
@@ -342,9 +350,10 @@ impl Array {
             Place::Fetch { fetch, group } if at == 0 => {
                 FrameBytes::batched(fetch, whole, frame_bytes, group)
             }
-            Place::Stream(_) | Place::Fetch { .. } => {
+            Place::Pipe(pipe) if at == 0 => FrameBytes::Pipe(pipe),
+            Place::Stream(_) | Place::Fetch { .. } | Place::Pipe(_) => {
                 return Err(self.fault(
-                    "a compressed array whose frame axis is not the first",
+                    "a compressed or piped array whose frame axis is not the first",
                     "save it as .npy; then its frames are gathered in place",
                 ));
             }

@@ -2,51 +2,47 @@
 //! `--trailer`. Never guessed.
 
 use super::Format;
-use super::raw_files::frame_files;
+use super::raw_files::{TRAILERS, frame_files};
 use crate::capture::about::{About, Packing};
 use crate::capture::count_frames::CountFrames;
+use crate::capture::frame_bytes::FrameBytes;
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::packed::{PackedFrames, Placement, stored_bytes};
+use crate::capture::pipe::{Pipe, STDIN, Tail};
 use crate::capture::probe::Probe;
 use crate::capture::samples::{MONO, SampleFrames, Scale};
 use crate::error::{Result, SimError};
 use crate::frame::Size;
 use crate::npy::Sample;
+use std::io::Read;
+use std::path::Path;
 
 pub(super) const BITS: Format = Format {
     name: "raw-bits",
     title: "packed bits without header",
     probe: |_| Ok(None),
-    open: |probe, options, about| {
-        let size = size(options)?;
-        let axis = match options.pack_axis {
-            Some(axis @ (PackAxis::Width | PackAxis::Height)) => axis,
-            Some(PackAxis::None) | None => PackAxis::Width,
-        };
-        let (rows, columns) = stored_bytes(size, axis);
-        let bytes = frame_files(&files(probe)?, rows * columns, 0, options, about)?;
-        let order = options.bit_order.unwrap_or(BitOrder::Msb);
-        about.max_count = Some(1);
-        about.packing = Some(Packing { axis, order });
-        let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
-        let placement = Placement::packed(size, axis, transposed);
-        Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
-    },
+    open: |probe, options, about| bits(options, about, &mut from_files(probe, options)),
 };
 
 pub(super) const BYTES: Format = Format {
     name: "raw-u8",
     title: "one byte per count without header",
     probe: |_| Ok(None),
-    open: |probe, options, about| samples(probe, options, about, Sample::U8),
+    open: |probe, options, about| {
+        samples(Sample::U8, &probe.path, options, about, &mut from_files(probe, options))
+    },
 };
 
 pub(super) const WORDS: Format = Format {
     name: "raw-u16",
     title: "two little-endian bytes per count without header",
     probe: |_| Ok(None),
-    open: |probe, options, about| samples(probe, options, about, Sample::U16 { big_endian: false }),
+    open: |probe, options, about| {
+        samples(WORD, &probe.path, options, about, &mut from_files(probe, options))
+    },
 };
+
+const WORD: Sample = Sample::U16 { big_endian: false };
 
 fn size(options: &ReadOptions) -> Result<Size> {
     options.size.ok_or_else(|| {
@@ -71,16 +67,76 @@ fn files(probe: &Probe) -> Result<Vec<std::path::PathBuf>> {
     Ok(files)
 }
 
-fn samples(
-    probe: &Probe,
+/// Frames of so many bytes.
+type Source<'a> = dyn FnMut(usize, &mut About) -> Result<FrameBytes> + 'a;
+
+fn from_files<'a>(
+    probe: &'a Probe,
+    options: &'a ReadOptions,
+) -> impl FnMut(usize, &mut About) -> Result<FrameBytes> + 'a {
+    |frame_bytes, about| frame_files(&files(probe)?, frame_bytes, 0, options, about)
+}
+
+/// Frames of the raw format `name` out of a pipe; `None` if there is no such format.
+pub(super) fn piped(
+    name: &str,
+    reader: Box<dyn Read + Send>,
+    options: &ReadOptions,
+) -> Option<Result<(Box<dyn CountFrames>, About)>> {
+    let format = [BITS, BYTES, WORDS].into_iter().find(|format| format.name == name)?;
+    let mut about = About::new(format.name, format.title);
+    about.evidence.push("--format".to_owned());
+    let mut reader = Some(reader);
+    let mut source = |frame_bytes: usize, _: &mut About| {
+        // Asked once: the reader goes with the frames.
+        let mut reader = reader.take().unwrap_or_else(|| Box::new(std::io::empty()));
+        let header = options.header.unwrap_or(0);
+        std::io::copy(&mut (&mut reader).take(header), &mut std::io::sink())
+            .map_err(|e| SimError::io("read", Path::new(STDIN), e))?;
+        let trailer = options.trailer.unwrap_or(0);
+        let tail = Tail { trailer, known: &TRAILERS, lenient: options.lenient };
+        Ok(FrameBytes::Pipe(Pipe::new(reader, frame_bytes, None, tail)))
+    };
+    let place = Path::new(STDIN);
+    let frames = match name {
+        "raw-bits" => bits(options, &mut about, &mut source),
+        "raw-u8" => samples(Sample::U8, place, options, &mut about, &mut source),
+        _ => samples(WORD, place, options, &mut about, &mut source),
+    };
+    Some(frames.map(|frames| (frames, about)))
+}
+
+fn bits(
     options: &ReadOptions,
     about: &mut About,
-    sample: Sample,
+    source: &mut Source<'_>,
 ) -> Result<Box<dyn CountFrames>> {
     let size = size(options)?;
-    let bytes = frame_files(&files(probe)?, size.pixels() * sample.bytes(), 0, options, about)?;
+    let axis = match options.pack_axis {
+        Some(axis @ (PackAxis::Width | PackAxis::Height)) => axis,
+        Some(PackAxis::None) | None => PackAxis::Width,
+    };
+    let (rows, columns) = stored_bytes(size, axis);
+    let bytes = source(rows * columns, about)?;
+    let order = options.bit_order.unwrap_or(BitOrder::Msb);
+    about.max_count = Some(1);
+    about.packing = Some(Packing { axis, order });
+    let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
+    let placement = Placement::packed(size, axis, transposed);
+    Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
+}
+
+fn samples(
+    sample: Sample,
+    place: &Path,
+    options: &ReadOptions,
+    about: &mut About,
+    source: &mut Source<'_>,
+) -> Result<Box<dyn CountFrames>> {
+    let size = size(options)?;
+    let bytes = source(size.pixels() * sample.bytes(), about)?;
     let full = sample.full_scale().unwrap_or(1.0);
     let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
     let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
-    Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, &probe.path)))
+    Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, place)))
 }

@@ -9,7 +9,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// What camera servers append to a stream of frames.
-const TRAILERS: [&[u8]; 2] = [b"DONE", b"ERROR"];
+pub(super) const TRAILERS: [&[u8]; 2] = [b"DONE", b"ERROR"];
 
 /// The frames of `files`, `frame_bytes` each, after `header` bytes.
 pub(super) fn frame_files(
