@@ -63,6 +63,8 @@ fn more_light_is_better_and_bars_are_kept() {
     let found = eval(&folder, "scene:text --ppp 3.25,26 --frames 11 --csv f.csv --markdown t.md");
     let psnr = |row: usize| found["rows"][row]["psnr_a"]["all"]["mean"].as_f64().unwrap();
     assert!(psnr(2) > psnr(0) + 1.0 && psnr(3) > psnr(1) + 1.0, "{found}");
+    let row = &found["rows"][0];
+    assert!(row["peak_mib"].is_number() == cfg!(target_os = "linux"), "{row}");
     let csv = std::fs::read_to_string(folder.join("f.csv")).unwrap();
     assert_eq!(csv.lines().count(), 1 + 4 * 11);
     assert!(std::fs::read_to_string(folder.join("t.md")).unwrap().contains("| mle | 26 |"));
@@ -112,4 +114,66 @@ fn the_quiver_protocol_judges_the_middle_of_every_window() {
         .assert()
         .code(2);
     qudi(&folder).args("eval scene:text --protocol quiver --frames 10".split(' ')).assert().code(2);
+}
+
+/// A recorded clip has no true flow; one is estimated on it, and says about the same.
+#[test]
+fn recorded_clips_flicker_along_an_estimated_flow() {
+    let folder = scratch("eval-flow");
+    qudi(&folder)
+        .args(
+            "simulate scene:dead-leaves --size 256x256 --frames 6 --seed 1 -o x.npy -q".split(' '),
+        )
+        .args(["--truth", "clip.npy"])
+        .assert()
+        .success();
+    let known = eval(&folder, "scene:dead-leaves --ppp 9.75 --frames 6 --method average,mle");
+    let recorded = eval(&folder, "clip.npy --ppp 9.75 --markdown t.md --method average,mle");
+    for row in 0..2 {
+        let (known, recorded) = (&known["rows"][row], &recorded["rows"][row]);
+        assert_eq!((&known["flow"], &recorded["flow"]), (&"true".into(), &"estimated".into()));
+        let flicker = |row: &Value| row["flicker"].as_f64().unwrap();
+        let ratio = flicker(recorded) / flicker(known);
+        assert!((0.7..1.4).contains(&ratio), "{} {}", flicker(recorded), flicker(known));
+    }
+    let table = std::fs::read_to_string(folder.join("t.md")).unwrap();
+    assert!(table.contains("flicker (estimated flow)"), "{table}");
+}
+
+#[test]
+fn a_capture_is_judged_without_truth() {
+    let folder = scratch("eval-capture");
+    qudi(&folder)
+        .args("simulate scene:dead-leaves --size 48x64 --frames 40 --seed 2 -o c.npy -q".split(' '))
+        .assert()
+        .success();
+    let files = "--html r.html --csv f.csv --markdown t.md";
+    let found = eval(&folder, &format!("c.npy --capture --frames 20 {files}"));
+    for row in found["rows"].as_array().unwrap() {
+        let chi_square = row["chi_square"].as_f64().unwrap();
+        assert!((0.3..3.0).contains(&chi_square), "{row}");
+        assert!(row["seconds_per_frame"].is_number());
+        assert_eq!(row["clips"][0]["frames"].as_array().unwrap().len(), 20);
+        for truth in ["psnr_a", "psnr", "ssim", "ssim_g", "flicker", "flow"] {
+            assert!(row.get(truth).is_none(), "{truth} is absent, not zero: {row}");
+        }
+    }
+    let read = |name: &str| std::fs::read_to_string(folder.join(name)).unwrap();
+    assert!(!read("t.md").contains("psnr") && read("t.md").contains("chi-square"));
+    assert_eq!(read("f.csv").lines().count(), 1 + 2 * 20);
+    assert!(read("f.csv").lines().nth(1).unwrap().contains(",0,,,,,"), "empty, not zero");
+    let page = read("r.html");
+    assert!(page.contains(">counts<") && page.contains("mle chi-square"));
+    assert!(!page.contains(">truth<") && !page.contains(": error") && !page.contains("<svg"));
+    for refused in [
+        "c.npy",
+        "c.npy --capture --min-psnr 3",
+        "c.npy --capture --protocol quiver",
+        "c.npy --capture --ppp 3,4",
+        "c.npy --capture --frames 0",
+        "scene:text --sum 3",
+        "scene:text --gain 3",
+    ] {
+        qudi(&folder).arg("eval").args(refused.split(' ')).assert().code(2);
+    }
 }

@@ -83,7 +83,7 @@ pub(crate) enum Color {
 pub(crate) enum Command {
     Simulate(Box<Simulate>),
     Restore(Box<Restore>),
-    Eval(Eval),
+    Eval(Box<Eval>),
     Bench(Bench),
     Convert(Box<Convert>),
     Calibrate(Box<Calibrate>),

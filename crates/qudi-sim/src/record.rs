@@ -17,7 +17,7 @@ pub const VERSION: u32 = 1;
 const MAX_FILE: u64 = 1 << 24;
 
 /// Where the record of the file at `path` lies: `NAME.npy.json` beside `NAME.npy`.
-pub(crate) fn beside(path: &Path) -> PathBuf {
+pub fn beside(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".json");
     name.into()

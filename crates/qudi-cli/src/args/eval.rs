@@ -1,29 +1,40 @@
 //! Options of `qudi eval` and `qudi bench`.
 
+use super::Reading;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_sim::Size;
 use std::path::PathBuf;
 
-/// Compare methods on clips whose truth is known: the same photons and frames for all
+/// Compare methods on clips whose truth is known, or on a real capture: the same photons and frames for all
 ///
 /// DATA is a clip, or a folder of clips: folders of images, videos, GIF, Y4M, .npy, or scene:NAME.
 /// Each clip is exposed once per light level, with a seed of its own. Figures lead with PSNR after the
 /// best gain (psnr-a): counts do not fix the brightness of a picture, and no method is told.
+///
+/// With --capture, DATA is a capture in any format. It has no truth, so that there are pictures (--html) and
+/// the chi-square of its counts given the result; a method that fits the noise gets below 1, one that blurs
+/// or invents above.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Eval {
-    /// A clip, or a folder of clips
+    /// A clip, a folder of clips, or a capture
     #[arg(value_hint = ValueHint::AnyPath)]
     pub(crate) data: String,
+    /// DATA is a capture of counts, without truth
+    #[arg(long)]
+    pub(crate) capture: bool,
     /// Methods to compare
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
     pub(crate) method: Vec<String>,
-    /// Incident photons per pixel and frame
-    #[arg(long, value_name = "PPP,...", value_delimiter = ',', default_values_t = [3.25, 9.75, 26.0])]
+    /// Incident photons per pixel and frame [default: 3.25,9.75,26; of a capture: from its record, or estimated]
+    #[arg(long, value_name = "PPP,...", value_delimiter = ',')]
     pub(crate) ppp: Vec<f64>,
-    /// Sensor: a name or a .toml file
-    #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
-    pub(crate) sensor: String,
-    /// Frames of each clip at most
+    /// Sensor: a name or a .toml file [default: qudi-paper; of a capture: known from record or format]
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) sensor: Option<String>,
+    /// Gain of a capture in DN per electron, for sensors whose gain follows the light
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, requires = "capture")]
+    pub(crate) gain: Option<f64>,
+    /// Frames of each clip, or of the capture, at most
     #[arg(long, value_name = "N", default_value_t = 33)]
     pub(crate) frames: u64,
     /// How photons are drawn: strict (once per clip) or quiver (anew for every window of 11, light
@@ -57,6 +68,8 @@ pub(crate) struct Eval {
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true)]
     pub(crate) min_psnr: Option<f64>,
+    #[command(flatten)]
+    pub(crate) reading: Reading,
 }
 
 /// Measure speed and memory of methods

@@ -1,61 +1,27 @@
-//! `qudi eval`: methods against known truth, on the same photons.
+//! `qudi eval`: methods against known truth on the same photons, or on a real capture without one.
 
 use crate::args::{Eval, Global, Protocol};
-use crate::cmd::eval_clip::{Clip, Score};
+use crate::cmd::eval_capture::{Judged, judge};
+use crate::cmd::eval_clip::Clip;
 use crate::cmd::eval_html::html;
-use crate::cmd::eval_table::{about, csv, markdown, table};
+use crate::cmd::eval_score::{Figure, FlowKind, Row};
+use crate::cmd::eval_table::{csv, markdown, table};
 use crate::cmd::methods::METHODS;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
-use qudi_sim::metrics::Statistics;
+use qudi_sim::capture::{MaskChoice, ReadOptions};
 use qudi_sim::output::{Overwrite, PendingFile, refuse_taken};
 use qudi_sim::sensor::Sensor;
 use serde_json::{Value, json};
 use std::io::Write;
 use std::path::Path;
 
-/// All scores of one method at one light level.
-pub(crate) struct Row {
-    pub(crate) method: String,
-    pub(crate) ppp: f64,
-    /// One per clip.
-    pub(crate) scores: Vec<Score>,
-}
+/// Light levels of clips unless said otherwise: those of the paper's table.
+const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
 
-/// A figure of a frame, and its name.
-type Figure = fn(&crate::cmd::eval_clip::FrameScore) -> f64;
-
-impl Row {
-    /// Statistics over clips of the mean over each clip's frames.
-    pub(crate) fn over_clips(&self, figure: Figure) -> Option<Statistics> {
-        let means: Vec<f64> = self
-            .scores
-            .iter()
-            .map(|score| score.frames.iter().map(figure).sum::<f64>() / score.frames.len() as f64)
-            .collect();
-        Statistics::of(&means)
-    }
-
-    /// Statistics over clips of the frame in the middle.
-    pub(crate) fn centre(&self, figure: Figure) -> Option<Statistics> {
-        let centres: Vec<f64> =
-            self.scores.iter().map(|s| figure(&s.frames[s.frames.len() / 2])).collect();
-        Statistics::of(&centres)
-    }
-
-    /// Statistics over all frames of all clips.
-    pub(crate) fn over_frames(&self, figure: Figure) -> Option<Statistics> {
-        let all: Vec<f64> = self.scores.iter().flat_map(|s| &s.frames).map(figure).collect();
-        Statistics::of(&all)
-    }
-
-    /// Mean over clips, where known.
-    pub(crate) fn mean(&self, value: impl Fn(&Score) -> Option<f64>) -> Option<f64> {
-        let known: Option<Vec<f64>> = self.scores.iter().map(value).collect();
-        known.and_then(|values| Statistics::of(&values)).map(|statistics| statistics.mean)
-    }
-}
+/// Sensor of clips unless said otherwise.
+const SENSOR: &str = "qudi-paper";
 
 pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
@@ -70,6 +36,32 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
             format!("there are {}", METHODS.join(" and ")),
         ));
     }
+    let Judged { rows, pictures, about, settings } =
+        if args.capture { judge(args, report)? } else { judge_clips(args, report, overwrite)? };
+    write(args.csv.as_deref(), &csv(&rows), overwrite)?;
+    if args.html.is_some() {
+        let page = html(&rows, &pictures, &about);
+        write(args.html.as_deref(), &page, overwrite)?;
+    }
+    write(args.markdown.as_deref(), &markdown(&rows), overwrite)?;
+    report.result(&table(&rows, &about), || document(settings, &rows))?;
+    let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
+    match args.min_psnr {
+        Some(bar) => match rows.iter().find(|row| psnr_a(row) < bar) {
+            Some(row) => Err(Fault::Missed(format!(
+                "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
+                row.method,
+                psnr_a(row),
+                row.ppp
+            ))),
+            None => Ok(()),
+        },
+        None => Ok(()),
+    }
+}
+
+/// Every method on every clip at every light level.
+fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Judged> {
     if args.protocol == Protocol::Quiver
         && (args.export_photons.is_some() || !args.external.is_empty())
     {
@@ -79,7 +71,15 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
             "other programs are compared under the strict protocol",
         ));
     }
-    let sensor = Sensor::load(&args.sensor)?;
+    if args.reading.options(MaskChoice::Auto) != ReadOptions::default() {
+        return Err(Fault::new(
+            "options for reading captures, and DATA is taken for clips",
+            &args.data,
+            "add --capture if it is a capture, or leave them out",
+        ));
+    }
+    let sensor = Sensor::load(args.sensor.as_deref().unwrap_or(SENSOR))?;
+    let levels = if args.ppp.is_empty() { &LEVELS[..] } else { &args.ppp };
     let clips = Clip::find(&args.data)?;
     if let Some(folder) = &args.export_photons {
         std::fs::create_dir_all(folder)
@@ -88,7 +88,7 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     let mut rows: Vec<Row> = Vec::new();
     let names: Vec<&String> =
         args.method.iter().chain(args.external.iter().map(|external| &external.name)).collect();
-    for &ppp in &args.ppp {
+    for &ppp in levels {
         rows.extend(names.iter().map(|&name| Row {
             method: name.clone(),
             ppp,
@@ -97,10 +97,12 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     }
     let mut pictures = Vec::new();
     let mut bar = report.bar();
-    let total = (clips.len() * args.ppp.len()) as u64;
-    for (i, clip) in clips.iter().enumerate() {
-        for (j, &ppp) in args.ppp.iter().enumerate() {
-            bar.update("evaluating", (i * args.ppp.len() + j) as u64, Some(total));
+    let number = clips.len();
+    let total = (number * levels.len()) as u64;
+    // By value: what was found out about a clip goes with it.
+    for (i, clip) in clips.into_iter().enumerate() {
+        for (j, &ppp) in levels.iter().enumerate() {
+            bar.update("evaluating", (i * levels.len() + j) as u64, Some(total));
             if interrupt::check().is_break() {
                 return Err(Fault::Interrupted);
             }
@@ -120,26 +122,30 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
         }
     }
     drop(bar);
-    write(args.csv.as_deref(), &csv(&rows), overwrite)?;
-    if args.html.is_some() {
-        let page = html(&rows, &pictures, &about(args, clips.len()));
-        write(args.html.as_deref(), &page, overwrite)?;
-    }
-    write(args.markdown.as_deref(), &markdown(&rows), overwrite)?;
-    report.result(&table(&rows, args, clips.len()), || document(args, &sensor, &rows))?;
-    let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
-    match args.min_psnr {
-        Some(bar) => match rows.iter().find(|row| psnr_a(row) < bar) {
-            Some(row) => Err(Fault::Missed(format!(
-                "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
-                row.method,
-                psnr_a(row),
-                row.ppp
-            ))),
-            None => Ok(()),
-        },
-        None => Ok(()),
-    }
+    let flow = match rows.first().and_then(Row::flow) {
+        Some(FlowKind::True) => "; flicker: rms change along the true flow beyond the truth's",
+        Some(FlowKind::Estimated) => {
+            "; flicker: rms change along the estimated flow (on the truth, checked both ways) beyond the truth's"
+        }
+        None => "",
+    };
+    let protocol = match args.protocol {
+        Protocol::Strict => "strict",
+        Protocol::Quiver => "quiver",
+    };
+    let about = format!(
+        "{number} clips, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
+        sensor.name, args.seed
+    );
+    let settings = json!({
+        "protocol": args.protocol,
+        "data": args.data,
+        "sensor": sensor,
+        "seed": args.seed,
+        "exposure": args.exposure,
+        "overlap": args.overlap,
+    });
+    Ok(Judged { rows, pictures, about, settings })
 }
 
 fn write(path: Option<&Path>, text: &str, overwrite: Overwrite) -> Result<()> {
@@ -149,28 +155,32 @@ fn write(path: Option<&Path>, text: &str, overwrite: Overwrite) -> Result<()> {
     Ok(file.finish()?)
 }
 
-fn document(args: &Eval, sensor: &Sensor, rows: &[Row]) -> Value {
+/// What is not known is left out.
+fn document(mut settings: Value, rows: &[Row]) -> Value {
     let row = |row: &Row| {
-        json!({
+        let of = |figure: Figure| {
+            Some(
+                json!({"centre": row.centre(figure)?, "all": row.over_clips(figure)?, "frames": row.over_frames(figure)?}),
+            )
+        };
+        let figures = json!({
             "method": row.method,
             "ppp": row.ppp,
-            "psnr_a": {"centre": row.centre(|f| f.psnr_a), "all": row.over_clips(|f| f.psnr_a), "frames": row.over_frames(|f| f.psnr_a)},
-            "psnr": {"centre": row.centre(|f| f.psnr), "all": row.over_clips(|f| f.psnr)},
-            "ssim": {"centre": row.centre(|f| f.ssim), "all": row.over_clips(|f| f.ssim)},
-            "ssim_g": {"centre": row.centre(|f| f.ssim_g), "all": row.over_clips(|f| f.ssim_g)},
+            "psnr_a": of(|f| f.psnr_a),
+            "psnr": of(|f| f.psnr),
+            "ssim": of(|f| f.ssim),
+            "ssim_g": of(|f| f.ssim_g),
             "chi_square": row.mean(|s| s.chi_square),
             "flicker": row.mean(|s| s.flicker),
+            "flow": row.flow(),
             "seconds_per_frame": row.mean(|s| s.seconds_per_frame),
+            "peak_mib": row.peak_mib(),
             "clips": row.scores,
-        })
+        });
+        let Value::Object(mut figures) = figures else { return figures };
+        figures.retain(|_, figure| !figure.is_null());
+        Value::Object(figures)
     };
-    json!({
-        "protocol": args.protocol,
-        "data": args.data,
-        "sensor": sensor,
-        "seed": args.seed,
-        "exposure": args.exposure,
-        "overlap": args.overlap,
-        "rows": rows.iter().map(row).collect::<Vec<_>>(),
-    })
+    settings["rows"] = rows.iter().map(row).collect();
+    settings
 }

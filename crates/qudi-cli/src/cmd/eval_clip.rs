@@ -2,15 +2,19 @@
 
 use crate::args::{Eval, External};
 use crate::cmd::eval_html::Pictures;
+use crate::cmd::eval_score::{Cost, FlowKind, FrameScore, Score};
 use crate::cmd::methods::method;
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::memory::Peak;
 use qudi_sim::burst::{BurstFormat, BurstWriter};
 use qudi_sim::capture::Capture;
-use qudi_sim::metrics::{best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim, warping_error};
+use qudi_sim::metrics::{
+    best_gain, estimate_flow, gain_aligned_psnr, gaussian_ssim, psnr, ssim, warping_error,
+};
 use qudi_sim::npy::read_clip;
 use qudi_sim::output::Overwrite;
-use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
+use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION, beside};
 use qudi_sim::restore::{BurstView, Consistency, Context, RestoreSink, Windows, run as run_method};
 use qudi_sim::scene::Flow;
 use qudi_sim::sensor::Sensor;
@@ -18,38 +22,17 @@ use qudi_sim::source::{Input, Sampling};
 use qudi_sim::{
     Camera, Exposed, Frame, Light, PppDefinition, SimError, Simulation, Sink, Size, Start, simulate,
 };
-use serde::Serialize;
+use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::time::Instant;
 
 /// A clip by name, and what to give [`Input::parse`].
 pub(crate) struct Clip {
     name: String,
     place: String,
-}
-
-/// Figures of one frame.
-#[derive(Clone, Copy, Debug, Serialize)]
-pub(crate) struct FrameScore {
-    pub(crate) psnr_a: f64,
-    pub(crate) psnr: f64,
-    pub(crate) ssim: f64,
-    pub(crate) ssim_g: f64,
-}
-
-/// Figures of one method on one clip.
-#[derive(Clone, Debug, Serialize)]
-pub(crate) struct Score {
-    pub(crate) clip: String,
-    pub(crate) frames: Vec<FrameScore>,
-    pub(crate) chi_square: Option<f64>,
-    /// Root mean square flicker along the true flow beyond the truth's own, after the best gain;
-    /// synthetic scenes only.
-    pub(crate) flicker: Option<f64>,
-    pub(crate) seconds_per_frame: Option<f64>,
-    /// The middle frame after the best gain.
-    #[serde(skip)]
-    pub(crate) picture: Frame,
+    /// Estimated once: the truth is the same at every light level.
+    estimated_flow: OnceCell<Rc<Vec<Flow>>>,
 }
 
 impl Clip {
@@ -61,7 +44,14 @@ impl Clip {
                 Some(name) => name.to_owned(),
                 None => stem(path),
             };
-            return Ok(vec![Self { name, place: data.to_owned() }]);
+            if beside(path).is_file() {
+                return Err(Fault::new(
+                    "a burst of counts (its record lies beside it), and clips are pictures",
+                    data,
+                    "measure on it without truth with --capture, or name the clip that it was made of",
+                ));
+            }
+            return Ok(vec![Self::new(name, data.to_owned())]);
         }
         let io = |e| SimError::io("list the folder", path, e);
         let mut inside = Vec::new();
@@ -77,8 +67,12 @@ impl Clip {
         };
         let clips: Vec<_> = inside.into_iter().filter(is_clip).collect();
         let clips = if clips.is_empty() { vec![path.to_owned()] } else { clips };
-        let named = |path: PathBuf| Self { name: stem(&path), place: path.display().to_string() };
+        let named = |path: PathBuf| Self::new(stem(&path), path.display().to_string());
         Ok(clips.into_iter().map(named).collect())
+    }
+
+    fn new(name: String, place: String) -> Self {
+        Self { name, place, estimated_flow: OnceCell::new() }
     }
 
     /// Exposes the clip; the same photons for the same seed, name, sensor and light.
@@ -130,8 +124,25 @@ impl Clip {
             gain: summary.gain,
             dark: None,
         };
-        Ok(ExposedClip { name: self.name.clone(), size, ppp, seed, kept, context })
+        let motion = if kept.flow.is_empty() {
+            let estimate = || {
+                let pairs = kept.truth.windows(2);
+                Rc::new(pairs.map(|pair| estimate_flow(&pair[0], &pair[1])).collect())
+            };
+            Motion::Estimated(Rc::clone(self.estimated_flow.get_or_init(estimate)))
+        } else {
+            Motion::True(std::mem::take(&mut kept.flow))
+        };
+        Ok(ExposedClip { name: self.name.clone(), size, ppp, seed, kept, motion, context })
     }
+}
+
+/// From each frame of the truth to the next.
+enum Motion {
+    /// Known, since the scene is synthetic.
+    True(Vec<Flow>),
+    /// Found in the clean frames.
+    Estimated(Rc<Vec<Flow>>),
 }
 
 /// Name of a clip at a light level, as in `dog-ppp9_75`: no dot, so that a folder may have it.
@@ -139,7 +150,7 @@ fn burst_name(clip: &str, ppp: f64) -> String {
     format!("{clip}-ppp{}", ppp.to_string().replace('.', "_"))
 }
 
-fn stem(path: &Path) -> String {
+pub(crate) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
@@ -181,6 +192,7 @@ pub(crate) struct ExposedClip {
     ppp: f64,
     seed: u64,
     kept: Kept,
+    motion: Motion,
     context: Context,
 }
 
@@ -189,6 +201,7 @@ impl ExposedClip {
         let sensor = &self.context.sensor;
         let mut capture =
             Capture::in_memory(&self.name, self.size, self.kept.counts.clone(), sensor)?;
+        let peak = Peak::start();
         let start = Instant::now();
         let (mut restorer, _) = method(name, &mut capture, &self.context)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
@@ -203,8 +216,11 @@ impl ExposedClip {
             &mut sink,
             &mut |_, _| interrupt::check(),
         )?;
-        let seconds = start.elapsed().as_secs_f64() / sink.0.len() as f64;
-        self.score(&sink.0, Some(seconds))
+        let cost = Cost {
+            seconds_per_frame: start.elapsed().as_secs_f64() / sink.0.len() as f64,
+            peak_mib: peak.grown_mib(),
+        };
+        self.score(&sink.0, Some(cost))
     }
 
     /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
@@ -220,7 +236,8 @@ impl ExposedClip {
             ));
         }
         let sensor = &self.context.sensor;
-        let (mut frames, mut middles, mut seconds) = (Vec::new(), Vec::new(), 0.0);
+        let (mut frames, mut middles) = (Vec::new(), Vec::new());
+        let (mut seconds, mut highest) = (0.0, None::<f64>);
         let windows = truth.len() - WINDOW + 1;
         for first in 0..windows {
             if interrupt::check().is_break() {
@@ -236,12 +253,14 @@ impl ExposedClip {
                 counts.push(camera.expose(t as u64, &[frame])?);
             }
             let context = Context { gain: camera.gain(), ppp: self.ppp, ..self.context.clone() };
+            let peak = Peak::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
             let (mut restorer, _) = method(name, &mut capture, &context)?;
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &context)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();
+            highest = [highest, peak.grown_mib()].into_iter().flatten().reduce(f64::max);
             frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
             middles.push(restored);
         }
@@ -252,7 +271,9 @@ impl ExposedClip {
             frames,
             chi_square: None,
             flicker: None,
+            flow: None,
             seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
+            peak_mib: highest,
             picture,
         })
     }
@@ -266,10 +287,11 @@ impl ExposedClip {
             )
         };
         Ok(FrameScore {
-            psnr_a: gain_aligned_psnr(image, truth),
-            psnr: psnr(image, truth),
-            ssim: ssim(image, truth).ok_or_else(small)?,
-            ssim_g: gaussian_ssim(image, truth).ok_or_else(small)?,
+            psnr_a: Some(gain_aligned_psnr(image, truth)),
+            psnr: Some(psnr(image, truth)),
+            ssim: Some(ssim(image, truth).ok_or_else(small)?),
+            ssim_g: Some(gaussian_ssim(image, truth).ok_or_else(small)?),
+            chi_square: None,
         })
     }
 
@@ -305,20 +327,26 @@ impl ExposedClip {
         self.score(&frames, None)
     }
 
-    fn score(&self, restored: &[Frame], seconds_per_frame: Option<f64>) -> Result<Score> {
+    fn score(&self, restored: &[Frame], cost: Option<Cost>) -> Result<Score> {
         let mut consistency = Consistency::new(self.size, &self.context);
         let mut frames = Vec::with_capacity(restored.len());
         for ((image, truth), counts) in restored.iter().zip(&self.kept.truth).zip(&self.kept.counts)
         {
-            consistency.add(image, counts, &self.context)?;
-            frames.push(self.score_frame(image, truth)?);
+            let chi_square = Some(consistency.add(image, counts, &self.context)?);
+            frames.push(FrameScore { chi_square, ..self.score_frame(image, truth)? });
         }
         Ok(Score {
             clip: self.name.clone(),
             frames,
             chi_square: consistency.chi_square(),
             flicker: self.flicker(restored),
-            seconds_per_frame,
+            flow: match &self.motion {
+                _ if restored.len() < 2 => None,
+                Motion::True(_) => Some(FlowKind::True),
+                Motion::Estimated(_) => Some(FlowKind::Estimated),
+            },
+            seconds_per_frame: cost.map(|cost| cost.seconds_per_frame),
+            peak_mib: cost.and_then(|cost| cost.peak_mib),
             picture: aligned(&restored[restored.len() / 2], &self.kept.truth[restored.len() / 2]),
         })
     }
@@ -334,13 +362,17 @@ impl ExposedClip {
             clip: self.name.clone(),
             ppp: self.ppp,
             counts: Frame { size: self.size, data: counts.collect() },
-            truth: self.kept.truth[middle].clone(),
+            truth: Some(self.kept.truth[middle].clone()),
         }
     }
 
     fn flicker(&self, restored: &[Frame]) -> Option<f64> {
         let mut excess = Vec::new();
-        for (t, flow) in self.kept.flow.iter().enumerate() {
+        let flow = match &self.motion {
+            Motion::True(flow) => flow,
+            Motion::Estimated(flow) => flow.as_ref(),
+        };
+        for (t, flow) in flow.iter().enumerate() {
             let truth = &self.kept.truth;
             // One gain for both frames: flicker of brightness counts.
             let gain = best_gain(&restored[t], &truth[t]);

@@ -1,7 +1,7 @@
 //! The report of `qudi eval` as one HTML file: table, plot, pictures side by side. Nothing is fetched.
 
-use crate::cmd::eval::Row;
-use crate::cmd::eval_table::{TITLES, cells};
+use crate::cmd::eval_score::Row;
+use crate::cmd::eval_table::columns;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::{ExtendedColorType, ImageEncoder};
@@ -20,7 +20,7 @@ pub(crate) struct Pictures {
     pub(crate) ppp: f64,
     /// Counts of the middle frame, full scale for 1.
     pub(crate) counts: Frame,
-    pub(crate) truth: Frame,
+    pub(crate) truth: Option<Frame>,
 }
 
 /// The whole page.
@@ -31,7 +31,11 @@ pub(crate) fn html(rows: &[Row], pictures: &[Pictures], about: &str) -> String {
     );
     page += &table(rows);
     page += &plot(rows);
-    page += "<h2>Pictures</h2>\n<p>Middle frame of each clip, after the best gain; errors are doubled, none is middle gray. Choose what lies on either side, and drag the slider.</p>\n";
+    page += "<h2>Pictures</h2>\n<p>Middle frame of each clip";
+    if pictures.iter().any(|clip| clip.truth.is_some()) {
+        page += ", after the best gain; errors are doubled, none is middle gray";
+    }
+    page += ". Choose what lies on either side, and drag the slider.</p>\n";
     for clip in pictures {
         page += &figure(rows, clip);
     }
@@ -44,13 +48,14 @@ fn escape(text: &str) -> String {
 
 fn table(rows: &[Row]) -> String {
     let mut text = "<table><thead><tr>".to_owned();
-    for title in TITLES {
-        let _ = write!(text, "<th>{}</th>", escape(title));
+    let mut lines = columns(rows).into_iter();
+    for title in lines.next().unwrap_or_default() {
+        let _ = write!(text, "<th>{}</th>", escape(&title));
     }
     text += "</tr></thead><tbody>\n";
-    for row in rows {
+    for line in lines {
         text += "<tr>";
-        for cell in cells(row) {
+        for cell in line {
             let _ = write!(text, "<td>{}</td>", escape(&cell));
         }
         text += "</tr>\n";
@@ -166,22 +171,29 @@ fn figure(rows: &[Row], clip: &Pictures) -> String {
     let mut figures = Vec::new();
     for row in rows.iter().filter(|row| row.ppp == clip.ppp) {
         let Some(score) = row.scores.iter().find(|score| score.clip == clip.clip) else { continue };
-        let middle = &score.frames[score.frames.len() / 2];
-        figures.push(format!("{} {:.2} dB, SSIM {:.3}", row.method, middle.psnr_a, middle.ssim));
+        let middle = score.frames.get(score.frames.len() / 2).copied().unwrap_or_default();
+        let mut figure = row.method.clone();
+        if let (Some(psnr_a), Some(ssim)) = (middle.psnr_a, middle.ssim) {
+            let _ = write!(figure, " {psnr_a:.2} dB, SSIM {ssim:.3}");
+        } else if let Some(chi_square) = middle.chi_square {
+            let _ = write!(figure, " chi-square {chi_square:.3}");
+        }
+        figures.push(figure);
         names.push((row.method.clone(), picture(&score.picture)));
+        let Some(truth) = &clip.truth else { continue };
         let error = Frame {
-            size: clip.truth.size,
+            size: truth.size,
             data: score
                 .picture
                 .data
                 .iter()
-                .zip(&clip.truth.data)
+                .zip(&truth.data)
                 .map(|(image, truth)| 0.5 + ERROR_GAIN * 0.5 * (image - truth))
                 .collect(),
         };
         names.push((format!("{}: error", row.method), picture(&error)));
     }
-    names.push(("truth".to_owned(), picture(&clip.truth)));
+    names.extend(clip.truth.iter().map(|truth| ("truth".to_owned(), picture(truth))));
     let options = |chosen: usize| -> String {
         let option = |(i, (name, _)): (usize, &(String, String))| {
             let selected = if i == chosen { " selected" } else { "" };
@@ -191,15 +203,16 @@ fn figure(rows: &[Row], clip: &Pictures) -> String {
     };
     // Each picture is in the page once; the script puts two of them under the slider.
     let pictures: Vec<&str> = names.iter().map(|(_, data)| data.as_str()).collect();
-    // The last method against the truth.
-    let (left, right) = (names.len().saturating_sub(3), names.len() - 1);
-    let (width, height) =
-        (clip.truth.size.width.min(CROP) * 2, clip.truth.size.height.min(CROP) * 2);
+    // The last method against the truth; without one, what was seen against it.
+    let right = names.len() - 1;
+    let left = if clip.truth.is_some() { right.saturating_sub(2) } else { 0 };
+    let size = clip.counts.size;
+    let (width, height) = (size.width.min(CROP) * 2, size.height.min(CROP) * 2);
     format!(
         "<figure data-pictures=\"{}\"><figcaption><b>{}</b>, {} PPP<br>{}</figcaption>\n<div class=\"pair\" style=\"width:{width}px;height:{height}px\"><img class=\"left\" alt=\"left picture\"><img class=\"right\" alt=\"right picture\"></div>\n<input type=\"range\" min=\"0\" max=\"100\" value=\"50\" aria-label=\"where the pictures meet\" style=\"width:{width}px\"><br><select class=\"l\" aria-label=\"left\">{}</select> <select class=\"r\" aria-label=\"right\">{}</select></figure>\n",
         pictures.join(" "),
         escape(&clip.clip),
-        clip.ppp,
+        (clip.ppp * 1e4).round() / 1e4,
         escape(&figures.join("; ")),
         options(left),
         options(right)

@@ -1,58 +1,79 @@
 //! The figures of `qudi eval` as text, Markdown and CSV.
 
-use crate::args::{Eval, Protocol};
-use crate::cmd::eval::Row;
+use crate::cmd::eval_score::{FlowKind, FrameScore, Row};
 use qudi_sim::metrics::Statistics;
 use std::fmt::Write;
 
-/// Column titles, in order.
-pub(crate) const TITLES: [&str; 11] = [
-    "method",
-    "PPP",
-    "psnr-a centre",
-    "psnr-a all",
-    "worst 5 %",
-    "psnr all",
-    "ssim all",
-    "ssim-g all",
-    "chi-square",
-    "flicker",
-    "s/frame",
-];
+/// Columns, in order.
+const COLUMNS: usize = 12;
 
-/// One row, in the order of [`TITLES`].
-pub(crate) fn cells(row: &Row) -> [String; 11] {
+/// What stands where nothing is known.
+const UNKNOWN: &str = "-";
+
+/// Titles and rows; columns in which nothing is known are left out.
+pub(crate) fn columns(rows: &[Row]) -> Vec<Vec<String>> {
+    let lines: Vec<[String; COLUMNS]> =
+        std::iter::once(titles(rows)).chain(rows.iter().map(cells)).collect();
+    let known = |&i: &usize| lines[1..].iter().any(|line| line[i] != UNKNOWN);
+    let kept: Vec<usize> = (0..COLUMNS).filter(known).collect();
+    lines.iter().map(|line| kept.iter().map(|&i| line[i].clone()).collect()).collect()
+}
+
+fn titles(rows: &[Row]) -> [String; COLUMNS] {
+    let flicker = match rows.first().and_then(Row::flow) {
+        Some(FlowKind::Estimated) => "flicker (estimated flow)",
+        Some(FlowKind::True) | None => "flicker",
+    };
+    [
+        "method",
+        "PPP",
+        "psnr-a centre",
+        "psnr-a all",
+        "worst 5 %",
+        "psnr all",
+        "ssim all",
+        "ssim-g all",
+        "chi-square",
+        flicker,
+        "s/frame",
+        "peak MiB",
+    ]
+    .map(str::to_owned)
+}
+
+fn cells(row: &Row) -> [String; COLUMNS] {
     let interval = |statistics: Option<Statistics>, digits: usize| match statistics {
         Some(Statistics { mean, ci95: Some(ci95), .. }) => {
             format!("{mean:.digits$} ± {ci95:.digits$}")
         }
         Some(Statistics { mean, .. }) => format!("{mean:.digits$}"),
-        None => "-".to_owned(),
+        None => UNKNOWN.to_owned(),
     };
-    let known = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.3}"));
-    let worst =
-        row.over_frames(|f| f.psnr_a).map_or("-".to_owned(), |s| format!("{:.2}", s.worst5));
+    let known = |value: Option<f64>, digits: usize| {
+        value.map_or(UNKNOWN.to_owned(), |v| format!("{v:.digits$}"))
+    };
     [
         row.method.clone(),
-        row.ppp.to_string(),
+        // Four digits of an estimate are plenty.
+        ((row.ppp * 1e4).round() / 1e4).to_string(),
         interval(row.centre(|f| f.psnr_a), 2),
         interval(row.over_clips(|f| f.psnr_a), 2),
-        worst,
+        known(row.over_frames(|f| f.psnr_a).map(|s| s.worst5), 2),
         interval(row.over_clips(|f| f.psnr), 2),
         interval(row.over_clips(|f| f.ssim), 3),
         interval(row.over_clips(|f| f.ssim_g), 3),
-        known(row.mean(|s| s.chi_square)),
-        known(row.mean(|s| s.flicker)),
-        row.mean(|s| s.seconds_per_frame).map_or("-".to_owned(), |v| format!("{v:.4}")),
+        known(row.mean(|s| s.chi_square), 3),
+        known(row.mean(|s| s.flicker), 3),
+        known(row.mean(|s| s.seconds_per_frame), 4),
+        known(row.peak_mib(), 1),
     ]
 }
 
-/// An aligned table for people.
-pub(crate) fn table(rows: &[Row], args: &Eval, clips: usize) -> String {
-    let lines: Vec<[String; 11]> =
-        std::iter::once(TITLES.map(str::to_owned)).chain(rows.iter().map(cells)).collect();
+/// An aligned table for people, and what the figures are.
+pub(crate) fn table(rows: &[Row], about: &str) -> String {
+    let lines = columns(rows);
     let width = |i: usize| lines.iter().map(|line| line[i].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..TITLES.len()).map(width).collect();
+    let widths: Vec<usize> = (0..lines[0].len()).map(width).collect();
     let mut text = String::new();
     for line in &lines {
         for (i, (cell, &width)) in line.iter().zip(&widths).enumerate() {
@@ -64,48 +85,41 @@ pub(crate) fn table(rows: &[Row], args: &Eval, clips: usize) -> String {
         }
         text.push('\n');
     }
-    let _ = writeln!(text, "\n{}", about(args, clips));
+    let _ = writeln!(text, "\n{about}");
     text
 }
 
-/// What the figures are.
-pub(crate) fn about(args: &Eval, clips: usize) -> String {
-    let protocol = match args.protocol {
-        Protocol::Strict => "strict",
-        Protocol::Quiver => "quiver",
-    };
-    format!(
-        "{clips} clips, {}, protocol {}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames; flicker: rms along the true flow beyond the truth's",
-        args.sensor, protocol, args.seed
-    )
-}
-
 pub(crate) fn markdown(rows: &[Row]) -> String {
-    let mut text =
-        format!("| {} |\n|---|{}\n", TITLES.join(" | "), "--:|".repeat(TITLES.len() - 1));
-    for row in rows {
-        let _ = writeln!(text, "| {} |", cells(row).join(" | "));
+    let mut lines = columns(rows).into_iter();
+    let titles = lines.next().unwrap_or_default();
+    let mut text = format!(
+        "| {} |\n|---|{}\n",
+        titles.join(" | "),
+        "--:|".repeat(titles.len().saturating_sub(1))
+    );
+    for line in lines {
+        let _ = writeln!(text, "| {} |", line.join(" | "));
     }
     text
 }
 
-/// One line per method, light level, clip and frame.
+/// One line per method, light level, clip and frame; what is not known stays empty.
 pub(crate) fn csv(rows: &[Row]) -> String {
-    let mut text = "method,ppp,clip,frame,psnr_a,psnr,ssim,ssim_g\n".to_owned();
+    let mut text = "method,ppp,clip,frame,psnr_a,psnr,ssim,ssim_g,chi_square\n".to_owned();
     let quoted = |name: &str| format!("\"{}\"", name.replace('"', "\"\""));
     for row in rows {
         for score in &row.scores {
-            for (n, f) in score.frames.iter().enumerate() {
+            for (n, &frame) in score.frames.iter().enumerate() {
+                let FrameScore { psnr_a, psnr, ssim, ssim_g, chi_square } = frame;
+                let figures = [psnr_a, psnr, ssim, ssim_g, chi_square]
+                    .map(|figure| figure.map_or(String::new(), |v| v.to_string()));
                 let _ = writeln!(
                     text,
-                    "{},{},{},{n},{},{},{},{}",
+                    "{},{},{},{n},{}",
                     quoted(&row.method),
                     row.ppp,
                     quoted(&score.clip),
-                    f.psnr_a,
-                    f.psnr,
-                    f.ssim,
-                    f.ssim_g
+                    figures.join(",")
                 );
             }
         }
