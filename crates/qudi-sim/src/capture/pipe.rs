@@ -49,6 +49,12 @@ impl Pipe {
         Self { reader, frame_bytes, promised, tail, arrived: 0, kept, wanted_from: 0, ended: false }
     }
 
+    /// Says how long a frame is and how many a header promises, before any has arrived.
+    pub(crate) fn lay_out(&mut self, frame_bytes: usize, promised: u64) {
+        debug_assert_eq!(self.arrived, 0);
+        (self.frame_bytes, self.promised) = (frame_bytes, Some(promised));
+    }
+
     /// Frames that have arrived.
     pub(crate) fn arrived(&self) -> u64 {
         self.arrived

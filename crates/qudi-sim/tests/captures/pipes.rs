@@ -1,7 +1,8 @@
 //! Captures through a pipe: the same frames as from a file, memory bounded, ends noticed.
 
 use crate::{counts, npy, open, pack, plain, refusal, scene, scratch, write};
-use qudi_sim::capture::{Capture, PackAxis, ReadOptions};
+use proptest::prelude::*;
+use qudi_sim::capture::{Axes, Capture, PackAxis, ReadOptions};
 use qudi_sim::restore::{Average, Context, RestoreSink, Windows, run};
 use qudi_sim::sensor::Sensor;
 use qudi_sim::{Frame, SimError};
@@ -17,6 +18,44 @@ fn raw(size: &str) -> ReadOptions {
         size: Some(size.parse().unwrap()),
         bits: Some(1),
         ..plain()
+    }
+}
+
+proptest! {
+    /// Headers, lengths and options of any kind: frames or an error, never a panic.
+    #[test]
+    fn no_piped_array_panics(
+        shape in prop::collection::vec(0usize..7, 0..5),
+        descr in prop::sample::select(vec!["|u1", "|b1", "<u2", ">i4", "<f4"]),
+        fortran in prop::sample::select(vec!["True", "False"]),
+        data in prop::collection::vec(0u8..3, 0..600),
+        (start, end) in (0u64..9, prop::option::of(0u64..9)),
+        sum in 0u32..5,
+        (lenient, channel) in (any::<bool>(), prop::option::of(0usize..4)),
+        axes in prop::option::of(prop::sample::select(vec![Axes::Thw, Axes::Twh, Axes::Hwt])),
+    ) {
+        let shape: Vec<String> = shape.iter().map(|d| format!("{d},")).collect();
+        let bytes = npy(descr, fortran, &format!("({})", shape.concat()), &data);
+        let options = ReadOptions {
+            pack_axis: Some(PackAxis::None),
+            start: Some(start),
+            end,
+            sum: Some(sum),
+            lenient,
+            channel,
+            axes,
+            ..plain()
+        };
+        if let Ok(mut capture) = piped(&bytes, &options) {
+            prop_assert!(capture.frames() > 0);
+            let mut counts = vec![0; capture.size().pixels()];
+            if let Ok(frames) = capture.reach(u64::MAX) {
+                for frame in 0..frames {
+                    let _ = capture.read(frame, &mut counts);
+                }
+                prop_assert_eq!(capture.length(), Some(frames));
+            }
+        }
     }
 }
 

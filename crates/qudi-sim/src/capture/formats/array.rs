@@ -96,6 +96,9 @@ impl Array {
         }
         let stored = Size::new(rows, columns, &self.path.display().to_string())?;
         let frame_bytes = stored.pixels() * channel.of * self.sample.bytes();
+        if let Place::Pipe(pipe) = &mut self.place {
+            pipe.lay_out(frame_bytes, frames as u64);
+        }
         let sample_bytes = self.look(frames as u64, frame_bytes)?;
         let packing = self.packing(options, hints, channel, stored, &sample_bytes)?;
         let size = self.true_size(stored, packing, options.size.or(hints.size))?;

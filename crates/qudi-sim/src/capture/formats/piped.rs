@@ -79,23 +79,9 @@ pub(crate) fn open_pipe(
     let header = Header::read(&mut reader, place)?;
     let mut about = About::new("npy", "NumPy array");
     about.evidence.push("NumPy's magic number".to_owned());
-    let (frames, rest) = header.shape.split_first().unwrap_or((&0, &[]));
-    let item = rest.iter().try_fold(header.sample.bytes(), |n, &d| n.checked_mul(d));
-    let possible = item.filter(|&bytes| bytes > 0 && header.data_bytes().is_some());
-    let Some(frame_bytes) = possible else {
-        return Err(SimError::data(
-            format!("its header claims an impossible shape, {:?}", header.shape),
-            place,
-            "pipe an array of frames, height, width",
-        ));
-    };
-    // An array of two dimensions is one frame.
-    let (frames, frame_bytes) = match rest {
-        [_] => (1, frame_bytes.saturating_mul(*frames)),
-        _ => (*frames as u64, frame_bytes),
-    };
+    // How long a frame is follows from the order of the axes.
     let tail = Tail { trailer: 0, known: &[], lenient: options.lenient };
-    let pipe = Pipe::new(reader, frame_bytes, Some(frames), tail);
+    let pipe = Pipe::new(reader, 0, None, tail);
     let frames =
         array(place, header, Place::Pipe(pipe)).open(options, &Hints::default(), &mut about)?;
     Ok((frames, about))
