@@ -1,6 +1,6 @@
 //! Sizes of the network, read from TOML; the presets.
 
-use crate::error::{ModelError, Result};
+use qudi_sim::{Result, SimError};
 use serde::{Deserialize, Serialize};
 
 /// Sizes of the whole network (docs/network.md).
@@ -105,14 +105,15 @@ impl NetworkConfig {
     /// A preset by name.
     ///
     /// # Errors
-    /// [`ModelError::Preset`] if there is none of that name.
+    /// [`SimError::Request`] if there is none of that name.
     pub fn preset(name: &str) -> Result<Self> {
-        let (_, text) = PRESETS
-            .iter()
-            .find(|preset| preset.0 == name)
-            .ok_or_else(|| ModelError::Preset(name.into()))?;
+        let Some((_, text)) = PRESETS.iter().find(|preset| preset.0 == name) else {
+            let names: Vec<_> = PRESETS.iter().map(|preset| preset.0).collect();
+            let help = format!("there are {}", names.join(", "));
+            return Err(SimError::request(format!("no preset named `{name}`"), "--preset", help));
+        };
         let document: Document = toml::from_str(text)
-            .map_err(|e| ModelError::Config { key: "network".into(), problem: e.to_string() })?;
+            .map_err(|e| SimError::request(e.message(), name, "correct the preset's file"))?;
         document.network.checked()
     }
 
@@ -125,7 +126,7 @@ impl NetworkConfig {
     /// The sizes, if a network can be built from them.
     ///
     /// # Errors
-    /// [`ModelError::Config`] with the key that is wrong. Sizes come from weight files, too: nothing may be
+    /// [`SimError::Request`] with the key that is wrong. Sizes come from weight files, too: nothing may be
     /// allocated from them before this.
     pub fn checked(self) -> Result<Self> {
         let levels = self.unet.multipliers.len();
@@ -159,7 +160,12 @@ impl NetworkConfig {
         ];
         for (key, good, problem) in rules {
             if !good {
-                return Err(ModelError::Config { key: key.into(), problem: problem.into() });
+                let key = format!("network.{key}");
+                return Err(SimError::request(
+                    format!("{key} {problem}"),
+                    &key,
+                    "see docs/network.md",
+                ));
             }
         }
         Ok(self)

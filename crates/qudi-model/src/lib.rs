@@ -1,15 +1,21 @@
 //! Quanta Diffusion on Burn: from photon counts to clean video.
 //!
-//! In the order of the data: counts become tensors ([`tensor`]); the [`network`], whose sizes are a
-//! [`config`], predicts clean frames from them and from a noisy image. The device a tensor lives on decides
-//! the backend; this crate chooses none.
+//! In the order of the data: a [`measurement`] turns counts into planes; the [`network`], whose sizes are a
+//! [`config`], predicts clean frames from them and from a noisy image; the [`sampler`] takes noise to a
+//! picture along the noise [`schedule`], measuring every estimate again with the sensor ([`physics`]); the
+//! [`restorer`] does so for whole windows, tile by tile. Weights are a [`checkpoint`]; training minimises the
+//! [`objective`]. The device a tensor lives on decides the backend; this crate chooses none.
 #![warn(missing_docs)]
 
+pub mod checkpoint;
 pub mod config;
-mod error;
+pub mod measurement;
 pub mod network;
+pub mod noise;
 pub mod objective;
+pub mod physics;
+pub mod restorer;
+pub mod sampler;
 pub mod schedule;
 pub mod tensor;
-
-pub use error::{ModelError, Result};
+pub mod tiles;

@@ -1,6 +1,6 @@
 //! Layers that several blocks use.
 
-use burn::module::{Module, Param};
+use burn::module::{Module, Param, ParamId};
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
@@ -48,8 +48,12 @@ pub(super) enum Bias {
     No,
 }
 
+/// A parameter that takes no memory before it is filled or used: sizes may come from a file that lies.
 fn zeros<const D: usize>(shape: [usize; D], device: &Device) -> Param<Tensor<D>> {
-    Param::from_tensor(Tensor::zeros(shape, device))
+    let init = move |device: &Device, require_grad: bool| {
+        Tensor::zeros(shape, device).set_require_grad(require_grad)
+    };
+    Param::uninitialized(ParamId::new(), init, device.clone(), true, shape.into())
 }
 
 impl Conv2d {

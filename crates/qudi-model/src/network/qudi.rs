@@ -80,15 +80,20 @@ impl NetworkConfig {
     /// The network with initial weights of `seed`, the same on every device. The sizes must be
     /// [checked](Self::checked).
     pub fn init(&self, seed: u64, device: &Device) -> Qudi {
-        let zeros = Qudi {
+        let initial = |name: &str, shape: &[usize]| super::weights::initial(seed, name, shape);
+        super::fill(self.shell(device), initial)
+    }
+
+    /// The network without weights: it takes no memory yet.
+    pub(crate) fn shell(&self, device: &Device) -> Qudi {
+        Qudi {
             pre: self.pre.init(self.fold, device),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
             flow: self.flow.init(device),
             fusion: self.fusion.init(&self.features, self.pre.width, self.fold, device),
             unet: self.unet.init(&self.fusion, self.fold, device),
-        };
-        super::fill(zeros, |name, shape| super::weights::initial(seed, name, shape))
+        }
     }
 }
 

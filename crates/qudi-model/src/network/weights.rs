@@ -32,13 +32,12 @@ impl<F: FnMut(&str, &[usize]) -> Vec<f32>> ModuleMapper for Fill<F> {
     }
 
     fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        let (id, tensor, mapper) = param.consume();
-        let shape = tensor.dims();
-        let values = (self.values)(&self.path.join("."), &shape);
+        let shape = param.lazy_shape();
+        let values = (self.values)(&self.path.join("."), shape.as_slice());
         let data = TensorData::new(values, shape);
-        let filled = Tensor::from_data(data, &tensor.device());
-        let filled = filled.set_require_grad(tensor.is_require_grad());
-        Param::from_mapped_value(id, filled, mapper)
+        let mut filled = Param::from_tensor(Tensor::from_data(data, &param.lazy_device()));
+        filled.id = param.id; // optimizers know parameters by it
+        filled
     }
 }
 
@@ -58,7 +57,7 @@ impl ModuleVisitor for Names {
     }
 
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        self.list.push((self.path.join("."), param.shape().to_vec()));
+        self.list.push((self.path.join("."), param.lazy_shape().to_vec()));
     }
 }
 

@@ -1,0 +1,233 @@
+//! Weights in one SafeTensors file that says what it is.
+
+use crate::config::NetworkConfig;
+use crate::network::{Qudi, fill, parameters};
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::tensor::{Device, Tensor};
+use qudi_sim::output::{Overwrite, PendingFile};
+use qudi_sim::{Result, SimError};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::io::Write;
+use std::path::Path;
+
+/// The key of the description among a file's metadata.
+const KEY: &str = "qudi";
+
+/// Largest file that is read: the paper's network has 0.2 GiB.
+const LARGEST: u64 = 4 << 30;
+
+/// What a weight file says about itself.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Description {
+    /// Version of the program that wrote it.
+    pub program: String,
+    /// Name of the preset, if its sizes are one's.
+    pub preset: Option<String>,
+    /// Sizes of the network.
+    pub network: NetworkConfig,
+    /// Frames of a window that it was trained on.
+    pub window: usize,
+    /// Sensors that it was trained for.
+    pub sensors: Vec<String>,
+    /// Photons per pixel and frame that it was trained for: least and most.
+    pub ppp: [f64; 2],
+    /// What it was trained on.
+    pub data: Vec<String>,
+    /// Optimisation steps.
+    pub steps: u64,
+    /// Commit of the program that trained it.
+    pub commit: Option<String>,
+    /// Licence of the weights.
+    pub licence: String,
+}
+
+/// Writes the network's weights, whole or not at all.
+///
+/// # Errors
+/// [`SimError`] if the file cannot be written or the device cannot be read.
+pub fn save(
+    network: &Qudi,
+    description: &Description,
+    path: &Path,
+    overwrite: Overwrite,
+) -> Result<()> {
+    let mut values = Values::default();
+    network.visit(&mut values);
+    if let Some(error) = values.error {
+        return Err(error);
+    }
+    let text = serde_json::to_string(description).expect("plain data");
+    let metadata = HashMap::from([(KEY.to_owned(), text), ("format".to_owned(), "pt".to_owned())]);
+    let views = values.list.iter().map(|(name, shape, bytes)| {
+        let view = TensorView::new(Dtype::F32, shape.clone(), bytes);
+        (name, view.expect("as many bytes as the shape says"))
+    });
+    let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| {
+        SimError::data(format!("cannot lay out the weights: {e}"), path, "report this")
+    })?;
+    let mut file = PendingFile::create(path, overwrite)?;
+    file.write_all(&bytes).map_err(|e| SimError::io("write the weights", path, e))?;
+    file.finish()
+}
+
+/// Reads the description alone.
+///
+/// # Errors
+/// [`SimError::Data`] if it is no weight file of ours.
+pub fn describe(path: &Path) -> Result<Description> {
+    Ok(File::open(path)?.description)
+}
+
+/// Reads a network onto `device`. Nothing is allocated that the file does not hold.
+///
+/// # Errors
+/// [`SimError::Data`] if the file does not fit its own description, or holds values that are no numbers.
+pub fn load(path: &Path, device: &Device) -> Result<(Qudi, Description)> {
+    let file = File::open(path)?;
+    let tensors = SafeTensors::deserialize(&file.bytes).map_err(|e| damaged(path, e))?;
+    let description = file.description;
+    let network = description.network.shell(device);
+    let expected = parameters(&network);
+    for (name, shape) in &expected {
+        let Ok(tensor) = tensors.tensor(name) else {
+            return Err(mismatch(path, format!("`{name}` is missing")));
+        };
+        if tensor.shape() != shape.as_slice() {
+            let what = format!("`{name}` is {:?}, the network wants {shape:?}", tensor.shape());
+            return Err(mismatch(path, what));
+        }
+        if !matches!(tensor.dtype(), Dtype::F32 | Dtype::F16) {
+            return Err(mismatch(
+                path,
+                format!("`{name}` holds {:?}, not F32 or F16", tensor.dtype()),
+            ));
+        }
+    }
+    if let Some(name) = tensors
+        .names()
+        .into_iter()
+        .find(|name| !expected.iter().any(|(expected, _)| expected == name))
+    {
+        return Err(mismatch(path, format!("`{name}` belongs to no part of the network")));
+    }
+    let mut broken = None;
+    let network = fill(network, |name, shape| {
+        let values = tensors.tensor(name).map(|tensor| numbers(&tensor)).unwrap_or_default();
+        if broken.is_none() && !values.iter().all(|value| value.is_finite()) {
+            broken = Some(name.to_owned());
+        }
+        debug_assert_eq!(values.len(), shape.iter().product::<usize>());
+        values
+    });
+    match broken {
+        Some(name) => Err(SimError::data(
+            format!("`{name}` holds values that are no numbers"),
+            path,
+            "the training that wrote it had failed: use an earlier checkpoint",
+        )),
+        None => Ok((network, description)),
+    }
+}
+
+/// A file, its description read.
+struct File {
+    bytes: Vec<u8>,
+    description: Description,
+}
+
+impl File {
+    fn open(path: &Path) -> Result<Self> {
+        let failed = |e| SimError::io("read the weights", path, e);
+        let length = std::fs::metadata(path).map_err(failed)?.len();
+        if length > LARGEST {
+            return Err(SimError::data(
+                format!("{length} bytes are too many for weights"),
+                path,
+                "name a file that `qudi train` wrote",
+            ));
+        }
+        let bytes = std::fs::read(path).map_err(failed)?;
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| damaged(path, e))?;
+        let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
+        let Some(text) = text else {
+            return Err(SimError::data(
+                "a SafeTensors file of another program",
+                path,
+                "weights of this program say so in their metadata; name a file that `qudi train` wrote",
+            ));
+        };
+        let description: Description = serde_json::from_str(text)
+            .map_err(|e| mismatch(path, format!("the description cannot be read: {e}")))?;
+        let network = description.network.checked().map_err(|e| mismatch(path, e.to_string()))?;
+        if !(3..=1000).contains(&description.window) {
+            return Err(mismatch(path, format!("a window of {} frames", description.window)));
+        }
+        Ok(Self { bytes, description: Description { network, ..description } })
+    }
+}
+
+fn damaged(path: &Path, error: impl std::fmt::Display) -> SimError {
+    SimError::data(
+        format!("not a whole SafeTensors file: {error}"),
+        path,
+        "copy or download it again",
+    )
+}
+
+fn mismatch(path: &Path, what: impl Into<String>) -> SimError {
+    SimError::data(what, path, "the file is damaged, or of another version of the program")
+}
+
+/// The values of a tensor of F32 or F16.
+fn numbers(tensor: &TensorView<'_>) -> Vec<f32> {
+    let bytes = tensor.data();
+    if tensor.dtype() == Dtype::F16 {
+        let words = bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]]));
+        words.map(half_to_f32).collect()
+    } else {
+        let words = bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
+        words.map(f32::from_le_bytes).collect()
+    }
+}
+
+/// IEEE half precision.
+fn half_to_f32(half: u16) -> f32 {
+    let sign = if half & 0x8000 == 0 { 1.0 } else { -1.0 };
+    let (exponent, fraction) = (i32::from(half >> 10 & 31), f32::from(half & 1023) / 1024.0);
+    match exponent {
+        0 => sign * fraction * 2f32.powi(-14),
+        31 if fraction == 0.0 => sign * f32::INFINITY,
+        31 => f32::NAN,
+        _ => sign * (1.0 + fraction) * 2f32.powi(exponent - 15),
+    }
+}
+
+/// Values of all parameters, as little-endian bytes.
+#[derive(Default)]
+struct Values {
+    path: Vec<String>,
+    list: Vec<(String, Vec<usize>, Vec<u8>)>,
+    error: Option<SimError>,
+}
+
+impl ModuleVisitor for Values {
+    fn enter_module(&mut self, name: &str, _container: &str) {
+        self.path.push(name.into());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        match crate::tensor::read(param.val()) {
+            Ok(values) => {
+                let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+                self.list.push((self.path.join("."), param.shape().to_vec(), bytes));
+            }
+            Err(error) => self.error = Some(error),
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! What the network is told of a burst: counts, their linear estimate, and the sensor in numbers.
+
+use crate::network::SENSOR_NUMBERS;
+use qudi_sim::restore::{BurstView, Context};
+use qudi_sim::sensor::{Response, Sensor};
+
+/// Brightest linear estimate, in image units: twice white.
+const BRIGHTEST: f64 = 2.0;
+
+/// Planes of a burst, frame after frame, row-major.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Planes {
+    /// Counts over full scale.
+    pub y: Vec<f32>,
+    /// The linear estimate in image units, in [0, 2].
+    pub u: Vec<f32>,
+}
+
+impl Planes {
+    /// The planes of a captured burst.
+    pub fn of(burst: BurstView<'_>, context: &Context) -> Self {
+        let response = CountResponse::new(
+            &context.sensor,
+            context.photons_per_unit(),
+            context.gain,
+            dark(&context.sensor),
+        );
+        let mut planes = Self { y: Vec::new(), u: Vec::new() };
+        for frame in burst.frames {
+            response.add(frame, &mut planes);
+            if let Some(map) = &context.dark {
+                let start = planes.u.len() - frame.len();
+                for ((u, &count), &dark) in planes.u[start..].iter_mut().zip(frame).zip(map) {
+                    *u = response.estimate(count, f64::from(dark));
+                }
+            }
+        }
+        planes
+    }
+}
+
+/// What a count of a sensor under a certain light means.
+#[derive(Clone, Debug)]
+pub struct CountResponse<'a> {
+    sensor: &'a Sensor,
+    photons_per_unit: f64,
+    gain: f64,
+    /// Counts over full scale, and linear estimates of an ordinary pixel, by count.
+    table: Vec<(f32, f32)>,
+}
+
+impl<'a> CountResponse<'a> {
+    /// For pixels with `dark` electrons per output frame.
+    pub fn new(sensor: &'a Sensor, photons_per_unit: f64, gain: f64, dark: f64) -> Self {
+        let mut response = Self { sensor, photons_per_unit, gain, table: Vec::new() };
+        let full_scale = f32::from(sensor.max_count());
+        let of = |count| (f32::from(count) / full_scale, response.estimate(count, dark));
+        response.table = (0..=sensor.max_count()).map(of).collect();
+        response
+    }
+
+    /// The linear estimate from one count, in image units.
+    fn estimate(&self, count: u16, dark: f64) -> f32 {
+        let photons = self.sensor.estimate_flux(f64::from(count), 1, self.gain, dark);
+        (photons / self.photons_per_unit).min(BRIGHTEST) as f32
+    }
+
+    /// Appends a frame. Counts above full scale, which no such sensor gives, count as full scale.
+    pub fn add(&self, counts: &[u16], planes: &mut Planes) {
+        let last = self.table.len() - 1;
+        let values = counts.iter().map(|&count| self.table[usize::from(count).min(last)]);
+        for (y, u) in values {
+            planes.y.push(y);
+            planes.u.push(u);
+        }
+    }
+}
+
+/// Dark electrons per output frame; none where the sensor does not say.
+pub(crate) fn dark(sensor: &Sensor) -> f64 {
+    sensor.dark_per_frame().unwrap_or(0.0)
+}
+
+/// The sensor and its light as the network is told them (docs/network.md).
+pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
+    let sensor = &context.sensor;
+    let binary = sensor.response == Response::Binary;
+    [
+        context.ppp.max(1e-6).log10(),
+        context.exposure,
+        sensor.quantum_efficiency,
+        dark(sensor),
+        sensor.read_noise,
+        context.gain.max(1e-6).log10(),
+        (f64::from(sensor.max_count()) + 1.0).log2() / 8.0,
+        f64::from(u8::from(binary)),
+        f64::from(sensor.frames_summed).log2() / 8.0,
+    ]
+    .map(|number| number as f32)
+}

@@ -1,0 +1,275 @@
+//! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
+
+use crate::checkpoint::Description;
+use crate::config::NetworkConfig;
+use crate::measurement::{Planes, sensor_numbers};
+use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
+use crate::noise::Noise;
+use crate::physics::LoopSensor;
+use crate::sampler::{Sampler, Step, TIMES};
+use crate::schedule::NoiseSchedule;
+use crate::tensor::{read, to_tensor};
+use crate::tiles::Tiles;
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
+use qudi_sim::{Frame, Result, SimError, Size};
+
+/// Fewest frames that the fusion makes sense of.
+const FEWEST_FRAMES: usize = 3;
+
+/// How to sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SampleOptions {
+    /// Reverse steps: 1 is the mean of all pictures that fit, more are sharper.
+    pub steps: usize,
+    /// How noise leaves.
+    pub sampler: Sampler,
+    /// Pictures drawn; their mean is the result, their deviation its uncertainty.
+    pub samples: usize,
+    /// Side of the tiles that the network sees, in pixels.
+    pub tile: usize,
+}
+
+impl Default for SampleOptions {
+    fn default() -> Self {
+        Self { steps: 10, sampler: Sampler::Ddim, samples: 1, tile: 320 }
+    }
+}
+
+/// The network with everything that restoring needs.
+#[derive(Debug)]
+pub struct QudiRestorer {
+    network: Qudi,
+    config: NetworkConfig,
+    schedule: NoiseSchedule,
+    options: SampleOptions,
+    device: Device,
+    window: usize,
+}
+
+impl QudiRestorer {
+    /// A restorer on `device`, which is where the network's weights are.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] for options that make no sense.
+    pub fn new(
+        network: Qudi,
+        description: &Description,
+        options: SampleOptions,
+        device: &Device,
+    ) -> Result<Self> {
+        let (config, window) = (description.network.clone(), description.window);
+        if !(1..=TIMES).contains(&options.steps) {
+            let what = format!("{} reverse steps", options.steps);
+            return Err(SimError::request(what, "--steps", format!("use 1 to {TIMES}")));
+        }
+        if options.samples == 0 {
+            return Err(SimError::request("no samples at all", "--samples", "draw at least 1"));
+        }
+        let smallest = 4 * config.multiple();
+        if options.tile < smallest {
+            let what = format!("tiles of {} pixels", options.tile);
+            let help = format!("this network needs at least {smallest}");
+            return Err(SimError::request(what, "--tile", help));
+        }
+        let schedule = NoiseSchedule::cosine(TIMES);
+        Ok(Self { network, config, schedule, options, device: device.clone(), window })
+    }
+
+    /// One sample of a window whose planes are padded to `size`.
+    fn sample(&self, job: &Job<'_>, sample: u64) -> Result<Vec<f32>> {
+        let noise = Noise::new(job.context.seed, sample);
+        let frames = || (job.context.first_frame..).take(job.frames);
+        let pixels = job.size.pixels();
+        let mut x: Vec<f32> = frames().flat_map(|frame| noise.frame(frame, 0, pixels)).collect();
+        let mut x0 = vec![0.0; x.len()];
+        let mut flows: Vec<Option<Flows>> = vec![None; job.tiles.count()];
+        for step in self.options.sampler.steps(&self.schedule, self.options.steps) {
+            let simulated = if step.number == 1 {
+                None
+            } else {
+                let sensor = LoopSensor::at(job.context, step.time, TIMES);
+                let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
+                let seed = noise.photon_seed(step.number);
+                Some(sensor.measure(&images, job.size, job.context.first_frame, seed)?)
+            };
+            if self.config.flow.steps.contains(&step.number) {
+                flows.fill(None);
+            }
+            let mut next = vec![0.0; x.len()];
+            for (number, flows) in flows.iter_mut().enumerate() {
+                let tile = self.predict(job, number, simulated.as_ref(), &x, &x0, &step, flows)?;
+                job.tiles.blend(number, &tile, &mut next);
+            }
+            x0 = next;
+            let fresh = frames().flat_map(|frame| noise.frame(frame, step.number, pixels));
+            step.advance(&mut x, &x0, fresh);
+        }
+        Ok(x0)
+    }
+
+    /// The network's clean image of one tile, in [-1, 1].
+    #[allow(clippy::too_many_arguments)]
+    fn predict(
+        &self,
+        job: &Job<'_>,
+        number: usize,
+        simulated: Option<&Planes>,
+        x: &[f32],
+        x0: &[f32],
+        step: &Step,
+        flows: &mut Option<Flows>,
+    ) -> Result<Vec<f32>> {
+        let tensor = |images: &[f32]| {
+            to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
+        };
+        let fresh;
+        let prepared = match &job.prepared {
+            Some(prepared) => prepared,
+            None => {
+                fresh = self.prepare(job, number);
+                &fresh
+            }
+        };
+        let simulated = simulated.map(|planes| Simulated {
+            y: tensor(&planes.y),
+            u: tensor(&planes.u),
+            exists: vec![true],
+        });
+        let state = State { x_t: tensor(x), x0_prev: tensor(x0), times: vec![step.time] };
+        let prediction = self.network.forward(prepared, simulated.as_ref(), &state, flows.take());
+        *flows = Some(prediction.flows);
+        let mut values = read(prediction.x0)?;
+        for value in &mut values {
+            *value = value.clamp(-1.0, 1.0);
+        }
+        Ok(values)
+    }
+
+    fn prepare(&self, job: &Job<'_>, number: usize) -> Prepared {
+        let tensor = |images: &[f32]| {
+            to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
+        };
+        let numbers = sensor_numbers(job.context).to_vec();
+        let sensor = TensorData::new(numbers, [1, SENSOR_NUMBERS]);
+        self.network.prepare(&Measured {
+            y: tensor(&job.planes.y),
+            u: tensor(&job.planes.u),
+            sensor: Tensor::from_data(sensor, &self.device),
+            frames: job.frames,
+        })
+    }
+}
+
+/// A window, padded.
+struct Job<'a> {
+    context: &'a Context,
+    planes: Planes,
+    frames: usize,
+    size: Size,
+    tiles: Tiles,
+    /// Kept for all steps where there is one tile only: it takes memory.
+    prepared: Option<Prepared>,
+}
+
+impl Restorer for QudiRestorer {
+    fn name(&self) -> &'static str {
+        "qudi"
+    }
+
+    fn window(&self) -> usize {
+        self.window
+    }
+
+    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
+        let frames = burst.frames.len();
+        if frames < FEWEST_FRAMES {
+            return Err(SimError::request(
+                format!("a burst of {frames} frames"),
+                "--method qudi",
+                format!("it needs at least {FEWEST_FRAMES}, better {}", self.window),
+            ));
+        }
+        let multiple = self.config.multiple();
+        let size = Size {
+            height: burst.size.height.next_multiple_of(multiple),
+            width: burst.size.width.next_multiple_of(multiple),
+        };
+        let planes = Planes::of(burst, context);
+        let pad = |images: &[f32]| padded(images, burst.size, size);
+        let planes = Planes { y: pad(&planes.y), u: pad(&planes.u) };
+        let side = self.options.tile / multiple * multiple;
+        let tiles = Tiles::new(size, side, (side / 8).next_multiple_of(multiple), multiple);
+        let mut job = Job { context, planes, frames, size, tiles, prepared: None };
+        if job.tiles.count() == 1 {
+            job.prepared = Some(self.prepare(&job, 0));
+        }
+        let mut sum = Moments::default();
+        for sample in 0..self.options.samples as u64 {
+            sum.add(&self.sample(&job, sample)?);
+        }
+        let images = |values: &[f32]| {
+            let images = values.chunks_exact(size.pixels());
+            images.map(|image| cropped(image, size, burst.size)).collect()
+        };
+        Ok(Restored {
+            frames: images(&sum.mean()),
+            std: (self.options.samples > 1).then(|| images(&sum.deviation())),
+        })
+    }
+}
+
+/// Mean and deviation over samples, in image units.
+#[derive(Debug, Default)]
+struct Moments {
+    count: f32,
+    sum: Vec<f32>,
+    squares: Vec<f32>,
+}
+
+impl Moments {
+    fn add(&mut self, x0: &[f32]) {
+        self.sum.resize(x0.len(), 0.0);
+        self.squares.resize(x0.len(), 0.0);
+        self.count += 1.0;
+        for ((sum, square), x0) in self.sum.iter_mut().zip(&mut self.squares).zip(x0) {
+            let image = (x0 + 1.0) * 0.5;
+            *sum += image;
+            *square += image * image;
+        }
+    }
+
+    fn mean(&self) -> Vec<f32> {
+        self.sum.iter().map(|sum| sum / self.count).collect()
+    }
+
+    fn deviation(&self) -> Vec<f32> {
+        let pairs = self.sum.iter().zip(&self.squares);
+        let variance = pairs
+            .map(|(sum, squares)| (squares - sum * sum / self.count) / (self.count - 1.0).max(1.0));
+        variance.map(|variance| variance.max(0.0).sqrt()).collect()
+    }
+}
+
+/// Images mirrored at their lower and right edges.
+fn padded(images: &[f32], from: Size, to: Size) -> Vec<f32> {
+    // 0 1 2 3 2 1 0 1 2 ...: the edge itself is not repeated.
+    let mirror = |place: usize, length: usize| {
+        let period = (2 * length - 2).max(1);
+        let place = place % period;
+        if place < length { place } else { period - place }
+    };
+    let mut values = Vec::with_capacity(images.len() / from.pixels() * to.pixels());
+    for image in images.chunks_exact(from.pixels()) {
+        for y in 0..to.height {
+            let row = mirror(y, from.height) * from.width;
+            values.extend((0..to.width).map(|x| image[row + mirror(x, from.width)]));
+        }
+    }
+    values
+}
+
+fn cropped(image: &[f32], from: Size, to: Size) -> Frame {
+    let rows = image.chunks_exact(from.width).take(to.height);
+    Frame { size: to, data: rows.flat_map(|row| &row[..to.width]).copied().collect() }
+}
