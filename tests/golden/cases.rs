@@ -43,6 +43,18 @@ impl File {
         self.cases().find(|case| case.name == name).unwrap()
     }
 
+    /// A tensor of f32, by its name in the file.
+    pub fn f32s(&self, name: &str) -> Vec<f32> {
+        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
+        let bytes = tensors.tensor(name).unwrap().data().chunks_exact(4);
+        bytes.map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect()
+    }
+
+    /// A tensor of bytes, by its name in the file.
+    pub fn bytes(&self, name: &str) -> Vec<u8> {
+        SafeTensors::deserialize(&self.bytes).unwrap().tensor(name).unwrap().data().to_vec()
+    }
+
     /// A tensor of f64, by its name in the file.
     pub fn f64s(&self, name: &str) -> Vec<f64> {
         let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
@@ -120,11 +132,6 @@ impl Case<'_> {
         let values = uniform(&format!("cotangent.{output}"), shape.iter().product());
         let values: Vec<f32> = values.iter().map(|&value| value as f32).collect();
         Tensor::from_data(TensorData::new(values, shape), device)
-    }
-
-    /// A tensor of the case as bytes.
-    pub fn bytes(&self, name: &str) -> Vec<u8> {
-        self.tensors.tensor(&format!("{}/{name}", self.name)).unwrap().data().to_vec()
     }
 
     pub fn expected(&self, name: &str) -> Option<Vec<f32>> {

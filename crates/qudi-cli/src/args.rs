@@ -2,12 +2,14 @@
 
 mod convert;
 mod eval;
+mod network;
 mod reading;
 mod restore;
 mod simulate;
 
 pub(crate) use convert::{Calibrate, Convert};
 pub(crate) use eval::{Bench, Eval, External, Protocol};
+pub(crate) use network::{Network, SamplerName};
 pub(crate) use reading::Reading;
 pub(crate) use restore::Restore;
 pub(crate) use simulate::Simulate;
@@ -84,7 +86,8 @@ pub(crate) enum Command {
     Simulate(Box<Simulate>),
     Restore(Box<Restore>),
     Eval(Box<Eval>),
-    Bench(Bench),
+    Bench(Box<Bench>),
+    Selftest(Selftest),
     Convert(Box<Convert>),
     Calibrate(Box<Calibrate>),
     Demo(Demo),
@@ -94,6 +97,19 @@ pub(crate) enum Command {
     Completions(Completions),
     #[command(hide = true)]
     Man(Man),
+}
+
+/// Check that a device computes what the processor does: every operation of the network, and a small network whole
+///
+/// Exits with 1 if a result is off. GPU drivers and backends have had wrong kernels; run this once on yours.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Selftest {
+    /// The device: auto, cpu, ndarray, wgpu[:N], vulkan[:N], cuda[:N], metal
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub(crate) device: String,
+    /// Checks whose names contain one of these
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
+    pub(crate) only: Vec<String>,
 }
 
 /// See what the camera sees: a built-in scene, simulated, averaged, measured, in one picture

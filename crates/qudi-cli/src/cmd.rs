@@ -1,6 +1,7 @@
 //! One verb per file.
 
 pub(crate) mod bench;
+mod bench_network;
 pub(crate) mod calibrate;
 mod capture_info;
 mod capture_light;
@@ -17,7 +18,10 @@ mod eval_table;
 pub(crate) mod info;
 pub(crate) mod light;
 mod methods;
+mod network;
 pub(crate) mod restore;
+mod restore_deviation;
 mod restore_output;
+pub(crate) mod selftest;
 pub(crate) mod simulate;
 mod tiff_samples;

@@ -1,13 +1,22 @@
 //! The compute devices of this build and this machine.
 
+use crate::error::{Fault, Result};
+use burn::tensor::Device;
 #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
-use burn::tensor::{Device, DeviceType};
+use burn::tensor::DeviceType;
 
 /// A device that `--device` can name.
 #[derive(Debug)]
 pub(crate) struct Listed {
     pub(crate) name: String,
     pub(crate) description: String,
+}
+
+/// A device to compute on.
+#[derive(Debug)]
+pub(crate) struct Opened {
+    pub(crate) name: String,
+    pub(crate) device: Device,
 }
 
 /// All devices: the CPU first, then the graphics cards of each backend that was compiled in.
@@ -21,31 +30,127 @@ pub(crate) fn list() -> Vec<Listed> {
     if cfg!(feature = "ndarray") {
         add("ndarray".to_owned(), format!("{cores} cores (ndarray: slow, deprecated upstream)"));
     }
-    #[cfg(feature = "wgpu")]
-    add_cards("wgpu", DeviceType::Wgpu, &mut add);
-    #[cfg(feature = "vulkan")]
-    add_cards("vulkan", DeviceType::Vulkan, &mut add);
-    #[cfg(feature = "metal")]
-    add_cards("metal", DeviceType::Metal, &mut add);
-    #[cfg(feature = "cuda")]
-    add_cards("cuda", DeviceType::Cuda, &mut add);
+    for (backend, cards) in all_cards() {
+        for (n, card) in cards.into_iter().enumerate() {
+            add(format!("{backend}:{n}"), card);
+        }
+    }
     devices
 }
 
+/// Opens a device by name and computes something small on it.
+pub(crate) fn open(name: &str) -> Result<Opened> {
+    let name = if name == "auto" { best() } else { name.to_owned() };
+    let (backend, number) = match name.split_once(':') {
+        None => (name.as_str(), Some(0)),
+        Some((backend, number)) => (backend, number.parse::<usize>().ok()),
+    };
+    let missing = || {
+        let names: Vec<_> = list().into_iter().map(|device| device.name).collect();
+        Fault::new(
+            format!("there is no device `{name}`"),
+            "--device",
+            format!("this build and machine have {}; or use auto", names.join(", ")),
+        )
+    };
+    let number = number.ok_or_else(missing)?;
+    let on_card = all_cards().iter().any(|(b, cards)| *b == backend && number < cards.len());
+    if !on_card && !matches!(backend, "cpu" | "flex" | "ndarray") {
+        return Err(missing());
+    }
+    let opened = guarded(&name, || {
+        let device = create(backend, number)?;
+        let two = burn::tensor::Tensor::<1>::ones([2], &device) + 1.0;
+        (two.try_into_data().ok()?.try_to_vec::<f32>().ok()? == [2.0, 2.0]).then_some(device)
+    });
+    match opened {
+        Ok(Some(device)) => Ok(Opened { name: name.clone(), device }),
+        Ok(None) => Err(missing()),
+        Err(problem) => Err(Fault::new(
+            format!("the device cannot be used: {problem}"),
+            &name,
+            "check its driver with `qudi selftest`, or use --device cpu",
+        )),
+    }
+}
+
+/// The first real graphics card, or the processor.
+fn best() -> String {
+    // Drivers that compute on the processor are slower than our own way to do so.
+    let software = ["llvmpipe", "lavapipe", "swiftshader", "software", "cpu"];
+    for (backend, cards) in all_cards() {
+        let real = |card: &String| !software.iter().any(|s| card.to_lowercase().contains(s));
+        if let Some(n) = cards.iter().position(real) {
+            return format!("{backend}:{n}");
+        }
+    }
+    if cfg!(feature = "cpu") { "cpu".to_owned() } else { "ndarray".to_owned() }
+}
+
+#[allow(unused_variables)] // which backends there are depends on features
+fn create(backend: &str, number: usize) -> Option<Device> {
+    #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal"))]
+    use burn::tensor::DeviceKind;
+    match backend {
+        #[cfg(feature = "cpu")]
+        "cpu" | "flex" => Some(Device::flex()),
+        #[cfg(feature = "ndarray")]
+        #[allow(deprecated)] // asked for by name
+        "ndarray" => Some(Device::ndarray()),
+        #[cfg(feature = "wgpu")]
+        "wgpu" => {
+            card(DeviceType::Wgpu, number).or_else(|| Some(Device::wgpu(DeviceKind::DefaultDevice)))
+        }
+        #[cfg(feature = "vulkan")]
+        "vulkan" => card(DeviceType::Vulkan, number),
+        #[cfg(feature = "metal")]
+        "metal" => card(DeviceType::Metal, number),
+        #[cfg(feature = "cuda")]
+        "cuda" => Some(Device::cuda(number)),
+        _ => None,
+    }
+}
+
+#[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal"))]
+fn card(kind: DeviceType, number: usize) -> Option<Device> {
+    Device::enumerate(kind).into_vec().into_iter().nth(number)
+}
+
+/// Backends with the names of their cards.
+fn all_cards() -> Vec<(&'static str, Vec<String>)> {
+    vec![
+        #[cfg(feature = "cuda")]
+        ("cuda", cards(DeviceType::Cuda)),
+        #[cfg(feature = "vulkan")]
+        ("vulkan", cards(DeviceType::Vulkan)),
+        #[cfg(feature = "metal")]
+        ("metal", cards(DeviceType::Metal)),
+        #[cfg(feature = "wgpu")]
+        ("wgpu", cards(DeviceType::Wgpu)),
+    ]
+}
+
 #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
-fn add_cards(backend: &str, kind: DeviceType, add: &mut impl FnMut(String, String)) {
-    // Drivers that are missing or broken make some backends panic; then there is no such device.
+fn cards(kind: DeviceType) -> Vec<String> {
+    let names = guarded("", || {
+        let cards = Device::enumerate(kind).into_vec().into_iter();
+        cards.map(|card| card.identity().map_or_else(|| format!("{card:?}"), |i| i.name)).collect()
+    });
+    names.unwrap_or_default()
+}
+
+/// Runs what a missing or broken driver, or too little memory, makes panic; gives the panic's words.
+pub(crate) fn guarded<T>(device: &str, run: impl FnOnce() -> T) -> Result<T, String> {
     let quiet = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
-    let cards = std::panic::catch_unwind(|| {
-        let cards = Device::enumerate(kind).into_vec();
-        cards
-            .into_iter()
-            .map(|card| card.identity().map_or_else(|| format!("{card:?}"), |i| i.name))
-            .collect::<Vec<_>>()
-    });
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run));
     std::panic::set_hook(quiet);
-    for (n, card) in cards.unwrap_or_default().into_iter().enumerate() {
-        add(format!("{backend}:{n}"), card);
-    }
+    result.map_err(|panic| {
+        let text = panic.downcast_ref::<String>().map(String::as_str);
+        let text = text.or_else(|| panic.downcast_ref::<&str>().copied());
+        text.map_or_else(
+            || format!("{device} failed"),
+            |text| text.lines().next().unwrap_or_default().to_owned(),
+        )
+    })
 }

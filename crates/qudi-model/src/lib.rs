@@ -9,6 +9,7 @@
 
 pub mod checkpoint;
 pub mod config;
+mod cost;
 pub mod measurement;
 pub mod network;
 pub mod noise;
@@ -17,5 +18,6 @@ pub mod physics;
 pub mod restorer;
 pub mod sampler;
 pub mod schedule;
+pub mod selftest;
 pub mod tensor;
 pub mod tiles;

@@ -1,7 +1,16 @@
 //! What training minimises (DESIGN 4.8): squared error and differences of gradients, of the prediction and of
 //! the pre-denoised frames.
 
+use crate::measurement::Planes;
+use crate::network::{Measured, Qudi, Simulated, State};
+use crate::physics::LoopSensor;
+use crate::sampler::TIMES;
+use crate::schedule::NoiseSchedule;
+use crate::tensor::{read, to_tensor};
+use burn::module::Module;
 use burn::tensor::Tensor;
+use qudi_sim::restore::Context;
+use qudi_sim::{Result, Size};
 
 /// Weight of the total variation of the error.
 const VARIATION: f32 = 0.01;
@@ -32,4 +41,137 @@ pub fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
     };
     let variation = difference(3, width) + difference(2, height);
     error.powi_scalar(2).mean() + variation * VARIATION
+}
+
+/// Time steps between the reverse steps of sampling, which training imitates.
+const STRIDE: usize = TIMES / 10;
+
+/// Bursts to learn from.
+#[derive(Clone, Debug)]
+pub struct Example<'a> {
+    /// What was measured.
+    pub measured: &'a Measured,
+    /// The clean frames, `[bursts * frames, 1, height, width]` in [0, 1].
+    pub truth: Tensor<4>,
+    /// Sensor and light of every burst.
+    pub contexts: &'a [Context],
+    /// Standard normal noise of the truth's shape.
+    pub noise: Tensor<4>,
+    /// Diffusion time of every burst.
+    pub times: &'a [usize],
+}
+
+/// Whether a first pass makes the estimate that the network is given, as at sampling after the first step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FirstPass {
+    /// The network starts from nothing.
+    No,
+    /// The network gets its own estimate from a noisier image, and that estimate measured again with photons
+    /// of this seed.
+    Yes(u64),
+}
+
+/// The terms of the loss, `[1]` each, unweighted but the total.
+#[derive(Clone, Debug)]
+pub struct Terms {
+    /// The weighted sum.
+    pub total: Tensor<1>,
+    /// Of the prediction.
+    pub prediction: Tensor<1>,
+    /// Of the pre-denoised frames.
+    pub pre: Tensor<1>,
+}
+
+/// A diffusion time to train at, from two uniform numbers in [0, 1): a fifth of all at the start, where sampling
+/// begins; the others late, where the photons must do the work (DESIGN 3).
+pub fn training_time(kind: f64, place: f64) -> usize {
+    if kind < 0.2 { TIMES - 1 } else { ((TIMES as f64 * place.sqrt()) as usize).min(TIMES - 1) }
+}
+
+/// The loss of `network`, which is on an autodiff device, on an example on the same device.
+///
+/// # Errors
+/// [`SimError`](qudi_sim::SimError) if the device fails or a sensor is impossible.
+pub fn terms(
+    network: &Qudi,
+    example: &Example<'_>,
+    first_pass: FirstPass,
+    weights: LossWeights,
+) -> Result<Terms> {
+    let schedule = NoiseSchedule::cosine(TIMES);
+    let clean = example.truth.clone() * 2.0 - 1.0;
+    let noisy = |times: &[usize]| {
+        let bursts = times.len();
+        let [images, _, height, width] = clean.dims();
+        let level = |f: fn(f64) -> f64| {
+            let values: Vec<f32> =
+                times.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32).collect();
+            let values = Tensor::<1>::from_floats(values.as_slice(), &clean.device());
+            values.reshape([bursts, 1]).repeat_dim(1, images / bursts).reshape([images, 1, 1, 1])
+        };
+        let signal = level(f64::sqrt).expand([images, 1, height, width]);
+        let noise = level(|a| (1.0 - a).sqrt()).expand([images, 1, height, width]);
+        clean.clone() * signal + example.noise.clone() * noise
+    };
+    let (x0_prev, simulated) = match first_pass {
+        FirstPass::No => (clean.zeros_like(), None),
+        FirstPass::Yes(seed) => {
+            let earlier: Vec<usize> =
+                example.times.iter().map(|t| (t + STRIDE).min(TIMES - 1)).collect();
+            let x_t = noisy(&earlier);
+            estimate(network, example, x_t, earlier, seed)?
+        }
+    };
+    let state = State { x_t: noisy(example.times), x0_prev, times: example.times.to_vec() };
+    let prepared = network.prepare(example.measured);
+    let result = network.forward(&prepared, simulated.as_ref(), &state, None);
+    let prediction = reconstruction((result.x0 + 1.0) * 0.5, example.truth.clone());
+    let pre = reconstruction(result.d, example.truth.clone());
+    let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
+    Ok(Terms { total, prediction, pre })
+}
+
+/// The network's own estimate, without gradient, and its simulated measurement. Bursts at the last time have
+/// neither: there sampling starts.
+fn estimate(
+    network: &Qudi,
+    example: &Example<'_>,
+    x_t: Tensor<4>,
+    earlier: Vec<usize>,
+    seed: u64,
+) -> Result<(Tensor<4>, Option<Simulated>)> {
+    let device = example.truth.device();
+    let measured = Measured {
+        y: example.measured.y.clone().inner(),
+        u: example.measured.u.clone().inner(),
+        sensor: example.measured.sensor.clone().inner(),
+        frames: example.measured.frames,
+    };
+    let network = network.valid();
+    let x_t = x_t.inner();
+    let state = State { x0_prev: x_t.zeros_like(), x_t, times: earlier };
+    let prediction = network.forward(&network.prepare(&measured), None, &state, None);
+    let [_, _, height, width] = example.truth.dims();
+    let size = Size { height, width };
+    let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;
+    let burst = measured.frames * size.pixels();
+    let mut planes = Planes { y: Vec::new(), u: Vec::new() };
+    let exists: Vec<bool> = example.times.iter().map(|&t| t < TIMES - 1).collect();
+    for (number, (x0, context)) in x0.chunks_exact_mut(burst).zip(example.contexts).enumerate() {
+        if !exists[number] {
+            x0.fill(0.0);
+            planes.y.resize(planes.y.len() + burst, 0.0);
+            planes.u.resize(planes.u.len() + burst, 0.0);
+            continue;
+        }
+        let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
+        let sensor = LoopSensor::at(context, example.times[number], TIMES);
+        let first = (number * measured.frames) as u64;
+        let more = sensor.measure(&images, size, first, seed)?;
+        planes.y.extend(more.y);
+        planes.u.extend(more.u);
+    }
+    let tensor = |values| to_tensor(values, size, &device);
+    let simulated = Simulated { y: tensor(planes.y), u: tensor(planes.u), exists };
+    Ok((tensor(x0), Some(simulated)))
 }

@@ -1,6 +1,6 @@
 //! Options of `qudi eval` and `qudi bench`.
 
-use super::Reading;
+use super::{Network, Reading};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_sim::Size;
 use std::path::PathBuf;
@@ -69,6 +69,8 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "DB", allow_negative_numbers = true)]
     pub(crate) min_psnr: Option<f64>,
     #[command(flatten)]
+    pub(crate) network: Network,
+    #[command(flatten)]
     pub(crate) reading: Reading,
 }
 
@@ -93,6 +95,11 @@ pub(crate) struct Bench {
     /// Results of an earlier run (--json) to compare with
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) compare: Option<PathBuf>,
+    /// Instead of methods, measure networks of these sizes with random weights: tiny, small, base, paper
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
+    pub(crate) preset: Vec<String>,
+    #[command(flatten)]
+    pub(crate) network: Network,
 }
 
 /// How a clip becomes photons, and which frames count.

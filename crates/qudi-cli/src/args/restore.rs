@@ -1,6 +1,6 @@
 //! Options of `qudi restore`.
 
-use super::Reading;
+use super::{Network, Reading};
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
@@ -17,9 +17,10 @@ pub(crate) struct Restore {
     /// Where the frames go
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
-    /// How: average (11 frames), or mle (response inverted, dark counts subtracted, length chosen)
-    #[arg(long, value_name = "NAME", default_value = "mle")]
-    pub(crate) method: String,
+    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen), or qudi (the network)
+    /// [default: qudi with --weights, else mle]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) method: Option<String>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
@@ -50,6 +51,11 @@ pub(crate) struct Restore {
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
+    /// Write the deviation of every pixel over the samples (--samples K), .npy
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) deviation: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) network: Network,
     #[command(flatten)]
     pub(crate) reading: Reading,
 }
@@ -79,5 +85,13 @@ impl std::str::FromStr for Shard {
             Some((number, of)) if (1..=of).contains(&number) => Ok(Self { number, of }),
             _ => Err("expected I/N with I from 1 to N, as in 3/8".to_owned()),
         }
+    }
+}
+
+impl Restore {
+    /// The method that was asked for, or follows from the weights.
+    pub(crate) fn method(&self) -> &str {
+        let by_weights = if self.network.weights.is_some() { "qudi" } else { "mle" };
+        self.method.as_deref().unwrap_or(by_weights)
     }
 }

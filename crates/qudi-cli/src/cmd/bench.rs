@@ -1,6 +1,7 @@
 //! `qudi bench`: speed and memory of methods, medians after a warm-up.
 
 use crate::args::{Bench, Global};
+use crate::cmd::bench_network;
 use crate::cmd::methods::method;
 use crate::error::{Fault, Result};
 use crate::interrupt;
@@ -48,35 +49,20 @@ struct Results {
 }
 
 pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
+    if !args.preset.is_empty() {
+        return bench_network::run(args, report);
+    }
     let old = args.compare.as_deref().map(load).transpose()?;
     if args.rounds == 0 || args.frames == 0 {
         return Err(Fault::new("nothing to measure", "--rounds, --frames", "ask for at least 1"));
     }
-    let sensor = Sensor::load("qudi-paper")?;
-    let light = Light { ppp: 3.25, exposure: EXPOSURE };
-    let scene =
-        Procedural { kind: ProceduralScene::DeadLeaves, size: args.size, seed: 1, speed: 2.0 };
-    let scene = scene.scene();
-    let mut camera = Camera::new(&sensor, args.size, light, 1)?;
-    let gain = camera.gain();
-    let mut counts = Vec::with_capacity(args.frames);
-    for t in 0..args.frames {
-        counts.push(camera.expose(t as u64, &[&scene.render(t as f64)])?);
-    }
-    let context = Context {
-        seed: 1,
-        first_frame: 0,
-        ppp: light.ppp,
-        exposure: EXPOSURE,
-        sensor: sensor.clone(),
-        gain,
-        dark: None,
-    };
+    let (counts, context) = burst(args)?;
+    let sensor = context.sensor.clone();
     let mut measured = Vec::new();
     let mut bar = report.bar();
     for name in &args.method {
         let mut capture = Capture::in_memory("bench", args.size, counts.clone(), &sensor)?;
-        let (mut restorer, _) = method(name, &mut capture, &context)?;
+        let (mut restorer, _) = method(name, &mut capture, &context, &args.network)?;
         let burst = BurstView { size: args.size, frames: &counts };
         let peak = Peak::start();
         // The first round warms caches up, and compiles kernels where there are any.
@@ -110,6 +96,24 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
         methods: measured,
     };
     report.result(&describe(&results, old.as_ref()), || json!(results))
+}
+
+/// A simulated burst to restore.
+pub(crate) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Context)> {
+    let sensor = Sensor::load("qudi-paper")?;
+    let light = Light { ppp: 3.25, exposure: EXPOSURE };
+    let scene =
+        Procedural { kind: ProceduralScene::DeadLeaves, size: args.size, seed: 1, speed: 2.0 };
+    let scene = scene.scene();
+    let mut camera = Camera::new(&sensor, args.size, light, 1)?;
+    let gain = camera.gain();
+    let mut counts = Vec::with_capacity(args.frames);
+    for t in 0..args.frames {
+        counts.push(camera.expose(t as u64, &[&scene.render(t as f64)])?);
+    }
+    let (ppp, exposure) = (light.ppp, light.exposure);
+    let context = Context { seed: 1, first_frame: 0, ppp, exposure, sensor, gain, dark: None };
+    Ok((counts, context))
 }
 
 fn load(path: &Path) -> Result<Results> {

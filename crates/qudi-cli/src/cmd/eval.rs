@@ -115,7 +115,7 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
                 let score = match (external, args.protocol) {
                     (Some(external), _) => exposed.score_external(external)?,
                     (None, Protocol::Strict) => exposed.score_method(name, args)?,
-                    (None, Protocol::Quiver) => exposed.score_windows(name)?,
+                    (None, Protocol::Quiver) => exposed.score_windows(name, args)?,
                 };
                 rows[j * names.len() + k].scores.push(score);
             }

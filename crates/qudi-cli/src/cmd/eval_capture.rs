@@ -61,7 +61,7 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
     let mut bar = report.bar();
     for (n, name) in args.method.iter().enumerate() {
         bar.update("evaluating", n as u64, Some(args.method.len() as u64));
-        let score = score(name, &clip, &mut capture, frames, &context, args.overlap)?;
+        let score = score(name, &clip, &mut capture, frames, &context, args)?;
         rows.push(Row { method: name.clone(), ppp: context.ppp, scores: vec![score] });
     }
     drop(bar);
@@ -120,7 +120,7 @@ fn score(
     capture: &mut Capture,
     frames: u64,
     context: &Context,
-    overlap: u64,
+    args: &Eval,
 ) -> Result<Score> {
     let mut sink = Watch {
         consistency: Consistency::new(capture.size(), context),
@@ -131,8 +131,8 @@ fn score(
     };
     let peak = Peak::start();
     let start = Instant::now();
-    let (mut restorer, _) = method(name, capture, context)?;
-    let windows = Windows::new(capture.frames(), restorer.window() as u64, overlap)?;
+    let (mut restorer, _) = method(name, capture, context, &args.network)?;
+    let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(restorer.as_mut(), capture, &windows, 0..frames, context, &mut sink, &mut go_on)?;
     let seconds = start.elapsed().as_secs_f64();

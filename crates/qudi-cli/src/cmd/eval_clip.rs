@@ -203,7 +203,7 @@ impl ExposedClip {
             Capture::in_memory(&self.name, self.size, self.kept.counts.clone(), sensor)?;
         let peak = Peak::start();
         let start = Instant::now();
-        let (mut restorer, _) = method(name, &mut capture, &self.context)?;
+        let (mut restorer, _) = method(name, &mut capture, &self.context, &args.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
@@ -225,7 +225,7 @@ impl ExposedClip {
 
     /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
     /// exposed anew with its own mean at `ppp`, and its middle frame judged.
-    pub(crate) fn score_windows(&self, name: &str) -> Result<Score> {
+    pub(crate) fn score_windows(&self, name: &str, args: &Eval) -> Result<Score> {
         const WINDOW: usize = 11;
         let truth = &self.kept.truth;
         if truth.len() < WINDOW {
@@ -256,7 +256,7 @@ impl ExposedClip {
             let peak = Peak::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
-            let (mut restorer, _) = method(name, &mut capture, &context)?;
+            let (mut restorer, _) = method(name, &mut capture, &context, &args.network)?;
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &context)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();

@@ -1,11 +1,13 @@
 //! Methods by name.
 
+use crate::args::Network;
+use crate::cmd::network;
 use crate::error::{Fault, Result};
 use qudi_sim::capture::Capture;
 use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer};
 
 /// All methods.
-pub(crate) const METHODS: &[&str] = &["average", "mle"];
+pub(crate) const METHODS: &[&str] = &["average", "mle", "qudi"];
 
 /// Windows of a clip that a method's settings are chosen on.
 const SAMPLES: u64 = 4;
@@ -15,6 +17,7 @@ pub(crate) fn method(
     name: &str,
     capture: &mut Capture,
     context: &Context,
+    options: &Network,
 ) -> Result<(Box<dyn Restorer>, String)> {
     match name {
         "average" => Ok((Box::new(Average), String::new())),
@@ -25,10 +28,11 @@ pub(crate) fn method(
             let mle = Mle::choose(&views, context);
             Ok((Box::new(mle), format!(" over {} frames", mle.length())))
         }
+        "qudi" => network::restorer(options, context),
         other => Err(Fault::new(
             format!("no method named `{other}`"),
             "--method",
-            format!("there are {}", METHODS.join(" and ")),
+            format!("there are {}", METHODS.join(", ")),
         )),
     }
 }

@@ -4,6 +4,7 @@ use crate::args::{Global, Restore};
 use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::cmd::capture_light::{Stated, context};
 use crate::cmd::methods::method;
+use crate::cmd::restore_deviation::Deviation;
 use crate::cmd::restore_output::{Misfit, Output};
 use crate::cmd::tiff_samples::tiff_samples;
 use crate::error::{Fault, Result};
@@ -30,7 +31,7 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
         ));
     }
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
-    for path in [&args.chi_map, &args.side_by_side].into_iter().flatten() {
+    for path in [&args.chi_map, &args.side_by_side, &args.deviation].into_iter().flatten() {
         refuse_taken(path, overwrite)?;
     }
     if args.shard.is_some() && args.side_by_side.is_some() {
@@ -53,13 +54,14 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     let part = args.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut misfit = Misfit::new(&job.capture, &job.context);
     let done = output.finished(part.clone());
+    let mut deviation = Deviation::create(args, &job.capture, done, overwrite)?;
     let rest = part.start + done..part.end;
     if done == 0 {
-        job.run(rest, &mut output, Some(&mut misfit), report)?;
+        job.run(rest, &mut output, Some(&mut misfit), &mut deviation, report)?;
     } else {
         // Frames of an interrupted run are judged with the others, in the same order; but after
         // the rest is made, so that a run that keeps being killed still gets on.
-        job.run(rest, &mut output, None, report)?;
+        job.run(rest, &mut output, None, &mut deviation, report)?;
         misfit.read_finished(&output, &mut job.capture, part.clone())?;
     }
     let frames = job.capture.frames();
@@ -67,6 +69,7 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     let results = json!({"chi_square": misfit.chi_square()});
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
+    deviation.finish()?;
     if let Some(path) = &args.chi_map {
         save_map(&misfit, path, overwrite)?;
     }
@@ -150,7 +153,7 @@ impl Job {
         let stated =
             Stated { ppp: args.ppp, gain: args.gain, exposure: args.exposure, seed: args.seed };
         let (context, source) = context(&stated, &mut capture, &sensor)?;
-        let (restorer, choice) = method(&args.method, &mut capture, &context)?;
+        let (restorer, choice) = method(args.method(), &mut capture, &context, &args.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
         let place = if is_pipe(args) {
             capture.path().to_owned()
@@ -169,6 +172,7 @@ impl Job {
             "window": restorer.window(),
             "overlap": args.overlap,
             "seed": args.seed,
+            "network": network_settings(args)?,
             "ppp": context.ppp,
             "exposure": context.exposure,
             "gain": context.gain,
@@ -183,6 +187,7 @@ impl Job {
         wanted: Range<u64>,
         output: &mut Output,
         misfit: Option<&mut Misfit>,
+        deviation: &mut Deviation,
         report: &Report,
     ) -> Result<()> {
         if wanted.is_empty() {
@@ -193,11 +198,27 @@ impl Job {
             bar.update("restoring", done, total);
             interrupt::check()
         };
-        let mut sink = output.sink(misfit);
+        let mut sink = output.sink(misfit, deviation);
         let (capture, context) = (&mut self.capture, &self.context);
         let restorer = self.restorer.as_mut();
         Ok(run_method(restorer, capture, &self.windows, wanted, context, &mut sink, &mut progress)?)
     }
+}
+
+/// What the frames depend on besides, where the network makes them.
+fn network_settings(args: &Restore) -> Result<Option<Value>> {
+    let Some(path) = args.network.weights.as_ref().filter(|_| args.method() == "qudi") else {
+        return Ok(None);
+    };
+    let bytes = std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
+    Ok(Some(json!({
+        "weights": path,
+        "weights_crc32": format!("{:08x}", crc32fast::hash(&bytes)),
+        "steps": args.network.steps,
+        "sampler": format!("{:?}", args.network.sampler).to_lowercase(),
+        "samples": args.network.samples,
+        "tile": args.network.tile,
+    })))
 }
 
 fn describe(

@@ -1,5 +1,6 @@
 //! Where restored frames go, and how well they explain the photons.
 
+use crate::cmd::restore_deviation::Deviation;
 use crate::error::{Fault, Result};
 use qudi_sim::capture::Capture;
 use qudi_sim::output::{FramesWriter, Overwrite, Picture, TiffSamples, refuse_taken};
@@ -63,8 +64,12 @@ impl Output {
         }
     }
 
-    pub(crate) fn sink<'a>(&'a mut self, misfit: Option<&'a mut Misfit>) -> Sink<'a> {
-        Sink { output: self, misfit }
+    pub(crate) fn sink<'a>(
+        &'a mut self,
+        misfit: Option<&'a mut Misfit>,
+        deviation: &'a mut Deviation,
+    ) -> Sink<'a> {
+        Sink { output: self, misfit, deviation }
     }
 
     /// Gives a file its name, or notes in the folder's manifest that it is complete.
@@ -80,9 +85,14 @@ impl Output {
 pub(crate) struct Sink<'a> {
     output: &'a mut Output,
     misfit: Option<&'a mut Misfit>,
+    deviation: &'a mut Deviation,
 }
 
 impl RestoreSink for Sink<'_> {
+    fn deviation(&mut self, _: u64, deviation: &Frame) -> qudi_sim::Result<()> {
+        self.deviation.push(deviation)
+    }
+
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
         // What a reader of the file will see is what is judged.
         let seen = match &mut *self.output {

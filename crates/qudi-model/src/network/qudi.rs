@@ -118,6 +118,18 @@ impl Qudi {
         state: &State,
         flows: Option<Flows>,
     ) -> Prediction {
+        self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
+    }
+
+    /// [`Self::forward`], telling `done` the name of every block that is done.
+    pub fn forward_observed(
+        &self,
+        prepared: &Prepared,
+        simulated: Option<&Simulated>,
+        state: &State,
+        flows: Option<Flows>,
+        done: &mut dyn FnMut(&'static str),
+    ) -> Prediction {
         let frames = prepared.frames;
         let u = prepared.u.clone();
         let device = u.device();
@@ -134,14 +146,20 @@ impl Qudi {
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim.clone()], 1);
         let (d, features) = self.pre.forward(prepared.pre.clone(), u.clone(), both, flag);
+        done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
+        done("low");
         let high = self.high.forward(state.x_t.clone(), state.x0_prev.clone(), frames);
+        done("high");
         let flows = flows.unwrap_or_else(|| self.flow.forward(d.clone(), frames));
+        done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
+        done("fusion");
         let signed = |image: Tensor<4>| image * 2.0 - 1.0;
         let planes = [state.x_t.clone(), state.x0_prev.clone(), signed(u), signed(d.clone())];
         let sensor = prepared.sensor.clone();
         let x0 = self.unet.forward(planes, fused, &state.times, sensor, frames);
+        done("unet");
         Prediction { x0, d, flows }
     }
 }

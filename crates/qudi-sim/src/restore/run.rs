@@ -14,6 +14,16 @@ pub trait RestoreSink {
     /// # Errors
     /// The sink's own; the run ends with it.
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()>;
+
+    /// Takes the deviation of frame `number` over a method's samples, right after the frame. Methods that draw none
+    /// have none.
+    ///
+    /// # Errors
+    /// The sink's own; the run ends with it.
+    fn deviation(&mut self, number: u64, deviation: &Frame) -> Result<()> {
+        let _ = (number, deviation);
+        Ok(())
+    }
 }
 
 /// Restores the frames `wanted` of `capture` and hands them to `sink`. A window is computed if it
@@ -37,6 +47,7 @@ pub fn run(
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
     let mut first_held = 0;
     let mut fade = CrossFade::default();
+    let mut deviations = CrossFade::default();
     for number in windows.first_with(wanted.start).. {
         // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
         // the next one is whole, or no more frames come.
@@ -66,11 +77,19 @@ pub fn run(
         let burst = BurstView { size, frames: counts.make_contiguous() };
         let restored = restorer.restore(burst, &context)?;
         fade.push(range.start, restored.frames);
+        if let Some(deviation) = restored.std {
+            deviations.push(range.start, deviation);
+        }
         let last = number + 1 == windows.count();
         let until = if last { range.end } else { windows.range(number + 1).start };
         while let Some((frame, image)) = fade.pop(until) {
             if wanted.contains(&frame) {
                 sink.frame(frame, &image, &counts[(frame - first_held) as usize])?;
+            }
+            if let Some((frame, deviation)) = deviations.pop(until)
+                && wanted.contains(&frame)
+            {
+                sink.deviation(frame, &deviation)?;
             }
         }
     }

@@ -1,0 +1,37 @@
+//! Options of commands that may run the network.
+
+use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use std::path::PathBuf;
+
+/// The network, for the method `qudi`.
+#[derive(Clone, Debug, ClapArgs)]
+#[command(next_help_heading = "Network (method qudi)")]
+pub(crate) struct Network {
+    /// Weights that `qudi train` wrote
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) weights: Option<PathBuf>,
+    /// Reverse steps: 1 is truest to the photons on average (best PSNR), 10 looks sharpest
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    pub(crate) steps: usize,
+    /// How noise leaves
+    #[arg(long, value_name = "NAME", default_value = "ddim")]
+    pub(crate) sampler: SamplerName,
+    /// Pictures drawn; the result is their mean, --deviation their spread
+    #[arg(long, value_name = "K", default_value_t = 1)]
+    pub(crate) samples: usize,
+    /// Where it runs: auto, cpu, ndarray, wgpu[:N], vulkan[:N], cuda[:N], metal (see `qudi info --devices`)
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub(crate) device: String,
+    /// Side of the tiles that the network sees at once, in pixels: memory grows with its square
+    #[arg(long, value_name = "PIXELS", default_value_t = 320)]
+    pub(crate) tile: usize,
+}
+
+/// Samplers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum SamplerName {
+    /// No fresh noise on the way (eta 0)
+    Ddim,
+    /// The noise of the posterior at every step
+    Ancestral,
+}

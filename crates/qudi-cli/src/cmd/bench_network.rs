@@ -1,0 +1,241 @@
+//! `qudi bench --preset`: speed, memory and size of networks with random weights, by block.
+
+use crate::args::Bench;
+use crate::cmd::bench::burst;
+use crate::cmd::network::sample_options;
+use crate::device::{self, Opened};
+use crate::error::{Fault, Result};
+use crate::interrupt;
+use crate::memory::Peak;
+use crate::report::{Bar, Report};
+use burn::tensor::{Device, Tensor};
+use qudi_model::checkpoint::Description;
+use qudi_model::config::NetworkConfig;
+use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State, parameters};
+use qudi_model::objective::reconstruction;
+use qudi_model::restorer::QudiRestorer;
+use qudi_sim::Size;
+use qudi_sim::restore::{BurstView, Restorer};
+use serde::Serialize;
+use serde_json::json;
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::time::Instant;
+
+/// Frame size of the training step that is timed.
+const CROP: Size = Size { height: 128, width: 128 };
+
+/// Figures of one network.
+#[derive(Debug, Serialize)]
+struct Figures {
+    preset: String,
+    parameters: usize,
+    /// Floating-point operations of all convolutions, for one frame and one step that estimates the flow.
+    gflop_per_frame_step: f64,
+    /// Median seconds of one reverse step over all frames, flow included.
+    step: f64,
+    /// The fastest.
+    step_fastest: f64,
+    /// Median seconds of every block in such a step.
+    blocks: BTreeMap<&'static str, f64>,
+    /// Median seconds of what is computed once for all steps.
+    prepare: f64,
+    /// Seconds of the whole restoration, sampling and simulated measurements included.
+    restore: f64,
+    /// Its peak memory above what the process held before, in MiB.
+    peak_mib: Option<f64>,
+    /// Median seconds of a forward and backward pass on frames of 128 x 128.
+    forward_backward: f64,
+}
+
+pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
+    if args.rounds == 0 || args.frames < 3 {
+        let help = "ask for at least 1 round of 3 frames";
+        return Err(Fault::new("nothing to measure", "--rounds, --frames", help));
+    }
+    let device = device::open(&args.network.device)?;
+    let mut bar = report.bar();
+    let mut all = Vec::new();
+    for preset in &args.preset {
+        let config = NetworkConfig::preset(preset)?;
+        all.push(measure(preset, config, args, &device, &mut bar)?);
+    }
+    drop(bar);
+    report.result(&describe(&all, args, &device), || {
+        json!({
+            "program": format!("qudi {}", env!("CARGO_PKG_VERSION")),
+            "device": device.name,
+            "threads": rayon::current_num_threads(),
+            "height": args.size.height,
+            "width": args.size.width,
+            "frames": args.frames,
+            "rounds": args.rounds,
+            "steps": args.network.steps,
+            "networks": all,
+        })
+    })
+}
+
+fn measure(
+    preset: &str,
+    config: NetworkConfig,
+    args: &Bench,
+    device: &Opened,
+    bar: &mut Bar,
+) -> Result<Figures> {
+    let network = config.init(1, &device.device);
+    let shapes = parameters(&network);
+    let parameters = shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
+    let (mut steps, mut prepares) = (Vec::new(), Vec::new());
+    let mut blocks: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
+    // The first round warms up and is not counted.
+    for round in 0..=args.rounds {
+        bar.update("measuring", round as u64, Some(2 * args.rounds as u64 + 3));
+        if interrupt::check().is_break() {
+            return Err(Fault::Interrupted);
+        }
+        let times = step(&network, args.size, args.frames, &device.device);
+        if round > 0 {
+            prepares.push(times[0].1);
+            steps.push(times[1..].iter().map(|(_, seconds)| seconds).sum());
+            for &(block, seconds) in &times[1..] {
+                blocks.entry(block).or_default().push(seconds);
+            }
+        }
+    }
+    let mut training = Vec::new();
+    let autodiff = device.device.clone().autodiff();
+    let differentiable = config.init(1, &autodiff);
+    for round in 0..=args.rounds {
+        bar.update("measuring", (args.rounds + 1 + round) as u64, Some(2 * args.rounds as u64 + 3));
+        if interrupt::check().is_break() {
+            return Err(Fault::Interrupted);
+        }
+        let seconds = forward_backward(&differentiable, args.frames, &autodiff);
+        if round > 0 {
+            training.push(seconds);
+        }
+    }
+    drop(differentiable);
+    let (counts, context) = burst(args)?;
+    let description = Description {
+        program: String::new(),
+        preset: Some(preset.to_owned()),
+        network: config.clone(),
+        window: args.frames,
+        sensors: Vec::new(),
+        ppp: [0.0, f64::MAX],
+        data: Vec::new(),
+        steps: 0,
+        commit: None,
+        licence: String::new(),
+    };
+    let options = sample_options(&args.network);
+    let mut restorer = QudiRestorer::new(network, &description, options, &device.device)?;
+    let peak = Peak::start();
+    let start = Instant::now();
+    restorer.restore(BurstView { size: args.size, frames: &counts }, &context)?;
+    let restore = start.elapsed().as_secs_f64();
+    let fastest = steps.iter().copied().fold(f64::MAX, f64::min);
+    Ok(Figures {
+        preset: preset.to_owned(),
+        parameters,
+        gflop_per_frame_step: 2e-9
+            * config.multiplications(args.size, args.frames, &device.device) as f64
+            / args.frames as f64,
+        step: median(steps),
+        step_fastest: fastest,
+        blocks: blocks.into_iter().map(|(block, times)| (block, median(times))).collect(),
+        prepare: median(prepares),
+        restore,
+        peak_mib: peak.grown_mib(),
+        forward_backward: median(training),
+    })
+}
+
+fn median(mut times: Vec<f64>) -> f64 {
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
+}
+
+/// Inputs of a step: values do not matter for speed.
+fn inputs(size: Size, frames: usize, device: &Device) -> (Measured, Simulated, State) {
+    let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
+    let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
+    let measured = Measured { y: image(), u: image(), sensor, frames };
+    let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
+    (measured, simulated, State { x_t: image(), x0_prev: image(), times: vec![500] })
+}
+
+/// Seconds of the preparation and of every block of one step.
+fn step(network: &Qudi, size: Size, frames: usize, device: &Device) -> Vec<(&'static str, f64)> {
+    let (measured, simulated, state) = inputs(size, frames, device);
+    let mut last = Instant::now();
+    let mut times = Vec::new();
+    let mut mark = |block: &'static str| {
+        // A device that fails here fails at the next read, with words.
+        let _ = device.sync();
+        times.push((block, last.elapsed().as_secs_f64()));
+        last = Instant::now();
+    };
+    let prepared = network.prepare(&measured);
+    mark("prepare");
+    network.forward_observed(&prepared, Some(&simulated), &state, None, &mut mark);
+    times
+}
+
+fn forward_backward(network: &Qudi, frames: usize, device: &Device) -> f64 {
+    let (measured, simulated, state) = inputs(CROP, frames, device);
+    let truth = Tensor::<4>::zeros([frames, 1, CROP.height, CROP.width], device);
+    let start = Instant::now();
+    let prepared = network.prepare(&measured);
+    let prediction = network.forward(&prepared, Some(&simulated), &state, None);
+    let loss = reconstruction((prediction.x0 + 1.0) * 0.5, truth.clone())
+        + reconstruction(prediction.d, truth) * 0.2;
+    let _grads = loss.backward();
+    let _ = device.sync();
+    start.elapsed().as_secs_f64()
+}
+
+fn describe(all: &[Figures], args: &Bench, device: &Opened) -> String {
+    let mut text = format!(
+        "{:<8}{:>12}{:>13}{:>9}{:>10}{:>10}{:>10}{:>11}\n",
+        "preset",
+        "parameters",
+        "GFLOP/frame",
+        "s/step",
+        "GFLOP/s",
+        "s/burst",
+        "peak MiB",
+        "fwd+bwd s"
+    );
+    for f in all {
+        let rate = f.gflop_per_frame_step * args.frames as f64 / f.step;
+        let peak = f.peak_mib.map_or("-".to_owned(), |mib| format!("{mib:.0}"));
+        let _ = writeln!(
+            text,
+            "{:<8}{:>12}{:>13.2}{:>9.3}{rate:>10.1}{:>10.2}{peak:>10}{:>11.3}",
+            f.preset, f.parameters, f.gflop_per_frame_step, f.step, f.restore, f.forward_backward
+        );
+    }
+    text.push('\n');
+    for f in all {
+        let _ = write!(text, "{:<8}ms: prepare {:.1}", f.preset, 1e3 * f.prepare);
+        for (block, seconds) in &f.blocks {
+            let _ = write!(text, ", {block} {:.1}", 1e3 * seconds);
+        }
+        text.push('\n');
+    }
+    let _ = writeln!(
+        text,
+        "\n{} frames of {}, {} steps, on {}, {} threads; medians of {} rounds after one of warm-up; \
+         forward and backward on {CROP}",
+        args.frames,
+        args.size,
+        args.network.steps,
+        device.name,
+        rayon::current_num_threads(),
+        args.rounds
+    );
+    text
+}

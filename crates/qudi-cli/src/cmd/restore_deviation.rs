@@ -1,0 +1,55 @@
+//! The deviation over samples, written beside the frames.
+
+use crate::args::Restore;
+use crate::error::{Fault, Result};
+use qudi_sim::Frame;
+use qudi_sim::capture::Capture;
+use qudi_sim::output::{ArrayWriter, Overwrite};
+use std::path::Path;
+
+/// A `.npy` file of deviations, float32 `[frames, height, width]`, or none.
+#[derive(Debug)]
+pub(crate) struct Deviation(Option<ArrayWriter>);
+
+impl Deviation {
+    /// The file that was asked for. `finished` frames were there already; theirs would be missing.
+    pub(crate) fn create(
+        args: &Restore,
+        capture: &Capture,
+        finished: u64,
+        overwrite: Overwrite,
+    ) -> Result<Self> {
+        let Some(path) = &args.deviation else { return Ok(Self(None)) };
+        if args.method() != "qudi" || args.network.samples < 2 {
+            return Err(Fault::new(
+                "there is no deviation of one sample",
+                "--deviation",
+                "draw several with --samples K (method qudi)",
+            ));
+        }
+        if path.extension() != Some("npy".as_ref()) {
+            return Err(Fault::new("deviations are .npy", path.display(), "name a .npy file"));
+        }
+        if finished > 0 {
+            return Err(Fault::new(
+                format!(
+                    "{finished} frames were restored by an earlier run, without their deviation"
+                ),
+                Path::new(&args.output).display(),
+                "write into another folder",
+            ));
+        }
+        let size = capture.size();
+        let shape = [size.height, size.width];
+        Ok(Self(Some(ArrayWriter::create(path, overwrite, "<f4", &shape)?)))
+    }
+
+    pub(crate) fn push(&mut self, deviation: &Frame) -> qudi_sim::Result<()> {
+        let values = deviation.data.iter().copied();
+        self.0.as_mut().map_or(Ok(()), |writer| writer.push_f32(values))
+    }
+
+    pub(crate) fn finish(self) -> Result<()> {
+        Ok(self.0.map_or(Ok(()), ArrayWriter::finish)?)
+    }
+}

@@ -1,0 +1,62 @@
+//! `qudi selftest`: a device against the processor.
+
+use crate::args::Selftest;
+use crate::device;
+use crate::error::{Fault, Result};
+use crate::interrupt;
+use crate::report::Report;
+use burn::tensor::Device;
+use qudi_model::selftest::{CHECKS, TOLERANCE};
+use serde_json::json;
+use std::fmt::Write;
+use std::time::Instant;
+
+pub(crate) fn run(args: &Selftest, report: &Report) -> Result<()> {
+    let device = device::open(&args.device)?;
+    let reference = Device::flex();
+    let chosen =
+        |name: &str| args.only.is_empty() || args.only.iter().any(|o| name.contains(o.as_str()));
+    let checks: Vec<_> = CHECKS.iter().filter(|check| chosen(check.name)).collect();
+    if checks.is_empty() {
+        let names: Vec<_> = CHECKS.iter().map(|check| check.name).collect();
+        let help = format!("there are {}", names.join(", "));
+        return Err(Fault::new("no check of that name", "--only", help));
+    }
+    let mut text = format!("{} against cpu\n", device.name);
+    let mut results = Vec::new();
+    let mut missed = Vec::new();
+    let mut bar = report.bar();
+    for (number, check) in checks.iter().enumerate() {
+        bar.update("checking", number as u64, Some(checks.len() as u64));
+        if interrupt::check().is_break() {
+            return Err(Fault::Interrupted);
+        }
+        let start = Instant::now();
+        let outcome = device::guarded(&device.name, || check.error(&device.device, &reference));
+        let seconds = start.elapsed().as_secs_f64();
+        let (error, verdict) = match outcome {
+            Ok(Ok(error)) if error < TOLERANCE => (Some(error), "ok".to_owned()),
+            Ok(Ok(error)) => (Some(error), "WRONG".to_owned()),
+            Ok(Err(fault)) => (None, format!("FAILED: {fault}")),
+            Err(problem) => (None, format!("FAILED: {problem}")),
+        };
+        let shown = error.map_or("-".to_owned(), |error| format!("{error:.1e}"));
+        let _ = writeln!(text, "  {:<24}{shown:>9}  {seconds:>7.2} s  {verdict}", check.name);
+        if verdict != "ok" {
+            missed.push(check.name);
+        }
+        results.push(
+            json!({"check": check.name, "error": error, "seconds": seconds, "verdict": verdict}),
+        );
+    }
+    drop(bar);
+    let _ = writeln!(
+        text,
+        "largest difference over the largest value; at most {TOLERANCE:.0e} is right"
+    );
+    report.result(&text, || json!({"device": device.name, "checks": results}))?;
+    if missed.is_empty() {
+        return Ok(());
+    }
+    Err(Fault::Missed(format!("{} is wrong in {}", device.name, missed.join(", "))))
+}

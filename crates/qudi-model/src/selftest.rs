@@ -1,0 +1,186 @@
+//! What a device must get right: every operation of the network with its gradients, and a small network whole.
+
+use crate::config::NetworkConfig;
+use crate::network::{Measured, SENSOR_NUMBERS, Simulated, State};
+use crate::objective::reconstruction;
+use crate::tensor::read;
+use burn::tensor::activation::softmax;
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
+use qudi_kernels::group_norm::{self, Norm, group_norm};
+use qudi_kernels::warp;
+use qudi_sim::Result;
+
+/// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
+pub const TOLERANCE: f32 = 2e-3;
+
+/// One check.
+#[derive(Clone, Copy, Debug)]
+pub struct Check {
+    /// What is checked.
+    pub name: &'static str,
+    run: fn(&Device) -> Result<Vec<Vec<f32>>>,
+}
+
+impl Check {
+    /// Largest difference between the devices' results, in terms of the largest value.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if a device fails.
+    pub fn error(&self, device: &Device, reference: &Device) -> Result<f32> {
+        let (got, expected) = ((self.run)(device)?, (self.run)(reference)?);
+        let mut worst = 0f32;
+        for (got, expected) in got.iter().zip(&expected) {
+            let scale = expected.iter().fold(1e-6f32, |scale, value| scale.max(value.abs()));
+            for (got, expected) in got.iter().zip(expected) {
+                let error = (got - expected).abs() / scale;
+                // NaN is an error, too.
+                worst = if error <= worst { worst } else { error };
+                if error.is_nan() {
+                    return Ok(f32::INFINITY);
+                }
+            }
+        }
+        Ok(worst)
+    }
+}
+
+/// All checks, cheap ones first.
+pub const CHECKS: &[Check] = &[
+    Check { name: "arithmetic", run: arithmetic },
+    Check { name: "joining and slicing", run: joining },
+    Check { name: "warp", run: warping },
+    Check { name: "group norm", run: normalising },
+    Check { name: "matrix product", run: products },
+    Check { name: "softmax", run: attention },
+    Check { name: "convolution 3x3", run: |device| convolution(device, 3, 1) },
+    Check { name: "convolution 1x1", run: |device| convolution(device, 1, 1) },
+    Check { name: "convolution 7x7", run: |device| convolution(device, 7, 1) },
+    Check { name: "convolution, stride 2", run: |device| convolution(device, 3, 2) },
+    Check { name: "convolution 5x5x5", run: |device| convolution_3d(device, 1) },
+    Check { name: "convolution 5x5x5 / 2", run: |device| convolution_3d(device, 2) },
+    Check { name: "network", run: network },
+];
+
+/// Repeatable values in [-1, 1).
+fn values<const D: usize>(seed: u32, shape: [usize; D], device: &Device) -> Tensor<D> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9) | 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as f32 / 2f32.powi(31) - 1.0
+    };
+    let values: Vec<f32> = (0..shape.iter().product()).map(|_| next()).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
+}
+
+/// The result, and the gradients of a weighted sum of it.
+fn with_gradients<const D: usize>(
+    output: Tensor<D>,
+    inputs: &[Tensor<D>],
+) -> Result<Vec<Vec<f32>>> {
+    let weights = values(99, output.dims(), &output.device());
+    let grads = (output.clone() * weights).sum().backward();
+    let mut results = vec![read(output.inner())?];
+    for input in inputs {
+        results.push(input.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?);
+    }
+    Ok(results)
+}
+
+fn arithmetic(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let a = values(1, [2, 3, 5, 7], &device).require_grad();
+    let b = values(2, [2, 3, 5, 7], &device).require_grad();
+    let positive = b.clone() * b.clone() + 0.1;
+    let output = (a.clone() * 2.0 - b.clone()) / positive.clone().sqrt()
+        + a.clone().abs() * burn::tensor::activation::silu(b.clone())
+        + burn::tensor::activation::relu(a.clone());
+    with_gradients(output, &[a, b])
+}
+
+fn joining(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let a = values(3, [2, 3, 4, 6], &device).require_grad();
+    let b = values(4, [2, 2, 4, 6], &device).require_grad();
+    let joined = Tensor::cat(vec![a.clone(), b.clone()], 1).narrow(1, 1, 3);
+    let folded = joined.reshape([2, 3, 2, 2, 3, 2]).permute([0, 1, 3, 5, 2, 4]);
+    with_gradients(folded.reshape([2, 12, 2, 3]), &[a, b])
+}
+
+fn warping(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(5, [2, 3, 12, 20], &device).require_grad();
+    let flow = (values(6, [2, 2, 12, 20], &device) * 3.3).require_grad();
+    with_gradients(warp(x.clone(), flow.clone()), &[x, flow])
+}
+
+fn normalising(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(7, [4, 12, 6, 10], &device).require_grad();
+    let weight = values(8, [2, 12], &device) + 1.5;
+    let bias = values(9, [2, 12], &device);
+    let norm = Norm { groups: 6, activation: group_norm::Activation::Silu };
+    with_gradients(group_norm(x.clone(), weight, bias, norm), &[x])
+}
+
+fn products(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let a = values(10, [3, 17, 33], &device).require_grad();
+    let b = values(11, [3, 33, 9], &device).require_grad();
+    with_gradients(a.clone().matmul(b.clone()), &[a, b])
+}
+
+fn attention(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = (values(12, [3, 40, 40], &device) * 4.0).require_grad();
+    with_gradients(softmax(x.clone(), 2), &[x])
+}
+
+fn convolution(device: &Device, kernel: usize, stride: usize) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(13, [2, 6, 24, 36], &device).require_grad();
+    let weight = values(14, [8, 6, kernel, kernel], &device).require_grad();
+    let bias = values(15, [8], &device);
+    let options = Options { stride, activation: Activation::Relu, ..Options::default() };
+    let output = conv_2d(&[x.clone()], weight.clone(), bias, options);
+    with_gradients(output, &[x, weight])
+}
+
+fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(16, [5, 4, 16, 24], &device).require_grad();
+    let weight = values(17, [6, 4, 5, 5, 5], &device);
+    let options = Options { stride, ..Options::default() };
+    let output = conv_3d(&[x.clone()], weight, values(18, [6], &device), 5, options);
+    with_gradients(output, &[x])
+}
+
+/// `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the loss's gradient for the
+/// noisy image.
+fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let network = NetworkConfig::preset("tiny")?.init(1, &device);
+    let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
+    let measured = Measured {
+        y: image(21),
+        u: image(22),
+        sensor: values(23, [1, SENSOR_NUMBERS], &device),
+        frames: 4,
+    };
+    let simulated = Simulated { y: image(24), u: image(25), exists: vec![true] };
+    let x_t = values(26, [4, 1, 32, 48], &device).require_grad();
+    let x0_prev = values(27, [4, 1, 32, 48], &device);
+    let state = State { x_t: x_t.clone(), x0_prev, times: vec![500] };
+    let prepared = network.prepare(&measured);
+    let prediction = network.forward(&prepared, Some(&simulated), &state, None);
+    let loss = reconstruction((prediction.x0.clone() + 1.0) * 0.5, image(28));
+    let grads = loss.backward();
+    Ok(vec![
+        read(prediction.x0.inner())?,
+        read(prediction.d.inner())?,
+        read(prediction.flows.to_next.inner())?,
+        x_t.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?,
+    ])
+}

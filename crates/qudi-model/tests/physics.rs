@@ -1,0 +1,115 @@
+//! The measurement inside the loop: exact distribution, same counts everywhere, and what the planes say.
+#![allow(clippy::unwrap_used)]
+
+use qudi_model::measurement::Planes;
+use qudi_model::physics::LoopSensor;
+use qudi_sim::Size;
+use qudi_sim::restore::{BurstView, Context};
+use qudi_sim::sensor::{CountLaw, FullWell, Gain, Sensor};
+
+const SIZE: Size = Size { height: 128, width: 256 };
+
+fn context(sensor: &str, ppp: f64, frames_summed: u32) -> Context {
+    let mut sensor = Sensor::load(sensor).unwrap();
+    sensor.frames_summed = frames_summed;
+    let gain = sensor.gain_at(ppp).unwrap();
+    Context { seed: 1, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+}
+
+/// Counts of a flat image of value 0.5 by level, measured at a diffusion time.
+fn histogram(context: &Context, time: usize, levels: usize) -> Vec<f64> {
+    let sensor = LoopSensor::at(context, time, 1000);
+    let image = vec![0.5; SIZE.pixels()];
+    let planes = sensor.measure(&image, SIZE, 3, 77).unwrap();
+    let mut histogram = vec![0.0; levels];
+    for y in planes.y {
+        histogram[(y * (levels - 1) as f32).round() as usize] += 1.0;
+    }
+    histogram
+}
+
+fn check(observed: &[f64], probabilities: &[f64]) {
+    let n: f64 = observed.iter().sum();
+    let (mut chi, mut cells) = (0.0, 0.0);
+    for (observed, p) in observed.iter().zip(probabilities) {
+        if n * p >= 5.0 {
+            chi += (observed - n * p).powi(2) / (n * p);
+            cells += 1.0;
+        }
+    }
+    // Five standard deviations of chi-square; the seed is fixed.
+    let freedom: f64 = cells - 1.0;
+    assert!(
+        chi < freedom + 5.0 * (2.0 * freedom).sqrt(),
+        "chi-square {chi} of {freedom}: {observed:?}"
+    );
+}
+
+#[test]
+fn counts_follow_the_sensors_law_under_growing_light() {
+    let context = context("qudi-paper", 3.25, 1);
+    for (time, factor) in [(900, 10f64.powf(0.1)), (500, 10f64.powf(0.5)), (0, 10.0)] {
+        let mut sensor = context.sensor.clone();
+        let gain = context.gain / factor;
+        sensor.gain = Gain::Fixed(gain);
+        sensor.full_well = FullWell::new(sensor.full_well.electrons() * factor);
+        let detections = 0.8 * 3.25 * factor * 0.5 / 0.45 + 1.6;
+        let law = CountLaw::new(&sensor, gain);
+        check(&histogram(&context, time, 8), &law.probabilities(detections));
+    }
+}
+
+#[test]
+fn sums_of_binary_frames_keep_their_light_and_get_longer() {
+    let context = context("swissspad2", 2.0, 7);
+    let sensor = Sensor { frames_summed: 22, ..context.sensor.clone() }; // round(7 * sqrt(10))
+    let dark = sensor.dark_per_frame().unwrap();
+    let photons = 2.0 * 22.0 / 7.0 * 0.5 / 0.45;
+    let detections = sensor.quantum_efficiency * photons + dark;
+    let law = CountLaw::new(&sensor, 1.0);
+    check(&histogram(&context, 500, 23), &law.probabilities(detections));
+}
+
+#[test]
+fn the_same_estimate_gives_the_same_counts() {
+    let context = context("qudi-paper", 9.75, 1);
+    let image: Vec<f32> = (0..2 * SIZE.pixels()).map(|i| (i % 97) as f32 / 97.0).collect();
+    let sensor = LoopSensor::at(&context, 300, 1000);
+    let measure = |first, seed| sensor.measure(&image, SIZE, first, seed).unwrap();
+    let all = measure(5, 9);
+    assert_eq!(all, measure(5, 9));
+    assert_ne!(all.y, measure(5, 10).y);
+    // Frames are drawn by their number in the capture: windows that overlap agree.
+    let second = sensor.measure(&image[SIZE.pixels()..], SIZE, 6, 9).unwrap();
+    assert_eq!(all.y[SIZE.pixels()..], second.y);
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    assert_eq!(all, one.install(|| measure(5, 9)));
+}
+
+#[test]
+fn the_linear_estimate_is_unbiased_in_image_units() {
+    // Without read noise and with light far from saturation the mean estimate is the image.
+    let mut context = context("qudi-paper", 3.25, 1);
+    context.sensor.dark = qudi_sim::sensor::DarkRate::PerFrame(0.0);
+    context.sensor.bits = 8;
+    context.gain = 10.0;
+    context.sensor.gain = Gain::Fixed(10.0);
+    let image = vec![0.45; SIZE.pixels()];
+    let planes = LoopSensor::at(&context, 1000, 1000).measure(&image, SIZE, 0, 3).unwrap();
+    let mean = planes.u.iter().map(|&u| f64::from(u)).sum::<f64>() / planes.u.len() as f64;
+    assert!((mean - 0.45).abs() < 0.01, "mean estimate {mean}");
+}
+
+#[test]
+fn planes_hold_counts_over_full_scale_and_follow_a_dark_map() {
+    let mut context = context("qudi-paper", 3.25, 1);
+    let size = Size { height: 1, width: 4 };
+    let frames = [vec![0, 3, 7, 9]];
+    let planes = Planes::of(BurstView { size, frames: &frames }, &context);
+    assert_eq!(planes.y, [0.0, 3.0 / 7.0, 1.0, 1.0]);
+    assert_eq!(planes.u[0], 0.0);
+    context.dark = Some(vec![0.0, 3.0, 1.6, 1.6]);
+    let mapped = Planes::of(BurstView { size, frames: &frames }, &context);
+    assert!(mapped.u[1] < planes.u[1]);
+    assert_eq!(mapped.u[2], planes.u[2]);
+}

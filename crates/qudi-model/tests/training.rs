@@ -1,0 +1,157 @@
+//! Learning works: gradients reach every parameter, one burst can be learnt by heart, and a step runs on ndarray.
+#![allow(clippy::unwrap_used)]
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::{AdamConfig, GradientsParams};
+use burn::tensor::{Device, Gradients, Tensor, TensorData};
+use qudi_model::config::NetworkConfig;
+use qudi_model::measurement::{Planes, sensor_numbers};
+use qudi_model::network::{Measured, Qudi};
+use qudi_model::noise::Noise;
+use qudi_model::objective::{Example, FirstPass, LossWeights, Terms, terms, training_time};
+use qudi_model::tensor::to_tensor;
+use qudi_sim::restore::{BurstView, Context};
+use qudi_sim::sensor::Sensor;
+use qudi_sim::{Camera, Frame, Light, Size};
+
+/// A burst of a moving disk, its truth and its light.
+struct Burst {
+    measured: Measured,
+    truth: Tensor<4>,
+    context: Context,
+    size: Size,
+}
+
+fn burst(size: Size, frames: usize, device: &Device) -> Burst {
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let light = Light { ppp: 9.75, exposure: 0.45 };
+    let mut camera = Camera::new(&sensor, size, light, 4).unwrap();
+    let scene = |t: usize| {
+        Frame::from_fn(size, |x, y| {
+            let (dx, dy) = (x as f32 - 10.0 - t as f32, y as f32 - 14.0);
+            if dx * dx + dy * dy < 40.0 { 0.9 } else { 0.2 + 0.01 * y as f32 }
+        })
+    };
+    let truth: Vec<Frame> = (0..frames).map(scene).collect();
+    let counts: Vec<Vec<u16>> =
+        truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
+    let context = Context {
+        seed: 0,
+        first_frame: 0,
+        ppp: light.ppp,
+        exposure: light.exposure,
+        gain: camera.gain(),
+        sensor,
+        dark: None,
+    };
+    let planes = Planes::of(BurstView { size, frames: &counts }, &context);
+    let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, 9]);
+    let measured = Measured {
+        y: to_tensor(planes.y, size, device),
+        u: to_tensor(planes.u, size, device),
+        sensor: Tensor::from_data(numbers, device),
+        frames,
+    };
+    let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
+    Burst { measured, truth: to_tensor(truth, size, device), context, size }
+}
+
+/// The loss of step `number`, at a time and with noise of its own.
+fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
+    let frames = burst.measured.frames;
+    let noise = Noise::new(number, 1);
+    let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
+    let place = (number as f64 * 0.618_034).fract();
+    let time = training_time((number as f64 * 0.414_214).fract(), place);
+    let example = Example {
+        measured: &burst.measured,
+        truth: burst.truth.clone(),
+        contexts: std::slice::from_ref(&burst.context),
+        noise: to_tensor(values, burst.size, &burst.truth.device()),
+        times: &[time],
+    };
+    let first_pass = if number % 2 == 0 { FirstPass::No } else { FirstPass::Yes(number) };
+    terms(network, &example, first_pass, LossWeights::default()).unwrap()
+}
+
+/// Names of parameters whose gradient is missing or zero.
+struct Without<'a> {
+    grads: &'a Gradients,
+    path: Vec<String>,
+    names: Vec<String>,
+}
+
+impl ModuleVisitor for Without<'_> {
+    fn enter_module(&mut self, name: &str, _container: &str) {
+        self.path.push(name.into());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let size = param.val().grad(self.grads).map(|g| g.abs().sum().into_scalar::<f32>());
+        if !size.is_some_and(|size| size > 0.0 && size.is_finite()) {
+            self.names.push(self.path.join("."));
+        }
+    }
+}
+
+#[test]
+fn gradients_reach_every_parameter() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let mut config = NetworkConfig::preset("tiny").unwrap();
+    config.unet.temporal = true;
+    config.unet.attention = vec![1];
+    let mut network = config.init(3, &device);
+    let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
+    for number in 0..10 {
+        let grads = loss(&network, &burst, number).total.backward();
+        let grads = GradientsParams::from_grads(grads, &network);
+        network = optimizer.step(1e-3, network, grads);
+    }
+    // A step with a first pass: only then the simulated measurement matters. Its time is not the last one.
+    let number = (1..).step_by(2).find(|&n| (f64::from(n) * 0.414_214).fract() > 0.2).unwrap();
+    let grads = loss(&network, &burst, number as u64).total.backward();
+    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut without);
+    assert!(without.names.is_empty(), "no gradient: {}", without.names.join(", "));
+}
+
+#[test]
+fn one_burst_is_learnt_by_heart() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 5, &device);
+    let mut network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
+    let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
+    let mut losses = Vec::new();
+    for number in 0..200u32 {
+        let terms = loss(&network, &burst, u64::from(number));
+        losses.push(terms.total.clone().into_scalar::<f32>());
+        let grads = GradientsParams::from_grads(terms.total.backward(), &network);
+        let rate = 4e-3 * (1.0 - f64::from(number) / 220.0);
+        network = optimizer.step(rate, network, grads);
+    }
+    let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
+    let (first, last) = (losses[0], mean(&losses[190..]));
+    assert!(last < 0.1 * first, "the loss went from {first} to {last} only");
+}
+
+#[test]
+fn a_step_on_ndarray_is_that_on_flex() {
+    #[allow(deprecated)] // asked for by name
+    let devices = [Device::flex(), Device::ndarray()];
+    let losses = devices.map(|device| {
+        let device = device.autodiff();
+        let burst = burst(Size { height: 16, width: 16 }, 3, &device);
+        let mut network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
+        let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
+        let grads = loss(&network, &burst, 2).total.backward();
+        let grads = GradientsParams::from_grads(grads, &network);
+        network = optimizer.step(1e-3, network, grads);
+        loss(&network, &burst, 4).total.into_scalar::<f32>()
+    });
+    assert!((losses[0] / losses[1] - 1.0).abs() < 1e-3, "{losses:?}");
+}
