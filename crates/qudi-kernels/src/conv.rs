@@ -13,7 +13,7 @@ mod geometry;
 #[cfg(feature = "flex")]
 mod micro;
 #[cfg(feature = "flex")]
-mod native;
+pub(crate) mod native;
 #[cfg(feature = "flex")]
 mod pass;
 #[cfg(feature = "flex")]

@@ -3,9 +3,14 @@
 //! Every operation takes tensors of any device: on flex it is computed here, elsewhere composed of Burn's
 //! own operations with the same result.
 #![warn(missing_docs)]
+// Vector code must be inlined into the functions that are compiled for the machine's vector unit.
+#![allow(clippy::inline_always)]
 
+mod attention;
 mod backend;
 pub mod conv;
+#[cfg(feature = "flex")]
+mod exp;
 #[cfg(feature = "flex")]
 mod flex;
 pub mod group_norm;
@@ -13,5 +18,6 @@ pub mod group_norm;
 mod uninitialised;
 mod warp;
 
+pub use attention::attention;
 pub use backend::is_flex;
 pub use warp::warp;

@@ -24,7 +24,7 @@ struct Burst {
 
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let sensor = Sensor::load("qudi-paper").unwrap();
-    let light = Light { ppp: 9.75, exposure: 0.45 };
+    let light = Light { ppp: 3.25, exposure: 0.45 };
     let mut camera = Camera::new(&sensor, size, light, 4).unwrap();
     let scene = |t: usize| {
         Frame::from_fn(size, |x, y| {
@@ -126,17 +126,20 @@ fn one_burst_is_learnt_by_heart() {
     let burst = burst(Size { height: 32, width: 32 }, 5, &device);
     let mut network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
     let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
-    let mut losses = Vec::new();
+    let (mut totals, mut predictions) = (Vec::new(), Vec::new());
     for number in 0..200u32 {
         let terms = loss(&network, &burst, u64::from(number));
-        losses.push(terms.total.clone().into_scalar::<f32>());
+        totals.push(terms.total.clone().into_scalar::<f32>());
+        predictions.push(terms.prediction.into_scalar::<f32>());
         let grads = GradientsParams::from_grads(terms.total.backward(), &network);
-        let rate = 4e-3 * (1.0 - f64::from(number) / 220.0);
+        let rate = 2e-3 * (1.0 - f64::from(number) / 220.0);
         network = optimizer.step(rate, network, grads);
     }
-    let mean = |part: &[f32]| part.iter().sum::<f32>() / part.len() as f32;
-    let (first, last) = (losses[0], mean(&losses[190..]));
-    assert!(last < 0.1 * first, "the loss went from {first} to {last} only");
+    let drop = |losses: &[f32]| losses[190..].iter().sum::<f32>() / 10.0 / losses[0];
+    let (total, prediction) = (drop(&totals), drop(&predictions));
+    assert!(prediction < 0.1, "the prediction's loss is still {prediction} of the first");
+    // The pre-denoiser sees single frames and cannot learn their noise by heart.
+    assert!(total < 0.25, "the loss is still {total} of the first");
 }
 
 #[test]

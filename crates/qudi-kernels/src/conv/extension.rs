@@ -186,6 +186,7 @@ impl<B: ConvBackend + ConvGradients> Backward<B, PARENTS> for Step {
     }
 }
 
+#[allow(clippy::redundant_closure_for_method_calls)] // the tensors' type has no public path
 impl<B: ConvBackend + ConvGradients, C: CheckpointStrategy> ConvBackend for Autodiff<B, C> {
     fn conv_frames(
         a: FloatTensor<Self>,

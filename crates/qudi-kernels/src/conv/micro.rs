@@ -3,7 +3,8 @@
 //!
 //! A tap is an offset into scratch memory, so the same loops serve every kernel size, stride and
 //! direction.
-#![allow(unsafe_code)]
+// Plain indices over arrays of known length: the compiler unrolls them into registers.
+#![allow(unsafe_code, clippy::needless_range_loop)]
 
 use pulp::{Arch, Simd, WithSimd};
 

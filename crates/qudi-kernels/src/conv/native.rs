@@ -9,7 +9,7 @@ use super::weight_gradient::{WeightGradient, weight_gradient};
 
 /// Results, `[images, outputs, rows, columns]`. Inputs `[images, channels, height, width]`, then the addend
 /// if there is one; weights `[outputs, channels, frames, rows, columns]`.
-pub(super) fn forward(
+pub(crate) fn forward(
     geometry: &Geometry,
     inputs: &[&[f32]],
     weight: &[f32],
@@ -77,7 +77,7 @@ pub(super) fn addend_gradient(gradient: &[f32], output: &[f32]) -> Vec<f32> {
 }
 
 /// Gradients for weights and bias.
-pub(super) fn weight_gradients(
+pub(crate) fn weight_gradients(
     geometry: &Geometry,
     inputs: &[&[f32]],
     gradient: &[f32],

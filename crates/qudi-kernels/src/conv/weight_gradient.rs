@@ -16,9 +16,9 @@ const PARTS: usize = 16;
 
 /// Gradients of weights, `[outputs, planes, taps]`, and of the bias.
 #[derive(Debug)]
-pub(super) struct WeightGradient {
-    pub(super) weight: Vec<f32>,
-    pub(super) bias: Vec<f32>,
+pub(crate) struct WeightGradient {
+    pub(crate) weight: Vec<f32>,
+    pub(crate) bias: Vec<f32>,
 }
 
 /// Sums over all images and results of `gradient` (of the pass's grid, `outputs` channels) times what

@@ -1,8 +1,11 @@
 //! The normalisation and its gradients on plain memory.
+// Plain indices over arrays of known length: the compiler turns them into vectors.
+#![allow(clippy::needless_range_loop)]
 
 use super::{Activation, EPSILON, Norm};
+use crate::exp::exp;
 use crate::uninitialised::fill;
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
@@ -57,27 +60,46 @@ pub(super) fn forward(
     weight: &[f32],
     bias: &[f32],
 ) -> Vec<f32> {
-    let sizes = Sizes::new(shape, norm, weight.len());
+    let sizes = &Sizes::new(shape, norm, weight.len());
     let size = sizes.group * sizes.plane;
-    let arch = Arch::new();
+    let (arch, activation) = (Arch::new(), norm.activation);
     fill(x.len(), |result| {
         let groups = result.par_chunks_mut(size).zip(x.par_chunks(size)).enumerate();
         groups.for_each(|(number, (result, x))| {
-            arch.dispatch(|| {
-                let (mean, scale) = moments(x);
-                let planes = result.chunks_mut(sizes.plane).zip(x.chunks(sizes.plane));
-                for (k, (result, x)) in planes.enumerate() {
-                    let place = sizes.weight(number, k);
-                    let slope = scale * weight[place];
-                    let offset = bias[place] - mean * slope;
-                    match norm.activation {
-                        Activation::None => affine(x, slope, offset, result),
-                        Activation::Silu => affine_silu(x, slope, offset, result),
-                    }
-                }
-            });
+            arch.dispatch(Forward { sizes, activation, number, x, weight, bias, result });
         });
     })
+}
+
+/// One group of one image.
+struct Forward<'a> {
+    sizes: &'a Sizes,
+    activation: Activation,
+    number: usize,
+    x: &'a [f32],
+    weight: &'a [f32],
+    bias: &'a [f32],
+    result: &'a mut [MaybeUninit<f32>],
+}
+
+impl WithSimd for Forward<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let (mean, scale) = moments(self.x);
+        let plane = self.sizes.plane;
+        let planes = self.result.chunks_mut(plane).zip(self.x.chunks(plane));
+        for (k, (result, x)) in planes.enumerate() {
+            let place = self.sizes.weight(self.number, k);
+            let slope = scale * self.weight[place];
+            let offset = self.bias[place] - mean * slope;
+            match self.activation {
+                Activation::None => affine(x, slope, offset, result),
+                Activation::Silu => affine_silu(x, slope, offset, result),
+            }
+        }
+    }
 }
 
 /// Gradients of a sum whose gradient for the result is `gradient`.
@@ -89,22 +111,17 @@ pub(super) fn gradients(
     bias: &[f32],
     gradient: &[f32],
 ) -> NormGradients {
-    let sizes = Sizes::new(shape, norm, weight.len());
+    let sizes = &Sizes::new(shape, norm, weight.len());
     let size = sizes.group * sizes.plane;
-    let arch = Arch::new();
+    let (arch, activation) = (Arch::new(), norm.activation);
     let count = shape[0] * sizes.groups;
     let mut sums: Vec<Vec<(f32, f32)>> = vec![Vec::new(); count];
     let mut dx = vec![0.0; x.len()];
     let groups = dx.par_chunks_mut(size).zip(x.par_chunks(size));
     let groups = groups.zip(gradient.par_chunks(size)).zip(&mut sums).enumerate();
     groups.for_each(|(number, (((dx, x), gradient), sums))| {
-        arch.dispatch(|| {
-            let weights = (0..sizes.group).map(|k| {
-                let place = sizes.weight(number, k);
-                (weight[place], bias[place])
-            });
-            *sums = group_gradient(x, gradient, weights, sizes.plane, norm.activation, dx);
-        });
+        *sums =
+            arch.dispatch(Backward { sizes, activation, number, x, weight, bias, gradient, dx });
     });
     let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; weight.len()]);
     for (number, sums) in sums.iter().enumerate() {
@@ -117,42 +134,60 @@ pub(super) fn gradients(
     NormGradients { x: dx, weight: dweight, bias: dbias }
 }
 
+/// One group of one image.
+struct Backward<'a> {
+    sizes: &'a Sizes,
+    activation: Activation,
+    number: usize,
+    x: &'a [f32],
+    weight: &'a [f32],
+    bias: &'a [f32],
+    gradient: &'a [f32],
+    dx: &'a mut [f32],
+}
+
+impl WithSimd for Backward<'_> {
+    type Output = Vec<(f32, f32)>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> Self::Output {
+        let weights: Vec<(f32, f32)> = (0..self.sizes.group)
+            .map(|k| {
+                let place = self.sizes.weight(self.number, k);
+                (self.weight[place], self.bias[place])
+            })
+            .collect();
+        group_gradient(self.x, self.gradient, &weights, self.sizes.plane, self.activation, self.dx)
+    }
+}
+
 /// Writes the gradient for one group of one image; gives those for its channels' weights and biases.
 #[inline(always)]
 fn group_gradient(
     x: &[f32],
     gradient: &[f32],
-    weights: impl Iterator<Item = (f32, f32)> + Clone,
+    weights: &[(f32, f32)],
     plane: usize,
     activation: Activation,
     dx: &mut [f32],
 ) -> Vec<(f32, f32)> {
     let (mean, scale) = moments(x);
-    let mut sums = Vec::with_capacity(x.len() / plane);
-    let planes = || x.chunks(plane).zip(weights.clone());
-    for (((x, (weight, bias)), gradient), dx) in
-        planes().zip(gradient.chunks(plane)).zip(dx.chunks_mut(plane))
-    {
+    let mut sums = Vec::with_capacity(weights.len());
+    let planes = x.chunks(plane).zip(gradient.chunks(plane)).zip(dx.chunks_mut(plane));
+    for (((x, gradient), dx), &affine) in planes.zip(weights) {
         sums.push(match activation {
-            Activation::None => through(x, gradient, mean, scale, |_| 1.0, dx),
-            Activation::Silu => {
-                let slope = |normal: f32| {
-                    let v = normal.mul_add(weight, bias);
-                    let s = sigmoid(v);
-                    s * (1.0 - s).mul_add(v, 1.0)
-                };
-                through(x, gradient, mean, scale, slope, dx)
-            }
+            Activation::None => through::<false>(x, gradient, mean, scale, affine, dx),
+            Activation::Silu => through::<true>(x, gradient, mean, scale, affine, dx),
         });
     }
     // dx = scale * (d * weight - mean(d * weight) - normal * mean(d * weight * normal))
     let count = x.len() as f32;
     let (mut plain, mut along) = (0.0, 0.0);
-    for (&(affine, sum), (weight, _)) in sums.iter().zip(weights.clone()) {
+    for (&(affine, sum), (weight, _)) in sums.iter().zip(weights) {
         plain += sum * weight / count;
         along += affine * weight / count;
     }
-    for ((x, (weight, _)), dx) in planes().zip(dx.chunks_mut(plane)) {
+    for ((x, (weight, _)), dx) in x.chunks(plane).zip(weights).zip(dx.chunks_mut(plane)) {
         let (slope, tilt) = (scale * weight, -scale * scale * along);
         let offset = -scale * plain - tilt * mean;
         for (&x, dx) in x.iter().zip(dx) {
@@ -162,15 +197,14 @@ fn group_gradient(
     sums
 }
 
-/// Writes the gradient before the affine part, `gradient * slope(normal)`, and sums it, once times
-/// `normal` and once alone.
+/// Writes the gradient before the affine part, and sums it, once times the normal value and once alone.
 #[inline(always)]
-fn through(
+fn through<const SILU: bool>(
     x: &[f32],
     gradient: &[f32],
     mean: f32,
     scale: f32,
-    slope: impl Fn(f32) -> f32,
+    (weight, bias): (f32, f32),
     dx: &mut [f32],
 ) -> (f32, f32) {
     let (mut affine, mut plain) = (0f64, 0f64);
@@ -182,7 +216,14 @@ fn through(
             let lanes = along.iter_mut().zip(&mut alone);
             for ((((along, alone), &x), &gradient), dx) in lanes.zip(x).zip(gradient).zip(dx) {
                 let normal = (x - mean) * scale;
-                let d = gradient * slope(normal);
+                let slope = if SILU {
+                    let v = normal.mul_add(weight, bias);
+                    let s = sigmoid(v);
+                    s * (1.0 - s).mul_add(v, 1.0)
+                } else {
+                    1.0
+                };
+                let d = gradient * slope;
                 *dx = d;
                 *along = d.mul_add(normal, *along);
                 *alone += d;
@@ -200,11 +241,16 @@ fn moments(x: &[f32]) -> (f32, f32) {
     let (mut sum, mut squares) = (0f64, 0f64);
     for x in x.chunks(BLOCK) {
         let (mut a, mut b) = ([0f32; LANES], [0f32; LANES]);
-        for x in x.chunks(LANES) {
-            for ((a, b), &x) in a.iter_mut().zip(&mut b).zip(x) {
-                *a += x;
-                *b = x.mul_add(x, *b);
+        let (rows, rest) = x.as_chunks::<LANES>();
+        for x in rows {
+            for i in 0..LANES {
+                a[i] += x[i];
+                b[i] = x[i].mul_add(x[i], b[i]);
             }
+        }
+        for (i, &x) in rest.iter().enumerate() {
+            a[i] += x;
+            b[i] = x.mul_add(x, b[i]);
         }
         sum += f64::from(a.iter().sum::<f32>());
         squares += f64::from(b.iter().sum::<f32>());
@@ -229,23 +275,9 @@ fn affine_silu(x: &[f32], slope: f32, offset: f32, result: &mut [MaybeUninit<f32
     }
 }
 
-/// `1 / (1 + exp(-v))` to 2e-7, in operations that have vector forms: exp by a polynomial of degree six after
-/// reduction to half a power of two (Cephes, expf).
 #[inline(always)]
 fn sigmoid(v: f32) -> f32 {
-    let x = (-v).clamp(-87.0, 88.0);
-    let n = (x * std::f32::consts::LOG2_E).round_ties_even();
-    let r = n.mul_add(-0.693_359_4, x);
-    let r = n.mul_add(2.121_944_4e-4, r);
-    let p = 1.987_569_1e-4_f32
-        .mul_add(r, 1.398_199_9e-3)
-        .mul_add(r, 8.333_452e-3)
-        .mul_add(r, 4.166_579_6e-2)
-        .mul_add(r, 0.166_666_65)
-        .mul_add(r, 0.5);
-    let exp = p.mul_add(r * r, r) + 1.0;
-    let power = f32::from_bits(((n as i32 + 127) << 23) as u32);
-    1.0 / (1.0 + exp * power)
+    1.0 / (1.0 + exp(-v))
 }
 
 #[cfg(test)]

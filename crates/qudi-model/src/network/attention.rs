@@ -4,6 +4,7 @@ use super::layers::{Bias, Conv2d, GroupNorm};
 use burn::module::Module;
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor};
+use qudi_kernels::attention;
 
 #[derive(Module, Debug)]
 pub(super) struct Attention {
@@ -23,13 +24,8 @@ impl Attention {
 
     /// Every cell attends to the cells of its frame. `x`: `[images, channels, h, w]`.
     pub(super) fn spatial(&self, x: Tensor<4>) -> Tensor<4> {
-        let [images, channels, h, w] = x.dims();
         let qkv = self.qkv.linear(&[self.norm.plain(x.clone())]);
-        let qkv = qkv.reshape([images, 3 * channels, h * w]);
-        let part = |n: usize| qkv.clone().narrow(1, n * channels, channels).swap_dims(1, 2);
-        let mixed = attend(part(0), part(1), part(2)); // [images, cells, C]
-        let mixed = mixed.swap_dims(1, 2).reshape([images, channels, h, w]);
-        self.project.add(&[mixed], x)
+        self.project.add(&[attention(qkv)], x)
     }
 
     /// Every cell attends to the same cell of the other frames.

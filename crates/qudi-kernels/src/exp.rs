@@ -1,0 +1,34 @@
+//! The exponential in operations that have vector forms.
+
+/// `exp(x)` to 2e-7 for x from -87 to 88, cut there: a polynomial of degree six after reduction to half a power of
+/// two (Cephes, expf).
+#[inline(always)]
+pub(crate) fn exp(x: f32) -> f32 {
+    let x = x.clamp(-87.0, 88.0);
+    let n = (x * std::f32::consts::LOG2_E).round_ties_even();
+    let r = n.mul_add(-0.693_359_4, x);
+    let r = n.mul_add(2.121_944_4e-4, r);
+    let p = 1.987_569_1e-4_f32
+        .mul_add(r, 1.398_199_9e-3)
+        .mul_add(r, 8.333_452e-3)
+        .mul_add(r, 4.166_579_6e-2)
+        .mul_add(r, 0.166_666_65)
+        .mul_add(r, 0.5);
+    let power = f32::from_bits(((n as i32 + 127) << 23) as u32);
+    (p.mul_add(r * r, r) + 1.0) * power
+}
+
+#[cfg(test)]
+mod tests {
+    use super::exp;
+
+    #[test]
+    fn exp_is_that_of_the_library() {
+        for i in -86_999..=87_999 {
+            let x = i as f32 * 1e-3;
+            let expected = f64::from(x).exp();
+            let error = (f64::from(exp(x)) - expected).abs() / expected;
+            assert!(error < 3e-7, "exp({x}) is off by {error:e}");
+        }
+    }
+}
