@@ -1,5 +1,5 @@
 //! Reads the golden files that scripts/reference/network_goldens.py writes; its docstring gives the format.
-#![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
+#![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::struct_field_names)]
 
 use burn::tensor::{Device, Tensor, TensorData};
 use safetensors::SafeTensors;

@@ -170,12 +170,12 @@ pub(crate) struct Light {
     pub(crate) magnification: f64,
 }
 
-/// Describe anything: captures in any format, bursts, sensors, devices
+/// Describe anything: captures in any format, bursts, weights, sensors, devices
 #[derive(Debug, ClapArgs)]
 #[group(skip)]
 #[command(group(ArgGroup::new("what").required(true)))]
 pub(crate) struct Info {
-    /// A capture (file or folder), a burst or its record, a sensor's name or .toml file
+    /// A capture (file or folder), a burst or its record, weights (.safetensors), a sensor's name or .toml file
     #[arg(group = "what", value_hint = ValueHint::AnyPath)]
     pub(crate) subject: Option<String>,
     /// List the built-in sensors

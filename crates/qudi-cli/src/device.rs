@@ -4,6 +4,7 @@ use crate::error::{Fault, Result};
 use burn::tensor::Device;
 #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
 use burn::tensor::DeviceType;
+use std::sync::OnceLock;
 
 /// A device that `--device` can name.
 #[derive(Debug)]
@@ -31,8 +32,8 @@ pub(crate) fn list() -> Vec<Listed> {
         add("ndarray".to_owned(), format!("{cores} cores (ndarray: slow, deprecated upstream)"));
     }
     for (backend, cards) in all_cards() {
-        for (n, card) in cards.into_iter().enumerate() {
-            add(format!("{backend}:{n}"), card);
+        for (n, card) in cards.iter().enumerate() {
+            add(format!("{backend}:{n}"), card.clone());
         }
     }
     devices
@@ -116,8 +117,13 @@ fn card(kind: DeviceType, number: usize) -> Option<Device> {
     Device::enumerate(kind).into_vec().into_iter().nth(number)
 }
 
-/// Backends with the names of their cards.
-fn all_cards() -> Vec<(&'static str, Vec<String>)> {
+/// Backends with the names of their cards; looked for once, since drivers talk on standard error.
+fn all_cards() -> &'static [(&'static str, Vec<String>)] {
+    static CARDS: OnceLock<Vec<(&'static str, Vec<String>)>> = OnceLock::new();
+    CARDS.get_or_init(find_cards)
+}
+
+fn find_cards() -> Vec<(&'static str, Vec<String>)> {
     vec![
         #[cfg(feature = "cuda")]
         ("cuda", cards(DeviceType::Cuda)),

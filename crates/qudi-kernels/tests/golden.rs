@@ -69,7 +69,7 @@ fn convolutions() {
                 check(&case, y, &[("x", &x)], &[("conv.weight", &weight)], &biases);
             } else {
                 let weight: Tensor<4> = case.parameter("conv.weight", &device).require_grad();
-                let y = conv_2d(&[x.clone()], weight.clone(), bias.clone(), options);
+                let y = conv_2d(std::slice::from_ref(&x), weight.clone(), bias.clone(), options);
                 check(&case, y, &[("x", &x)], &[("conv.weight", &weight)], &biases);
             }
         }
@@ -90,7 +90,7 @@ fn an_addend_is_added_and_gets_its_gradient() {
         let bias = Tensor::<1>::zeros([6], &device);
         let call = |addend: Option<Tensor<4>>, activation| {
             let options = Options { addend, activation, ..Options::default() };
-            conv_2d(&[x.clone()], weight.clone(), bias.clone(), options)
+            conv_2d(std::slice::from_ref(&x), weight.clone(), bias.clone(), options)
         };
         let fused = call(Some(addend.clone()), Activation::Relu);
         let apart = burn::tensor::activation::relu(call(None, Activation::None) + addend.clone());

@@ -6,6 +6,12 @@ use burn::tensor::Device;
 use qudi_sim::Size;
 
 impl NetworkConfig {
+    /// Number of parameters.
+    pub fn parameters(&self, device: &Device) -> usize {
+        let list = parameters(&self.shell(device));
+        list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum()
+    }
+
     /// Multiplications of all convolutions in one reverse step that estimates the flow, over `frames` frames of
     /// `size`; nothing is computed on `device`. Norms, attention scores and the embedding, a few hundredths of it, are left out.
     pub fn multiplications(&self, size: Size, frames: usize, device: &Device) -> usize {

@@ -124,12 +124,11 @@ impl QudiRestorer {
             to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
         };
         let fresh;
-        let prepared = match &job.prepared {
-            Some(prepared) => prepared,
-            None => {
-                fresh = self.prepare(job, number);
-                &fresh
-            }
+        let prepared = if let Some(prepared) = &job.prepared {
+            prepared
+        } else {
+            fresh = self.prepare(job, number);
+            &fresh
         };
         let simulated = simulated.map(|planes| Simulated {
             y: tensor(&planes.y),

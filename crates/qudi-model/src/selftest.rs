@@ -144,7 +144,7 @@ fn convolution(device: &Device, kernel: usize, stride: usize) -> Result<Vec<Vec<
     let weight = values(14, [8, 6, kernel, kernel], &device).require_grad();
     let bias = values(15, [8], &device);
     let options = Options { stride, activation: Activation::Relu, ..Options::default() };
-    let output = conv_2d(&[x.clone()], weight.clone(), bias, options);
+    let output = conv_2d(std::slice::from_ref(&x), weight.clone(), bias, options);
     with_gradients(output, &[x, weight])
 }
 
@@ -153,7 +153,7 @@ fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
     let x = values(16, [5, 4, 16, 24], &device).require_grad();
     let weight = values(17, [6, 4, 5, 5, 5], &device);
     let options = Options { stride, ..Options::default() };
-    let output = conv_3d(&[x.clone()], weight, values(18, [6], &device), 5, options);
+    let output = conv_3d(std::slice::from_ref(&x), weight, values(18, [6], &device), 5, options);
     with_gradients(output, &[x])
 }
 

@@ -70,7 +70,7 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
         noise: to_tensor(values, burst.size, &burst.truth.device()),
         times: &[time],
     };
-    let first_pass = if number % 2 == 0 { FirstPass::No } else { FirstPass::Yes(number) };
+    let first_pass = if number.is_multiple_of(2) { FirstPass::No } else { FirstPass::Yes(number) };
     terms(network, &example, first_pass, LossWeights::default()).unwrap()
 }
 

@@ -11,7 +11,7 @@ use crate::report::{Bar, Report};
 use burn::tensor::{Device, Tensor};
 use qudi_model::checkpoint::Description;
 use qudi_model::config::NetworkConfig;
-use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State, parameters};
+use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State};
 use qudi_model::objective::reconstruction;
 use qudi_model::restorer::QudiRestorer;
 use qudi_sim::Size;
@@ -84,8 +84,6 @@ fn measure(
     bar: &mut Bar,
 ) -> Result<Figures> {
     let network = config.init(1, &device.device);
-    let shapes = parameters(&network);
-    let parameters = shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
     let (mut steps, mut prepares) = (Vec::new(), Vec::new());
     let mut blocks: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
     // The first round warms up and is not counted.
@@ -139,7 +137,7 @@ fn measure(
     let fastest = steps.iter().copied().fold(f64::MAX, f64::min);
     Ok(Figures {
         preset: preset.to_owned(),
-        parameters,
+        parameters: config.parameters(&device.device),
         gflop_per_frame_step: 2e-9
             * config.multiplications(args.size, args.frames, &device.device) as f64
             / args.frames as f64,

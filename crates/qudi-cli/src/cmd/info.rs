@@ -1,9 +1,11 @@
-//! `qudi info`: captures, bursts, sensors, devices.
+//! `qudi info`: captures, bursts, weights, sensors, devices.
 
 use crate::args::{Global, Info};
 use crate::cmd::{capture_info, convert};
 use crate::error::{Fault, Result};
 use crate::report::Report;
+use burn::tensor::Device;
+use qudi_model::checkpoint::describe;
 use qudi_sim::record::Described;
 use qudi_sim::sensor::{PRESETS, Response, Sensor, preset};
 use serde_json::{Value, json};
@@ -26,6 +28,7 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
     let transforms = path.file_name().is_some_and(|name| name == "transforms.json");
     match extension.as_deref() {
         Some("toml") => sensor(subject, report),
+        Some("safetensors") if path.is_file() => weights(path, report),
         Some("json") if path.is_file() && !transforms => burst(path, report),
         _ if path.exists() => {
             let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
@@ -69,6 +72,27 @@ fn sensors(report: &Report) -> Result<()> {
     }
     text += "\n?  no source confirms this number.  Sources: `qudi info NAME`.  dark: e- per frame, or per second (/s); read noise in e-.\n";
     report.result(&text, || json!(sensors))
+}
+
+/// A weight file, as it describes itself.
+fn weights(path: &Path, report: &Report) -> Result<()> {
+    let d = describe(path)?;
+    let mut text = String::new();
+    let mut line = |key: &str, value: String| {
+        let _ = writeln!(text, "{key:<11}{value}");
+    };
+    let sizes = d.network.parameters(&Device::flex());
+    line("network", format!("{}, {sizes} parameters", d.preset.as_deref().unwrap_or("own sizes")));
+    line("window", format!("{} frames", d.window));
+    line("sensors", d.sensors.join(", "));
+    line("light", format!("{} to {} photons per pixel and frame", d.ppp[0], d.ppp[1]));
+    line("trained", format!("{} steps on {}", d.steps, d.data.join(", ")));
+    line(
+        "made by",
+        d.program.clone() + &d.commit.map_or(String::new(), |c| format!(", commit {c}")),
+    );
+    line("licence", d.licence.clone());
+    report.result(&text, || json!(describe(path).ok()))
 }
 
 fn sensor(name: &str, report: &Report) -> Result<()> {

@@ -92,7 +92,7 @@ impl PreDenoiser {
             outputs.push(x.clone());
         }
         let features = self.spread.add(&[self.gather.linear(&outputs)], shallow);
-        let correction = unfold(self.out.linear(&[features.clone()]), self.fold);
+        let correction = unfold(self.out.linear(std::slice::from_ref(&features)), self.fold);
         (u + correction, features)
     }
 }

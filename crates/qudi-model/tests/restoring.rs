@@ -1,0 +1,177 @@
+//! Quanta Diffusion as a method: sizes, seeds, samples, tiles, backends, and what it refuses.
+#![allow(clippy::unwrap_used)]
+
+use burn::tensor::Device;
+use qudi_model::checkpoint::Description;
+use qudi_model::config::NetworkConfig;
+use qudi_model::network::fill;
+use qudi_model::restorer::{QudiRestorer, SampleOptions};
+use qudi_model::sampler::Sampler;
+use qudi_sim::Size;
+use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
+use qudi_sim::sensor::Sensor;
+
+fn context(seed: u64, first_frame: u64) -> Context {
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let gain = sensor.gain_at(3.25).unwrap();
+    Context { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark: None }
+}
+
+/// A tiny network whose last layers are not zero, so that everything matters.
+fn restorer(options: SampleOptions, device: &Device) -> QudiRestorer {
+    let config = NetworkConfig::preset("tiny").unwrap();
+    let network = fill(config.init(2, device), |name, shape| {
+        let count: usize = shape.iter().product();
+        let seed = name.bytes().fold(7u32, |h, b| h.wrapping_mul(31).wrapping_add(b.into()));
+        let bound = if shape.len() > 1 { (1.5 / (count / shape[0]) as f32).sqrt() } else { 0.1 };
+        let norm = shape.len() == 1 && name.ends_with("weight");
+        (0..count as u32)
+            .map(|i| {
+                let z = seed.wrapping_add(i).wrapping_mul(0x9E37_79B9);
+                let z = (z ^ (z >> 15)).wrapping_mul(0x85EB_CA6B);
+                let u = (z >> 8) as f32 / (1 << 23) as f32 - 1.0;
+                if norm { 1.0 + 0.1 * u } else { bound * u }
+            })
+            .collect()
+    });
+    let description = Description {
+        program: String::new(),
+        preset: None,
+        network: config,
+        window: 11,
+        sensors: vec![],
+        ppp: [1.0, 30.0],
+        data: vec![],
+        steps: 0,
+        commit: None,
+        licence: String::new(),
+    };
+    QudiRestorer::new(network, &description, options, device).unwrap()
+}
+
+fn counts(size: Size, frames: usize) -> Vec<Vec<u16>> {
+    (0..frames)
+        .map(|t| {
+            (0..size.pixels()).map(|i| ((i * 7 + t * 13 + i / size.width) % 8) as u16).collect()
+        })
+        .collect()
+}
+
+fn restore(options: SampleOptions, context: &Context, size: Size, frames: usize) -> Restored {
+    let counts = counts(size, frames);
+    let burst = BurstView { size, frames: &counts };
+    restorer(options, &Device::flex()).restore(burst, context).unwrap()
+}
+
+const SIZE: Size = Size { height: 21, width: 38 };
+
+fn quick() -> SampleOptions {
+    SampleOptions { steps: 2, ..SampleOptions::default() }
+}
+
+#[test]
+fn any_size_and_length_comes_back_as_it_was() {
+    for (height, width, frames) in [(21, 38, 4), (8, 8, 3), (1, 50, 5), (40, 33, 12)] {
+        let size = Size { height, width };
+        let restored = restore(quick(), &context(1, 0), size, frames);
+        assert_eq!(restored.frames.len(), frames);
+        assert!(restored.std.is_none());
+        for frame in restored.frames {
+            assert_eq!(frame.size, size);
+            assert!(frame.data.iter().all(|v| (0.0..=1.0).contains(v)), "{size}");
+        }
+    }
+}
+
+#[test]
+fn the_result_depends_on_the_seed_and_on_nothing_else() {
+    for sampler in [Sampler::Ddim, Sampler::Ancestral] {
+        let options = SampleOptions { sampler, ..quick() };
+        let frames = |seed| restore(options, &context(seed, 40), SIZE, 3).frames;
+        assert_eq!(frames(1), frames(1));
+        assert_ne!(frames(1), frames(2));
+    }
+}
+
+#[test]
+fn samples_have_a_mean_and_a_deviation() {
+    let options = SampleOptions { samples: 3, ..quick() };
+    let three = restore(options, &context(1, 0), SIZE, 3);
+    let std = three.std.unwrap();
+    assert!(std.iter().all(|frame| frame.data.iter().all(|v| v.is_finite() && *v >= 0.0)));
+    assert!(std.iter().any(|frame| frame.data.iter().any(|&v| v > 0.0)));
+    // The first of the samples is what one sample gives.
+    let one = restore(quick(), &context(1, 0), SIZE, 3);
+    assert_ne!(one.frames, three.frames);
+}
+
+#[test]
+fn ndarray_restores_what_flex_does() {
+    #[allow(deprecated)] // asked for by name
+    let ndarray = Device::ndarray();
+    let size = Size { height: 16, width: 16 };
+    let counts = counts(size, 3);
+    let burst = BurstView { size, frames: &counts };
+    // One step: later ones draw counts from estimates, and a count may flip on rounding.
+    let options = SampleOptions { steps: 1, ..quick() };
+    let [a, b] = [Device::flex(), ndarray.clone()]
+        .map(|device| restorer(options, &device).restore(burst, &context(1, 0)).unwrap().frames);
+    for (a, b) in a.iter().zip(&b) {
+        for (a, b) in a.data.iter().zip(&b.data) {
+            assert!((a - b).abs() < 1e-4, "{a} and {b}");
+        }
+    }
+    restorer(quick(), &ndarray).restore(burst, &context(1, 0)).unwrap();
+}
+
+#[test]
+fn tiles_agree_on_their_noise_and_cover_the_frame() {
+    let size = Size { height: 48, width: 80 };
+    let options = SampleOptions { steps: 2, tile: 32, ..SampleOptions::default() };
+    let tiled = restore(options, &context(1, 0), size, 3);
+    let whole = restore(quick(), &context(1, 0), size, 3);
+    // Random weights let every pixel see far: the two are alike, not equal.
+    for (tiled, whole) in tiled.frames.iter().zip(&whole.frames) {
+        assert_eq!(tiled.size, whole.size);
+        let pairs = tiled.data.iter().zip(&whole.data);
+        let difference = pairs.map(|(a, b)| (a - b).powi(2)).sum::<f32>() / size.pixels() as f32;
+        let mean = whole.data.iter().sum::<f32>() / size.pixels() as f32;
+        let variance =
+            whole.data.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / size.pixels() as f32;
+        assert!(difference < 0.5 * variance, "{difference} of {variance}");
+    }
+}
+
+#[test]
+fn what_makes_no_sense_is_refused() {
+    let device = Device::flex();
+    let size = Size { height: 16, width: 16 };
+    let two = counts(size, 2);
+    let error = restorer(quick(), &device)
+        .restore(BurstView { size, frames: &two }, &context(1, 0))
+        .unwrap_err();
+    assert!(error.to_string().contains("2 frames") && error.help().is_some(), "{error}");
+    let config = NetworkConfig::preset("tiny").unwrap();
+    let description = Description {
+        program: String::new(),
+        preset: None,
+        network: config.clone(),
+        window: 11,
+        sensors: vec![],
+        ppp: [1.0, 2.0],
+        data: vec![],
+        steps: 0,
+        commit: None,
+        licence: String::new(),
+    };
+    for options in [
+        SampleOptions { steps: 0, ..quick() },
+        SampleOptions { steps: 1001, ..quick() },
+        SampleOptions { samples: 0, ..quick() },
+        SampleOptions { tile: 8, ..quick() },
+    ] {
+        let network = config.init(1, &device);
+        let error = QudiRestorer::new(network, &description, options, &device).unwrap_err();
+        assert!(error.place().unwrap().starts_with("--") && error.help().is_some(), "{error}");
+    }
+}

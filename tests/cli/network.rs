@@ -1,0 +1,146 @@
+//! The method `qudi` on the command line: weights, devices, options, and what is refused.
+
+use crate::outputs::{listing, qudi, scratch};
+use burn::tensor::Device;
+use qudi_model::checkpoint::{Description, save};
+use qudi_model::config::NetworkConfig;
+use qudi_model::network::fill;
+use qudi_sim::output::Overwrite;
+use std::path::{Path, PathBuf};
+
+/// A folder with a burst and untrained weights of the smallest network.
+fn prepared(name: &str) -> PathBuf {
+    let folder = scratch(name);
+    qudi(&folder)
+        .args(
+            "simulate scene:text --size 32x40 --frames 13 --ppp 9.75 --seed 3 -o b.npy -q"
+                .split(' '),
+        )
+        .assert()
+        .success();
+    weights(&folder.join("w.safetensors"), 0.0);
+    folder
+}
+
+fn weights(path: &Path, value: f32) {
+    let network = NetworkConfig::preset("tiny").unwrap();
+    let description = Description {
+        program: "qudi test".into(),
+        preset: Some("tiny".into()),
+        network: network.clone(),
+        window: 11,
+        sensors: vec!["qudi-paper".into()],
+        ppp: [3.25, 26.0],
+        data: vec!["nothing".into()],
+        steps: 0,
+        commit: None,
+        licence: "MIT OR Apache-2.0".into(),
+    };
+    let mut module = network.init(1, &Device::flex());
+    if value != 0.0 {
+        module = fill(module, |_, shape| vec![value; shape.iter().product()]);
+    }
+    save(&module, &description, path, Overwrite::Yes).unwrap();
+}
+
+fn refused(folder: &Path, args: &str, words: &[&str]) {
+    let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{args}: {text}");
+    for part in ["error: ", "where: ", "help: "].iter().chain(words) {
+        assert!(text.contains(part), "{args}: no `{part}` in\n{text}");
+    }
+}
+
+#[test]
+fn a_burst_is_restored_and_gone_on_with() {
+    let folder = prepared("network-restore");
+    let run = |args: &str| qudi(&folder).args(args.split_whitespace()).assert().success();
+    let common = "restore b.npy --weights w.safetensors --device cpu --steps 2 --overlap 5";
+    run(&format!("{common} -o whole"));
+    run(&format!("{common} -o parts --shard 1/2"));
+    run(&format!("{common} -o parts --shard 2/2"));
+    let frames = |name: &str| {
+        let mut list: Vec<_> = listing(&folder.join(name));
+        list.retain(|name| name != "manifest.json");
+        list.iter().map(|f| std::fs::read(folder.join(name).join(f)).unwrap()).collect::<Vec<_>>()
+    };
+    assert_eq!(frames("whole").len(), 13);
+    assert_eq!(frames("whole"), frames("parts"));
+    // Other weights or steps are another result: the folder refuses to mix them.
+    refused(&folder, &format!("{common} -o whole --steps 3").replace("--steps 2 ", ""), &["whole"]);
+    run("info w.safetensors");
+    run(&format!("{common} -o s.npy --samples 2 --deviation d.npy --sampler ancestral"));
+    let header = std::fs::read(folder.join("d.npy")).unwrap();
+    assert!(String::from_utf8_lossy(&header[..128]).contains("(13, 32, 40)"));
+}
+
+#[test]
+fn what_does_not_fit_is_refused_in_three_parts() {
+    let folder = prepared("network-refuse");
+    let with =
+        |rest: &str| format!("restore b.npy -o out --weights w.safetensors --device cpu {rest}");
+    refused(&folder, "restore b.npy -o out --method qudi", &["needs weights", "--weights"]);
+    refused(&folder, "restore b.npy -o out --weights none.safetensors", &["none.safetensors"]);
+    refused(&folder, &with("--steps 0"), &["--steps"]);
+    refused(&folder, &with("--samples 0"), &["--samples"]);
+    refused(&folder, &with("--tile 8"), &["--tile"]);
+    refused(&folder, &with("--ppp 1e5"), &["weights know 3.25 to 26"]);
+    refused(&folder, &with("--deviation d.npy"), &["--samples"]);
+    refused(
+        &folder,
+        &with("").replace("--device cpu", "--device nothing"),
+        &["no device `nothing`"],
+    );
+    refused(&folder, &with("").replace("--device cpu", "--device wgpu:99"), &["wgpu:99"]);
+    std::fs::write(
+        folder.join("torn.safetensors"),
+        &std::fs::read(folder.join("w.safetensors")).unwrap()[..5000],
+    )
+    .unwrap();
+    refused(
+        &folder,
+        "restore b.npy -o out --weights torn.safetensors",
+        &["not a whole SafeTensors file"],
+    );
+    weights(&folder.join("nan.safetensors"), f32::NAN);
+    refused(
+        &folder,
+        "restore b.npy -o out --weights nan.safetensors --device cpu",
+        &["no numbers"],
+    );
+    qudi(&folder)
+        .args("simulate scene:text --size 32x40 --frames 2 --ppp 9.75 -o two.npy -q".split(' '))
+        .assert()
+        .success();
+    refused(
+        &folder,
+        "restore two.npy -o out --weights w.safetensors --device cpu",
+        &["a burst of 2 frames"],
+    );
+    assert!(!folder.join("out").join("000000.png").exists(), "no partial output");
+}
+
+#[test]
+fn the_processor_passes_its_own_test() {
+    let folder = scratch("network-selftest");
+    let only = "selftest --device cpu --only arithmetic,warp,network";
+    let output = qudi(&folder).args(only.split(' ')).output().unwrap();
+    assert!(output.status.success());
+    assert_eq!(String::from_utf8_lossy(&output.stdout).matches(" ok\n").count(), 3);
+    refused(&folder, "selftest --only nothing", &["--only"]);
+}
+
+/// Where there is a graphics card, or a driver that imitates one: what such a driver does in seconds.
+#[test]
+fn a_graphics_card_computes_what_the_processor_does() {
+    let folder = scratch("network-gpu");
+    let devices = qudi(&folder).args(["info", "--devices"]).output().unwrap();
+    if !String::from_utf8_lossy(&devices.stdout).contains("wgpu:0") {
+        return;
+    }
+    let only = "selftest --device wgpu:0 --only arithmetic,joining,warp,softmax";
+    let output = qudi(&folder).args(only.split(' ')).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
+}
