@@ -5,7 +5,7 @@
 //! Prints the fastest of three runs in seconds. RAYON_NUM_THREADS sets the threads.
 #![allow(clippy::print_stdout)]
 
-use qudi_baselines::Bm3d;
+use qudi_baselines::bm3d;
 use qudi_sim::SimError;
 use qudi_sim::npy::{read_image, write_header};
 use std::path::Path;
@@ -14,24 +14,19 @@ use std::time::Instant;
 fn main() -> qudi_sim::Result<()> {
     let args: Vec<String> = std::env::args().collect();
     let [_, noisy, sigma, out] = args.as_slice() else {
-        return Err(SimError::request("three arguments", "command line", "NOISY.npy SIGMA OUT.npy"));
+        return Err(SimError::request(
+            "three arguments",
+            "command line",
+            "NOISY.npy SIGMA OUT.npy",
+        ));
     };
     let image = read_image(Path::new(noisy))?;
     let sigma = sigma.parse().unwrap_or(0.0);
-    let mut profile = Bm3d::default();
-    let over = |name: &str, value: &mut f32| {
-        if let Ok(text) = std::env::var(name) { *value = text.parse().unwrap_or(*value); }
-    };
-    over("L", &mut profile.lambda);
-    over("N1", &mut profile.match_noise);
-    over("I1", &mut profile.match_image);
-    over("N2", &mut profile.match_noise_2);
-    over("I2", &mut profile.match_image_2);
     let mut fastest = f64::INFINITY;
     let mut denoised = image.clone();
     for _ in 0..3 {
         let start = Instant::now();
-        denoised = profile.denoise(&image, sigma);
+        denoised = bm3d(&image, sigma);
         fastest = fastest.min(start.elapsed().as_secs_f64());
     }
     println!("{fastest:.4}");

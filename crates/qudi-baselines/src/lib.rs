@@ -1,6 +1,18 @@
-//! Classical restoration of single-photon bursts, written from the papers.
+//! The classical methods of the field's tables, written from their papers: a tool that beats
+//! methods should beat them at their best.
+//!
+//! All are [`Restorer`](qudi_sim::restore::Restorer)s: a window of counts `[frames][height][width]` in,
+//! all its frames out, in image units. Constants were chosen on training clips; docs/results.md
+//! tells how.
 #![warn(missing_docs)]
 
 mod bm3d;
+mod plane;
+mod qbp;
+mod stabilizer;
+mod transform_denoise;
 
-pub use bm3d::Bm3d;
+pub use bm3d::bm3d;
+pub use qbp::{Finish, Qbp, QbpSettings, patch_flow};
+pub use stabilizer::{Stabilizer, Transform};
+pub use transform_denoise::{NOISE_LEFT, TransformDenoise};

@@ -4,6 +4,7 @@ mod average;
 mod consistency;
 mod frame_folder;
 mod mle;
+mod moving;
 mod run;
 mod windows;
 
@@ -11,6 +12,7 @@ pub use average::Average;
 pub use consistency::Consistency;
 pub use frame_folder::{FrameFolder, MANIFEST};
 pub use mle::Mle;
+pub use moving::{LONGEST_HALF, half_of_least_risk, moving_sums};
 pub use run::{RestoreSink, run};
 pub use windows::{CrossFade, Windows};
 
@@ -79,29 +81,5 @@ impl Context {
     /// Dark electrons per frame of pixel `i`; `ordinary` where no map is known.
     pub fn dark_of(&self, i: usize, ordinary: f64) -> f64 {
         self.dark.as_ref().map_or(ordinary, |map| f64::from(map[i]))
-    }
-}
-
-/// Sums of the frames within `half` of each frame, and how many those are; the window's ends have
-/// fewer.
-pub(crate) fn moving_sums(burst: BurstView<'_>, half: usize, mut f: impl FnMut(&[u32], u32)) {
-    let n = burst.frames.len();
-    let mut sums = vec![0u32; burst.size.pixels()];
-    let (mut from, mut to) = (0, 0);
-    for frame in 0..n {
-        let (low, high) = (frame.saturating_sub(half), (frame + half + 1).min(n));
-        while to < high {
-            for (sum, &count) in sums.iter_mut().zip(&burst.frames[to]) {
-                *sum += u32::from(count);
-            }
-            to += 1;
-        }
-        while from < low {
-            for (sum, &count) in sums.iter_mut().zip(&burst.frames[from]) {
-                *sum -= u32::from(count);
-            }
-            from += 1;
-        }
-        f(&sums, (high - low) as u32);
     }
 }

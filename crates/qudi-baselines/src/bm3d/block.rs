@@ -228,7 +228,8 @@ mod tests {
             transform.inverse(&mut block);
             assert!(largest_difference(&block, &some_block()) < 1e-4, "{transform:?}");
         }
-        let mut group: Vec<Block> = (0..16).map(|i| some_block().map(|row| row * i as f32)).collect();
+        let mut group: Vec<Block> =
+            (0..16).map(|i| some_block().map(|row| row * i as f32)).collect();
         let before = group.clone();
         haar(&mut group);
         assert!(largest_difference(&group[0], &before[15].map(|row| row * 2.0)) < 1e-2);

@@ -10,6 +10,8 @@ use qudi_sim::Size;
 /// Where similar blocks are looked for, and which count as similar.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Search {
+    /// Pixels between reference blocks.
+    pub(super) step: usize,
     /// Largest displacement in pixels, in x and in y.
     pub(super) radius: usize,
     /// Blocks in a group at most; the reference block is one of them.
@@ -98,7 +100,8 @@ impl Matcher {
         let there = first.wrapping_add_signed(dx);
         let columns = &mut self.columns[..n];
         let a: [&[f32]; BLOCK] = std::array::from_fn(|r| &image[(y + r) * width + first..][..n]);
-        let b: [&[f32]; BLOCK] = std::array::from_fn(|r| &image[(other + r) * width + there..][..n]);
+        let b: [&[f32]; BLOCK] =
+            std::array::from_fn(|r| &image[(other + r) * width + there..][..n]);
         square_differences(a, b, columns);
         sum_neighbours(&self.columns[..n], 1, &mut self.pairs[..n - 1]);
         sum_neighbours(&self.pairs[..n - 1], 2, &mut self.fours[..n - 3]);
@@ -165,11 +168,12 @@ mod tests {
     #[test]
     fn groups_are_those_of_an_exhaustive_search() {
         let size = Size { height: 23, width: 30 };
-        let image: Vec<f32> = (0..size.pixels()).map(|i| ((i * i * 31 + i * 7) % 101) as f32).collect();
+        let image: Vec<f32> =
+            (0..size.pixels()).map(|i| ((i * i * 31 + i * 7) % 101) as f32).collect();
         let xs: Vec<usize> = (0..=22).step_by(3).chain([22]).collect();
         let mut matcher = Matcher::default();
         for y in [0, 6, 15] {
-            let search = Search { radius: 9, most: 6, threshold: 2500.0 };
+            let search = Search { step: 3, radius: 9, most: 6, threshold: 2500.0 };
             let groups = matcher.groups(&image, size, y, &xs, search).to_vec();
             for (&x, group) in xs.iter().zip(&groups) {
                 let mut expected = Vec::new();
@@ -199,13 +203,12 @@ mod tests {
     fn known_shifts_are_found() {
         let size = Size { height: 32, width: 40 };
         let texture = |x: usize, y: usize| ((x * 7919 + y * 104_729) % 251) as f32;
-        let mut image: Vec<f32> =
-            (0..size.pixels()).map(|i| texture(i % 40, i / 40)).collect();
+        let mut image: Vec<f32> = (0..size.pixels()).map(|i| texture(i % 40, i / 40)).collect();
         for (r, c) in (0..8).flat_map(|r| (0..8).map(move |c| (r, c))) {
             image[(12 + 3 + r) * 40 + 15 + 5 + c] = 1000.0 + (r * 8 + c) as f32;
             image[(4 + r) * 40 + 4 + c] = 1000.0 + (r * 8 + c) as f32;
         }
-        let search = Search { radius: 19, most: 2, threshold: 1.0 };
+        let search = Search { step: 3, radius: 19, most: 2, threshold: 1.0 };
         let groups = Matcher::default().groups(&image, size, 4, &[4], search).to_vec();
         assert_eq!(groups[0].len(), 2);
         assert_eq!(groups[0][1], Match { distance: 0.0, at: 15 * 40 + 20 });

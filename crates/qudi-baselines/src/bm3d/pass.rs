@@ -10,9 +10,6 @@ use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
 use wide::f32x8;
 
-/// Pixels between reference blocks.
-const STEP: usize = 3;
-
 /// Rows of reference blocks in a strip. Part of the result's rounding, so not of the machine.
 const STRIP: usize = 8;
 
@@ -35,8 +32,8 @@ const KAISER: [f32; BLOCK] = [
 /// Filters `noisy` in groups of blocks that are similar in `guide`.
 pub(super) fn pass(noisy: &Frame, guide: &Frame, search: Search, filter: Filter) -> Frame {
     let size = noisy.size;
-    let rows = corners(size.height);
-    let columns = corners(size.width);
+    let rows = corners(size.height, search.step);
+    let columns = corners(size.width, search.step);
     let strips: Vec<Strip> = rows
         .par_chunks(STRIP)
         .map(|rows| {
@@ -66,10 +63,10 @@ pub(super) fn pass(noisy: &Frame, guide: &Frame, search: Search, filter: Filter)
     Frame { size, data }
 }
 
-/// Corners of reference blocks along a side of `length`, the last one at its end.
-fn corners(length: usize) -> Vec<usize> {
+/// Corners of reference blocks along a side of `length`, `step` apart, the last one at its end.
+fn corners(length: usize, step: usize) -> Vec<usize> {
     let last = length - BLOCK;
-    (0..last).step_by(STEP).chain([last]).collect()
+    (0..last).step_by(step).chain([last]).collect()
 }
 
 /// Estimates of some rows of reference blocks.

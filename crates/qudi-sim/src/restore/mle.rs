@@ -1,13 +1,11 @@
 //! The most likely flux of a moving mean: response inverted, dark counts subtracted, over as many
 //! frames as the motion allows.
 
-use super::{BurstView, Context, Restored, Restorer, moving_sums};
+use super::{
+    BurstView, Context, LONGEST_HALF, Restored, Restorer, half_of_least_risk, moving_sums,
+};
 use crate::error::Result;
 use crate::frame::Frame;
-use crate::sensor::{CountLaw, CountMoments};
-
-/// Frames on either side that are tried.
-const HALVES: [usize; 6] = [0, 1, 2, 3, 4, 5];
 
 /// Maximum-likelihood estimate over a window of 1 to 11 frames.
 #[derive(Clone, Copy, Debug)]
@@ -21,32 +19,9 @@ impl Mle {
         Self { half }
     }
 
-    /// Chooses the length of least estimated risk on windows of the clip. With `y` a frame's counts
-    /// and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y` is the mean
-    /// squared error of `m` (Stein 1981; Mallows 1973), and the sensor says what `Var y` is.
+    /// Chooses the length on windows of the clip, by [`half_of_least_risk`].
     pub fn choose(samples: &[BurstView<'_>], context: &Context) -> Self {
-        let moments = CountMoments::new(&CountLaw::new(&context.sensor, context.gain));
-        let risk = |half: usize| -> f64 {
-            let mut total = 0.0;
-            for burst in samples {
-                let mut frame = 0;
-                moving_sums(*burst, half, |sums, n| {
-                    let n = f64::from(n);
-                    for (&sum, &own) in sums.iter().zip(&burst.frames[frame]) {
-                        let mean = f64::from(sum) / n;
-                        let difference = mean - f64::from(own);
-                        // The longest mean would know the variance best; it hardly matters.
-                        let variance = moments.variance_at_mean(mean);
-                        total += difference * difference + (2.0 / n - 1.0) * variance;
-                    }
-                    frame += 1;
-                });
-            }
-            total
-        };
-        let risks = HALVES.map(risk);
-        let best = (0..risks.len()).min_by(|&a, &b| risks[a].total_cmp(&risks[b])).unwrap_or(0);
-        Self { half: HALVES[best] }
+        Self { half: half_of_least_risk(samples, context, 1.0) }
     }
 
     /// Frames that it sums.
@@ -61,7 +36,7 @@ impl Restorer for Mle {
     }
 
     fn window(&self) -> usize {
-        2 * HALVES[HALVES.len() - 1] + 1
+        2 * LONGEST_HALF + 1
     }
 
     fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {

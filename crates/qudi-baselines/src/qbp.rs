@@ -1,0 +1,273 @@
+//! Quanta burst photography (Ma, Gupta, Ulku, Bruschini, Charbon and Gupta, ACM TOG 39(4), 2020):
+//! frames are summed into blocks, the blocks aligned patch by patch with one reference, the motion
+//! interpolated between them, the frames warped and merged robustly, and the response inverted.
+//!
+//! Every frame of the window is the reference once. Binary and few-bit counts are treated alike.
+
+mod align;
+mod blocks;
+mod dft;
+mod grid;
+mod hot;
+mod merge;
+mod pyramid;
+
+use crate::stabilizer::{Stabilizer, Transform};
+use crate::transform_denoise::{denoise, image};
+use align::{align, finest_grid, sample};
+use blocks::Blocks;
+use dft::SIDE;
+use grid::Grid;
+use merge::{Member, merge};
+use pyramid::Pyramid;
+use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
+use qudi_sim::sensor::{CountLaw, CountMoments};
+use qudi_sim::{Frame, Result, Size};
+use rayon::prelude::*;
+
+/// What follows the merge.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Finish {
+    /// Nothing.
+    Plain,
+    /// The variance is stabilised and BM3D removes the noise that is left.
+    Bm3d,
+}
+
+/// Numbers that training clips decide.
+#[derive(Clone, Copy, Debug)]
+pub struct QbpSettings {
+    /// Blocks hold as many frames as it takes for this many detections per pixel, at most 5.
+    pub detections: f64,
+    /// Squared difference, in that which noise makes, at which a block counts half.
+    pub trust: f32,
+    /// Deviation that BM3D assumes, in that of the merge's own noise.
+    pub noise: f64,
+}
+
+impl Default for QbpSettings {
+    fn default() -> Self {
+        Self { detections: 0.0, trust: 8.0, noise: 1.0 }
+    }
+}
+
+/// Variance that the pyramid's smoothing leaves: `(sum of its squared taps)^2`, 70/256 each way.
+const SMOOTHED: f32 = 0.074_768;
+
+/// Align and merge.
+#[derive(Clone, Copy, Debug)]
+pub struct Qbp {
+    finish: Finish,
+    settings: QbpSettings,
+}
+
+impl Qbp {
+    /// With the settings of docs/results.md.
+    pub fn new(finish: Finish) -> Self {
+        Self::with_settings(finish, QbpSettings::default())
+    }
+
+    /// With others.
+    pub fn with_settings(finish: Finish, settings: QbpSettings) -> Self {
+        Self { finish, settings }
+    }
+
+    /// Frames in a block.
+    fn block(self, context: &Context) -> Result<usize> {
+        let sensor = &context.sensor;
+        let detections = sensor.quantum_efficiency * context.ppp + sensor.dark_per_frame()?;
+        let frames = (self.settings.detections / detections).ceil().clamp(1.0, 5.0) as usize;
+        // Odd, so that a block has a middle.
+        Ok(frames | 1)
+    }
+}
+
+impl Restorer for Qbp {
+    fn name(&self) -> &'static str {
+        match self.finish {
+            Finish::Plain => "qbp",
+            Finish::Bm3d => "qbp-bm3d",
+        }
+    }
+
+    fn window(&self) -> usize {
+        2 * LONGEST_HALF + 1
+    }
+
+    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
+        let ordinary = context.sensor.dark_per_frame()?;
+        let units = 1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency);
+        let transform = match self.finish {
+            Finish::Plain => Transform::Identity,
+            Finish::Bm3d => Transform::Integral,
+        };
+        let n = burst.frames.len() as f64;
+        let stabilizer =
+            Stabilizer::new(transform, &context.sensor, context.gain, burst.frames.len() as u32);
+        let merger = Merger::new(burst, context, self.block(context)?, self.settings.trust);
+        let finish = |frame: usize| {
+            let Merged { counts, noise } = merger.merge(frame);
+            let z =
+                counts.data.iter().map(|&mean| stabilizer.transform(n * f64::from(mean)) as f32);
+            let mut z = Frame { size: counts.size, data: z.collect() };
+            if self.finish == Finish::Bm3d {
+                z = denoise(z, &stabilizer, self.settings.noise * (n * noise).sqrt());
+            }
+            image(&z, &stabilizer, context, ordinary, units)
+        };
+        Ok(Restored { frames: (0..burst.frames.len()).map(finish).collect(), std: None })
+    }
+}
+
+/// The motion of every patch of a frame to every frame of the window: `flow[frame][patch]`, right
+/// and down in pixels, and the patches' corners. What [`Qbp`] works with, for measuring it.
+///
+/// # Errors
+/// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
+pub fn patch_flow(
+    burst: BurstView<'_>,
+    context: &Context,
+    reference: usize,
+) -> Result<(Vec<[usize; 2]>, Vec<Vec<[f32; 2]>>)> {
+    let qbp = Qbp::new(Finish::Plain);
+    let merger = Merger::new(burst, context, qbp.block(context)?, qbp.settings.trust);
+    let (_, flow) = merger.flow(reference);
+    Ok(((0..merger.grid.len()).map(|i| merger.grid.corner(i)).collect(), flow))
+}
+
+/// A merged frame.
+struct Merged {
+    /// Mean counts.
+    counts: Frame,
+    /// Variance of their noise, in that of one frame.
+    noise: f64,
+}
+
+/// Merges the frames of one window.
+struct Merger {
+    /// Size of the window's frames; `frames` may be larger.
+    size: Size,
+    /// Counts, hot pixels repaired, at least as large as a patch.
+    frames: Vec<Frame>,
+    block: usize,
+    trust: f32,
+    moments: CountMoments,
+    grid: Grid,
+    /// Pyramids of single frames, of which blocks of one frame need no others.
+    pyramids: Vec<Pyramid>,
+}
+
+impl Merger {
+    fn new(burst: BurstView<'_>, context: &Context, block: usize, trust: f32) -> Self {
+        let moments = CountMoments::new(&CountLaw::new(&context.sensor, context.gain));
+        let size = Size { height: burst.size.height.max(SIDE), width: burst.size.width.max(SIDE) };
+        let hot = hot::HotPixels::find(burst, context.sensor.max_count());
+        let frames: Vec<Frame> = burst
+            .frames
+            .par_iter()
+            .map(|counts| {
+                let counts = hot.repaired(counts);
+                Frame::from_fn(size, |x, y| {
+                    let (x, y) = (x.min(burst.size.width - 1), y.min(burst.size.height - 1));
+                    counts[y * burst.size.width + x]
+                })
+            })
+            .collect();
+        let pyramids =
+            if block == 1 { frames.par_iter().map(Pyramid::new).collect() } else { Vec::new() };
+        let grid = finest_grid(size);
+        Self { size: burst.size, frames, block, trust, moments, grid, pyramids }
+    }
+
+    /// The blocks around `reference`, and the motion of every patch to every frame.
+    fn flow(&self, reference: usize) -> (Blocks, Vec<Vec<[f32; 2]>>) {
+        let blocks = Blocks::around(reference, self.frames.len(), self.block);
+        let single = |mean: f64| self.moments.variance_at_mean(mean) as f32;
+        let own = self.pyramid(&blocks, blocks.reference);
+        let variance = single(self.frames[reference].mean()) * SMOOTHED;
+        let flows: Vec<Vec<[f32; 2]>> = (0..blocks.ranges.len())
+            .into_par_iter()
+            .map(|k| {
+                if k == blocks.reference {
+                    return vec![[0.0; 2]; self.grid.len()];
+                }
+                let there = self.pyramid(&blocks, k);
+                align(&own, &there, variance / blocks.ranges[k].len() as f32)
+            })
+            .collect();
+        let flow = blocks.interpolate(&flows, reference);
+        (blocks, flow)
+    }
+
+    fn pyramid(&self, blocks: &Blocks, k: usize) -> std::borrow::Cow<'_, Pyramid> {
+        let range = blocks.ranges[k].clone();
+        if let ([pyramid], 1) = (self.pyramids.get(range.clone()).unwrap_or_default(), self.block) {
+            return std::borrow::Cow::Borrowed(pyramid);
+        }
+        let mut mean = Frame::filled(self.frames[0].size, 0.0);
+        let share = 1.0 / range.len() as f32;
+        for frame in &self.frames[range] {
+            for (sum, count) in mean.data.iter_mut().zip(&frame.data) {
+                *sum += share * count;
+            }
+        }
+        std::borrow::Cow::Owned(Pyramid::new(&mean))
+    }
+
+    fn merge(&self, reference: usize) -> Merged {
+        let (blocks, flow) = self.flow(reference);
+        let patches: Vec<_> =
+            (0..self.grid.len()).into_par_iter().map(|i| self.patch(i, &blocks, &flow)).collect();
+        let mut sum = Frame::filled(self.frames[0].size, 0.0);
+        let mut weights = sum.clone();
+        let window: [f32; SIDE] = std::array::from_fn(|k| {
+            0.5 - 0.5 * (2.0 * std::f32::consts::PI * (k as f32 + 0.5) / SIDE as f32).cos()
+        });
+        let width = sum.size.width;
+        for (i, (patch, _)) in patches.iter().enumerate() {
+            let [x, y] = self.grid.corner(i);
+            for (r, row) in patch.iter().enumerate() {
+                for (c, value) in row.iter().enumerate() {
+                    let weight = window[r] * window[c];
+                    let at = (y + r) * width + x + c;
+                    sum.data[at] += weight * value;
+                    weights.data[at] += weight;
+                }
+            }
+        }
+        let counts = Frame::from_fn(self.size, |x, y| (sum.row(y)[x] / weights.row(y)[x]).max(0.0));
+        let noise = patches.iter().map(|(_, noise)| f64::from(*noise)).sum::<f64>();
+        Merged { counts, noise: noise / patches.len() as f64 }
+    }
+
+    /// Patch `i` of the reference, merged, and its noise.
+    fn patch(&self, i: usize, blocks: &Blocks, flow: &[Vec<[f32; 2]>]) -> (dft::Patch, f32) {
+        let corner = self.grid.corner(i).map(|c| c as f32);
+        let member = |range: &std::ops::Range<usize>| {
+            let share = 1.0 / range.len() as f32;
+            let mut mean = [[0.0; SIDE]; SIDE];
+            let mut noise = 0.0;
+            for frame in range.clone() {
+                let d = flow[frame][i];
+                let warped = sample(&self.frames[frame], [corner[0] + d[0], corner[1] + d[1]]);
+                for (mean, value) in mean.iter_mut().flatten().zip(warped.iter().flatten()) {
+                    *mean += share * value;
+                }
+                // Between pixels the sample is a mean of some of them.
+                let left = d.map(|d| {
+                    let part = d - d.floor();
+                    part * part + (1.0 - part) * (1.0 - part)
+                });
+                noise += share * share * left[0] * left[1];
+            }
+            Member { patch: mean, frames: range.len() as f32, noise }
+        };
+        let others =
+            (0..blocks.ranges.len()).filter(|&k| k != blocks.reference).map(|k| &blocks.ranges[k]);
+        let members: Vec<Member> =
+            std::iter::once(&blocks.ranges[blocks.reference]).chain(others).map(member).collect();
+        let mean = members[0].patch.iter().flatten().sum::<f32>() / (SIDE * SIDE) as f32;
+        let variance = self.moments.variance_at_mean(f64::from(mean)) as f32;
+        merge(&members, variance, self.trust)
+    }
+}

@@ -1,0 +1,53 @@
+//! Patches that cover an image.
+
+use qudi_sim::Size;
+
+/// Corners of square patches, the last ones at the borders.
+#[derive(Clone, Debug)]
+pub(super) struct Grid {
+    pub(super) side: usize,
+    pub(super) xs: Vec<usize>,
+    pub(super) ys: Vec<usize>,
+}
+
+impl Grid {
+    /// Patches of `side` pixels, `step` apart, on an image at least that large.
+    pub(super) fn new(size: Size, side: usize, step: usize) -> Self {
+        let corners = |length: usize| {
+            let last = length.saturating_sub(side);
+            (0..last).step_by(step).chain([last]).collect()
+        };
+        Self { side, xs: corners(size.width), ys: corners(size.height) }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.xs.len() * self.ys.len()
+    }
+
+    /// Corner of patch `i`.
+    pub(super) fn corner(&self, i: usize) -> [usize; 2] {
+        [self.xs[i % self.xs.len()], self.ys[i / self.xs.len()]]
+    }
+
+    /// The patch whose centre is nearest to `point`, and its neighbours left, right, above and below.
+    pub(super) fn around(&self, point: [f32; 2]) -> [usize; 5] {
+        let nearest = |corners: &[usize], at: f32| {
+            let corner = at - 0.5 * self.side as f32;
+            let above = corners.partition_point(|&c| (c as f32) < corner).min(corners.len() - 1);
+            let below = above.saturating_sub(1);
+            let distance = |i: usize| (corners[i] as f32 - corner).abs();
+            if distance(below) < distance(above) { below } else { above }
+        };
+        let (x, y) = (nearest(&self.xs, point[0]), nearest(&self.ys, point[1]));
+        let columns = self.xs.len();
+        let right = (x + 1).min(columns - 1);
+        let below = (y + 1).min(self.ys.len() - 1);
+        [
+            y * columns + x,
+            y * columns + x.saturating_sub(1),
+            y * columns + right,
+            y.saturating_sub(1) * columns + x,
+            below * columns + x,
+        ]
+    }
+}
