@@ -6,7 +6,7 @@
 //! FOLDER holds clips; the first FRAMES frames and the middle SIDE x SIDE pixels of each are used.
 #![allow(clippy::print_stdout)]
 
-use qudi_baselines::{Transform, TransformDenoise};
+use qudi_baselines::{Finish, Qbp, QbpSettings, Transform, TransformDenoise};
 use qudi_sim::metrics::gain_aligned_psnr;
 use qudi_sim::restore::{BurstView, Context, Restorer, half_of_least_risk};
 use qudi_sim::sensor::Sensor;
@@ -74,6 +74,23 @@ fn sweep(clips: &[Exposed], ppp: f64) -> Result<()> {
         }
         let best = mean(&|i| figures[i].iter().copied().fold(f64::MIN, f64::max));
         println!("  {transform:?}, best length of every clip: {best:.2} dB");
+    }
+    let mean = |finish, settings| -> Result<f64> {
+        let figures: Result<Vec<f64>> = clips
+            .iter()
+            .map(|clip| psnr(clip, &mut Qbp::with_settings(finish, settings)))
+            .collect();
+        Ok(figures?.iter().sum::<f64>() / clips.len() as f64)
+    };
+    let usual = QbpSettings::default();
+    let detections = [0.0, 10.0, 20.0].map(|detections| QbpSettings { detections, ..usual });
+    let trust = [2.0, 4.0, 8.0, 16.0, 32.0].map(|trust| QbpSettings { trust, ..usual });
+    for settings in detections.into_iter().chain(trust) {
+        println!("  {:.2} dB: qbp, {settings:?}", mean(Finish::Plain, settings)?);
+    }
+    let noise = [0.8, 1.0, 1.2, 1.5].map(|noise| QbpSettings { noise, ..usual });
+    for settings in noise.into_iter().chain(trust) {
+        println!("  {:.2} dB: qbp-bm3d, {settings:?}", mean(Finish::Bm3d, settings)?);
     }
     Ok(())
 }

@@ -15,4 +15,4 @@ mod transform_denoise;
 pub use bm3d::bm3d;
 pub use qbp::{Finish, Qbp, QbpSettings, patch_flow};
 pub use stabilizer::{Stabilizer, Transform};
-pub use transform_denoise::{NOISE_LEFT, TransformDenoise};
+pub use transform_denoise::TransformDenoise;

@@ -51,9 +51,6 @@ impl Default for QbpSettings {
     }
 }
 
-/// Variance that the pyramid's smoothing leaves: `(sum of its squared taps)^2`, 70/256 each way.
-const SMOOTHED: f32 = 0.074_768;
-
 /// Align and merge.
 #[derive(Clone, Copy, Debug)]
 pub struct Qbp {
@@ -184,7 +181,7 @@ impl Merger {
         let blocks = Blocks::around(reference, self.frames.len(), self.block);
         let single = |mean: f64| self.moments.variance_at_mean(mean) as f32;
         let own = self.pyramid(&blocks, blocks.reference);
-        let variance = single(self.frames[reference].mean()) * SMOOTHED;
+        let variance = single(self.frames[reference].mean());
         let flows: Vec<Vec<[f32; 2]>> = (0..blocks.ranges.len())
             .into_par_iter()
             .map(|k| {

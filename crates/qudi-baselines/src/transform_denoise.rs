@@ -10,8 +10,8 @@ use qudi_sim::restore::{
 };
 use qudi_sim::{Frame, Result};
 
-/// What BM3D leaves of the noise's variance when the length of the sum is chosen.
-pub const NOISE_LEFT: f64 = 0.1;
+/// What BM3D leaves of the variance of the noise, about (chosen on training clips, docs/results.md).
+const NOISE_LEFT: f64 = 0.1;
 
 /// BM3D on moving sums of frames.
 #[derive(Clone, Copy, Debug)]
@@ -27,14 +27,9 @@ impl TransformDenoise {
     }
 
     /// Chooses the length of the sums on windows of the clip, so that what moves is not blurred more
-    /// than the noise allows; `noise_left` of the variance survives BM3D.
-    pub fn choose(
-        transform: Transform,
-        samples: &[BurstView<'_>],
-        context: &Context,
-        noise_left: f64,
-    ) -> Self {
-        Self::new(transform, half_of_least_risk(samples, context, noise_left))
+    /// than the noise allows.
+    pub fn choose(transform: Transform, samples: &[BurstView<'_>], context: &Context) -> Self {
+        Self::new(transform, half_of_least_risk(samples, context, NOISE_LEFT))
     }
 
     /// Frames that it sums.

@@ -50,4 +50,24 @@ impl Grid {
             below * columns + x,
         ]
     }
+
+    /// Medians of both components over the 3 x 3 patches around patch `i`.
+    pub(super) fn median_around(&self, flow: &[[f32; 2]], i: usize) -> [f32; 2] {
+        let (columns, rows) = (self.xs.len(), self.ys.len());
+        let (x, y) = (i % columns, i / columns);
+        let mut near = [[0.0f32; 9]; 2];
+        let mut n = 0;
+        for row in y.saturating_sub(1)..(y + 2).min(rows) {
+            for column in x.saturating_sub(1)..(x + 2).min(columns) {
+                for k in 0..2 {
+                    near[k][n] = flow[row * columns + column][k];
+                }
+                n += 1;
+            }
+        }
+        near.map(|mut values| {
+            values[..n].sort_unstable_by(f32::total_cmp);
+            0.5 * (values[(n - 1) / 2] + values[n / 2])
+        })
+    }
 }

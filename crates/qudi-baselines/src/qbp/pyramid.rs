@@ -8,7 +8,7 @@ const RATIOS: [usize; 2] = [2, 4];
 /// Smallest side of a level worth matching on.
 const LEAST_SIDE: usize = 8;
 
-/// Mean counts, finest level first.
+/// Mean counts, smoothed, finest level first.
 #[derive(Clone, Debug)]
 pub(super) struct Pyramid {
     pub(super) levels: Vec<Level>,
@@ -32,7 +32,7 @@ impl Pyramid {
                 break;
             }
             image = shrink(&image, size, ratio);
-            levels.push(Level { image: image.clone(), ratio });
+            levels.push(Level { image: smooth(&image), ratio });
         }
         Self { levels }
     }

@@ -33,7 +33,7 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
         return Err(Fault::new(
             format!("no method named `{unknown}`"),
             "--method",
-            format!("there are {}", METHODS.join(" and ")),
+            format!("there are {}", METHODS.join(", ")),
         ));
     }
     let Judged { rows, pictures, about, settings } =

@@ -3,11 +3,13 @@
 use crate::args::Network;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
+use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise};
 use qudi_sim::capture::Capture;
 use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer};
 
 /// All methods.
-pub(crate) const METHODS: &[&str] = &["average", "mle", "qudi"];
+pub(crate) const METHODS: &[&str] =
+    &["average", "mle", "transform-denoise", "bm3d", "qbp", "qbp-bm3d", "qudi"];
 
 /// Windows of a clip that a method's settings are chosen on.
 const SAMPLES: u64 = 4;
@@ -22,19 +24,36 @@ pub(crate) fn method(
     match name {
         "average" => Ok((Box::new(Average), String::new())),
         "mle" => {
-            let samples = sample_windows(capture)?;
-            let size = capture.size();
-            let views: Vec<_> = samples.iter().map(|frames| BurstView { size, frames }).collect();
-            let mle = Mle::choose(&views, context);
-            Ok((Box::new(mle), format!(" over {} frames", mle.length())))
+            let mle = sampled(capture, |views| Mle::choose(views, context))?;
+            Ok((Box::new(mle), over(mle.length())))
         }
         "qudi" => network::restorer(options, context),
+        "transform-denoise" | "bm3d" => {
+            let transform = if name == "bm3d" { Transform::Identity } else { Transform::Integral };
+            let chosen =
+                sampled(capture, |views| TransformDenoise::choose(transform, views, context))?;
+            Ok((Box::new(chosen), over(chosen.length())))
+        }
+        "qbp" => Ok((Box::new(Qbp::new(Finish::Plain)), String::new())),
+        "qbp-bm3d" => Ok((Box::new(Qbp::new(Finish::Bm3d)), String::new())),
         other => Err(Fault::new(
             format!("no method named `{other}`"),
             "--method",
             format!("there are {}", METHODS.join(", ")),
         )),
     }
+}
+
+fn over(frames: usize) -> String {
+    format!(" over {frames} frames")
+}
+
+/// What `choose` makes of a few windows of the capture.
+fn sampled<T>(capture: &mut Capture, choose: impl FnOnce(&[BurstView<'_>]) -> T) -> Result<T> {
+    let samples = sample_windows(capture)?;
+    let size = capture.size();
+    let views: Vec<_> = samples.iter().map(|frames| BurstView { size, frames }).collect();
+    Ok(choose(&views))
 }
 
 /// A few windows spread over the capture; the first ones of a file that only goes forward.
