@@ -82,15 +82,15 @@ fn sweep(clips: &[Exposed], ppp: f64) -> Result<()> {
             .collect();
         Ok(figures?.iter().sum::<f64>() / clips.len() as f64)
     };
-    let usual = QbpSettings::default();
-    let detections = [0.0, 10.0, 20.0].map(|detections| QbpSettings { detections, ..usual });
-    let trust = [2.0, 4.0, 8.0, 16.0, 32.0].map(|trust| QbpSettings { trust, ..usual });
-    for settings in detections.into_iter().chain(trust) {
-        println!("  {:.2} dB: qbp, {settings:?}", mean(Finish::Plain, settings)?);
+    let of = |detections, trust, noise| QbpSettings { detections, trust, noise };
+    let plain = [16.0, 32.0, 64.0].map(|trust| [of(0.0, trust, 1.0), of(8.0, trust, 1.0)]);
+    for settings in plain.into_iter().flatten() {
+        println!("  qbp, {settings:?}: {:.2} dB", mean(Finish::Plain, settings)?);
     }
-    let noise = [0.8, 1.0, 1.2, 1.5].map(|noise| QbpSettings { noise, ..usual });
-    for settings in noise.into_iter().chain(trust) {
-        println!("  {:.2} dB: qbp-bm3d, {settings:?}", mean(Finish::Bm3d, settings)?);
+    let trust = [8.0, 16.0, 32.0].map(|trust| of(8.0, trust, 1.3));
+    let others = [of(0.0, 16.0, 1.3), of(8.0, 16.0, 1.1), of(8.0, 16.0, 1.5)];
+    for settings in trust.into_iter().chain(others) {
+        println!("  qbp-bm3d, {settings:?}: {:.2} dB", mean(Finish::Bm3d, settings)?);
     }
     Ok(())
 }

@@ -27,9 +27,10 @@ const STEP: [usize; 2] = [3, 2];
 const LAMBDA: f32 = 2.7;
 
 /// Similar blocks differ by less than this mean square, of images in [0, 255] (table I: 3000 and
-/// 400). In the first pass both blocks are noisy, which alone makes for twice the variance; of 3000, 2000
-/// is what remains for the image at the noise of the paper's examples.
-const SIMILAR: [f32; 2] = [2000.0, 400.0];
+/// 400). The paper's 3000 is for noise of deviation 25 to 30; for both blocks are noisy in the first
+/// pass, which alone makes for twice the variance, the threshold follows the noise: three times
+/// its variance and this.
+const SIMILAR: [f32; 2] = [500.0, 400.0];
 
 /// Removes white noise of deviation `sigma` from an image whose contents span about [0, 1]. Of any
 /// size: below a block's 8 pixels the border is repeated. Without noise the image comes back as
@@ -53,6 +54,6 @@ pub fn bm3d(image: &Frame, sigma: f32) -> Frame {
         most: MOST[pass],
         threshold: noise + SIMILAR[pass] / (255.0 * 255.0),
     };
-    let basic = pass(image, image, search(0, 2.0 * variance), Filter::Cut(LAMBDA * sigma));
+    let basic = pass(image, image, search(0, 3.0 * variance), Filter::Cut(LAMBDA * sigma));
     pass(image, &basic, search(1, 0.0), Filter::Wiener(variance))
 }

@@ -148,7 +148,7 @@ impl Stabilizer {
 
     fn closed_form(&self, z: f64) -> f64 {
         match self.forward {
-            Forward::Identity | Forward::Table { .. } => z / self.gain,
+            Forward::Identity | Forward::Table { .. } => (z / self.gain).max(0.0),
             Forward::Binomial { trials } => {
                 let angle =
                     (z / (2.0 * (trials + 0.5).sqrt())).clamp(0.0, 0.5 * std::f64::consts::PI);

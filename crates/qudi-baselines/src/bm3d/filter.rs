@@ -26,6 +26,8 @@ impl Filter {
     /// (eqs. 10 and 11).
     pub(super) fn apply(self, noisy: &mut [Block], basic: &mut [Block]) -> f32 {
         haar(noisy);
+        // The group's mean stays, however dark.
+        let mean = noisy[0][0].to_array()[0];
         let weight = match self {
             Self::Cut(threshold) => cut(noisy, threshold),
             Self::Wiener(variance) => {
@@ -33,14 +35,15 @@ impl Filter {
                 shrink(noisy, basic, variance)
             }
         };
+        let mut first = noisy[0][0].to_array();
+        first[0] = mean;
+        noisy[0][0] = f32x8::new(first);
         inverse_haar(noisy);
         weight
     }
 }
 
 fn cut(group: &mut [Block], threshold: f32) -> f32 {
-    // The group's mean stays, however dark.
-    let mean = group[0][0].to_array()[0];
     let limit = f32x8::splat(threshold);
     let mut kept = f32x8::splat(0.0);
     for row in group.iter_mut().flatten() {
@@ -48,9 +51,6 @@ fn cut(group: &mut [Block], threshold: f32) -> f32 {
         kept += large & f32x8::splat(1.0);
         *row &= large;
     }
-    let mut first = group[0][0].to_array();
-    first[0] = mean;
-    group[0][0] = f32x8::new(first);
     1.0 / kept.reduce_add().max(1.0)
 }
 

@@ -16,9 +16,6 @@ const RELUCTANCE: [f32; 3] = [0.5, 0.5, 0.1];
 /// Search radius at each level, finest first, in its pixels.
 const RADII: [isize; 3] = [1, 4, 8];
 
-/// Side of the patches at each level.
-const SIDES: [usize; 3] = [SIDE, SIDE, 8];
-
 /// Refining steps (FIELD 6.2: numLKIters).
 const STEPS: usize = 3;
 
@@ -46,7 +43,7 @@ pub(super) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<
     let variance = (2.0 * variance).max(1e-6);
     let mut parents: Option<(Grid, Vec<[isize; 2]>)> = None;
     for (number, (level, there)) in reference.levels.iter().zip(&other.levels).enumerate().rev() {
-        let side = SIDES[number];
+        let side = level.side;
         let step = if number == 0 { side / 2 } else { side };
         let ratio = reference.levels.get(number + 1).map_or(1, |coarser: &Level| coarser.ratio);
         let grid = Grid::new(level.image.size, side, step);

@@ -1,12 +1,10 @@
 //! A block of frames at the scales that alignment works on.
 
+use super::dft::SIDE;
 use qudi_sim::{Frame, Size};
 
-/// Coarser by these factors than the level before (FIELD: 1, 2, 4).
-const RATIOS: [usize; 2] = [2, 4];
-
-/// Smallest side of a level worth matching on.
-const LEAST_SIDE: usize = 8;
+/// Coarser levels: by which factor than the level before, and the side of the patches matched on it.
+const COARSER: [(usize, usize); 2] = [(2, SIDE), (4, SIDE / 2)];
 
 /// Mean counts, smoothed, finest level first.
 #[derive(Clone, Debug)]
@@ -20,19 +18,21 @@ pub(super) struct Level {
     pub(super) image: Frame,
     /// Coarser than the level before by this.
     pub(super) ratio: usize,
+    /// Side of its patches; it is at least that large.
+    pub(super) side: usize,
 }
 
 impl Pyramid {
     pub(super) fn new(counts: &Frame) -> Self {
-        let mut levels = vec![Level { image: smooth(counts), ratio: 1 }];
+        let mut levels = vec![Level { image: smooth(counts), ratio: 1, side: SIDE }];
         let mut image = counts.clone();
-        for ratio in RATIOS {
+        for (ratio, side) in COARSER {
             let size = Size { height: image.size.height / ratio, width: image.size.width / ratio };
-            if size.height.min(size.width) < LEAST_SIDE {
+            if size.height.min(size.width) < side {
                 break;
             }
             image = shrink(&image, size, ratio);
-            levels.push(Level { image: smooth(&image), ratio });
+            levels.push(Level { image: smooth(&image), ratio, side });
         }
         Self { levels }
     }

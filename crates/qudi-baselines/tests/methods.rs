@@ -1,0 +1,111 @@
+//! All methods on moving scenes, on any number of threads, and on input that nobody wants.
+#![allow(clippy::unwrap_used)]
+
+use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise};
+use qudi_sim::metrics::gain_aligned_psnr;
+use qudi_sim::restore::{Average, BurstView, Context, Restorer};
+use qudi_sim::scene::{Procedural, ProceduralScene};
+use qudi_sim::sensor::Sensor;
+use qudi_sim::{Camera, Frame, Light, Size};
+
+fn methods() -> Vec<Box<dyn Restorer>> {
+    vec![
+        Box::new(TransformDenoise::new(Transform::Integral, 1)),
+        Box::new(TransformDenoise::new(Transform::Anscombe, 5)),
+        Box::new(TransformDenoise::new(Transform::Identity, 1)),
+        Box::new(Qbp::new(Finish::Plain)),
+        Box::new(Qbp::new(Finish::Bm3d)),
+    ]
+}
+
+fn context(sensor: Sensor, ppp: f64) -> Context {
+    let gain = sensor.gain_at(ppp).unwrap();
+    Context { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+}
+
+/// A window of a scene in motion, and its truth.
+fn exposed(size: Size, sensor: &Sensor, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>) {
+    let scene = Procedural { kind: ProceduralScene::Text, size, seed: 2, speed: 2.0 }.scene();
+    let mut camera = Camera::new(sensor, size, Light { ppp, exposure: 0.45 }, 5).unwrap();
+    let truth: Vec<Frame> = (0..frames).map(|t| scene.render(t as f64)).collect();
+    let counts =
+        truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
+    (counts, truth)
+}
+
+fn mean_psnr(images: &[Frame], truth: &[Frame]) -> f64 {
+    let total: f64 = images.iter().zip(truth).map(|(i, t)| gain_aligned_psnr(i, t)).sum();
+    total / truth.len() as f64
+}
+
+#[test]
+fn every_method_beats_the_average_of_a_moving_scene() {
+    let size = Size { height: 96, width: 112 };
+    let mut spad = Sensor::load("spad512s").unwrap();
+    spad.frames_summed = 7;
+    for sensor in [Sensor::load("qudi-paper").unwrap(), spad] {
+        let (counts, truth) = exposed(size, &sensor, 6.0, 11);
+        let context = context(sensor, 6.0);
+        let burst = BurstView { size, frames: &counts };
+        let naive = mean_psnr(&Average.restore(burst, &context).unwrap().frames, &truth);
+        for mut method in methods() {
+            let restored = method.restore(burst, &context).unwrap().frames;
+            let found = mean_psnr(&restored, &truth);
+            let name = method.name();
+            println!("{} {name}: {found:.2} dB, average {naive:.2} dB", context.sensor.name);
+            // A sum of 11 is no better than the average where everything moves.
+            let margin = if name == "transform-denoise" { 0.0 } else { 0.5 };
+            assert!(found > naive + margin, "{name}: {found} dB, average {naive} dB");
+        }
+    }
+}
+
+#[test]
+fn threads_do_not_change_a_bit() {
+    let size = Size { height: 48, width: 64 };
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let (counts, _) = exposed(size, &sensor, 9.75, 5);
+    let context = context(sensor, 9.75);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let burst = BurstView { size, frames: &counts };
+        pool.install(|| -> Vec<Vec<Frame>> {
+            methods().iter_mut().map(|m| m.restore(burst, &context).unwrap().frames).collect()
+        })
+    };
+    assert_eq!(on(1), on(2));
+}
+
+/// One frame, tiny frames, none or all of the light: every pixel of every frame is a number.
+#[test]
+fn odd_input_gives_pictures() {
+    for name in ["qudi-paper", "swissspad2", "qis4-gj"] {
+        let sensor = Sensor::load(name).unwrap();
+        let most = sensor.max_count();
+        let context = context(sensor, 3.25);
+        for (height, width) in [(1, 1), (5, 9), (16, 16), (17, 40)] {
+            let size = Size { height, width };
+            for (count, frames) in [(0, 1), (most, 1), (0, 3), (most, 3), (most / 2, 12)] {
+                let counts = vec![vec![count; size.pixels()]; frames];
+                for mut method in methods() {
+                    let burst = BurstView { size, frames: &counts };
+                    let restored = method.restore(burst, &context).unwrap().frames;
+                    assert_eq!(restored.len(), frames);
+                    for frame in restored {
+                        assert_eq!(frame.size, size);
+                        let (least, largest) = frame
+                            .data
+                            .iter()
+                            .fold((f32::MAX, f32::MIN), |(a, b), &v| (a.min(v), b.max(v)));
+                        let case = format!("{name} {} {size} {count} x {frames}", method.name());
+                        assert!(frame.data.iter().all(|v| v.is_finite() && *v >= 0.0), "{case}");
+                        assert!(
+                            largest - least < 0.02 * largest.max(1e-3),
+                            "{case}: {least} {largest}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+}
