@@ -20,9 +20,10 @@ lint:
 doc:
     cargo doc --workspace --no-deps --open
 
-# Nanoseconds per pixel of the camera
+# Nanoseconds per pixel of the camera, seconds per window of the classical methods
 bench:
     cargo bench -p qudi-sim
+    cargo bench -p qudi-baselines
 
 # The picture of the README
 picture:

@@ -81,6 +81,25 @@ fn more_light_is_better_and_bars_are_kept() {
 }
 
 #[test]
+fn the_classical_methods_beat_a_mean_where_things_move() {
+    let folder = scratch("eval-classical");
+    let methods = "mle,transform-denoise,bm3d,qbp,qbp-bm3d";
+    let clip = "--size 80x96 --frames 11 --ppp 3 --seed 1 --truth clip.npy -o burst.npy -q";
+    qudi(&folder).args("simulate scene:text".split(' ')).args(clip.split(' ')).assert().success();
+    let found = eval(&folder, &format!("clip.npy --ppp 9.75 --method {methods}"));
+    let psnr = |row: usize| found["rows"][row]["psnr_a"]["all"]["mean"].as_f64().unwrap();
+    for row in 1..5 {
+        assert!(
+            psnr(row) > psnr(0),
+            "{}: {} dB, mle {} dB",
+            found["rows"][row]["method"],
+            psnr(row),
+            psnr(0)
+        );
+    }
+}
+
+#[test]
 fn the_report_is_one_file_that_fetches_nothing() {
     let folder = scratch("eval-html");
     eval(&folder, "scene:dead-leaves --ppp 3.25,26 --frames 11 --html report.html");

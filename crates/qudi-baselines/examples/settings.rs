@@ -83,12 +83,12 @@ fn sweep(clips: &[Exposed], ppp: f64) -> Result<()> {
         Ok(figures?.iter().sum::<f64>() / clips.len() as f64)
     };
     let of = |detections, trust, noise| QbpSettings { detections, trust, noise };
-    let plain = [16.0, 32.0, 64.0].map(|trust| [of(0.0, trust, 1.0), of(8.0, trust, 1.0)]);
+    let plain = [16.0, 32.0, 64.0].map(|trust| [of(4.0, trust, 1.0), of(8.0, trust, 1.0)]);
     for settings in plain.into_iter().flatten() {
         println!("  qbp, {settings:?}: {:.2} dB", mean(Finish::Plain, settings)?);
     }
-    let trust = [8.0, 16.0, 32.0].map(|trust| of(8.0, trust, 1.3));
-    let others = [of(0.0, 16.0, 1.3), of(8.0, 16.0, 1.1), of(8.0, 16.0, 1.5)];
+    let trust = [8.0, 16.0, 32.0].map(|trust| of(4.0, trust, 1.3));
+    let others = [of(8.0, 16.0, 1.3), of(4.0, 16.0, 1.1), of(4.0, 16.0, 1.5)];
     for settings in trust.into_iter().chain(others) {
         println!("  qbp-bm3d, {settings:?}: {:.2} dB", mean(Finish::Bm3d, settings)?);
     }

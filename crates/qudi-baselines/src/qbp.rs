@@ -53,7 +53,7 @@ impl QbpSettings {
             Finish::Plain => 64.0,
             Finish::Bm3d => 16.0,
         };
-        Self { detections: 8.0, trust, noise: 1.3 }
+        Self { detections: 4.0, trust, noise: 1.3 }
     }
 }
 

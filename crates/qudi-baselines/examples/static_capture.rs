@@ -1,12 +1,13 @@
 //! Methods on a real static capture: a mean of many binary frames holds exact counts, which are
 //! split at random into 11 sums of 7 frames and a reference of all others.
 //!
-//!     cargo run --release -p qudi-sim --example static_capture -- FOLDER 256 SEED
+//!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED
 //!
 //! FOLDER holds one image of means of 256 binary frames. The split is hypergeometric, so that input
 //! and reference are independent; the reference's own variance is subtracted from the error.
 #![allow(clippy::print_stdout)]
 
+use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise};
 use qudi_sim::capture::{Capture, MaskChoice, ReadOptions};
 use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer};
 use qudi_sim::sensor::Sensor;
@@ -86,19 +87,24 @@ fn main() -> qudi_sim::Result<()> {
     );
     let burst = BurstView { size, frames: &frames };
     let mut mle = Mle::choose(&[burst], &context);
-    let methods: [&mut dyn Restorer; 2] = [&mut Average, &mut mle];
+    let choose = |transform| TransformDenoise::choose(transform, &[burst], &context);
+    let mut stabilized = choose(Transform::Integral);
+    let mut plain = choose(Transform::Identity);
+    let (mut qbp, mut qbp_bm3d) = (Qbp::new(Finish::Plain), Qbp::new(Finish::Bm3d));
+    let methods: [&mut dyn Restorer; 6] =
+        [&mut Average, &mut mle, &mut stabilized, &mut plain, &mut qbp, &mut qbp_bm3d];
     for method in methods {
         let restored = method.restore(burst, &context)?.frames;
         let error = squared_error(&restored[FRAMES / 2], &truth);
         let corrected = (error - own_noise).max(1e-12);
         println!(
-            "{:<10} psnr-a {:6.2} dB, with the reference's own noise {:6.2} dB",
+            "{:<17} psnr-a {:6.2} dB, with the reference's own noise {:6.2} dB",
             method.name(),
             -10.0 * corrected.log10(),
             -10.0 * error.log10()
         );
     }
-    println!("mle over {} frames", mle.length());
+    println!("mle over {} frames, transform-denoise over {}", mle.length(), stabilized.length());
     Ok(())
 }
 
