@@ -122,20 +122,27 @@ impl Restorer for Qbp {
     }
 }
 
-/// The motion of every patch of a frame to every frame of the window: `flow[frame][patch]`, right
-/// and down in pixels, and the patches' corners. What [`Qbp`] works with, for measuring it.
-///
-/// # Errors
-/// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
-pub fn patch_flow(
-    burst: BurstView<'_>,
-    context: &Context,
-    reference: usize,
-) -> Result<(Vec<[usize; 2]>, Vec<Vec<[f32; 2]>>)> {
-    let qbp = Qbp::new(Finish::Plain);
-    let merger = Merger::new(burst, context, qbp.block(context)?, qbp.settings.trust);
-    let (_, flow) = merger.flow(reference);
-    Ok(((0..merger.grid.len()).map(|i| merger.grid.corner(i)).collect(), flow))
+/// The motion of every patch of one frame to every frame of its window.
+#[derive(Clone, Debug)]
+pub struct PatchFlow {
+    /// Corners of the patches of 16 x 16 pixels, `(x, y)`.
+    pub corners: Vec<[usize; 2]>,
+    /// `[frame][patch]`, right and down in pixels.
+    pub flow: Vec<Vec<[f32; 2]>>,
+}
+
+impl PatchFlow {
+    /// What [`Qbp`] finds for frame `reference`, for measuring it.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
+    pub fn find(burst: BurstView<'_>, context: &Context, reference: usize) -> Result<Self> {
+        let qbp = Qbp::new(Finish::Plain);
+        let merger = Merger::new(burst, context, qbp.block(context)?, qbp.settings.trust);
+        let (_, flow) = merger.flow(reference);
+        let corners = (0..merger.grid.len()).map(|i| merger.grid.corner(i)).collect();
+        Ok(Self { corners, flow })
+    }
 }
 
 /// A merged frame.

@@ -23,8 +23,8 @@ pub enum Transform {
     Integral,
 }
 
-/// Deeper linear samples are not tabulated.
-const DEEPEST: u16 = 255;
+/// Deeper linear samples are not tabulated: the closed form is exact enough, and they rarely clip.
+const DEEPEST: u16 = 63;
 
 /// Larger sums of binary frames neither: their law is that of Poisson's, nearly.
 const MOST_FRAMES: f64 = 4096.0;
@@ -177,13 +177,19 @@ impl Stabilizer {
             Response::Linear => law.detections_for_mean(full),
             Response::Binary => -full * (0.5 / (self.frames * full)).ln(),
         };
+        // Sums of binary frames are sums of more binary frames.
+        let mut longer = sensor.clone();
+        longer.frames_summed *= frames;
+        let binary = CountLaw::new(&longer, 1.0);
         for i in 0..=NODES {
             let detections = most * (i as f64 / NODES as f64).powi(2);
-            let single = law.probabilities(detections);
-            let mut sum = vec![1.0];
-            for _ in 0..frames {
-                sum = convolve(&sum, &single);
-            }
+            let sum = match sensor.response {
+                Response::Binary => binary.probabilities(self.frames * detections),
+                Response::Linear => {
+                    let single = law.probabilities(detections);
+                    (0..frames).fold(vec![1.0], |sum, _| convolve(&sum, &single))
+                }
+            };
             let values = || sum.iter().enumerate().map(|(s, p)| (self.transform(s as f64), p));
             let mean: f64 = values().map(|(z, p)| z * p).sum();
             let variance: f64 = values().map(|(z, p)| (z - mean) * (z - mean) * p).sum();
@@ -191,6 +197,10 @@ impl Stabilizer {
             if self.nodes.last().is_none_or(|node| node[1] < mean - 1e-9) {
                 self.nodes.push([detections, mean, variance.max(0.0).sqrt()]);
             }
+        }
+        // A gain at which every count is 0: nothing to look up.
+        if self.nodes.len() < 2 {
+            self.nodes.clear();
         }
     }
 }

@@ -1,6 +1,6 @@
 //! BM3D against the reference package's figures: `tests/golden/baselines`, made by
 //! `scripts/reference/baselines.py`.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_baselines::bm3d;
 use qudi_sim::npy::read_image;

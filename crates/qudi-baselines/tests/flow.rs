@@ -3,7 +3,7 @@
 //!     cargo test --release -p qudi-baselines --test flow -- --nocapture
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use qudi_baselines::patch_flow;
+use qudi_baselines::PatchFlow;
 use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::scene::{Motion, Procedural, ProceduralScene, Scene};
 use qudi_sim::sensor::Sensor;
@@ -26,7 +26,7 @@ fn exposed(scene: &Scene, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Context) {
 fn errors(scene: &Scene, ppp: f64, reference: usize, others: &[usize]) -> Vec<f64> {
     let (counts, context) = exposed(scene, ppp, 11);
     let burst = BurstView { size: scene.size, frames: &counts };
-    let (corners, flow) = patch_flow(burst, &context, reference).unwrap();
+    let PatchFlow { corners, flow } = PatchFlow::find(burst, &context, reference).unwrap();
     let mut errors = Vec::new();
     for &other in others {
         let truth = scene.flow(reference as f64, other as f64);

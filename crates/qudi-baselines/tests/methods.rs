@@ -1,5 +1,5 @@
 //! All methods on moving scenes, on any number of threads, and on input that nobody wants.
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise};
 use qudi_sim::metrics::gain_aligned_psnr;

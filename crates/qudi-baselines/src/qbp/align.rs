@@ -174,21 +174,18 @@ fn refine(
     variance: f32,
 ) -> Refined {
     let (width, height) = (image.size.width, image.size.height);
-    let mut slopes = [[[0.0f32; SIDE]; SIDE]; 2];
+    let mut slopes_x = [[0.0f32; SIDE]; SIDE];
+    let mut slopes_y = slopes_x;
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-    for r in 0..SIDE {
-        let y = y0 + r;
+    for (y, (slopes_x, slopes_y)) in (y0..).zip(slopes_x.iter_mut().zip(&mut slopes_y)) {
         let row = image.row(y);
         let (up, down) = (image.row(y.saturating_sub(1)), image.row((y + 1).min(height - 1)));
-        for c in 0..SIDE {
-            let x = x0 + c;
-            let dx = 0.5 * (row[(x + 1).min(width - 1)] - row[x.saturating_sub(1)]);
-            let dy = 0.5 * (down[x] - up[x]);
-            slopes[0][r][c] = dx;
-            slopes[1][r][c] = dy;
-            xx += dx * dx;
-            xy += dx * dy;
-            yy += dy * dy;
+        for (x, (sx, sy)) in (x0..).zip(slopes_x.iter_mut().zip(slopes_y)) {
+            *sx = 0.5 * (row[(x + 1).min(width - 1)] - row[x.saturating_sub(1)]);
+            *sy = 0.5 * (down[x] - up[x]);
+            xx += *sx * *sx;
+            xy += *sx * *sy;
+            yy += *sy * *sy;
         }
     }
     let solve = Damped::new([xx, xy, yy], variance / (STEP_PRIOR * STEP_PRIOR));
@@ -196,12 +193,12 @@ fn refine(
     for _ in 0..STEPS {
         let moved = sample(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
         let (mut bx, mut by) = (0.0, 0.0);
-        for r in 0..SIDE {
+        for (r, moved) in moved.iter().enumerate() {
             let row = &image.row(y0 + r)[x0..x0 + SIDE];
-            for c in 0..SIDE {
-                let difference = moved[r][c] - row[c];
-                bx += slopes[0][r][c] * difference;
-                by += slopes[1][r][c] * difference;
+            let slopes = slopes_x[r].iter().zip(&slopes_y[r]);
+            for ((moved, here), (sx, sy)) in moved.iter().zip(row).zip(slopes) {
+                bx += sx * (moved - here);
+                by += sy * (moved - here);
             }
         }
         let step = solve.solve([bx, by]);

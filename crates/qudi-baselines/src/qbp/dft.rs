@@ -73,13 +73,8 @@ fn columns(Spectrum { re, im }: &mut Spectrum) {
 
 fn transpose(Spectrum { re, im }: &mut Spectrum) {
     for part in [re, im] {
-        for y in 0..SIDE {
-            for x in 0..y {
-                let upper = part[x][y];
-                part[x][y] = part[y][x];
-                part[y][x] = upper;
-            }
-        }
+        let old = *part;
+        *part = std::array::from_fn(|y| std::array::from_fn(|x| old[x][y]));
     }
 }
 
