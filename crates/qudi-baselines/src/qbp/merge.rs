@@ -55,8 +55,8 @@ pub(super) fn merge(members: &[Member], variance: f32, trust: f32) -> (Patch, f3
 mod tests {
     use super::*;
 
-    fn member(patch: Patch) -> Member {
-        Member { patch, frames: 1.0, noise: 1.0 }
+    fn member(patch: &Patch) -> Member {
+        Member { patch: *patch, frames: 1.0, noise: 1.0 }
     }
 
     fn texture(seed: usize) -> Patch {
@@ -67,7 +67,7 @@ mod tests {
 
     #[test]
     fn equal_patches_merge_into_themselves() {
-        let (merged, noise) = merge(&vec![member(texture(1)); 7], 0.5, 4.0);
+        let (merged, noise) = merge(&vec![member(&texture(1)); 7], 0.5, 4.0);
         for (a, b) in merged.iter().flatten().zip(texture(1).iter().flatten()) {
             assert!((a - b).abs() < 1e-4);
         }
@@ -77,20 +77,20 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_left_out() {
         let other = texture(5).map(|row| row.map(|v| 40.0 - 3.0 * v));
-        let (merged, noise) = merge(&[member(texture(1)), member(other)], 1e-4, 4.0);
+        let (merged, noise) = merge(&[member(&texture(1)), member(&other)], 1e-4, 4.0);
         for (a, b) in merged.iter().flatten().zip(texture(1).iter().flatten()) {
             assert!((a - b).abs() < 0.05, "{a} {b}");
         }
         assert!(noise > 0.95, "{noise}");
         // With noise that large they could be the same.
-        let (_, noise) = merge(&[member(texture(1)), member(other)], 1e4, 4.0);
+        let (_, noise) = merge(&[member(&texture(1)), member(&other)], 1e4, 4.0);
         assert!(noise < 0.55, "{noise}");
     }
 
     #[test]
     fn members_without_noise_or_light_are_no_trouble() {
         let black = [[0.0; SIDE]; SIDE];
-        let (merged, _) = merge(&[member(black), member(black)], 0.0, 4.0);
+        let (merged, _) = merge(&[member(&black), member(&black)], 0.0, 4.0);
         assert!(merged.iter().flatten().all(|v| *v == 0.0));
     }
 }
