@@ -65,7 +65,7 @@ fn sweep(clips: &[Exposed], ppp: f64) -> Result<()> {
             let figure = mean(&|i| figures[i][length / 2]);
             println!("  {transform:?}, sums of {length:2}: {figure:.2} dB");
         }
-        for noise_left in [1.0, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02] {
+        for noise_left in [1.0, 0.3, 0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01] {
             let chosen = mean(&|i| {
                 let samples = [clips[i].burst()];
                 figures[i][half_of_least_risk(&samples, &clips[i].context, noise_left)]

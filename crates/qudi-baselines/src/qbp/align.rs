@@ -16,7 +16,7 @@ const RELUCTANCE: [f32; 3] = [0.5, 0.5, 0.1];
 /// Search radius at each level, finest first, in its pixels.
 const RADII: [isize; 3] = [1, 4, 8];
 
-/// Refining steps (FIELD 6.2: numLKIters).
+/// Refining steps, as in the authors' experiments.
 const STEPS: usize = 3;
 
 /// Deviation in pixels of the refinement, if nothing is seen.
