@@ -11,7 +11,7 @@ use qudi_sim::restore::{
 use qudi_sim::{Frame, Result};
 
 /// What BM3D leaves of the variance of the noise, about (chosen on training clips, docs/results.md).
-const NOISE_LEFT: f64 = 0.1;
+const NOISE_LEFT: f64 = 0.05;
 
 /// BM3D on moving sums of frames.
 #[derive(Clone, Copy, Debug)]
