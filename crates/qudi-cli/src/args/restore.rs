@@ -17,8 +17,8 @@ pub(crate) struct Restore {
     /// Where the frames go
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
-    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen), or qudi (the network)
-    /// [default: qudi with --weights, else mle]
+    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen), transform-denoise, bm3d, qbp,
+    /// qbp-bm3d, or qudi (the network) [default: qudi with --weights, else mle]
     #[arg(long, value_name = "NAME")]
     pub(crate) method: Option<String>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
