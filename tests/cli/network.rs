@@ -115,10 +115,10 @@ fn what_does_not_fit_is_refused_in_three_parts() {
         .success();
     refused(
         &folder,
-        "restore two.npy -o out --weights w.safetensors --device cpu",
+        "restore two.npy -o none --weights w.safetensors --device cpu",
         &["a burst of 2 frames"],
     );
-    assert!(!folder.join("out").join("000000.png").exists(), "no partial output");
+    assert!(!folder.join("none").join("000000.png").exists(), "no partial output");
 }
 
 #[test]

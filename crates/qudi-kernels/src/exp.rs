@@ -1,11 +1,17 @@
 //! The exponential in operations that have vector forms.
 
+/// 1.5 * 2^23.
+const ROUNDING: f32 = 12_582_912.0;
+
 /// `exp(x)` to 2e-7 for x from -87 to 88, cut there: a polynomial of degree six after reduction to half a power of
 /// two (Cephes, expf).
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
-    let n = (x * std::f32::consts::LOG2_E).round_ties_even();
+    // Adding this number rounds to a whole one and leaves it in the lowest bits; a cast would check for numbers
+    // that do not fit and has no vector form.
+    let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUNDING);
+    let n = shifted - ROUNDING;
     let r = n.mul_add(-0.693_359_4, x);
     let r = n.mul_add(2.121_944_4e-4, r);
     let p = 1.987_569_1e-4_f32
@@ -14,7 +20,8 @@ pub(crate) fn exp(x: f32) -> f32 {
         .mul_add(r, 4.166_579_6e-2)
         .mul_add(r, 0.166_666_65)
         .mul_add(r, 0.5);
-    let power = f32::from_bits(((n as i32 + 127) << 23) as u32);
+    let exponent = shifted.to_bits().wrapping_sub(ROUNDING.to_bits()).wrapping_add(127);
+    let power = f32::from_bits(exponent << 23);
     (p.mul_add(r * r, r) + 1.0) * power
 }
 

@@ -1,7 +1,9 @@
 //! What tiles cost: a tiny network learns for a while on procedural scenes, then restores one burst whole and in
 //! tiles.
 //!
-//!     cargo test --workspace --no-run && target/debug/examples/seams [STEPS] [SIDE]
+//!     cargo test --workspace --no-run && target/debug/examples/seams [STEPS] [SIDE] [REVERSE]
+//!
+//! learns for STEPS steps (0: the weights of the last time), and restores SIDE x SIDE pixels in REVERSE steps.
 #![allow(clippy::print_stdout, clippy::unwrap_used)]
 
 use burn::optim::{AdamConfig, GradientsParams};
@@ -91,14 +93,17 @@ fn main() {
     let mut arguments = std::env::args().skip(1).map(|a| a.parse::<usize>().unwrap());
     let steps = arguments.next().unwrap_or(600) as u64;
     let side = arguments.next().unwrap_or(512);
+    let reverse = arguments.next().unwrap_or(10);
     let path = std::env::temp_dir().join("qudi-seams.safetensors");
-    learn(steps, &path);
+    if steps > 0 {
+        learn(steps, &path);
+    }
     let device = Device::flex();
     let size = Size { height: side, width: side };
     let (counts, truth, context) = burst(size, 11, 1_000_000);
     let restore = |tile: usize| {
         let (network, description) = load(&path, &device).unwrap();
-        let options = SampleOptions { tile, ..SampleOptions::default() };
+        let options = SampleOptions { tile, steps: reverse, ..SampleOptions::default() };
         let mut restorer = QudiRestorer::new(network, &description, options, &device).unwrap();
         restorer.restore(BurstView { size, frames: &counts }, &context).unwrap().frames
     };
@@ -107,7 +112,7 @@ fn main() {
     };
     let whole = restore(side);
     println!("whole: {:.2} dB against the truth", mean(&whole, &truth));
-    for tile in [320, 256, 192, 128] {
+    for tile in [384, 320, 256, 192, 128] {
         let tiled = restore(tile);
         println!(
             "tiles of {tile}: {:.2} dB against the truth, {:.2} dB against the whole",

@@ -32,7 +32,7 @@ pub struct SampleOptions {
 
 impl Default for SampleOptions {
     fn default() -> Self {
-        Self { steps: 10, sampler: Sampler::Ddim, samples: 1, tile: 320 }
+        Self { steps: 10, sampler: Sampler::Ddim, samples: 1, tile: 512 }
     }
 }
 

@@ -23,7 +23,7 @@ pub(crate) struct Network {
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub(crate) device: String,
     /// Side of the tiles that the network sees at once, in pixels: memory grows with its square
-    #[arg(long, value_name = "PIXELS", default_value_t = 320)]
+    #[arg(long, value_name = "PIXELS", default_value_t = 512)]
     pub(crate) tile: usize,
 }
 

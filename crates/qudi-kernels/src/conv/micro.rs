@@ -10,8 +10,17 @@ use pulp::{Arch, Simd, WithSimd};
 
 /// Channels and vectors of a block; 12 accumulators fit the 16 registers of AVX2.
 pub(super) const WIDE: (usize, usize) = (4, 3);
-/// The same for channel counts that divide by six.
+/// The same with more channels and fewer pixels.
 pub(super) const TALL: (usize, usize) = (6, 2);
+
+/// Channels of the kind of block that wastes less on results of `outputs` channels and `columns` pixels.
+pub(super) fn block(outputs: usize, columns: usize) -> usize {
+    let lanes = longest_run() / WIDE.1.max(TALL.1);
+    let cost = |(channels, vectors): (usize, usize)| {
+        outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors * lanes)
+    };
+    if cost(TALL) <= cost(WIDE) { TALL.0 } else { WIDE.0 }
+}
 
 /// Longest run of pixels of a block on this machine.
 pub(super) fn longest_run() -> usize {

@@ -2,6 +2,7 @@
 #![allow(unsafe_code)]
 
 use super::geometry::Geometry;
+use super::micro::longest_run;
 use super::pass::Pass;
 use super::run::{Finish, Packed, Target, run};
 use super::source::Source;
@@ -21,7 +22,8 @@ pub(crate) fn forward(
     let depth = geometry.kernel[0];
     let planes = geometry.all_channels() * depth;
     let taps = pass.taps.len();
-    let packed = Packed::new(geometry.outputs, planes, taps, |output, plane, tap| {
+    let columns = pass.tiling(planes, longest_run()).columns;
+    let packed = Packed::new(columns, geometry.outputs, planes, taps, |output, plane, tap| {
         weight[(output * planes + plane) * taps + tap]
     });
     let inputs = with_channels(inputs, geometry);
@@ -56,7 +58,8 @@ pub(super) fn input_gradients(
         let parity = [parity / geometry.stride, parity % geometry.stride];
         let Some((pass, kernel)) = Pass::backward(geometry, parity) else { continue };
         let planes = geometry.outputs * depth;
-        let packed = Packed::new(channels, planes, kernel.len(), |channel, plane, tap| {
+        let columns = pass.tiling(planes, longest_run()).columns;
+        let packed = Packed::new(columns, channels, planes, kernel.len(), |channel, plane, tap| {
             let (output, frame) = (plane / depth, depth - 1 - plane % depth);
             let [y, x] = kernel[tap];
             let plane = (output * channels + channel) * depth + frame;

@@ -70,14 +70,15 @@ pub(super) struct Packed {
 }
 
 impl Packed {
-    /// `weight(output, plane, tap)` of a pass.
+    /// `weight(output, plane, tap)` of a pass whose tiles are `columns` wide.
     pub(super) fn new(
+        columns: usize,
         outputs: usize,
         planes: usize,
         taps: usize,
         weight: impl Fn(usize, usize, usize) -> f32,
     ) -> Self {
-        let block = if outputs.is_multiple_of(TALL.0) { TALL.0 } else { WIDE.0 };
+        let block = micro::block(outputs, columns);
         let mut values = Vec::with_capacity(outputs.next_multiple_of(block) * planes * taps);
         for first in (0..outputs).step_by(block) {
             for plane in 0..planes {
