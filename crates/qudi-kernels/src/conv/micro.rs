@@ -15,7 +15,7 @@ pub(super) const TALL: (usize, usize) = (6, 2);
 
 /// Channels of the kind of block that wastes less on results of `outputs` channels and `columns` pixels.
 pub(super) fn block(outputs: usize, columns: usize) -> usize {
-    let lanes = longest_run() / WIDE.1.max(TALL.1);
+    let lanes = lanes();
     let cost = |(channels, vectors): (usize, usize)| {
         outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors * lanes)
     };
@@ -24,15 +24,20 @@ pub(super) fn block(outputs: usize, columns: usize) -> usize {
 
 /// Longest run of pixels of a block on this machine.
 pub(super) fn longest_run() -> usize {
-    struct Run;
-    impl WithSimd for Run {
+    WIDE.1.max(TALL.1) * lanes()
+}
+
+/// Values of a vector on this machine.
+pub(super) fn lanes() -> usize {
+    struct Lanes;
+    impl WithSimd for Lanes {
         type Output = usize;
         #[inline(always)]
         fn with_simd<S: Simd>(self, _: S) -> usize {
-            WIDE.1.max(TALL.1) * S::F32_LANES
+            S::F32_LANES
         }
     }
-    Arch::new().dispatch(Run)
+    Arch::new().dispatch(Lanes)
 }
 
 /// `sums[m][v] += sum over k of weights[k * M + m] * x[offsets[k] + v * lanes ..]`.

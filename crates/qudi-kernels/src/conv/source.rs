@@ -90,18 +90,18 @@ fn copy_row(from: &[f32], mask: Option<&[f32]>, left: isize, step: usize, to: &m
     }
     let offset = (left + start as isize * step) as usize;
     let to = &mut to[start..end];
-    match (step, mask) {
-        (1, None) => to.copy_from_slice(&from[offset..offset + to.len()]),
-        (_, None) => {
+    match mask {
+        None if step == 1 => to.copy_from_slice(&from[offset..offset + to.len()]),
+        None => {
             for (to, &from) in to.iter_mut().zip(from[offset..].iter().step_by(step as usize)) {
                 *to = from;
             }
         }
-        (_, Some(mask)) => {
-            let step = step as usize;
-            let from = from[offset..].iter().step_by(step);
-            let mask = mask[offset..].iter().step_by(step);
-            for ((to, &from), &mask) in to.iter_mut().zip(from).zip(mask) {
+        // Only gradients are masked, and those are read one by one.
+        Some(mask) => {
+            debug_assert_eq!(step, 1);
+            let pairs = from[offset..].iter().zip(&mask[offset..]);
+            for (to, (&from, &mask)) in to.iter_mut().zip(pairs) {
                 *to = if mask > 0.0 { from } else { 0.0 };
             }
         }

@@ -45,7 +45,7 @@ pub(super) fn weight_gradient(
             let (image, number) = (task / tiling.count(), task % tiling.count());
             let (at, size) = tiling.tile(number, pass.grid);
             SCRATCH.with_borrow_mut(|scratch| {
-                let length = tiling.columns.next_multiple_of(micro::longest_run());
+                let length = tiling.columns.next_multiple_of(micro::lanes());
                 let area = tiling.planes * tiling.plane();
                 let needed = area + outputs * tiling.rows * length;
                 if scratch.len() < needed {
