@@ -104,7 +104,7 @@ pub(crate) enum Command {
 /// Exits with 1 if a result is off. GPU drivers and backends have had wrong kernels; run this once on yours.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Selftest {
-    /// The device: auto, cpu, ndarray, wgpu[:N], vulkan[:N], cuda[:N], metal
+    /// The device: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub(crate) device: String,
     /// Checks whose names contain one of these

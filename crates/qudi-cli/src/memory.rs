@@ -1,5 +1,11 @@
 //! Memory of this process: what becomes of freed pages, and the peak, where the system tells (Linux).
 
+/// `mi_option_purge_delay` of mimalloc.h; the bindings name its neighbours 14 and 16 only.
+const PURGE_DELAY: i32 = 15;
+
+/// The delay that never comes.
+const KEEP: std::ffi::c_long = -1;
+
 /// Growth of the peak since a moment.
 #[derive(Debug)]
 pub(crate) struct Peak {
@@ -7,8 +13,15 @@ pub(crate) struct Peak {
 }
 
 impl Peak {
-    /// Forgets the peak so far.
+    /// Forgets the peak so far, and gives kept pages back first: they would hide what comes.
+    #[allow(unsafe_code)]
     pub(crate) fn start() -> Self {
+        // SAFETY: measurements start while no other thread works; both values are in the option's range.
+        unsafe {
+            libmimalloc_sys::mi_option_set(PURGE_DELAY, 0);
+            libmimalloc_sys::mi_collect(true);
+            libmimalloc_sys::mi_option_set(PURGE_DELAY, KEEP);
+        }
         // 5 resets the peak (proc(5), clear_refs); elsewhere there is no such file.
         let reset = std::fs::write("/proc/self/clear_refs", "5").is_ok();
         Self { before: reset.then(|| field("VmRSS:")).flatten() }
@@ -32,8 +45,6 @@ fn field(name: &str) -> Option<f64> {
 /// to the system and faulting them in again costs a tenth of the time.
 #[allow(unsafe_code)]
 pub(crate) fn keep_freed_pages() {
-    /// `mi_option_purge_delay` of mimalloc.h; the bindings name its neighbours 14 and 16 only.
-    const PURGE_DELAY: i32 = 15;
-    // SAFETY: called at the start of `main`, before there are other threads; -1 is in the option's range.
-    unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, -1) };
+    // SAFETY: called at the start of `main`, before there are other threads; the value is in the option's range.
+    unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, KEEP) };
 }

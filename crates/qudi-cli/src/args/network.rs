@@ -19,7 +19,7 @@ pub(crate) struct Network {
     /// Pictures drawn; the result is their mean, --deviation their spread
     #[arg(long, value_name = "K", default_value_t = 1)]
     pub(crate) samples: usize,
-    /// Where it runs: auto, cpu, ndarray, wgpu[:N], vulkan[:N], cuda[:N], metal (see `qudi info --devices`)
+    /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info --devices`)
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub(crate) device: String,
     /// Side of the tiles that the network sees at once, in pixels: memory grows with its square
