@@ -101,7 +101,9 @@ impl Pass {
     /// over tiles come out the same with any number. `run` is the longest run of pixels of a block.
     pub(super) fn tiling(&self, planes: usize, run: usize) -> Tiling {
         let [grid_rows, grid_columns] = self.grid;
-        let across = grid_columns.div_ceil(if grid_rows == 1 { TILE } else { 192 });
+        // One long row is cut so that all planes fit at once; sums of parts would go through memory.
+        let widest = if grid_rows == 1 { (SCRATCH / planes).clamp(4 * run, TILE) } else { 8 * run };
+        let across = grid_columns.div_ceil(widest);
         let columns = grid_columns.div_ceil(across);
         let reach = |axis: usize| self.taps.iter().map(|tap| tap[axis]).max().unwrap_or(0);
         // Blocks read whole runs: the row is as long as if the tile's last run were full.

@@ -234,6 +234,11 @@ impl Tile<'_> {
             if self.planes.0 > 0 {
                 let from = self.place(first + m, row, column);
                 let values: &mut [f32] = pulp::bytemuck::cast_slice_mut(sum);
+                if self.pass.step == 1 {
+                    // SAFETY: this thread wrote `count` values there for the planes before.
+                    unsafe { std::ptr::copy_nonoverlapping(from, values.as_mut_ptr(), count) };
+                    continue;
+                }
                 for (p, value) in values.iter_mut().enumerate().take(count) {
                     // SAFETY: this thread wrote it for the planes before.
                     *value = unsafe { *from.add(p * self.pass.step) };
