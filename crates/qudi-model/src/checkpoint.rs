@@ -3,7 +3,7 @@
 use crate::config::NetworkConfig;
 use crate::network::{Qudi, fill, parameters};
 use burn::module::{Module, ModuleVisitor, Param};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Tensor, f16};
 use qudi_sim::output::{Overwrite, PendingFile};
 use qudi_sim::{Result, SimError};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -184,23 +184,11 @@ fn mismatch(path: &Path, what: impl Into<String>) -> SimError {
 fn numbers(tensor: &TensorView<'_>) -> Vec<f32> {
     let bytes = tensor.data();
     if tensor.dtype() == Dtype::F16 {
-        let words = bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]]));
-        words.map(half_to_f32).collect()
+        let words = bytes.chunks_exact(2).map(|b| [b[0], b[1]]);
+        words.map(|bytes| f16::from_le_bytes(bytes).to_f32()).collect()
     } else {
         let words = bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
         words.map(f32::from_le_bytes).collect()
-    }
-}
-
-/// IEEE half precision.
-fn half_to_f32(half: u16) -> f32 {
-    let sign = if half & 0x8000 == 0 { 1.0 } else { -1.0 };
-    let (exponent, fraction) = (i32::from(half >> 10 & 31), f32::from(half & 1023) / 1024.0);
-    match exponent {
-        0 => sign * fraction * 2f32.powi(-14),
-        31 if fraction == 0.0 => sign * f32::INFINITY,
-        31 => f32::NAN,
-        _ => sign * (1.0 + fraction) * 2f32.powi(exponent - 15),
     }
 }
 
