@@ -2,7 +2,11 @@
 //! than fit into scratch, odd sizes, channels that fill no block.
 #![allow(clippy::unwrap_used)]
 
+#[path = "../../../tests/golden/cases.rs"]
+mod cases;
+
 use burn::tensor::{Device, Tensor, TensorData};
+use cases::uniform;
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 
 /// Images, frames, channels of the inputs, height, width, outputs, kernel, stride.
@@ -23,15 +27,8 @@ const SHAPES: &[Shape] = &[
     (1, 1, &[2], 2, 2, 3, [1, 7, 7], 2),
 ];
 
-fn values(count: usize, seed: u32) -> Vec<f32> {
-    let mut state = seed.wrapping_mul(0x9E37_79B9) | 1;
-    let mut next = || {
-        state ^= state << 13;
-        state ^= state >> 17;
-        state ^= state << 5;
-        state as f32 / 2f32.powi(31) - 1.0
-    };
-    (0..count).map(|_| next()).collect()
+fn values(count: usize, seed: usize) -> Vec<f32> {
+    uniform(&format!("shapes {seed}"), count).into_iter().map(|value| value as f32).collect()
 }
 
 /// Output and gradients of all inputs, weight and bias.

@@ -1,7 +1,7 @@
 //! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017).
 
 use super::layers::{Bias, Conv2d};
-use super::resample::{double, halve, rescale_flow, shrink};
+use super::resample::{by_burst, double, halve, rescale_flow, shrink};
 use crate::config::FlowConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -68,7 +68,7 @@ impl Flow {
         }
         let flow = flow.expect("at least one level");
         let pairs = images / frames * (frames - 1);
-        let part = |first| spread(flow.clone().narrow(0, first, pairs), frames - 1);
+        let part = |first| by_burst(flow.clone().narrow(0, first, pairs), frames - 1);
         let pad = |flow: Tensor<5>, before: usize| {
             let [bursts, _, _, h, w] = flow.dims();
             let none = Tensor::zeros([bursts, 1, 2, h, w], &flow.device());
@@ -113,19 +113,13 @@ impl Flows {
     }
 }
 
-/// `[bursts * frames, c, h, w]` as `[bursts, frames, c, h, w]`.
-fn spread(x: Tensor<4>, frames: usize) -> Tensor<5> {
-    let [images, c, h, w] = x.dims();
-    x.reshape([images / frames, frames, c, h, w])
-}
-
 /// References and neighbours: first every frame but the last with the next one, then every frame but the first
 /// with the one before.
 fn both(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
     let [images, c, h, w] = x.dims();
     let pairs = images / frames * (frames - 1);
     let part =
-        |first| spread(x.clone(), frames).narrow(1, first, frames - 1).reshape([pairs, c, h, w]);
+        |first| by_burst(x.clone(), frames).narrow(1, first, frames - 1).reshape([pairs, c, h, w]);
     let (early, late) = (part(0), part(1));
     let references = Tensor::cat(vec![early.clone(), late.clone()], 0);
     (references, Tensor::cat(vec![late, early], 0))

@@ -4,7 +4,7 @@ use super::features::Pyramid;
 use super::flow::Flows;
 use super::layers::{Bias, Conv2d};
 use super::pre::DenseBlock;
-use super::resample::halve;
+use super::resample::{by_burst, halve};
 use crate::config::{FeaturesConfig, FusionConfig};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -108,7 +108,7 @@ impl Fusion {
 /// The next frame of every frame, or the one before; at the ends the frame itself.
 fn shifted(x: Tensor<4>, frames: usize, next: bool) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
-    let x = x.reshape([images / frames, frames, c, h, w]);
+    let x = by_burst(x, frames);
     let part = |first, count| x.clone().narrow(1, first, count);
     let parts = if next {
         vec![part(1, frames - 1), part(frames - 1, 1)]
@@ -122,10 +122,7 @@ impl Cell {
     fn forward(&self, x: Tensor<4>, flows: &Flows, frames: usize) -> Tensor<4> {
         let [images, c, h, w] = x.dims();
         let bursts = images / frames;
-        let by_frame = |x: &Tensor<4>| {
-            let [_, c, h, w] = x.dims();
-            x.clone().reshape([bursts, frames, c, h, w])
-        };
+        let by_frame = |x: &Tensor<4>| by_burst(x.clone(), frames);
         let (inputs, to_next, to_prev) =
             (by_frame(&x), by_frame(&flows.to_next), by_frame(&flows.to_prev));
         let frame = |x: &Tensor<5>, i: usize| {

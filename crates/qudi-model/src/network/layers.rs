@@ -56,6 +56,11 @@ fn zeros<const D: usize>(shape: [usize; D], device: &Device) -> Param<Tensor<D>>
     Param::uninitialized(ParamId::new(), init, device.clone(), true, shape.into())
 }
 
+/// One value for every output of a weight.
+fn bias_or_zeros<const D: usize>(bias: Option<&Param<Tensor<1>>>, weight: &Tensor<D>) -> Tensor<1> {
+    bias.map_or_else(|| Tensor::zeros([weight.dims()[0]], &weight.device()), Param::val)
+}
+
 impl Conv2d {
     /// A layer of zeros; [`super::fill`] gives weights their values by name.
     pub(super) fn zeros(
@@ -92,10 +97,7 @@ impl Conv2d {
 
     fn call(&self, inputs: &[Tensor<4>], options: Options) -> Tensor<4> {
         let weight = self.weight.val();
-        let bias = self
-            .bias
-            .as_ref()
-            .map_or_else(|| Tensor::zeros([weight.dims()[0]], &inputs[0].device()), Param::val);
+        let bias = bias_or_zeros(self.bias.as_ref(), &weight);
         conv_2d(inputs, weight, bias, options)
     }
 }
@@ -120,7 +122,7 @@ impl Conv3d {
         self.call(x, frames, Options { addend: Some(addend), activation, ..Options::default() })
     }
 
-    /// The sum over several inputs joined by channel, cut at zero.
+    /// The sum, cut at zero.
     pub(super) fn relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         self.call(x, frames, Options { activation: Activation::Relu, ..Options::default() })
     }
@@ -133,10 +135,7 @@ impl Conv3d {
 
     fn call(&self, x: Tensor<4>, frames: usize, options: Options) -> Tensor<4> {
         let weight = self.weight.val();
-        let bias = self
-            .bias
-            .as_ref()
-            .map_or_else(|| Tensor::zeros([weight.dims()[0]], &x.device()), Param::val);
+        let bias = bias_or_zeros(self.bias.as_ref(), &weight);
         conv_3d(&[x], weight, bias, frames, options)
     }
 }

@@ -4,6 +4,12 @@ use burn::tensor::Tensor;
 use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::{AvgPoolOptions, PadMode};
 
+/// `[bursts * frames, c, h, w]` as `[bursts, frames, c, h, w]`.
+pub(super) fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
+    let [images, c, h, w] = x.dims();
+    x.reshape([images / frames, frames, c, h, w])
+}
+
 /// Squares of `fold` pixels become channels: `[images, c, h * fold, w * fold]` to `[images, c * fold * fold, h, w]`.
 pub(super) fn fold(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
