@@ -90,8 +90,6 @@ fn best() -> String {
 
 #[allow(unused_variables)] // which backends there are depends on features
 fn create(backend: &str, number: usize) -> Option<Device> {
-    #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal"))]
-    use burn::tensor::DeviceKind;
     match backend {
         #[cfg(feature = "cpu")]
         "cpu" | "flex" => Some(Device::flex()),
@@ -99,9 +97,7 @@ fn create(backend: &str, number: usize) -> Option<Device> {
         #[allow(deprecated)] // asked for by name
         "ndarray" => Some(Device::ndarray()),
         #[cfg(feature = "wgpu")]
-        "wgpu" => {
-            card(DeviceType::Wgpu, number).or_else(|| Some(Device::wgpu(DeviceKind::DefaultDevice)))
-        }
+        "wgpu" => card(DeviceType::Wgpu, number),
         #[cfg(feature = "vulkan")]
         "vulkan" => card(DeviceType::Vulkan, number),
         #[cfg(feature = "metal")]

@@ -104,7 +104,8 @@ fn main() {
     let restore = |tile: usize| {
         let (network, description) = load(&path, &device).unwrap();
         let options = SampleOptions { tile, steps: reverse, ..SampleOptions::default() };
-        let mut restorer = QudiRestorer::new(network, &description, options, &device).unwrap();
+        let mut restorer =
+            QudiRestorer::new(network, &description.network, 11, options, &device).unwrap();
         restorer.restore(BurstView { size, frames: &counts }, &context).unwrap().frames
     };
     let mean = |a: &[Frame], b: &[Frame]| {

@@ -1,6 +1,5 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
-use crate::checkpoint::Description;
 use crate::config::NetworkConfig;
 use crate::measurement::{Planes, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
@@ -48,17 +47,18 @@ pub struct QudiRestorer {
 }
 
 impl QudiRestorer {
-    /// A restorer on `device`, which is where the network's weights are.
+    /// A restorer of windows of `window` frames on `device`, which is where the weights of the network of sizes
+    /// `config` are.
     ///
     /// # Errors
     /// [`SimError::Request`] for options that make no sense.
     pub fn new(
         network: Qudi,
-        description: &Description,
+        config: &NetworkConfig,
+        window: usize,
         options: SampleOptions,
         device: &Device,
     ) -> Result<Self> {
-        let (config, window) = (description.network.clone(), description.window);
         if !(1..=TIMES).contains(&options.steps) {
             let what = format!("{} reverse steps", options.steps);
             return Err(SimError::request(what, "--steps", format!("use 1 to {TIMES}")));
@@ -73,7 +73,8 @@ impl QudiRestorer {
             return Err(SimError::request(what, "--tile", help));
         }
         let schedule = NoiseSchedule::cosine(TIMES);
-        Ok(Self { network, config, schedule, options, device: device.clone(), window })
+        let (config, device) = (config.clone(), device.clone());
+        Ok(Self { network, config, schedule, options, device, window })
     }
 
     /// One sample of a window whose planes are padded to `size`.
@@ -120,9 +121,7 @@ impl QudiRestorer {
         step: &Step,
         flows: &mut Option<Flows>,
     ) -> Result<Vec<f32>> {
-        let tensor = |images: &[f32]| {
-            to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
-        };
+        let tensor = |images: &[f32]| self.tile(job, number, images);
         let fresh;
         let prepared = if let Some(prepared) = &job.prepared {
             prepared
@@ -145,10 +144,13 @@ impl QudiRestorer {
         Ok(values)
     }
 
+    /// Tile `number` of images of the whole frame.
+    fn tile(&self, job: &Job<'_>, number: usize, images: &[f32]) -> Tensor<4> {
+        to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
+    }
+
     fn prepare(&self, job: &Job<'_>, number: usize) -> Prepared {
-        let tensor = |images: &[f32]| {
-            to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
-        };
+        let tensor = |images: &[f32]| self.tile(job, number, images);
         let numbers = sensor_numbers(job.context).to_vec();
         let sensor = TensorData::new(numbers, [1, SENSOR_NUMBERS]);
         self.network.prepare(&Measured {

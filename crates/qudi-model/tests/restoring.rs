@@ -2,7 +2,6 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
-use qudi_model::checkpoint::Description;
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::fill;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
@@ -34,19 +33,7 @@ fn restorer(options: SampleOptions, device: &Device) -> QudiRestorer {
             })
             .collect()
     });
-    let description = Description {
-        program: String::new(),
-        preset: None,
-        network: config,
-        window: 11,
-        sensors: vec![],
-        ppp: [1.0, 30.0],
-        data: vec![],
-        steps: 0,
-        commit: None,
-        licence: String::new(),
-    };
-    QudiRestorer::new(network, &description, options, device).unwrap()
+    QudiRestorer::new(network, &config, 11, options, device).unwrap()
 }
 
 fn counts(size: Size, frames: usize) -> Vec<Vec<u16>> {
@@ -152,18 +139,6 @@ fn what_makes_no_sense_is_refused() {
         .unwrap_err();
     assert!(error.to_string().contains("2 frames") && error.help().is_some(), "{error}");
     let config = NetworkConfig::preset("tiny").unwrap();
-    let description = Description {
-        program: String::new(),
-        preset: None,
-        network: config.clone(),
-        window: 11,
-        sensors: vec![],
-        ppp: [1.0, 2.0],
-        data: vec![],
-        steps: 0,
-        commit: None,
-        licence: String::new(),
-    };
     for options in [
         SampleOptions { steps: 0, ..quick() },
         SampleOptions { steps: 1001, ..quick() },
@@ -171,7 +146,7 @@ fn what_makes_no_sense_is_refused() {
         SampleOptions { tile: 8, ..quick() },
     ] {
         let network = config.init(1, &device);
-        let error = QudiRestorer::new(network, &description, options, &device).unwrap_err();
+        let error = QudiRestorer::new(network, &config, 11, options, &device).unwrap_err();
         assert!(error.place().unwrap().starts_with("--") && error.help().is_some(), "{error}");
     }
 }

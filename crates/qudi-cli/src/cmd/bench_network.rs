@@ -1,7 +1,7 @@
 //! `qudi bench --preset`: speed, memory and size of networks with random weights, by block.
 
 use crate::args::Bench;
-use crate::cmd::bench::burst;
+use crate::cmd::bench::{burst, median};
 use crate::cmd::network::sample_options;
 use crate::device::{self, Opened};
 use crate::error::{Fault, Result};
@@ -9,7 +9,6 @@ use crate::interrupt;
 use crate::memory::Peak;
 use crate::report::{Bar, Report};
 use burn::tensor::{Device, Tensor};
-use qudi_model::checkpoint::Description;
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State};
 use qudi_model::objective::reconstruction;
@@ -116,20 +115,8 @@ fn measure(
     }
     drop(differentiable);
     let (counts, context) = burst(args)?;
-    let description = Description {
-        program: String::new(),
-        preset: Some(preset.to_owned()),
-        network: config.clone(),
-        window: args.frames,
-        sensors: Vec::new(),
-        ppp: [0.0, f64::MAX],
-        data: Vec::new(),
-        steps: 0,
-        commit: None,
-        licence: String::new(),
-    };
     let options = sample_options(&args.network);
-    let mut restorer = QudiRestorer::new(network, &description, options, &device.device)?;
+    let mut restorer = QudiRestorer::new(network, &config, args.frames, options, &device.device)?;
     let peak = Peak::start();
     let start = Instant::now();
     restorer.restore(BurstView { size: args.size, frames: &counts }, &context)?;
@@ -149,11 +136,6 @@ fn measure(
         peak_mib: peak.grown_mib(),
         forward_backward: median(training),
     })
-}
-
-fn median(mut times: Vec<f64>) -> f64 {
-    times.sort_by(f64::total_cmp);
-    times[times.len() / 2]
 }
 
 /// Inputs of a step: values do not matter for speed.

@@ -23,12 +23,12 @@ pub(crate) fn restorer(
             "name a file that `qudi train` wrote, or use another --method",
         ));
     };
-    let description = checkpoint::describe(path)?;
-    check(&description, context)?;
     let device = device::open(&options.device)?;
     let (network, description) = checkpoint::load(path, &device.device)?;
-    let restorer =
-        QudiRestorer::new(network, &description, sample_options(options), &device.device)?;
+    check(&description, context)?;
+    let (config, window) = (&description.network, description.window);
+    let sampling = sample_options(options);
+    let restorer = QudiRestorer::new(network, config, window, sampling, &device.device)?;
     let steps = options.steps;
     let choice =
         format!(" in {steps} step{} on {}", if steps == 1 { "" } else { "s" }, device.name);
