@@ -21,6 +21,7 @@
 pub mod burst;
 mod camera;
 pub mod capture;
+pub mod dataset;
 pub mod error;
 mod frame;
 mod light;

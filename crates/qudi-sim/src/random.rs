@@ -14,6 +14,8 @@ pub(crate) enum Domain {
     Pattern = 2,
     /// The layout of a procedural scene.
     Scene = 3,
+    /// What training draws.
+    Training = 4,
 }
 
 /// Rows per frame that have streams of their own (2^24); frames get the 38 bits above them.

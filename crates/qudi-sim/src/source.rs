@@ -14,8 +14,8 @@ mod synthetic;
 mod video;
 mod y4m;
 
-pub(crate) use image_file::decode_image;
 pub use image_file::read_still;
+pub(crate) use image_file::{decode_image, is_image};
 pub use input::{Input, Sampling};
 pub(crate) use video::Video;
 

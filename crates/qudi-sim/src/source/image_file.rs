@@ -9,6 +9,12 @@ use std::path::Path;
 /// Extensions of image files.
 pub(super) const EXTENSIONS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
 
+/// Whether a file's name is that of an image.
+pub(crate) fn is_image(path: &Path) -> bool {
+    let known = |e: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known));
+    path.extension().is_some_and(known) && path.is_file()
+}
+
 /// Reads one image as gray values in [0, 1]; an alpha channel is ignored.
 ///
 /// # Errors

@@ -1,7 +1,7 @@
 //! A folder of image files, in the order of the numbers in their names.
 
 use super::FrameReader;
-use super::image_file::{EXTENSIONS, read_still};
+use super::image_file::{EXTENSIONS, is_image, read_still};
 use crate::error::{Result, SimError};
 use crate::frame::{Frame, Size};
 use crate::natural_order::natural_order;
@@ -22,10 +22,7 @@ impl ImageFolder {
         let mut files = Vec::new();
         for entry in std::fs::read_dir(folder).map_err(read)? {
             let path = entry.map_err(read)?.path();
-            let is_image = path
-                .extension()
-                .is_some_and(|e| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known)));
-            if is_image && path.is_file() {
+            if is_image(&path) {
                 files.push(path);
             }
         }

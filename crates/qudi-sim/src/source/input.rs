@@ -149,6 +149,20 @@ impl Input {
         Ok(input)
     }
 
+    /// A recorded clip: a folder of frames or a file.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is none.
+    pub fn clip(path: &Path) -> Result<Self> {
+        Self::parse(&path.to_string_lossy(), None, None, 0, 0.0)
+    }
+
+    /// One image, at rest.
+    pub fn still(path: &Path) -> Self {
+        let motion = StillMotion::default();
+        Self::Still { path: path.to_owned(), motion, size: None, seed: 0 }
+    }
+
     /// Copies standard input to a temporary file, so that the clip can be read twice.
     /// Does nothing for other kinds. `on` is asked between pieces whether to go on.
     ///

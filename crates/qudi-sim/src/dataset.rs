@@ -1,0 +1,16 @@
+//! Training data: clips, stills and procedural scenes, drawn sample by sample.
+//!
+//! Files are decoded once, into a [`Pack`]; a [`Dataset`] draws from it. Sample `k` of seed `s` is the same on any
+//! machine and for any number of threads.
+
+mod config;
+mod content;
+mod crop;
+mod draw;
+mod pack;
+mod pack_writer;
+
+pub use config::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
+pub use draw::{Dataset, Sample};
+pub use pack::{Clip, Pack};
+pub use pack_writer::{PackProgress, write_pack};
