@@ -7,6 +7,9 @@
 //! [`objective`]. The device a tensor lives on decides the backend; this crate chooses none.
 #![warn(missing_docs)]
 
+#[cfg(test)]
+#[path = "../../../tests/golden/cases.rs"]
+mod cases;
 pub mod checkpoint;
 pub mod config;
 mod cost;

@@ -1,14 +1,12 @@
 //! Every block, and the whole network, against PyTorch, forward and backward, on both CPU backends.
 #![allow(clippy::unwrap_used)]
 
-#[path = "../../../../tests/golden/cases.rs"]
-mod cases;
-
 use super::attention::Attention;
 use super::flow::Flows;
 use super::pre::DenseBlock;
 use super::unet::ResidualBlock;
 use super::{Measured, Pyramid, SENSOR_NUMBERS, Simulated, State, fill, resample};
+use crate::cases::{self, Case, File, parameter};
 use crate::config::NetworkConfig;
 use crate::measurement::sensor_numbers;
 use crate::objective::reconstruction;
@@ -18,7 +16,6 @@ use crate::tensor::{read, to_tensor};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Gradients, Tensor};
-use cases::{Case, File, parameter};
 use qudi_sim::Size;
 use qudi_sim::restore::Context;
 
