@@ -20,5 +20,6 @@ pub use flow::{Flow, Flows};
 pub use fusion::Fusion;
 pub use pre::PreDenoiser;
 pub use qudi::{Measured, Prediction, Prepared, Qudi, Simulated, State};
+pub(crate) use resample::{fold, halve};
 pub use unet::UNet;
 pub use weights::{fill, parameters};

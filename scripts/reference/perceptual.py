@@ -1,0 +1,204 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["lpips", "numpy", "safetensors", "torch", "torchvision"]
+# ///
+"""Golden values of the perceptual distances for the Rust tests, in tests/golden/perceptual.
+
+    python scripts/reference/perceptual.py [FOLDER HEADS]
+
+LPIPS is the authors' package with torchvision's networks, their weights made by a formula: weight
+NAME of network NET (`vgg`, `alex`, `squeeze`) is sqrt(6 / fan-in) * uniform("NET.NAME") and a bias
+0.05 * uniform("NET.NAME"), heads are uniform squared / 10 (`uniform.py`), all rounded to float32.
+MS-SSIM and the oriented filters are written here a second time, from their definitions.
+
+`distances.safetensors`: `p`, `q` [2, 64, 75] are images in 255ths, `q` a blurred, darker, noisy `p`.
+Per kind, computed in float64: `KIND/distance` [2], and of the gradient of their mean by `p`
+`KIND/gradient` [67]: its largest magnitude, its norm, its product with uniform("probe.p"), and its values
+at the flat indices 149 i.
+
+`zip.pth` and `plain.pth` are the two layouts of torch.save: `a.weight` [2, 3], `b.weight` [3, 2, 1, 1] (both
+uniform(name)), `half` (16 bits), `turned` (not in rows) and `bad` (holds a NaN). `code.pth` calls a function.
+
+With a FOLDER, for checking by hand: writes there the networks of the formula under torchvision's names, copies
+of the published heads (HEADS/{vgg,alex,squeeze}.pth), and prints the distances with these.
+"""
+
+import math
+import shutil
+import sys
+import warnings
+from pathlib import Path
+
+import lpips
+import numpy as np
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import Tensor
+from uniform import uniform
+
+OUT = Path(__file__).resolve().parents[2] / "tests/golden/perceptual"
+NETS = {"vgg": "vgg16-397923af", "alex": "alexnet-owt-7be5be79", "squeeze": "squeezenet1_1-b8a52dc0"}
+
+
+def images() -> tuple[Tensor, Tensor]:
+    """Two pictures of discs and stripes, and what a poor restoration might make of them."""
+    rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(75.0), indexing="ij")
+    discs = (((rows - 30) ** 2 + (columns - 40) ** 2) < 300).double() * 0.5 + columns / 300
+    stripes = 0.5 + 0.4 * torch.sin(rows / 2.5 + columns / 4) * (columns > 30)
+    p = torch.stack([discs, stripes.double()])[:, None]
+    blurred = F.avg_pool2d(F.pad(p, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    noise = torch.from_numpy(uniform("noise", p.numel())).reshape(p.shape)
+    grain = torch.from_numpy(uniform("grain", p.numel())).reshape(p.shape)
+    q = 0.9 * blurred + 0.1 * noise
+    return [(x.clamp(0, 1) * 255).round().to(torch.uint8) for x in (p + 0.02 * grain, q)]
+
+
+def parameter(name: str, shape: tuple[int, ...]) -> Tensor:
+    values = uniform(name, math.prod(shape)).reshape(shape)
+    if ".lin" in name:
+        values = values**2 / 10
+    elif len(shape) > 1:
+        values = values * math.sqrt(6 / math.prod(shape[1:]))
+    else:
+        values = values * 0.05
+    return torch.from_numpy(values.astype(np.float32))
+
+
+def formula(net: str) -> tuple[lpips.LPIPS, dict[str, Tensor], dict[str, Tensor]]:
+    """LPIPS, and the weights of backbone and heads under their published names."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = lpips.LPIPS(net=net, pretrained=False, pnet_rand=True, verbose=False)
+    backbone = {}
+    for part, module in model.net.named_children():  # slices of torchvision's `features`
+        for name, value in module.state_dict().items():
+            assert part.startswith("slice")
+            backbone[f"features.{name}"] = parameter(f"{net}.features.{name}", tuple(value.shape))
+            module.state_dict()[name].copy_(backbone[f"features.{name}"])
+    heads = {}
+    for tap, lin in enumerate(model.lins):
+        name = f"lin{tap}.model.1.weight"
+        weight = lin.model[1].weight
+        heads[name] = parameter(f"{net}.{name}", tuple(weight.shape))
+        weight.data.copy_(heads[name])
+    return model.eval(), backbone, heads
+
+
+def lpips_distance(model: lpips.LPIPS, p: Tensor, q: Tensor) -> Tensor:
+    gray = lambda x: x.expand(-1, 3, -1, -1)
+    return model(gray(p), gray(q), normalize=True).flatten()
+
+
+def ms_ssim_distance(p: Tensor, q: Tensor) -> Tensor:
+    """Wang et al. 2003, with a window in two dimensions."""
+    place = torch.arange(11, dtype=p.dtype) - 5
+    window = torch.exp(-(place[:, None] ** 2 + place**2) / (2 * 1.5**2))
+    window = (window / window.sum())[None, None]
+    mean = lambda x: F.conv2d(x, window)
+    weights = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333]
+    weights = [w for k, w in enumerate(weights) if k == 0 or min(p.shape[2:]) >> k >= 11]
+    similarity = torch.ones(len(p), dtype=p.dtype)
+    for k, weight in enumerate(weights):
+        mp, mq = mean(p), mean(q)
+        vp, vq, cov = mean(p * p) - mp**2, mean(q * q) - mq**2, mean(p * q) - mp * mq
+        value = (2 * cov + 0.03**2) / (vp + vq + 0.03**2)
+        if k + 1 == len(weights):
+            value = value * (2 * mp * mq + 0.01**2) / (mp**2 + mq**2 + 0.01**2)
+        similarity = similarity * value.mean((1, 2, 3)).clamp(min=1e-3) ** (weight / sum(weights))
+        p, q = F.avg_pool2d(p, 2), F.avg_pool2d(q, 2)
+    return 1 - similarity
+
+
+def gabor(angle: float, phase: float) -> np.ndarray:
+    rows, columns = np.mgrid[-4:5, -4:5]
+    window = np.exp(-(rows**2 + columns**2) / 8)
+    wave = np.cos(np.pi / 2 * (columns * np.cos(angle) + rows * np.sin(angle)) - phase)
+    even = window * (wave - (window * wave).sum() / window.sum())
+    return even / (even * wave).sum()
+
+
+def oriented_distance(p: Tensor, q: Tensor) -> Tensor:
+    """Teo and Heeger 1994, small."""
+    angles = [k * np.pi / 4 for k in range(4)]
+    even, odd = (torch.from_numpy(np.stack([gabor(a, f) for a in angles]))[:, None].to(p.dtype) for f in (0, np.pi / 2))
+    parts = []
+    for k in range(4):
+        if k and min(p.shape[2:]) < 9:
+            break
+        features = []
+        for x in (p, q):
+            e, o = F.conv2d(x, even), F.conv2d(x, odd)
+            power = e**2 + o**2
+            total = power.sum(1, keepdim=True) + 0.02**2
+            features.append((e / total.sqrt(), o / total.sqrt(), power / total))
+        parts.append(sum(((a - b) ** 2).sum(1).mean((1, 2)) for a, b in zip(*features)))
+        p, q = F.avg_pool2d(p, 2), F.avg_pool2d(q, 2)
+    return sum(parts) / len(parts)
+
+
+def add(tensors: dict[str, Tensor], kind: str, distance, p: Tensor, q: Tensor) -> None:
+    p = (p.double() / 255).float().double().requires_grad_()
+    q = (q.double() / 255).float().double()
+    values = distance(p, q)
+    values.mean().backward()
+    flat = p.grad.flatten()
+    probe = torch.from_numpy(uniform("probe.p", len(flat)))
+    facts = torch.stack([flat.abs().max(), flat.norm(), flat @ probe])
+    tensors[f"{kind}/distance"] = values.detach().float()
+    tensors[f"{kind}/gradient"] = torch.cat([facts, flat[::149][:64]]).float()
+    print(f"{kind}: {values.tolist()}, largest gradient {facts[0]:.2e}")
+
+
+class Call:
+    """Pickled, this asks whoever reads it to run a command."""
+
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+def state_dicts() -> None:
+    value = lambda name, *shape: torch.from_numpy(uniform(name, math.prod(shape)).astype(np.float32)).reshape(shape)
+    state = {
+        "a.weight": value("a.weight", 2, 3),
+        "b.weight": value("b.weight", 3, 2, 1, 1),
+        "half": value("half", 4).half(),
+        "turned": value("turned", 3, 2).T,
+        "bad": torch.tensor([1.0, float("nan")]),
+    }
+    # One storage for two tensors: the second starts within it.
+    state["both.first"], state["both.last"] = value("both", 10).split([4, 6])
+    torch.save(state, OUT / "zip.pth")
+    torch.save(state, OUT / "plain.pth", _use_new_zipfile_serialization=False)
+    torch.save({"a.weight": Call()}, OUT / "code.pth")
+
+
+def main() -> None:
+    p, q = images()
+    if len(sys.argv) == 3:
+        folder, heads = map(Path, sys.argv[1:])
+        for net, name in NETS.items():
+            model, backbone, _ = formula(net)
+            torch.save(backbone, folder / f"{name}.pth", _use_new_zipfile_serialization=net != "alex")
+            shutil.copyfile(heads / f"{net}.pth", folder / f"{net}_lpips.pth")
+            state = torch.load(heads / f"{net}.pth", map_location="cpu", weights_only=True)
+            model.load_state_dict(state, strict=False)
+            distances = lpips_distance(model, p.float() / 255, q.float() / 255)
+            print(f"lpips-{net}: {distances.tolist()}")
+        return
+    OUT.mkdir(parents=True, exist_ok=True)
+    tensors = {"p": p[:, 0].contiguous(), "q": q[:, 0].contiguous()}
+    for net in NETS:
+        model = formula(net)[0].double()
+        add(tensors, f"lpips-{net}", lambda p, q: lpips_distance(model, p, q), p, q)
+    add(tensors, "ms-ssim", ms_ssim_distance, p, q)
+    add(tensors, "oriented", oriented_distance, p, q)
+    save_file(tensors, OUT / "distances.safetensors")
+    state_dicts()
+    for path in OUT.iterdir():
+        path.chmod(0o644)
+        print(f"{path.name}: {path.stat().st_size} bytes")
+
+
+if __name__ == "__main__":
+    main()
