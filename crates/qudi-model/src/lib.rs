@@ -4,7 +4,8 @@
 //! [`config`], predicts clean frames from them and from a noisy image; the [`sampler`] takes noise to a
 //! picture along the noise [`schedule`], measuring every estimate again with the sensor ([`physics`]); the
 //! [`restorer`] does so for whole windows, tile by tile. Weights are a [`checkpoint`]; training minimises the
-//! [`objective`] and a [`perceptual`] distance. The device a tensor lives on decides the backend; this crate chooses none.
+//! [`objective`], of which a [`perceptual`] distance can be a part. The device a tensor lives on decides the
+//! backend; this crate chooses none.
 #![warn(missing_docs)]
 
 #[cfg(test)]

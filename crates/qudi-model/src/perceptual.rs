@@ -199,6 +199,12 @@ impl Perceptual {
     }
 }
 
+/// Where weights are looked for if no folder is given: where Burn's own LPIPS keeps its downloads. None if the
+/// system names no home.
+pub fn cache_folder() -> Option<PathBuf> {
+    files::cache()
+}
+
 /// Downloads the weights of a kind into `folder`, by the `curl` program, and checks their hashes. Files that are
 /// there already are checked and kept. Gives the paths: none for kinds without weights.
 ///

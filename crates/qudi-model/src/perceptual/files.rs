@@ -99,7 +99,7 @@ fn locate(files: &[WeightFile; 2], kind: &str, folders: &[PathBuf]) -> Result<[P
 }
 
 /// Where Burn's own LPIPS keeps its downloads.
-fn cache() -> Option<PathBuf> {
+pub(super) fn cache() -> Option<PathBuf> {
     let variable =
         |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let home = std::env::home_dir;
