@@ -59,7 +59,8 @@ pub fn save(
         return Err(error);
     }
     let text = serde_json::to_string(description).expect("plain data");
-    let metadata = HashMap::from([(KEY.to_owned(), text), ("format".to_owned(), "pt".to_owned())]);
+    // One entry only: the library writes several in any order, and equal weights should make equal files.
+    let metadata = HashMap::from([(KEY.to_owned(), text)]);
     let views = values.list.iter().map(|(name, shape, bytes)| {
         let view = TensorView::new(Dtype::F32, shape.clone(), bytes);
         (name, view.expect("as many bytes as the shape says"))

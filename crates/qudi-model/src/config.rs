@@ -19,6 +19,23 @@ pub struct NetworkConfig {
     pub fusion: FusionConfig,
     /// U-Net.
     pub unet: UNetConfig,
+    /// What is left out, to measure what it is worth.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub without: Vec<Part>,
+}
+
+/// A part of the method that can be left out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Part {
+    /// The measurement of every estimate by the sensor model.
+    Physics,
+    /// Optical flow: neighbours are taken as they are.
+    Flow,
+    /// The previous estimate as an input.
+    SelfConditioning,
+    /// The exposure as an input.
+    Exposure,
 }
 
 /// Sizes of the pre-denoiser.
@@ -115,6 +132,11 @@ impl NetworkConfig {
         let document: Document = toml::from_str(text)
             .map_err(|e| SimError::request(e.message(), name, "correct the preset's file"))?;
         document.network.checked()
+    }
+
+    /// Whether a part is left out.
+    pub fn lacks(&self, part: Part) -> bool {
+        self.without.contains(&part)
     }
 
     /// Height and width of the frames are multiples of this.

@@ -26,3 +26,4 @@ pub mod schedule;
 pub mod selftest;
 pub mod tensor;
 pub mod tiles;
+pub mod train;

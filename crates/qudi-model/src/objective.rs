@@ -3,6 +3,7 @@
 
 use crate::measurement::Planes;
 use crate::network::{Measured, Qudi, Simulated, State};
+use crate::perceptual::Perceptual;
 use crate::physics::LoopSensor;
 use crate::sampler::TIMES;
 use crate::schedule::NoiseSchedule;
@@ -10,7 +11,7 @@ use crate::tensor::{read, to_tensor};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use qudi_sim::restore::Context;
-use qudi_sim::{Result, Size};
+use qudi_sim::{Result, SimError, Size};
 
 /// Weight of the total variation of the error.
 const VARIATION: f32 = 0.01;
@@ -22,12 +23,28 @@ pub struct LossWeights {
     pub prediction: f32,
     /// Of the pre-denoised frames.
     pub pre: f32,
+    /// Of the perceptual term, if there is one.
+    pub perceptual: f32,
 }
 
 impl Default for LossWeights {
     fn default() -> Self {
-        Self { prediction: 1.0, pre: 0.2 }
+        Self { prediction: 1.0, pre: 0.2, perceptual: 0.0 }
     }
+}
+
+/// What a pass makes use of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Switches {
+    /// The sensor inside the loop.
+    pub physics: bool,
+    /// The previous estimate as an input.
+    pub self_conditioning: bool,
+}
+
+impl Switches {
+    /// Everything.
+    pub const ALL: Self = Self { physics: true, self_conditioning: true };
 }
 
 /// `mean (p - q)^2 + 0.01 (mean |across| + mean |down|)`, where across and down are differences of neighbours of
@@ -80,6 +97,8 @@ pub struct Terms {
     pub prediction: Tensor<1>,
     /// Of the pre-denoised frames.
     pub pre: Tensor<1>,
+    /// The perceptual distance of the prediction.
+    pub perceptual: Option<Tensor<1>>,
 }
 
 /// A diffusion time to train at, from two uniform numbers in [0, 1): a fifth of all at the start, where sampling
@@ -97,6 +116,8 @@ pub fn terms(
     example: &Example<'_>,
     first_pass: FirstPass,
     weights: LossWeights,
+    switches: Switches,
+    perceptual: Option<&Perceptual>,
 ) -> Result<Terms> {
     let schedule = NoiseSchedule::cosine(TIMES);
     let clean = example.truth.clone() * 2.0 - 1.0;
@@ -119,16 +140,23 @@ pub fn terms(
             let earlier: Vec<usize> =
                 example.times.iter().map(|t| (t + STRIDE).min(TIMES - 1)).collect();
             let x_t = noisy(&earlier);
-            estimate(network, example, x_t, earlier, seed)?
+            let (x0_prev, simulated) = estimate(network, example, x_t, earlier, seed)?;
+            let x0_prev = if switches.self_conditioning { x0_prev } else { clean.zeros_like() };
+            (x0_prev, simulated.filter(|_| switches.physics))
         }
     };
     let state = State { x_t: noisy(example.times), x0_prev, times: example.times.to_vec() };
     let prepared = network.prepare(example.measured);
     let result = network.forward(&prepared, simulated.as_ref(), &state, None);
-    let prediction = reconstruction((result.x0 + 1.0) * 0.5, example.truth.clone());
+    let image = (result.x0 + 1.0) * 0.5;
+    let prediction = reconstruction(image.clone(), example.truth.clone());
+    let perceptual = perceptual.map(|term| term.loss(image, example.truth.clone()));
     let pre = reconstruction(result.d, example.truth.clone());
-    let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
-    Ok(Terms { total, prediction, pre })
+    let mut total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
+    if let Some(term) = &perceptual {
+        total = total + term.clone() * weights.perceptual;
+    }
+    Ok(Terms { total, prediction, pre, perceptual })
 }
 
 /// The network's own estimate, without gradient, and its simulated measurement. Bursts at the last time have
@@ -154,6 +182,13 @@ fn estimate(
     let [_, _, height, width] = example.truth.dims();
     let size = Size { height, width };
     let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;
+    if !x0.iter().all(|value| value.is_finite()) {
+        return Err(SimError::request(
+            "the network's estimate in the first pass is no number any more: the last checkpoint is good",
+            "the first pass",
+            "lower train.rate or train.clip and go on from the checkpoint with --resume",
+        ));
+    }
     let burst = measured.frames * size.pixels();
     let mut planes = Planes { y: Vec::new(), u: Vec::new() };
     let exists: Vec<bool> = example.times.iter().map(|&t| t < TIMES - 1).collect();

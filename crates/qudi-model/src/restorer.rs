@@ -1,6 +1,6 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
-use crate::config::NetworkConfig;
+use crate::config::{NetworkConfig, Part};
 use crate::measurement::{Planes, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
 use crate::noise::Noise;
@@ -84,9 +84,10 @@ impl QudiRestorer {
         let pixels = job.size.pixels();
         let mut x: Vec<f32> = frames().flat_map(|frame| noise.frame(frame, 0, pixels)).collect();
         let mut x0 = vec![0.0; x.len()];
+        let nothing = x0.clone();
         let mut flows: Vec<Option<Flows>> = vec![None; job.tiles.count()];
         for step in self.options.sampler.steps(&self.schedule, self.options.steps) {
-            let simulated = if step.number == 1 {
+            let simulated = if step.number == 1 || self.config.lacks(Part::Physics) {
                 None
             } else {
                 let sensor = LoopSensor::at(job.context, step.time, TIMES);
@@ -97,9 +98,11 @@ impl QudiRestorer {
             if self.config.flow.steps.contains(&step.number) {
                 flows.fill(None);
             }
+            let given = if self.config.lacks(Part::SelfConditioning) { &nothing } else { &x0 };
             let mut next = vec![0.0; x.len()];
             for (number, flows) in flows.iter_mut().enumerate() {
-                let tile = self.predict(job, number, simulated.as_ref(), &x, &x0, &step, flows)?;
+                let tile =
+                    self.predict(job, number, simulated.as_ref(), &x, given, &step, flows)?;
                 job.tiles.blend(number, &tile, &mut next);
             }
             x0 = next;

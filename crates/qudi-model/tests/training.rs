@@ -8,7 +8,9 @@ use qudi_model::config::NetworkConfig;
 use qudi_model::measurement::{Planes, sensor_numbers};
 use qudi_model::network::{Measured, Qudi};
 use qudi_model::noise::Noise;
-use qudi_model::objective::{Example, FirstPass, LossWeights, Terms, terms, training_time};
+use qudi_model::objective::{
+    Example, FirstPass, LossWeights, Switches, Terms, terms, training_time,
+};
 use qudi_model::tensor::to_tensor;
 use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::sensor::Sensor;
@@ -71,7 +73,7 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
         times: &[time],
     };
     let first_pass = if number.is_multiple_of(2) { FirstPass::No } else { FirstPass::Yes(number) };
-    terms(network, &example, first_pass, LossWeights::default()).unwrap()
+    terms(network, &example, first_pass, LossWeights::default(), Switches::ALL, None).unwrap()
 }
 
 /// Names of parameters whose gradient is missing or zero.

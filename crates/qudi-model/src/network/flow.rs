@@ -31,16 +31,18 @@ pub struct Flow {
     /// Finest first.
     levels: Vec<Level>,
     scale: usize,
+    /// Whether nothing moves.
+    off: bool,
 }
 
 impl FlowConfig {
-    /// The flow network, weights zero.
-    pub fn init(&self, device: &Device) -> Flow {
+    /// The flow network, weights zero; `off` says that nothing moves.
+    pub fn init(&self, off: bool, device: &Device) -> Flow {
         let [a, b, c, d] = self.widths;
         let sizes = [[4, a], [a, b], [b, c], [c, d], [d, 2]];
         let layer = |sizes| Conv2d::zeros(sizes, 7, Bias::Yes, device);
         let level = |_| Level { layers: sizes.map(layer).into() };
-        Flow { levels: (0..self.levels).map(level).collect(), scale: self.scale }
+        Flow { levels: (0..self.levels).map(level).collect(), scale: self.scale, off }
     }
 }
 
@@ -48,12 +50,12 @@ impl Flow {
     /// Flows between the pre-denoised frames `d`, `[bursts * frames, 1, height, width]`.
     pub fn forward(&self, d: Tensor<4>, frames: usize) -> Flows {
         let [images, _, height, width] = d.dims();
-        let finest = shrink(d, self.scale);
         let grid = [height / self.scale, width / self.scale];
-        if frames < 2 {
-            let none = Tensor::zeros([images, 2, grid[0], grid[1]], &finest.device());
+        if frames < 2 || self.off {
+            let none = Tensor::zeros([images, 2, grid[0], grid[1]], &d.device());
             return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
         }
+        let finest = shrink(d, self.scale);
         // Both directions of every pair of neighbours at once.
         let mut references = both(finest, frames);
         let mut pyramid = Vec::with_capacity(self.levels.len());

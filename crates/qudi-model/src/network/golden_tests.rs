@@ -209,7 +209,7 @@ fn flow() {
     let file = File::open("flow");
     for device in devices() {
         for case in file.cases() {
-            let flow = weighted(config(&case).flow.init(&device), "flow");
+            let flow = weighted(config(&case).flow.init(false, &device), "flow");
             let d: Tensor<4> = case.input("d", &device).require_grad();
             let flows = flow.forward(d.clone(), case.number("frames"));
             let outputs = [("to_next", flows.to_next), ("to_prev", flows.to_prev)];

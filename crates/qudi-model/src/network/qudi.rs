@@ -5,7 +5,7 @@ use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
 use super::pre::PreDenoiser;
 use super::unet::UNet;
-use crate::config::NetworkConfig;
+use crate::config::{NetworkConfig, Part};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -90,7 +90,7 @@ impl NetworkConfig {
             pre: self.pre.init(self.fold, device),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
-            flow: self.flow.init(device),
+            flow: self.flow.init(self.lacks(Part::Flow), device),
             fusion: self.fusion.init(&self.features, self.pre.width, self.fold, device),
             unet: self.unet.init(&self.fusion, self.fold, device),
         }

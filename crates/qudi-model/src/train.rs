@@ -1,0 +1,25 @@
+//! Learning the network from photons: data, loop, state, validation.
+//!
+//! A [`Recipe`] says everything that decides the result. A [`Feed`] draws batches on threads of its own; the
+//! [`Trainer`] learns from them, step by step; a [`Run`] does so in a folder that a killed run goes on from.
+
+mod adam;
+mod batch;
+mod feed;
+mod learning_rate;
+mod recipe;
+mod run;
+mod state;
+mod trainer;
+mod validate;
+mod values;
+
+pub use adam::Adam;
+pub use batch::Batch;
+pub use feed::Feed;
+pub use learning_rate::learning_rate;
+pub use recipe::{LossConfig, Recipe, TrainConfig, ValidationConfig};
+pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
+pub use trainer::{Losses, StepReport, Trainer};
+pub use validate::{Validation, ValidationClip, Validator};
+pub use values::{gradients, values, with_values};

@@ -1,0 +1,108 @@
+//! Samples as planes, noise and times, ready to go to a device.
+
+use super::recipe::Recipe;
+use crate::config::Part;
+use crate::measurement::{Planes, sensor_numbers};
+use crate::network::{Measured, SENSOR_NUMBERS};
+use crate::noise::Noise;
+use crate::objective::{Example, training_time};
+use crate::tensor::to_tensor;
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_sim::dataset::Dataset;
+use qudi_sim::restore::{BurstView, Context};
+use qudi_sim::{Result, Size};
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+
+/// Exposure that networks without that input are told.
+const USUAL_EXPOSURE: f64 = 0.45;
+
+/// Samples for one pass.
+#[derive(Clone, Debug)]
+pub struct Batch {
+    /// Number of the batch in its run.
+    pub number: u64,
+    size: Size,
+    frames: usize,
+    planes: Planes,
+    truth: Vec<f32>,
+    noise: Vec<f32>,
+    numbers: Vec<f32>,
+    contexts: Vec<Context>,
+    times: Vec<usize>,
+}
+
+impl Batch {
+    /// Batch `number` of a recipe.
+    ///
+    /// # Errors
+    /// [`qudi_sim::SimError`] if the data cannot be read.
+    pub fn draw(recipe: &Recipe, dataset: &mut Dataset, number: u64) -> Result<Self> {
+        let (seed, count) = (recipe.train.seed, recipe.train.batch);
+        let size = Size { height: recipe.data.crop, width: recipe.data.crop };
+        let frames = recipe.data.frames;
+        let mut batch = Self {
+            number,
+            size,
+            frames,
+            planes: Planes { y: Vec::new(), u: Vec::new() },
+            truth: Vec::new(),
+            noise: Vec::new(),
+            numbers: Vec::new(),
+            contexts: Vec::new(),
+            times: Vec::new(),
+        };
+        for sample in (number * count as u64..).take(count) {
+            let mut drawn = dataset.sample(seed, sample)?;
+            if recipe.network.lacks(Part::Exposure) {
+                drawn.context.exposure = USUAL_EXPOSURE;
+            }
+            let view = BurstView { size, frames: &drawn.counts };
+            let planes = Planes::of(view, &drawn.context);
+            batch.planes.y.extend(planes.y);
+            batch.planes.u.extend(planes.u);
+            batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
+            let noise = Noise::new(drawn.context.seed, 0);
+            let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
+            batch.noise.extend(noise);
+            batch.numbers.extend(sensor_numbers(&drawn.context));
+            let mut random = ChaCha8Rng::seed_from_u64(drawn.context.seed);
+            batch.times.push(training_time(random.random(), random.random()));
+            batch.contexts.push(drawn.context);
+        }
+        Ok(batch)
+    }
+
+    /// Samples in it.
+    pub fn len(&self) -> usize {
+        self.contexts.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.contexts.is_empty()
+    }
+
+    /// What was measured, on `device`.
+    pub(super) fn measured(&self, device: &Device) -> Measured {
+        let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
+        Measured {
+            y: to_tensor(self.planes.y.clone(), self.size, device),
+            u: to_tensor(self.planes.u.clone(), self.size, device),
+            sensor: Tensor::from_data(numbers, device),
+            frames: self.frames,
+        }
+    }
+
+    /// The batch as an example of the objective, on the device of `measured`.
+    pub(super) fn example<'a>(&'a self, measured: &'a Measured) -> Example<'a> {
+        let device = measured.y.device();
+        Example {
+            measured,
+            truth: to_tensor(self.truth.clone(), self.size, &device),
+            contexts: &self.contexts,
+            noise: to_tensor(self.noise.clone(), self.size, &device),
+            times: &self.times,
+        }
+    }
+}
