@@ -6,6 +6,7 @@ mod network;
 mod reading;
 mod restore;
 mod simulate;
+mod train;
 
 pub(crate) use convert::{Calibrate, Convert};
 pub(crate) use eval::{Bench, Eval, External, Protocol};
@@ -13,6 +14,7 @@ pub(crate) use network::{Network, SamplerName};
 pub(crate) use reading::Reading;
 pub(crate) use restore::Restore;
 pub(crate) use simulate::Simulate;
+pub(crate) use train::Train;
 
 use clap::{ArgGroup, Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
 use clap_complete::Shell;
@@ -85,6 +87,7 @@ pub(crate) enum Color {
 pub(crate) enum Command {
     Simulate(Box<Simulate>),
     Restore(Box<Restore>),
+    Train(Box<Train>),
     Eval(Box<Eval>),
     Bench(Box<Bench>),
     Selftest(Selftest),

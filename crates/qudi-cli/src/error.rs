@@ -13,6 +13,8 @@ pub(crate) enum Fault {
     Error { what: String, place: Option<String>, help: Option<String> },
     /// It worked, but a bar that was set has been missed; the results are out already.
     Missed(String),
+    /// Ctrl-C, after what was done has been saved.
+    Stopped(String),
     /// Ctrl-C.
     Interrupted,
     /// The reader of our output has gone.

@@ -102,6 +102,10 @@ impl Report {
                 self.remark("interrupted: nothing was written");
                 ExitCode::from(interrupt::EXIT_CODE)
             }
+            Fault::Stopped(what) => {
+                self.remark(what);
+                ExitCode::from(interrupt::EXIT_CODE)
+            }
             Fault::Missed(what) => {
                 self.remark(what);
                 ExitCode::from(1)
@@ -155,6 +159,25 @@ impl Bar {
             let total = total.map_or("?".to_owned(), |total| total.to_string());
             tracing::info!("{what}: {done}/{total} frames");
         }
+    }
+}
+
+impl Bar {
+    /// Progress of training, with words of its own.
+    pub(crate) fn learning(&mut self, words: String, done: u64, total: u64) {
+        self.bar.set_length(total);
+        self.bar.set_position(done);
+        let percent = 100 * done / total.max(1);
+        if percent > self.tenth {
+            self.tenth = percent;
+            tracing::info!("step {done}/{total}: {words}");
+        }
+        self.bar.set_message(words);
+    }
+
+    /// A remark above the bar.
+    pub(crate) fn above(&self, text: &str, report: &Report) {
+        self.bar.suspend(|| report.remark(text));
     }
 }
 

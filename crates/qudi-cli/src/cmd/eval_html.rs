@@ -42,7 +42,8 @@ pub(crate) fn html(rows: &[Row], pictures: &[Pictures], about: &str) -> String {
     page + "<script>" + SCRIPT + "</script>\n</body></html>\n"
 }
 
-fn escape(text: &str) -> String {
+/// Text that holds no markup.
+pub(crate) fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

@@ -1,0 +1,46 @@
+//! Options of `qudi train`.
+
+use clap::{Args as ClapArgs, ValueHint};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+/// Learn a network from videos, stills and procedural scenes
+///
+/// A recipe says everything that decides the result; --set KEY=VALUE changes it, as in --set train.steps=1000. The run's
+/// folder gets the recipe, metrics, pictures, weights.safetensors for `qudi restore --weights`, and the state that
+/// --resume goes on from, exactly.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Train {
+    /// The recipe: tiny, small, base, paper, or a .toml file [default with --resume: the run's own]
+    pub(crate) recipe: Option<String>,
+    /// Folder of the run
+    #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present = "cache_only")]
+    pub(crate) output: Option<PathBuf>,
+    /// Folder that the recipe's files lie in
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
+    pub(crate) data: Option<PathBuf>,
+    /// Decoded data in one file; made from --data if it is not there [default: pack.zip in the run's folder]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) pack: Option<PathBuf>,
+    /// Make the pack, and stop
+    #[arg(long, requires = "pack")]
+    pub(crate) cache_only: bool,
+    /// Go on from the run's last state
+    #[arg(long, conflicts_with_all = ["cache_only", "init"])]
+    pub(crate) resume: bool,
+    /// Start from these weights instead of random ones
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) init: Option<PathBuf>,
+    /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
+    pub(crate) device: Vec<String>,
+    /// Threads that draw samples
+    #[arg(long, value_name = "N", default_value = "1")]
+    pub(crate) workers: NonZeroUsize,
+    /// Download the weights of the recipe's LPIPS term into --backbones first, with curl
+    #[arg(long, requires = "backbones")]
+    pub(crate) fetch: bool,
+    /// Folder with the weights of the LPIPS backbone and heads [default: where Burn keeps them]
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
+    pub(crate) backbones: Option<PathBuf>,
+}

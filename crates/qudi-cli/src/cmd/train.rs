@@ -1,0 +1,199 @@
+//! `qudi train`: a recipe and data in, weights out.
+
+use crate::args::{Global, Train};
+use crate::cmd::train_environment::{ENVIRONMENT, environment};
+use crate::cmd::train_watch::{Watch, told, write, write_report};
+use crate::device::{self, Opened};
+use crate::error::{Fault, Result};
+use crate::interrupt;
+use crate::report::Report;
+use qudi_model::checkpoint;
+use qudi_model::perceptual::fetch;
+use qudi_model::train::{From, RECIPE, Recipe, Run, Validation, WEIGHTS};
+use qudi_sim::dataset::{Pack, write_pack};
+use qudi_sim::output::Overwrite;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> {
+    let recipe = recipe(args, global)?;
+    if args.cache_only {
+        let path = args.pack.as_deref().unwrap_or(Path::new("pack.zip"));
+        make_pack(args, &recipe, path, overwrite(global), report)?;
+        let pack = Pack::open(path)?;
+        let frames: usize = pack.clips().iter().map(|clip| clip.frames).sum();
+        let clips = pack.clips().len();
+        let text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
+        return report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}));
+    }
+    let folder = args.output.clone().unwrap_or_default();
+    let exists = Run::exists(&folder);
+    check_folder(args, global, &folder, exists)?;
+    let devices = args.device.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
+    std::fs::create_dir_all(&folder).map_err(|e| {
+        Fault::new(
+            format!("cannot make the run's folder: {e}"),
+            folder.display(),
+            "choose another with -o",
+        )
+    })?;
+    if let (true, Some(backbones)) = (args.fetch, &args.backbones) {
+        for path in fetch(recipe.train.loss.term, backbones)? {
+            report.remark(&format!("{} is there", path.display()));
+        }
+    }
+    let pack = pack(args, &recipe, &folder, report)?;
+    let from = if args.resume {
+        From::State
+    } else {
+        From::Start(
+            args.init.as_deref().map(|path| initial(path, &recipe, &devices[0])).transpose()?,
+        )
+    };
+    let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
+    let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
+    let mut run =
+        Run::open(&folder, &recipe, from, pack, &list, args.backbones.as_deref(), commit)?;
+    write(&folder, ENVIRONMENT, environment(&devices).as_bytes())?;
+    let mut watch = Watch::new(&recipe, &folder, report)?;
+    let learnt = device::guarded("training", || {
+        run.learn(args.workers.get(), &mut |event| watch.event(&event))
+    });
+    let [step, steps] = run.progress();
+    let last = watch.finish()?;
+    match learnt {
+        Ok(Ok(())) => {}
+        Ok(Err(qudi_sim::SimError::Interrupted)) => {
+            let text = format!("stopped after step {step} of {steps}: --resume goes on");
+            return Err(Fault::Stopped(text));
+        }
+        Ok(Err(error)) => return Err(error.into()),
+        Err(problem) => {
+            return Err(Fault::new(
+                format!("the device failed in step {}: {problem}", step + 1),
+                "--device",
+                "lower train.batch or data.crop and raise train.accumulate; --resume goes on from the last state",
+            ));
+        }
+    }
+    write_report(&folder)?;
+    let weights = folder.join(WEIGHTS);
+    let means = last.as_ref().map(Validation::means).unwrap_or_default();
+    let quality: Vec<_> = means
+        .iter()
+        .map(|(ppp, [psnr_a, psnr, ssim])| {
+            json!({"ppp": ppp, "psnr_a": psnr_a, "psnr": psnr, "ssim": ssim})
+        })
+        .collect();
+    let text = format!("{} after {steps} steps\n{}", weights.display(), told(&means));
+    report.result(&text, || json!({"weights": weights, "steps": steps, "validation": quality}))
+}
+
+fn overwrite(global: &Global) -> Overwrite {
+    if global.force { Overwrite::Yes } else { Overwrite::No }
+}
+
+fn recipe(args: &Train, global: &Global) -> Result<Recipe> {
+    let mut changes = Vec::new();
+    for assignment in &global.set {
+        let Some((key, value)) = assignment.split_once('=') else {
+            let what = format!("`{assignment}` sets nothing");
+            return Err(Fault::new(what, "--set", "write KEY=VALUE, as in --set train.steps=1000"));
+        };
+        changes.push((key.trim().to_owned(), value.trim().to_owned()));
+    }
+    let own = args.output.as_ref().map(|folder| folder.join(RECIPE));
+    let name = match (&args.recipe, own) {
+        (Some(name), _) => name.clone(),
+        (None, Some(own)) if args.resume => own.display().to_string(),
+        _ => {
+            return Err(Fault::new(
+                "no recipe",
+                "RECIPE",
+                "name one: tiny, small, base, paper, or a .toml file",
+            ));
+        }
+    };
+    Ok(Recipe::load(&name, &changes)?)
+}
+
+fn check_folder(args: &Train, global: &Global, folder: &Path, exists: bool) -> Result<()> {
+    if args.resume && !exists {
+        return Err(Fault::new(
+            "there is no state to go on from",
+            folder.display(),
+            "start without --resume, or name the run's folder with -o",
+        ));
+    }
+    let taken = exists || folder.join(WEIGHTS).exists();
+    if !args.resume && taken && !global.force {
+        return Err(Fault::new(
+            "the folder holds a run already",
+            folder.display(),
+            "go on with --resume, choose another folder, or start anew with --force",
+        ));
+    }
+    if !args.resume && taken {
+        // A new run must not be taken for the old one's continuation.
+        for name in ["state", "state.old", "state.new"] {
+            let _ = std::fs::remove_dir_all(folder.join(name));
+        }
+        let _ = std::fs::remove_file(folder.join(qudi_model::train::METRICS));
+    }
+    Ok(())
+}
+
+/// The recipe's files, decoded; made first if they are not there.
+fn pack(args: &Train, recipe: &Recipe, folder: &Path, report: &Report) -> Result<Option<Pack>> {
+    if !recipe.data.needs_files() && recipe.validation_data().is_none() {
+        return Ok(None);
+    }
+    let path: PathBuf = args.pack.clone().unwrap_or_else(|| folder.join("pack.zip"));
+    if !path.exists() {
+        make_pack(args, recipe, &path, Overwrite::No, report)?;
+    }
+    Ok(Some(Pack::open(&path)?))
+}
+
+fn make_pack(
+    args: &Train,
+    recipe: &Recipe,
+    path: &Path,
+    overwrite: Overwrite,
+    report: &Report,
+) -> Result<()> {
+    let Some(data) = &args.data else {
+        return Err(Fault::new(
+            "the recipe reads files",
+            "--data",
+            "name the folder that they lie in, or a pack with --pack",
+        ));
+    };
+    let validation = recipe.validation_data();
+    let mut configs = vec![&recipe.data];
+    configs.extend(&validation);
+    let mut bar = report.bar();
+    write_pack(&configs, data, path, overwrite, &mut |progress| {
+        let [done, total] = progress.done;
+        bar.update("decoding", done as u64, Some(total as u64));
+        interrupt::check()
+    })?;
+    Ok(())
+}
+
+/// Weights to start from.
+fn initial(
+    path: &Path,
+    recipe: &Recipe,
+    device: &Opened,
+) -> Result<Box<qudi_model::network::Qudi>> {
+    let (network, description) = checkpoint::load(path, &device.device)?;
+    if description.network != recipe.network {
+        return Err(Fault::new(
+            "these weights are for a network of other sizes than the recipe's",
+            path.display(),
+            "choose the recipe that they were trained with, or its [network] table",
+        ));
+    }
+    Ok(Box::new(network))
+}
