@@ -13,6 +13,8 @@ mod network;
 mod outputs;
 #[path = "cli/restore.rs"]
 mod restore;
+#[path = "cli/train.rs"]
+mod train;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")

@@ -43,7 +43,7 @@ fn weights(path: &Path, value: f32) {
     save(&module, &description, path, Overwrite::Yes).unwrap();
 }
 
-fn refused(folder: &Path, args: &str, words: &[&str]) {
+pub(crate) fn refused(folder: &Path, args: &str, words: &[&str]) {
     let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{args}: {text}");

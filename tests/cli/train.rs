@@ -1,0 +1,123 @@
+//! `qudi train` from recipe to restored frames, and what is refused.
+
+use crate::network::refused;
+use crate::outputs::{listing, qudi, scratch};
+use image::{GrayImage, Luma};
+use std::path::Path;
+
+/// Settings that make `tiny` a matter of seconds.
+const QUICK: &str = "--device cpu -q --set train.steps=4 --set train.checkpoint=2 --set data.crop=32 \
+    --set data.frames=3 --set validation.crop=32 --set validation.frames=3 --set validation.every=2";
+
+fn run(folder: &Path, args: &str) {
+    qudi(folder).args(args.split_whitespace()).assert().success();
+}
+
+/// The shipped recipe as it is: it learns, in less than two minutes on two cores.
+#[test]
+fn the_tiny_recipe_learns_without_a_file() {
+    let folder = scratch("train-tiny");
+    run(&folder, "train tiny -o run --device cpu -q");
+    let run_folder = folder.join("run");
+    let mut names = listing(&run_folder);
+    names.retain(|name| !name.starts_with("events.out.tfevents."));
+    let expected = [
+        "environment.json",
+        "metrics.jsonl",
+        "recipe.toml",
+        "report.html",
+        "samples",
+        "state",
+        "weights.safetensors",
+    ];
+    assert_eq!(names, expected);
+    assert_eq!(listing(&run_folder.join("samples")), ["step-0000200.png", "step-0000400.png"]);
+    let metrics = std::fs::read_to_string(run_folder.join("metrics.jsonl")).unwrap();
+    let lines: Vec<serde_json::Value> =
+        metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let losses: Vec<f64> = lines.iter().filter_map(|line| line["total"].as_f64()).collect();
+    let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
+    let (first, last) = (mean(&losses[..20]), mean(&losses[350..]));
+    assert!(losses.len() == 400 && last < 0.5 * first, "{first} {last}");
+    let page = std::fs::read_to_string(run_folder.join("report.html")).unwrap();
+    assert!(page.contains("<polyline") && page.contains("data:image/png;base64,"));
+    assert!(!page.contains("http"), "the report fetches something");
+    // What it learnt is of use: better than the linear estimate averaged over the burst.
+    run(&folder, "simulate scene:text --size 64x64 --frames 11 --seed 3 -o b.npy -q");
+    run(&folder, "restore b.npy --weights run/weights.safetensors --steps 1 --device cpu -o r -q");
+    assert_eq!(listing(&folder.join("r")).len(), 12); // frames and manifest
+    let quality = lines.last().unwrap()["clips"][0]["psnr_a"].as_f64().unwrap();
+    assert!(quality > 15.5, "{quality} dB");
+}
+
+#[test]
+fn packs_train_without_the_files() {
+    let folder = scratch("train-pack");
+    let clip = folder.join("data/films/a");
+    std::fs::create_dir_all(&clip).unwrap();
+    for t in 0..6 {
+        let image = GrayImage::from_fn(48, 40, |x, y| Luma([(4 * (x + t) + 2 * y) as u8]));
+        image.save(clip.join(format!("{t}.png"))).unwrap();
+    }
+    let recipe = std::fs::read_to_string(crate::root().join("configs/tiny.toml")).unwrap();
+    let films =
+        "[[data.source]]\nname = \"films\"\nkind = \"clips\"\nfrom = [\"films\"]\n\n[train]";
+    let recipe = recipe.replacen("[train]", films, 1);
+    let recipe =
+        recipe.replace("from = [\"scene:dead-leaves\", \"scene:text\"]", "from = [\"films\"]");
+    std::fs::write(folder.join("mine.toml"), recipe).unwrap();
+    run(
+        &folder,
+        "train mine.toml --data data --pack p.zip --cache-only -q --set data.crop=32 --set data.frames=3",
+    );
+    std::fs::remove_dir_all(folder.join("data")).unwrap();
+    run(&folder, &format!("train mine.toml --pack p.zip -o run {QUICK}"));
+    let metrics = std::fs::read_to_string(folder.join("run/metrics.jsonl")).unwrap();
+    assert!(metrics.contains("films-a"), "validated on the pack's clip");
+    refused(&folder, "train mine.toml -o other", &["--data"]);
+    assert!(!folder.join("other/weights.safetensors").exists());
+}
+
+#[test]
+fn runs_are_gone_on_with_and_never_lost() {
+    let folder = scratch("train-resume");
+    run(&folder, &format!("train tiny -o run {QUICK}"));
+    refused(&folder, &format!("train tiny -o run {QUICK}"), &["--resume", "--force"]);
+    refused(&folder, &format!("train tiny -o nothing --resume {QUICK}"), &["no state"]);
+    // Longer than planned: the recipe of the run, with one key changed.
+    run(&folder, "train -o run --resume --device cpu -q --set train.steps=6");
+    let metrics = std::fs::read_to_string(folder.join("run/metrics.jsonl")).unwrap();
+    assert_eq!(metrics.lines().filter(|line| line.contains("\"kind\":\"step\"")).count(), 6);
+    run(&folder, &format!("train tiny -o run --force {QUICK}"));
+    let metrics = std::fs::read_to_string(folder.join("run/metrics.jsonl")).unwrap();
+    assert_eq!(metrics.lines().filter(|line| line.contains("\"kind\":\"step\"")).count(), 4);
+    // A stage that starts from another run's weights.
+    run(&folder, &format!("train tiny -o stage --init run/weights.safetensors {QUICK}"));
+    let wide = format!(
+        "train tiny -o wide --init run/weights.safetensors --set network.unet.width=16 {QUICK}"
+    );
+    refused(&folder, &wide, &["other sizes"]);
+}
+
+#[test]
+fn impossible_trainings_are_refused() {
+    let folder = scratch("train-refused");
+    for (args, words) in [
+        ("train -o run", ["no recipe"].as_slice()),
+        ("train huge -o run", &["huge", "tiny"]),
+        ("train tiny -o run --set train.stepz=3", &["stepz"]),
+        ("train tiny -o run --set train.steps", &["KEY=VALUE"]),
+        ("train tiny -o run --device cuda:7", &["cuda:7"]),
+        ("train tiny -o run --init none.safetensors", &["none.safetensors"]),
+        ("train small -o run", &["--data"]),
+        ("train small -o run --data .", &["cups"]),
+        (
+            "train tiny -o run --set train.loss.term=lpips-vgg --set train.loss.perceptual=0.3 --backbones .",
+            &["vgg16"],
+        ),
+    ] {
+        refused(&folder, args, words);
+    }
+    std::fs::write(folder.join("taken"), "a file").unwrap();
+    refused(&folder, "train tiny -o taken", &["taken"]);
+}
