@@ -33,6 +33,21 @@ impl Peak {
     }
 }
 
+/// Bytes that the system and this process's control group can still give, where they tell.
+pub(crate) fn available_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let free = 1024 * line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?;
+    let number = |name: &str| {
+        let text = std::fs::read_to_string(format!("/sys/fs/cgroup/{name}")).ok()?;
+        text.trim().parse::<u64>().ok()
+    };
+    match (number("memory.max"), number("memory.current")) {
+        (Some(most), Some(used)) => Some(free.min(most.saturating_sub(used))),
+        _ => Some(free),
+    }
+}
+
 /// A field of /proc/self/status in MiB.
 fn field(name: &str) -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

@@ -19,5 +19,5 @@ mod uninitialised;
 mod warp;
 
 pub use attention::attention;
-pub use backend::is_flex;
+pub use backend::{is_flex, with_stock_operations};
 pub use warp::warp;

@@ -12,6 +12,17 @@ impl NetworkConfig {
         list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum()
     }
 
+    /// Bytes that restoring a window of `frames` frames of `size` takes on the processor at most, about: activations
+    /// of the finest level, `PLANES` times its widths at once, and the weights. From measurements of `tiny` and `small`.
+    pub fn memory(&self, size: Size, frames: usize) -> u64 {
+        const PLANES: f64 = 6.5;
+        let widths = self.unet.width + self.fusion.widths[0] + self.pre.width;
+        let cells = (size.pixels() * frames) as f64 / (self.fold * self.fold) as f64;
+        // What the program holds besides, planes of the whole window among it.
+        let others = 50.0 * (1 << 20) as f64 + 40.0 * (size.pixels() * frames) as f64;
+        (4.0 * PLANES * widths as f64 * cells + others) as u64
+    }
+
     /// Multiplications of all convolutions in one reverse step that estimates the flow, over `frames` frames of
     /// `size`; nothing is computed on `device`. Norms, attention scores and the embedding, a few hundredths of it, are left out.
     pub fn multiplications(&self, size: Size, frames: usize, device: &Device) -> usize {

@@ -27,7 +27,7 @@ pub(crate) fn method(
             let mle = sampled(capture, |views| Mle::choose(views, context))?;
             Ok((Box::new(mle), over(mle.length())))
         }
-        "qudi" => network::restorer(options, context),
+        "qudi" => network::restorer(options, context, capture.size()),
         "transform-denoise" | "bm3d" => {
             let transform = if name == "bm3d" { Transform::Identity } else { Transform::Integral };
             let chosen =

@@ -3,10 +3,13 @@
 use crate::args::{Network, SamplerName};
 use crate::device;
 use crate::error::{Fault, Result};
+use crate::memory::available_bytes;
 use qudi_model::checkpoint::{self, Description};
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
 use qudi_model::sampler::Sampler;
+use qudi_sim::Size;
 use qudi_sim::restore::{Context, Restorer};
+use qudi_sim::sensor::Sensor;
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const TOLERATED: f64 = 10.0;
@@ -15,6 +18,7 @@ const TOLERATED: f64 = 10.0;
 pub(crate) fn restorer(
     options: &Network,
     context: &Context,
+    size: Size,
 ) -> Result<(Box<dyn Restorer>, String)> {
     let Some(path) = &options.weights else {
         return Err(Fault::new(
@@ -26,6 +30,9 @@ pub(crate) fn restorer(
     let device = device::open(&options.device)?;
     let (network, description) = checkpoint::load(path, &device.device)?;
     check(&description, context)?;
+    if matches!(device.name.as_str(), "cpu" | "ndarray") {
+        check_memory(&description, options.tile, size, available_bytes())?;
+    }
     let (config, window) = (&description.network, description.window);
     let sampling = sample_options(options);
     let restorer = QudiRestorer::new(network, config, window, sampling, &device.device)?;
@@ -47,6 +54,61 @@ pub(crate) fn sample_options(options: &Network) -> SampleOptions {
     }
 }
 
+/// Refuses tiles that memory cannot hold, before the system ends the program for it.
+fn check_memory(
+    description: &Description,
+    tile: usize,
+    size: Size,
+    available: Option<u64>,
+) -> Result<()> {
+    let network = &description.network;
+    let needed = |tile: usize| {
+        let side = |length: usize| length.min(tile);
+        let size = Size { height: side(size.height), width: side(size.width) };
+        network.memory(size, description.window)
+    };
+    let Some(available) = available.filter(|&available| needed(tile) > available) else {
+        return Ok(());
+    };
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    let what = format!(
+        "tiles of {tile} pixels take about {:.1} GiB, {:.1} GiB are free",
+        gib(needed(tile)),
+        gib(available)
+    );
+    let smallest = 4 * network.multiple();
+    let fitting = (smallest..tile).rev().find(|&tile| tile % 32 == 0 && needed(tile) <= available);
+    let help = match fitting {
+        Some(fitting) => format!("--tile {fitting} fits"),
+        None => "free some memory, or use smaller weights".to_owned(),
+    };
+    Err(Fault::new(what, "--tile", help))
+}
+
+/// What went wrong on a device, with a way out; `problem` are its own words.
+pub(crate) fn device_failed(problem: &str, options: &Network) -> Fault {
+    let half = options.tile / 2 / 32 * 32;
+    let help = if half >= 64 {
+        format!("--tile {half} needs a quarter of the memory; `qudi selftest` checks the device; or --device cpu")
+    } else {
+        "check the device with `qudi selftest`, or use --device cpu".to_owned()
+    };
+    Fault::new(format!("the device failed: {problem}"), &options.device, help)
+}
+
+/// Whether a sensor counts like one that the weights were trained for: the same response, and full scales within a
+/// factor of four.
+fn is_like(sensor: &Sensor, trained: &str) -> bool {
+    // Sums of binary frames are listed as `name x frames`.
+    let (name, frames) = trained.split_once(" x ").unwrap_or((trained, ""));
+    let Ok(mut known) = Sensor::load(name) else { return true };
+    if let Ok(frames) = frames.parse() {
+        known.frames_summed = frames;
+    }
+    let ratio = f64::from(sensor.max_count()) / f64::from(known.max_count());
+    known.response == sensor.response && (0.25..=4.0).contains(&ratio)
+}
+
 /// Refuses a capture far outside what the weights were trained for.
 fn check(description: &Description, context: &Context) -> Result<()> {
     let [least, most] = description.ppp;
@@ -60,5 +122,73 @@ fn check(description: &Description, context: &Context) -> Result<()> {
             "sum frames (--sum N) or average fewer, give --ppp if it was estimated wrongly, or train for this light",
         ));
     }
+    let sensor = &context.sensor;
+    if !description.sensors.iter().any(|trained| is_like(sensor, trained)) {
+        let response = format!("{:?}", sensor.response).to_lowercase();
+        return Err(Fault::new(
+            format!(
+                "sensor {} is {response} and counts up to {}; the weights know {}",
+                sensor.name,
+                sensor.max_count(),
+                description.sensors.join(", ")
+            ),
+            "--weights",
+            "sum binary frames to the depth that the weights know (--sum N), or train for this sensor",
+        ));
+    }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_model::config::NetworkConfig;
+
+    fn description(sensors: &[&str]) -> Description {
+        Description {
+            program: String::new(),
+            preset: None,
+            network: NetworkConfig::preset("small").unwrap_or_else(|e| panic!("{e}")),
+            window: 11,
+            sensors: sensors.iter().map(|&name| name.to_owned()).collect(),
+            ppp: [1.0, 30.0],
+            data: Vec::new(),
+            steps: 0,
+            commit: None,
+            licence: String::new(),
+        }
+    }
+
+    #[test]
+    fn tiles_that_do_not_fit_name_one_that_does() {
+        let about = description(&["qudi-paper"]);
+        let size = Size { height: 2000, width: 3000 };
+        let check = |tile, available| check_memory(&about, tile, size, Some(available));
+        assert!(check(512, 4 << 30).is_ok());
+        assert!(check_memory(&about, 4096, size, None).is_ok());
+        let Err(Fault::Error { what, help: Some(help), .. }) = check(1024, 1 << 30) else {
+            panic!("a tile of 1024 in 1 GiB");
+        };
+        assert!(what.contains("1.0 GiB are free"), "{what}");
+        let fitting = help.split_whitespace().nth(1).and_then(|tile| tile.parse().ok());
+        let fitting: usize = fitting.unwrap_or_else(|| panic!("{help}"));
+        assert!((192..512).contains(&fitting) && check(fitting, 1 << 30).is_ok(), "{help}");
+        assert!(check(fitting + 32, 1 << 30).is_err());
+        // The whole frame is smaller than the tile.
+        let small = Size { height: 128, width: 128 };
+        assert!(check_memory(&about, 1024, small, Some(1 << 30)).is_ok());
+    }
+
+    #[test]
+    fn sensors_are_like_those_of_their_kind() {
+        let load = |name: &str| Sensor::load(name).unwrap_or_else(|e| panic!("{e}"));
+        let mut binary = load("swissspad2");
+        assert!(is_like(&load("qudi-paper"), "qudi-paper"));
+        assert!(!is_like(&binary, "qudi-paper"));
+        assert!(is_like(&binary, "swissspad2"));
+        assert!(!is_like(&binary, "swissspad2 x 7"));
+        binary.frames_summed = 7;
+        assert!(is_like(&binary, "spad512s x 15"));
+        assert!(is_like(&binary, "a sensor of the user's own"));
+    }
 }

@@ -1,12 +1,14 @@
 //! `qudi restore`: a capture through a method into frames.
 
-use crate::args::{Global, Restore};
+use crate::args::{Global, Network, Restore};
 use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::cmd::capture_light::{Stated, context};
 use crate::cmd::methods::method;
+use crate::cmd::network::device_failed;
 use crate::cmd::restore_deviation::Deviation;
 use crate::cmd::restore_output::{Misfit, Output};
 use crate::cmd::tiff_samples::tiff_samples;
+use crate::device;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
@@ -57,11 +59,11 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     let mut deviation = Deviation::create(args, &job.capture, done, overwrite)?;
     let rest = part.start + done..part.end;
     if done == 0 {
-        job.run(rest, &mut output, Some(&mut misfit), &mut deviation, report)?;
+        job.run(rest, &mut output, Some(&mut misfit), &mut deviation, &args.network, report)?;
     } else {
         // Frames of an interrupted run are judged with the others, in the same order; but after
         // the rest is made, so that a run that keeps being killed still gets on.
-        job.run(rest, &mut output, None, &mut deviation, report)?;
+        job.run(rest, &mut output, None, &mut deviation, &args.network, report)?;
         misfit.read_finished(&output, &mut job.capture, part.clone())?;
     }
     let frames = job.capture.frames();
@@ -188,6 +190,7 @@ impl Job {
         output: &mut Output,
         misfit: Option<&mut Misfit>,
         deviation: &mut Deviation,
+        network: &Network,
         report: &Report,
     ) -> Result<()> {
         if wanted.is_empty() {
@@ -201,7 +204,16 @@ impl Job {
         let mut sink = output.sink(misfit, deviation);
         let (capture, context) = (&mut self.capture, &self.context);
         let restorer = self.restorer.as_mut();
-        Ok(run_method(restorer, capture, &self.windows, wanted, context, &mut sink, &mut progress)?)
+        let restorer_is_network = restorer.name() == "qudi";
+        let windows = &self.windows;
+        let run =
+            || run_method(restorer, capture, windows, wanted, context, &mut sink, &mut progress);
+        if restorer_is_network {
+            // Devices report too little memory and broken drivers by panicking.
+            let run = device::guarded(&network.device, run);
+            return Ok(run.map_err(|problem| device_failed(&problem, network))??);
+        }
+        Ok(run()?)
     }
 }
 

@@ -22,7 +22,7 @@ pub(crate) fn run(args: &Selftest, report: &Report) -> Result<()> {
         let help = format!("there are {}", names.join(", "));
         return Err(Fault::new("no check of that name", "--only", help));
     }
-    let mut text = format!("{} against cpu\n", device.name);
+    let mut text = format!("{} against the stock operations of cpu\n", device.name);
     let mut results = Vec::new();
     let mut missed = Vec::new();
     let mut bar = report.bar();
