@@ -126,7 +126,7 @@ fn gradients_reach_every_parameter() {
 #[test]
 fn one_burst_is_learnt_by_heart() {
     let device = Device::flex().autodiff();
-    let burst = burst(Size { height: 32, width: 32 }, 5, &device);
+    let burst = burst(Size { height: 16, width: 16 }, 5, &device);
     let mut network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
     let mut optimizer = Adam::new(&values(&network));
     let (mut totals, mut predictions) = (Vec::new(), Vec::new());

@@ -164,7 +164,7 @@ fn pre_denoiser() {
             let flag = flag.reshape([2 * frames, 1, 1, 1]);
             let both = Tensor::cat(vec![y_sim.clone(), u_sim.clone()], 1);
             let prepared = pre.prepare(y.clone(), u.clone());
-            let (d, g) = pre.forward(prepared, u.clone(), both, flag);
+            let (d, g) = pre.forward(prepared, resample::smooth(u.clone()), both, flag);
             let mut inputs = vec![("y", &y), ("u", &u)];
             if case.name == "with" {
                 inputs.extend([("y_sim", &y_sim), ("u_sim", &u_sim)]);

@@ -73,12 +73,12 @@ impl PreDenoiser {
     }
 
     /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.
-    /// `prepared` as from [`Self::prepare`]; `simulated` are `y_sim` and `u_sim`, `flag` says of every image
+    /// `prepared` as from [`Self::prepare`]; `base` is a first guess, in image units; `simulated` are `y_sim` and `u_sim`, `flag` says of every image
     /// whether they exist, `[images, 1, 1, 1]`.
     pub fn forward(
         &self,
         prepared: Tensor<4>,
-        u: Tensor<4>,
+        base: Tensor<4>,
         simulated: Tensor<4>,
         flag: Tensor<4>,
     ) -> (Tensor<4>, Tensor<4>) {
@@ -93,6 +93,6 @@ impl PreDenoiser {
         }
         let features = self.spread.add(&[self.gather.linear(&outputs)], shallow);
         let correction = unfold(self.out.linear(std::slice::from_ref(&features)), self.fold);
-        (u + correction, features)
+        (base + correction, features)
     }
 }

@@ -4,6 +4,7 @@ use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
 use super::pre::PreDenoiser;
+use super::resample::smooth;
 use super::unet::UNet;
 use crate::config::{NetworkConfig, Part};
 use burn::module::Module;
@@ -51,6 +52,8 @@ pub struct Prepared {
     low: Tensor<4>,
     sensor: Tensor<2>,
     u: Tensor<4>,
+    /// What the pre-denoiser corrects.
+    base: Tensor<4>,
     frames: usize,
 }
 
@@ -105,6 +108,7 @@ impl Qudi {
             pre: self.pre.prepare(y, u.clone()),
             low: self.low.prepare(u.clone(), measured.frames),
             sensor: self.unet.prepare(measured.sensor.clone()),
+            base: smooth(u.clone()),
             u,
             frames: measured.frames,
         }
@@ -145,7 +149,7 @@ impl Qudi {
         let flag = Tensor::<4>::from_data(flags, &device).repeat_dim(1, frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim.clone()], 1);
-        let (d, features) = self.pre.forward(prepared.pre.clone(), u.clone(), both, flag);
+        let (d, features) = self.pre.forward(prepared.pre.clone(), prepared.base.clone(), both, flag);
         done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
         done("low");
