@@ -8,6 +8,7 @@
     python scripts/reference/network_speed.py small --backward              # and its gradients, 128x128
     python scripts/reference/network_speed.py small --per-block
     python scripts/reference/network_speed.py small --mode steps            # the ten-step loop
+    python scripts/reference/network_speed.py small --mode train --frames 7 --size 96 --batch 2
 
 Times are seconds, medians after a warm-up; `cpu` is the sum over threads (on a shared machine the
 wall clock says little, PyTorch's threads wait for each other). `loop` times the network's calls and the simulated
@@ -47,13 +48,14 @@ def times(run: Callable[[], object], rounds: int, warm: int = 1) -> dict:
     return {"median": statistics.median(seconds), "fastest": fastest, "cpu": statistics.median(cpu), "rounds": rounds}
 
 
-def inputs(frames: int, size: int) -> dict[str, Tensor]:
+def inputs(frames: int, size: int, batch: int) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(1)
-    shape = (frames, 1, size, size)
+    shape = (batch * frames, 1, size, size)
     rand = lambda: torch.rand(shape, generator=generator)
     x = {name: rand() for name in ("y", "u", "y_sim", "u_sim")}
-    x |= {"flag": torch.ones(1), "x_t": torch.randn(shape, generator=generator), "x0_prev": 2 * rand() - 1}
-    return x | {"t": torch.tensor([500]), "sensor": torch.tensor([network.sensor_numbers(PPP, EXPOSURE)])}
+    x |= {"flag": torch.ones(batch), "x_t": torch.randn(shape, generator=generator), "x0_prev": 2 * rand() - 1}
+    sensor = torch.tensor([network.sensor_numbers(PPP, EXPOSURE)] * batch)
+    return x | {"t": torch.tensor([500] * batch), "sensor": sensor}
 
 
 def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: int) -> dict[str, dict]:
@@ -77,6 +79,13 @@ def backward(model: network.Qudi, x: dict[str, Tensor], frames: int) -> None:
     model.zero_grad()
     x0, d, _ = model(**x, frames=frames)
     network.loss(x0, d, x["u"]).backward()
+
+
+def train(model: network.Qudi, x: dict[str, Tensor], frames: int, adam: torch.optim.Adam) -> None:
+    """A training step without a first pass."""
+    backward(model, x, frames)
+    torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
+    adam.step()
 
 
 def loop(model: network.Qudi, x: dict[str, Tensor], frames: int, flow_steps: list[int], ancestral: bool) -> dict:
@@ -104,10 +113,11 @@ def loop(model: network.Qudi, x: dict[str, Tensor], frames: int, flow_steps: lis
 def main() -> None:
     parser = argparse.ArgumentParser(description="Times the PyTorch network.")
     parser.add_argument("preset")
-    parser.add_argument("--mode", choices=["step", "steps"], default="step")
+    parser.add_argument("--mode", choices=["step", "steps", "train"], default="step")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--size", type=int, help="256, with --backward 128")
     parser.add_argument("--frames", type=int, default=11)
+    parser.add_argument("--batch", type=int, default=1, help="bursts at once")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--backward", action="store_true", help="time forward and backward together")
     parser.add_argument("--per-block", action="store_true")
@@ -119,11 +129,14 @@ def main() -> None:
     size = args.size or (128 if args.backward else 256)
     config = network.load(args.preset)
     model = network.Qudi(config)
-    x = inputs(args.frames, size)
+    x = inputs(args.frames, size, args.batch)
     result = {"preset": args.preset, "threads": args.threads, "size": size, "frames": args.frames}
     result |= {"torch": torch.__version__, "parameters": sum(p.numel() for p in model.parameters())}
     result["base_mib"] = peak_mib()
-    if args.backward:
+    if args.mode == "train":
+        adam = torch.optim.Adam(model.parameters(), lr=1e-4)
+        result["train"] = times(lambda: train(model, x, args.frames, adam), args.rounds)
+    elif args.backward:
         result["forward_backward"] = times(lambda: backward(model, x, args.frames), args.rounds)
     else:
         with torch.inference_mode():

@@ -196,3 +196,29 @@ fn a_capture_is_judged_without_truth() {
         qudi(&folder).arg("eval").args(refused.split(' ')).assert().code(2);
     }
 }
+
+#[test]
+fn parts_of_the_clips_give_the_figures_of_the_whole() {
+    let folder = scratch("eval-shard");
+    let clips = folder.join("clips");
+    std::fs::create_dir(&clips).unwrap();
+    for seed in ["1", "2", "3"] {
+        let scene = "simulate scene:text --size 32x32 --frames 5 --ppp 3 --seed 1 -q -f -o ../x.npy";
+        let truth = format!("{seed}.npy");
+        qudi(&clips)
+            .args(scene.split(' '))
+            .args(["--scene-seed", seed, "--truth", &truth])
+            .assert()
+            .success();
+    }
+    let scores = |shard: &str| {
+        let result = eval(&folder, &format!("clips --method average --ppp 9.75{shard}"));
+        let clips = result["rows"][0]["clips"].as_array().unwrap().clone();
+        clips.into_iter().map(|clip| clip["frames"].to_string()).collect::<Vec<_>>()
+    };
+    let parts = [scores(" --shard 1/2"), scores(" --shard 2/2")];
+    assert_eq!(parts.concat(), scores(""));
+    assert_eq!(parts.map(|part| part.len()), [1, 2]);
+    let none = "eval clips --method average --shard 1/9";
+    crate::network::refused(&folder, none, &["--shard"]);
+}

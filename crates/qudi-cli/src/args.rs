@@ -12,7 +12,7 @@ pub(crate) use convert::{Calibrate, Convert};
 pub(crate) use eval::{Bench, Eval, External, Protocol};
 pub(crate) use network::{Network, SamplerName};
 pub(crate) use reading::Reading;
-pub(crate) use restore::Restore;
+pub(crate) use restore::{Restore, Shard};
 pub(crate) use simulate::Simulate;
 pub(crate) use train::Train;
 

@@ -45,6 +45,8 @@ pub struct Switches {
 impl Switches {
     /// Everything.
     pub const ALL: Self = Self { physics: true, self_conditioning: true };
+    /// Nothing: a first pass would be in vain.
+    pub const NONE: Self = Self { physics: false, self_conditioning: false };
 }
 
 /// `mean (p - q)^2 + 0.01 (mean |across| + mean |down|)`, where across and down are differences of neighbours of

@@ -1,6 +1,6 @@
 //! Options of `qudi eval` and `qudi bench`.
 
-use super::{Network, Reading};
+use super::{Network, Reading, Shard};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_sim::Size;
 use std::path::PathBuf;
@@ -56,6 +56,9 @@ pub(crate) struct Eval {
     /// Score frames that another program made of them: DIR/dog-ppp9_75.npy, or a folder of that name
     #[arg(long, value_name = "NAME=DIR")]
     pub(crate) external: Vec<External>,
+    /// Do part I of N (from 1) of the clips: parts give the same figures as the whole, and their --csv files join
+    #[arg(long, value_name = "I/N", conflicts_with = "capture")]
+    pub(crate) shard: Option<Shard>,
     /// Write every figure of every frame
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) csv: Option<PathBuf>,

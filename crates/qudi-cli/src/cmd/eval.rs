@@ -80,7 +80,15 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
     }
     let sensor = Sensor::load(args.sensor.as_deref().unwrap_or(SENSOR))?;
     let levels = if args.ppp.is_empty() { &LEVELS[..] } else { &args.ppp };
-    let clips = Clip::find(&args.data)?;
+    let mut clips = Clip::find(&args.data)?;
+    if let Some(shard) = args.shard {
+        let part = shard.range(clips.len() as u64);
+        clips = clips.drain(part.start as usize..part.end as usize).collect();
+        if clips.is_empty() {
+            let help = "ask for at most as many parts as there are clips";
+            return Err(Fault::new("this part holds no clip", "--shard", help));
+        }
+    }
     if let Some(folder) = &args.export_photons {
         std::fs::create_dir_all(folder)
             .map_err(|e| qudi_sim::SimError::io("create the folder", folder, e))?;

@@ -6,8 +6,11 @@ use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 use std::fmt::Write;
 
-/// Points of a curve at most: more cannot be seen.
-const POINTS: usize = 400;
+/// Points of a curve at most: single steps jump, means of neighbours show where it goes.
+const POINTS: usize = 120;
+
+/// Curves of fewer points show them.
+const FEW: usize = 40;
 
 /// Size of a plot in pixels, and the margins for its numbers.
 const SIZE: [f64; 2] = [680.0, 260.0];
@@ -160,12 +163,13 @@ fn plot(title: &str, curves: &[Curve], logarithmic: bool) -> String {
         let value = if logarithmic { 10f64.powf(y) } else { y };
         let _ = writeln!(
             svg,
-            "<line class=\"grid\" x1=\"{}\" x2=\"{}\" y1=\"{2:.1}\" y2=\"{2:.1}\"/><text x=\"4\" y=\"{2:.1}\">{value:.3e}</text><text x=\"{3:.1}\" y=\"{4}\" text-anchor=\"middle\">{x:.0}</text>",
+            "<line class=\"grid\" x1=\"{0}\" x2=\"{1}\" y1=\"{2:.1}\" y2=\"{2:.1}\"/><text x=\"4\" y=\"{2:.1}\">{5}</text><text x=\"{3:.1}\" y=\"{4}\" text-anchor=\"middle\">{x:.0}</text>",
             MARGIN[0],
             SIZE[0] - 10.0,
             down(y),
             across(x),
-            SIZE[1] - 6.0
+            SIZE[1] - 6.0,
+            number(value)
         );
     }
     for (curve, colour) in curves.iter().zip(COLOURS.iter().cycle()) {
@@ -178,17 +182,32 @@ fn plot(title: &str, curves: &[Curve], logarithmic: bool) -> String {
             points.join(" "),
             escape(&curve.name)
         );
+        for &(x, y) in curve.points.iter().filter(|p| p.1.is_finite() && curve.points.len() < FEW) {
+            let (x, y) = (across(x), down(scale(y)));
+            let _ = write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3\" fill=\"{colour}\"/>");
+        }
     }
     svg += "</svg>\n<p>";
     for (curve, colour) in curves.iter().zip(COLOURS.iter().cycle()) {
         let last = curve.points.last().map_or(f64::NAN, |p| p.1);
         let _ = write!(
             svg,
-            "<span style=\"color:{colour}\">&#9632;</span> {} ({last:.4}) ",
-            escape(&curve.name)
+            "<span style=\"color:{colour}\">&#9632;</span> {} ({}) ",
+            escape(&curve.name),
+            number(last)
         );
     }
     svg + "</p>\n"
+}
+
+/// A number with about four digits.
+fn number(value: f64) -> String {
+    let size = value.abs();
+    if size == 0.0 || !(1e-3..1e5).contains(&size) {
+        return if size == 0.0 { "0".to_owned() } else { format!("{value:.2e}") };
+    }
+    let digits = (3.0 - size.log10().floor()).max(0.0) as usize;
+    format!("{value:.digits$}")
 }
 
 /// The last validation, clip by clip.

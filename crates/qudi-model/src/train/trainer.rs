@@ -229,13 +229,14 @@ impl Trainer {
         let measured = batch.measured(device);
         let mut random = ChaCha8Rng::seed_from_u64(self.recipe.train.seed);
         random.set_stream(batch.number);
+        let (weights, switches) = self.options();
         // Half of all batches start from nothing, as sampling does.
-        let first_pass = if random.next_u64() & 1 == 0 {
+        let from_nothing = random.next_u64() & 1 == 0;
+        let first_pass = if from_nothing || switches == Switches::NONE {
             FirstPass::No
         } else {
             FirstPass::Yes(random.next_u64())
         };
-        let (weights, switches) = self.options();
         let example = batch.example(&measured);
         let terms =
             terms(network, &example, first_pass, weights, switches, self.perceptual.get(number))?;
