@@ -203,7 +203,8 @@ fn parts_of_the_clips_give_the_figures_of_the_whole() {
     let clips = folder.join("clips");
     std::fs::create_dir(&clips).unwrap();
     for seed in ["1", "2", "3"] {
-        let scene = "simulate scene:text --size 32x32 --frames 5 --ppp 3 --seed 1 -q -f -o ../x.npy";
+        let scene =
+            "simulate scene:text --size 32x32 --frames 5 --ppp 3 --seed 1 -q -f -o ../x.npy";
         let truth = format!("{seed}.npy");
         qudi(&clips)
             .args(scene.split(' '))

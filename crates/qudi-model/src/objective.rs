@@ -25,11 +25,13 @@ pub struct LossWeights {
     pub pre: f32,
     /// Of the perceptual term, if there is one.
     pub perceptual: f32,
+    /// Of the flows' misfit.
+    pub flow: f32,
 }
 
 impl Default for LossWeights {
     fn default() -> Self {
-        Self { prediction: 1.0, pre: 0.2, perceptual: 0.0 }
+        Self { prediction: 1.0, pre: 0.2, perceptual: 0.0, flow: 0.0 }
     }
 }
 
@@ -101,6 +103,8 @@ pub struct Terms {
     pub pre: Tensor<1>,
     /// The perceptual distance of the prediction.
     pub perceptual: Option<Tensor<1>>,
+    /// How far neighbours warped along the flows are from the truth; computed only where it has a weight.
+    pub flow: Option<Tensor<1>>,
 }
 
 /// A diffusion time to train at, from two uniform numbers in [0, 1): a fifth of all at the start, where sampling
@@ -158,7 +162,12 @@ pub fn terms(
     if let Some(term) = &perceptual {
         total = total + term.clone() * weights.perceptual;
     }
-    Ok(Terms { total, prediction, pre, perceptual })
+    let frames = example.measured.frames;
+    let flow = (weights.flow > 0.0).then(|| result.flows.misfit(example.truth.clone(), frames));
+    if let Some(term) = &flow {
+        total = total + term.clone() * weights.flow;
+    }
+    Ok(Terms { total, prediction, pre, perceptual, flow })
 }
 
 /// The network's own estimate, without gradient, and its simulated measurement. Bursts at the last time have

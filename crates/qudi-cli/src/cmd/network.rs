@@ -89,7 +89,9 @@ fn check_memory(
 pub(crate) fn device_failed(problem: &str, options: &Network) -> Fault {
     let half = options.tile / 2 / 32 * 32;
     let help = if half >= 64 {
-        format!("--tile {half} needs a quarter of the memory; `qudi selftest` checks the device; or --device cpu")
+        format!(
+            "--tile {half} needs a quarter of the memory; `qudi selftest` checks the device; or --device cpu"
+        )
     } else {
         "check the device with `qudi selftest`, or use --device cpu".to_owned()
     };

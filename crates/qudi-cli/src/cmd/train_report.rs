@@ -40,7 +40,7 @@ pub(crate) fn page(
             steps.iter().filter_map(|line| Some((line["step"].as_f64()?, line[key].as_f64()?)));
         Curve { name: key.to_owned(), points: thinned(&points.collect::<Vec<_>>()) }
     };
-    let losses = ["total", "prediction", "pre", "perceptual"].map(curve);
+    let losses = ["total", "prediction", "pre", "perceptual", "flow"].map(curve);
     let losses = losses.into_iter().filter(|curve| curve.points.iter().any(|p| p.1 > 0.0));
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>qudi train</title>\n<style>{STYLE}</style></head><body>\n<h1>qudi train</h1>\n"

@@ -83,6 +83,7 @@ impl<'a> Watch<'a> {
             ("loss/prediction", step.loss.prediction),
             ("loss/pre", step.loss.pre),
             ("loss/perceptual", step.loss.perceptual),
+            ("loss/flow", step.loss.flow),
             ("train/rate", step.rate),
             ("train/norm", step.norm),
         ];

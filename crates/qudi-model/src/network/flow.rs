@@ -107,12 +107,36 @@ impl Level {
 }
 
 impl Flows {
+    /// How far warped neighbours are from the images, mean of absolute differences, `[1]`. `images` are the true frames,
+    /// `[bursts * frames, 1, height, width]`; flow is judged on its own grid.
+    pub fn misfit(&self, images: Tensor<4>, frames: usize) -> Tensor<1> {
+        let images = shrink(images, self.scale);
+        let one = |next: bool, flow: &Tensor<4>| {
+            let warped = warp(shifted(images.clone(), frames, next), flow.clone());
+            (warped - images.clone()).abs().mean()
+        };
+        (one(true, &self.to_next) + one(false, &self.to_prev)) * 0.5
+    }
+
     /// The same flows on a grid of another scale.
     #[must_use]
     pub fn at(&self, scale: usize) -> Self {
         let to = |flow: &Tensor<4>| rescale_flow(flow.clone(), self.scale, scale);
         Self { to_next: to(&self.to_next), to_prev: to(&self.to_prev), scale }
     }
+}
+
+/// The next frame of every frame, or the one before; at the ends the frame itself, where the flow is zero.
+pub(super) fn shifted(x: Tensor<4>, frames: usize, next: bool) -> Tensor<4> {
+    let [images, c, h, w] = x.dims();
+    let x = by_burst(x, frames);
+    let part = |first, count| x.clone().narrow(1, first, count);
+    let parts = if next {
+        vec![part(1, frames - 1), part(frames - 1, 1)]
+    } else {
+        vec![part(0, 1), part(0, frames - 1)]
+    };
+    Tensor::cat(parts, 1).reshape([images, c, h, w])
 }
 
 /// References and neighbours: first every frame but the last with the next one, then every frame but the first

@@ -1,7 +1,7 @@
 //! Temporal fusion: aligned neighbours on the fine levels, a bidirectional recurrence on a coarser one.
 
 use super::features::Pyramid;
-use super::flow::Flows;
+use super::flow::{Flows, shifted};
 use super::layers::{Bias, Conv2d};
 use super::pre::DenseBlock;
 use super::resample::{by_burst, halve};
@@ -103,19 +103,6 @@ impl Fusion {
         let prev = warp(shifted(x.clone(), frames, false), flows.to_prev.clone());
         self.align[k].relu(&[x, next, prev])
     }
-}
-
-/// The next frame of every frame, or the one before; at the ends the frame itself.
-fn shifted(x: Tensor<4>, frames: usize, next: bool) -> Tensor<4> {
-    let [images, c, h, w] = x.dims();
-    let x = by_burst(x, frames);
-    let part = |first, count| x.clone().narrow(1, first, count);
-    let parts = if next {
-        vec![part(1, frames - 1), part(frames - 1, 1)]
-    } else {
-        vec![part(0, 1), part(0, frames - 1)]
-    };
-    Tensor::cat(parts, 1).reshape([images, c, h, w])
 }
 
 impl Cell {

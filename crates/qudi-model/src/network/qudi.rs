@@ -149,7 +149,8 @@ impl Qudi {
         let flag = Tensor::<4>::from_data(flags, &device).repeat_dim(1, frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim.clone()], 1);
-        let (d, features) = self.pre.forward(prepared.pre.clone(), prepared.base.clone(), both, flag);
+        let (d, features) =
+            self.pre.forward(prepared.pre.clone(), prepared.base.clone(), both, flag);
         done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
         done("low");

@@ -67,6 +67,9 @@ pub struct LossConfig {
     pub perceptual: f32,
     /// Which perceptual term.
     pub term: PerceptualKind,
+    /// Of the misfit of true neighbours warped along the flows: flow learns from it long before fusion can teach it.
+    #[serde(default)]
+    pub flow: f32,
 }
 
 /// How progress is measured.
@@ -156,6 +159,7 @@ impl Recipe {
             (
                 "train.loss",
                 weight(train.loss.prediction)
+                    && weight(train.loss.flow)
                     && weight(train.loss.pre)
                     && weight(train.loss.perceptual),
                 "must have weights of 0 or more",

@@ -31,6 +31,8 @@ pub struct Losses {
     pub pre: f64,
     /// Of the perceptual term.
     pub perceptual: f64,
+    /// Of the flows.
+    pub flow: f64,
 }
 
 /// What a step did.
@@ -241,18 +243,18 @@ impl Trainer {
         let terms =
             terms(network, &example, first_pass, weights, switches, self.perceptual.get(number))?;
         let number_of = |term: &Tensor<1>| Ok(f64::from(read(term.clone())?[0]));
+        let optional = |term: &Option<Tensor<1>>| term.as_ref().map_or(Ok(0.0), number_of);
         let loss = Losses {
             total: number_of(&terms.total)?,
             prediction: number_of(&terms.prediction)?,
             pre: number_of(&terms.pre)?,
-            perceptual: match &terms.perceptual {
-                Some(term) => number_of(term)?,
-                None => 0.0,
-            },
+            perceptual: optional(&terms.perceptual)?,
+            flow: optional(&terms.flow)?,
         };
         self.check("the loss of the prediction", loss.prediction)?;
         self.check("the loss of the pre-denoised frames", loss.pre)?;
         self.check("the perceptual loss", loss.perceptual)?;
+        self.check("the misfit of the flows", loss.flow)?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let gradients = gradients(network, &terms.total.backward());
@@ -261,13 +263,13 @@ impl Trainer {
     }
 
     fn options(&self) -> (LossWeights, Switches) {
-        let LossConfig { prediction, pre, perceptual, .. } = self.recipe.train.loss;
+        let LossConfig { prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
         let network = &self.recipe.network;
         let switches = Switches {
             physics: !network.lacks(Part::Physics),
             self_conditioning: !network.lacks(Part::SelfConditioning),
         };
-        (LossWeights { prediction, pre, perceptual }, switches)
+        (LossWeights { prediction, pre, perceptual, flow }, switches)
     }
 
     fn check(&self, what: &str, value: f64) -> Result<()> {
@@ -291,6 +293,7 @@ impl Losses {
         self.prediction += share * other.prediction;
         self.pre += share * other.pre;
         self.perceptual += share * other.perceptual;
+        self.flow += share * other.flow;
     }
 }
 
