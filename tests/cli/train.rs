@@ -47,7 +47,7 @@ fn the_tiny_recipe_learns_without_a_file() {
     assert_eq!(listing(&folder.join("r")).len(), 12); // frames and manifest
     // Untrained, the smoothed estimate reaches 17.98 and 17.08 dB.
     let quality = |clip: usize| lines.last().unwrap()["clips"][clip]["psnr_a"].as_f64().unwrap();
-    assert!(quality(0) > 18.3 && quality(1) > 17.6, "{} and {} dB", quality(0), quality(1));
+    assert!(quality(0) > 18.2 && quality(1) > 17.5, "{} and {} dB", quality(0), quality(1));
 }
 
 #[test]
