@@ -125,6 +125,9 @@ pub fn terms(
     switches: Switches,
     perceptual: Option<&Perceptual>,
 ) -> Result<Terms> {
+    if weights.prediction == 0.0 && perceptual.is_none() {
+        return Ok(front_terms(network, example, weights));
+    }
     let schedule = NoiseSchedule::cosine(TIMES);
     let clean = example.truth.clone() * 2.0 - 1.0;
     let noisy = |times: &[usize]| {
@@ -168,6 +171,17 @@ pub fn terms(
         total = total + term.clone() * weights.flow;
     }
     Ok(Terms { total, prediction, pre, perceptual, flow })
+}
+
+/// The terms of pre-denoiser and flow alone, at a fifth of the cost: a first stage for what must work before the rest
+/// can learn from it.
+fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> Terms {
+    let measured = example.measured;
+    let (d, flows) = network.denoise_and_align(&network.prepare(measured));
+    let pre = reconstruction(d, example.truth.clone());
+    let flow = flows.misfit(example.truth.clone(), measured.frames);
+    let total = pre.clone() * weights.pre + flow.clone() * weights.flow;
+    Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow: Some(flow) }
 }
 
 /// The network's own estimate, without gradient, and its simulated measurement. Bursts at the last time have

@@ -77,6 +77,41 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
     terms(network, &example, first_pass, LossWeights::default(), Switches::ALL, None).unwrap()
 }
 
+/// The first stage computes what the whole network would of pre-denoiser and flow, and nothing else learns.
+#[test]
+fn the_first_stage_is_a_part_of_the_whole() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
+    let with = |prediction: f32| {
+        let weights = LossWeights { prediction, pre: 1.0, flow: 0.5, ..LossWeights::default() };
+        let example = Example {
+            measured: &burst.measured,
+            truth: burst.truth.clone(),
+            contexts: std::slice::from_ref(&burst.context),
+            noise: burst.truth.zeros_like(),
+            times: &[500],
+        };
+        terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap()
+    };
+    let (part, whole) = (with(0.0), with(1.0));
+    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
+    assert_eq!(value(&part.pre), value(&whole.pre));
+    let flows = [&part, &whole].map(|terms| value(terms.flow.as_ref().unwrap()));
+    assert_eq!(flows[0], flows[1]);
+    assert!((value(&part.total) - value(&part.pre) - 0.5 * flows[0]).abs() < 1e-7);
+    let grads = part.total.backward();
+    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut without);
+    let idle = |name: &String| !name.starts_with("pre.") && !name.starts_with("flow.");
+    assert!(without.names.iter().any(|name| name.starts_with("unet.")));
+    // At first flow's last layers are zero, and hide the layers before from the gradient.
+    let hidden = |name: &String| name.starts_with("flow.") && !name.contains("layers.4");
+    let other = without.names.iter().find(|name| !idle(name) && !hidden(name));
+    // What reads simulated measurements sees zeros here.
+    assert!(other.is_none_or(|name| name.starts_with("pre.simulated_in")), "{other:?}");
+}
+
 /// Names of parameters whose gradient is missing or zero.
 struct Without<'a> {
     grads: &'a Gradients,

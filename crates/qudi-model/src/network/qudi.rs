@@ -125,6 +125,36 @@ impl Qudi {
         self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
     }
 
+    /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.
+    /// No gradient goes from the flows to the frames.
+    pub fn denoise_and_align(&self, prepared: &Prepared) -> (Tensor<4>, Flows) {
+        let (d, _) = self.pre_denoise(prepared, None);
+        let flows = self.flow.forward(d.clone().detach(), prepared.frames);
+        (d, flows)
+    }
+
+    /// The pre-denoised frames and their features.
+    fn pre_denoise(
+        &self,
+        prepared: &Prepared,
+        simulated: Option<&Simulated>,
+    ) -> (Tensor<4>, Tensor<4>) {
+        let (frames, u) = (prepared.frames, &prepared.u);
+        let bursts = u.dims()[0] / frames;
+        let (y_sim, u_sim, flags) = match simulated {
+            Some(simulated) => {
+                let flags = simulated.exists.iter().map(|&exists| f32::from(u8::from(exists)));
+                (simulated.y.clone(), simulated.u.clone(), flags.collect())
+            }
+            None => (u.zeros_like(), u.zeros_like(), vec![0.0; bursts]),
+        };
+        let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
+        let flag = Tensor::<4>::from_data(flags, &u.device()).repeat_dim(1, frames);
+        let flag = flag.reshape([bursts * frames, 1, 1, 1]);
+        let both = Tensor::cat(vec![y_sim, u_sim], 1);
+        self.pre.forward(prepared.pre.clone(), prepared.base.clone(), both, flag)
+    }
+
     /// [`Self::forward`], telling `done` the name of every block that is done.
     pub fn forward_observed(
         &self,
@@ -136,21 +166,8 @@ impl Qudi {
     ) -> Prediction {
         let frames = prepared.frames;
         let u = prepared.u.clone();
-        let device = u.device();
-        let bursts = u.dims()[0] / frames;
-        let (y_sim, u_sim, flags) = match simulated {
-            Some(simulated) => {
-                let flags = simulated.exists.iter().map(|&exists| f32::from(u8::from(exists)));
-                (simulated.y.clone(), simulated.u.clone(), flags.collect())
-            }
-            None => (u.zeros_like(), u.zeros_like(), vec![0.0; bursts]),
-        };
-        let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
-        let flag = Tensor::<4>::from_data(flags, &device).repeat_dim(1, frames);
-        let flag = flag.reshape([bursts * frames, 1, 1, 1]);
-        let both = Tensor::cat(vec![y_sim, u_sim.clone()], 1);
-        let (d, features) =
-            self.pre.forward(prepared.pre.clone(), prepared.base.clone(), both, flag);
+        let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
+        let (d, features) = self.pre_denoise(prepared, simulated);
         done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
         done("low");
