@@ -116,7 +116,7 @@ pub fn training_time(kind: f64, place: f64) -> usize {
 /// The loss of `network`, which is on an autodiff device, on an example on the same device.
 ///
 /// # Errors
-/// [`SimError`](qudi_sim::SimError) if the device fails or a sensor is impossible.
+/// [`SimError`] if the device fails or a sensor is impossible.
 pub fn terms(
     network: &Qudi,
     example: &Example<'_>,
