@@ -9,7 +9,6 @@ use qudi_sim::{Result, SimError};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
-use std::io::Write;
 use std::path::Path;
 
 /// The key of the description among a file's metadata.
@@ -68,9 +67,7 @@ pub fn save(
     let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| {
         SimError::data(format!("cannot lay out the weights: {e}"), path, "report this")
     })?;
-    let mut file = PendingFile::create(path, overwrite)?;
-    file.write_all(&bytes).map_err(|e| SimError::io("write the weights", path, e))?;
-    file.finish()
+    PendingFile::write_whole(path, &bytes, overwrite)
 }
 
 /// Reads the description alone.

@@ -13,7 +13,8 @@ impl NetworkConfig {
     }
 
     /// Bytes that restoring a window of `frames` frames of `size` takes on the processor at most, about: activations
-    /// of the finest level, `PLANES` times its widths at once, and the weights. From measurements of `tiny` and `small`.
+    /// of the finest level, `PLANES` times its widths at once. A third and more above what `small` took where it was
+    /// measured.
     pub fn memory(&self, size: Size, frames: usize) -> u64 {
         const PLANES: f64 = 6.5;
         let widths = self.unet.width + self.fusion.widths[0] + self.pre.width;

@@ -43,7 +43,8 @@ pub use camera::Camera;
 pub use error::{Result, SimError};
 pub use frame::{Frame, Size};
 pub use light::{
-    ClipStatistics, Light, PppDefinition, Spectrum, ppp_from_lux, resolve_light, sensor_lux,
+    ClipStatistics, Light, PppDefinition, Spectrum, USUAL_EXPOSURE, ppp_from_lux, resolve_light,
+    sensor_lux,
 };
 pub use simulate::{Exposed, Progress, Simulation, Sink, Stage, Start, Summary, simulate};
 pub use transfer::{Transfer, linear_to_srgb, srgb_to_linear};

@@ -4,6 +4,9 @@ use crate::error::{Result, SimError};
 use crate::sensor::{CountLaw, Gain, Response, Sensor};
 use serde::{Deserialize, Serialize};
 
+/// Mean value of scenes as they usually are: what is told where nobody knows the true exposure.
+pub const USUAL_EXPOSURE: f64 = 0.45;
+
 /// What a number of "photons per pixel" counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

@@ -2,7 +2,7 @@
 
 use super::{Network, Reading, Shard};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
-use qudi_sim::Size;
+use qudi_sim::{Size, USUAL_EXPOSURE};
 use std::path::PathBuf;
 
 /// Compare methods on clips whose truth is known, or on a real capture: the same photons and frames for all
@@ -45,7 +45,7 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
     /// Mean image value that methods are told
-    #[arg(long, value_name = "VALUE", default_value_t = 0.45)]
+    #[arg(long, value_name = "VALUE", default_value_t = USUAL_EXPOSURE)]
     pub(crate) exposure: f64,
     /// Frames that neighbouring windows share, blended
     #[arg(long, value_name = "N", default_value_t = 3)]

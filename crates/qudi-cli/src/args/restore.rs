@@ -2,6 +2,7 @@
 
 use super::{Network, Reading};
 use clap::{Args as ClapArgs, ValueHint};
+use qudi_sim::USUAL_EXPOSURE;
 use std::path::PathBuf;
 
 /// Restore video from a capture
@@ -31,7 +32,7 @@ pub(crate) struct Restore {
     #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
     pub(crate) gain: Option<f64>,
     /// Image value that PPP photons become: counts do not fix the brightness of a picture
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, default_value_t = 0.45)]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, default_value_t = USUAL_EXPOSURE)]
     pub(crate) exposure: f64,
     /// Seed of methods that draw
     #[arg(long, value_name = "N", default_value_t = 0)]

@@ -44,9 +44,7 @@ pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<
     })?;
     let bad = calibration.bad.mask(calibration.size);
     write_map(&maps[1], "|b1", &calibration, overwrite, |i, bytes| bytes.push(u8::from(bad[i])))?;
-    let mut file = PendingFile::create(&args.output, overwrite)?;
-    file.write_all(document.as_bytes()).map_err(|e| file.fault(e))?;
-    file.finish()?;
+    PendingFile::write_whole(&args.output, document.as_bytes(), overwrite)?;
     // What was written must be readable.
     Sensor::load(&args.output.to_string_lossy())?;
     remarks(&capture, report);

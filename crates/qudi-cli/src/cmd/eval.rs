@@ -14,7 +14,6 @@ use qudi_sim::capture::{MaskChoice, ReadOptions};
 use qudi_sim::output::{Overwrite, PendingFile, refuse_taken};
 use qudi_sim::sensor::Sensor;
 use serde_json::{Value, json};
-use std::io::Write;
 use std::path::Path;
 
 /// Light levels of clips unless said otherwise: those of the paper's table.
@@ -158,9 +157,7 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
 
 fn write(path: Option<&Path>, text: &str, overwrite: Overwrite) -> Result<()> {
     let Some(path) = path else { return Ok(()) };
-    let mut file = PendingFile::create(path, overwrite)?;
-    file.write_all(text.as_bytes()).map_err(|e| file.fault(e))?;
-    Ok(file.finish()?)
+    Ok(PendingFile::write_whole(path, text.as_bytes(), overwrite)?)
 }
 
 /// What is not known is left out.

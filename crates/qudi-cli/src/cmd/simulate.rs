@@ -239,12 +239,10 @@ impl<'a> Outputs<'a> {
         let path = PathBuf::from(&self.args.output);
         if self.args.visionsim {
             let transforms = transforms_path(self.args);
-            let mut file = PendingFile::create(&transforms, self.overwrite)?;
             let document = serde_json::to_vec(&visionsim_transforms(record, &path));
             let document = document
                 .map_err(|e| Fault::new(e, transforms.display(), "report this as a bug"))?;
-            file.write_all(&document).map_err(|e| file.fault(e))?;
-            file.finish()?;
+            PendingFile::write_whole(&transforms, &document, self.overwrite)?;
             written.push(transforms);
         }
         if let Some(burst) = self.burst {

@@ -10,7 +10,6 @@ use crate::report::{Bar, Report};
 use qudi_model::train::{Event, METRICS, RECIPE, Recipe, StepReport, Validation};
 use qudi_sim::SimError;
 use qudi_sim::output::{Overwrite, PendingFile};
-use std::io::Write as _;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -125,9 +124,7 @@ impl<'a> Watch<'a> {
 
 /// Writes a file of the run.
 pub(crate) fn write(folder: &Path, name: &str, bytes: &[u8]) -> Result<()> {
-    let mut file = PendingFile::create(&folder.join(name), Overwrite::Yes)?;
-    file.write_all(bytes).map_err(|e| file.fault(e))?;
-    Ok(file.finish()?)
+    Ok(PendingFile::write_whole(&folder.join(name), bytes, Overwrite::Yes)?)
 }
 
 /// Writes the report of a run's folder.

@@ -73,8 +73,8 @@ impl PreDenoiser {
     }
 
     /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.
-    /// `prepared` as from [`Self::prepare`]; `base` is a first guess, in image units; `simulated` are `y_sim` and `u_sim`, `flag` says of every image
-    /// whether they exist, `[images, 1, 1, 1]`.
+    /// `prepared` as from [`Self::prepare`]; `base` is a first guess, in image units; `simulated` are `y_sim` and
+    /// `u_sim`, `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
     pub fn forward(
         &self,
         prepared: Tensor<4>,

@@ -10,12 +10,9 @@ use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_sim::dataset::Dataset;
 use qudi_sim::restore::{BurstView, Context};
-use qudi_sim::{Result, Size};
+use qudi_sim::{Result, Size, USUAL_EXPOSURE};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
-
-/// Exposure that networks without that input are told.
-const USUAL_EXPOSURE: f64 = 0.45;
 
 /// Samples for one pass.
 #[derive(Clone, Debug)]

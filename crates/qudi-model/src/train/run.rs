@@ -186,9 +186,7 @@ impl Run {
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
-        let mut file = PendingFile::create(&self.folder.join(name), Overwrite::Yes)?;
-        file.write_all(bytes).map_err(|e| self.failed(name, e))?;
-        file.finish()
+        PendingFile::write_whole(&self.folder.join(name), bytes, Overwrite::Yes)
     }
 
     fn metrics(&self) -> Result<std::fs::File> {

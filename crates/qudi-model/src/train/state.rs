@@ -66,7 +66,8 @@ impl Trainer {
         let bytes = safetensors::serialize(views, None).map_err(|e| {
             SimError::data(format!("cannot lay out the state: {e}"), &new, "report this")
         })?;
-        let counters = serde_json::to_vec(&Counters { step: self.step }).expect("plain data");
+        let counters =
+            serde_json::to_vec(&Counters { step: self.step_number() }).expect("plain data");
         let write = |name: &str, bytes: &[u8]| {
             let path = new.join(name);
             let write = || {
@@ -144,7 +145,6 @@ impl Trainer {
         trainer.network = with_values(trainer.network, weights?);
         trainer.average = average?;
         trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
-        trainer.step = counters.step;
         Ok(trainer)
     }
 }

@@ -66,7 +66,6 @@ pub struct Trainer {
     pub(super) network: Qudi,
     pub(super) average: Vec<Tensor<1>>,
     pub(super) adam: Adam,
-    pub(super) step: u64,
     perceptual: Vec<Perceptual>,
 }
 
@@ -117,19 +116,18 @@ impl Trainer {
             average: start,
             network: learner,
             devices,
-            step: 0,
             perceptual,
         })
     }
 
     /// Steps taken.
     pub fn step_number(&self) -> u64 {
-        self.step
+        self.adam.steps
     }
 
     /// Batches used.
     pub fn batches(&self) -> u64 {
-        self.step * self.recipe.train.accumulate as u64
+        self.step_number() * self.recipe.train.accumulate as u64
     }
 
     /// The network with averaged weights, for use.
@@ -165,19 +163,18 @@ impl Trainer {
         let norm = norm(&gradients)? / count as f64;
         self.check("the gradient", norm)?;
         let train = &self.recipe.train;
-        let rate = learning_rate(train, self.step);
+        let taken = self.step_number();
+        let rate = learning_rate(train, taken);
         let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
-        let network = self.network.clone();
-        let moved = self.adam.step(values(&network), gradients, scale, rate);
+        let moved = self.adam.step(values(&self.network), gradients, scale, rate);
         // An average over few steps at first, or the initial weights would stay in it for long.
-        let keep = train.ema.min((1 + self.step) as f64 / (10 + self.step) as f64);
+        let keep = train.ema.min((1 + taken) as f64 / (10 + taken) as f64);
         let average = std::mem::take(&mut self.average).into_iter().zip(&moved);
         self.average = average.map(|(a, b)| a * keep + b.clone() * (1.0 - keep)).collect();
-        self.network = with_values(network, moved);
-        self.step += 1;
+        self.network = with_values(self.network.clone(), moved);
         let optimizer_s = start.elapsed().as_secs_f64();
         Ok(StepReport {
-            step: self.step,
+            step: self.step_number(),
             rate,
             loss,
             norm,
@@ -202,8 +199,7 @@ impl Trainer {
                 move || -> Result<Vec<(usize, Pass)>> {
                     let inner = device.clone().inner();
                     let weights = weights.into_iter().map(|w| w.to_device(&inner)).collect();
-                    let network = self.recipe.network.init(self.recipe.train.seed, device);
-                    let network = with_values(network, weights);
+                    let network = with_values(self.recipe.network.shell(device), weights);
                     mine.map(|(at, batch)| Ok((at, self.pass(&network, batch, number)?))).collect()
                 }
             };
@@ -279,7 +275,7 @@ impl Trainer {
         Err(SimError::request(
             format!(
                 "{what} is {value} in step {}: training stopped, the last checkpoint is good",
-                self.step + 1
+                self.step_number() + 1
             ),
             what,
             "lower train.rate or train.clip and go on from the checkpoint with --resume",

@@ -10,11 +10,8 @@ use qudi_sim::metrics::{gain_aligned_psnr, psnr, ssim};
 use qudi_sim::restore::{BurstView, Context, Restorer};
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use qudi_sim::sensor::Sensor;
-use qudi_sim::{Camera, Frame, Light, Result, SimError, Size};
+use qudi_sim::{Camera, Frame, Light, Result, SimError, Size, USUAL_EXPOSURE};
 use serde::Serialize;
-
-/// Exposure that the network is told: no user knows the true one.
-const EXPOSURE: f64 = 0.45;
 
 /// Seed of the photons.
 const SEED: u64 = 2026;
@@ -149,7 +146,7 @@ impl Validator {
                     seed: SEED,
                     first_frame: 0,
                     ppp,
-                    exposure: EXPOSURE,
+                    exposure: USUAL_EXPOSURE,
                     sensor: self.sensor.clone(),
                     gain: camera.gain(),
                     dark: None,

@@ -68,6 +68,16 @@ impl PendingFile {
         })
     }
 
+    /// Writes a file whose bytes are all there.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken, or the file cannot be written.
+    pub fn write_whole(path: &Path, bytes: &[u8], overwrite: Overwrite) -> Result<()> {
+        let mut file = Self::create(path, overwrite)?;
+        file.write_all(bytes).map_err(|e| file.fault(e))?;
+        file.finish()
+    }
+
     /// The name it will have.
     pub fn path(&self) -> &Path {
         &self.path
