@@ -116,6 +116,25 @@ def smooth(x: Tensor) -> Tensor:
     return F.conv2d(padded, (row[:, None] * row[None, :])[None, None])
 
 
+def mean_around(x: Tensor, radius: int) -> Tensor:
+    """Means over squares, edges repeated."""
+    padded = F.pad(x, (radius,) * 4, mode="replicate")
+    return F.avg_pool2d(padded, 2 * radius + 1, stride=1)
+
+
+class Variance:
+    """Of the linear estimate, affine in the light."""
+
+    def __init__(self, sensor: Tensor, frames: int):
+        images = lambda x: x.detach().repeat_interleave(frames)[:, None, None, None]
+        self.floor, self.mean = (images(10 ** (2 * sensor[:, place])) for place in (9, 10))
+        self.exposure = images(sensor[:, 1])
+
+    def at(self, image: Tensor) -> Tensor:
+        slope = (self.mean - self.floor) / self.exposure.clamp(min=1e-3)
+        return (self.floor + slope * mean_around(image, 2)).clamp(min=1e-8)
+
+
 class PreDenoiser(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
@@ -199,33 +218,80 @@ class FlowLevel(nn.Module):
         return self.layers[-1](x)
 
 
+@torch.no_grad()
+def lucas_kanade(reference: Tensor, neighbour: Tensor, start: Tensor, prior: Tensor) -> Tensor:
+    """How much further than `start` to look, [pairs, 2, h, w]."""
+    motion = torch.zeros_like(start)
+    for _ in range(3):
+        warped = warp(neighbour, start + motion)
+        middle = F.pad((reference + warped) / 2, (1, 1, 1, 1), mode="replicate")
+        a = (middle[:, :, 1:-1, 2:] - middle[:, :, 1:-1, :-2]) / 2
+        b = (middle[:, :, 2:, 1:-1] - middle[:, :, :-2, 1:-1]) / 2
+        e = reference - warped + a * motion[:, :1] + b * motion[:, 1:]
+        aa, ab, bb, ae, be = (mean_around(x, 4) for x in (a * a, a * b, b * b, a * e, b * e))
+        matrix = torch.stack([aa + prior, ab, ab, bb + prior], -1).unflatten(-1, (2, 2))
+        solved = torch.linalg.solve(matrix[:, 0], torch.stack([ae, be], -1)[:, 0])
+        motion = solved.permute(0, 3, 1, 2).clamp(-3, 3)
+    return mean_around(motion, 2)
+
+
 class Flow(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
         flow = config["flow"]
-        self.scale = flow["scale"]
-        self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["levels"]))
+        self.scale, self.pyramid = flow["scale"], flow["levels"]
+        self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["networks"]))
 
-    def forward(self, d: Tensor, frames: int) -> Flows:
-        """to_next and to_prev, [B*N, 2, H/scale, W/scale] each."""
+    def forward(self, d: Tensor, variance: Tensor, frames: int) -> Flows:
+        """to_next and to_prev, [B*N, 2, H/scale, W/scale]; `variance` [B*N, 1, 1, 1]."""
         pyramid = [F.avg_pool2d(d, self.scale)]
-        for _ in self.levels[1:]:
+        for _ in range(1, self.pyramid):
             pyramid.append(F.avg_pool2d(pyramid[-1], 2))
-        flow = None
-        for net, image in zip(reversed(self.levels), reversed(pyramid)):
-            x = bursts(image, frames)
-            # Both directions in one batch: frames 0..N-1 look ahead, frames 1..N look back.
-            reference = torch.cat([x[:, :-1], x[:, 1:]], 1).flatten(0, 1)
+        # Both directions in one batch: frames 0..N-1 look ahead, frames 1..N look back.
+        ahead_back = lambda x, y: torch.cat([x[:, :-1], y[:, 1:]], 1).flatten(0, 1)
+        v = bursts(variance, frames)
+        prior = 0.03 * ahead_back(v, v)
+        flow = torch.zeros(len(prior), 2, *pyramid[-1].shape[2:], dtype=d.dtype)
+        skipped = self.pyramid - len(self.levels)
+        for j in reversed(range(self.pyramid)):
+            x = bursts(pyramid[j], frames)
+            reference = ahead_back(x, x)
             neighbour = torch.cat([x[:, 1:], x[:, :-1]], 1).flatten(0, 1)
-            if flow is None:
-                flow = reference.new_zeros(len(reference), 2, *reference.shape[2:])
-            else:
+            if j < self.pyramid - 1:
                 flow = up2(flow) * 2
-                neighbour = warp(neighbour, flow)
-            flow = flow + net(torch.cat([reference, neighbour, flow], 1))
+            flow = flow + lucas_kanade(reference, neighbour, flow, prior)
+            if j >= skipped:
+                images = (4 * (x - 0.5) for x in (reference, warp(neighbour, flow)))
+                flow = flow + self.levels[j - skipped](torch.cat([*images, flow], 1))
         ahead, back = bursts(flow, 2 * (frames - 1)).chunk(2, 1)
         nothing = torch.zeros_like(ahead[:, :1])
         return torch.cat([ahead, nothing], 1).flatten(0, 1), torch.cat([nothing, back], 1).flatten(0, 1)
+
+
+def merge(u: Tensor, d: Tensor, variance: Variance, flows: Flows, frames: int) -> tuple[Tensor, Tensor, Tensor]:
+    """u_m, d_m and W; `flows` in full-resolution pixels."""
+    # One sweep: `order` is that of the frames, each aligned with the one before it.
+    smoothed = smooth(u).detach()
+    explained = bursts(0.04523 * variance.at(smoothed), frames)
+    own, lowpass = bursts(torch.cat([u.detach(), d, torch.ones_like(u)], 1), frames), bursts(smoothed, frames)
+
+    def sweep(order: list[int], flow: Tensor) -> list[Tensor]:
+        sums: dict[int, Tensor] = {order[0]: own[:, order[0]]}
+        for before, i in zip(order, order[1:]):
+            m = warp(sums[before], flow[:, i])
+            known = m.detach()
+            mass = known[:, 2:]
+            t = mean_around(lowpass[:, i] - smooth(known[:, :1] / mass), 1)
+            x = mean_around(t**2, 2) / (explained[:, i] * (1 + 1 / mass))
+            sums[i] = own[:, i] + torch.exp(-0.5 * F.relu(x - 1)) * m
+        return [sums[i] for i in range(frames)]
+
+    to_next, to_prev = (bursts(flow.detach(), frames) for flow in flows)
+    order = list(range(frames))
+    forward, backward = sweep(order, to_prev), sweep(order[::-1], to_next)
+    total = (torch.stack(forward, 1) + torch.stack(backward, 1) - own).flatten(0, 1)
+    mass = total[:, 2:].detach()
+    return total[:, :1].detach() / mass, total[:, 1:2] / mass, mass
 
 
 class Cell(nn.Module):
@@ -376,12 +442,12 @@ class UNet(nn.Module):
         unet, self.fold = config["unet"], config["fold"]
         self.size = size = unet["embedding"]
         self.time_in, self.time_out = nn.Linear(size, size), nn.Linear(size, size)
-        self.sensor_in, self.sensor_out = nn.Linear(9, size), nn.Linear(size, size)
+        self.sensor_in, self.sensor_out = nn.Linear(11, size), nn.Linear(size, size)
 
         widths = [unet["width"] * m for m in unet["multipliers"]]
         levels, blocks = len(widths), unet["blocks"]
         before = [widths[0], *widths[:-1]]
-        self.inp = conv(4 * self.fold**2, widths[0], 3)
+        self.inp = conv(6 * self.fold**2, widths[0], 3)
         self.merge = nn.ModuleList(
             conv(x + fused, x, 1) for x, fused in zip(before, config["fusion"]["widths"])
         )
@@ -406,7 +472,7 @@ class UNet(nn.Module):
         self,
         x_t: Tensor,
         x0_prev: Tensor,
-        u: Tensor,
+        merged: tuple[Tensor, Tensor, Tensor],
         d: Tensor,
         fused: list[Tensor],
         t: Tensor,
@@ -414,7 +480,9 @@ class UNet(nn.Module):
         frames: int,
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
-        x = self.inp(F.pixel_unshuffle(torch.cat([x_t, x0_prev, 2 * u - 1, 2 * d - 1], 1), self.fold))
+        u_m, d_m, mass = merged
+        images = [x_t, x0_prev, 2 * u_m - 1, 2 * d_m - 1, 2 * d - 1, mass**-0.5]
+        x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
         for k, level in enumerate(self.encoder):
             if k < len(self.merge):
@@ -430,7 +498,7 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        return 2 * d - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
+        return 2 * d_m - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
 
 
 class Qudi(nn.Module):
@@ -461,10 +529,13 @@ class Qudi(nn.Module):
         d, g = self.pre(y, u, y_sim, u_sim, flag)
         low = self.low(u, u_sim, d, frames)
         high = self.high(x_t, x0_prev, frames)
+        variance = Variance(sensor, frames)
         if flows is None:
-            flows = self.flow(d, frames)
+            flows = self.flow(d, variance.mean.clamp(min=1e-8), frames)
         fused = self.fusion(low, high, g, flows, frames)
-        return self.unet(x_t, x0_prev, u, d, fused, t, sensor, frames), d, flows
+        fine = tuple(resize_flow(flow, self.flow.scale, 1) for flow in flows)
+        merged = merge(u, d, variance, fine, frames)
+        return self.unet(x_t, x0_prev, merged, d, fused, t, sensor, frames), d, flows
 
 
 # The loss (without the perceptual term)
@@ -529,8 +600,23 @@ def linear(ppp: float, exposure: float) -> np.ndarray:
     return np.clip((counts / gain(ppp) - DARK) / QE * exposure / ppp, 0, 2).astype(np.float32)
 
 
+def deviation(ppp: float, exposure: float, image: float) -> float:
+    """Of the linear estimate, summed over electrons and the reading's steps."""
+    electrons = np.arange(FULL_WELL + 1)
+    rate = QE * image * ppp / exposure + DARK
+    weight = np.exp(electrons * math.log(rate) - rate - np.array([math.lgamma(k + 1) for k in electrons]))
+    weight[-1] += 1 - weight.sum()
+    edges = (np.arange(FULL_SCALE) + 0.5) / gain(ppp)
+    below = np.array([[0.5 * math.erfc((k - edge) / READ / math.sqrt(2)) for edge in edges] for k in electrons])
+    chances = weight @ np.diff(below, prepend=0, append=1)
+    values = linear(ppp, exposure).astype(np.float64)
+    mean = chances @ values
+    return math.sqrt(chances @ (values - mean) ** 2)
+
+
 def sensor_numbers(ppp: float, exposure: float) -> list[float]:
-    return [math.log10(ppp), exposure, QE, DARK, READ, math.log10(gain(ppp)), math.log2(FULL_SCALE + 1) / 8, 0.0, 0.0]
+    numbers = [math.log10(ppp), exposure, QE, DARK, READ, math.log10(gain(ppp)), math.log2(FULL_SCALE + 1) / 8, 0.0, 0.0]
+    return numbers + [math.log10(deviation(ppp, exposure, image)) for image in (0, exposure)]
 
 
 def sample(

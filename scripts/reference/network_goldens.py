@@ -105,12 +105,13 @@ def spread(shape: tuple[int, ...], offset: float = 0.0, scale: float = math.sqrt
 
 
 def given(values: list) -> dict:
-    return {"shape": list(np.shape(values)), "values": values}
+    return {"shape": list(np.shape(values)), "values": np.ravel(values).tolist()}
 
 
 def make(name: str, spec: dict, dtype: torch.dtype) -> Tensor:
     if "values" in spec:
-        return torch.tensor(np.array(spec["values"], np.float32)).to(dtype)
+        values = np.array(spec["values"], np.float32)
+        return torch.from_numpy(values.reshape(spec["shape"])).to(dtype)
     value = affine(f"input.{name}", tuple(spec["shape"]), spec["offset"], spec["scale"])
     value[spec.get("zero", [])] = 0
     return torch.from_numpy(value).to(dtype)
@@ -362,22 +363,47 @@ def feature_file() -> File:
     return file
 
 
+def sensors(*deviations: list[float]) -> dict:
+    """Two sensors with these deviations of the linear estimate, as logarithms, at no and at mean light."""
+    first = [0.5, 0.45, 0.8, 1.6, 0.2, 0.03, 0.375, 0, 0]
+    second = [1, 0.3, 0.4, 0.1, 0.9, 1, 0.5, 1, 0.4]
+    return {"sensor": given([first + deviations[0], second + deviations[1]])}
+
+
 def flow_file() -> File:
     file = File("flow", 128)
     config = network.load("tiny")
-    for levels in (2, 3):
-        config = variant(config, flow={"levels": levels})
+    for levels, networks in ((2, 2), (3, 2)):
+        config = variant(config, flow={"levels": levels, "networks": networks})
         module = network.Flow(config)
-        run = lambda d: dict(zip(("to_next", "to_prev"), module(d, 4)))
-        d = {"d": spread((8, 1, 32, 48), 0.5, 44.0)}
-        file.case(f"levels_{levels}", run, d, module, "flow", {"config": config, "frames": 4})
+        run = lambda d, variance: dict(zip(("to_next", "to_prev"), module(d, variance, 4)))
+        inputs = {"d": spread((8, 1, 32, 48), 0.5, 8.0), "variance": spread((8, 1, 1, 1), 20.0, 5.0)}
+        about = {"config": config, "frames": 4}
+        file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance",))
+    return file
+
+
+def merge_file() -> File:
+    file = File("merge", 128)
+    shape, flow = (8, 1, 16, 24), (8, 2, 16, 24)
+    inputs = {"u": spread(shape, 0.6, 0.5), "d": spread(shape, *COUNTS)} | sensors([-1, -0.5], [-1.5, -1])
+    # Frames 0..3 and 4..7 are bursts.
+    inputs["to_next"] = spread(flow, 0.05, 1.3) | {"zero": [3, 7]}
+    inputs["to_prev"] = spread(flow, -0.05, 1.3) | {"zero": [0, 4]}
+
+    def run(u: Tensor, d: Tensor, sensor: Tensor, to_next: Tensor, to_prev: Tensor) -> Tensors:
+        merged = network.merge(u, d, network.Variance(sensor, 4), (to_next, to_prev), 4)
+        return dict(zip(("u_m", "d_m", "mass"), merged))
+
+    about = {"operation": "merge", "frames": 4}
+    file.case("merge", run, inputs, about=about, constant=("u", "sensor", "to_next", "to_prev"))
     return file
 
 
 def fusion_file() -> File:
     file = File("fusion", 128)
     for level in range(3):
-        config = variant(network.load("tiny"), fusion={"level": level, "widths": [6, 8, 10]})
+        config = variant(network.load("tiny"), fusion={"level": level, "widths": [6, 8, 10]}, flow={"scale": 4})
         module = network.Fusion(config)
         inputs: dict[str, dict] = {}
         for kind in ("low", "high"):
@@ -407,15 +433,17 @@ def unet_file() -> File:
         module = network.UNet(config)
         shape = (6, 1, 16, 24)
         inputs = {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
-        inputs |= {"u": spread(shape, *LINEAR), "d": spread(shape, *COUNTS)}
+        inputs |= {"u_m": spread(shape, *LINEAR), "d_m": spread(shape, *COUNTS), "mass": spread(shape, 3.0, 1.5)}
+        inputs["d"] = spread(shape, *COUNTS)
         for k, width in enumerate(config["fusion"]["widths"]):
             scale = config["fold"] << k
             inputs[f"fused_{k}"] = spread((6, width, 16 // scale, 24 // scale), 0.5, 0.5)
-        inputs |= {"t": given([700, 40]), "sensor": spread((2, 9), scale=1.0)}
+        inputs |= {"t": given([700, 40]), "sensor": spread((2, 11), scale=1.0)}
 
         def run(**x: Tensor) -> Tensors:
             fused = [x.pop(f"fused_{k}") for k in range(3)]
-            return {"x0": module(**x, fused=fused, frames=3)}
+            merged = tuple(x.pop(name) for name in ("u_m", "d_m", "mass"))
+            return {"x0": module(**x, merged=merged, fused=fused, frames=3)}
 
         file.case(name, run, inputs, module, "unet", {"config": config, "frames": 3})
     return file
@@ -433,7 +461,9 @@ def network_file() -> File:
     inputs = {"y": spread(shape, *COUNTS), "u": spread(shape, 0.664, 0.55)}
     inputs |= {"y_sim": spread(shape, *COUNTS), "u_sim": spread(shape, *LINEAR), "flag": given([1, 1])}
     inputs |= {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
-    inputs |= {"t": given([700, 40]), "sensor": spread((2, 9), scale=1.0), "truth": spread(shape, 0.5, 0.4)}
+    inputs |= {"t": given([700, 40]), "truth": spread(shape, 0.5, 0.4)}
+    # Strong noise: else flow between random images, and all that depends on it, turns on the last digit.
+    inputs |= sensors([0.0, 0.5], [-0.5, 0.3])
 
     def run(**x: Tensor) -> Tensors:
         x0, d, flows = module(**x, frames=4)
@@ -444,7 +474,7 @@ def network_file() -> File:
         return outputs["loss"].sum()
 
     about = {"config": config, "frames": 4, "loss": "1.0 L((x0 + 1) / 2, truth) + 0.2 L(d, truth)"}
-    file.case("tiny", run, inputs, module, "", about, ("flag", "t", "truth"), loss)
+    file.case("tiny", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), loss)
     return file
 
 
@@ -530,6 +560,7 @@ FILES: dict[str, Callable[[], File]] = {
     "pre": pre_file,
     "features": feature_file,
     "flow": flow_file,
+    "merge": merge_file,
     "fusion": fusion_file,
     "unet": unet_file,
     "network": network_file,

@@ -68,6 +68,8 @@ pub struct FlowConfig {
     pub scale: usize,
     /// Levels of the pyramid.
     pub levels: usize,
+    /// How many of them, from the coarsest, have a network.
+    pub networks: usize,
     /// Channels of the layers of a level's network but the last.
     pub widths: [usize; 4],
     /// Reverse steps, from 1, that estimate the flow anew; others keep the last one.
@@ -161,6 +163,11 @@ impl NetworkConfig {
             ("features", widths(&[self.features.low, self.features.high].concat()), SIZES),
             ("flow.scale", matches!(self.flow.scale, 1 | 2 | 4 | 8), "must be 1, 2, 4 or 8"),
             ("flow.levels", (1..=6).contains(&self.flow.levels), "must be from 1 to 6"),
+            (
+                "flow.networks",
+                (1..=self.flow.levels).contains(&self.flow.networks),
+                "must be from 1 to flow.levels",
+            ),
             ("flow.widths", widths(&self.flow.widths), SIZES),
             ("flow.steps", self.flow.steps.contains(&1), "must contain the first step, 1"),
             ("fusion.level", self.fusion.level < 3, "must be 0, 1 or 2"),
@@ -206,7 +213,7 @@ mod tests {
             .iter()
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
             .collect();
-        assert_eq!(multiples, [8, 16, 16, 16]);
+        assert_eq!(multiples, [8, 32, 32, 16]);
     }
 
     #[test]

@@ -49,7 +49,10 @@ impl NetworkConfig {
             |at: usize| parts.get(at).and_then(|part| part.parse::<usize>().ok()).unwrap_or(0);
         let last = self.unet.multipliers.len() - 1;
         let level = match (parts[0], parts[1]) {
-            ("flow", _) => return (self.flow.scale << number(2), 2.0 * (frames - 1.0)),
+            ("flow", _) => {
+                let level = self.flow.levels - self.flow.networks + number(2);
+                return (self.flow.scale << level, 2.0 * (frames - 1.0));
+            }
             ("low" | "high", "half") => 1,
             ("low" | "high", "quarter") => 2,
             ("fusion", "cell") => self.fusion.level,

@@ -2,7 +2,7 @@
 
 use crate::network::SENSOR_NUMBERS;
 use qudi_sim::restore::{BurstView, Context};
-use qudi_sim::sensor::{Response, Sensor};
+use qudi_sim::sensor::{CountLaw, Response, Sensor};
 
 /// Brightest linear estimate, in image units: twice white.
 const BRIGHTEST: f64 = 2.0;
@@ -85,6 +85,7 @@ pub(crate) fn dark(sensor: &Sensor) -> f64 {
 pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
     let sensor = &context.sensor;
     let binary = sensor.response == Response::Binary;
+    let deviation = |image| linear_deviation(context, image).max(1e-4).log10();
     [
         context.ppp.max(1e-6).log10(),
         context.exposure,
@@ -95,6 +96,19 @@ pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
         (f64::from(sensor.max_count()) + 1.0).log2() / 8.0,
         f64::from(u8::from(binary)),
         f64::from(sensor.frames_summed).log2() / 8.0,
+        deviation(0.0),
+        deviation(context.exposure),
     ]
     .map(|number| number as f32)
+}
+
+/// Deviation of the linear estimate where the image has the value `image`, from the count's exact law.
+fn linear_deviation(context: &Context, image: f64) -> f64 {
+    let (sensor, light) = (&context.sensor, context.photons_per_unit());
+    let response = CountResponse::new(sensor, light, context.gain, dark(sensor));
+    let detections = sensor.quantum_efficiency * image * light + dark(sensor);
+    let law = CountLaw::new(sensor, context.gain).probabilities(detections);
+    let values = || law.iter().zip(&response.table).map(|(p, &(_, u))| (p, f64::from(u)));
+    let mean: f64 = values().map(|(p, u)| p * u).sum();
+    values().map(|(p, u)| p * (u - mean).powi(2)).sum::<f64>().sqrt()
 }

@@ -8,18 +8,23 @@ mod fusion;
 #[cfg(test)]
 mod golden_tests;
 mod layers;
+mod lucas_kanade;
+mod merge;
 mod pre;
 mod qudi;
 mod resample;
 mod unet;
+mod variance;
 mod weights;
 
 pub use embedding::SENSOR_NUMBERS;
 pub use features::{HighFeatures, LowFeatures, Pyramid};
 pub use flow::{Flow, Flows};
 pub use fusion::Fusion;
+pub use merge::Merged;
 pub use pre::PreDenoiser;
 pub use qudi::{Measured, Prediction, Prepared, Qudi, Simulated, State};
 pub(crate) use resample::{fold, halve};
 pub use unet::UNet;
+pub use variance::Variance;
 pub use weights::{fill, parameters};

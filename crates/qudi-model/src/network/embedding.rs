@@ -1,7 +1,7 @@
 //! What the U-Net knows of diffusion time.
 
 /// Numbers that describe a sensor and its light.
-pub const SENSOR_NUMBERS: usize = 9;
+pub const SENSOR_NUMBERS: usize = 11;
 
 /// Sines, then cosines, of `t * 10000^(-j / (size / 2 - 1))` for every time; in f64, the angles are large.
 pub(super) fn sinusoids(times: &[usize], size: usize) -> Vec<f32> {

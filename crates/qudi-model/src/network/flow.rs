@@ -1,6 +1,8 @@
-//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017).
+//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what steps of Lucas
+//! and Kanade find on every level.
 
 use super::layers::{Bias, Conv2d};
+use super::lucas_kanade::lucas_kanade;
 use super::resample::{by_burst, double, halve, rescale_flow, shrink};
 use crate::config::FlowConfig;
 use burn::module::Module;
@@ -30,6 +32,8 @@ struct Level {
 pub struct Flow {
     /// Finest first.
     levels: Vec<Level>,
+    /// Levels of the pyramid; the finest may have no network.
+    pyramid: usize,
     scale: usize,
     /// Whether nothing moves.
     off: bool,
@@ -42,13 +46,19 @@ impl FlowConfig {
         let sizes = [[4, a], [a, b], [b, c], [c, d], [d, 2]];
         let layer = |sizes| Conv2d::zeros(sizes, 7, Bias::Yes, device);
         let level = |_| Level { layers: sizes.map(layer).into() };
-        Flow { levels: (0..self.levels).map(level).collect(), scale: self.scale, off }
+        Flow {
+            levels: (0..self.networks).map(level).collect(),
+            pyramid: self.levels,
+            scale: self.scale,
+            off,
+        }
     }
 }
 
 impl Flow {
-    /// Flows between the pre-denoised frames `d`, `[bursts * frames, 1, height, width]`.
-    pub fn forward(&self, d: Tensor<4>, frames: usize) -> Flows {
+    /// Flows between the pre-denoised frames `d`, `[bursts * frames, 1, height, width]`; `variance` is that of the linear
+    /// estimate's noise at the mean light, `[bursts * frames, 1, 1, 1]`.
+    pub fn forward(&self, d: Tensor<4>, variance: Tensor<4>, frames: usize) -> Flows {
         let [images, _, height, width] = d.dims();
         let grid = [height / self.scale, width / self.scale];
         if frames < 2 || self.off {
@@ -58,17 +68,26 @@ impl Flow {
         let finest = shrink(d, self.scale);
         // Both directions of every pair of neighbours at once.
         let mut references = both(finest, frames);
-        let mut pyramid = Vec::with_capacity(self.levels.len());
-        for _ in 1..self.levels.len() {
+        let mut pyramid = Vec::with_capacity(self.pyramid);
+        for _ in 1..self.pyramid {
             let coarser = (halve(references.0.clone()), halve(references.1.clone()));
             pyramid.push(std::mem::replace(&mut references, coarser));
         }
         pyramid.push(references);
-        let mut flow: Option<Tensor<4>> = None;
-        for (level, (reference, neighbour)) in self.levels.iter().zip(pyramid).rev() {
-            flow = Some(level.refine(reference, neighbour, flow));
+        let (variance, _) = both(variance, frames);
+        let [pairs, _, h, w] = pyramid[self.pyramid - 1].0.dims();
+        let mut flow = Tensor::zeros([pairs, 2, h, w], &variance.device());
+        // Coarsest first.
+        for (number, (reference, neighbour)) in pyramid.into_iter().enumerate().rev() {
+            if number + 1 < self.pyramid {
+                flow = double(flow) * 2.0;
+            }
+            let (i, j, start) = (reference.clone(), neighbour.clone(), flow.clone());
+            flow = flow + lucas_kanade(i, j, start, variance.clone());
+            if let Some(at) = number.checked_sub(self.pyramid - self.levels.len()) {
+                flow = self.levels[at].correct(reference, neighbour, flow);
+            }
         }
-        let flow = flow.expect("at least one level");
         let pairs = images / frames * (frames - 1);
         let part = |first| by_burst(flow.clone().narrow(0, first, pairs), frames - 1);
         let pad = |flow: Tensor<5>, before: usize| {
@@ -82,23 +101,13 @@ impl Flow {
 }
 
 impl Level {
-    /// The flow on this level's grid from that of the next coarser one.
-    fn refine(
-        &self,
-        reference: Tensor<4>,
-        neighbour: Tensor<4>,
-        coarse: Option<Tensor<4>>,
-    ) -> Tensor<4> {
-        let [pairs, _, h, w] = reference.dims();
-        let (flow, warped) = match coarse {
-            None => (Tensor::zeros([pairs, 2, h, w], &reference.device()), neighbour),
-            Some(coarse) => {
-                let flow = double(coarse) * 2.0;
-                (flow.clone(), warp(neighbour, flow))
-            }
-        };
+    /// The flow with what the network adds to it.
+    fn correct(&self, reference: Tensor<4>, neighbour: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
+        let warped = warp(neighbour, flow.clone());
+        // Stretched to the flow's own range.
+        let stretched = |image: Tensor<4>| (image - 0.5) * 4.0;
+        let mut inputs = vec![stretched(reference), stretched(warped), flow.clone()];
         let (last, first) = self.layers.split_last().expect("five layers");
-        let mut inputs = vec![reference, warped, flow.clone()];
         for layer in first {
             inputs = vec![layer.relu(&inputs)];
         }

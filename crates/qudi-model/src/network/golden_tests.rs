@@ -3,8 +3,10 @@
 
 use super::attention::Attention;
 use super::flow::Flows;
+use super::merge::merge;
 use super::pre::DenseBlock;
 use super::unet::ResidualBlock;
+use super::variance::Variance;
 use super::{Measured, Pyramid, SENSOR_NUMBERS, Simulated, State, fill, resample};
 use crate::cases::{self, Case, File, parameter};
 use crate::config::NetworkConfig;
@@ -211,10 +213,30 @@ fn flow() {
         for case in file.cases() {
             let flow = weighted(config(&case).flow.init(false, &device), "flow");
             let d: Tensor<4> = case.input("d", &device).require_grad();
-            let flows = flow.forward(d.clone(), case.number("frames"));
+            let variance: Tensor<4> = case.input("variance", &device);
+            let flows = flow.forward(d.clone(), variance, case.number("frames"));
             let outputs = [("to_next", flows.to_next), ("to_prev", flows.to_prev)];
             check(&case, &outputs, &[("d", &d)], &flow, "flow");
         }
+    }
+}
+
+#[test]
+fn merged_frames() {
+    let file = File::open("merge");
+    for device in devices() {
+        let case = file.case("merge");
+        let input = |name: &str| -> Tensor<4> { case.input(name, &device) };
+        let (u, d) = (input("u"), input("d").require_grad());
+        let frames = case.number("frames");
+        let variance = Variance::of(&case.input("sensor", &device), frames);
+        let flows = Flows { to_next: input("to_next"), to_prev: input("to_prev"), scale: 1 };
+        let merged = merge(&u, &resample::smooth(u.clone()), &d, &variance, &flows, frames);
+        case.check_output("u_m", merged.u.inner());
+        case.check_output("d_m", merged.d.clone().inner());
+        case.check_output("mass", merged.mass.inner());
+        let grads = (merged.d * case.cotangent("d_m", &device)).sum().backward();
+        case.check_gradient("d", d.grad(&grads).unwrap());
     }
 }
 
@@ -259,19 +281,24 @@ fn u_net() {
             let sizes = config(&case);
             let unet = weighted(sizes.unet.init(&sizes.fusion, sizes.fold, &device), "unet");
             let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
-            let [x_t, x0_prev, u, d] = ["x_t", "x0_prev", "u", "d"].map(input);
+            let [x_t, x0_prev, u, d, single, mass] =
+                ["x_t", "x0_prev", "u_m", "d_m", "d", "mass"].map(input);
             let fused = ["fused_0", "fused_1", "fused_2"].map(input);
             let times: Vec<usize> = case.values("t").iter().map(|&t| t as usize).collect();
             let sensor: Tensor<2> = case.input("sensor", &device);
             let signed = |image: &Tensor<4>| image.clone() * 2.0 - 1.0;
-            let planes = [x_t.clone(), x0_prev.clone(), signed(&u), signed(&d)];
+            let doubt = mass.clone().sqrt().recip();
+            let planes =
+                [x_t.clone(), x0_prev.clone(), signed(&u), signed(&d), signed(&single), doubt];
             let frames = case.number("frames");
             let x0 = unet.forward(planes, fused.clone(), &times, unet.prepare(sensor), frames);
             let inputs = [
                 ("x_t", &x_t),
                 ("x0_prev", &x0_prev),
-                ("u", &u),
-                ("d", &d),
+                ("u_m", &u),
+                ("d_m", &d),
+                ("d", &single),
+                ("mass", &mass),
                 ("fused_0", &fused[0]),
                 ("fused_1", &fused[1]),
                 ("fused_2", &fused[2]),

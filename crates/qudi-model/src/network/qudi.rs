@@ -3,9 +3,11 @@
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
+use super::merge::merge;
 use super::pre::PreDenoiser;
 use super::resample::smooth;
 use super::unet::UNet;
+use super::variance::Variance;
 use crate::config::{NetworkConfig, Part};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -17,7 +19,7 @@ pub struct Measured {
     pub y: Tensor<4>,
     /// The linear estimate in image units.
     pub u: Tensor<4>,
-    /// Numbers of sensor and light, `[bursts, 9]`.
+    /// Numbers of sensor and light, `[bursts, 11]`.
     pub sensor: Tensor<2>,
     /// Frames of a burst.
     pub frames: usize,
@@ -54,6 +56,7 @@ pub struct Prepared {
     u: Tensor<4>,
     /// What the pre-denoiser corrects.
     base: Tensor<4>,
+    variance: Variance,
     frames: usize,
 }
 
@@ -109,6 +112,7 @@ impl Qudi {
             low: self.low.prepare(u.clone(), measured.frames),
             sensor: self.unet.prepare(measured.sensor.clone()),
             base: smooth(u.clone()),
+            variance: Variance::of(&measured.sensor, measured.frames),
             u,
             frames: measured.frames,
         }
@@ -129,8 +133,12 @@ impl Qudi {
     /// No gradient goes from the flows to the frames.
     pub fn denoise_and_align(&self, prepared: &Prepared) -> (Tensor<4>, Flows) {
         let (d, _) = self.pre_denoise(prepared, None);
-        let flows = self.flow.forward(d.clone().detach(), prepared.frames);
+        let flows = self.estimate_flow(prepared, d.clone().detach());
         (d, flows)
+    }
+
+    fn estimate_flow(&self, prepared: &Prepared, d: Tensor<4>) -> Flows {
+        self.flow.forward(d, prepared.variance.mean(), prepared.frames)
     }
 
     /// The pre-denoised frames and their features.
@@ -173,12 +181,17 @@ impl Qudi {
         done("low");
         let high = self.high.forward(state.x_t.clone(), state.x0_prev.clone(), frames);
         done("high");
-        let flows = flows.unwrap_or_else(|| self.flow.forward(d.clone(), frames));
+        let flows = flows.unwrap_or_else(|| self.estimate_flow(prepared, d.clone()));
         done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
         let signed = |image: Tensor<4>| image * 2.0 - 1.0;
-        let planes = [state.x_t.clone(), state.x0_prev.clone(), signed(u), signed(d.clone())];
+        let Prepared { base, variance, .. } = prepared;
+        let merged = merge(&u, base, &d, variance, &flows.at(1), frames);
+        done("merge");
+        let (x_t, x0_prev) = (state.x_t.clone(), state.x0_prev.clone());
+        let doubt = merged.mass.sqrt().recip();
+        let planes = [x_t, x0_prev, signed(merged.u), signed(merged.d), signed(d.clone()), doubt];
         let sensor = prepared.sensor.clone();
         let x0 = self.unet.forward(planes, fused, &state.times, sensor, frames);
         done("unet");

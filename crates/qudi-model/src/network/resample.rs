@@ -110,3 +110,38 @@ fn smooth_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
     let at = |first: usize| padded.clone().narrow(axis, first, size);
     (at(0) + at(4)) * 0.0625 + (at(1) + at(3)) * 0.25 + x * 0.375
 }
+
+/// Means over squares of `2 * radius + 1` pixels; edges repeated. `radius` is 1, 2 or 4.
+pub(super) fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
+    mean_axis(mean_axis(x, 2, radius), 3, radius)
+}
+
+fn mean_axis(x: Tensor<4>, axis: usize, radius: usize) -> Tensor<4> {
+    let size = x.dims()[axis];
+    let mut pads = [(0, 0); 4];
+    pads[axis] = (radius, radius);
+    let padded = x.pad(pads, PadMode::Edge);
+    // Sums of `count` values, `step` apart, beginning at each of the first `size` places.
+    let sums = |x: &Tensor<4>, size: usize, step: usize, count: usize| {
+        let at = |k: usize| x.clone().narrow(axis, k * step, size);
+        (1..count).fold(at(0), |sum, k| sum + at(k))
+    };
+    let sum = if radius == 4 {
+        sums(&sums(&padded, size + 6, 1, 3), size, 3, 3) // nine as three threes
+    } else {
+        sums(&padded, size, 1, 2 * radius + 1)
+    };
+    sum / (2 * radius + 1) as f32
+}
+
+/// Half of what the pixel after has more than the one before, along rows and along columns; edges repeated.
+pub(super) fn differences(x: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
+    let along = |axis: usize| {
+        let size = x.dims()[axis];
+        let mut pads = [(0, 0); 4];
+        pads[axis] = (1, 1);
+        let padded = x.clone().pad(pads, PadMode::Edge);
+        (padded.clone().narrow(axis, 2, size) - padded.narrow(axis, 0, size)) * 0.5
+    };
+    (along(3), along(2))
+}

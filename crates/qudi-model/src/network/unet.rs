@@ -10,6 +10,9 @@ use burn::module::Module;
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor, TensorData};
 
+/// Images that the U-Net sees besides the fused features.
+pub(super) const PLANES: usize = 6;
+
 /// Two convolutions with norms, steered by the embedding.
 #[derive(Module, Debug)]
 pub(super) struct ResidualBlock {
@@ -129,7 +132,7 @@ impl UNetConfig {
             time_out: linear(size),
             sensor_in: linear(SENSOR_NUMBERS),
             sensor_out: linear(size),
-            inp: conv([4 * fold * fold, channels[0]], 3),
+            inp: conv([PLANES * fold * fold, channels[0]], 3),
             merge: (0..levels.min(3))
                 .map(|k| conv([before(k) + fusion.widths[k], before(k)], 1))
                 .collect(),
@@ -164,11 +167,11 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// The prediction, `[images, 1, H, W]` in [-1, 1]. `planes` are `x_t`, `x0_prev`, `2u - 1` and `2d - 1`, each
-    /// `[images, 1, H, W]`; `times` one number for each burst; `sensor` as from [`Self::prepare`].
+    /// The prediction, `[images, 1, H, W]` in [-1, 1]. `planes` are `x_t`, `x0_prev`, the merged `2u - 1` and
+    /// `2d - 1`, `2d - 1` of the frame alone, and one over the root of the merge's mass, each `[images, 1, H, W]`; `times` one number for each burst; `sensor` as from [`Self::prepare`].
     pub fn forward(
         &self,
-        planes: [Tensor<4>; 4],
+        planes: [Tensor<4>; PLANES],
         fused: Pyramid,
         times: &[usize],
         sensor: Tensor<2>,
