@@ -107,10 +107,10 @@ pub struct Terms {
     pub flow: Option<Tensor<1>>,
 }
 
-/// A diffusion time to train at, from two uniform numbers in [0, 1): a fifth of all at the start, where sampling
-/// begins; the others late, where the photons must do the work (DESIGN 3).
-pub fn training_time(kind: f64, place: f64) -> usize {
-    if kind < 0.2 { TIMES - 1 } else { ((TIMES as f64 * place.sqrt()) as usize).min(TIMES - 1) }
+/// A diffusion time to train at, from two uniform numbers in [0, 1): the share `start` of all where sampling begins, the
+/// others late, where the photons must do the work (DESIGN 3).
+pub fn training_time(kind: f64, place: f64, start: f64) -> usize {
+    if kind < start { TIMES - 1 } else { ((TIMES as f64 * place.sqrt()) as usize).min(TIMES - 1) }
 }
 
 /// The loss of `network`, which is on an autodiff device, on an example on the same device.
@@ -145,6 +145,10 @@ pub fn terms(
     };
     let (x0_prev, simulated) = match first_pass {
         FirstPass::No => (clean.zeros_like(), None),
+        // Where sampling begins, nothing comes before.
+        FirstPass::Yes(_) if example.times.iter().all(|&t| t == TIMES - 1) => {
+            (clean.zeros_like(), None)
+        }
         FirstPass::Yes(seed) => {
             let earlier: Vec<usize> =
                 example.times.iter().map(|t| (t + STRIDE).min(TIMES - 1)).collect();

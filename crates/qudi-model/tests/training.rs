@@ -65,7 +65,7 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
     let noise = Noise::new(number, 1);
     let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
     let place = (number as f64 * 0.618_034).fract();
-    let time = training_time((number as f64 * 0.414_214).fract(), place);
+    let time = training_time((number as f64 * 0.414_214).fract(), place, 0.2);
     let example = Example {
         measured: &burst.measured,
         truth: burst.truth.clone(),

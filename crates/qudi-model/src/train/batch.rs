@@ -64,7 +64,8 @@ impl Batch {
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.context));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.context.seed);
-            batch.times.push(training_time(random.random(), random.random()));
+            let time = training_time(random.random(), random.random(), recipe.train.start);
+            batch.times.push(time);
             batch.contexts.push(drawn.context);
         }
         Ok(batch)

@@ -47,6 +47,8 @@ pub struct TrainConfig {
     pub clip: f64,
     /// Share of the average of weights that a step keeps.
     pub ema: f64,
+    /// Share of the samples at the time where sampling begins: where nothing but the photons helps.
+    pub start: f64,
     /// Steps between checkpoints.
     pub checkpoint: u64,
     /// The loss.
@@ -155,6 +157,7 @@ impl Recipe {
             ),
             ("train.clip", train.clip > 0.0, "must be above 0"),
             ("train.ema", share(train.ema), "must be from 0 to below 1"),
+            ("train.start", (0.0..=1.0).contains(&train.start), "must be from 0 to 1"),
             ("train.checkpoint", train.checkpoint > 0, "must be at least 1"),
             (
                 "train.loss",
