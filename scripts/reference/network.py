@@ -159,7 +159,7 @@ class PreDenoiser(nn.Module):
             x = block(x)
             outputs.append(x)
         g = self.spread(self.gather(torch.cat(outputs, 1))) + s
-        return smooth(u) + F.pixel_shuffle(self.out(g), self.fold), g
+        return smooth(u) + F.pixel_shuffle(self.out(g), self.fold) / 10, g
 
 
 class Features(nn.Module):
@@ -262,7 +262,7 @@ class Flow(nn.Module):
             flow = flow + lucas_kanade(reference, neighbour, flow, prior)
             if j >= skipped:
                 images = (4 * (x - 0.5) for x in (reference, warp(neighbour, flow)))
-                flow = flow + self.levels[j - skipped](torch.cat([*images, flow], 1))
+                flow = flow + self.levels[j - skipped](torch.cat([*images, flow], 1)) / 10
         ahead, back = bursts(flow, 2 * (frames - 1)).chunk(2, 1)
         nothing = torch.zeros_like(ahead[:, :1])
         return torch.cat([ahead, nothing], 1).flatten(0, 1), torch.cat([nothing, back], 1).flatten(0, 1)
@@ -498,7 +498,7 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        return 2 * d_m - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
+        return 2 * d_m - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold) / 10
 
 
 class Qudi(nn.Module):

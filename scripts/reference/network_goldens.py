@@ -40,8 +40,7 @@ and the noise of step K (from 1; none at the last) `gaussian("noise.K")`, of sha
 `counts` [4, 32, 32] are the burst, `simulated` [9, 4, 32, 32] the simulated measurements of steps 2 to
 10; y = counts / 7; u = `u_table`[counts], u_sim of step K = `u_sim_table`[K - 2][counts]. The flows of
 steps 1, 3 and 6 serve the steps after them. `x` and `x0` [10, 64] are x and the clipped x0 after
-each step at the flat indices 61 i; `x0_last` is the result. `about.scaled` names weights multiplied by a
-further factor.
+each step at the flat indices 61 i; `x0_last` is the result.
 """
 
 import json
@@ -377,7 +376,7 @@ def flow_file() -> File:
         config = variant(config, flow={"levels": levels, "networks": networks})
         module = network.Flow(config)
         run = lambda d, variance: dict(zip(("to_next", "to_prev"), module(d, variance, 4)))
-        inputs = {"d": spread((8, 1, 32, 48), 0.5, 8.0), "variance": spread((8, 1, 1, 1), 20.0, 5.0)}
+        inputs = {"d": spread((8, 1, 32, 48), 0.6, 6.0), "variance": spread((8, 1, 1, 1), 20.0, 5.0)}
         about = {"config": config, "frames": 4}
         file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance",))
     return file
@@ -493,8 +492,6 @@ def step_file() -> File:
 
 
 PPP, EXPOSURE, FRAMES, SIZE = 3.25, 0.45, 4, 32
-# With the weights of the other files most of x0 would be clipped, and little be tested.
-SCALED = {"pre.out.weight": 0.25, "unet.out.weight": 0.25}
 
 
 def sample_file(ancestral: bool) -> File:
@@ -511,9 +508,7 @@ def sample_file(ancestral: bool) -> File:
     simulated: dict[int, np.ndarray] = {}
     results: dict[torch.dtype, Tensors] = {}
     for dtype in (torch.float64, torch.float32):
-        named = fill(module, "", dtype)
-        for name, factor in SCALED.items():
-            named[name].data *= factor
+        fill(module, "", dtype)
 
         def both(counts: np.ndarray, table: np.ndarray) -> tuple[Tensor, Tensor]:
             y = (counts / network.FULL_SCALE).astype(np.float32)
@@ -546,7 +541,7 @@ def sample_file(ancestral: bool) -> File:
     file.tensors["simulated"] = torch.from_numpy(np.stack([simulated[k][:, 0] for k in range(2, 11)]))
     file.tensors["u_table"], file.tensors["u_sim_table"] = torch.from_numpy(table), torch.from_numpy(tables)
     about = {"config": config, "sampler": "ancestral" if ancestral else "ddim", "sensor": sensor.flatten().tolist()}
-    about |= {"ppp": PPP, "exposure": EXPOSURE, "frames": FRAMES, "scaled": SCALED}
+    about |= {"ppp": PPP, "exposure": EXPOSURE, "frames": FRAMES}
     file.cases["sample"] = {"about": about, "parameters": {n: list(p.shape) for n, p in module.named_parameters()}}
     return file
 

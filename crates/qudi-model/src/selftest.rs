@@ -5,6 +5,7 @@ use crate::network::{Measured, SENSOR_NUMBERS, Simulated, State};
 use crate::objective::reconstruction;
 use crate::tensor::read;
 use burn::tensor::activation::softmax;
+use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
@@ -98,7 +99,8 @@ fn arithmetic(device: &Device) -> Result<Vec<Vec<f32>>> {
     let positive = b.clone() * b.clone() + 0.1;
     let output = (a.clone() * 2.0 - b.clone()) / positive.clone().sqrt()
         + a.clone().abs() * burn::tensor::activation::silu(b.clone())
-        + burn::tensor::activation::relu(a.clone());
+        + burn::tensor::activation::relu(a.clone())
+        + (b.clone().clamp_min(0.0) * -0.5).exp() * positive.recip() * a.clone().clamp(-0.5, 0.5);
     with_gradients(output, &[a, b])
 }
 
@@ -107,8 +109,9 @@ fn joining(device: &Device) -> Result<Vec<Vec<f32>>> {
     let a = values(3, [2, 3, 4, 6], &device).require_grad();
     let b = values(4, [2, 2, 4, 6], &device).require_grad();
     let joined = Tensor::cat(vec![a.clone(), b.clone()], 1).narrow(1, 1, 3);
-    let folded = joined.reshape([2, 3, 2, 2, 3, 2]).permute([0, 1, 3, 5, 2, 4]);
-    with_gradients(folded.reshape([2, 12, 2, 3]), &[a, b])
+    let joined = joined.pad([(0, 0), (0, 0), (1, 1), (2, 4)], PadMode::Edge);
+    let folded = joined.reshape([2, 3, 3, 2, 6, 2]).permute([0, 1, 3, 5, 2, 4]);
+    with_gradients(folded.reshape([2, 12, 3, 6]), &[a, b])
 }
 
 fn warping(device: &Device) -> Result<Vec<Vec<f32>>> {

@@ -8,36 +8,42 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Channels and vectors of a block; 12 accumulators fit the 16 registers of AVX2.
-pub(super) const WIDE: (usize, usize) = (4, 3);
-/// The same with more channels and fewer pixels.
-pub(super) const TALL: (usize, usize) = (6, 2);
+/// Channels and vectors of the kinds of blocks: 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512, NEON).
+/// Best first: the more channels, the fewer loads.
+pub(super) const KINDS: [(usize, usize); 4] = [(12, 2), (8, 3), (6, 2), (4, 3)];
 
-/// Channels of the kind of block that wastes less on results of `outputs` channels and `columns` pixels.
+/// Channels of the kind of block that wastes least on results of `outputs` channels and `columns` pixels.
 pub(super) fn block(outputs: usize, columns: usize) -> usize {
-    let lanes = lanes();
-    let cost = |(channels, vectors): (usize, usize)| {
+    let (lanes, registers) = machine();
+    let fits = |&(channels, vectors): &(usize, usize)| channels * vectors < registers;
+    let cost = |&(channels, vectors): &(usize, usize)| {
         outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors * lanes)
     };
-    if cost(TALL) <= cost(WIDE) { TALL.0 } else { WIDE.0 }
+    // Of equals the first.
+    KINDS.into_iter().filter(fits).min_by_key(cost).map_or(KINDS[3].0, |kind| kind.0)
 }
 
 /// Longest run of pixels of a block on this machine.
 pub(super) fn longest_run() -> usize {
-    WIDE.1.max(TALL.1) * lanes()
+    KINDS.map(|kind| kind.1).into_iter().max().unwrap_or(1) * lanes()
 }
 
 /// Values of a vector on this machine.
 pub(super) fn lanes() -> usize {
-    struct Lanes;
-    impl WithSimd for Lanes {
-        type Output = usize;
+    machine().0
+}
+
+/// Values of a vector on this machine, and its registers.
+fn machine() -> (usize, usize) {
+    struct Machine;
+    impl WithSimd for Machine {
+        type Output = (usize, usize);
         #[inline(always)]
-        fn with_simd<S: Simd>(self, _: S) -> usize {
-            S::F32_LANES
+        fn with_simd<S: Simd>(self, _: S) -> (usize, usize) {
+            (S::F32_LANES, S::REGISTER_COUNT)
         }
     }
-    Arch::new().dispatch(Lanes)
+    Arch::new().dispatch(Machine)
 }
 
 /// `sums[m][v] += sum over k of weights[k * M + m] * x[offsets[k] + v * lanes ..]`.

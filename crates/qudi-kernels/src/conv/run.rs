@@ -1,7 +1,7 @@
 //! Runs a pass: fills scratch, calls the innermost loops, writes results.
 #![allow(unsafe_code)]
 
-use super::micro::{self, TALL, WIDE};
+use super::micro::{self, KINDS};
 use super::pass::{Pass, Tiling};
 use super::source::Source;
 use pulp::{Arch, Simd, WithSimd};
@@ -171,10 +171,11 @@ impl WithSimd for Tile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        if self.weights.block == TALL.0 {
-            self.blocks::<S, { TALL.0 }, { TALL.1 }>(simd);
-        } else {
-            self.blocks::<S, { WIDE.0 }, { WIDE.1 }>(simd);
+        match self.weights.block {
+            block if block == KINDS[0].0 => self.blocks::<S, { KINDS[0].0 }, { KINDS[0].1 }>(simd),
+            block if block == KINDS[1].0 => self.blocks::<S, { KINDS[1].0 }, { KINDS[1].1 }>(simd),
+            block if block == KINDS[2].0 => self.blocks::<S, { KINDS[2].0 }, { KINDS[2].1 }>(simd),
+            _ => self.blocks::<S, { KINDS[3].0 }, { KINDS[3].1 }>(simd),
         }
     }
 }

@@ -8,8 +8,8 @@ use super::source::Source;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-/// Output channels and taps of a block.
-const BLOCK: (usize, usize) = (4, 3);
+/// Taps of a block.
+const TAPS: usize = 3;
 
 /// Partial sums: enough for many threads, and the same for any number of them.
 const PARTS: usize = 16;
@@ -117,8 +117,18 @@ impl WithSimd for Tile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        const M: usize = BLOCK.0;
-        const K: usize = BLOCK.1;
+        // As many output channels as registers hold.
+        if S::REGISTER_COUNT >= 32 {
+            self.blocks::<S, 8, TAPS>(simd);
+        } else {
+            self.blocks::<S, 4, TAPS>(simd);
+        }
+    }
+}
+
+impl Tile<'_> {
+    #[inline(always)]
+    fn blocks<S: Simd, const M: usize, const K: usize>(self, simd: S) {
         let channel = self.rows * self.length;
         for m in (0..self.outputs).step_by(M) {
             for k in (0..self.offsets.len()).step_by(K) {

@@ -1,7 +1,7 @@
 //! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what steps of Lucas
 //! and Kanade find on every level.
 
-use super::layers::{Bias, Conv2d};
+use super::layers::{Bias, CORRECTION, Conv2d};
 use super::lucas_kanade::lucas_kanade;
 use super::resample::{by_burst, double, halve, rescale_flow, shrink};
 use crate::config::FlowConfig;
@@ -111,7 +111,7 @@ impl Level {
         for layer in first {
             inputs = vec![layer.relu(&inputs)];
         }
-        last.add(&inputs, flow)
+        flow + last.linear(&inputs) * CORRECTION
     }
 }
 

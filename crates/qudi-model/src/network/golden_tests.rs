@@ -380,10 +380,7 @@ fn sampling() {
         let case = file.case("sample");
         let device = Device::flex();
         let config = config(&case);
-        let network = fill(config.init(0, &device), |name, shape| {
-            let factor = case.about["scaled"][name].as_f64().unwrap_or(1.0);
-            parameter(name, shape).iter().map(|&w| (f64::from(w) * factor) as f32).collect()
-        });
+        let network = fill(config.init(0, &device), parameter);
         let frames = case.number("frames");
         let sensor: Vec<f32> = serde_json::from_value(case.about["sensor"].clone()).unwrap();
         let ours = paper_numbers();

@@ -5,6 +5,10 @@ use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 
+/// What of a last layer's output corrects an image or a flow. Adam moves all weights by the same amount: the sum of a
+/// whole layer's would jump.
+pub(super) const CORRECTION: f32 = 0.1;
+
 /// A convolution of frames one by one.
 #[derive(Module, Debug)]
 pub(super) struct Conv2d {

@@ -1,5 +1,6 @@
 //! The pre-denoiser: a residual dense network (Zhang et al. 2018), frame by frame.
 
+use super::layers::CORRECTION;
 use super::layers::{Bias, Conv2d};
 use super::resample::{fold, unfold};
 use crate::config::PreConfig;
@@ -93,6 +94,6 @@ impl PreDenoiser {
         }
         let features = self.spread.add(&[self.gather.linear(&outputs)], shallow);
         let correction = unfold(self.out.linear(std::slice::from_ref(&features)), self.fold);
-        (base + correction, features)
+        (base + correction * CORRECTION, features)
     }
 }

@@ -3,7 +3,7 @@
 use super::attention::Attention;
 use super::embedding::{SENSOR_NUMBERS, sinusoids};
 use super::features::Pyramid;
-use super::layers::{Bias, Conv2d, GroupNorm, Linear};
+use super::layers::{Bias, CORRECTION, Conv2d, GroupNorm, Linear};
 use super::resample::{fold, repeat, unfold};
 use crate::config::{FusionConfig, UNetConfig};
 use burn::module::Module;
@@ -209,6 +209,6 @@ impl UNet {
                 x = self.up[k - 1].linear(&[repeat(x)]);
             }
         }
-        base + unfold(self.out.linear(&[self.norm.silu(x)]), self.fold)
+        base + unfold(self.out.linear(&[self.norm.silu(x)]), self.fold) * CORRECTION
     }
 }
