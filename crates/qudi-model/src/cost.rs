@@ -13,14 +13,14 @@ impl NetworkConfig {
     }
 
     /// Bytes that restoring a window of `frames` frames of `size` takes on the processor at most, about: activations
-    /// of the finest level, `PLANES` times its widths at once. A third and more above what `small` took where it was
-    /// measured.
+    /// of the finest level, `PLANES` times its widths at once. Above what `small` took where it was measured: by a
+    /// twentieth at 256 x 256, by half at 512 x 512.
     pub fn memory(&self, size: Size, frames: usize) -> u64 {
         const PLANES: f64 = 6.5;
         let widths = self.unet.width + self.fusion.widths[0] + self.pre.width;
         let cells = (size.pixels() * frames) as f64 / (self.fold * self.fold) as f64;
         // What the program holds besides, planes of the whole window among it.
-        let others = 50.0 * (1 << 20) as f64 + 40.0 * (size.pixels() * frames) as f64;
+        let others = 50.0 * (1 << 20) as f64 + 80.0 * (size.pixels() * frames) as f64;
         (4.0 * PLANES * widths as f64 * cells + others) as u64
     }
 
