@@ -242,9 +242,9 @@ class Flow(nn.Module):
         self.scale, self.pyramid = flow["scale"], flow["levels"]
         self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["networks"]))
 
-    def forward(self, d: Tensor, variance: Tensor, frames: int) -> Flows:
+    def forward(self, d: Tensor, smoothed: Tensor, variance: Tensor, frames: int) -> Flows:
         """to_next and to_prev, [B*N, 2, H/scale, W/scale]; `variance` [B*N, 1, 1, 1]."""
-        pyramid = [F.avg_pool2d(d, self.scale)]
+        pyramid = [F.avg_pool2d(torch.cat([d, smoothed], 1), self.scale)]
         for _ in range(1, self.pyramid):
             pyramid.append(F.avg_pool2d(pyramid[-1], 2))
         # Both directions in one batch: frames 0..N-1 look ahead, frames 1..N look back.
@@ -259,37 +259,46 @@ class Flow(nn.Module):
             neighbour = torch.cat([x[:, 1:], x[:, :-1]], 1).flatten(0, 1)
             if j < self.pyramid - 1:
                 flow = up2(flow) * 2
-            flow = flow + lucas_kanade(reference, neighbour, flow, prior)
+            flow = flow + lucas_kanade(reference[:, 1:], neighbour[:, 1:], flow, prior)
             if j >= skipped:
-                images = (4 * (x - 0.5) for x in (reference, warp(neighbour, flow)))
+                images = (4 * (x - 0.5) for x in (reference[:, :1], warp(neighbour[:, :1], flow)))
                 flow = flow + self.levels[j - skipped](torch.cat([*images, flow], 1)) / 10
         ahead, back = bursts(flow, 2 * (frames - 1)).chunk(2, 1)
         nothing = torch.zeros_like(ahead[:, :1])
         return torch.cat([ahead, nothing], 1).flatten(0, 1), torch.cat([nothing, back], 1).flatten(0, 1)
 
 
-def merge(u: Tensor, d: Tensor, variance: Variance, flows: Flows, frames: int) -> tuple[Tensor, Tensor, Tensor]:
-    """u_m, d_m and W; `flows` in full-resolution pixels."""
-    # One sweep: `order` is that of the frames, each aligned with the one before it.
+def merge(
+    u: Tensor, d: Tensor, variance: Variance, flows: Flows, scale: int, frames: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """u_m, d_m and W; `flows` of `scale`."""
     smoothed = smooth(u).detach()
     explained = bursts(0.04523 * variance.at(smoothed), frames)
-    own, lowpass = bursts(torch.cat([u.detach(), d, torch.ones_like(u)], 1), frames), bursts(smoothed, frames)
-
-    def sweep(order: list[int], flow: Tensor) -> list[Tensor]:
-        sums: dict[int, Tensor] = {order[0]: own[:, order[0]]}
-        for before, i in zip(order, order[1:]):
-            m = warp(sums[before], flow[:, i])
-            known = m.detach()
-            mass = known[:, 2:]
-            t = mean_around(lowpass[:, i] - smooth(known[:, :1] / mass), 1)
-            x = mean_around(t**2, 2) / (explained[:, i] * (1 + 1 / mass))
-            sums[i] = own[:, i] + torch.exp(-0.5 * F.relu(x - 1)) * m
-        return [sums[i] for i in range(frames)]
-
+    own = bursts(torch.cat([u.detach(), d, torch.ones_like(u)], 1), frames)
     to_next, to_prev = (bursts(flow.detach(), frames) for flow in flows)
-    order = list(range(frames))
-    forward, backward = sweep(order, to_prev), sweep(order[::-1], to_next)
-    total = (torch.stack(forward, 1) + torch.stack(backward, 1) - own).flatten(0, 1)
+    total = own.clone()
+    # Composed flows from every frame to the one k ahead, and to the one k behind.
+    ahead: dict[int, Tensor] = {}
+    behind: dict[int, Tensor] = {}
+    for k in range(1, min(5, frames - 1) + 1):
+        known = total.detach()
+        lowpass = bursts(smooth((known[:, :, :1] / known[:, :, 2:]).flatten(0, 1)), frames)
+        new = list(total.unbind(1))
+        for i in range(frames):
+            for j, composed, step in ((i + k, ahead, to_next), (i - k, behind, to_prev)):
+                if not 0 <= j < frames:
+                    continue
+                if k == 1:
+                    composed[i] = step[:, i]
+                else:
+                    last = step[:, j - 1 if j > i else j + 1]
+                    composed[i] = composed[i] + warp(last, composed[i])
+                moved = warp(own[:, j], resize_flow(composed[i], scale, 1))
+                t = mean_around(smooth(moved[:, :1].detach()) - lowpass[:, i], 1)
+                x = mean_around(t**2, 2) / (explained[:, i] * (1 + 1 / known[:, i, 2:]))
+                new[i] = new[i] + torch.exp(-F.relu(x - 1)) * moved
+        total = torch.stack(new, 1)
+    total = total.flatten(0, 1)
     mass = total[:, 2:].detach()
     return total[:, :1].detach() / mass, total[:, 1:2] / mass, mass
 
@@ -531,10 +540,9 @@ class Qudi(nn.Module):
         high = self.high(x_t, x0_prev, frames)
         variance = Variance(sensor, frames)
         if flows is None:
-            flows = self.flow(d, variance.mean.clamp(min=1e-8), frames)
+            flows = self.flow(d, smooth(u).detach(), variance.mean.clamp(min=1e-8), frames)
         fused = self.fusion(low, high, g, flows, frames)
-        fine = tuple(resize_flow(flow, self.flow.scale, 1) for flow in flows)
-        merged = merge(u, d, variance, fine, frames)
+        merged = merge(u, d, variance, flows, self.flow.scale, frames)
         return self.unet(x_t, x0_prev, merged, d, fused, t, sensor, frames), d, flows
 
 

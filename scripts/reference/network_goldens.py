@@ -375,26 +375,27 @@ def flow_file() -> File:
     for levels, networks in ((2, 2), (3, 2)):
         config = variant(config, flow={"levels": levels, "networks": networks})
         module = network.Flow(config)
-        run = lambda d, variance: dict(zip(("to_next", "to_prev"), module(d, variance, 4)))
-        inputs = {"d": spread((8, 1, 32, 48), 0.6, 6.0), "variance": spread((8, 1, 1, 1), 20.0, 5.0)}
+        run = lambda d, smoothed, variance: dict(zip(("to_next", "to_prev"), module(d, smoothed, variance, 4)))
+        inputs = {"d": spread((8, 1, 32, 48), 0.45, 6.0), "smoothed": spread((8, 1, 32, 48), 0.5, 8.0)}
+        inputs |= {"variance": spread((8, 1, 1, 1), 20.0, 5.0)}
         about = {"config": config, "frames": 4}
-        file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance",))
+        file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance", "smoothed"))
     return file
 
 
 def merge_file() -> File:
     file = File("merge", 128)
-    shape, flow = (8, 1, 16, 24), (8, 2, 16, 24)
+    shape, flow = (8, 1, 16, 24), (8, 2, 8, 12)
     inputs = {"u": spread(shape, 0.6, 0.5), "d": spread(shape, *COUNTS)} | sensors([-1, -0.5], [-1.5, -1])
     # Frames 0..3 and 4..7 are bursts.
     inputs["to_next"] = spread(flow, 0.05, 1.3) | {"zero": [3, 7]}
     inputs["to_prev"] = spread(flow, -0.05, 1.3) | {"zero": [0, 4]}
 
     def run(u: Tensor, d: Tensor, sensor: Tensor, to_next: Tensor, to_prev: Tensor) -> Tensors:
-        merged = network.merge(u, d, network.Variance(sensor, 4), (to_next, to_prev), 4)
+        merged = network.merge(u, d, network.Variance(sensor, 4), (to_next, to_prev), 2, 4)
         return dict(zip(("u_m", "d_m", "mass"), merged))
 
-    about = {"operation": "merge", "frames": 4}
+    about = {"operation": "merge", "frames": 4, "scale": 2}
     file.case("merge", run, inputs, about=about, constant=("u", "sensor", "to_next", "to_prev"))
     return file
 

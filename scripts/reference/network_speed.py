@@ -64,16 +64,17 @@ def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: in
     low, high = model.low(x["u"], x["u_sim"], d, frames), model.high(x["x_t"], x["x0_prev"], frames)
     variance = network.Variance(x["sensor"], frames)
     mean = variance.mean.clamp(min=1e-8)
-    flows = model.flow(d, mean, frames)
-    fine = tuple(network.resize_flow(flow, model.flow.scale, 1) for flow in flows)
-    merged = network.merge(x["u"], d, variance, fine, frames)
+    smoothed = network.smooth(x["u"])
+    flows = model.flow(d, smoothed, mean, frames)
+    merge = lambda: network.merge(x["u"], d, variance, flows, model.flow.scale, frames)
+    merged = merge()
     fused = model.fusion(low, high, g, flows, frames)
     blocks = {
         "pre": lambda: model.pre(*measured),
         "low": lambda: model.low(x["u"], x["u_sim"], d, frames),
         "high": lambda: model.high(x["x_t"], x["x0_prev"], frames),
-        "flow": lambda: model.flow(d, mean, frames),
-        "merge": lambda: network.merge(x["u"], d, variance, fine, frames),
+        "flow": lambda: model.flow(d, smoothed, mean, frames),
+        "merge": merge,
         "fusion": lambda: model.fusion(low, high, g, flows, frames),
         "unet": lambda: model.unet(x["x_t"], x["x0_prev"], merged, d, fused, x["t"], x["sensor"], frames),
     }

@@ -56,17 +56,24 @@ impl FlowConfig {
 }
 
 impl Flow {
-    /// Flows between the pre-denoised frames `d`, `[bursts * frames, 1, height, width]`; `variance` is that of the linear
-    /// estimate's noise at the mean light, `[bursts * frames, 1, 1, 1]`.
-    pub fn forward(&self, d: Tensor<4>, variance: Tensor<4>, frames: usize) -> Flows {
+    /// Flows between frames: registered are the `smoothed` linear estimates, whose noise is known and whose faint texture no
+    /// denoiser has taken; the networks see the pre-denoised frames `d`. Both `[bursts * frames, 1, height, width]`;
+    /// `variance` is that of the linear estimate's noise at the mean light, `[bursts * frames, 1, 1, 1]`.
+    pub fn forward(
+        &self,
+        d: Tensor<4>,
+        smoothed: Tensor<4>,
+        variance: Tensor<4>,
+        frames: usize,
+    ) -> Flows {
         let [images, _, height, width] = d.dims();
         let grid = [height / self.scale, width / self.scale];
         if frames < 2 || self.off {
             let none = Tensor::zeros([images, 2, grid[0], grid[1]], &d.device());
             return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
         }
-        let finest = shrink(d, self.scale);
-        // Both directions of every pair of neighbours at once.
+        // Both directions of every pair of neighbours at once; both kinds of image as channels.
+        let finest = shrink(Tensor::cat(vec![d, smoothed.detach()], 1), self.scale);
         let mut references = both(finest, frames);
         let mut pyramid = Vec::with_capacity(self.pyramid);
         for _ in 1..self.pyramid {
@@ -82,10 +89,12 @@ impl Flow {
             if number + 1 < self.pyramid {
                 flow = double(flow) * 2.0;
             }
-            let (i, j, start) = (reference.clone(), neighbour.clone(), flow.clone());
-            flow = flow + lucas_kanade(i, j, start, variance.clone());
+            let kind = |x: &Tensor<4>, channel| x.clone().narrow(1, channel, 1);
+            let (i, j) = (kind(&reference, 1), kind(&neighbour, 1));
+            flow = flow.clone() + lucas_kanade(i, j, flow, variance.clone());
             if let Some(at) = number.checked_sub(self.pyramid - self.levels.len()) {
-                flow = self.levels[at].correct(reference, neighbour, flow);
+                let (i, j) = (kind(&reference, 0), kind(&neighbour, 0));
+                flow = self.levels[at].correct(i, j, flow);
             }
         }
         let pairs = images / frames * (frames - 1);

@@ -214,7 +214,8 @@ fn flow() {
             let flow = weighted(config(&case).flow.init(false, &device), "flow");
             let d: Tensor<4> = case.input("d", &device).require_grad();
             let variance: Tensor<4> = case.input("variance", &device);
-            let flows = flow.forward(d.clone(), variance, case.number("frames"));
+            let smoothed: Tensor<4> = case.input("smoothed", &device);
+            let flows = flow.forward(d.clone(), smoothed, variance, case.number("frames"));
             let outputs = [("to_next", flows.to_next), ("to_prev", flows.to_prev)];
             check(&case, &outputs, &[("d", &d)], &flow, "flow");
         }
@@ -230,7 +231,7 @@ fn merged_frames() {
         let (u, d) = (input("u"), input("d").require_grad());
         let frames = case.number("frames");
         let variance = Variance::of(&case.input("sensor", &device), frames);
-        let flows = Flows { to_next: input("to_next"), to_prev: input("to_prev"), scale: 1 };
+        let flows = Flows { to_next: input("to_next"), to_prev: input("to_prev"), scale: 2 };
         let merged = merge(&u, &resample::smooth(u.clone()), &d, &variance, &flows, frames);
         case.check_output("u_m", merged.u.inner());
         case.check_output("d_m", merged.d.clone().inner());

@@ -1,11 +1,14 @@
-//! What all frames say of each one, merged along the flows: a mean over the frames that agree, as robust merging
-//! does it (Ma et al. 2020, section 5.2), made recursive, so that only neighbours need be aligned.
+//! What all frames say of each one: a mean over the frames that agree, as robust merging of bursts does it (Ma et
+//! al. 2020, section 5.2), nearest frames first.
 
 use super::flow::Flows;
-use super::resample::{by_burst, mean_around, smooth};
+use super::resample::{by_burst, mean_around, rescale_flow, smooth};
 use super::variance::Variance;
 use burn::tensor::Tensor;
 use qudi_kernels::warp;
+
+/// Frames on either side that are merged: flows to farther ones have added up too many errors.
+const REACH: usize = 5;
 
 /// Variance that is left of a pixel's where images are smoothed with 5 x 5 binomial weights and averaged over 3 x 3.
 const LEFT: f32 = 0.045_23;
@@ -14,7 +17,7 @@ const LEFT: f32 = 0.045_23;
 const EXPECTED: f32 = 1.0;
 
 /// How much a difference of once more what noise explains is held against it, in nats.
-const SUSPICION: f32 = 0.5;
+const SUSPICION: f32 = 1.0;
 
 /// The frames, merged; `[images, 1, H, W]` each.
 #[derive(Clone, Debug)]
@@ -27,10 +30,11 @@ pub struct Merged {
     pub mass: Tensor<4>,
 }
 
-/// Merges linear estimates `u` and pre-denoised frames `d`, `[images, 1, H, W]`, along `flows` of scale 1. `smoothed` is
-/// [`smooth`] of `u`: its differences, against what `variance` explains, say which frames agree.
+/// Merges linear estimates `u` and pre-denoised frames `d`, `[images, 1, H, W]`, along `flows`. `smoothed` is [`smooth`]
+/// of `u`: how it differs from the frames merged so far, against what `variance` explains, says which frames agree.
 ///
-/// Forwards, the sum of frame `i` is its own value plus `g` times the warped sum of the frame before; backwards likewise. Gradients reach `d` alone.
+/// Flows to farther frames are composed of those between neighbours, so that every frame is interpolated once. Gradients
+/// reach `d` alone.
 pub(super) fn merge(
     u: &Tensor<4>,
     smoothed: &Tensor<4>,
@@ -41,46 +45,55 @@ pub(super) fn merge(
 ) -> Merged {
     let [images, _, height, width] = u.dims();
     let bursts = images / frames;
-    let own = Tensor::cat(vec![u.clone().detach(), d.clone(), u.ones_like().detach()], 1);
-    let smoothed = smoothed.clone().detach();
+    let u = u.clone().detach();
     let noise = variance.at(smoothed.clone()) * LEFT;
-    // Both sweeps run at once: frame i forward beside frame N - 1 - i backward.
-    let pair = |forward: &Tensor<4>, backward: &Tensor<4>, i: usize| {
-        let frame = |x: &Tensor<4>, i: usize| {
+    let own = Tensor::cat(vec![u.clone(), d.clone(), u.ones_like()], 1);
+    let (next, prev) = (flows.to_next.clone().detach(), flows.to_prev.clone().detach());
+    let mut sum = own.clone();
+    let mut reach: Option<Tensor<4>> = None;
+    for k in 1..frames.min(REACH + 1) {
+        let count = frames - k;
+        // `count` frames of every burst from one of the first; first for the frames ahead, then for those behind.
+        let part = |x: &Tensor<4>, first: usize| {
             let [_, c, h, w] = x.dims();
-            by_burst(x.clone(), frames).narrow(1, i, 1).reshape([bursts, c, h, w])
+            let frames = x.dims()[0] / bursts;
+            by_burst(x.clone(), frames).narrow(1, first, count).reshape([bursts * count, c, h, w])
         };
-        Tensor::cat(vec![frame(forward, i), frame(backward, frames - 1 - i)], 0)
-    };
-    let (to_prev, to_next) = (flows.to_prev.clone().detach(), flows.to_next.clone().detach());
-    let mut sums: Option<Tensor<4>> = None;
-    let (mut forward, mut backward) = (Vec::new(), Vec::new());
-    for i in 0..frames {
-        let own = pair(&own, &own, i);
-        let sum = match sums {
-            None => own,
-            Some(sums) => {
-                let moved = warp(sums, pair(&to_prev, &to_next, i));
-                let known = moved.clone().detach();
-                let mass = known.clone().narrow(1, 2, 1);
-                let before = smooth(known.narrow(1, 0, 1) / mass.clone());
-                let difference = mean_around(pair(&smoothed, &smoothed, i) - before, 1);
-                let noise = pair(&noise, &noise, i) * (mass.recip() + 1.0);
-                let excess = mean_around(difference.powi_scalar(2), 2) / noise - EXPECTED;
-                let agreement = (excess.clamp_min(0.0) * -SUSPICION).exp();
-                own + moved * agreement
+        let both = |ahead: Tensor<4>, behind: Tensor<4>| Tensor::cat(vec![ahead, behind], 0);
+        // From a frame to the one k farther: to the one k - 1 farther, and on from there.
+        let last = both(part(&next, k - 1), part(&prev, 1));
+        let flow = match reach {
+            None => last,
+            Some(reach) => {
+                let [ahead, behind] = halves(&reach);
+                let before = both(part(&ahead, 0), part(&behind, 1));
+                before.clone() + warp(last, before)
             }
         };
-        forward.push(sum.clone().narrow(0, 0, bursts));
-        backward.push(sum.clone().narrow(0, bursts, bursts));
-        sums = Some(sum);
+        reach = Some(flow.clone());
+        let moved = warp(both(part(&own, k), part(&own, 0)), rescale_flow(flow, flows.scale, 1));
+        let known = sum.clone().detach();
+        let mass = known.clone().narrow(1, 2, 1);
+        let merged = smooth(known.narrow(1, 0, 1) / mass.clone());
+        let here = |x: &Tensor<4>| both(part(x, 0), part(x, k));
+        let there = smooth(moved.clone().detach().narrow(1, 0, 1));
+        let difference = mean_around(there - here(&merged), 1);
+        let noise = here(&(noise.clone() * (mass.recip() + 1.0)));
+        let excess = mean_around(difference.powi_scalar(2), 2) / noise - EXPECTED;
+        let votes = moved * (excess.clamp_min(0.0) * -SUSPICION).exp();
+        let [ahead, behind] = halves(&votes);
+        let none = Tensor::zeros([bursts, k, 3, height, width], &own.device());
+        let ahead = Tensor::cat(vec![by_burst(ahead, count), none.clone()], 1);
+        let behind = Tensor::cat(vec![none, by_burst(behind, count)], 1);
+        sum = sum + (ahead + behind).reshape([images, 3, height, width]);
     }
-    backward.reverse();
-    let joined =
-        |list: Vec<Tensor<4>>| Tensor::stack::<5>(list, 1).reshape([images, 3, height, width]);
-    // Every frame is in both sums.
-    let sum = joined(forward) + joined(backward) - own;
     let [u, d, mass] = [0, 1, 2].map(|place| sum.clone().narrow(1, place, 1));
     let mass = mass.detach();
     Merged { u: u.detach() / mass.clone(), d: d / mass.clone(), mass }
+}
+
+/// The first and the second half of the images.
+fn halves(x: &Tensor<4>) -> [Tensor<4>; 2] {
+    let half = x.dims()[0] / 2;
+    [0, half].map(|first| x.clone().narrow(0, first, half))
 }

@@ -138,7 +138,7 @@ impl Qudi {
     }
 
     fn estimate_flow(&self, prepared: &Prepared, d: Tensor<4>) -> Flows {
-        self.flow.forward(d, prepared.variance.mean(), prepared.frames)
+        self.flow.forward(d, prepared.base.clone(), prepared.variance.mean(), prepared.frames)
     }
 
     /// The pre-denoised frames and their features.
@@ -187,7 +187,7 @@ impl Qudi {
         done("fusion");
         let signed = |image: Tensor<4>| image * 2.0 - 1.0;
         let Prepared { base, variance, .. } = prepared;
-        let merged = merge(&u, base, &d, variance, &flows.at(1), frames);
+        let merged = merge(&u, base, &d, variance, &flows, frames);
         done("merge");
         let (x_t, x0_prev) = (state.x_t.clone(), state.x0_prev.clone());
         let doubt = merged.mass.sqrt().recip();
