@@ -139,8 +139,10 @@ fn a_graphics_card_computes_what_the_processor_does() {
     if !String::from_utf8_lossy(&devices.stdout).contains("wgpu:0") {
         return;
     }
-    let only = "selftest --device wgpu:0 --only arithmetic,joining,warp,softmax";
-    let output = qudi(&folder).args(only.split(' ')).output().unwrap();
+    let only =
+        "arithmetic,joining,warp,softmax,group norm,matrix product,convolution 1x1,convolution 3x3";
+    let device = ["selftest", "--device", "wgpu:0", "--only", only];
+    let output = qudi(&folder).args(device).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
 }
