@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "torch"]
 # ///
-"""The network of docs/network.md in PyTorch, written from that page alone, and the sampling loop around it.
+"""The network of docs/network.md in PyTorch, a second writing of that page, and the sampling loop around it.
 
 Modules are named as on the page, so the keys of `state_dict()` are the names of weight files.
 
