@@ -65,6 +65,14 @@ impl<'a> CountResponse<'a> {
         (photons / self.photons_per_unit).min(BRIGHTEST) as f32
     }
 
+    /// Deviation of the linear estimate at `detections` expected per output frame, from the count's exact law.
+    fn linear_deviation(&self, detections: f64) -> f64 {
+        let law = CountLaw::new(self.sensor, self.gain).probabilities(detections);
+        let values = || law.iter().zip(&self.table).map(|(p, &(_, u))| (p, f64::from(u)));
+        let mean: f64 = values().map(|(p, u)| p * u).sum();
+        values().map(|(p, u)| p * (u - mean).powi(2)).sum::<f64>().sqrt()
+    }
+
     /// Appends a frame. Counts above full scale, which no such sensor gives, count as full scale.
     pub fn add(&self, counts: &[u16], planes: &mut Planes) {
         let last = self.table.len() - 1;
@@ -85,7 +93,12 @@ pub(crate) fn dark(sensor: &Sensor) -> f64 {
 pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
     let sensor = &context.sensor;
     let binary = sensor.response == Response::Binary;
-    let deviation = |image| linear_deviation(context, image).max(1e-4).log10();
+    let light = context.photons_per_unit();
+    let response = CountResponse::new(sensor, light, context.gain, dark(sensor));
+    let deviation = |image| {
+        let detections = sensor.quantum_efficiency * image * light + dark(sensor);
+        response.linear_deviation(detections).max(1e-4).log10()
+    };
     [
         context.ppp.max(1e-6).log10(),
         context.exposure,
@@ -100,15 +113,4 @@ pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
         deviation(context.exposure),
     ]
     .map(|number| number as f32)
-}
-
-/// Deviation of the linear estimate where the image has the value `image`, from the count's exact law.
-fn linear_deviation(context: &Context, image: f64) -> f64 {
-    let (sensor, light) = (&context.sensor, context.photons_per_unit());
-    let response = CountResponse::new(sensor, light, context.gain, dark(sensor));
-    let detections = sensor.quantum_efficiency * image * light + dark(sensor);
-    let law = CountLaw::new(sensor, context.gain).probabilities(detections);
-    let values = || law.iter().zip(&response.table).map(|(p, &(_, u))| (p, f64::from(u)));
-    let mean: f64 = values().map(|(p, u)| p * u).sum();
-    values().map(|(p, u)| p * (u - mean).powi(2)).sum::<f64>().sqrt()
 }

@@ -144,12 +144,8 @@ pub fn terms(
         clean.clone() * signal + example.noise.clone() * noise
     };
     let (x0_prev, simulated) = match first_pass {
-        FirstPass::No => (clean.zeros_like(), None),
         // Where sampling begins, nothing comes before.
-        FirstPass::Yes(_) if example.times.iter().all(|&t| t == TIMES - 1) => {
-            (clean.zeros_like(), None)
-        }
-        FirstPass::Yes(seed) => {
+        FirstPass::Yes(seed) if example.times.iter().any(|&t| t < TIMES - 1) => {
             let earlier: Vec<usize> =
                 example.times.iter().map(|t| (t + STRIDE).min(TIMES - 1)).collect();
             let x_t = noisy(&earlier);
@@ -157,6 +153,7 @@ pub fn terms(
             let x0_prev = if switches.self_conditioning { x0_prev } else { clean.zeros_like() };
             (x0_prev, simulated.filter(|_| switches.physics))
         }
+        _ => (clean.zeros_like(), None),
     };
     let state = State { x_t: noisy(example.times), x0_prev, times: example.times.to_vec() };
     let prepared = network.prepare(example.measured);

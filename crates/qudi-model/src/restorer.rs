@@ -154,8 +154,7 @@ impl QudiRestorer {
 
     fn prepare(&self, job: &Job<'_>, number: usize) -> Prepared {
         let tensor = |images: &[f32]| self.tile(job, number, images);
-        let numbers = sensor_numbers(job.context).to_vec();
-        let sensor = TensorData::new(numbers, [1, SENSOR_NUMBERS]);
+        let sensor = TensorData::new(job.sensor.to_vec(), [1, SENSOR_NUMBERS]);
         self.network.prepare(&Measured {
             y: tensor(&job.planes.y),
             u: tensor(&job.planes.u),
@@ -168,6 +167,8 @@ impl QudiRestorer {
 /// A window, padded.
 struct Job<'a> {
     context: &'a Context,
+    /// The sensor in numbers: the same for all tiles and steps.
+    sensor: [f32; SENSOR_NUMBERS],
     planes: Planes,
     frames: usize,
     size: Size,
@@ -204,7 +205,8 @@ impl Restorer for QudiRestorer {
         let planes = Planes { y: pad(&planes.y), u: pad(&planes.u) };
         let side = self.options.tile / multiple * multiple;
         let tiles = Tiles::new(size, side, (side / 8).next_multiple_of(multiple), multiple);
-        let mut job = Job { context, planes, frames, size, tiles, prepared: None };
+        let sensor = sensor_numbers(context);
+        let mut job = Job { context, sensor, planes, frames, size, tiles, prepared: None };
         if job.tiles.count() == 1 {
             job.prepared = Some(self.prepare(&job, 0));
         }

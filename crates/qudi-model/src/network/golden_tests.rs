@@ -232,7 +232,8 @@ fn merged_frames() {
         let frames = case.number("frames");
         let variance = Variance::of(&case.input("sensor", &device), frames);
         let flows = Flows { to_next: input("to_next"), to_prev: input("to_prev"), scale: 2 };
-        let merged = merge(&u, &resample::smooth(u.clone()), &d, &variance, &flows, frames);
+        let variance = variance.at(resample::smooth(u.clone()));
+        let merged = merge(&u, &d, &variance, &flows, frames);
         case.check_output("u_m", merged.u.inner());
         case.check_output("d_m", merged.d.clone().inner());
         case.check_output("mass", merged.mass.inner());

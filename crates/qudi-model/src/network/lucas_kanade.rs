@@ -4,8 +4,8 @@ use super::resample::{differences, mean_around};
 use burn::tensor::Tensor;
 use qudi_kernels::warp;
 
-/// Variance of the prior's precision over that of a pixel: where the noise hides what moves, a motion
-/// stays as it was. Found on the validation clips (docs/results.md).
+/// Weight of the prior, in variances of a pixel's noise: where that hides what moves, a motion stays as it was. Found
+/// on the validation clips (docs/results.md).
 const PRIOR: f32 = 0.03;
 
 /// Radius of the window that moves as one, in cells.

@@ -3,7 +3,6 @@
 
 use super::flow::Flows;
 use super::resample::{by_burst, mean_around, rescale_flow, smooth};
-use super::variance::Variance;
 use burn::tensor::Tensor;
 use qudi_kernels::warp;
 
@@ -20,8 +19,7 @@ const EXPECTED: f32 = 1.0;
 const SUSPICION: f32 = 1.0;
 
 /// The frames, merged; `[images, 1, H, W]` each.
-#[derive(Clone, Debug)]
-pub struct Merged {
+pub(super) struct Merged {
     /// Linear estimates.
     pub u: Tensor<4>,
     /// Pre-denoised frames.
@@ -30,23 +28,22 @@ pub struct Merged {
     pub mass: Tensor<4>,
 }
 
-/// Merges linear estimates `u` and pre-denoised frames `d`, `[images, 1, H, W]`, along `flows`. `smoothed` is [`smooth`]
-/// of `u`: how it differs from the frames merged so far, against what `variance` explains, says which frames agree.
+/// Merges linear estimates `u` and pre-denoised frames `d` along `flows`. How an estimate differs from those merged so far,
+/// against what the `variance` of their noise explains, says which frames agree. `u`, `d`, `variance`: `[images, 1, H, W]`.
 ///
 /// Flows to farther frames are composed of those between neighbours, so that every frame is interpolated once. Gradients
 /// reach `d` alone.
 pub(super) fn merge(
     u: &Tensor<4>,
-    smoothed: &Tensor<4>,
     d: &Tensor<4>,
-    variance: &Variance,
+    variance: &Tensor<4>,
     flows: &Flows,
     frames: usize,
 ) -> Merged {
     let [images, _, height, width] = u.dims();
     let bursts = images / frames;
     let u = u.clone().detach();
-    let noise = variance.at(smoothed.clone()) * LEFT;
+    let noise = variance.clone() * LEFT;
     let own = Tensor::cat(vec![u.clone(), d.clone(), u.ones_like()], 1);
     let (next, prev) = (flows.to_next.clone().detach(), flows.to_prev.clone().detach());
     let mut sum = own.clone();

@@ -56,7 +56,8 @@ pub struct Prepared {
     u: Tensor<4>,
     /// What the pre-denoiser corrects.
     base: Tensor<4>,
-    variance: Variance,
+    /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`, and at every pixel.
+    variance: [Tensor<4>; 2],
     frames: usize,
 }
 
@@ -107,12 +108,14 @@ impl Qudi {
     /// Computes what does not depend on the step.
     pub fn prepare(&self, measured: &Measured) -> Prepared {
         let (y, u) = (measured.y.clone(), measured.u.clone());
+        let base = smooth(u.clone());
+        let variance = Variance::of(&measured.sensor, measured.frames);
         Prepared {
             pre: self.pre.prepare(y, u.clone()),
             low: self.low.prepare(u.clone(), measured.frames),
             sensor: self.unet.prepare(measured.sensor.clone()),
-            base: smooth(u.clone()),
-            variance: Variance::of(&measured.sensor, measured.frames),
+            variance: [variance.mean(), variance.at(base.clone())],
+            base,
             u,
             frames: measured.frames,
         }
@@ -138,7 +141,8 @@ impl Qudi {
     }
 
     fn estimate_flow(&self, prepared: &Prepared, d: Tensor<4>) -> Flows {
-        self.flow.forward(d, prepared.base.clone(), prepared.variance.mean(), prepared.frames)
+        let [variance, _] = prepared.variance.clone();
+        self.flow.forward(d, prepared.base.clone(), variance, prepared.frames)
     }
 
     /// The pre-denoised frames and their features.
@@ -186,8 +190,8 @@ impl Qudi {
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
         let signed = |image: Tensor<4>| image * 2.0 - 1.0;
-        let Prepared { base, variance, .. } = prepared;
-        let merged = merge(&u, base, &d, variance, &flows, frames);
+        let [_, variance] = &prepared.variance;
+        let merged = merge(&u, &d, variance, &flows, frames);
         done("merge");
         let (x_t, x0_prev) = (state.x_t.clone(), state.x0_prev.clone());
         let doubt = merged.mass.sqrt().recip();

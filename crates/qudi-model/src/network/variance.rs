@@ -12,8 +12,7 @@ const AT_MEAN_LIGHT: usize = 10;
 const LEAST: f32 = 1e-8;
 
 /// Variance of the linear estimate `u`, affine in the light: that of shot noise is.
-#[derive(Clone, Debug)]
-pub struct Variance {
+pub(super) struct Variance {
     /// At no light, `[images, 1, 1, 1]`.
     floor: Tensor<4>,
     /// At the mean light.
