@@ -15,13 +15,23 @@ use matching::Search;
 use pass::pass;
 use qudi_sim::{Frame, Size};
 
-/// Largest displacement of similar blocks: a window of 39 x 39 (table I, "normal profile").
-const RADIUS: usize = 19;
-
-/// Blocks in a group of the first and of the second pass (table I). The second pass looks at a
-/// block every 2 pixels instead of 3: 0.02 dB for half as much time again (docs/results.md).
+/// Blocks in a group of the first and of the second pass (table I).
 const MOST: [usize; 2] = [16, 32];
-const STEP: [usize; 2] = [3, 2];
+
+/// How hard to look.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Profile {
+    /// Largest displacement of similar blocks, in pixels.
+    pub(crate) radius: usize,
+    /// Pixels between the blocks that are looked for, in the first and in the second pass.
+    pub(crate) step: [usize; 2],
+}
+
+impl Profile {
+    /// Windows of 39 x 39 (table I, "normal profile"). The second pass looks for a block every 2 pixels instead
+    /// of 3: 0.02 dB for half as much time again (docs/results.md).
+    pub(crate) const NORMAL: Self = Self { radius: 19, step: [3, 2] };
+}
 
 /// Cut of the first pass, in deviations of the noise (table I).
 const LAMBDA: f32 = 2.7;
@@ -36,6 +46,11 @@ const SIMILAR: [f32; 2] = [500.0, 400.0];
 /// size: below a block's 8 pixels the border is repeated. Without noise the image comes back as
 /// it is.
 pub fn bm3d(image: &Frame, sigma: f32) -> Frame {
+    bm3d_as(Profile::NORMAL, image, sigma)
+}
+
+/// [`bm3d`] in another profile.
+pub(crate) fn bm3d_as(profile: Profile, image: &Frame, sigma: f32) -> Frame {
     // Also where sigma is no number.
     if !(sigma > 0.0 && sigma.is_finite()) {
         return image.clone();
@@ -44,13 +59,13 @@ pub fn bm3d(image: &Frame, sigma: f32) -> Frame {
     let size = Size { height: height.max(block::BLOCK), width: width.max(block::BLOCK) };
     if size != image.size {
         let inside = |x: usize, y: usize| image.row(y.min(height - 1))[x.min(width - 1)];
-        let whole = bm3d(&Frame::from_fn(size, inside), sigma);
+        let whole = bm3d_as(profile, &Frame::from_fn(size, inside), sigma);
         return Frame::from_fn(image.size, |x, y| whole.row(y)[x]);
     }
     let variance = sigma * sigma;
     let search = |pass: usize, noise: f32| Search {
-        step: STEP[pass],
-        radius: RADIUS,
+        step: profile.step[pass],
+        radius: profile.radius,
         most: MOST[pass],
         threshold: noise + SIMILAR[pass] / (255.0 * 255.0),
     };

@@ -6,18 +6,23 @@
 
 mod align;
 mod blocks;
+mod cubic;
 mod dft;
 mod grid;
+mod guide;
 mod hot;
 mod merge;
 mod pyramid;
 
+use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
 use crate::transform_denoise::{denoise, image};
 use align::{align, finest_grid, sample};
 use blocks::Blocks;
+use cubic::{cubic, squares};
 use dft::SIDE;
 use grid::Grid;
+pub use guide::Guide;
 use merge::{Member, merge};
 use pyramid::Pyramid;
 use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
@@ -109,12 +114,13 @@ impl Restorer for Qbp {
             Stabilizer::new(transform, &context.sensor, context.gain, burst.frames.len() as u32);
         let merger = Merger::new(burst, context, self.block(context)?, self.settings.trust);
         let finish = |frame: usize| {
-            let Merged { counts, noise } = merger.merge(frame);
+            let Merged { counts, noise, .. } = merger.merge(frame);
             let z =
                 counts.data.iter().map(|&mean| stabilizer.transform(n * f64::from(mean)) as f32);
             let mut z = Frame { size: counts.size, data: z.collect() };
             if self.finish == Finish::Bm3d {
-                z = denoise(z, &stabilizer, self.settings.noise * (n * noise).sqrt());
+                let scale = self.settings.noise * (n * noise).sqrt();
+                z = denoise(Profile::NORMAL, z, &stabilizer, scale);
             }
             image(&z, &stabilizer, context, ordinary, units)
         };
@@ -151,6 +157,8 @@ struct Merged {
     counts: Frame,
     /// Variance of their noise, in that of one frame.
     noise: f64,
+    /// The same at every pixel.
+    noises: Frame,
 }
 
 /// Merges the frames of one window.
@@ -165,6 +173,16 @@ struct Merger {
     grid: Grid,
     /// Pyramids of single frames, of which blocks of one frame need no others.
     pyramids: Vec<Pyramid>,
+    /// Estimates of the frames' mean counts, if there are any.
+    pilots: Option<Pilots>,
+}
+
+/// What an earlier round made of the frames: motion is found in it, and what does not fit.
+struct Pilots {
+    /// Mean counts, as large as the frames.
+    frames: Vec<Frame>,
+    /// Variance of their errors, in that of the counts' noise.
+    error: f32,
 }
 
 impl Merger {
@@ -172,21 +190,12 @@ impl Merger {
         let moments = CountMoments::new(&CountLaw::new(&context.sensor, context.gain));
         let size = Size { height: burst.size.height.max(SIDE), width: burst.size.width.max(SIDE) };
         let hot = hot::HotPixels::find(burst, context.sensor.max_count());
-        let frames: Vec<Frame> = burst
-            .frames
-            .par_iter()
-            .map(|counts| {
-                let counts = hot.repaired(counts);
-                Frame::from_fn(size, |x, y| {
-                    let (x, y) = (x.min(burst.size.width - 1), y.min(burst.size.height - 1));
-                    counts[y * burst.size.width + x]
-                })
-            })
-            .collect();
+        let repaired = |counts: &Vec<u16>| at_least(&hot.repaired(counts), burst.size, size);
+        let frames: Vec<Frame> = burst.frames.par_iter().map(repaired).collect();
         let pyramids =
             if block == 1 { frames.par_iter().map(Pyramid::new).collect() } else { Vec::new() };
         let grid = finest_grid(size);
-        Self { size: burst.size, frames, block, trust, moments, grid, pyramids }
+        Self { size: burst.size, frames, block, trust, moments, grid, pyramids, pilots: None }
     }
 
     /// The blocks around `reference`, and the motion of every patch to every frame.
@@ -194,7 +203,8 @@ impl Merger {
         let blocks = Blocks::around(reference, self.frames.len(), self.block);
         let single = |mean: f64| self.moments.variance_at_mean(mean) as f32;
         let own = self.pyramid(&blocks, blocks.reference);
-        let variance = single(self.frames[reference].mean());
+        let error = self.pilots.as_ref().map_or(1.0, |pilots| pilots.error);
+        let variance = error * single(self.frames[reference].mean());
         let flows: Vec<Vec<[f32; 2]>> = (0..blocks.ranges.len())
             .into_par_iter()
             .map(|k| {
@@ -229,12 +239,12 @@ impl Merger {
         let patches: Vec<_> =
             (0..self.grid.len()).into_par_iter().map(|i| self.patch(i, &blocks, &flow)).collect();
         let mut sum = Frame::filled(self.frames[0].size, 0.0);
-        let mut weights = sum.clone();
+        let (mut weights, mut noises) = (sum.clone(), sum.clone());
         let window: [f32; SIDE] = std::array::from_fn(|k| {
             0.5 - 0.5 * (2.0 * std::f32::consts::PI * (k as f32 + 0.5) / SIDE as f32).cos()
         });
         let width = sum.size.width;
-        for (i, (patch, _)) in patches.iter().enumerate() {
+        for (i, (patch, noise)) in patches.iter().enumerate() {
             let [x, y] = self.grid.corner(i);
             for (r, row) in patch.iter().enumerate() {
                 for (c, value) in row.iter().enumerate() {
@@ -242,12 +252,20 @@ impl Merger {
                     let at = (y + r) * width + x + c;
                     sum.data[at] += weight * value;
                     weights.data[at] += weight;
+                    noises.data[at] += weight * noise;
                 }
             }
         }
-        let counts = Frame::from_fn(self.size, |x, y| (sum.row(y)[x] / weights.row(y)[x]).max(0.0));
+        let mean = |of: &Frame| {
+            Frame::from_fn(self.size, |x, y| (of.row(y)[x] / weights.row(y)[x]).max(0.0))
+        };
         let noise = patches.iter().map(|(_, noise)| f64::from(*noise)).sum::<f64>();
-        Merged { counts, noise: noise / patches.len() as f64 }
+        Merged { counts: mean(&sum), noise: noise / patches.len() as f64, noises: mean(&noises) }
+    }
+
+    /// A patch between pixels. Bilinear as in the paper; what pilots have aligned deserves better.
+    fn sample(&self, image: &Frame, corner: [f32; 2]) -> dft::Patch {
+        if self.pilots.is_some() { cubic(image, corner) } else { sample(image, corner) }
     }
 
     /// Patch `i` of the reference, merged, and its noise.
@@ -259,18 +277,26 @@ impl Merger {
             let mut noise = 0.0;
             for frame in range.clone() {
                 let d = flow[frame][i];
-                let warped = sample(&self.frames[frame], [corner[0] + d[0], corner[1] + d[1]]);
+                let warped = self.sample(&self.frames[frame], [corner[0] + d[0], corner[1] + d[1]]);
                 for (mean, value) in mean.iter_mut().flatten().zip(warped.iter().flatten()) {
                     *mean += share * value;
                 }
                 // Between pixels the sample is a mean of some of them.
                 let left = d.map(|d| {
                     let part = d - d.floor();
-                    part * part + (1.0 - part) * (1.0 - part)
+                    match self.pilots {
+                        Some(_) => squares(part),
+                        None => part * part + (1.0 - part) * (1.0 - part),
+                    }
                 });
                 noise += share * share * left[0] * left[1];
             }
-            Member { patch: mean, frames: range.len() as f32, noise }
+            // Blocks have one frame where there are pilots.
+            let pilot = self.pilots.as_ref().map(|pilots| {
+                let d = flow[range.start][i];
+                self.sample(&pilots.frames[range.start], [corner[0] + d[0], corner[1] + d[1]])
+            });
+            Member { patch: mean, frames: range.len() as f32, noise, pilot }
         };
         let others =
             (0..blocks.ranges.len()).filter(|&k| k != blocks.reference).map(|k| &blocks.ranges[k]);
@@ -280,4 +306,9 @@ impl Merger {
         let variance = self.moments.variance_at_mean(f64::from(mean)) as f32;
         merge(&members, variance, self.trust)
     }
+}
+
+/// Values of size `from` with the border repeated up to `size`.
+fn at_least(values: &[f32], from: Size, size: Size) -> Frame {
+    Frame::from_fn(size, |x, y| values[y.min(from.height - 1) * from.width + x.min(from.width - 1)])
 }

@@ -129,6 +129,11 @@ impl Stabilizer {
         if self.nodes.is_empty() { self.closed_form(z) } else { self.look_up(z, 0) }
     }
 
+    /// The mean count whose expected transform is `z`.
+    pub fn mean_count(&self, z: f64) -> f64 {
+        self.moments.at(self.invert(z)).0
+    }
+
     /// The deviation of the transform where it is expected to be `z`: close to 1, or that of the mean
     /// count.
     pub fn deviation(&self, z: f64) -> f64 {

@@ -2,7 +2,7 @@
 //! for quanta image sensors", Sensors 16(11):1961, 2016): sums of frames, a variance-stabilising
 //! transform, BM3D, the exact inverse. Without the transform it is BM3D alone.
 
-use crate::bm3d::bm3d;
+use crate::bm3d::{Profile, bm3d_as};
 use crate::plane::{Spread, spread};
 use crate::stabilizer::{Stabilizer, Transform};
 use qudi_sim::restore::{
@@ -57,7 +57,8 @@ impl Restorer for TransformDenoise {
                 Stabilizer::new(self.transform, &context.sensor, context.gain, n)
             });
             let z = sums.iter().map(|&sum| stabilizer.transform(f64::from(sum)) as f32).collect();
-            let z = denoise(Frame { size: burst.size, data: z }, stabilizer, 1.0);
+            let z = Frame { size: burst.size, data: z };
+            let z = denoise(Profile::NORMAL, z, stabilizer, 1.0);
             frames.push(image(&z, stabilizer, context, ordinary, units));
         });
         Ok(Restored { frames, std: None })
@@ -65,14 +66,19 @@ impl Restorer for TransformDenoise {
 }
 
 /// BM3D on a transformed frame, whose noise is `scale` times that of the transform.
-pub(crate) fn denoise(mut z: Frame, stabilizer: &Stabilizer, scale: f64) -> Frame {
+pub(crate) fn denoise(
+    profile: Profile,
+    mut z: Frame,
+    stabilizer: &Stabilizer,
+    scale: f64,
+) -> Frame {
     let Spread { low, high, variance } =
         spread(&z, |mean| (scale * stabilizer.deviation(mean)).powi(2));
     let sigma = variance.sqrt();
     // BM3D's thresholds are for contents within [0, 1].
     let range = (high - low).max(sigma).max(f64::MIN_POSITIVE);
     z.data.iter_mut().for_each(|v| *v = ((f64::from(*v) - low) / range) as f32);
-    let mut clean = bm3d(&z, (sigma / range) as f32);
+    let mut clean = bm3d_as(profile, &z, (sigma / range) as f32);
     clean.data.iter_mut().for_each(|v| *v = (f64::from(*v) * range + low) as f32);
     clean
 }

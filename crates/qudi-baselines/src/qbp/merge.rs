@@ -13,6 +13,8 @@ pub(super) struct Member {
     pub(super) frames: f32,
     /// Variance of its noise, in the variance of one frame's counts.
     pub(super) noise: f32,
+    /// An estimate of what it shows, if there is one: then that is what must fit.
+    pub(super) pilot: Option<Patch>,
 }
 
 /// Merges `members`, the reference first, whose frames have counts of `variance`. `trust` is the
@@ -20,6 +22,7 @@ pub(super) struct Member {
 /// variance of its noise, in that of one frame.
 pub(super) fn merge(members: &[Member], variance: f32, trust: f32) -> (Patch, f32) {
     let reference = forward(&members[0].patch);
+    let pilot = members[0].pilot.as_ref().map(forward);
     let total: f32 = members.iter().map(|member| member.frames).sum();
     let share = members[0].frames / total;
     let mut sum = Spectrum { re: reference.re, im: reference.im };
@@ -32,11 +35,15 @@ pub(super) fn merge(members: &[Member], variance: f32, trust: f32) -> (Patch, f3
     for member in &members[1..] {
         let share = member.frames / total;
         let Spectrum { re, im } = forward(&member.patch);
+        let powers = match (&pilot, &member.pilot) {
+            (Some(pilot), Some(other)) => powers(&forward(other), pilot),
+            _ => powers(&Spectrum { re, im }, &reference),
+        };
         let expected = trust * (SIDE * SIDE) as f32 * variance * (members[0].noise + member.noise);
         for y in 0..SIDE {
             for x in 0..SIDE {
                 let (dr, di) = (re[y][x] - reference.re[y][x], im[y][x] - reference.im[y][x]);
-                let power = dr * dr + di * di;
+                let power = powers[y][x];
                 let distrust = power / (power + expected).max(f32::MIN_POSITIVE);
                 let kept = share * (1.0 - distrust);
                 sum.re[y][x] += share * reference.re[y][x] + kept * dr;
@@ -51,12 +58,22 @@ pub(super) fn merge(members: &[Member], variance: f32, trust: f32) -> (Patch, f3
     (inverse(sum), left / (SIDE * SIDE) as f32)
 }
 
+/// Powers of the difference's coefficients.
+fn powers(a: &Spectrum, b: &Spectrum) -> Patch {
+    std::array::from_fn(|y| {
+        std::array::from_fn(|x| {
+            let (dr, di) = (a.re[y][x] - b.re[y][x], a.im[y][x] - b.im[y][x]);
+            dr * dr + di * di
+        })
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn member(patch: &Patch) -> Member {
-        Member { patch: *patch, frames: 1.0, noise: 1.0 }
+        Member { patch: *patch, frames: 1.0, noise: 1.0, pilot: None }
     }
 
     fn texture(seed: usize) -> Patch {
@@ -85,6 +102,20 @@ mod tests {
         // With noise that large they could be the same.
         let (_, noise) = merge(&[member(&texture(1)), member(&other)], 1e4, 4.0);
         assert!(noise < 0.55, "{noise}");
+    }
+
+    /// However much the patches differ, if their pilots agree: that was noise.
+    #[test]
+    fn pilots_decide_what_fits() {
+        let pair = |pilots: [Patch; 2]| {
+            let [a, b] = pilots.map(Some);
+            let other = texture(5).map(|row| row.map(|v| 40.0 - 3.0 * v));
+            [Member { pilot: a, ..member(&texture(1)) }, Member { pilot: b, ..member(&other) }]
+        };
+        let (_, alike) = merge(&pair([texture(2), texture(2)]), 1e-4, 4.0);
+        assert!((alike - 0.5).abs() < 1e-4, "{alike}");
+        let (_, apart) = merge(&pair([texture(2), texture(9)]), 1e-4, 4.0);
+        assert!(apart > 0.9, "{apart}");
     }
 
     #[test]
