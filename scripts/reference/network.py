@@ -109,30 +109,16 @@ class DenseBlock(nn.Module):
         return x + self.fuse(seen)
 
 
-def smooth(x: Tensor) -> Tensor:
-    """5 x 5 binomial weights, edges repeated; `x` has one channel."""
-    row = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]).to(x) / 16
-    padded = F.pad(x, (2, 2, 2, 2), mode="replicate")
-    return F.conv2d(padded, (row[:, None] * row[None, :])[None, None])
-
-
 def mean_around(x: Tensor, radius: int) -> Tensor:
     """Means over squares, edges repeated."""
     padded = F.pad(x, (radius,) * 4, mode="replicate")
     return F.avg_pool2d(padded, 2 * radius + 1, stride=1)
 
 
-class Variance:
-    """Of the linear estimate, affine in the light."""
-
-    def __init__(self, sensor: Tensor, frames: int):
-        images = lambda x: x.detach().repeat_interleave(frames)[:, None, None, None]
-        self.floor, self.mean = (images(10 ** (2 * sensor[:, place])) for place in (9, 10))
-        self.exposure = images(sensor[:, 1])
-
-    def at(self, image: Tensor) -> Tensor:
-        slope = (self.mean - self.floor) / self.exposure.clamp(min=1e-3)
-        return (self.floor + slope * mean_around(image, 2)).clamp(min=1e-8)
+def mean_variance(sensor: Tensor, frames: int) -> Tensor:
+    """Of the linear estimate at the mean light, [B*N, 1, 1, 1]."""
+    variance = (10 ** (2 * sensor[:, 10])).detach().clamp(min=1e-8)
+    return variance.repeat_interleave(frames)[:, None, None, None]
 
 
 class PreDenoiser(nn.Module):
@@ -141,15 +127,17 @@ class PreDenoiser(nn.Module):
         self.fold = config["fold"]
         cells, pre = self.fold**2, config["pre"]
         width = pre["width"]
-        self.static_in = conv(2 * cells, width, 3)
+        self.static_in = conv(5 * cells, width, 3)
         self.simulated_in = conv(2 * cells + 1, width, 3, bias=False)
         self.blocks = nn.ModuleList(DenseBlock(width, pre["growth"]) for _ in range(pre["blocks"]))
         self.gather = conv(pre["blocks"] * width, width, 1)
         self.spread = conv(width, width, 3)
         self.out = conv(width, cells, 3)
 
-    def forward(self, y: Tensor, u: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor) -> tuple[Tensor, Tensor]:
-        static = F.pixel_unshuffle(torch.cat([y, u], 1), self.fold)
+    def forward(
+        self, y: Tensor, u: Tensor, guide: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        static = F.pixel_unshuffle(torch.cat([y, u, guide], 1), self.fold)
         simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
         frames = len(y) // len(flag)
         plane = flag.to(y).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *static.shape[2:])
@@ -159,7 +147,7 @@ class PreDenoiser(nn.Module):
             x = block(x)
             outputs.append(x)
         g = self.spread(self.gather(torch.cat(outputs, 1))) + s
-        return smooth(u) + F.pixel_shuffle(self.out(g), self.fold) / 10, g
+        return guide[:, :1] + F.pixel_shuffle(self.out(g), self.fold) / 10, g
 
 
 class Features(nn.Module):
@@ -242,15 +230,15 @@ class Flow(nn.Module):
         self.scale, self.pyramid = flow["scale"], flow["levels"]
         self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["networks"]))
 
-    def forward(self, d: Tensor, smoothed: Tensor, variance: Tensor, frames: int) -> Flows:
+    def forward(self, d: Tensor, clean: Tensor, variance: Tensor, frames: int) -> Flows:
         """to_next and to_prev, [B*N, 2, H/scale, W/scale]; `variance` [B*N, 1, 1, 1]."""
-        pyramid = [F.avg_pool2d(torch.cat([d, smoothed], 1), self.scale)]
+        pyramid = [F.avg_pool2d(torch.cat([d, clean], 1), self.scale)]
         for _ in range(1, self.pyramid):
             pyramid.append(F.avg_pool2d(pyramid[-1], 2))
         # Both directions in one batch: frames 0..N-1 look ahead, frames 1..N look back.
         ahead_back = lambda x, y: torch.cat([x[:, :-1], y[:, 1:]], 1).flatten(0, 1)
         v = bursts(variance, frames)
-        prior = 0.03 * ahead_back(v, v)
+        prior = 0.005 * ahead_back(v, v)
         flow = torch.zeros(len(prior), 2, *pyramid[-1].shape[2:], dtype=d.dtype)
         skipped = self.pyramid - len(self.levels)
         for j in reversed(range(self.pyramid)):
@@ -266,41 +254,6 @@ class Flow(nn.Module):
         ahead, back = bursts(flow, 2 * (frames - 1)).chunk(2, 1)
         nothing = torch.zeros_like(ahead[:, :1])
         return torch.cat([ahead, nothing], 1).flatten(0, 1), torch.cat([nothing, back], 1).flatten(0, 1)
-
-
-def merge(
-    u: Tensor, d: Tensor, variance: Variance, flows: Flows, scale: int, frames: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """u_m, d_m and W; `flows` of `scale`."""
-    smoothed = smooth(u).detach()
-    explained = bursts(0.04523 * variance.at(smoothed), frames)
-    own = bursts(torch.cat([u.detach(), d, torch.ones_like(u)], 1), frames)
-    to_next, to_prev = (bursts(flow.detach(), frames) for flow in flows)
-    total = own.clone()
-    # Composed flows from every frame to the one k ahead, and to the one k behind.
-    ahead: dict[int, Tensor] = {}
-    behind: dict[int, Tensor] = {}
-    for k in range(1, min(5, frames - 1) + 1):
-        known = total.detach()
-        lowpass = bursts(smooth((known[:, :, :1] / known[:, :, 2:]).flatten(0, 1)), frames)
-        new = list(total.unbind(1))
-        for i in range(frames):
-            for j, composed, step in ((i + k, ahead, to_next), (i - k, behind, to_prev)):
-                if not 0 <= j < frames:
-                    continue
-                if k == 1:
-                    composed[i] = step[:, i]
-                else:
-                    last = step[:, j - 1 if j > i else j + 1]
-                    composed[i] = composed[i] + warp(last, composed[i])
-                moved = warp(own[:, j], resize_flow(composed[i], scale, 1))
-                t = mean_around(smooth(moved[:, :1].detach()) - lowpass[:, i], 1)
-                x = mean_around(t**2, 2) / (explained[:, i] * (1 + 1 / known[:, i, 2:]))
-                new[i] = new[i] + torch.exp(-F.relu(x - 1)) * moved
-        total = torch.stack(new, 1)
-    total = total.flatten(0, 1)
-    mass = total[:, 2:].detach()
-    return total[:, :1].detach() / mass, total[:, 1:2] / mass, mass
 
 
 class Cell(nn.Module):
@@ -481,7 +434,7 @@ class UNet(nn.Module):
         self,
         x_t: Tensor,
         x0_prev: Tensor,
-        merged: tuple[Tensor, Tensor, Tensor],
+        guide: Tensor,
         d: Tensor,
         fused: list[Tensor],
         t: Tensor,
@@ -489,8 +442,8 @@ class UNet(nn.Module):
         frames: int,
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
-        u_m, d_m, mass = merged
-        images = [x_t, x0_prev, 2 * u_m - 1, 2 * d_m - 1, 2 * d - 1, mass**-0.5]
+        clean, merged, doubt = guide.split(1, 1)
+        images = [2 * d - 1, x_t, x0_prev, 2 * clean - 1, 2 * merged - 1, doubt]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
         for k, level in enumerate(self.encoder):
@@ -507,7 +460,7 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        return 2 * d_m - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold) / 10
+        return 2 * d - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold) / 10
 
 
 class Qudi(nn.Module):
@@ -524,6 +477,7 @@ class Qudi(nn.Module):
         self,
         y: Tensor,
         u: Tensor,
+        guide: Tensor,
         y_sim: Tensor,
         u_sim: Tensor,
         flag: Tensor,
@@ -535,15 +489,13 @@ class Qudi(nn.Module):
         flows: Flows | None = None,
     ) -> tuple[Tensor, Tensor, Flows]:
         """x0 in [-1, 1] (not clipped), d in image units, and the flows, new unless given."""
-        d, g = self.pre(y, u, y_sim, u_sim, flag)
+        d, g = self.pre(y, u, guide, y_sim, u_sim, flag)
         low = self.low(u, u_sim, d, frames)
         high = self.high(x_t, x0_prev, frames)
-        variance = Variance(sensor, frames)
         if flows is None:
-            flows = self.flow(d, smooth(u).detach(), variance.mean.clamp(min=1e-8), frames)
+            flows = self.flow(d, guide[:, :1].detach(), mean_variance(sensor, frames), frames)
         fused = self.fusion(low, high, g, flows, frames)
-        merged = merge(u, d, variance, flows, self.flow.scale, frames)
-        return self.unet(x_t, x0_prev, merged, d, fused, t, sensor, frames), d, flows
+        return self.unet(x_t, x0_prev, guide, d, fused, t, sensor, frames), d, flows
 
 
 # The loss (without the perceptual term)
@@ -631,6 +583,7 @@ def sample(
     model: Qudi,
     y: Tensor,
     u: Tensor,
+    guide: Tensor,
     sensor: Tensor,
     frames: int,
     flow_steps: list[int],
@@ -652,7 +605,7 @@ def sample(
         flag = torch.full((len(sensor),), float(k > 1), dtype=x.dtype)
         time = torch.full((len(sensor),), t)
         known = None if k in flow_steps else flows
-        x0, _, flows = model(y, u, y_sim, u_sim, flag, x, estimate, time, sensor, frames, known)
+        x0, _, flows = model(y, u, guide, y_sim, u_sim, flag, x, estimate, time, sensor, frames, known)
         estimate = x0.clamp(-1, 1)
         c0, cx, sigma = coefficients(t, after, ancestral)
         x = c0 * estimate + cx * x

@@ -336,7 +336,7 @@ def pre_file() -> File:
     config = network.load("tiny")
     module = network.PreDenoiser(config)
     shape = (6, 1, 12, 20)
-    measured = {"y": spread(shape, *COUNTS), "u": spread(shape, *LINEAR)}
+    measured = {"y": spread(shape, *COUNTS), "u": spread(shape, *LINEAR), "guide": spread((6, 3, 12, 20), *COUNTS)}
     simulated = {"y_sim": spread(shape, *COUNTS), "u_sim": spread(shape, *LINEAR)}
     for name, flags, absent in (("with", [1, 1], []), ("without", [0, 0], range(6)), ("mixed", [1, 0], range(3, 6))):
         now = {key: spec | {"zero": list(absent)} for key, spec in simulated.items()}
@@ -375,28 +375,11 @@ def flow_file() -> File:
     for levels, networks in ((2, 2), (3, 2)):
         config = variant(config, flow={"levels": levels, "networks": networks})
         module = network.Flow(config)
-        run = lambda d, smoothed, variance: dict(zip(("to_next", "to_prev"), module(d, smoothed, variance, 4)))
-        inputs = {"d": spread((8, 1, 32, 48), 0.45, 6.0), "smoothed": spread((8, 1, 32, 48), 0.5, 8.0)}
-        inputs |= {"variance": spread((8, 1, 1, 1), 20.0, 5.0)}
+        run = lambda d, clean, variance: dict(zip(("to_next", "to_prev"), module(d, clean, variance, 4)))
+        inputs = {"d": spread((8, 1, 32, 48), 0.45, 6.0), "clean": spread((8, 1, 32, 48), 0.5, 7.0)}
+        inputs |= {"variance": spread((8, 1, 1, 1), 120.0, 30.0)}
         about = {"config": config, "frames": 4}
-        file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance", "smoothed"))
-    return file
-
-
-def merge_file() -> File:
-    file = File("merge", 128)
-    shape, flow = (8, 1, 16, 24), (8, 2, 8, 12)
-    inputs = {"u": spread(shape, 0.6, 0.5), "d": spread(shape, *COUNTS)} | sensors([-1, -0.5], [-1.5, -1])
-    # Frames 0..3 and 4..7 are bursts.
-    inputs["to_next"] = spread(flow, 0.05, 1.3) | {"zero": [3, 7]}
-    inputs["to_prev"] = spread(flow, -0.05, 1.3) | {"zero": [0, 4]}
-
-    def run(u: Tensor, d: Tensor, sensor: Tensor, to_next: Tensor, to_prev: Tensor) -> Tensors:
-        merged = network.merge(u, d, network.Variance(sensor, 4), (to_next, to_prev), 2, 4)
-        return dict(zip(("u_m", "d_m", "mass"), merged))
-
-    about = {"operation": "merge", "frames": 4, "scale": 2}
-    file.case("merge", run, inputs, about=about, constant=("u", "sensor", "to_next", "to_prev"))
+        file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance", "clean"))
     return file
 
 
@@ -433,8 +416,7 @@ def unet_file() -> File:
         module = network.UNet(config)
         shape = (6, 1, 16, 24)
         inputs = {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
-        inputs |= {"u_m": spread(shape, *LINEAR), "d_m": spread(shape, *COUNTS), "mass": spread(shape, 3.0, 1.5)}
-        inputs["d"] = spread(shape, *COUNTS)
+        inputs |= {"d": spread(shape, *COUNTS), "guide": spread((6, 3, 16, 24), *COUNTS)}
         for k, width in enumerate(config["fusion"]["widths"]):
             scale = config["fold"] << k
             inputs[f"fused_{k}"] = spread((6, width, 16 // scale, 24 // scale), 0.5, 0.5)
@@ -442,8 +424,7 @@ def unet_file() -> File:
 
         def run(**x: Tensor) -> Tensors:
             fused = [x.pop(f"fused_{k}") for k in range(3)]
-            merged = tuple(x.pop(name) for name in ("u_m", "d_m", "mass"))
-            return {"x0": module(**x, merged=merged, fused=fused, frames=3)}
+            return {"x0": module(**x, fused=fused, frames=3)}
 
         file.case(name, run, inputs, module, "unet", {"config": config, "frames": 3})
     return file
@@ -457,8 +438,8 @@ def network_file() -> File:
     config = network.load("tiny")
     module = network.Qudi(config)
     shape = (8, 1, 32, 48)
-    # Chosen so that no coordinate of a warp is within 9e-5 of a kink.
-    inputs = {"y": spread(shape, *COUNTS), "u": spread(shape, 0.664, 0.55)}
+    # Chosen so that no coordinate of a warp is within 6e-6 of a kink.
+    inputs = {"y": spread(shape, *COUNTS), "u": spread(shape, *LINEAR), "guide": spread((8, 3, 32, 48), 0.55, 0.56)}
     inputs |= {"y_sim": spread(shape, *COUNTS), "u_sim": spread(shape, *LINEAR), "flag": given([1, 1])}
     inputs |= {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
     inputs |= {"t": given([700, 40]), "truth": spread(shape, 0.5, 0.4)}
@@ -504,6 +485,9 @@ def sample_file(ancestral: bool) -> File:
     y, x = np.mgrid[:SIZE, :SIZE]
     scene = np.stack([0.45 + 0.35 * np.sin((x + 2 * i) / 4) * np.cos(y / 5) for i in range(FRAMES)])[:, None]
     counts = network.expose(rng, scene, PPP, EXPOSURE)
+    # Any guide serves: an estimate, a noisier one, and how noisy.
+    around = lambda noise: (scene + noise * rng.standard_normal(scene.shape)).astype(np.float32)
+    guide = [around(0.05), around(0.1), rng.uniform(0.3, 1, scene.shape).astype(np.float32)]
     table = network.linear(PPP, EXPOSURE)
     tables = np.stack([network.linear(network.light(PPP, t), EXPOSURE) for t, _ in network.steps(10)[1:]])
     simulated: dict[int, np.ndarray] = {}
@@ -524,8 +508,9 @@ def sample_file(ancestral: bool) -> File:
 
         noise = lambda k: torch.from_numpy(gaussian(f"noise.{k}", shape)).to(dtype)
         sensor = torch.tensor([network.sensor_numbers(PPP, EXPOSURE)]).to(dtype)
+        planes = torch.from_numpy(np.concatenate(guide, 1)).to(dtype)
         run = network.sample(
-            module, *both(counts, table), sensor, FRAMES, config["flow"]["steps"], noise, measure, ancestral=ancestral
+            module, *both(counts, table), planes, sensor, FRAMES, config["flow"]["steps"], noise, measure, ancestral=ancestral
         )
         with torch.no_grad():
             states = list(run)
@@ -538,6 +523,8 @@ def sample_file(ancestral: bool) -> File:
     for name in ("x", "x0", "x0_last"):
         file.judge("sample", f"output.{name}", single[name], double[name])
         file.tensors[name] = double[name].float().contiguous().clone()
+    for name, plane in zip(("clean", "merged", "doubt"), guide):
+        file.tensors[name] = torch.from_numpy(plane[:, 0].copy())
     file.tensors["counts"] = torch.from_numpy(counts[:, 0].copy())
     file.tensors["simulated"] = torch.from_numpy(np.stack([simulated[k][:, 0] for k in range(2, 11)]))
     file.tensors["u_table"], file.tensors["u_sim_table"] = torch.from_numpy(table), torch.from_numpy(tables)
@@ -556,7 +543,6 @@ FILES: dict[str, Callable[[], File]] = {
     "pre": pre_file,
     "features": feature_file,
     "flow": flow_file,
-    "merge": merge_file,
     "fusion": fusion_file,
     "unet": unet_file,
     "network": network_file,

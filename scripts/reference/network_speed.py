@@ -53,30 +53,27 @@ def inputs(frames: int, size: int, batch: int) -> dict[str, Tensor]:
     shape = (batch * frames, 1, size, size)
     rand = lambda: torch.rand(shape, generator=generator)
     x = {name: rand() for name in ("y", "u", "y_sim", "u_sim")}
+    x["guide"] = torch.rand((batch * frames, 3, size, size), generator=generator)
     x |= {"flag": torch.ones(batch), "x_t": torch.randn(shape, generator=generator), "x0_prev": 2 * rand() - 1}
     sensor = torch.tensor([network.sensor_numbers(PPP, EXPOSURE)] * batch)
     return x | {"t": torch.tensor([500] * batch), "sensor": sensor}
 
 
 def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: int) -> dict[str, dict]:
-    measured = [x[name] for name in ("y", "u", "y_sim", "u_sim", "flag")]
+    measured = [x[name] for name in ("y", "u", "guide", "y_sim", "u_sim", "flag")]
     d, g = model.pre(*measured)
     low, high = model.low(x["u"], x["u_sim"], d, frames), model.high(x["x_t"], x["x0_prev"], frames)
-    variance = network.Variance(x["sensor"], frames)
-    mean = variance.mean.clamp(min=1e-8)
-    smoothed = network.smooth(x["u"])
-    flows = model.flow(d, smoothed, mean, frames)
-    merge = lambda: network.merge(x["u"], d, variance, flows, model.flow.scale, frames)
-    merged = merge()
+    variance = network.mean_variance(x["sensor"], frames)
+    clean = x["guide"][:, :1]
+    flows = model.flow(d, clean, variance, frames)
     fused = model.fusion(low, high, g, flows, frames)
     blocks = {
         "pre": lambda: model.pre(*measured),
         "low": lambda: model.low(x["u"], x["u_sim"], d, frames),
         "high": lambda: model.high(x["x_t"], x["x0_prev"], frames),
-        "flow": lambda: model.flow(d, smoothed, mean, frames),
-        "merge": merge,
+        "flow": lambda: model.flow(d, clean, variance, frames),
         "fusion": lambda: model.fusion(low, high, g, flows, frames),
-        "unet": lambda: model.unet(x["x_t"], x["x0_prev"], merged, d, fused, x["t"], x["sensor"], frames),
+        "unet": lambda: model.unet(x["x_t"], x["x0_prev"], x["guide"], d, fused, x["t"], x["sensor"], frames),
     }
     return {name: times(run, rounds) for name, run in blocks.items()}
 
@@ -111,7 +108,7 @@ def loop(model: network.Qudi, x: dict[str, Tensor], frames: int, flow_steps: lis
 
     noise = lambda k: torch.randn(x["y"].shape, generator=generator)
     start = time.perf_counter()
-    run = network.sample(model, x["y"], x["u"], x["sensor"], frames, flow_steps, noise, measure, ancestral=ancestral)
+    run = network.sample(model, x["y"], x["u"], x["guide"], x["sensor"], frames, flow_steps, noise, measure, ancestral=ancestral)
     steps = len(list(run))
     return {"seconds": time.perf_counter() - start, "simulating": simulating, "steps": steps}
 

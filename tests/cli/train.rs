@@ -38,16 +38,16 @@ fn the_tiny_recipe_learns_without_a_file() {
     let losses: Vec<f64> = lines.iter().filter_map(|line| line["prediction"].as_f64()).collect();
     let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
     let (first, last) = (mean(&losses[..50]), mean(&losses[300..]));
-    assert!(losses.len() == 400 && last < 0.9 * first, "{first} {last}");
+    assert!(losses.len() == 400 && last < 0.98 * first, "{first} {last}");
     let page = std::fs::read_to_string(run_folder.join("report.html")).unwrap();
     assert!(page.contains("<polyline") && page.contains("data:image/png;base64,"));
     assert!(!page.contains("http"), "the report fetches something");
     run(&folder, "simulate scene:text --size 64x64 --frames 11 --seed 3 -o b.npy -q");
     run(&folder, "restore b.npy --weights run/weights.safetensors --steps 1 --device cpu -o r -q");
     assert_eq!(listing(&folder.join("r")).len(), 12); // frames and manifest
-    // Untrained, the smoothed estimate reaches 17.98 and 17.08 dB.
+    // Untrained, the guide alone reaches 19.09 and 18.89 dB.
     let quality = |clip: usize| lines.last().unwrap()["clips"][clip]["psnr_a"].as_f64().unwrap();
-    assert!(quality(0) > 18.2 && quality(1) > 17.5, "{} and {} dB", quality(0), quality(1));
+    assert!(quality(0) > 19.1 && quality(1) > 18.93, "{} and {} dB", quality(0), quality(1));
 }
 
 #[test]

@@ -1,8 +1,12 @@
 //! What the network is told of a burst: counts, their linear estimate, and the sensor in numbers.
 
 use crate::network::SENSOR_NUMBERS;
+use crate::tensor::to_tensor;
+use burn::tensor::{Device, Tensor};
+use qudi_baselines::Guide;
 use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::sensor::{CountLaw, Response, Sensor};
+use qudi_sim::{Frame, Result, Size};
 
 /// Brightest linear estimate, in image units: twice white.
 const BRIGHTEST: f64 = 2.0;
@@ -36,6 +40,55 @@ impl Planes {
             }
         }
         planes
+    }
+}
+
+/// The classical estimate of a burst that the network goes on from, frame after frame, row-major.
+#[derive(Clone, Debug, Default)]
+pub struct GuidePlanes {
+    /// Restored, in image units.
+    pub clean: Vec<f32>,
+    /// Aligned and merged, still noisy, in image units.
+    pub merged: Vec<f32>,
+    /// Deviation of the merged frames' noise, in that of one frame's: between 0 and 1.
+    pub doubt: Vec<f32>,
+}
+
+impl GuidePlanes {
+    /// The guide of a captured burst.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
+    pub fn of(burst: BurstView<'_>, context: &Context) -> Result<Self> {
+        let guide = Guide::find(burst, context)?;
+        let values = |frames: Vec<Frame>, most: f64| {
+            let values = frames.into_iter().flat_map(|frame| frame.data);
+            values.map(|value| value.min(most as f32)).collect()
+        };
+        Ok(Self {
+            clean: values(guide.clean, BRIGHTEST),
+            merged: values(guide.merged, BRIGHTEST),
+            doubt: values(guide.doubt, 1.0),
+        })
+    }
+
+    /// Every plane changed by `f`.
+    #[must_use]
+    pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {
+        Self { clean: f(&self.clean), merged: f(&self.merged), doubt: f(&self.doubt) }
+    }
+
+    /// Appends another burst's.
+    pub fn extend(&mut self, more: Self) {
+        self.clean.extend(more.clean);
+        self.merged.extend(more.merged);
+        self.doubt.extend(more.doubt);
+    }
+
+    /// The planes as channels, `[frames, 3, height, width]`.
+    pub fn to_tensor(&self, size: Size, device: &Device) -> Tensor<4> {
+        let planes = [&self.clean, &self.merged, &self.doubt];
+        Tensor::cat(planes.map(|plane| to_tensor(plane.clone(), size, device)).into(), 1)
     }
 }
 

@@ -9,7 +9,6 @@ mod fusion;
 mod golden_tests;
 mod layers;
 mod lucas_kanade;
-mod merge;
 mod pre;
 mod qudi;
 mod resample;

@@ -1,5 +1,5 @@
 //! What training minimises (DESIGN 4.8): squared error and differences of gradients, of the prediction and of
-//! the pre-denoised frames.
+//! the pre-denoised frames, relative to the error of the guide.
 
 use crate::measurement::Planes;
 use crate::network::{Measured, Qudi, Simulated, State};
@@ -15,6 +15,22 @@ use qudi_sim::{Result, SimError, Size};
 
 /// Weight of the total variation of the error.
 const VARIATION: f32 = 0.01;
+
+/// Least squared error that a guide counts with: better ones leave nothing to learn.
+const LEAST_ERROR: f32 = 1e-4;
+
+/// One over the root of the guide's mean squared error, for every image that of its burst, `[images, 1, 1, 1]`. Errors that are
+/// multiplied by it count relative to the guide's: else a few dark bursts, whose errors are thirty times those of bright
+/// ones, would be all that matters.
+fn relative(example: &Example<'_>) -> Tensor<4> {
+    let (guide, frames) = (example.measured.guide.clone(), example.measured.frames);
+    let error = (guide.narrow(1, 0, 1) - example.truth.clone()).detach();
+    let [images, _, height, width] = error.dims();
+    let bursts = images / frames;
+    let error = error.powi_scalar(2).reshape([bursts, frames * height * width]).mean_dim(1);
+    let scale = error.clamp_min(LEAST_ERROR).sqrt().recip();
+    scale.repeat_dim(1, frames).reshape([images, 1, 1, 1])
+}
 
 /// Weights of the terms.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -97,7 +113,7 @@ pub enum FirstPass {
 pub struct Terms {
     /// The weighted sum.
     pub total: Tensor<1>,
-    /// Of the prediction.
+    /// Of the prediction; about 1 where it is no better than the guide.
     pub prediction: Tensor<1>,
     /// Of the pre-denoised frames.
     pub pre: Tensor<1>,
@@ -159,9 +175,11 @@ pub fn terms(
     let prepared = network.prepare(example.measured);
     let result = network.forward(&prepared, simulated.as_ref(), &state, None);
     let image = (result.x0 + 1.0) * 0.5;
-    let prediction = reconstruction(image.clone(), example.truth.clone());
+    let relative = relative(example);
+    let truth = example.truth.clone() * relative.clone();
+    let prediction = reconstruction(image.clone() * relative.clone(), truth.clone());
     let perceptual = perceptual.map(|term| term.loss(image, example.truth.clone()));
-    let pre = reconstruction(result.d, example.truth.clone());
+    let pre = reconstruction(result.d * relative, truth);
     let mut total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     if let Some(term) = &perceptual {
         total = total + term.clone() * weights.perceptual;
@@ -179,7 +197,8 @@ pub fn terms(
 fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> Terms {
     let measured = example.measured;
     let (d, flows) = network.denoise_and_align(&network.prepare(measured));
-    let pre = reconstruction(d, example.truth.clone());
+    let relative = relative(example);
+    let pre = reconstruction(d * relative.clone(), example.truth.clone() * relative);
     let flow = flows.misfit(example.truth.clone(), measured.frames);
     let total = pre.clone() * weights.pre + flow.clone() * weights.flow;
     Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow: Some(flow) }
@@ -198,6 +217,7 @@ fn estimate(
     let measured = Measured {
         y: example.measured.y.clone().inner(),
         u: example.measured.u.clone().inner(),
+        guide: example.measured.guide.clone().inner(),
         sensor: example.measured.sensor.clone().inner(),
         frames: example.measured.frames,
     };

@@ -1,7 +1,7 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
 use crate::config::{NetworkConfig, Part};
-use crate::measurement::{Planes, sensor_numbers};
+use crate::measurement::{GuidePlanes, Planes, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
 use crate::noise::Noise;
 use crate::physics::LoopSensor;
@@ -154,10 +154,12 @@ impl QudiRestorer {
 
     fn prepare(&self, job: &Job<'_>, number: usize) -> Prepared {
         let tensor = |images: &[f32]| self.tile(job, number, images);
+        let guide = job.guide.map(|images| job.tiles.crop(number, images));
         let sensor = TensorData::new(job.sensor.to_vec(), [1, SENSOR_NUMBERS]);
         self.network.prepare(&Measured {
             y: tensor(&job.planes.y),
             u: tensor(&job.planes.u),
+            guide: guide.to_tensor(job.tiles.tile, &self.device),
             sensor: Tensor::from_data(sensor, &self.device),
             frames: job.frames,
         })
@@ -170,6 +172,7 @@ struct Job<'a> {
     /// The sensor in numbers: the same for all tiles and steps.
     sensor: [f32; SENSOR_NUMBERS],
     planes: Planes,
+    guide: GuidePlanes,
     frames: usize,
     size: Size,
     tiles: Tiles,
@@ -203,10 +206,11 @@ impl Restorer for QudiRestorer {
         let planes = Planes::of(burst, context);
         let pad = |images: &[f32]| padded(images, burst.size, size);
         let planes = Planes { y: pad(&planes.y), u: pad(&planes.u) };
+        let guide = GuidePlanes::of(burst, context)?.map(pad);
         let side = self.options.tile / multiple * multiple;
         let tiles = Tiles::new(size, side, (side / 8).next_multiple_of(multiple), multiple);
         let sensor = sensor_numbers(context);
-        let mut job = Job { context, sensor, planes, frames, size, tiles, prepared: None };
+        let mut job = Job { context, sensor, planes, guide, frames, size, tiles, prepared: None };
         if job.tiles.count() == 1 {
             job.prepared = Some(self.prepare(&job, 0));
         }

@@ -171,6 +171,7 @@ fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let measured = Measured {
         y: image(21),
         u: image(22),
+        guide: Tensor::cat(vec![image(29), image(30), image(31)], 1),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
     };

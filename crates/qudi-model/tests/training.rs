@@ -5,7 +5,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_model::config::NetworkConfig;
-use qudi_model::measurement::{Planes, sensor_numbers};
+use qudi_model::measurement::{GuidePlanes, Planes, sensor_numbers};
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS};
 use qudi_model::noise::Noise;
 use qudi_model::objective::{
@@ -47,11 +47,14 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
         sensor,
         dark: None,
     };
-    let planes = Planes::of(BurstView { size, frames: &counts }, &context);
+    let view = BurstView { size, frames: &counts };
+    let planes = Planes::of(view, &context);
+    let guide = GuidePlanes::of(view, &context).unwrap();
     let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
     let measured = Measured {
         y: to_tensor(planes.y, size, device),
         u: to_tensor(planes.u, size, device),
+        guide: guide.to_tensor(size, device),
         sensor: Tensor::from_data(numbers, device),
         frames,
     };

@@ -56,13 +56,13 @@ impl FlowConfig {
 }
 
 impl Flow {
-    /// Flows between frames: registered are the `smoothed` linear estimates, whose noise is known and whose faint texture no
-    /// denoiser has taken; the networks see the pre-denoised frames `d`. Both `[bursts * frames, 1, height, width]`;
+    /// Flows between frames: registered are the guide's `clean` images; the networks see the pre-denoised frames `d`.
+    /// Both `[bursts * frames, 1, height, width]`;
     /// `variance` is that of the linear estimate's noise at the mean light, `[bursts * frames, 1, 1, 1]`.
     pub fn forward(
         &self,
         d: Tensor<4>,
-        smoothed: Tensor<4>,
+        clean: Tensor<4>,
         variance: Tensor<4>,
         frames: usize,
     ) -> Flows {
@@ -73,7 +73,7 @@ impl Flow {
             return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
         }
         // Both directions of every pair of neighbours at once; both kinds of image as channels.
-        let finest = shrink(Tensor::cat(vec![d, smoothed.detach()], 1), self.scale);
+        let finest = shrink(Tensor::cat(vec![d, clean.detach()], 1), self.scale);
         let mut references = both(finest, frames);
         let mut pyramid = Vec::with_capacity(self.pyramid);
         for _ in 1..self.pyramid {

@@ -3,10 +3,8 @@
 
 use super::attention::Attention;
 use super::flow::Flows;
-use super::merge::merge;
 use super::pre::DenseBlock;
 use super::unet::ResidualBlock;
-use super::variance::Variance;
 use super::{Measured, Pyramid, SENSOR_NUMBERS, Simulated, State, fill, resample};
 use crate::cases::{self, Case, File, parameter};
 use crate::config::NetworkConfig;
@@ -158,16 +156,17 @@ fn pre_denoiser() {
         for case in file.cases() {
             let config = config(&case);
             let pre = weighted(config.pre.init(config.fold, &device), "pre");
-            let [y, u, y_sim, u_sim] = ["y", "u", "y_sim", "u_sim"]
+            let [y, u, guide, y_sim, u_sim] = ["y", "u", "guide", "y_sim", "u_sim"]
                 .map(|name| -> Tensor<4> { case.input(name, &device).require_grad() });
             let frames = y.dims()[0] / 2;
             let flag: Tensor<1> = case.input("flag", &device);
             let flag = flag.reshape([2, 1, 1, 1]).repeat_dim(1, frames);
             let flag = flag.reshape([2 * frames, 1, 1, 1]);
             let both = Tensor::cat(vec![y_sim.clone(), u_sim.clone()], 1);
-            let prepared = pre.prepare(y.clone(), u.clone());
-            let (d, g) = pre.forward(prepared, resample::smooth(u.clone()), both, flag);
-            let mut inputs = vec![("y", &y), ("u", &u)];
+            let prepared = pre.prepare(Tensor::cat(vec![y.clone(), u.clone(), guide.clone()], 1));
+            let base = guide.clone().narrow(1, 0, 1);
+            let (d, g) = pre.forward(prepared, base, both, flag);
+            let mut inputs = vec![("y", &y), ("u", &u), ("guide", &guide)];
             if case.name == "with" {
                 inputs.extend([("y_sim", &y_sim), ("u_sim", &u_sim)]);
             }
@@ -214,31 +213,11 @@ fn flow() {
             let flow = weighted(config(&case).flow.init(false, &device), "flow");
             let d: Tensor<4> = case.input("d", &device).require_grad();
             let variance: Tensor<4> = case.input("variance", &device);
-            let smoothed: Tensor<4> = case.input("smoothed", &device);
-            let flows = flow.forward(d.clone(), smoothed, variance, case.number("frames"));
+            let clean: Tensor<4> = case.input("clean", &device);
+            let flows = flow.forward(d.clone(), clean, variance, case.number("frames"));
             let outputs = [("to_next", flows.to_next), ("to_prev", flows.to_prev)];
             check(&case, &outputs, &[("d", &d)], &flow, "flow");
         }
-    }
-}
-
-#[test]
-fn merged_frames() {
-    let file = File::open("merge");
-    for device in devices() {
-        let case = file.case("merge");
-        let input = |name: &str| -> Tensor<4> { case.input(name, &device) };
-        let (u, d) = (input("u"), input("d").require_grad());
-        let frames = case.number("frames");
-        let variance = Variance::of(&case.input("sensor", &device), frames);
-        let flows = Flows { to_next: input("to_next"), to_prev: input("to_prev"), scale: 2 };
-        let variance = variance.at(resample::smooth(u.clone()));
-        let merged = merge(&u, &d, &variance, &flows, frames);
-        case.check_output("u_m", merged.u.inner());
-        case.check_output("d_m", merged.d.clone().inner());
-        case.check_output("mass", merged.mass.inner());
-        let grads = (merged.d * case.cotangent("d_m", &device)).sum().backward();
-        case.check_gradient("d", d.grad(&grads).unwrap());
     }
 }
 
@@ -283,24 +262,21 @@ fn u_net() {
             let sizes = config(&case);
             let unet = weighted(sizes.unet.init(&sizes.fusion, sizes.fold, &device), "unet");
             let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
-            let [x_t, x0_prev, u, d, single, mass] =
-                ["x_t", "x0_prev", "u_m", "d_m", "d", "mass"].map(input);
+            let [x_t, x0_prev, d, guide] = ["x_t", "x0_prev", "d", "guide"].map(input);
             let fused = ["fused_0", "fused_1", "fused_2"].map(input);
             let times: Vec<usize> = case.values("t").iter().map(|&t| t as usize).collect();
             let sensor: Tensor<2> = case.input("sensor", &device);
             let signed = |image: &Tensor<4>| image.clone() * 2.0 - 1.0;
-            let doubt = mass.clone().sqrt().recip();
+            let [clean, merged, doubt] = [0, 1, 2].map(|part| guide.clone().narrow(1, part, 1));
             let planes =
-                [x_t.clone(), x0_prev.clone(), signed(&u), signed(&d), signed(&single), doubt];
+                [signed(&d), x_t.clone(), x0_prev.clone(), signed(&clean), signed(&merged), doubt];
             let frames = case.number("frames");
             let x0 = unet.forward(planes, fused.clone(), &times, unet.prepare(sensor), frames);
             let inputs = [
                 ("x_t", &x_t),
                 ("x0_prev", &x0_prev),
-                ("u_m", &u),
-                ("d_m", &d),
-                ("d", &single),
-                ("mass", &mass),
+                ("d", &d),
+                ("guide", &guide),
                 ("fused_0", &fused[0]),
                 ("fused_1", &fused[1]),
                 ("fused_2", &fused[2]),
@@ -317,11 +293,12 @@ fn whole_network() {
         let case = file.case("tiny");
         let network = fill(config(&case).init(0, &device), parameter);
         let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
-        let [y, u, y_sim, u_sim, x_t, x0_prev] =
-            ["y", "u", "y_sim", "u_sim", "x_t", "x0_prev"].map(input);
+        let [y, u, guide, y_sim, u_sim, x_t, x0_prev] =
+            ["y", "u", "guide", "y_sim", "u_sim", "x_t", "x0_prev"].map(input);
         let measured = Measured {
             y: y.clone(),
             u: u.clone(),
+            guide: guide.clone(),
             sensor: case.input("sensor", &device),
             frames: case.number("frames"),
         };
@@ -343,6 +320,7 @@ fn whole_network() {
         let inputs = [
             ("y", &y),
             ("u", &u),
+            ("guide", &guide),
             ("y_sim", &y_sim),
             ("u_sim", &u_sim),
             ("x_t", &x_t),
@@ -394,7 +372,10 @@ fn sampling() {
         };
         let (y, u) = planes(&file.bytes("counts"), &file.f32s("u_table"));
         let sensor = Tensor::<1>::from_floats(sensor.as_slice(), &device).unsqueeze();
-        let prepared = network.prepare(&Measured { y, u, sensor, frames });
+        let guide = ["clean", "merged", "doubt"];
+        let guide = guide.map(|name| to_tensor(file.f32s(name), size, &device));
+        let guide = Tensor::cat(guide.into(), 1);
+        let prepared = network.prepare(&Measured { y, u, guide, sensor, frames });
         let (simulated, tables) = (file.bytes("simulated"), file.f32s("u_sim_table"));
         let count = frames * size.pixels();
         let mut x = cases::gaussian("noise.0", count);

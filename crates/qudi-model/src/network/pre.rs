@@ -7,6 +7,9 @@ use crate::config::PreConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
+/// Planes that do not depend on the step: counts, linear estimate, the guide's three.
+const MEASURED: usize = 5;
+
 /// Dense layers of a block.
 const LAYERS: usize = 3;
 
@@ -56,7 +59,7 @@ impl PreConfig {
         let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
         let block = |_| DenseBlock::zeros(width, self.growth, device);
         PreDenoiser {
-            static_in: conv([2 * planes, width], 3, Bias::Yes),
+            static_in: conv([MEASURED * planes, width], 3, Bias::Yes),
             simulated_in: conv([2 * planes + 1, width], 3, Bias::No),
             blocks: (0..self.blocks).map(block).collect(),
             gather: conv([self.blocks * width, width], 1, Bias::Yes),
@@ -68,13 +71,13 @@ impl PreConfig {
 }
 
 impl PreDenoiser {
-    /// What does not depend on the step: `[images, width, h, w]` of `y` and `u`, `[images, 1, H, W]`.
-    pub fn prepare(&self, y: Tensor<4>, u: Tensor<4>) -> Tensor<4> {
-        self.static_in.linear(&[fold(Tensor::cat(vec![y, u], 1), self.fold)])
+    /// What does not depend on the step: `[images, width, h, w]` of `seen`, `[images, 5, H, W]`: `y`, `u` and the guide.
+    pub fn prepare(&self, seen: Tensor<4>) -> Tensor<4> {
+        self.static_in.linear(&[fold(seen, self.fold)])
     }
 
     /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.
-    /// `prepared` as from [`Self::prepare`]; `base` is a first guess, in image units; `simulated` are `y_sim` and
+    /// `prepared` as from [`Self::prepare`]; `base` is what is corrected, in image units; `simulated` are `y_sim` and
     /// `u_sim`, `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
     pub fn forward(
         &self,

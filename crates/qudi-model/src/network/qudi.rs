@@ -3,11 +3,9 @@
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
-use super::merge::merge;
 use super::pre::PreDenoiser;
-use super::resample::smooth;
 use super::unet::UNet;
-use super::variance::Variance;
+use super::variance::mean_variance;
 use crate::config::{NetworkConfig, Part};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -19,6 +17,9 @@ pub struct Measured {
     pub y: Tensor<4>,
     /// The linear estimate in image units.
     pub u: Tensor<4>,
+    /// What classical methods make of it, `[bursts * frames, 3, height, width]`: the restored image and the merely merged
+    /// one, in image units, and the deviation of the latter's noise in that of one frame's.
+    pub guide: Tensor<4>,
     /// Numbers of sensor and light, `[bursts, 11]`.
     pub sensor: Tensor<2>,
     /// Frames of a burst.
@@ -54,10 +55,10 @@ pub struct Prepared {
     low: Tensor<4>,
     sensor: Tensor<2>,
     u: Tensor<4>,
-    /// What the pre-denoiser corrects.
-    base: Tensor<4>,
-    /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`, and at every pixel.
-    variance: [Tensor<4>; 2],
+    /// The restored, the merged image and the deviation of its noise.
+    guide: [Tensor<4>; 3],
+    /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`.
+    variance: Tensor<4>,
     frames: usize,
 }
 
@@ -108,14 +109,14 @@ impl Qudi {
     /// Computes what does not depend on the step.
     pub fn prepare(&self, measured: &Measured) -> Prepared {
         let (y, u) = (measured.y.clone(), measured.u.clone());
-        let base = smooth(u.clone());
-        let variance = Variance::of(&measured.sensor, measured.frames);
+        let part = |place| measured.guide.clone().narrow(1, place, 1);
+        let seen = Tensor::cat(vec![y, u.clone(), measured.guide.clone()], 1);
         Prepared {
-            pre: self.pre.prepare(y, u.clone()),
+            pre: self.pre.prepare(seen),
             low: self.low.prepare(u.clone(), measured.frames),
             sensor: self.unet.prepare(measured.sensor.clone()),
-            variance: [variance.mean(), variance.at(base.clone())],
-            base,
+            guide: [part(0), part(1), part(2)],
+            variance: mean_variance(&measured.sensor, measured.frames),
             u,
             frames: measured.frames,
         }
@@ -141,8 +142,8 @@ impl Qudi {
     }
 
     fn estimate_flow(&self, prepared: &Prepared, d: Tensor<4>) -> Flows {
-        let [variance, _] = prepared.variance.clone();
-        self.flow.forward(d, prepared.base.clone(), variance, prepared.frames)
+        let [clean, ..] = prepared.guide.clone();
+        self.flow.forward(d, clean, prepared.variance.clone(), prepared.frames)
     }
 
     /// The pre-denoised frames and their features.
@@ -164,7 +165,8 @@ impl Qudi {
         let flag = Tensor::<4>::from_data(flags, &u.device()).repeat_dim(1, frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim], 1);
-        self.pre.forward(prepared.pre.clone(), prepared.base.clone(), both, flag)
+        let [clean, ..] = prepared.guide.clone();
+        self.pre.forward(prepared.pre.clone(), clean, both, flag)
     }
 
     /// [`Self::forward`], telling `done` the name of every block that is done.
@@ -190,12 +192,9 @@ impl Qudi {
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
         let signed = |image: Tensor<4>| image * 2.0 - 1.0;
-        let [_, variance] = &prepared.variance;
-        let merged = merge(&u, &d, variance, &flows, frames);
-        done("merge");
+        let [clean, merged, doubt] = prepared.guide.clone();
         let (x_t, x0_prev) = (state.x_t.clone(), state.x0_prev.clone());
-        let doubt = merged.mass.sqrt().recip();
-        let planes = [x_t, x0_prev, signed(merged.u), signed(merged.d), signed(d.clone()), doubt];
+        let planes = [signed(d.clone()), x_t, x0_prev, signed(clean), signed(merged), doubt];
         let sensor = prepared.sensor.clone();
         let x0 = self.unet.forward(planes, fused, &state.times, sensor, frames);
         done("unet");

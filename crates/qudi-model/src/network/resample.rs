@@ -97,21 +97,7 @@ pub(super) fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tenso
     flow
 }
 
-/// Each pixel's neighbourhood, weighted by the binomial coefficients of 5 x 5; edges repeated.
-pub(super) fn smooth(x: Tensor<4>) -> Tensor<4> {
-    smooth_axis(smooth_axis(x, 2), 3)
-}
-
-fn smooth_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
-    let size = x.dims()[axis];
-    let mut pads = [(0, 0); 4];
-    pads[axis] = (2, 2);
-    let padded = x.clone().pad(pads, PadMode::Edge);
-    let at = |first: usize| padded.clone().narrow(axis, first, size);
-    (at(0) + at(4)) * 0.0625 + (at(1) + at(3)) * 0.25 + x * 0.375
-}
-
-/// Means over squares of `2 * radius + 1` pixels; edges repeated. `radius` is 1, 2 or 4.
+/// Means over squares of `2 * radius + 1` pixels; edges repeated. `radius` is 2 or 4.
 pub(super) fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
     mean_axis(mean_axis(x, 2, radius), 3, radius)
 }

@@ -167,8 +167,8 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// The prediction, `[images, 1, H, W]` in [-1, 1]. `planes` are `x_t`, `x0_prev`, the merged `2u - 1` and
-    /// `2d - 1`, `2d - 1` of the frame alone, and one over the root of the merge's mass, each `[images, 1, H, W]`; `times` one number for each burst; `sensor` as from [`Self::prepare`].
+    /// The prediction, `[images, 1, H, W]` in [-1, 1]. `planes` are `2d - 1`, which is corrected,
+    /// `x_t`, `x0_prev`, the guide's images, `2c - 1` and `2m - 1`, and the deviation of its noise, each `[images, 1, H, W]`; `times` one number for each burst; `sensor` as from [`Self::prepare`].
     pub fn forward(
         &self,
         planes: [Tensor<4>; PLANES],
@@ -178,7 +178,7 @@ impl UNet {
         frames: usize,
     ) -> Tensor<4> {
         let embedding = silu(self.embed(times, sensor));
-        let base = planes[3].clone();
+        let base = planes[0].clone();
         let mut x = self.inp.linear(&[fold(Tensor::cat(planes.into(), 1), self.fold)]);
         let mut skips = Vec::new();
         let mut fused = fused.into_iter();

@@ -2,7 +2,7 @@
 
 use super::recipe::Recipe;
 use crate::config::Part;
-use crate::measurement::{Planes, sensor_numbers};
+use crate::measurement::{GuidePlanes, Planes, sensor_numbers};
 use crate::network::{Measured, SENSOR_NUMBERS};
 use crate::noise::Noise;
 use crate::objective::{Example, training_time};
@@ -22,6 +22,7 @@ pub struct Batch {
     size: Size,
     frames: usize,
     planes: Planes,
+    guide: GuidePlanes,
     truth: Vec<f32>,
     noise: Vec<f32>,
     numbers: Vec<f32>,
@@ -43,6 +44,7 @@ impl Batch {
             size,
             frames,
             planes: Planes { y: Vec::new(), u: Vec::new() },
+            guide: GuidePlanes::default(),
             truth: Vec::new(),
             noise: Vec::new(),
             numbers: Vec::new(),
@@ -58,6 +60,7 @@ impl Batch {
             let planes = Planes::of(view, &drawn.context);
             batch.planes.y.extend(planes.y);
             batch.planes.u.extend(planes.u);
+            batch.guide.extend(GuidePlanes::of(view, &drawn.context)?);
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
             let noise = Noise::new(drawn.context.seed, 0);
             let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
@@ -87,6 +90,7 @@ impl Batch {
         Measured {
             y: to_tensor(self.planes.y.clone(), self.size, device),
             u: to_tensor(self.planes.u.clone(), self.size, device),
+            guide: self.guide.to_tensor(self.size, device),
             sensor: Tensor::from_data(numbers, device),
             frames: self.frames,
         }
