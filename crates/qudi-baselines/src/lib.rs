@@ -2,8 +2,8 @@
 //! methods should beat them at their best.
 //!
 //! All are [`Restorer`](qudi_sim::restore::Restorer)s: a window of counts `[frames][height][width]` in,
-//! all its frames out, in image units. Constants were chosen on training clips; docs/results.md
-//! tells how.
+//! all its frames out, in image units. Constants were chosen on training clips, but those of
+//! the [`Guide`]; docs/results.md tells how.
 #![warn(missing_docs)]
 
 mod bm3d;

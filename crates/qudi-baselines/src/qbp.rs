@@ -104,7 +104,6 @@ impl Restorer for Qbp {
 
     fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
         let ordinary = context.sensor.dark_per_frame()?;
-        let units = 1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency);
         let transform = match self.finish {
             Finish::Plain => Transform::Identity,
             Finish::Bm3d => Transform::Integral,
@@ -115,14 +114,12 @@ impl Restorer for Qbp {
         let merger = Merger::new(burst, context, self.block(context)?, self.settings.trust);
         let finish = |frame: usize| {
             let Merged { counts, noise, .. } = merger.merge(frame);
-            let z =
-                counts.data.iter().map(|&mean| stabilizer.transform(n * f64::from(mean)) as f32);
-            let mut z = Frame { size: counts.size, data: z.collect() };
+            let mut z = stabilizer.stabilized(&counts);
             if self.finish == Finish::Bm3d {
                 let scale = self.settings.noise * (n * noise).sqrt();
                 z = denoise(Profile::NORMAL, z, &stabilizer, scale);
             }
-            image(&z, &stabilizer, context, ordinary, units)
+            image(&z, &stabilizer, context, ordinary)
         };
         Ok(Restored { frames: (0..burst.frames.len()).map(finish).collect(), std: None })
     }
@@ -268,6 +265,15 @@ impl Merger {
         if self.pilots.is_some() { cubic(image, corner) } else { sample(image, corner) }
     }
 
+    /// What such a patch, `part` of a pixel along a side, keeps of the noise's variance along that side.
+    fn squares(&self, part: f32) -> f32 {
+        if self.pilots.is_some() {
+            squares(part)
+        } else {
+            part * part + (1.0 - part) * (1.0 - part)
+        }
+    }
+
     /// Patch `i` of the reference, merged, and its noise.
     fn patch(&self, i: usize, blocks: &Blocks, flow: &[Vec<[f32; 2]>]) -> (dft::Patch, f32) {
         let corner = self.grid.corner(i).map(|c| c as f32);
@@ -282,13 +288,7 @@ impl Merger {
                     *mean += share * value;
                 }
                 // Between pixels the sample is a mean of some of them.
-                let left = d.map(|d| {
-                    let part = d - d.floor();
-                    match self.pilots {
-                        Some(_) => squares(part),
-                        None => part * part + (1.0 - part) * (1.0 - part),
-                    }
-                });
+                let left = d.map(|d| self.squares(d - d.floor()));
                 noise += share * share * left[0] * left[1];
             }
             // Blocks have one frame where there are pilots.

@@ -10,6 +10,7 @@
 //! which the *expected* transform, under the sensor's own law with its rounding and clipping, is
 //! the given value. Only samples too deep to tabulate use the closed form.
 
+use qudi_sim::Frame;
 use qudi_sim::sensor::{CountLaw, CountMoments, Response, Sensor};
 
 /// How sums of counts are transformed.
@@ -121,6 +122,12 @@ impl Stabilizer {
     /// The transform of a sum of counts, which may lie between whole ones.
     pub fn transform(&self, sum: f64) -> f64 {
         self.forward.at(sum, self.frames)
+    }
+
+    /// The transform of a frame of mean counts.
+    pub(crate) fn stabilized(&self, means: &Frame) -> Frame {
+        let z = means.data.iter().map(|&mean| self.transform(self.frames * f64::from(mean)) as f32);
+        Frame { size: means.size, data: z.collect() }
     }
 
     /// The detections per frame whose expected transform is `z`, between 0 and half a count short

@@ -49,7 +49,6 @@ impl Restorer for TransformDenoise {
 
     fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
         let ordinary = context.sensor.dark_per_frame()?;
-        let units = 1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency);
         let mut stabilizers: Vec<Option<Stabilizer>> = vec![None; self.length() + 1];
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, self.half, |sums, n| {
@@ -59,7 +58,7 @@ impl Restorer for TransformDenoise {
             let z = sums.iter().map(|&sum| stabilizer.transform(f64::from(sum)) as f32).collect();
             let z = Frame { size: burst.size, data: z };
             let z = denoise(Profile::NORMAL, z, stabilizer, 1.0);
-            frames.push(image(&z, stabilizer, context, ordinary, units));
+            frames.push(image(&z, stabilizer, context, ordinary));
         });
         Ok(Restored { frames, std: None })
     }
@@ -84,13 +83,8 @@ pub(crate) fn denoise(
 }
 
 /// The image behind a denoised transform: inverse, dark counts subtracted.
-pub(crate) fn image(
-    z: &Frame,
-    stabilizer: &Stabilizer,
-    context: &Context,
-    ordinary: f64,
-    units: f64,
-) -> Frame {
+pub(crate) fn image(z: &Frame, stabilizer: &Stabilizer, context: &Context, ordinary: f64) -> Frame {
+    let units = 1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency);
     let pixel = |(i, &z): (usize, &f32)| {
         let detections = stabilizer.invert(f64::from(z)) - context.dark_of(i, ordinary);
         (detections.max(0.0) * units) as f32

@@ -13,8 +13,8 @@ impl NetworkConfig {
     }
 
     /// Bytes that restoring a window of `frames` frames of `size` takes on the processor at most, about: activations
-    /// of the finest level, `PLANES` times its widths at once. Above what `small` took where it was measured: by a
-    /// twentieth at 256 x 256, by half at 512 x 512.
+    /// of the finest level, `PLANES` times its widths at once. Just what `small` took at 256 x 256 where it was
+    /// measured, half as much again at 512 x 512.
     pub fn memory(&self, size: Size, frames: usize) -> u64 {
         const PLANES: f64 = 6.5;
         let widths = self.unet.width + self.fusion.widths[0] + self.pre.width;

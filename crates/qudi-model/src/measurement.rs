@@ -43,16 +43,10 @@ impl Planes {
     }
 }
 
-/// The classical estimate of a burst that the network goes on from, frame after frame, row-major.
+/// The classical estimate of a burst that the network goes on from: the restored image and the merely merged one, in image
+/// units in [0, 2], and the deviation of the latter's noise in that of one frame's; each frame after frame, row-major.
 #[derive(Clone, Debug, Default)]
-pub struct GuidePlanes {
-    /// Restored, in image units.
-    pub clean: Vec<f32>,
-    /// Aligned and merged, still noisy, in image units.
-    pub merged: Vec<f32>,
-    /// Deviation of the merged frames' noise, in that of one frame's: between 0 and 1.
-    pub doubt: Vec<f32>,
-}
+pub struct GuidePlanes([Vec<f32>; 3]);
 
 impl GuidePlanes {
     /// The guide of a captured burst.
@@ -60,35 +54,31 @@ impl GuidePlanes {
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
     pub fn of(burst: BurstView<'_>, context: &Context) -> Result<Self> {
-        let guide = Guide::find(burst, context)?;
-        let values = |frames: Vec<Frame>, most: f64| {
+        let Guide { clean, merged, doubt } = Guide::find(burst, context)?;
+        let values = |frames: Vec<Frame>| {
             let values = frames.into_iter().flat_map(|frame| frame.data);
-            values.map(|value| value.min(most as f32)).collect()
+            values.map(|value| value.min(BRIGHTEST as f32)).collect()
         };
-        Ok(Self {
-            clean: values(guide.clean, BRIGHTEST),
-            merged: values(guide.merged, BRIGHTEST),
-            doubt: values(guide.doubt, 1.0),
-        })
+        Ok(Self([clean, merged, doubt].map(values)))
     }
 
     /// Every plane changed by `f`.
     #[must_use]
     pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {
-        Self { clean: f(&self.clean), merged: f(&self.merged), doubt: f(&self.doubt) }
+        Self(self.0.each_ref().map(|plane| f(plane)))
     }
 
     /// Appends another burst's.
     pub fn extend(&mut self, more: Self) {
-        self.clean.extend(more.clean);
-        self.merged.extend(more.merged);
-        self.doubt.extend(more.doubt);
+        for (plane, more) in self.0.iter_mut().zip(more.0) {
+            plane.extend(more);
+        }
     }
 
     /// The planes as channels, `[frames, 3, height, width]`.
     pub fn to_tensor(&self, size: Size, device: &Device) -> Tensor<4> {
-        let planes = [&self.clean, &self.merged, &self.doubt];
-        Tensor::cat(planes.map(|plane| to_tensor(plane.clone(), size, device)).into(), 1)
+        let planes = self.0.each_ref().map(|plane| to_tensor(plane.clone(), size, device));
+        Tensor::cat(planes.into(), 1)
     }
 }
 

@@ -19,17 +19,18 @@ const VARIATION: f32 = 0.01;
 /// Least squared error that a guide counts with: better ones leave nothing to learn.
 const LEAST_ERROR: f32 = 1e-4;
 
-/// One over the root of the guide's mean squared error, for every image that of its burst, `[images, 1, 1, 1]`. Errors that are
-/// multiplied by it count relative to the guide's: else a few dark bursts, whose errors are thirty times those of bright
-/// ones, would be all that matters.
-fn relative(example: &Example<'_>) -> Tensor<4> {
+/// [`reconstruction`] of an example's images, with errors in the root of the guide's mean squared error over the burst: else
+/// a few dark bursts, whose errors are thirty times those of bright ones, would be all that matters.
+fn relative_reconstruction(example: &Example<'_>) -> impl Fn(Tensor<4>) -> Tensor<1> + use<> {
     let (guide, frames) = (example.measured.guide.clone(), example.measured.frames);
     let error = (guide.narrow(1, 0, 1) - example.truth.clone()).detach();
     let [images, _, height, width] = error.dims();
     let bursts = images / frames;
     let error = error.powi_scalar(2).reshape([bursts, frames * height * width]).mean_dim(1);
     let scale = error.clamp_min(LEAST_ERROR).sqrt().recip();
-    scale.repeat_dim(1, frames).reshape([images, 1, 1, 1])
+    let scale = scale.repeat_dim(1, frames).reshape([images, 1, 1, 1]);
+    let truth = example.truth.clone() * scale.clone();
+    move |estimate| reconstruction(estimate * scale.clone(), truth.clone())
 }
 
 /// Weights of the terms.
@@ -175,11 +176,10 @@ pub fn terms(
     let prepared = network.prepare(example.measured);
     let result = network.forward(&prepared, simulated.as_ref(), &state, None);
     let image = (result.x0 + 1.0) * 0.5;
-    let relative = relative(example);
-    let truth = example.truth.clone() * relative.clone();
-    let prediction = reconstruction(image.clone() * relative.clone(), truth.clone());
+    let judge = relative_reconstruction(example);
+    let prediction = judge(image.clone());
     let perceptual = perceptual.map(|term| term.loss(image, example.truth.clone()));
-    let pre = reconstruction(result.d * relative, truth);
+    let pre = judge(result.d);
     let mut total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     if let Some(term) = &perceptual {
         total = total + term.clone() * weights.perceptual;
@@ -197,8 +197,7 @@ pub fn terms(
 fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> Terms {
     let measured = example.measured;
     let (d, flows) = network.denoise_and_align(&network.prepare(measured));
-    let relative = relative(example);
-    let pre = reconstruction(d * relative.clone(), example.truth.clone() * relative);
+    let pre = relative_reconstruction(example)(d);
     let flow = flows.misfit(example.truth.clone(), measured.frames);
     let total = pre.clone() * weights.pre + flow.clone() * weights.flow;
     Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow: Some(flow) }

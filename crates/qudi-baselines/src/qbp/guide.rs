@@ -10,7 +10,7 @@ use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::{Frame, Result};
 use rayon::prelude::*;
 
-/// Numbers of the second round, chosen as docs/results.md tells.
+/// Numbers of the second round, chosen on the validation clips (docs/results.md).
 const TRUST: f32 = 0.7;
 const NOISE: f64 = 1.0;
 
@@ -39,17 +39,11 @@ impl Guide {
     /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
     pub fn find(burst: BurstView<'_>, context: &Context) -> Result<Self> {
         let ordinary = context.sensor.dark_per_frame()?;
-        let units = 1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency);
         let count = burst.frames.len();
         let n = count as f64;
         let transform = Transform::Integral;
         let stabilizer = Stabilizer::new(transform, &context.sensor, context.gain, count as u32);
-        let stabilized = |counts: &Frame| {
-            let z =
-                counts.data.iter().map(|&mean| stabilizer.transform(n * f64::from(mean)) as f32);
-            Frame { size: counts.size, data: z.collect() }
-        };
-        let image = |z: &Frame| image(z, &stabilizer, context, ordinary, units);
+        let image = |z: &Frame| image(z, &stabilizer, context, ordinary);
 
         let qbp = Qbp::new(Finish::Bm3d);
         let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
@@ -57,7 +51,7 @@ impl Guide {
         let pilot = |frame: usize| {
             let Merged { counts, noise, .. } = merger.merge(frame);
             let scale = first_noise * (n * noise).sqrt();
-            let z = denoise(QUICK, stabilized(&counts), &stabilizer, scale);
+            let z = denoise(QUICK, stabilizer.stabilized(&counts), &stabilizer, scale);
             let mean = |&z: &f32| stabilizer.mean_count(f64::from(z)) as f32;
             let means: Vec<f32> = z.data.iter().map(mean).collect();
             at_least(&means, burst.size, merger.frames[0].size)
@@ -68,11 +62,11 @@ impl Guide {
         let mut guide = Self { clean: Vec::new(), merged: Vec::new(), doubt: Vec::new() };
         for frame in 0..count {
             let Merged { counts, noise, noises } = merger.merge(frame);
-            let z = stabilized(&counts);
+            let z = stabilizer.stabilized(&counts);
             guide.merged.push(image(&z));
             let scale = NOISE * (n * noise).sqrt();
             guide.clean.push(image(&denoise(THOROUGH, z, &stabilizer, scale)));
-            let doubt = noises.data.iter().map(|noise| noise.sqrt()).collect();
+            let doubt = noises.data.iter().map(|noise| noise.sqrt().min(1.0)).collect();
             guide.doubt.push(Frame { size: noises.size, data: doubt });
         }
         Ok(guide)
