@@ -35,7 +35,10 @@ fn console_blocks_run_as_documented() {
         std::fs::create_dir_all(cases.join(format!("{stem}.out"))).unwrap();
         std::fs::copy(&page, cases.join(format!("{stem}.md"))).unwrap();
     }
-    trycmd::TestCases::new().env("NO_COLOR", "1").case(cases.join("*.md")).run();
+    // Graphics drivers complain on standard error where nobody is logged in.
+    let runtime = cases.to_str().unwrap();
+    let run = trycmd::TestCases::new();
+    run.env("NO_COLOR", "1").env("XDG_RUNTIME_DIR", runtime).case(cases.join("*.md")).run();
 }
 
 #[test]

@@ -121,13 +121,22 @@ def mean_variance(sensor: Tensor, frames: int) -> Tensor:
     return variance.repeat_interleave(frames)[:, None, None, None]
 
 
+def evidence(guide: Tensor) -> tuple[Tensor, ...]:
+    """Restored image, deviation of the merged one's noise, and what of both the networks see."""
+    clean, merged, noise = guide.split(1, 1)
+    deviation = noise.clamp(min=1e-3)
+    difference = ((merged - clean) / deviation).clamp(-5, 5) / 2
+    contrast = torch.asinh((clean - mean_around(mean_around(clean, 4), 4)) / deviation)
+    return clean, deviation, difference, contrast, deviation.log() + 3
+
+
 class PreDenoiser(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
         self.fold = config["fold"]
         cells, pre = self.fold**2, config["pre"]
         width = pre["width"]
-        self.static_in = conv(5 * cells, width, 3)
+        self.static_in = conv(4 * cells, width, 3)
         self.simulated_in = conv(2 * cells + 1, width, 3, bias=False)
         self.blocks = nn.ModuleList(DenseBlock(width, pre["growth"]) for _ in range(pre["blocks"]))
         self.gather = conv(pre["blocks"] * width, width, 1)
@@ -135,19 +144,20 @@ class PreDenoiser(nn.Module):
         self.out = conv(width, cells, 3)
 
     def forward(
-        self, y: Tensor, u: Tensor, guide: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
+        self, guide: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
     ) -> tuple[Tensor, Tensor]:
-        static = F.pixel_unshuffle(torch.cat([y, u, guide], 1), self.fold)
+        clean, deviation, difference, contrast, level = evidence(guide)
+        static = F.pixel_unshuffle(torch.cat([difference, contrast, 2 * clean - 1, level], 1), self.fold)
         simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
-        frames = len(y) // len(flag)
-        plane = flag.to(y).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *static.shape[2:])
+        frames = len(guide) // len(flag)
+        plane = flag.to(guide).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *static.shape[2:])
         s = self.static_in(static) + self.simulated_in(torch.cat([simulated, plane], 1))
         x, outputs = s, []
         for block in self.blocks:
             x = block(x)
             outputs.append(x)
         g = self.spread(self.gather(torch.cat(outputs, 1))) + s
-        return guide[:, :1] + F.pixel_shuffle(self.out(g), self.fold) / 10, g
+        return clean + 0.3 * deviation * F.pixel_shuffle(self.out(g), self.fold), g
 
 
 class Features(nn.Module):
@@ -442,8 +452,8 @@ class UNet(nn.Module):
         frames: int,
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
-        clean, merged, doubt = guide.split(1, 1)
-        images = [2 * d - 1, x_t, x0_prev, 2 * clean - 1, 2 * merged - 1, doubt]
+        clean, deviation, difference, _, level = evidence(guide)
+        images = [2 * d - 1, x_t, x0_prev, 2 * clean - 1, difference, level]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
         for k, level in enumerate(self.encoder):
@@ -460,7 +470,8 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        return 2 * d - 1 + F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold) / 10
+        correction = F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
+        return 2 * d - 1 + 0.6 * deviation * correction
 
 
 class Qudi(nn.Module):
@@ -475,7 +486,6 @@ class Qudi(nn.Module):
 
     def forward(
         self,
-        y: Tensor,
         u: Tensor,
         guide: Tensor,
         y_sim: Tensor,
@@ -489,7 +499,7 @@ class Qudi(nn.Module):
         flows: Flows | None = None,
     ) -> tuple[Tensor, Tensor, Flows]:
         """x0 in [-1, 1] (not clipped), d in image units, and the flows, new unless given."""
-        d, g = self.pre(y, u, guide, y_sim, u_sim, flag)
+        d, g = self.pre(guide, y_sim, u_sim, flag)
         low = self.low(u, u_sim, d, frames)
         high = self.high(x_t, x0_prev, frames)
         if flows is None:
@@ -581,7 +591,6 @@ def sensor_numbers(ppp: float, exposure: float) -> list[float]:
 
 def sample(
     model: Qudi,
-    y: Tensor,
     u: Tensor,
     guide: Tensor,
     sensor: Tensor,
@@ -605,7 +614,7 @@ def sample(
         flag = torch.full((len(sensor),), float(k > 1), dtype=x.dtype)
         time = torch.full((len(sensor),), t)
         known = None if k in flow_steps else flows
-        x0, _, flows = model(y, u, guide, y_sim, u_sim, flag, x, estimate, time, sensor, frames, known)
+        x0, _, flows = model(u, guide, y_sim, u_sim, flag, x, estimate, time, sensor, frames, known)
         estimate = x0.clamp(-1, 1)
         c0, cx, sigma = coefficients(t, after, ancestral)
         x = c0 * estimate + cx * x

@@ -52,7 +52,7 @@ def inputs(frames: int, size: int, batch: int) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(1)
     shape = (batch * frames, 1, size, size)
     rand = lambda: torch.rand(shape, generator=generator)
-    x = {name: rand() for name in ("y", "u", "y_sim", "u_sim")}
+    x = {name: rand() for name in ("u", "y_sim", "u_sim")}
     x["guide"] = torch.rand((batch * frames, 3, size, size), generator=generator)
     x |= {"flag": torch.ones(batch), "x_t": torch.randn(shape, generator=generator), "x0_prev": 2 * rand() - 1}
     sensor = torch.tensor([network.sensor_numbers(PPP, EXPOSURE)] * batch)
@@ -60,7 +60,7 @@ def inputs(frames: int, size: int, batch: int) -> dict[str, Tensor]:
 
 
 def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: int) -> dict[str, dict]:
-    measured = [x[name] for name in ("y", "u", "guide", "y_sim", "u_sim", "flag")]
+    measured = [x[name] for name in ("guide", "y_sim", "u_sim", "flag")]
     d, g = model.pre(*measured)
     low, high = model.low(x["u"], x["u_sim"], d, frames), model.high(x["x_t"], x["x0_prev"], frames)
     variance = network.mean_variance(x["sensor"], frames)
@@ -108,7 +108,7 @@ def loop(model: network.Qudi, x: dict[str, Tensor], frames: int, flow_steps: lis
 
     noise = lambda k: torch.randn(x["y"].shape, generator=generator)
     start = time.perf_counter()
-    run = network.sample(model, x["y"], x["u"], x["guide"], x["sensor"], frames, flow_steps, noise, measure, ancestral=ancestral)
+    run = network.sample(model, x["u"], x["guide"], x["sensor"], frames, flow_steps, noise, measure, ancestral=ancestral)
     steps = len(list(run))
     return {"seconds": time.perf_counter() - start, "simulating": simulating, "steps": steps}
 

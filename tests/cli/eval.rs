@@ -37,7 +37,14 @@ fn other_programs_are_scored_on_the_same_photons() {
     std::fs::create_dir(folder.join("theirs")).unwrap();
     for name in ["a-ppp9_75", "b-ppp9_75"] {
         qudi(&folder)
-            .args(["restore", &format!("photons/{name}.npy"), "-o", &format!("theirs/{name}.npy")])
+            .args([
+                "restore",
+                "--method",
+                "mle",
+                &format!("photons/{name}.npy"),
+                "-o",
+                &format!("theirs/{name}.npy"),
+            ])
             .args("--mask none -q".split(' '))
             .assert()
             .success();

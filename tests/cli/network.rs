@@ -2,7 +2,7 @@
 
 use crate::outputs::{listing, qudi, scratch};
 use burn::tensor::Device;
-use qudi_model::checkpoint::{Description, save};
+use qudi_model::checkpoint::{Description, Precision, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::fill;
 use qudi_sim::output::Overwrite;
@@ -40,7 +40,7 @@ fn weights(path: &Path, value: f32) {
     if value != 0.0 {
         module = fill(module, |_, shape| vec![value; shape.iter().product()]);
     }
-    save(&module, &description, path, Overwrite::Yes).unwrap();
+    save(&module, &description, Precision::Single, path, Overwrite::Yes).unwrap();
 }
 
 pub(crate) fn refused(folder: &Path, args: &str, words: &[&str]) {
@@ -70,7 +70,10 @@ fn a_burst_is_restored_and_gone_on_with() {
     // Other weights or steps are another result: the folder refuses to mix them.
     refused(&folder, &format!("{common} -o whole --steps 3").replace("--steps 2 ", ""), &["whole"]);
     run("info w.safetensors");
-    run(&format!("{common} -o s.npy --samples 2 --deviation d.npy --sampler ancestral"));
+    let samples = "--samples 2 --deviation d.npy --sampler ancestral";
+    refused(&folder, &format!("{common} -o s.npy {samples}"), &["samples would not differ"]);
+    weights(&folder.join("w.safetensors"), 0.01);
+    run(&format!("{common} -o s.npy {samples}"));
     let header = std::fs::read(folder.join("d.npy")).unwrap();
     assert!(String::from_utf8_lossy(&header[..128]).contains("(13, 32, 40)"));
 }
@@ -80,7 +83,6 @@ fn what_does_not_fit_is_refused_in_three_parts() {
     let folder = prepared("network-refuse");
     let with =
         |rest: &str| format!("restore b.npy -o out --weights w.safetensors --device cpu {rest}");
-    refused(&folder, "restore b.npy -o out --method qudi", &["needs weights", "--weights"]);
     refused(&folder, "restore b.npy -o out --weights none.safetensors", &["none.safetensors"]);
     refused(&folder, &with("--steps 0"), &["--steps"]);
     refused(&folder, &with("--samples 0"), &["--samples"]);
@@ -119,6 +121,61 @@ fn what_does_not_fit_is_refused_in_three_parts() {
         &["a burst of 2 frames"],
     );
     assert!(!folder.join("none").join("000000.png").exists(), "no partial output");
+}
+
+/// Without a word about methods or weights: the network that comes along where it knows the sensor and the light, else
+/// the best method that needs no training.
+#[test]
+fn the_usual_method_follows_the_capture() {
+    let folder = scratch("network-usual");
+    let run = |args: &str| {
+        let output = qudi(&folder).args(args.split_whitespace()).output().unwrap();
+        assert!(output.status.success(), "{args}: {}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    };
+    let cases = [
+        ("--ppp 3.25", 4, "by qudi in 1 step on cpu"),
+        ("--sensor spad512s --sum 7 --ppp 3.25", 4, "by qudi"),
+        ("--sensor qis16-gj --ppp 3.25", 4, "by guide"),
+        ("--ppp 3.25", 2, "by guide"),
+        ("--ppp 900", 4, "by guide"),
+    ];
+    for (number, (options, frames, expected)) in cases.into_iter().enumerate() {
+        let burst = format!("b{number}.npy");
+        run(&format!("simulate scene:text --size 32x40 --frames {frames} {options} -o {burst} -q"));
+        let said = run(&format!("restore {burst} -o out{number} --device cpu"));
+        assert!(said.contains(expected), "{options}, {frames} frames: {said}");
+    }
+    let said = run("info weights");
+    assert!(said.contains("small") && said.contains("qudi-paper"), "{said}");
+}
+
+/// What is published is what was trained, rounded, and its hash is right.
+#[test]
+fn published_weights_restore_what_trained_ones_do() {
+    let folder = prepared("network-publish");
+    let run = |args: &str| qudi(&folder).args(args.split_whitespace()).assert().success();
+    run("publish w.safetensors -o half.safetensors");
+    let said = run("info half.safetensors --json").get_output().stdout.clone();
+    assert!(String::from_utf8_lossy(&said).contains("\"window\""));
+    let hash = std::fs::read_to_string(folder.join("half.sha256")).unwrap();
+    let said = run("info half.safetensors").get_output().stdout.clone();
+    assert!(String::from_utf8_lossy(&said).contains(hash.trim()));
+    for weights in ["w", "half"] {
+        run(&format!(
+            "restore b.npy --weights {weights}.safetensors --device cpu -o {weights}.npy"
+        ));
+    }
+    let frames = |name: &str| -> Vec<f32> {
+        let bytes = std::fs::read(folder.join(name)).unwrap();
+        let words = bytes[bytes.len() - 13 * 32 * 40 * 4..].chunks_exact(4);
+        words.map(|word| f32::from_le_bytes(word.try_into().unwrap())).collect()
+    };
+    for (single, half) in frames("w.npy").iter().zip(frames("half.npy")) {
+        assert!((single - half).abs() < 1e-3, "{single} {half}");
+    }
+    refused(&folder, "publish w.safetensors -o half.safetensors", &["exists"]);
+    refused(&folder, "publish w.safetensors -o half.bin", &[".safetensors"]);
 }
 
 #[test]

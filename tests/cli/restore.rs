@@ -15,8 +15,14 @@ fn burst(name: &str, frames: u32) -> PathBuf {
     folder
 }
 
+/// By `mle` unless `args` say otherwise: quick, and what is tested here is the same for all methods.
 fn restore(folder: &Path, args: &str) {
-    qudi(folder).arg("restore").args(args.split_whitespace()).assert().success();
+    let quick = if args.contains("--method") { "" } else { " --method mle" };
+    qudi(folder)
+        .arg("restore")
+        .args((args.to_owned() + quick).split_whitespace())
+        .assert()
+        .success();
 }
 
 /// Name and content of every file of a folder.
@@ -64,8 +70,9 @@ fn every_output_holds_the_same_frames() {
         let _ = floats.more_images().then(|| floats.next_image().unwrap());
     }
     assert!(!floats.more_images());
-    qudi(&folder).args("restore b.npy -o g.npy --float".split(' ')).assert().code(2);
-    let piped = qudi(&folder).args("restore b.npy -o -".split(' ')).output().unwrap().stdout;
+    qudi(&folder).args("restore b.npy --method mle -o g.npy --float".split(' ')).assert().code(2);
+    let piped =
+        qudi(&folder).args("restore b.npy --method mle -o -".split(' ')).output().unwrap().stdout;
     assert!(piped.starts_with(b"YUV4MPEG2 W80 H64 F2000:1"));
     assert_eq!(
         piped.iter().position(|&b| b == b'\n').unwrap() + 1 + 14 * (6 + 64 * 80),
@@ -85,7 +92,7 @@ fn a_run_killed_ten_times_ends_like_an_undisturbed_one() {
         let before = finished();
         let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
             .current_dir(&folder)
-            .args("restore b.npy -o killed -q".split(' '))
+            .args("restore b.npy --method mle -o killed -q".split(' '))
             .stderr(Stdio::null())
             .spawn()
             .unwrap();
@@ -123,8 +130,11 @@ fn parts_of_the_work_meet_in_one_folder() {
     // A last look completes the manifest with the misfit of all frames.
     restore(&folder, "b.npy -o parts");
     assert!(contents(&folder.join("whole")) == contents(&folder.join("parts")));
-    qudi(&folder).args("restore b.npy -o x.npy --shard 1/2".split(' ')).assert().code(2);
-    qudi(&folder).args("restore b.npy -o x --shard 3/2".split(' ')).assert().code(2);
+    qudi(&folder)
+        .args("restore b.npy --method mle -o x.npy --shard 1/2".split(' '))
+        .assert()
+        .code(2);
+    qudi(&folder).args("restore b.npy --method mle -o x --shard 3/2".split(' ')).assert().code(2);
 }
 
 #[test]
@@ -135,8 +145,10 @@ fn short_captures_and_long_overlaps_work() {
         assert_eq!(listing(&folder.join(format!("short{end}"))).len(), end + 1);
     }
     restore(&folder, "b.npy --overlap 10 --method average -o dense");
-    let refused =
-        qudi(&folder).args("restore b.npy --overlap 11 -o no".split(' ')).assert().code(2);
+    let refused = qudi(&folder)
+        .args("restore b.npy --method mle --overlap 11 -o no".split(' '))
+        .assert()
+        .code(2);
     let words = String::from_utf8_lossy(&refused.get_output().stderr).into_owned();
     assert!(words.contains("windows are longer than their overlap"), "{words}");
     assert!(!folder.join("no").exists());
@@ -147,7 +159,9 @@ const KNOWN: &str = "--sensor qudi-paper --ppp 9.75";
 
 fn piped(folder: &Path, args: &str, input: &[u8]) -> std::process::Output {
     let mut command = qudi(folder);
-    command.arg("restore").args(args.split_whitespace()).args(KNOWN.split(' '));
+    let quick = if args.contains("--method") { "" } else { " --method mle" };
+    command.arg("restore").args((args.to_owned() + quick).split_whitespace());
+    command.args(KNOWN.split(' '));
     command.write_stdin(input).output().unwrap()
 }
 
@@ -207,7 +221,7 @@ fn a_running_pipe_is_restored_as_it_comes() {
     // Whoever looks may leave early.
     let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
         .current_dir(&folder)
-        .args("restore b.npy -o - -q".split(' '))
+        .args("restore b.npy --method mle -o - -q".split(' '))
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()

@@ -2,16 +2,20 @@
 //! split at random into 11 sums of 7 frames and a reference of all others.
 //!
 //!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED
+//!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED write BURST
+//!     qudi restore BURST.npy --sensor BURST.toml --ppp PPP -o RESTORED.npy
+//!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED score RESTORED.npy
 //!
 //! FOLDER holds one image of means of 256 binary frames. The split is hypergeometric, so that input
 //! and reference are independent; the reference's own variance is subtracted from the error.
 #![allow(clippy::print_stdout)]
 
-use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise};
+use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
 use qudi_sim::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_sim::output::{ArrayWriter, Overwrite, PendingFile};
 use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer};
 use qudi_sim::sensor::Sensor;
-use qudi_sim::{Frame, SimError};
+use qudi_sim::{Frame, SimError, Size};
 use rand::rngs::ChaCha8Rng;
 use rand::{Rng, SeedableRng};
 use std::path::Path;
@@ -22,8 +26,13 @@ const EXPOSURE: f64 = 0.45;
 
 fn main() -> qudi_sim::Result<()> {
     let args: Vec<String> = std::env::args().collect();
-    let [_, folder, levels, seed] = args.as_slice() else {
+    let [_, folder, levels, seed, rest @ ..] = args.as_slice() else {
         return Err(SimError::request("three arguments", "command line", "FOLDER LEVELS SEED"));
+    };
+    let other = match rest {
+        [] => None,
+        [word, path] if ["write", "score"].contains(&word.as_str()) => Some((word.as_str(), path)),
+        _ => return Err(SimError::request(rest.join(" "), "command line", "write or score PATH")),
     };
     let number = |text: &str| text.parse::<u64>().unwrap_or(0);
     let levels = number(levels) as u16;
@@ -86,26 +95,68 @@ fn main() -> qudi_sim::Result<()> {
         context.ppp
     );
     let burst = BurstView { size, frames: &frames };
+    match other {
+        Some(("write", path)) => return write(path, burst, &context.sensor),
+        Some((_, path)) => {
+            let image = middle(path, size)?;
+            println!("{path}: psnr-a {:.2} dB", corrected(&image, &truth, own_noise));
+            return Ok(());
+        }
+        None => {}
+    }
     let mut mle = Mle::choose(&[burst], &context);
     let choose = |transform| TransformDenoise::choose(transform, &[burst], &context);
     let mut stabilized = choose(Transform::Integral);
     let mut plain = choose(Transform::Identity);
     let (mut qbp, mut qbp_bm3d) = (Qbp::new(Finish::Plain), Qbp::new(Finish::Bm3d));
-    let methods: [&mut dyn Restorer; 6] =
-        [&mut Average, &mut mle, &mut stabilized, &mut plain, &mut qbp, &mut qbp_bm3d];
+    let methods: [&mut dyn Restorer; 7] = [
+        &mut Average,
+        &mut mle,
+        &mut stabilized,
+        &mut plain,
+        &mut qbp,
+        &mut qbp_bm3d,
+        &mut TwoRounds,
+    ];
     for method in methods {
         let restored = method.restore(burst, &context)?.frames;
-        let error = squared_error(&restored[FRAMES / 2], &truth);
-        let corrected = (error - own_noise).max(1e-12);
-        println!(
-            "{:<17} psnr-a {:6.2} dB, with the reference's own noise {:6.2} dB",
-            method.name(),
-            -10.0 * corrected.log10(),
-            -10.0 * error.log10()
-        );
+        let decibels = corrected(&restored[FRAMES / 2], &truth, own_noise);
+        println!("{:<17} psnr-a {decibels:6.2} dB", method.name());
     }
     println!("mle over {} frames, transform-denoise over {}", mle.length(), stabilized.length());
     Ok(())
+}
+
+/// PSNR after the best gain, in dB, the reference's own variance subtracted.
+fn corrected(image: &Frame, truth: &[f64], own_noise: f64) -> f64 {
+    -10.0 * (squared_error(image, truth) - own_noise).max(1e-12).log10()
+}
+
+/// The counts as PATH.npy and the sensor as PATH.toml.
+fn write(path: &str, burst: BurstView<'_>, sensor: &Sensor) -> qudi_sim::Result<()> {
+    let shape = [burst.size.height, burst.size.width];
+    let array = format!("{path}.npy");
+    let mut array = ArrayWriter::create(Path::new(&array), Overwrite::Yes, "|u1", &shape)?;
+    for frame in burst.frames {
+        array.push(&frame.iter().map(|&count| count as u8).collect::<Vec<_>>())?;
+    }
+    array.finish()?;
+    let text = toml::to_string(sensor)
+        .map_err(|e| SimError::request(e.to_string(), "the sensor", "report this"))?;
+    PendingFile::write_whole(Path::new(&format!("{path}.toml")), text.as_bytes(), Overwrite::Yes)
+}
+
+/// The middle one of 11 frames of float32 in a .npy file of ours.
+fn middle(path: &str, size: Size) -> qudi_sim::Result<Frame> {
+    let bytes = std::fs::read(path).map_err(|e| SimError::io("read", Path::new(path), e))?;
+    let frame = 4 * size.pixels();
+    let Some(values) = bytes.len().checked_sub(FRAMES * frame).map(|header| &bytes[header..])
+    else {
+        return Err(SimError::request("too few frames", path, "restore all of the burst"));
+    };
+    let words = values[FRAMES / 2 * frame..][..frame].chunks_exact(4);
+    let data = words.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    Ok(Frame { size, data })
 }
 
 /// Mean squared error after the best gain, in image units.

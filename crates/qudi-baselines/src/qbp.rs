@@ -22,7 +22,7 @@ use blocks::Blocks;
 use cubic::{cubic, squares};
 use dft::SIDE;
 use grid::Grid;
-pub use guide::Guide;
+pub use guide::{Guide, TwoRounds};
 use merge::{Member, merge};
 use pyramid::Pyramid;
 use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};

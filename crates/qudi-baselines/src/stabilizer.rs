@@ -136,6 +136,14 @@ impl Stabilizer {
         if self.nodes.is_empty() { self.closed_form(z) } else { self.look_up(z, 0) }
     }
 
+    /// The value closest to `z` that some light is expected to give.
+    pub(crate) fn possible(&self, z: f64) -> f64 {
+        match (self.nodes.first(), self.nodes.last()) {
+            (Some(least), Some(most)) => z.clamp(least[1], most[1]),
+            _ => z,
+        }
+    }
+
     /// The mean count whose expected transform is `z`.
     pub fn mean_count(&self, z: f64) -> f64 {
         self.moments.at(self.invert(z)).0

@@ -82,9 +82,14 @@ pub(crate) fn denoise(
     clean
 }
 
+/// Image units of a detection.
+pub(crate) fn units(context: &Context) -> f64 {
+    1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency)
+}
+
 /// The image behind a denoised transform: inverse, dark counts subtracted.
 pub(crate) fn image(z: &Frame, stabilizer: &Stabilizer, context: &Context, ordinary: f64) -> Frame {
-    let units = 1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency);
+    let units = units(context);
     let pixel = |(i, &z): (usize, &f32)| {
         let detections = stabilizer.invert(f64::from(z)) - context.dark_of(i, ordinary);
         (detections.max(0.0) * units) as f32

@@ -88,6 +88,7 @@ pub(crate) enum Command {
     Simulate(Box<Simulate>),
     Restore(Box<Restore>),
     Train(Box<Train>),
+    Publish(Publish),
     Eval(Box<Eval>),
     Bench(Box<Bench>),
     Selftest(Selftest),
@@ -116,7 +117,7 @@ pub(crate) struct Selftest {
     pub(crate) only: Vec<String>,
 }
 
-/// See what the camera sees: a built-in scene, simulated, averaged, measured, in one picture
+/// See what the camera sees, and what every method makes of it: a built-in scene in one picture and one page
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Demo {
     /// Picture to write [default: qudi-demo.png, overwritten]
@@ -131,6 +132,8 @@ pub(crate) struct Demo {
     /// Seed of photons and noise
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
+    #[command(flatten)]
+    pub(crate) network: Network,
 }
 
 /// Convert between lux and photons per pixel for a sensor
@@ -179,7 +182,8 @@ pub(crate) struct Light {
 #[group(skip)]
 #[command(group(ArgGroup::new("what").required(true)))]
 pub(crate) struct Info {
-    /// A capture (file or folder), a burst or its record, weights (.safetensors), a sensor's name or .toml file
+    /// A capture (file or folder), a burst or its record, weights (.safetensors, or `weights` for those that come along), a
+    /// sensor's name or .toml file
     #[arg(group = "what", value_hint = ValueHint::AnyPath)]
     pub(crate) subject: Option<String>,
     /// List the built-in sensors
@@ -208,6 +212,17 @@ pub(crate) struct Look {
     /// Write the mean picture as PNG: response inverted, bad pixels repaired
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) preview: Option<PathBuf>,
+}
+
+/// Write weights in half precision, half the size, with their SHA-256 beside them
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Publish {
+    /// Weights that `qudi train` wrote
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub(crate) weights: PathBuf,
+    /// Where they go: .safetensors
+    #[arg(short, long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) output: PathBuf,
 }
 
 /// Show settings and where they come from

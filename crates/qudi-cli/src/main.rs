@@ -9,6 +9,7 @@ mod keys;
 mod memory;
 mod report;
 mod settings;
+mod weights;
 
 use args::{Args, Command};
 use clap::Parser;
@@ -52,6 +53,7 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Simulate(simulate) => cmd::simulate::run(simulate, &args.global, report),
         Command::Restore(restore) => cmd::restore::run(restore, &args.global, report),
         Command::Train(train) => cmd::train::run(train, &args.global, report),
+        Command::Publish(publish) => cmd::publish::run(publish, &args.global, report),
         Command::Eval(eval) => cmd::eval::run(eval, &args.global, report),
         Command::Bench(bench) => cmd::bench::run(bench, &args.global, report),
         Command::Selftest(selftest) => cmd::selftest::run(selftest, report),

@@ -42,6 +42,15 @@ pub struct Description {
     pub licence: String,
 }
 
+/// How exactly numbers are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// In 32 bits, as they were learnt.
+    Single,
+    /// In 16 bits, for half the size.
+    Half,
+}
+
 /// Writes the network's weights, whole or not at all.
 ///
 /// # Errors
@@ -49,10 +58,11 @@ pub struct Description {
 pub fn save(
     network: &Qudi,
     description: &Description,
+    precision: Precision,
     path: &Path,
     overwrite: Overwrite,
 ) -> Result<()> {
-    let mut values = Values::default();
+    let mut values = Values { precision, path: Vec::new(), list: Vec::new(), error: None };
     network.visit(&mut values);
     if let Some(error) = values.error {
         return Err(error);
@@ -61,7 +71,7 @@ pub fn save(
     // One entry only: the library writes several in any order, and equal weights should make equal files.
     let metadata = HashMap::from([(KEY.to_owned(), text)]);
     let views = values.list.iter().map(|(name, shape, bytes)| {
-        let view = TensorView::new(Dtype::F32, shape.clone(), bytes);
+        let view = TensorView::new(precision.kind(), shape.clone(), bytes);
         (name, view.expect("as many bytes as the shape says"))
     });
     let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| {
@@ -78,14 +88,39 @@ pub fn describe(path: &Path) -> Result<Description> {
     Ok(File::open(path)?.description)
 }
 
+/// The description of a weight file that is in memory; `place` names it in errors.
+///
+/// # Errors
+/// [`SimError::Data`] if it is no weight file of ours.
+pub fn describe_bytes(bytes: &[u8], place: &Path) -> Result<Description> {
+    description(bytes, place)
+}
+
+/// [`load`], from memory.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_bytes(bytes: &[u8], place: &Path, device: &Device) -> Result<(Qudi, Description)> {
+    network(bytes, description(bytes, place)?, place, device)
+}
+
 /// Reads a network onto `device`. Nothing is allocated that the file does not hold.
 ///
 /// # Errors
 /// [`SimError::Data`] if the file does not fit its own description, or holds values that are no numbers.
 pub fn load(path: &Path, device: &Device) -> Result<(Qudi, Description)> {
-    let file = File::open(path)?;
-    let tensors = SafeTensors::deserialize(&file.bytes).map_err(|e| damaged(path, e))?;
-    let description = file.description;
+    let File { bytes, description } = File::open(path)?;
+    network(&bytes, description, path, device)
+}
+
+/// The network of a whole file, described by `description`.
+fn network(
+    bytes: &[u8],
+    description: Description,
+    path: &Path,
+    device: &Device,
+) -> Result<(Qudi, Description)> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| damaged(path, e))?;
     let network = description.network.shell(device);
     let expected = parameters(&network);
     for (name, shape) in &expected {
@@ -147,23 +182,28 @@ impl File {
             ));
         }
         let bytes = std::fs::read(path).map_err(failed)?;
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| damaged(path, e))?;
-        let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
-        let Some(text) = text else {
-            return Err(SimError::data(
-                "a SafeTensors file of another program",
-                path,
-                "weights of this program say so in their metadata; name a file that `qudi train` wrote",
-            ));
-        };
-        let description: Description = serde_json::from_str(text)
-            .map_err(|e| mismatch(path, format!("the description cannot be read: {e}")))?;
-        let network = description.network.checked().map_err(|e| mismatch(path, e.to_string()))?;
-        if !(3..=1000).contains(&description.window) {
-            return Err(mismatch(path, format!("a window of {} frames", description.window)));
-        }
-        Ok(Self { bytes, description: Description { network, ..description } })
+        let description = description(&bytes, path)?;
+        Ok(Self { bytes, description })
     }
+}
+
+fn description(bytes: &[u8], path: &Path) -> Result<Description> {
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(path, e))?;
+    let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
+    let Some(text) = text else {
+        return Err(SimError::data(
+            "a SafeTensors file of another program",
+            path,
+            "weights of this program say so in their metadata; name a file that `qudi train` wrote",
+        ));
+    };
+    let description: Description = serde_json::from_str(text)
+        .map_err(|e| mismatch(path, format!("the description cannot be read: {e}")))?;
+    let network = description.network.checked().map_err(|e| mismatch(path, e.to_string()))?;
+    if !(3..=1000).contains(&description.window) {
+        return Err(mismatch(path, format!("a window of {} frames", description.window)));
+    }
+    Ok(Description { network, ..description })
 }
 
 fn damaged(path: &Path, error: impl std::fmt::Display) -> SimError {
@@ -190,9 +230,28 @@ fn numbers(tensor: &TensorView<'_>) -> Vec<f32> {
     }
 }
 
+impl Precision {
+    fn kind(self) -> Dtype {
+        match self {
+            Self::Single => Dtype::F32,
+            Self::Half => Dtype::F16,
+        }
+    }
+
+    fn bytes(self, values: &[f32]) -> Vec<u8> {
+        match self {
+            Self::Single => values.iter().flat_map(|value| value.to_le_bytes()).collect(),
+            Self::Half => {
+                let halves = values.iter().map(|&value| f16::from_f32(value));
+                halves.flat_map(f16::to_le_bytes).collect()
+            }
+        }
+    }
+}
+
 /// Values of all parameters, as little-endian bytes.
-#[derive(Default)]
 struct Values {
+    precision: Precision,
     path: Vec<String>,
     list: Vec<(String, Vec<usize>, Vec<u8>)>,
     error: Option<SimError>,
@@ -210,7 +269,7 @@ impl ModuleVisitor for Values {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         match crate::tensor::read(param.val()) {
             Ok(values) => {
-                let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+                let bytes = self.precision.bytes(&values);
                 self.list.push((self.path.join("."), param.shape().to_vec(), bytes));
             }
             Err(error) => self.error = Some(error),

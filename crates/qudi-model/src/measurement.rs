@@ -43,10 +43,10 @@ impl Planes {
     }
 }
 
-/// The classical estimate of a burst that the network goes on from: the restored image and the merely merged one, in image
-/// units in [0, 2], and the deviation of the latter's noise in that of one frame's; each frame after frame, row-major.
+/// The classical estimate of a burst that the network goes on from: the restored image, the merely merged one and the
+/// deviation of the latter's noise; in image units, in [0, 2], each frame after frame, row-major.
 #[derive(Clone, Debug, Default)]
-pub struct GuidePlanes([Vec<f32>; 3]);
+pub struct GuidePlanes(pub(crate) [Vec<f32>; 3]);
 
 impl GuidePlanes {
     /// The guide of a captured burst.
@@ -54,12 +54,12 @@ impl GuidePlanes {
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
     pub fn of(burst: BurstView<'_>, context: &Context) -> Result<Self> {
-        let Guide { clean, merged, doubt } = Guide::find(burst, context)?;
+        let Guide { clean, merged, noise } = Guide::find(burst, context)?;
         let values = |frames: Vec<Frame>| {
             let values = frames.into_iter().flat_map(|frame| frame.data);
             values.map(|value| value.min(BRIGHTEST as f32)).collect()
         };
-        Ok(Self([clean, merged, doubt].map(values)))
+        Ok(Self([clean, merged, noise].map(values)))
     }
 
     /// Every plane changed by `f`.

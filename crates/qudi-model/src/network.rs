@@ -2,6 +2,7 @@
 
 mod attention;
 mod embedding;
+mod evidence;
 mod features;
 mod flow;
 mod fusion;

@@ -192,15 +192,23 @@ pub fn terms(
     Ok(Terms { total, prediction, pre, perceptual, flow })
 }
 
-/// The terms of pre-denoiser and flow alone, at a fifth of the cost: a first stage for what must work before the rest
-/// can learn from it.
+/// The terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no weight: a first stage, at
+/// a fifth of the cost or less, for what must work before the rest can learn from it.
 fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> Terms {
     let measured = example.measured;
-    let (d, flows) = network.denoise_and_align(&network.prepare(measured));
+    let (d, flows) = if weights.flow > 0.0 {
+        let (d, flows) = network.denoise_and_align(&network.prepare(measured));
+        (d, Some(flows))
+    } else {
+        (network.denoise(measured), None)
+    };
     let pre = relative_reconstruction(example)(d);
-    let flow = flows.misfit(example.truth.clone(), measured.frames);
-    let total = pre.clone() * weights.pre + flow.clone() * weights.flow;
-    Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow: Some(flow) }
+    let flow = flows.map(|flows| flows.misfit(example.truth.clone(), measured.frames));
+    let mut total = pre.clone() * weights.pre;
+    if let Some(term) = &flow {
+        total = total + term.clone() * weights.flow;
+    }
+    Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow }
 }
 
 /// The network's own estimate, without gradient, and its simulated measurement. Bursts at the last time have
@@ -214,7 +222,6 @@ fn estimate(
 ) -> Result<(Tensor<4>, Option<Simulated>)> {
     let device = example.truth.device();
     let measured = Measured {
-        y: example.measured.y.clone().inner(),
         u: example.measured.u.clone().inner(),
         guide: example.measured.guide.clone().inner(),
         sensor: example.measured.sensor.clone().inner(),

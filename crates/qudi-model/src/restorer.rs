@@ -14,7 +14,7 @@ use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
 use qudi_sim::{Frame, Result, SimError, Size};
 
 /// Fewest frames that the fusion makes sense of.
-const FEWEST_FRAMES: usize = 3;
+pub const FEWEST_FRAMES: usize = 3;
 
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,7 +31,7 @@ pub struct SampleOptions {
 
 impl Default for SampleOptions {
     fn default() -> Self {
-        Self { steps: 10, sampler: Sampler::Ddim, samples: 1, tile: 512 }
+        Self { steps: 1, sampler: Sampler::Ddim, samples: 1, tile: 512 }
     }
 }
 
@@ -65,6 +65,13 @@ impl QudiRestorer {
         }
         if options.samples == 0 {
             return Err(SimError::request("no samples at all", "--samples", "draw at least 1"));
+        }
+        if options.samples > 1 && !network.generates()? {
+            return Err(SimError::request(
+                "these weights make the same picture of any noise: samples would not differ",
+                "--samples",
+                "leave it out, or use weights that learnt with train.loss.prediction above 0 (docs/training.md)",
+            ));
         }
         let smallest = 4 * config.multiple();
         if options.tile < smallest {
@@ -157,7 +164,6 @@ impl QudiRestorer {
         let guide = job.guide.map(|images| job.tiles.crop(number, images));
         let sensor = TensorData::new(job.sensor.to_vec(), [1, SENSOR_NUMBERS]);
         self.network.prepare(&Measured {
-            y: tensor(&job.planes.y),
             u: tensor(&job.planes.u),
             guide: guide.to_tensor(job.tiles.tile, &self.device),
             sensor: Tensor::from_data(sensor, &self.device),

@@ -169,9 +169,8 @@ fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let network = NetworkConfig::preset("tiny")?.init(1, &device);
     let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
     let measured = Measured {
-        y: image(21),
         u: image(22),
-        guide: Tensor::cat(vec![image(29), image(30), image(31)], 1),
+        guide: Tensor::cat(vec![image(29), image(30), image(31) * 0.5 + 0.2], 1),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
     };

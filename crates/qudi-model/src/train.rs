@@ -5,6 +5,7 @@
 
 mod adam;
 mod batch;
+mod bursts;
 mod feed;
 mod learning_rate;
 mod recipe;
@@ -16,9 +17,10 @@ mod values;
 
 pub use adam::Adam;
 pub use batch::Batch;
+pub use bursts::Bursts;
 pub use feed::Feed;
 pub use learning_rate::learning_rate;
-pub use recipe::{LossConfig, Recipe, TrainConfig, ValidationConfig};
+pub use recipe::{LossConfig, PartsConfig, Recipe, TrainConfig, ValidationConfig};
 pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
 pub use trainer::{Losses, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
-use qudi_model::checkpoint::{Description, describe, load, save};
+use qudi_model::checkpoint::{Description, Precision, describe, load, load_bytes, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::{Qudi, fill, parameters};
 use qudi_sim::output::Overwrite;
@@ -31,7 +31,7 @@ fn network(seed: u64) -> Qudi {
 fn values(network: Qudi) -> Vec<(String, Vec<f32>)> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("w.safetensors");
-    save(&network, &description(), &path, Overwrite::No).unwrap();
+    save(&network, &description(), Precision::Single, &path, Overwrite::No).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let mut list: Vec<_> = tensors
@@ -50,7 +50,7 @@ fn values(network: Qudi) -> Vec<(String, Vec<f32>)> {
 fn saved() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("w.safetensors");
-    save(&network(5), &description(), &path, Overwrite::No).unwrap();
+    save(&network(5), &description(), Precision::Single, &path, Overwrite::No).unwrap();
     (folder, path)
 }
 
@@ -67,8 +67,26 @@ fn what_was_saved_comes_back() {
     assert_eq!(description_back, description());
     assert_eq!(values(back), values(network(5)));
     assert_ne!(values(network(6)), values(network(5)));
-    let taken = save(&network(6), &description(), &path, Overwrite::No).unwrap_err();
+    let taken =
+        save(&network(6), &description(), Precision::Single, &path, Overwrite::No).unwrap_err();
     assert!(taken.to_string().contains("exists"), "{taken}");
+}
+
+/// Sixteen bits keep eleven of the leading ones, in half the space.
+#[test]
+fn half_precision_is_close_and_small() {
+    let (folder, path) = saved();
+    let half = folder.path().join("half.safetensors");
+    save(&network(5), &description(), Precision::Half, &half, Overwrite::No).unwrap();
+    let length = |path: &Path| std::fs::metadata(path).unwrap().len();
+    assert!(length(&half) * 10 < length(&path) * 6);
+    let bytes = std::fs::read(&half).unwrap();
+    let (back, _) = load_bytes(&bytes, &half, &Device::flex()).unwrap();
+    for ((name, half), (_, single)) in values(back).into_iter().zip(values(network(5))) {
+        for (half, single) in half.iter().zip(single) {
+            assert!((half - single).abs() <= single.abs() / 2048.0 + 3e-8, "{name}");
+        }
+    }
 }
 
 #[test]
@@ -142,7 +160,7 @@ fn weights_that_are_no_numbers_are_refused() {
     });
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("nan.safetensors");
-    save(&broken, &description(), &path, Overwrite::No).unwrap();
+    save(&broken, &description(), Precision::Single, &path, Overwrite::No).unwrap();
     let message = refused(&path);
     assert!(message.contains("unet.norm.bias"), "{message}");
 }
@@ -177,5 +195,5 @@ fn every_parameter_has_a_name_of_its_own() {
     names.dedup();
     assert_eq!(names.len(), list.len());
     let count: usize = list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
-    assert_eq!(count, 180_136); // scripts/reference/network.py info tiny
+    assert_eq!(count, 179_848); // scripts/reference/network.py info tiny
 }

@@ -2,9 +2,10 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::{Device, Tensor};
-use qudi_model::network::{Qudi, fill};
+use qudi_model::network::{Qudi, fill, parameters};
 use qudi_model::train::{
-    Adam, Batch, Event, Feed, From, METRICS, Recipe, Run, StepReport, Trainer, WEIGHTS, values,
+    Adam, Batch, Bursts, Event, Feed, From, METRICS, Recipe, Run, StepReport, Trainer, WEIGHTS,
+    values,
 };
 use qudi_sim::SimError;
 use qudi_sim::dataset::Dataset;
@@ -34,8 +35,8 @@ fn weights(network: &Qudi) -> Vec<f32> {
 }
 
 fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Vec<StepReport>) {
-    let dataset = Dataset::new(&recipe.data, None).unwrap();
-    let mut feed = Feed::new(recipe, &dataset, 0, workers).unwrap();
+    let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, None).unwrap());
+    let mut feed = Feed::new(recipe, &bursts, 0, workers).unwrap();
     let mut trainer = Trainer::new(recipe, None, devices, None).unwrap();
     let steps = (0..3).map(|_| trainer.step(&mut feed).unwrap()).collect();
     (weights(&trainer.averaged()), steps)
@@ -197,15 +198,52 @@ fn damaged_states_are_refused() {
     open(folder.path(), &recipe, From::State).unwrap();
 }
 
+/// The first stage: the pre-denoiser alone, from single frames of bursts that are kept. Nothing else moves.
+#[test]
+fn the_pre_denoiser_learns_from_parts() {
+    let recipe = recipe(&[
+        ("train.parts", "{ bursts = 3, frames = 1, side = 24 }"),
+        (
+            "train.loss",
+            "{ prediction = 0.0, pre = 1.0, perceptual = 0.0, term = \"none\", flow = 0.0 }",
+        ),
+        ("train.steps", "4"),
+    ]);
+    let before = weights(&recipe.network.init(recipe.train.seed, &Device::flex()));
+    let (after, reports) = trained(&recipe, &[Device::flex()], 2);
+    assert_eq!(after, trained(&recipe, &[Device::flex()], 1).0, "whoever draws the bursts");
+    assert!(reports.iter().all(|report| report.loss.pre > 0.0 && report.loss.flow == 0.0));
+    let count = |part: &str| {
+        let list = parameters(&recipe.network.init(1, &Device::flex()));
+        let sizes = list.iter().filter(|(name, _)| name.starts_with(part));
+        sizes.map(|(_, shape)| shape.iter().product::<usize>()).sum::<usize>()
+    };
+    // Averages of equal weights are equal but for rounding.
+    let moved = after.iter().zip(&before).filter(|(a, b)| (**a - **b).abs() > 1e-6).count();
+    let pre = count("pre.");
+    assert!(moved > pre / 2 && moved <= pre, "{moved} of {pre} weights moved");
+    for (key, value, word) in [
+        ("train.parts", "{ bursts = 3, frames = 1, side = 24 }", "3 frames"),
+        ("train.parts", "{ bursts = 0, frames = 3, side = 24 }", "one burst"),
+        ("train.parts", "{ bursts = 3, frames = 3, side = 30 }", "train.parts.side"),
+        ("train.parts", "{ bursts = 3, frames = 3, side = 40 }", "fit"),
+    ] {
+        let changes = [("data.crop", "32"), ("data.frames", "3"), (key, value)];
+        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
+        let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
+        assert!(error.contains(word), "{value}: {error}");
+    }
+}
+
 /// A network that has gone wrong stops the run before it spoils the state, and the term is named.
 #[test]
 fn no_number_stops_the_run() {
     let recipe = recipe(&[]);
-    let dataset = Dataset::new(&recipe.data, None).unwrap();
+    let bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap());
     let broken = recipe.network.init(1, &Device::flex());
     let broken = fill(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
-    let mut feed = Feed::new(&recipe, &dataset, 0, 1).unwrap();
+    let mut feed = Feed::new(&recipe, &bursts, 0, 1).unwrap();
     let error = trainer.step(&mut feed).unwrap_err().to_string();
     assert!(error.contains("estimate") || error.contains("prediction is NaN"), "{error}");
     assert_eq!(trainer.step_number(), 0);
@@ -235,6 +273,7 @@ fn recipes_say_what_is_wrong_with_them() {
     assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);
     let recipe = load("data.sensor.0.ppp", "[3.25, 9.75]").unwrap();
     assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
-    let again = Batch::draw(&recipe, &mut Dataset::new(&recipe.data, None).unwrap(), 3).unwrap();
+    let mut bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap());
+    let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
     assert_eq!(again.len(), 2);
 }

@@ -52,7 +52,6 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let guide = GuidePlanes::of(view, &context).unwrap();
     let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
     let measured = Measured {
-        y: to_tensor(planes.y, size, device),
         u: to_tensor(planes.u, size, device),
         guide: guide.to_tensor(size, device),
         sensor: Tensor::from_data(numbers, device),

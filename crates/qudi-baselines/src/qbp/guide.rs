@@ -5,8 +5,8 @@
 use super::{Finish, Merged, Merger, Pilots, Qbp, QbpSettings, at_least};
 use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
-use crate::transform_denoise::{denoise, image};
-use qudi_sim::restore::{BurstView, Context};
+use crate::transform_denoise::{denoise, image, units};
+use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
 use qudi_sim::{Frame, Result};
 use rayon::prelude::*;
 
@@ -28,8 +28,8 @@ pub struct Guide {
     pub clean: Vec<Frame>,
     /// Only aligned and merged: unbiased and still noisy, in image units.
     pub merged: Vec<Frame>,
-    /// Deviation of the merged frame's noise at each pixel, in that of the frame's own: between 0 and 1.
-    pub doubt: Vec<Frame>,
+    /// Deviation of the merged frame's noise at each pixel, in image units.
+    pub noise: Vec<Frame>,
 }
 
 impl Guide {
@@ -44,6 +44,7 @@ impl Guide {
         let transform = Transform::Integral;
         let stabilizer = Stabilizer::new(transform, &context.sensor, context.gain, count as u32);
         let image = |z: &Frame| image(z, &stabilizer, context, ordinary);
+        let units = units(context);
 
         let qbp = Qbp::new(Finish::Bm3d);
         let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
@@ -59,17 +60,42 @@ impl Guide {
         let frames = (0..count).map(pilot).collect();
         merger.follow(Pilots { frames, error: ERROR });
 
-        let mut guide = Self { clean: Vec::new(), merged: Vec::new(), doubt: Vec::new() };
+        let mut guide = Self { clean: Vec::new(), merged: Vec::new(), noise: Vec::new() };
         for frame in 0..count {
             let Merged { counts, noise, noises } = merger.merge(frame);
             let z = stabilizer.stabilized(&counts);
             guide.merged.push(image(&z));
             let scale = NOISE * (n * noise).sqrt();
-            guide.clean.push(image(&denoise(THOROUGH, z, &stabilizer, scale)));
-            let doubt = noises.data.iter().map(|noise| noise.sqrt().min(1.0)).collect();
-            guide.doubt.push(Frame { size: noises.size, data: doubt });
+            let clean = denoise(THOROUGH, z, &stabilizer, scale);
+            // From one deviation below to one above, through the inverse of the transform; black is no bound.
+            let deviation = clean.data.iter().zip(&noises.data).map(|(&z, &noise)| {
+                let z = stabilizer.possible(f64::from(z));
+                let one = stabilizer.deviation(z) * (n * f64::from(noise)).sqrt();
+                let span = stabilizer.invert(z + one) - stabilizer.invert(z - one);
+                (0.5 * span * units) as f32
+            });
+            guide.noise.push(Frame { size: clean.size, data: deviation.collect() });
+            guide.clean.push(image(&clean));
         }
         Ok(guide)
+    }
+}
+
+/// The guide's restored frames as a method.
+#[derive(Clone, Copy, Debug)]
+pub struct TwoRounds;
+
+impl Restorer for TwoRounds {
+    fn name(&self) -> &'static str {
+        "guide"
+    }
+
+    fn window(&self) -> usize {
+        2 * LONGEST_HALF + 1
+    }
+
+    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
+        Ok(Restored { frames: Guide::find(burst, context)?.clean, std: None })
     }
 }
 

@@ -1,5 +1,6 @@
 //! Options of commands that may run the network.
 
+use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use std::path::PathBuf;
 
@@ -7,11 +8,12 @@ use std::path::PathBuf;
 #[derive(Clone, Debug, ClapArgs)]
 #[command(next_help_heading = "Network (method qudi)")]
 pub(crate) struct Network {
-    /// Weights that `qudi train` wrote
+    /// Weights that `qudi train` wrote [default: those that come along]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) weights: Option<PathBuf>,
-    /// Reverse steps: 1 is truest to the photons on average (best PSNR), 10 looks sharpest
-    #[arg(long, value_name = "N", default_value_t = 10)]
+    /// Reverse steps: 1 is fastest and truest to the photons on average; the paper takes 10, which the built-in weights do not
+    /// gain from (docs/model-card.md)
+    #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) steps: usize,
     /// How noise leaves
     #[arg(long, value_name = "NAME", default_value = "ddim")]
@@ -25,6 +27,13 @@ pub(crate) struct Network {
     /// Side of the tiles that the network sees at once, in pixels: memory grows with its square
     #[arg(long, value_name = "PIXELS", default_value_t = 512)]
     pub(crate) tile: usize,
+}
+
+impl Network {
+    /// The weights that were asked for.
+    pub(crate) fn weights(&self) -> Weights {
+        Weights::of(self.weights.as_deref())
+    }
 }
 
 /// Samplers.

@@ -19,7 +19,8 @@ pub(crate) struct Restore {
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
     /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen), transform-denoise, bm3d, qbp,
-    /// qbp-bm3d, or qudi (the network) [default: qudi with --weights, else mle]
+    /// qbp-bm3d, guide (that twice), or qudi (the network) [default: qudi; guide for sensors and light that the built-in weights
+    /// do not know, and mle where the dark rate is unknown, too]
     #[arg(long, value_name = "NAME")]
     pub(crate) method: Option<String>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
@@ -86,13 +87,5 @@ impl std::str::FromStr for Shard {
             Some((number, of)) if (1..=of).contains(&number) => Ok(Self { number, of }),
             _ => Err("expected I/N with I from 1 to N, as in 3/8".to_owned()),
         }
-    }
-}
-
-impl Restore {
-    /// The method that was asked for, or follows from the weights.
-    pub(crate) fn method(&self) -> &str {
-        let by_weights = if self.network.weights.is_some() { "qudi" } else { "mle" };
-        self.method.as_deref().unwrap_or(by_weights)
     }
 }

@@ -143,7 +143,7 @@ fn inputs(size: Size, frames: usize, device: &Device) -> (Measured, Simulated, S
     let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
     let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
     let guide = image().repeat_dim(1, 3);
-    let measured = Measured { y: image(), u: image(), guide, sensor, frames };
+    let measured = Measured { u: image(), guide, sensor, frames };
     let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
     (measured, simulated, State { x_t: image(), x0_prev: image(), times: vec![500] })
 }

@@ -1,114 +1,138 @@
-//! `qudi demo`: one built-in scene, what the sensor sees of it, and what averaging makes of that.
+//! `qudi demo`: what the tool is for, on one built-in scene: the noisy burst, what averaging and the best classical
+//! methods make of it, what the network makes of it, the truth, errors and uncertainty.
 
 use crate::args::{Demo, Global};
-use crate::error::Result;
+use crate::cmd::demo_html::html;
+use crate::cmd::network;
+use crate::error::{Fault, Result};
 use crate::interrupt;
-use crate::report::Report;
-use qudi_sim::metrics::{best_gain, gain_aligned_psnr, psnr};
-use qudi_sim::output::{Overwrite, Picture};
+use crate::report::{Bar, Report};
+use qudi_baselines::{Finish, Qbp, TwoRounds};
+use qudi_sim::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
+use qudi_sim::output::{Overwrite, PendingFile, Picture};
+use qudi_sim::restore::{Average, BurstView, Context, Restorer};
 use qudi_sim::scene::{Procedural, ProceduralScene, Scene};
-use qudi_sim::sensor::{CountLaw, Sensor};
-use qudi_sim::{Camera, ClipStatistics, Frame, PppDefinition, SimError, Size, resolve_light};
+use qudi_sim::sensor::Sensor;
+use qudi_sim::{
+    Camera, ClipStatistics, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE,
+    resolve_light,
+};
 use serde_json::json;
 use std::fmt::Write;
 use std::path::PathBuf;
+use std::time::Instant;
 
 /// Frames of the paper's window, and the one in its middle.
 const FRAMES: usize = 11;
 const CENTRE: usize = FRAMES / 2;
 const SIZE: Size = Size { height: 256, width: 256 };
 
-/// Errors are shown this many times brighter than images.
+/// Errors and uncertainty are shown this many times brighter than images.
 const ERROR_GAIN: f32 = 4.0;
+
+/// Bursts drawn from the result for its uncertainty.
+const REDRAWN: u64 = 4;
+
+/// What a method made of the centre frame.
+pub(crate) struct Shown {
+    label: &'static str,
+    pub(crate) name: &'static str,
+    frame: Frame,
+    pub(crate) psnr_a: f64,
+    pub(crate) psnr: f64,
+    pub(crate) ssim: f64,
+    pub(crate) seconds: f64,
+}
 
 pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
     let path = demo.output.clone().unwrap_or_else(|| PathBuf::from("qudi-demo.png"));
+    let page = path.with_extension("html");
+    if page == path {
+        let help = "name a .png; the page lies beside it";
+        return Err(Fault::new("the picture and the page are one file", path.display(), help));
+    }
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
     let sensor = Sensor::load(&demo.sensor)?;
-    let scene = built_in_scene();
-
     let mut bar = report.bar();
-    let mut truths = Vec::with_capacity(FRAMES);
-    let mut clip = ClipStatistics::default();
-    for t in 0..FRAMES {
-        let frame = scene.render(t as f64);
-        clip.add(&frame.data);
-        truths.push(frame);
-        bar.update("rendering", t as u64 + 1, Some(FRAMES as u64));
-    }
-    let light = resolve_light(
-        &sensor,
-        PppDefinition::Incident,
-        demo.ppp,
-        None,
-        &clip,
-        sensor.dark_per_frame()?,
-    )?;
+    let truths = render(&mut bar);
+    let light = light(demo, &sensor, &truths)?;
     let mut camera = Camera::new(&sensor, SIZE, light, demo.seed)?;
-    let estimator = Estimator::new(&sensor, camera.gain(), light.ppp / light.exposure)?;
-
-    let truth = &truths[CENTRE];
-    let mut moving = Vec::with_capacity(FRAMES);
-    let mut still = Vec::with_capacity(FRAMES);
-    for (t, frame) in truths.iter().enumerate() {
-        moving.push(as_frame(&camera.expose(t as u64, &[frame])?));
-        still.push(as_frame(&camera.expose((FRAMES + t) as u64, &[truth])?));
-        if interrupt::check().is_break() {
-            return Err(SimError::Interrupted.into());
-        }
-        bar.update("exposing", t as u64 + 1, Some(FRAMES as u64));
+    let mut burst = Vec::with_capacity(FRAMES);
+    for (t, frame) in (0..).zip(&truths) {
+        burst.push(camera.expose(t, &[frame])?);
     }
-    let results = [
-        ("ONE FRAME", "one frame", estimator.restore(&moving[CENTRE], 1)),
-        (
-            "AVERAGE OF 11",
-            "average of 11, moving",
-            estimator.restore(&mean(&moving), FRAMES as u32),
-        ),
-        (
-            "ALONG TRUE MOTION",
-            "average along the true motion",
-            estimator.restore(&aligned_mean(&scene, &moving), FRAMES as u32),
-        ),
-        (
-            "STILL CAMERA",
-            "average of 11, nothing moving",
-            estimator.restore(&mean(&still), FRAMES as u32),
-        ),
+    let context = Context {
+        seed: demo.seed,
+        first_frame: 0,
+        ppp: light.ppp,
+        exposure: USUAL_EXPOSURE,
+        gain: camera.gain(),
+        sensor: sensor.clone(),
+        dark: None,
+    };
+    let truth = &truths[CENTRE];
+    let mut methods: Vec<(&str, Box<dyn Restorer>)> = vec![
+        ("AVERAGE OF 11", Box::new(Average)),
+        ("QBP + BM3D", Box::new(Qbp::new(Finish::Bm3d))),
+        ("GUIDE", Box::new(TwoRounds)),
     ];
+    if demo.network.weights.is_some() || network::built_in_knows(&context)? {
+        methods.push(("QUDI", network::restorer(&demo.network, &context, SIZE)?.0));
+    } else {
+        report.remark(
+            "note: the built-in weights do not know this sensor or light; the other methods do",
+        );
+    }
+    let mut shown = Vec::new();
+    let mut last = Vec::new();
+    let count = methods.len() as u64;
+    for (done, (label, method)) in (1..).zip(&mut methods) {
+        let start = Instant::now();
+        let view = BurstView { size: SIZE, frames: &burst };
+        last = method.restore(view, &context)?.frames;
+        let frame = last[CENTRE].clone();
+        shown.push(Shown {
+            label,
+            name: method.name(),
+            psnr_a: gain_aligned_psnr(&frame, truth),
+            psnr: psnr(&frame, truth),
+            ssim: ssim(&frame, truth).unwrap_or(f64::NAN),
+            seconds: start.elapsed().as_secs_f64(),
+            frame,
+        });
+        bar.update("restoring", done, Some(count));
+        stop_if_asked()?;
+    }
+    let method = methods.last_mut().map(|(_, method)| method).expect("there are three at least");
+    let deviation = redrawn(method.as_mut(), &last, &context, &mut bar)?;
     drop(bar);
 
-    let mut picture = Picture::new(SIZE, 2, results.len() + 2, 2);
-    let full_scale = f32::from(sensor.max_count());
-    let counts =
-        Frame { size: SIZE, data: moving[CENTRE].data.iter().map(|c| c / full_scale).collect() };
-    picture.place(0, 0, &["COUNTS", &format!("{} BIT", sensor.output_bits())], &counts);
-    let mut text = format!("{:<32}{:>9}{:>9}\n", "centre frame", "psnr-a", "psnr");
-    let mut figures = Vec::new();
-    for (column, (label, name, frame)) in results.iter().enumerate() {
-        let (aligned, raw) = (gain_aligned_psnr(frame, truth), psnr(frame, truth));
-        let _ = writeln!(text, "{name:<32}{aligned:>9.2}{raw:>9.2}");
-        figures.push(json!({"method": name, "psnr_a": aligned, "psnr": raw}));
-        picture.place(0, column + 1, &[label, &format!("{aligned:.1} DB")], frame);
-        let error = error_map(frame, truth);
-        let rms = (error.data.iter().map(|e| f64::from(e * e)).sum::<f64>()
-            / error.data.len() as f64)
-            .sqrt();
-        let rms = format!("RMS {:.3}", rms / f64::from(ERROR_GAIN));
-        picture.place(1, column + 1, &["ERROR X4", &rms], &error);
-    }
-    picture.place(0, results.len() + 1, &["TRUTH", &format!("{} PPP", demo.ppp)], truth);
+    let picture = picture(&shown, &burst, &deviation, truth, &sensor, demo.ppp);
     picture.save(&path, overwrite)?;
-    let _ = writeln!(
-        text,
-        "\n{}   {} at {} photons/pixel/frame, seed {}; psnr in dB, -a after the best gain",
-        path.display(),
-        sensor.name,
-        demo.ppp,
-        demo.seed
+    let text = text(&shown, &deviation, truth);
+    let foot = format!(
+        "{} at {} photons/pixel/frame, seed {}; psnr in dB, -a after the best gain",
+        sensor.name, demo.ppp, demo.seed
     );
-    report.result(&text, || json!({"picture": path, "seed": demo.seed, "figures": figures}))
+    let png = std::fs::read(&path).map_err(|e| SimError::io("read", &path, e))?;
+    PendingFile::write_whole(&page, html(&png, &shown, &foot).as_bytes(), overwrite)?;
+    let figures = shown.iter().map(|s| {
+        json!({"method": s.name, "psnr_a": s.psnr_a, "psnr": s.psnr, "ssim": s.ssim, "seconds": s.seconds})
+    });
+    let text = format!("{text}\n{}   {foot}\n{}\n", path.display(), page.display());
+    report.result(&text, || {
+        json!({"picture": path, "page": page, "seed": demo.seed, "figures": figures.collect::<Vec<_>>()})
+    })
+}
+
+fn render(bar: &mut Bar) -> Vec<Frame> {
+    let scene = built_in_scene();
+    let frames = (0..FRAMES).map(|t| {
+        bar.update("rendering", t as u64 + 1, Some(FRAMES as u64));
+        scene.render(t as f64)
+    });
+    frames.collect()
 }
 
 /// A turning and panning chart behind two lines of text that pass it in opposite directions.
@@ -119,70 +143,118 @@ fn built_in_scene() -> Scene {
     chart
 }
 
-/// Inverts the mean response of the sensor, dark counts subtracted.
-struct Estimator {
-    law: CountLaw,
-    full_scale: f64,
-    dark: f64,
-    /// Electrons per unit of image value.
-    electrons: f64,
-}
-
-impl Estimator {
-    fn new(sensor: &Sensor, gain: f64, photons_per_value: f64) -> Result<Self> {
-        Ok(Self {
-            law: CountLaw::new(sensor, gain),
-            full_scale: f64::from(sensor.max_count()),
-            dark: sensor.dark_per_frame()?,
-            electrons: sensor.quantum_efficiency * photons_per_value,
-        })
+fn light(demo: &Demo, sensor: &Sensor, truths: &[Frame]) -> Result<Light> {
+    let mut clip = ClipStatistics::default();
+    for frame in truths {
+        clip.add(&frame.data);
     }
-
-    /// Image values from mean counts over `frames` frames.
-    fn restore(&self, mean_counts: &Frame, frames: u32) -> Frame {
-        // One table entry per possible mean of whole counts, and the fractions of warped ones.
-        let steps = (self.full_scale as usize * frames as usize * 4).clamp(64, 4096);
-        let value = |step: usize| {
-            let mean = self.full_scale * step as f64 / steps as f64;
-            let photons = self.law.detections_for_mean(mean) - self.dark;
-            (photons / self.electrons).clamp(0.0, 2.0) as f32
-        };
-        let table: Vec<f32> = (0..=steps).map(value).collect();
-        let data = mean_counts.data.iter().map(|&c| {
-            let position = (f64::from(c) / self.full_scale * steps as f64).clamp(0.0, steps as f64);
-            table[position.round() as usize]
-        });
-        Frame { size: mean_counts.size, data: data.collect() }
-    }
+    let dark = sensor.dark_per_frame()?;
+    Ok(resolve_light(sensor, PppDefinition::Incident, demo.ppp, None, &clip, dark)?)
 }
 
-fn as_frame(counts: &[u16]) -> Frame {
-    Frame { size: SIZE, data: counts.iter().map(|&c| f32::from(c)).collect() }
-}
-
-fn mean(frames: &[Frame]) -> Frame {
-    let at = |i: usize| frames.iter().map(|f| f.data[i]).sum::<f32>() / frames.len() as f32;
-    Frame { size: SIZE, data: (0..SIZE.pixels()).map(at).collect() }
-}
-
-/// Mean over the frames in which a surface of the centre frame is visible, each looked up where
-/// that surface is.
-fn aligned_mean(scene: &Scene, frames: &[Frame]) -> Frame {
-    let mut sum = vec![0.0f32; SIZE.pixels()];
-    let mut seen = vec![0.0f32; SIZE.pixels()];
-    for (t, frame) in frames.iter().enumerate() {
-        let flow = scene.flow(CENTRE as f64, t as f64);
-        for i in (0..sum.len()).filter(|&i| flow.visible[i]) {
-            let (x, y) = ((i % SIZE.width) as f64, (i / SIZE.width) as f64);
-            sum[i] += frame.bilinear(x + f64::from(flow.dx[i]), y + f64::from(flow.dy[i]));
-            seen[i] += 1.0;
+/// How the centre frame of `result` varies where the photons are drawn again, as if it were the truth: what a
+/// capture without truth can tell of its errors (Efron 1979, the parametric bootstrap).
+fn redrawn(
+    method: &mut dyn Restorer,
+    result: &[Frame],
+    context: &Context,
+    bar: &mut Bar,
+) -> Result<Frame> {
+    let light = Light { ppp: context.ppp, exposure: context.exposure };
+    let mut sums = vec![[0.0f32; 2]; SIZE.pixels()];
+    for draw in 1..=REDRAWN {
+        let mut camera = Camera::new(&context.sensor, SIZE, light, context.seed)?;
+        let mut burst = Vec::with_capacity(FRAMES);
+        for (t, frame) in (draw * FRAMES as u64..).zip(result) {
+            burst.push(camera.expose(t, &[frame])?);
         }
+        let view = BurstView { size: SIZE, frames: &burst };
+        let again = method.restore(view, context)?.frames;
+        for (sum, value) in sums.iter_mut().zip(&again[CENTRE].data) {
+            *sum = [sum[0] + value, sum[1] + value * value];
+        }
+        bar.update("drawing photons again", draw, Some(REDRAWN));
+        stop_if_asked()?;
     }
-    Frame { size: SIZE, data: sum.iter().zip(&seen).map(|(s, n)| s / n.max(1.0)).collect() }
+    let n = REDRAWN as f32;
+    let deviation =
+        |[sum, squares]: &[f32; 2]| ((squares - sum * sum / n).max(0.0) / (n - 1.0)).sqrt();
+    Ok(Frame { size: SIZE, data: sums.iter().map(deviation).collect() })
+}
+
+fn stop_if_asked() -> Result<()> {
+    if interrupt::check().is_break() {
+        return Err(SimError::Interrupted.into());
+    }
+    Ok(())
+}
+
+fn picture(
+    shown: &[Shown],
+    burst: &[Vec<u16>],
+    deviation: &Frame,
+    truth: &Frame,
+    sensor: &Sensor,
+    ppp: f64,
+) -> Picture {
+    let mut picture = Picture::new(SIZE, 2, shown.len() + 2, 2);
+    let full_scale = f32::from(sensor.max_count());
+    let scaled = |data: Vec<f32>| Frame { size: SIZE, data };
+    let counts =
+        |frame: usize| scaled(burst[frame].iter().map(|&c| f32::from(c) / full_scale).collect());
+    picture.place(0, 0, &["COUNTS", &format!("{} BIT", sensor.output_bits())], &counts(CENTRE));
+    picture.place(1, 0, &["COUNTS", "LAST OF 11"], &counts(FRAMES - 1));
+    for (column, method) in (1..).zip(shown) {
+        let error = error_map(&method.frame, truth);
+        let error_rms = format!("RMS {:.3}", rms(&error) / f64::from(ERROR_GAIN));
+        picture.place(
+            0,
+            column,
+            &[method.label, &format!("{:.1} DB", method.psnr_a)],
+            &aligned(&method.frame, truth),
+        );
+        picture.place(1, column, &["ERROR X4", &error_rms], &error);
+    }
+    let last = shown.len() + 1;
+    picture.place(0, last, &["TRUTH", &format!("{ppp} PPP")], truth);
+    let spread = format!("RMS {:.3}", rms(deviation));
+    let deviation = scaled(deviation.data.iter().map(|d| d * ERROR_GAIN).collect());
+    picture.place(1, last, &["UNCERTAINTY X4", &spread], &deviation);
+    picture
+}
+
+fn text(shown: &[Shown], deviation: &Frame, truth: &Frame) -> String {
+    let mut text = format!(
+        "{:<14}{:>9}{:>9}{:>8}{:>10}\n",
+        "centre frame", "psnr-a", "psnr", "ssim", "seconds"
+    );
+    for Shown { name, psnr_a, psnr, ssim, seconds, .. } in shown {
+        let _ = writeln!(text, "{name:<14}{psnr_a:>9.2}{psnr:>9.2}{ssim:>8.3}{seconds:>10.2}");
+    }
+    if let Some(method) = shown.last() {
+        let error = rms(&error_map(&method.frame, truth)) / f64::from(ERROR_GAIN);
+        let _ = writeln!(
+            text,
+            "\n{} errs by {error:.3}; where photons are drawn again from its result, it varies by {:.3}",
+            method.name,
+            rms(deviation)
+        );
+    }
+    text
+}
+
+fn rms(frame: &Frame) -> f64 {
+    let squares: f64 = frame.data.iter().map(|&e| f64::from(e) * f64::from(e)).sum();
+    (squares / frame.data.len() as f64).sqrt()
+}
+
+/// At the truth's brightness, which counts do not tell.
+fn aligned(frame: &Frame, truth: &Frame) -> Frame {
+    let gain = best_gain(frame, truth) as f32;
+    Frame { size: SIZE, data: frame.data.iter().map(|e| (e * gain).clamp(0.0, 1.0)).collect() }
 }
 
 fn error_map(frame: &Frame, truth: &Frame) -> Frame {
-    let gain = best_gain(frame, truth) as f32;
-    let error = |(e, t): (&f32, &f32)| ERROR_GAIN * ((e * gain).clamp(0.0, 1.0) - t).abs();
-    Frame { size: SIZE, data: frame.data.iter().zip(&truth.data).map(error).collect() }
+    let pairs = aligned(frame, truth).data.into_iter().zip(&truth.data);
+    Frame { size: SIZE, data: pairs.map(|(e, t)| ERROR_GAIN * (e - t).abs()).collect() }
 }

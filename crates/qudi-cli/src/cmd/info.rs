@@ -4,8 +4,8 @@ use crate::args::{Global, Info};
 use crate::cmd::{capture_info, convert};
 use crate::error::{Fault, Result};
 use crate::report::Report;
+use crate::weights::Weights;
 use burn::tensor::Device;
-use qudi_model::checkpoint::describe;
 use qudi_sim::record::Described;
 use qudi_sim::sensor::{PRESETS, Response, Sensor, preset};
 use serde_json::{Value, json};
@@ -28,7 +28,7 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
     let transforms = path.file_name().is_some_and(|name| name == "transforms.json");
     match extension.as_deref() {
         Some("toml") => sensor(subject, report),
-        Some("safetensors") if path.is_file() => weights(path, report),
+        Some("safetensors") if path.is_file() => weights(&Weights::File(path.to_owned()), report),
         Some("json") if path.is_file() && !transforms => burst(path, report),
         _ if path.exists() => {
             let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
@@ -38,6 +38,7 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
             capture_info::run(path, record.as_ref(), info, global, report)
         }
         _ if preset(subject).is_some() => sensor(subject, report),
+        _ if subject == "weights" => weights(&Weights::BuiltIn, report),
         _ => Err(Fault::new(
             format!("there is no file and no sensor named `{subject}`"),
             subject,
@@ -75,8 +76,8 @@ fn sensors(report: &Report) -> Result<()> {
 }
 
 /// A weight file, as it describes itself.
-fn weights(path: &Path, report: &Report) -> Result<()> {
-    let d = describe(path)?;
+fn weights(weights: &Weights, report: &Report) -> Result<()> {
+    let d = weights.describe()?;
     let mut text = String::new();
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "{key:<11}{value}");
@@ -92,7 +93,8 @@ fn weights(path: &Path, report: &Report) -> Result<()> {
         d.program.clone() + &d.commit.map_or(String::new(), |c| format!(", commit {c}")),
     );
     line("licence", d.licence.clone());
-    report.result(&text, || json!(describe(path).ok()))
+    line("sha-256", weights.sha256()?);
+    report.result(&text, || json!(weights.describe().ok()))
 }
 
 fn sensor(name: &str, report: &Report) -> Result<()> {

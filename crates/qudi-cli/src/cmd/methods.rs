@@ -3,13 +3,14 @@
 use crate::args::Network;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
-use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise};
+use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
+use qudi_model::restorer::FEWEST_FRAMES;
 use qudi_sim::capture::Capture;
 use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer};
 
 /// All methods.
 pub(crate) const METHODS: &[&str] =
-    &["average", "mle", "transform-denoise", "bm3d", "qbp", "qbp-bm3d", "qudi"];
+    &["average", "mle", "transform-denoise", "bm3d", "qbp", "qbp-bm3d", "guide", "qudi"];
 
 /// Windows of a clip that a method's settings are chosen on.
 const SAMPLES: u64 = 4;
@@ -36,12 +37,31 @@ pub(crate) fn method(
         }
         "qbp" => Ok((Box::new(Qbp::new(Finish::Plain)), String::new())),
         "qbp-bm3d" => Ok((Box::new(Qbp::new(Finish::Bm3d)), String::new())),
+        "guide" => Ok((Box::new(TwoRounds), String::new())),
         other => Err(Fault::new(
             format!("no method named `{other}`"),
             "--method",
             format!("there are {}", METHODS.join(", ")),
         )),
     }
+}
+
+/// The method of those who name none: the best that knows what to do with this capture.
+pub(crate) fn usual_method(
+    options: &Network,
+    capture: &Capture,
+    context: &Context,
+) -> Result<&'static str> {
+    let long_enough = capture.length().is_none_or(|frames| frames >= FEWEST_FRAMES as u64);
+    Ok(if options.weights.is_some() {
+        "qudi"
+    } else if context.sensor.dark_per_frame().is_err() {
+        "mle"
+    } else if long_enough && network::built_in_knows(context)? {
+        "qudi"
+    } else {
+        "guide"
+    })
 }
 
 fn over(frames: usize) -> String {

@@ -4,7 +4,8 @@ use crate::args::{Network, SamplerName};
 use crate::device;
 use crate::error::{Fault, Result};
 use crate::memory::available_bytes;
-use qudi_model::checkpoint::{self, Description};
+use crate::weights::Weights;
+use qudi_model::checkpoint::Description;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
 use qudi_model::sampler::Sampler;
 use qudi_sim::Size;
@@ -20,15 +21,8 @@ pub(crate) fn restorer(
     context: &Context,
     size: Size,
 ) -> Result<(Box<dyn Restorer>, String)> {
-    let Some(path) = &options.weights else {
-        return Err(Fault::new(
-            "the network needs weights",
-            "--weights",
-            "name a file that `qudi train` wrote, or use another --method",
-        ));
-    };
     let device = device::open(&options.device)?;
-    let (network, description) = checkpoint::load(path, &device.device)?;
+    let (network, description) = options.weights().load(&device.device)?;
     check(&description, context)?;
     if matches!(device.name.as_str(), "cpu" | "ndarray") {
         check_memory(&description, options.tile, size, available_bytes())?;
@@ -109,6 +103,11 @@ fn is_like(sensor: &Sensor, trained: &str) -> bool {
     }
     let ratio = f64::from(sensor.max_count()) / f64::from(known.max_count());
     known.response == sensor.response && (0.25..=4.0).contains(&ratio)
+}
+
+/// Whether the weights that come along were trained for such a capture.
+pub(crate) fn built_in_knows(context: &Context) -> Result<bool> {
+    Ok(check(&Weights::BuiltIn.describe()?, context).is_ok())
 }
 
 /// Refuses a capture far outside what the weights were trained for.

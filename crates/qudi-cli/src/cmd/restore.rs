@@ -3,7 +3,7 @@
 use crate::args::{Global, Network, Restore};
 use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::cmd::capture_light::{Stated, context};
-use crate::cmd::methods::method;
+use crate::cmd::methods::{method, usual_method};
 use crate::cmd::network::device_failed;
 use crate::cmd::restore_deviation::Deviation;
 use crate::cmd::restore_output::{Misfit, Output};
@@ -56,7 +56,8 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     let part = args.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut misfit = Misfit::new(&job.capture, &job.context);
     let done = output.finished(part.clone());
-    let mut deviation = Deviation::create(args, &job.capture, done, overwrite)?;
+    let mut deviation =
+        Deviation::create(args, job.restorer.name(), &job.capture, done, overwrite)?;
     let rest = part.start + done..part.end;
     if done == 0 {
         job.run(rest, &mut output, Some(&mut misfit), &mut deviation, &args.network, report)?;
@@ -155,7 +156,11 @@ impl Job {
         let stated =
             Stated { ppp: args.ppp, gain: args.gain, exposure: args.exposure, seed: args.seed };
         let (context, source) = context(&stated, &mut capture, &sensor)?;
-        let (restorer, choice) = method(args.method(), &mut capture, &context, &args.network)?;
+        let name = match &args.method {
+            Some(name) => name,
+            None => usual_method(&args.network, &capture, &context)?,
+        };
+        let (restorer, choice) = method(name, &mut capture, &context, &args.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
         let place = if is_pipe(args) {
             capture.path().to_owned()
@@ -174,7 +179,7 @@ impl Job {
             "window": restorer.window(),
             "overlap": args.overlap,
             "seed": args.seed,
-            "network": network_settings(args)?,
+            "network": network_settings(restorer.name(), &args.network)?,
             "ppp": context.ppp,
             "exposure": context.exposure,
             "gain": context.gain,
@@ -218,18 +223,18 @@ impl Job {
 }
 
 /// What the frames depend on besides, where the network makes them.
-fn network_settings(args: &Restore) -> Result<Option<Value>> {
-    let Some(path) = args.network.weights.as_ref().filter(|_| args.method() == "qudi") else {
+fn network_settings(method: &str, options: &Network) -> Result<Option<Value>> {
+    if method != "qudi" {
         return Ok(None);
-    };
-    let bytes = std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
+    }
+    let weights = options.weights();
     Ok(Some(json!({
-        "weights": path,
-        "weights_crc32": format!("{:08x}", crc32fast::hash(&bytes)),
-        "steps": args.network.steps,
-        "sampler": format!("{:?}", args.network.sampler).to_lowercase(),
-        "samples": args.network.samples,
-        "tile": args.network.tile,
+        "weights": weights.to_string(),
+        "weights_sha256": weights.sha256()?,
+        "steps": options.steps,
+        "sampler": format!("{:?}", options.sampler).to_lowercase(),
+        "samples": options.samples,
+        "tile": options.tile,
     })))
 }
 

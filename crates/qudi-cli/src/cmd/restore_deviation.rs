@@ -15,12 +15,13 @@ impl Deviation {
     /// The file that was asked for. `finished` frames were there already; theirs would be missing.
     pub(crate) fn create(
         args: &Restore,
+        method: &str,
         capture: &Capture,
         finished: u64,
         overwrite: Overwrite,
     ) -> Result<Self> {
         let Some(path) = &args.deviation else { return Ok(Self(None)) };
-        if args.method() != "qudi" || args.network.samples < 2 {
+        if method != "qudi" || args.network.samples < 2 {
             return Err(Fault::new(
                 "there is no deviation of one sample",
                 "--deviation",

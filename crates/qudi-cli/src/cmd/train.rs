@@ -7,7 +7,7 @@ use crate::device::{self, Opened};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
-use qudi_model::checkpoint;
+use qudi_model::checkpoint::load;
 use qudi_model::perceptual::fetch;
 use qudi_model::train::{From, RECIPE, Recipe, Run, Validation, WEIGHTS};
 use qudi_sim::dataset::{Pack, write_pack};
@@ -187,7 +187,7 @@ fn initial(
     recipe: &Recipe,
     device: &Opened,
 ) -> Result<Box<qudi_model::network::Qudi>> {
-    let (network, description) = checkpoint::load(path, &device.device)?;
+    let (network, description) = load(path, &device.device)?;
     if description.network != recipe.network {
         return Err(Fault::new(
             "these weights are for a network of other sizes than the recipe's",

@@ -1,7 +1,7 @@
 //! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what steps of Lucas
 //! and Kanade find on every level.
 
-use super::layers::{Bias, CORRECTION, Conv2d};
+use super::layers::{Bias, Conv2d, FLOW_CORRECTION};
 use super::lucas_kanade::lucas_kanade;
 use super::resample::{by_burst, double, halve, rescale_flow, shrink};
 use crate::config::FlowConfig;
@@ -120,7 +120,7 @@ impl Level {
         for layer in first {
             inputs = vec![layer.relu(&inputs)];
         }
-        flow + last.linear(&inputs) * CORRECTION
+        flow + last.linear(&inputs) * FLOW_CORRECTION
     }
 }
 

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use super::attention::Attention;
+use super::evidence::Evidence;
 use super::flow::Flows;
 use super::pre::DenseBlock;
 use super::unet::ResidualBlock;
@@ -156,17 +157,16 @@ fn pre_denoiser() {
         for case in file.cases() {
             let config = config(&case);
             let pre = weighted(config.pre.init(config.fold, &device), "pre");
-            let [y, u, guide, y_sim, u_sim] = ["y", "u", "guide", "y_sim", "u_sim"]
+            let [guide, y_sim, u_sim] = ["guide", "y_sim", "u_sim"]
                 .map(|name| -> Tensor<4> { case.input(name, &device).require_grad() });
-            let frames = y.dims()[0] / 2;
+            let frames = guide.dims()[0] / 2;
             let flag: Tensor<1> = case.input("flag", &device);
             let flag = flag.reshape([2, 1, 1, 1]).repeat_dim(1, frames);
             let flag = flag.reshape([2 * frames, 1, 1, 1]);
             let both = Tensor::cat(vec![y_sim.clone(), u_sim.clone()], 1);
-            let prepared = pre.prepare(Tensor::cat(vec![y.clone(), u.clone(), guide.clone()], 1));
-            let base = guide.clone().narrow(1, 0, 1);
-            let (d, g) = pre.forward(prepared, base, both, flag);
-            let mut inputs = vec![("y", &y), ("u", &u), ("guide", &guide)];
+            let evidence = Evidence::new(&guide);
+            let (d, g) = pre.forward(pre.prepare(&evidence), &evidence, both, flag);
+            let mut inputs = vec![("guide", &guide)];
             if case.name == "with" {
                 inputs.extend([("y_sim", &y_sim), ("u_sim", &u_sim)]);
             }
@@ -266,12 +266,10 @@ fn u_net() {
             let fused = ["fused_0", "fused_1", "fused_2"].map(input);
             let times: Vec<usize> = case.values("t").iter().map(|&t| t as usize).collect();
             let sensor: Tensor<2> = case.input("sensor", &device);
-            let signed = |image: &Tensor<4>| image.clone() * 2.0 - 1.0;
-            let [clean, merged, doubt] = [0, 1, 2].map(|part| guide.clone().narrow(1, part, 1));
-            let planes =
-                [signed(&d), x_t.clone(), x0_prev.clone(), signed(&clean), signed(&merged), doubt];
-            let frames = case.number("frames");
-            let x0 = unet.forward(planes, fused.clone(), &times, unet.prepare(sensor), frames);
+            let (base, images) = (d.clone() * 2.0 - 1.0, [x_t.clone(), x0_prev.clone()]);
+            let (evidence, frames) = (Evidence::new(&guide), case.number("frames"));
+            let sensor = unet.prepare(sensor);
+            let x0 = unet.forward(base, images, &evidence, fused.clone(), &times, sensor, frames);
             let inputs = [
                 ("x_t", &x_t),
                 ("x0_prev", &x0_prev),
@@ -293,10 +291,9 @@ fn whole_network() {
         let case = file.case("tiny");
         let network = fill(config(&case).init(0, &device), parameter);
         let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
-        let [y, u, guide, y_sim, u_sim, x_t, x0_prev] =
-            ["y", "u", "guide", "y_sim", "u_sim", "x_t", "x0_prev"].map(input);
+        let [u, guide, y_sim, u_sim, x_t, x0_prev] =
+            ["u", "guide", "y_sim", "u_sim", "x_t", "x0_prev"].map(input);
         let measured = Measured {
-            y: y.clone(),
             u: u.clone(),
             guide: guide.clone(),
             sensor: case.input("sensor", &device),
@@ -318,7 +315,6 @@ fn whole_network() {
         case.check_output("loss", loss.clone().inner());
         let grads = loss.backward();
         let inputs = [
-            ("y", &y),
             ("u", &u),
             ("guide", &guide),
             ("y_sim", &y_sim),
@@ -370,12 +366,12 @@ fn sampling() {
             let u = counts.iter().map(|&c| table[usize::from(c)]).collect();
             (to_tensor(y, size, &device), to_tensor(u, size, &device))
         };
-        let (y, u) = planes(&file.bytes("counts"), &file.f32s("u_table"));
+        let (_, u) = planes(&file.bytes("counts"), &file.f32s("u_table"));
         let sensor = Tensor::<1>::from_floats(sensor.as_slice(), &device).unsqueeze();
-        let guide = ["clean", "merged", "doubt"];
+        let guide = ["clean", "merged", "noise"];
         let guide = guide.map(|name| to_tensor(file.f32s(name), size, &device));
         let guide = Tensor::cat(guide.into(), 1);
-        let prepared = network.prepare(&Measured { y, u, guide, sensor, frames });
+        let prepared = network.prepare(&Measured { u, guide, sensor, frames });
         let (simulated, tables) = (file.bytes("simulated"), file.f32s("u_sim_table"));
         let count = frames * size.pixels();
         let mut x = cases::gaussian("noise.0", count);

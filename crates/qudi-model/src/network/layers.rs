@@ -5,9 +5,12 @@ use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 
-/// What of a last layer's output corrects an image or a flow. Adam moves all weights by the same amount: the sum of a
-/// whole layer's would jump.
-pub(super) const CORRECTION: f32 = 0.1;
+/// What of a last layer's output corrects a flow, in cells. Adam moves all weights by the same amount: the sum of a whole
+/// layer's would jump.
+pub(super) const FLOW_CORRECTION: f32 = 0.1;
+
+/// What of a last layer's output corrects an image, in deviations of the guide's noise.
+pub(super) const CORRECTION: f32 = 0.3;
 
 /// A convolution of frames one by one.
 #[derive(Module, Debug)]
@@ -77,6 +80,16 @@ impl Conv2d {
             weight: zeros([outputs, inputs, kernel, kernel], device),
             bias: (bias == Bias::Yes).then(|| zeros([outputs], device)),
         }
+    }
+
+    /// Its weights, `[outputs, inputs, rows, columns]`.
+    pub(super) fn weights(&self) -> Tensor<4> {
+        self.weight.val()
+    }
+
+    /// Its biases, `[outputs]`; zeros if it has none.
+    pub(super) fn biases(&self) -> Tensor<1> {
+        bias_or_zeros(self.bias.as_ref(), &self.weight.val())
     }
 
     /// The sum alone. `inputs` are joined by channel, `[images, channels, height, width]`.

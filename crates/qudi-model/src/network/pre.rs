@@ -1,14 +1,14 @@
 //! The pre-denoiser: a residual dense network (Zhang et al. 2018), frame by frame.
 
-use super::layers::CORRECTION;
-use super::layers::{Bias, Conv2d};
+use super::evidence::Evidence;
+use super::layers::{Bias, CORRECTION, Conv2d};
 use super::resample::{fold, unfold};
 use crate::config::PreConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-/// Planes that do not depend on the step: counts, linear estimate, the guide's three.
-const MEASURED: usize = 5;
+/// Planes of the guide.
+const PLANES: usize = 4;
 
 /// Dense layers of a block.
 const LAYERS: usize = 3;
@@ -59,7 +59,7 @@ impl PreConfig {
         let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
         let block = |_| DenseBlock::zeros(width, self.growth, device);
         PreDenoiser {
-            static_in: conv([MEASURED * planes, width], 3, Bias::Yes),
+            static_in: conv([PLANES * planes, width], 3, Bias::Yes),
             simulated_in: conv([2 * planes + 1, width], 3, Bias::No),
             blocks: (0..self.blocks).map(block).collect(),
             gather: conv([self.blocks * width, width], 1, Bias::Yes),
@@ -71,18 +71,20 @@ impl PreConfig {
 }
 
 impl PreDenoiser {
-    /// What does not depend on the step: `[images, width, h, w]` of `seen`, `[images, 5, H, W]`: `y`, `u` and the guide.
-    pub fn prepare(&self, seen: Tensor<4>) -> Tensor<4> {
-        self.static_in.linear(&[fold(seen, self.fold)])
+    /// What does not depend on the step: `[images, width, h, w]`.
+    pub(super) fn prepare(&self, evidence: &Evidence) -> Tensor<4> {
+        let Evidence { difference, contrast, level, .. } = evidence.clone();
+        let planes = Tensor::cat(vec![difference, contrast, evidence.signed(), level], 1);
+        self.static_in.linear(&[fold(planes, self.fold)])
     }
 
     /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.
-    /// `prepared` as from [`Self::prepare`]; `base` is what is corrected, in image units; `simulated` are `y_sim` and
-    /// `u_sim`, `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
-    pub fn forward(
+    /// `prepared` as from [`Self::prepare`] of the same `evidence`, whose restored image is corrected; `simulated` are
+    /// `y_sim` and `u_sim`, `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
+    pub(super) fn forward(
         &self,
         prepared: Tensor<4>,
-        base: Tensor<4>,
+        evidence: &Evidence,
         simulated: Tensor<4>,
         flag: Tensor<4>,
     ) -> (Tensor<4>, Tensor<4>) {
@@ -97,6 +99,7 @@ impl PreDenoiser {
         }
         let features = self.spread.add(&[self.gather.linear(&outputs)], shallow);
         let correction = unfold(self.out.linear(std::slice::from_ref(&features)), self.fold);
-        (base + correction * CORRECTION, features)
+        let correction = correction * evidence.deviation.clone() * CORRECTION;
+        (evidence.clean.clone() + correction, features)
     }
 }

@@ -1,5 +1,6 @@
 //! The whole network: pre-denoiser, features, flow, fusion, U-Net.
 
+use super::evidence::Evidence;
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
@@ -9,16 +10,15 @@ use super::variance::mean_variance;
 use crate::config::{NetworkConfig, Part};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
+use qudi_sim::Result;
 
 /// What was measured, `[bursts * frames, 1, height, width]`.
 #[derive(Clone, Debug)]
 pub struct Measured {
-    /// Counts over full scale.
-    pub y: Tensor<4>,
     /// The linear estimate in image units.
     pub u: Tensor<4>,
-    /// What classical methods make of it, `[bursts * frames, 3, height, width]`: the restored image and the merely merged
-    /// one, in image units, and the deviation of the latter's noise in that of one frame's.
+    /// What classical methods make of it, `[bursts * frames, 3, height, width]`: the restored image, the merely merged
+    /// one and the deviation of the latter's noise, in image units.
     pub guide: Tensor<4>,
     /// Numbers of sensor and light, `[bursts, 11]`.
     pub sensor: Tensor<2>,
@@ -55,8 +55,7 @@ pub struct Prepared {
     low: Tensor<4>,
     sensor: Tensor<2>,
     u: Tensor<4>,
-    /// The restored, the merged image and the deviation of its noise.
-    guide: [Tensor<4>; 3],
+    evidence: Evidence,
     /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`.
     variance: Tensor<4>,
     frames: usize,
@@ -106,16 +105,24 @@ impl NetworkConfig {
 }
 
 impl Qudi {
+    /// Whether the picture depends on the noise that sampling starts from. It does not where only the pre-denoiser has
+    /// learnt: the U-Net's correction starts at zero.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if the device fails.
+    pub fn generates(&self) -> Result<bool> {
+        self.unet.corrects()
+    }
+
     /// Computes what does not depend on the step.
     pub fn prepare(&self, measured: &Measured) -> Prepared {
-        let (y, u) = (measured.y.clone(), measured.u.clone());
-        let part = |place| measured.guide.clone().narrow(1, place, 1);
-        let seen = Tensor::cat(vec![y, u.clone(), measured.guide.clone()], 1);
+        let u = measured.u.clone();
+        let evidence = Evidence::new(&measured.guide);
         Prepared {
-            pre: self.pre.prepare(seen),
+            pre: self.pre.prepare(&evidence),
             low: self.low.prepare(u.clone(), measured.frames),
             sensor: self.unet.prepare(measured.sensor.clone()),
-            guide: [part(0), part(1), part(2)],
+            evidence,
             variance: mean_variance(&measured.sensor, measured.frames),
             u,
             frames: measured.frames,
@@ -133,40 +140,48 @@ impl Qudi {
         self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
     }
 
+    /// The pre-denoised frames alone, before any simulated measurement.
+    pub fn denoise(&self, measured: &Measured) -> Tensor<4> {
+        let evidence = Evidence::new(&measured.guide);
+        self.pre_denoise(&self.pre.prepare(&evidence), &evidence, measured.frames, None).0
+    }
+
     /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.
     /// No gradient goes from the flows to the frames.
     pub fn denoise_and_align(&self, prepared: &Prepared) -> (Tensor<4>, Flows) {
-        let (d, _) = self.pre_denoise(prepared, None);
+        let Prepared { pre, evidence, frames, .. } = prepared;
+        let (d, _) = self.pre_denoise(pre, evidence, *frames, None);
         let flows = self.estimate_flow(prepared, d.clone().detach());
         (d, flows)
     }
 
     fn estimate_flow(&self, prepared: &Prepared, d: Tensor<4>) -> Flows {
-        let [clean, ..] = prepared.guide.clone();
+        let clean = prepared.evidence.clean.clone();
         self.flow.forward(d, clean, prepared.variance.clone(), prepared.frames)
     }
 
     /// The pre-denoised frames and their features.
     fn pre_denoise(
         &self,
-        prepared: &Prepared,
+        prepared: &Tensor<4>,
+        evidence: &Evidence,
+        frames: usize,
         simulated: Option<&Simulated>,
     ) -> (Tensor<4>, Tensor<4>) {
-        let (frames, u) = (prepared.frames, &prepared.u);
-        let bursts = u.dims()[0] / frames;
+        let clean = &evidence.clean;
+        let bursts = clean.dims()[0] / frames;
         let (y_sim, u_sim, flags) = match simulated {
             Some(simulated) => {
                 let flags = simulated.exists.iter().map(|&exists| f32::from(u8::from(exists)));
                 (simulated.y.clone(), simulated.u.clone(), flags.collect())
             }
-            None => (u.zeros_like(), u.zeros_like(), vec![0.0; bursts]),
+            None => (clean.zeros_like(), clean.zeros_like(), vec![0.0; bursts]),
         };
         let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
-        let flag = Tensor::<4>::from_data(flags, &u.device()).repeat_dim(1, frames);
+        let flag = Tensor::<4>::from_data(flags, &clean.device()).repeat_dim(1, frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim], 1);
-        let [clean, ..] = prepared.guide.clone();
-        self.pre.forward(prepared.pre.clone(), clean, both, flag)
+        self.pre.forward(prepared.clone(), evidence, both, flag)
     }
 
     /// [`Self::forward`], telling `done` the name of every block that is done.
@@ -181,7 +196,7 @@ impl Qudi {
         let frames = prepared.frames;
         let u = prepared.u.clone();
         let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
-        let (d, features) = self.pre_denoise(prepared, simulated);
+        let (d, features) = self.pre_denoise(&prepared.pre, &prepared.evidence, frames, simulated);
         done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
         done("low");
@@ -191,12 +206,10 @@ impl Qudi {
         done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
-        let signed = |image: Tensor<4>| image * 2.0 - 1.0;
-        let [clean, merged, doubt] = prepared.guide.clone();
-        let (x_t, x0_prev) = (state.x_t.clone(), state.x0_prev.clone());
-        let planes = [signed(d.clone()), x_t, x0_prev, signed(clean), signed(merged), doubt];
+        let images = [state.x_t.clone(), state.x0_prev.clone()];
+        let (base, evidence) = (d.clone() * 2.0 - 1.0, &prepared.evidence);
         let sensor = prepared.sensor.clone();
-        let x0 = self.unet.forward(planes, fused, &state.times, sensor, frames);
+        let x0 = self.unet.forward(base, images, evidence, fused, &state.times, sensor, frames);
         done("unet");
         Prediction { x0, d, flows }
     }

@@ -2,16 +2,19 @@
 
 use super::attention::Attention;
 use super::embedding::{SENSOR_NUMBERS, sinusoids};
+use super::evidence::Evidence;
 use super::features::Pyramid;
 use super::layers::{Bias, CORRECTION, Conv2d, GroupNorm, Linear};
 use super::resample::{fold, repeat, unfold};
 use crate::config::{FusionConfig, UNetConfig};
+use crate::tensor::read;
 use burn::module::Module;
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor, TensorData};
+use qudi_sim::Result;
 
 /// Images that the U-Net sees besides the fused features.
-pub(super) const PLANES: usize = 6;
+const PLANES: usize = 6;
 
 /// Two convolutions with norms, steered by the embedding.
 #[derive(Module, Debug)]
@@ -154,6 +157,13 @@ impl UNetConfig {
 }
 
 impl UNet {
+    /// Whether it changes anything: not before it has learnt.
+    pub(super) fn corrects(&self) -> Result<bool> {
+        let mut weights = read(self.out.weights())?;
+        weights.extend(read(self.out.biases())?);
+        Ok(weights.iter().any(|&weight| weight != 0.0))
+    }
+
     /// The sensor's part of the embedding, `[bursts, M]`; does not depend on the step.
     pub fn prepare(&self, sensor: Tensor<2>) -> Tensor<2> {
         self.sensor_out.forward(silu(self.sensor_in.forward(sensor)))
@@ -167,19 +177,23 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// The prediction, `[images, 1, H, W]` in [-1, 1]. `planes` are `2d - 1`, which is corrected,
-    /// `x_t`, `x0_prev`, the guide's images, `2c - 1` and `2m - 1`, and the deviation of its noise, each `[images, 1, H, W]`; `times` one number for each burst; `sensor` as from [`Self::prepare`].
-    pub fn forward(
+    /// The prediction, `[images, 1, H, W]` in [-1, 1]: `base`, corrected. `x_t`, `x0_prev` and `base`, the pre-denoised
+    /// image, are in [-1, 1], too; `times` one number for each burst; `sensor` as from [`Self::prepare`].
+    #[allow(clippy::too_many_arguments)] // one for every box of docs/network.md that leads here
+    pub(super) fn forward(
         &self,
-        planes: [Tensor<4>; PLANES],
+        base: Tensor<4>,
+        [x_t, x0_prev]: [Tensor<4>; 2],
+        evidence: &Evidence,
         fused: Pyramid,
         times: &[usize],
         sensor: Tensor<2>,
         frames: usize,
     ) -> Tensor<4> {
         let embedding = silu(self.embed(times, sensor));
-        let base = planes[0].clone();
-        let mut x = self.inp.linear(&[fold(Tensor::cat(planes.into(), 1), self.fold)]);
+        let Evidence { difference, level, .. } = evidence.clone();
+        let planes = vec![base.clone(), x_t, x0_prev, evidence.signed(), difference, level];
+        let mut x = self.inp.linear(&[fold(Tensor::cat(planes, 1), self.fold)]);
         let mut skips = Vec::new();
         let mut fused = fused.into_iter();
         for (k, level) in self.encoder.iter().enumerate() {
@@ -209,6 +223,8 @@ impl UNet {
                 x = self.up[k - 1].linear(&[repeat(x)]);
             }
         }
-        base + unfold(self.out.linear(&[self.norm.silu(x)]), self.fold) * CORRECTION
+        let correction = unfold(self.out.linear(&[self.norm.silu(x)]), self.fold);
+        // A deviation spans twice as much in [-1, 1].
+        base + correction * evidence.deviation.clone() * (2.0 * CORRECTION)
     }
 }

@@ -1,16 +1,15 @@
 //! Samples as planes, noise and times, ready to go to a device.
 
+use super::bursts::{Bursts, Guided};
 use super::recipe::Recipe;
-use crate::config::Part;
 use crate::measurement::{GuidePlanes, Planes, sensor_numbers};
 use crate::network::{Measured, SENSOR_NUMBERS};
 use crate::noise::Noise;
 use crate::objective::{Example, training_time};
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_sim::dataset::Dataset;
 use qudi_sim::restore::{BurstView, Context};
-use qudi_sim::{Result, Size, USUAL_EXPOSURE};
+use qudi_sim::{Result, Size};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
@@ -21,7 +20,7 @@ pub struct Batch {
     pub number: u64,
     size: Size,
     frames: usize,
-    planes: Planes,
+    u: Vec<f32>,
     guide: GuidePlanes,
     truth: Vec<f32>,
     noise: Vec<f32>,
@@ -35,15 +34,15 @@ impl Batch {
     ///
     /// # Errors
     /// [`qudi_sim::SimError`] if the data cannot be read.
-    pub fn draw(recipe: &Recipe, dataset: &mut Dataset, number: u64) -> Result<Self> {
-        let (seed, count) = (recipe.train.seed, recipe.train.batch);
-        let size = Size { height: recipe.data.crop, width: recipe.data.crop };
-        let frames = recipe.data.frames;
+    pub fn draw(recipe: &Recipe, bursts: &mut Bursts, number: u64) -> Result<Self> {
+        let count = recipe.train.batch;
+        let (frames, side) = recipe.sample_size();
+        let size = Size { height: side, width: side };
         let mut batch = Self {
             number,
             size,
             frames,
-            planes: Planes { y: Vec::new(), u: Vec::new() },
+            u: Vec::new(),
             guide: GuidePlanes::default(),
             truth: Vec::new(),
             noise: Vec::new(),
@@ -52,15 +51,10 @@ impl Batch {
             times: Vec::new(),
         };
         for sample in (number * count as u64..).take(count) {
-            let mut drawn = dataset.sample(seed, sample)?;
-            if recipe.network.lacks(Part::Exposure) {
-                drawn.context.exposure = USUAL_EXPOSURE;
-            }
+            let Guided { sample: drawn, guide, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
-            let planes = Planes::of(view, &drawn.context);
-            batch.planes.y.extend(planes.y);
-            batch.planes.u.extend(planes.u);
-            batch.guide.extend(GuidePlanes::of(view, &drawn.context)?);
+            batch.u.extend(Planes::of(view, &drawn.context).u);
+            batch.guide.extend(guide);
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
             let noise = Noise::new(drawn.context.seed, 0);
             let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
@@ -88,8 +82,7 @@ impl Batch {
     pub(super) fn measured(&self, device: &Device) -> Measured {
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
         Measured {
-            y: to_tensor(self.planes.y.clone(), self.size, device),
-            u: to_tensor(self.planes.u.clone(), self.size, device),
+            u: to_tensor(self.u.clone(), self.size, device),
             guide: self.guide.to_tensor(self.size, device),
             sensor: Tensor::from_data(numbers, device),
             frames: self.frames,
@@ -98,7 +91,7 @@ impl Batch {
 
     /// The batch as an example of the objective, on the device of `measured`.
     pub(super) fn example<'a>(&'a self, measured: &'a Measured) -> Example<'a> {
-        let device = measured.y.device();
+        let device = measured.u.device();
         Example {
             measured,
             truth: to_tensor(self.truth.clone(), self.size, &device),

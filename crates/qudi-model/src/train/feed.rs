@@ -1,8 +1,8 @@
 //! Batches drawn ahead on threads of their own, in order.
 
 use super::batch::Batch;
+use super::bursts::Bursts;
 use super::recipe::Recipe;
-use qudi_sim::dataset::Dataset;
 use qudi_sim::{Result, SimError};
 use std::sync::mpsc::{Receiver, sync_channel};
 
@@ -21,15 +21,15 @@ impl Feed {
     ///
     /// # Errors
     /// [`SimError`] if the data cannot be opened.
-    pub fn new(recipe: &Recipe, dataset: &Dataset, first: u64, workers: usize) -> Result<Self> {
+    pub fn new(recipe: &Recipe, bursts: &Bursts, first: u64, workers: usize) -> Result<Self> {
         let count = workers.max(1) as u64;
         let start = |worker: u64| {
             let (sender, receiver) = sync_channel(AHEAD);
-            let (recipe, mut dataset) = (recipe.clone(), dataset.again()?);
+            let (recipe, mut bursts) = (recipe.clone(), bursts.again()?);
             let work = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.
                 let mut number = first + worker;
-                while sender.send(Batch::draw(&recipe, &mut dataset, number)).is_ok() {
+                while sender.send(Batch::draw(&recipe, &mut bursts, number)).is_ok() {
                     number += count;
                 }
             };

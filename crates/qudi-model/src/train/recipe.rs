@@ -35,6 +35,9 @@ pub struct TrainConfig {
     pub steps: u64,
     /// Samples that go through the network at once.
     pub batch: usize,
+    /// Parts of bursts to learn from; whole ones if there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parts: Option<PartsConfig>,
     /// Batches whose gradients make one step.
     pub accumulate: usize,
     /// Highest learning rate.
@@ -55,6 +58,18 @@ pub struct TrainConfig {
     pub loss: LossConfig,
     /// Licence of the weights, an SPDX expression.
     pub licence: String,
+}
+
+/// What samples are cut from: guides of whole bursts, which take long to compute and see no borders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PartsConfig {
+    /// Bursts that are drawn in all and kept in memory; samples come back to them.
+    pub bursts: u64,
+    /// Consecutive frames of a sample.
+    pub frames: usize,
+    /// Side of a sample in pixels.
+    pub side: usize,
 }
 
 /// Weights of the loss's terms.
@@ -133,18 +148,39 @@ impl Recipe {
         toml::to_string(self).expect("plain data")
     }
 
+    /// Frames of a sample, and the side of one.
+    pub fn sample_size(&self) -> (usize, usize) {
+        let whole = (self.data.frames, self.data.crop);
+        self.train.parts.map_or(whole, |parts| (parts.frames, parts.side))
+    }
+
+    /// Whether only the pre-denoiser learns: frame by frame.
+    pub(super) fn learns_frames(&self) -> bool {
+        let loss = &self.train.loss;
+        loss.prediction == 0.0 && loss.flow == 0.0 && loss.term == PerceptualKind::None
+    }
+
     fn checked(self) -> Result<Self> {
-        let network = self.network.checked()?;
-        let data = self.data.checked()?;
+        let network = self.network.clone().checked()?;
+        let data = self.data.clone().checked()?;
         let multiple = network.multiple();
         let train = &self.train;
         let share = |v: f64| (0.0..1.0).contains(&v);
         let weight = |v: f32| v.is_finite() && v >= 0.0;
+        let (frames, side) = self.sample_size();
+        let fewest = if self.learns_frames() { 1 } else { 3 };
         let rules = [
             (
-                "data.crop",
-                data.crop.is_multiple_of(multiple),
+                if train.parts.is_some() { "train.parts.side" } else { "data.crop" },
+                side.is_multiple_of(multiple) && side > 0,
                 "must be a multiple of the network's coarsest cell",
+            ),
+            (
+                "train.parts",
+                (fewest..=data.frames).contains(&frames)
+                    && side <= data.crop
+                    && train.parts.is_none_or(|parts| (1..=1 << 20).contains(&parts.bursts)),
+                "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
             ),
             ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
             ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),

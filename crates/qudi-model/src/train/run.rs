@@ -1,11 +1,12 @@
 //! A training run in a folder: recipe, metrics, weights, state, pictures.
 
+use super::bursts::Bursts;
 use super::feed::Feed;
 use super::recipe::Recipe;
 use super::state;
 use super::trainer::{StepReport, Trainer};
 use super::validate::{Validation, Validator};
-use crate::checkpoint::{Description, save};
+use crate::checkpoint::{Description, Precision, save};
 use crate::config::{NetworkConfig, PRESETS};
 use crate::network::Qudi;
 use burn::tensor::Device;
@@ -42,7 +43,7 @@ pub struct Run {
     folder: PathBuf,
     recipe: Recipe,
     trainer: Trainer,
-    dataset: Dataset,
+    bursts: Bursts,
     validator: Option<Validator>,
     device: Device,
     commit: Option<String>,
@@ -80,7 +81,7 @@ impl Run {
         commit: Option<String>,
     ) -> Result<Self> {
         let validator = Validator::new(recipe, pack.as_ref())?;
-        let dataset = Dataset::new(&recipe.data, pack)?;
+        let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, pack)?);
         let trainer = match from {
             From::Start(network) => {
                 Trainer::new(recipe, network.map(|network| *network), devices, backbones)?
@@ -92,7 +93,7 @@ impl Run {
             recipe: recipe.clone(),
             device: devices[0].clone(),
             trainer,
-            dataset,
+            bursts,
             validator,
             commit,
         };
@@ -123,7 +124,7 @@ impl Run {
         on: &mut dyn FnMut(Event<'_>) -> ControlFlow<()>,
     ) -> Result<()> {
         let train = self.recipe.train.clone();
-        let mut feed = Feed::new(&self.recipe, &self.dataset, self.trainer.batches(), workers)?;
+        let mut feed = Feed::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
         let mut metrics = self.metrics()?;
         while self.trainer.step_number() < train.steps {
             let report = self.trainer.step(&mut feed)?;
@@ -182,7 +183,7 @@ impl Run {
             licence: recipe.train.licence.clone(),
         };
         let path = self.folder.join(WEIGHTS);
-        save(&self.trainer.averaged(), &description, &path, Overwrite::Yes)
+        save(&self.trainer.averaged(), &description, Precision::Single, &path, Overwrite::Yes)
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {

@@ -99,7 +99,8 @@ impl Trainer {
         }
         let start = values(&learner);
         let term = recipe.train.loss.term;
-        let size = Size { height: recipe.data.crop, width: recipe.data.crop };
+        let (_, side) = recipe.sample_size();
+        let size = Size { height: side, width: side };
         let load = |device: &Device| {
             let loaded = Perceptual::load(term, backbones, device)?;
             loaded.check(size)?;

@@ -1,0 +1,43 @@
+//! `qudi publish`: weights in half the space, with the hash that proves them.
+
+use crate::args::{Global, Publish};
+use crate::error::{Fault, Result};
+use crate::report::Report;
+use crate::weights::{Weights, sha256};
+use burn::tensor::Device;
+use qudi_model::checkpoint::{Precision, save};
+use qudi_sim::SimError;
+use qudi_sim::output::{Overwrite, PendingFile};
+use serde_json::json;
+
+pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let path = &args.output;
+    if path.extension() != Some("safetensors".as_ref()) {
+        return Err(Fault::new(
+            "weights are .safetensors",
+            path.display(),
+            "name a .safetensors file",
+        ));
+    }
+    let device = Device::flex();
+    let (network, description) = Weights::File(args.weights.clone()).load(&device)?;
+    save(&network, &description, Precision::Half, path, overwrite)?;
+    let bytes = std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
+    let hash = sha256(&bytes);
+    PendingFile::write_whole(
+        &path.with_extension("sha256"),
+        format!("{hash}\n").as_bytes(),
+        overwrite,
+    )?;
+    let parameters = description.network.parameters(&device);
+    let text = format!(
+        "{}   {parameters} parameters in {} bytes\n  sha-256   {hash}\n",
+        path.display(),
+        bytes.len()
+    );
+    report.result(
+        &text,
+        || json!({"output": path, "parameters": parameters, "bytes": bytes.len(), "sha256": hash}),
+    )
+}
