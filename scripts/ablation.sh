@@ -18,7 +18,7 @@ for part in "$@"; do
     [ "$part" = whole ] || without="[\"$part\"]"
     "$qudi" train "$out/recipe.toml" -o "$out/$part" --pack "$pack" --device cpu --json \
         --set "network.without=$without" --set train.steps="$steps" --set train.rate=4e-3 \
-        --set train.parts='{ bursts = 300, frames = 5, side = 96 }' --set train.batch=2 --set train.loss="$loss" \
+        --set train.parts='{ bursts = 300, kept = 5, frames = 5, side = 96 }' --set train.batch=2 --set train.loss="$loss" \
         --set validation.every="$steps" --set validation.steps=10 >"$out/$part.json"
     printf '%s' "without $part:"
     sed -n 's/.*"ppp": \([0-9.]*\).*/ \1 PPP/p; s/.*"psnr_a": \([0-9.]*\).*/ \1 dB/p' "$out/$part.json" | tr '\n' ' '

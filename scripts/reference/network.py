@@ -121,9 +121,21 @@ def mean_variance(sensor: Tensor, frames: int) -> Tensor:
     return variance.repeat_interleave(frames)[:, None, None, None]
 
 
+def guide_planes(config: dict) -> int:
+    """Channels of a guide: three images, counts of the frame and of its neighbours, expectations of the neighbours."""
+    return 4 + 2 * config["pre"]["neighbours"]
+
+
+def aligned(guide: Tensor) -> Tensor:
+    """Counts and expectations as the pre-denoiser sees them, [B*N, 2 K + 1, H, W]."""
+    neighbours = (guide.shape[1] - 4) // 2
+    seen, expected = guide[:, 3:].split([neighbours + 1, neighbours], 1)
+    return torch.cat([seen.clamp(-8, 8) / 2, torch.asinh(2 * expected)], 1)
+
+
 def evidence(guide: Tensor) -> tuple[Tensor, ...]:
     """Restored image, deviation of the merged one's noise, and what of both the networks see."""
-    clean, merged, noise = guide.split(1, 1)
+    clean, merged, noise = guide[:, :3].split(1, 1)
     deviation = noise.clamp(min=1e-3)
     difference = ((merged - clean) / deviation).clamp(-5, 5) / 2
     contrast = torch.asinh((clean - mean_around(mean_around(clean, 4), 4)) / deviation)
@@ -136,7 +148,7 @@ class PreDenoiser(nn.Module):
         self.fold = config["fold"]
         cells, pre = self.fold**2, config["pre"]
         width = pre["width"]
-        self.static_in = conv(4 * cells, width, 3)
+        self.static_in = conv((guide_planes(config) + 1) * cells, width, 3)
         self.simulated_in = conv(2 * cells + 1, width, 3, bias=False)
         self.blocks = nn.ModuleList(DenseBlock(width, pre["growth"]) for _ in range(pre["blocks"]))
         self.gather = conv(pre["blocks"] * width, width, 1)
@@ -147,7 +159,7 @@ class PreDenoiser(nn.Module):
         self, guide: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
     ) -> tuple[Tensor, Tensor]:
         clean, deviation, difference, contrast, level = evidence(guide)
-        static = F.pixel_unshuffle(torch.cat([difference, contrast, 2 * clean - 1, level], 1), self.fold)
+        static = F.pixel_unshuffle(torch.cat([difference, contrast, 2 * clean - 1, level, aligned(guide)], 1), self.fold)
         simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
         frames = len(guide) // len(flag)
         plane = flag.to(guide).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *static.shape[2:])

@@ -338,7 +338,7 @@ def pre_file() -> File:
     config = network.load("tiny")
     module = network.PreDenoiser(config)
     shape = (6, 1, 12, 20)
-    measured = {"guide": spread((6, 3, 12, 20), *GUIDE)}
+    measured = {"guide": spread((6, network.guide_planes(config), 12, 20), *GUIDE)}
     simulated = {"y_sim": spread(shape, *COUNTS), "u_sim": spread(shape, *LINEAR)}
     for name, flags, absent in (("with", [1, 1], []), ("without", [0, 0], range(6)), ("mixed", [1, 0], range(3, 6))):
         now = {key: spec | {"zero": list(absent)} for key, spec in simulated.items()}
@@ -418,7 +418,7 @@ def unet_file() -> File:
         module = network.UNet(config)
         shape = (6, 1, 16, 24)
         inputs = {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
-        inputs |= {"d": spread(shape, *COUNTS), "guide": spread((6, 3, 16, 24), *GUIDE)}
+        inputs |= {"d": spread(shape, *COUNTS), "guide": spread((6, network.guide_planes(config), 16, 24), *GUIDE)}
         for k, width in enumerate(config["fusion"]["widths"]):
             scale = config["fold"] << k
             inputs[f"fused_{k}"] = spread((6, width, 16 // scale, 24 // scale), 0.5, 0.5)
@@ -440,8 +440,8 @@ def network_file() -> File:
     config = network.load("tiny")
     module = network.Qudi(config)
     shape = (8, 1, 32, 48)
-    # Chosen so that no coordinate of a warp is within 6e-6 of a kink.
-    inputs = {"u": spread(shape, *LINEAR), "guide": spread((8, 3, 32, 48), 0.55, 0.41)}
+    # Chosen so that no coordinate of a warp is within 4e-6 of a kink.
+    inputs = {"u": spread(shape, *LINEAR), "guide": spread((8, network.guide_planes(config), 32, 48), 0.55, 0.65)}
     inputs |= {"y_sim": spread(shape, *COUNTS), "u_sim": spread(shape, *LINEAR), "flag": given([1, 1])}
     inputs |= {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
     inputs |= {"t": given([700, 40]), "truth": spread(shape, 0.5, 0.4)}
@@ -487,9 +487,11 @@ def sample_file(ancestral: bool) -> File:
     y, x = np.mgrid[:SIZE, :SIZE]
     scene = np.stack([0.45 + 0.35 * np.sin((x + 2 * i) / 4) * np.cos(y / 5) for i in range(FRAMES)])[:, None]
     counts = network.expose(rng, scene, PPP, EXPOSURE)
-    # Any guide serves: an estimate, a noisier one, and the deviation of its noise.
+    # Any guide serves: an estimate, a noisier one, the deviation of its noise, and deviations.
     around = lambda noise: (scene + noise * rng.standard_normal(scene.shape)).astype(np.float32)
     guide = [around(0.05), around(0.1), rng.uniform(0.05, 0.15, scene.shape).astype(np.float32)]
+    more = network.guide_planes(config) - len(guide)
+    guide += [rng.standard_normal(scene.shape).astype(np.float32) for _ in range(more)]
     table = network.linear(PPP, EXPOSURE)
     tables = np.stack([network.linear(network.light(PPP, t), EXPOSURE) for t, _ in network.steps(10)[1:]])
     simulated: dict[int, np.ndarray] = {}
@@ -525,8 +527,7 @@ def sample_file(ancestral: bool) -> File:
     for name in ("x", "x0", "x0_last"):
         file.judge("sample", f"output.{name}", single[name], double[name])
         file.tensors[name] = double[name].float().contiguous().clone()
-    for name, plane in zip(("clean", "merged", "noise"), guide):
-        file.tensors[name] = torch.from_numpy(plane[:, 0].copy())
+    file.tensors["guide"] = torch.from_numpy(np.concatenate(guide, 1))
     file.tensors["counts"] = torch.from_numpy(counts[:, 0].copy())
     file.tensors["simulated"] = torch.from_numpy(np.stack([simulated[k][:, 0] for k in range(2, 11)]))
     file.tensors["u_table"], file.tensors["u_sim_table"] = torch.from_numpy(table), torch.from_numpy(tables)

@@ -48,12 +48,12 @@ def times(run: Callable[[], object], rounds: int, warm: int = 1) -> dict:
     return {"median": statistics.median(seconds), "fastest": fastest, "cpu": statistics.median(cpu), "rounds": rounds}
 
 
-def inputs(frames: int, size: int, batch: int) -> dict[str, Tensor]:
+def inputs(config: dict, frames: int, size: int, batch: int) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(1)
     shape = (batch * frames, 1, size, size)
     rand = lambda: torch.rand(shape, generator=generator)
     x = {name: rand() for name in ("u", "y_sim", "u_sim")}
-    x["guide"] = torch.rand((batch * frames, 3, size, size), generator=generator)
+    x["guide"] = torch.rand((batch * frames, network.guide_planes(config), size, size), generator=generator)
     x |= {"flag": torch.ones(batch), "x_t": torch.randn(shape, generator=generator), "x0_prev": 2 * rand() - 1}
     sensor = torch.tensor([network.sensor_numbers(PPP, EXPOSURE)] * batch)
     return x | {"t": torch.tensor([500] * batch), "sensor": sensor}
@@ -106,7 +106,7 @@ def loop(model: network.Qudi, x: dict[str, Tensor], frames: int, flow_steps: lis
         simulating += time.perf_counter() - start
         return y, u
 
-    noise = lambda k: torch.randn(x["y"].shape, generator=generator)
+    noise = lambda k: torch.randn(x["u"].shape, generator=generator)
     start = time.perf_counter()
     run = network.sample(model, x["u"], x["guide"], x["sensor"], frames, flow_steps, noise, measure, ancestral=ancestral)
     steps = len(list(run))
@@ -132,7 +132,7 @@ def main() -> None:
     size = args.size or (128 if args.backward else 256)
     config = network.load(args.preset)
     model = network.Qudi(config)
-    x = inputs(args.frames, size, args.batch)
+    x = inputs(config, args.frames, size, args.batch)
     result = {"preset": args.preset, "threads": args.threads, "size": size, "frames": args.frames}
     result |= {"torch": torch.__version__, "parameters": sum(p.numel() for p in model.parameters())}
     result["base_mib"] = peak_mib()

@@ -5,6 +5,7 @@
 //! Every frame of the window is the reference once. Binary and few-bit counts are treated alike.
 
 mod align;
+mod aligned;
 mod blocks;
 mod cubic;
 mod dft;
@@ -18,6 +19,7 @@ use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
 use crate::transform_denoise::{denoise, image};
 use align::{align, finest_grid, sample};
+pub use aligned::{Aligned, Alignment};
 use blocks::Blocks;
 use cubic::{cubic, squares};
 use dft::SIDE;
@@ -159,6 +161,7 @@ struct Merged {
 }
 
 /// Merges the frames of one window.
+#[derive(Debug)]
 struct Merger {
     /// Size of the window's frames; `frames` may be larger.
     size: Size,
@@ -175,6 +178,7 @@ struct Merger {
 }
 
 /// What an earlier round made of the frames: motion is found in it, and what does not fit.
+#[derive(Debug)]
 struct Pilots {
     /// Mean counts, as large as the frames.
     frames: Vec<Frame>,
@@ -233,31 +237,44 @@ impl Merger {
 
     fn merge(&self, reference: usize) -> Merged {
         let (blocks, flow) = self.flow(reference);
+        self.merge_along(&blocks, &flow)
+    }
+
+    fn merge_along(&self, blocks: &Blocks, flow: &[Vec<[f32; 2]>]) -> Merged {
         let patches: Vec<_> =
-            (0..self.grid.len()).into_par_iter().map(|i| self.patch(i, &blocks, &flow)).collect();
+            (0..self.grid.len()).into_par_iter().map(|i| self.patch(i, blocks, flow)).collect();
+        let noise = patches.iter().map(|(_, noise)| f64::from(*noise)).sum::<f64>();
+        let positive = |mut frame: Frame| {
+            frame.data.iter_mut().for_each(|v| *v = v.max(0.0));
+            frame
+        };
+        Merged {
+            counts: positive(self.blended(|i| patches[i].0)),
+            noise: noise / patches.len() as f64,
+            noises: positive(self.blended(|i| [[patches[i].1; SIDE]; SIDE])),
+        }
+    }
+
+    /// The frame that overlapping patches make, each of which fades out towards its borders.
+    fn blended(&self, patch: impl Fn(usize) -> dft::Patch) -> Frame {
         let mut sum = Frame::filled(self.frames[0].size, 0.0);
-        let (mut weights, mut noises) = (sum.clone(), sum.clone());
+        let mut weights = sum.clone();
         let window: [f32; SIDE] = std::array::from_fn(|k| {
             0.5 - 0.5 * (2.0 * std::f32::consts::PI * (k as f32 + 0.5) / SIDE as f32).cos()
         });
         let width = sum.size.width;
-        for (i, (patch, noise)) in patches.iter().enumerate() {
+        for i in 0..self.grid.len() {
             let [x, y] = self.grid.corner(i);
-            for (r, row) in patch.iter().enumerate() {
+            for (r, row) in patch(i).iter().enumerate() {
                 for (c, value) in row.iter().enumerate() {
                     let weight = window[r] * window[c];
                     let at = (y + r) * width + x + c;
                     sum.data[at] += weight * value;
                     weights.data[at] += weight;
-                    noises.data[at] += weight * noise;
                 }
             }
         }
-        let mean = |of: &Frame| {
-            Frame::from_fn(self.size, |x, y| (of.row(y)[x] / weights.row(y)[x]).max(0.0))
-        };
-        let noise = patches.iter().map(|(_, noise)| f64::from(*noise)).sum::<f64>();
-        Merged { counts: mean(&sum), noise: noise / patches.len() as f64, noises: mean(&noises) }
+        Frame::from_fn(self.size, |x, y| sum.row(y)[x] / weights.row(y)[x])
     }
 
     /// A patch between pixels. Bilinear as in the paper; what pilots have aligned deserves better.

@@ -1,7 +1,9 @@
 //! All methods on moving scenes, on any number of threads, and on input that nobody wants.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use qudi_baselines::{Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds};
+use qudi_baselines::{
+    Aligned, Alignment, Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds,
+};
 use qudi_sim::metrics::gain_aligned_psnr;
 use qudi_sim::restore::{Average, BurstView, Context, Restorer};
 use qudi_sim::scene::{Procedural, ProceduralScene};
@@ -73,14 +75,18 @@ fn the_second_round_beats_the_first() {
         let burst = BurstView { size, frames: &counts };
         let first = Qbp::new(Finish::Bm3d).restore(burst, &context).unwrap().frames;
         let guide = Guide::find(burst, &context).unwrap();
+        let alignment = Alignment::new(burst, &context, &guide).unwrap();
+        let aligned: Vec<Aligned> = (0..truth.len()).map(|frame| alignment.of(frame, 10)).collect();
+        let merged: Vec<Frame> = aligned.iter().map(|aligned| aligned.merged.clone()).collect();
         let [first, second, merged] =
-            [&first, &guide.clean, &guide.merged].map(|frames| mean_psnr(frames, &truth));
+            [&first, &guide.clean, &merged].map(|frames| mean_psnr(frames, &truth));
         println!("{name} at {ppp} PPP: {first:.2} dB, {second:.2} dB, merged {merged:.2} dB");
         assert!(second > first + margin, "{name}: {first} dB, then {second} dB");
         assert!(second > merged, "{name}: BM3D makes {second} dB of {merged} dB");
         // Half of all normal errors are within 0.6745 deviations; ghosts, which no noise explains, are few.
-        let errors = guide.merged.iter().zip(&guide.noise).zip(&truth).flat_map(|((m, s), t)| {
-            let pixels = m.data.iter().zip(&s.data).zip(&t.data);
+        let errors = aligned.iter().zip(&truth).flat_map(|(aligned, truth)| {
+            let Aligned { merged, noise, .. } = aligned;
+            let pixels = merged.data.iter().zip(&noise.data).zip(&truth.data);
             pixels.map(|((m, s), t)| ((m - t) / s).abs()).collect::<Vec<_>>()
         });
         let mut errors: Vec<f32> = errors.collect();
@@ -89,6 +95,36 @@ fn the_second_round_beats_the_first() {
         println!("errors of the merged frames: {deviation:.2} of the stated deviation");
         assert!((0.8..1.4).contains(&deviation), "{name}: {deviation}");
     }
+}
+
+/// Counts of a scene at rest, less what the guide expects of them, are noise of deviation one, the frame's own as much as
+/// its neighbours'; what is expected of these hardly differs. Past the ends of the window there is nothing.
+#[test]
+fn neighbours_are_seen_in_deviations() {
+    let size = Size { height: 48, width: 64 };
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let still =
+        Frame::from_fn(size, |x, y| 0.25 + 0.4 * (x as f32 / 64.0) + 0.2 * (y as f32 / 48.0));
+    let light = Light { ppp: 3.25, exposure: still.mean() };
+    let mut camera = Camera::new(&sensor, size, light, 9).unwrap();
+    let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
+    let context = context(sensor, 3.25);
+    let burst = BurstView { size, frames: &counts };
+    let guide = Guide::find(burst, &context).unwrap();
+    let aligned = Alignment::new(burst, &context, &guide).unwrap().of(2, 8);
+    assert_eq!((aligned.seen.len(), aligned.expected.len()), (9, 8));
+    let deviation = |frame: &Frame| {
+        let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+        (squares / frame.data.len() as f64).sqrt()
+    };
+    let own = deviation(&aligned.seen[0]);
+    assert!((0.9..1.1).contains(&own), "{own}");
+    for (seen, expected) in aligned.seen[1..7].iter().zip(&aligned.expected) {
+        // Between pixels some of the noise averages out.
+        let (seen, expected) = (deviation(seen), deviation(expected));
+        assert!((0.55..1.1).contains(&seen) && expected < 0.2, "{seen}, expected {expected}");
+    }
+    assert!(aligned.seen[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
 }
 
 #[test]

@@ -48,6 +48,8 @@ pub struct PreConfig {
     pub blocks: usize,
     /// Channels that each layer of a block adds.
     pub growth: usize,
+    /// Frames around each that are laid upon it and seen, the nearest ones.
+    pub neighbours: usize,
 }
 
 /// Channels of the spatio-temporal features on three levels.
@@ -159,6 +161,7 @@ impl NetworkConfig {
         let rules = [
             ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
             ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
+            ("pre.neighbours", self.pre.neighbours <= 64, "must be at most 64"),
             ("pre.blocks", (1..=64).contains(&self.pre.blocks), "must be from 1 to 64"),
             ("features", widths(&[self.features.low, self.features.high].concat()), SIZES),
             ("flow.scale", matches!(self.flow.scale, 1 | 2 | 4 | 8), "must be 1, 2, 4 or 8"),

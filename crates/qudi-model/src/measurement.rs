@@ -3,10 +3,11 @@
 use crate::network::SENSOR_NUMBERS;
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
-use qudi_baselines::Guide;
+use qudi_baselines::{Aligned, Alignment, Guide};
 use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::sensor::{CountLaw, Response, Sensor};
-use qudi_sim::{Frame, Result, Size};
+use qudi_sim::{Result, Size};
+use std::ops::Range;
 
 /// Brightest linear estimate, in image units: twice white.
 const BRIGHTEST: f64 = 2.0;
@@ -43,42 +44,72 @@ impl Planes {
     }
 }
 
-/// The classical estimate of a burst that the network goes on from: the restored image, the merely merged one and the
-/// deviation of the latter's noise; in image units, in [0, 2], each frame after frame, row-major.
+/// What classical methods make of a burst, for a network to go on from; frame after frame, row-major. In this order: the
+/// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 2]; the counts of the
+/// frame and of its neighbours laid upon it, and what is expected of the neighbours, in deviations (see
+/// [`Aligned`]).
 #[derive(Clone, Debug, Default)]
-pub struct GuidePlanes(pub(crate) [Vec<f32>; 3]);
+pub struct GuidePlanes(pub(crate) Vec<Vec<f32>>);
+
+/// Planes in image units.
+pub(crate) const IMAGES: usize = 3;
 
 impl GuidePlanes {
+    /// Planes with so many neighbours.
+    pub fn count(neighbours: usize) -> usize {
+        IMAGES + 2 * neighbours + 1
+    }
+
     /// The guide of a captured burst.
     ///
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
-    pub fn of(burst: BurstView<'_>, context: &Context) -> Result<Self> {
-        let Guide { clean, merged, noise } = Guide::find(burst, context)?;
-        let values = |frames: Vec<Frame>| {
-            let values = frames.into_iter().flat_map(|frame| frame.data);
-            values.map(|value| value.min(BRIGHTEST as f32)).collect()
-        };
-        Ok(Self([clean, merged, noise].map(values)))
+    pub fn of(burst: BurstView<'_>, context: &Context, neighbours: usize) -> Result<Self> {
+        Self::of_frames(burst, context, neighbours, 0..burst.frames.len())
+    }
+
+    /// The guide of some frames of a captured burst, found in all of them.
+    pub(crate) fn of_frames(
+        burst: BurstView<'_>,
+        context: &Context,
+        neighbours: usize,
+        frames: Range<usize>,
+    ) -> Result<Self> {
+        let guide = Guide::find(burst, context)?;
+        let alignment = Alignment::new(burst, context, &guide)?;
+        let mut planes = vec![Vec::new(); Self::count(neighbours)];
+        for frame in frames {
+            let clean = guide.clean[frame].clone();
+            let Aligned { merged, noise, seen, expected } = alignment.of(frame, neighbours);
+            let images = [clean, merged, noise].into_iter().map(|mut image| {
+                image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
+                image
+            });
+            for (plane, more) in planes.iter_mut().zip(images.chain(seen).chain(expected)) {
+                plane.extend(more.data);
+            }
+        }
+        Ok(Self(planes))
     }
 
     /// Every plane changed by `f`.
     #[must_use]
     pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {
-        Self(self.0.each_ref().map(|plane| f(plane)))
+        Self(self.0.iter().map(|plane| f(plane)).collect())
     }
 
     /// Appends another burst's.
     pub fn extend(&mut self, more: Self) {
+        self.0.resize(more.0.len(), Vec::new());
         for (plane, more) in self.0.iter_mut().zip(more.0) {
             plane.extend(more);
         }
     }
 
-    /// The planes as channels, `[frames, 3, height, width]`.
+    /// The planes as channels, `[frames, planes, height, width]`.
     pub fn to_tensor(&self, size: Size, device: &Device) -> Tensor<4> {
-        let planes = self.0.each_ref().map(|plane| to_tensor(plane.clone(), size, device));
-        Tensor::cat(planes.into(), 1)
+        let planes = self.0.iter().map(|plane| to_tensor(plane.clone(), size, device));
+        Tensor::cat(planes.collect(), 1)
     }
 }
 

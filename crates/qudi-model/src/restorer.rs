@@ -212,7 +212,7 @@ impl Restorer for QudiRestorer {
         let planes = Planes::of(burst, context);
         let pad = |images: &[f32]| padded(images, burst.size, size);
         let planes = Planes { y: pad(&planes.y), u: pad(&planes.u) };
-        let guide = GuidePlanes::of(burst, context)?.map(pad);
+        let guide = GuidePlanes::of(burst, context, self.config.pre.neighbours)?.map(pad);
         let side = self.options.tile / multiple * multiple;
         let tiles = Tiles::new(size, side, (side / 8).next_multiple_of(multiple), multiple);
         let sensor = sensor_numbers(context);

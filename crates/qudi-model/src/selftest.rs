@@ -1,6 +1,7 @@
 //! What a device must get right: every operation of the network with its gradients, and a small network whole.
 
 use crate::config::NetworkConfig;
+use crate::measurement::GuidePlanes;
 use crate::network::{Measured, SENSOR_NUMBERS, Simulated, State};
 use crate::objective::reconstruction;
 use crate::tensor::read;
@@ -166,11 +167,15 @@ fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
 /// noisy image.
 fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
-    let network = NetworkConfig::preset("tiny")?.init(1, &device);
+    let config = NetworkConfig::preset("tiny")?;
+    let network = config.init(1, &device);
     let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
+    let planes = GuidePlanes::count(config.pre.neighbours);
+    let mut guide = vec![image(29), image(30), image(31) * 0.5 + 0.2];
+    guide.extend((guide.len()..planes).map(|plane| image(29 + plane as u32)));
     let measured = Measured {
         u: image(22),
-        guide: Tensor::cat(vec![image(29), image(30), image(31) * 0.5 + 0.2], 1),
+        guide: Tensor::cat(guide, 1),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
     };

@@ -202,7 +202,7 @@ fn damaged_states_are_refused() {
 #[test]
 fn the_pre_denoiser_learns_from_parts() {
     let recipe = recipe(&[
-        ("train.parts", "{ bursts = 3, frames = 1, side = 24 }"),
+        ("train.parts", "{ bursts = 3, kept = 2, frames = 1, side = 24 }"),
         (
             "train.loss",
             "{ prediction = 0.0, pre = 1.0, perceptual = 0.0, term = \"none\", flow = 0.0 }",
@@ -223,10 +223,11 @@ fn the_pre_denoiser_learns_from_parts() {
     let pre = count("pre.");
     assert!(moved > pre / 2 && moved <= pre, "{moved} of {pre} weights moved");
     for (key, value, word) in [
-        ("train.parts", "{ bursts = 3, frames = 1, side = 24 }", "3 frames"),
-        ("train.parts", "{ bursts = 0, frames = 3, side = 24 }", "one burst"),
-        ("train.parts", "{ bursts = 3, frames = 3, side = 30 }", "train.parts.side"),
-        ("train.parts", "{ bursts = 3, frames = 3, side = 40 }", "fit"),
+        ("train.parts", "{ bursts = 3, kept = 2, frames = 1, side = 24 }", "3 frames"),
+        ("train.parts", "{ bursts = 0, kept = 3, frames = 3, side = 24 }", "one burst"),
+        ("train.parts", "{ bursts = 3, kept = 3, frames = 3, side = 30 }", "train.parts.side"),
+        ("train.parts", "{ bursts = 3, kept = 3, frames = 3, side = 40 }", "fit"),
+        ("train.parts", "{ bursts = 3, kept = 2, frames = 3, side = 24 }", "fit"),
     ] {
         let changes = [("data.crop", "32"), ("data.frames", "3"), (key, value)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));

@@ -25,6 +25,10 @@ struct Burst {
     size: Size,
 }
 
+fn tiny() -> NetworkConfig {
+    NetworkConfig::preset("tiny").unwrap()
+}
+
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let light = Light { ppp: 3.25, exposure: 0.45 };
@@ -49,7 +53,7 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     };
     let view = BurstView { size, frames: &counts };
     let planes = Planes::of(view, &context);
-    let guide = GuidePlanes::of(view, &context).unwrap();
+    let guide = GuidePlanes::of(view, &context, tiny().pre.neighbours).unwrap();
     let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
     let measured = Measured {
         u: to_tensor(planes.u, size, device),
@@ -84,7 +88,7 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
 fn the_first_stage_is_a_part_of_the_whole() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
-    let network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
+    let network = tiny().init(3, &device);
     let with = |prediction: f32| {
         let weights = LossWeights { prediction, pre: 1.0, flow: 0.5, ..LossWeights::default() };
         let example = Example {
@@ -139,7 +143,7 @@ impl ModuleVisitor for Without<'_> {
 fn gradients_reach_every_parameter() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
-    let mut config = NetworkConfig::preset("tiny").unwrap();
+    let mut config = tiny();
     config.unet.temporal = true;
     config.unet.attention = vec![1];
     let mut network = config.init(3, &device);
@@ -161,7 +165,7 @@ fn gradients_reach_every_parameter() {
 fn one_burst_is_learnt_by_heart() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 16, width: 16 }, 5, &device);
-    let mut network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
+    let mut network = tiny().init(3, &device);
     let mut optimizer = Adam::new(&values(&network));
     let (mut totals, mut predictions) = (Vec::new(), Vec::new());
     for number in 0..200u32 {
@@ -188,7 +192,7 @@ fn a_step_on_ndarray_is_that_on_flex() {
     let losses = devices.map(|device| {
         let device = device.autodiff();
         let burst = burst(Size { height: 16, width: 16 }, 3, &device);
-        let mut network = NetworkConfig::preset("tiny").unwrap().init(3, &device);
+        let mut network = tiny().init(3, &device);
         let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
         let grads = loss(&network, &burst, 2).total.backward();
         let grads = GradientsParams::from_grads(grads, &network);

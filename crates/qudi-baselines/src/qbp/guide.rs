@@ -5,7 +5,7 @@
 use super::{Finish, Merged, Merger, Pilots, Qbp, QbpSettings, at_least};
 use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
-use crate::transform_denoise::{denoise, image, units};
+use crate::transform_denoise::{denoise, image};
 use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
 use qudi_sim::{Frame, Result};
 use rayon::prelude::*;
@@ -21,15 +21,13 @@ const ERROR: f32 = 0.3;
 const QUICK: Profile = Profile { radius: 8, step: [4, 3] };
 const THOROUGH: Profile = Profile { radius: 12, step: [4, 3] };
 
-/// The best classical estimate of a window, for a network to go on from; one of each per frame.
+/// The best classical estimate of a window, for a network to go on from.
 #[derive(Clone, Debug)]
 pub struct Guide {
-    /// Restored, in image units.
+    /// Restored frames, in image units.
     pub clean: Vec<Frame>,
-    /// Only aligned and merged: unbiased and still noisy, in image units.
-    pub merged: Vec<Frame>,
-    /// Deviation of the merged frame's noise at each pixel, in image units.
-    pub noise: Vec<Frame>,
+    /// The same in mean counts, at least as large as a patch.
+    pub(super) means: Vec<Frame>,
 }
 
 impl Guide {
@@ -41,43 +39,30 @@ impl Guide {
         let ordinary = context.sensor.dark_per_frame()?;
         let count = burst.frames.len();
         let n = count as f64;
-        let transform = Transform::Integral;
-        let stabilizer = Stabilizer::new(transform, &context.sensor, context.gain, count as u32);
-        let image = |z: &Frame| image(z, &stabilizer, context, ordinary);
-        let units = units(context);
-
+        let stabilizer =
+            Stabilizer::new(Transform::Integral, &context.sensor, context.gain, count as u32);
         let qbp = Qbp::new(Finish::Bm3d);
         let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
         let mut merger = Merger::new(burst, context, qbp.block(context)?, trust);
-        let pilot = |frame: usize| {
-            let Merged { counts, noise, .. } = merger.merge(frame);
-            let scale = first_noise * (n * noise).sqrt();
-            let z = denoise(QUICK, stabilizer.stabilized(&counts), &stabilizer, scale);
-            let mean = |&z: &f32| stabilizer.mean_count(f64::from(z)) as f32;
-            let means: Vec<f32> = z.data.iter().map(mean).collect();
-            at_least(&means, burst.size, merger.frames[0].size)
+        let round = |merger: &Merger, profile, assumed| {
+            let restored = |frame: usize| {
+                let Merged { counts, noise, .. } = merger.merge(frame);
+                let scale = assumed * (n * noise).sqrt();
+                denoise(profile, stabilizer.stabilized(&counts), &stabilizer, scale)
+            };
+            (0..count).map(restored).collect::<Vec<Frame>>()
         };
-        let frames = (0..count).map(pilot).collect();
+        let means = |frames: &[Frame], size| {
+            let mean = |&z: &f32| stabilizer.mean_count(f64::from(z)) as f32;
+            let means = |z: &Frame| z.data.iter().map(mean).collect::<Vec<f32>>();
+            frames.iter().map(|z| at_least(&means(z), burst.size, size)).collect()
+        };
+        let size = merger.frames[0].size;
+        let frames = means(&round(&merger, QUICK, first_noise), size);
         merger.follow(Pilots { frames, error: ERROR });
-
-        let mut guide = Self { clean: Vec::new(), merged: Vec::new(), noise: Vec::new() };
-        for frame in 0..count {
-            let Merged { counts, noise, noises } = merger.merge(frame);
-            let z = stabilizer.stabilized(&counts);
-            guide.merged.push(image(&z));
-            let scale = NOISE * (n * noise).sqrt();
-            let clean = denoise(THOROUGH, z, &stabilizer, scale);
-            // From one deviation below to one above, through the inverse of the transform; black is no bound.
-            let deviation = clean.data.iter().zip(&noises.data).map(|(&z, &noise)| {
-                let z = stabilizer.possible(f64::from(z));
-                let one = stabilizer.deviation(z) * (n * f64::from(noise)).sqrt();
-                let span = stabilizer.invert(z + one) - stabilizer.invert(z - one);
-                (0.5 * span * units) as f32
-            });
-            guide.noise.push(Frame { size: clean.size, data: deviation.collect() });
-            guide.clean.push(image(&clean));
-        }
-        Ok(guide)
+        let restored = round(&merger, THOROUGH, NOISE);
+        let clean = restored.iter().map(|z| image(z, &stabilizer, context, ordinary)).collect();
+        Ok(Self { clean, means: means(&restored, size) })
     }
 }
 
@@ -101,7 +86,7 @@ impl Restorer for TwoRounds {
 
 impl Merger {
     /// From now on goes by `pilots`, frame by frame.
-    fn follow(&mut self, pilots: Pilots) {
+    pub(super) fn follow(&mut self, pilots: Pilots) {
         self.pyramids = pilots.frames.par_iter().map(super::Pyramid::new).collect();
         (self.block, self.trust) = (1, TRUST);
         self.pilots = Some(pilots);

@@ -10,6 +10,7 @@ use crate::memory::Peak;
 use crate::report::{Bar, Report};
 use burn::tensor::{Device, Tensor};
 use qudi_model::config::NetworkConfig;
+use qudi_model::measurement::GuidePlanes;
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State};
 use qudi_model::objective::reconstruction;
 use qudi_model::restorer::QudiRestorer;
@@ -83,6 +84,7 @@ fn measure(
     bar: &mut Bar,
 ) -> Result<Figures> {
     let network = config.init(1, &device.device);
+    let of_step = inputs(&config, args.size, args.frames, &device.device);
     let (mut steps, mut prepares) = (Vec::new(), Vec::new());
     let mut blocks: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
     // The first round warms up and is not counted.
@@ -91,7 +93,7 @@ fn measure(
         if interrupt::check().is_break() {
             return Err(Fault::Interrupted);
         }
-        let times = step(&network, args.size, args.frames, &device.device);
+        let times = step(&network, &of_step, &device.device);
         if round > 0 {
             prepares.push(times[0].1);
             steps.push(times[1..].iter().map(|(_, seconds)| seconds).sum());
@@ -103,17 +105,18 @@ fn measure(
     let mut training = Vec::new();
     let autodiff = device.device.clone().autodiff();
     let differentiable = config.init(1, &autodiff);
+    let of_pass = inputs(&config, CROP, args.frames, &autodiff);
     for round in 0..=args.rounds {
         bar.update("measuring", (args.rounds + 1 + round) as u64, Some(2 * args.rounds as u64 + 3));
         if interrupt::check().is_break() {
             return Err(Fault::Interrupted);
         }
-        let seconds = forward_backward(&differentiable, args.frames, &autodiff);
+        let seconds = forward_backward(&differentiable, &of_pass, &autodiff);
         if round > 0 {
             training.push(seconds);
         }
     }
-    drop(differentiable);
+    drop((differentiable, of_step));
     let (counts, context) = burst(args)?;
     let options = sample_options(&args.network);
     let mut restorer = QudiRestorer::new(network, &config, args.frames, options, &device.device)?;
@@ -138,19 +141,21 @@ fn measure(
     })
 }
 
+type Inputs = (Measured, Simulated, State);
+
 /// Inputs of a step: values do not matter for speed.
-fn inputs(size: Size, frames: usize, device: &Device) -> (Measured, Simulated, State) {
+fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) -> Inputs {
     let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
     let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
-    let guide = image().repeat_dim(1, 3);
+    let guide = image().repeat_dim(1, GuidePlanes::count(config.pre.neighbours));
     let measured = Measured { u: image(), guide, sensor, frames };
     let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
     (measured, simulated, State { x_t: image(), x0_prev: image(), times: vec![500] })
 }
 
 /// Seconds of the preparation and of every block of one step.
-fn step(network: &Qudi, size: Size, frames: usize, device: &Device) -> Vec<(&'static str, f64)> {
-    let (measured, simulated, state) = inputs(size, frames, device);
+fn step(network: &Qudi, inputs: &Inputs, device: &Device) -> Vec<(&'static str, f64)> {
+    let (measured, simulated, state) = inputs;
     let mut last = Instant::now();
     let mut times = Vec::new();
     let mut mark = |block: &'static str| {
@@ -159,18 +164,19 @@ fn step(network: &Qudi, size: Size, frames: usize, device: &Device) -> Vec<(&'st
         times.push((block, last.elapsed().as_secs_f64()));
         last = Instant::now();
     };
-    let prepared = network.prepare(&measured);
+    let prepared = network.prepare(measured);
     mark("prepare");
-    network.forward_observed(&prepared, Some(&simulated), &state, None, &mut mark);
+    network.forward_observed(&prepared, Some(simulated), state, None, &mut mark);
     times
 }
 
-fn forward_backward(network: &Qudi, frames: usize, device: &Device) -> f64 {
-    let (measured, simulated, state) = inputs(CROP, frames, device);
+fn forward_backward(network: &Qudi, inputs: &Inputs, device: &Device) -> f64 {
+    let (measured, simulated, state) = inputs;
+    let frames = measured.frames;
     let truth = Tensor::<4>::zeros([frames, 1, CROP.height, CROP.width], device);
     let start = Instant::now();
-    let prepared = network.prepare(&measured);
-    let prediction = network.forward(&prepared, Some(&simulated), &state, None);
+    let prepared = network.prepare(measured);
+    let prediction = network.forward(&prepared, Some(simulated), state, None);
     let loss = reconstruction((prediction.x0 + 1.0) * 0.5, truth.clone())
         + reconstruction(prediction.d, truth) * 0.2;
     let _grads = loss.backward();

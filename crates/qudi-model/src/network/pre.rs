@@ -7,8 +7,8 @@ use crate::config::PreConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-/// Planes of the guide.
-const PLANES: usize = 4;
+/// Planes of the guide without neighbours.
+const PLANES: usize = 5;
 
 /// Dense layers of a block.
 const LAYERS: usize = 3;
@@ -59,7 +59,7 @@ impl PreConfig {
         let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
         let block = |_| DenseBlock::zeros(width, self.growth, device);
         PreDenoiser {
-            static_in: conv([PLANES * planes, width], 3, Bias::Yes),
+            static_in: conv([(PLANES + 2 * self.neighbours) * planes, width], 3, Bias::Yes),
             simulated_in: conv([2 * planes + 1, width], 3, Bias::No),
             blocks: (0..self.blocks).map(block).collect(),
             gather: conv([self.blocks * width, width], 1, Bias::Yes),
@@ -73,8 +73,8 @@ impl PreConfig {
 impl PreDenoiser {
     /// What does not depend on the step: `[images, width, h, w]`.
     pub(super) fn prepare(&self, evidence: &Evidence) -> Tensor<4> {
-        let Evidence { difference, contrast, level, .. } = evidence.clone();
-        let planes = Tensor::cat(vec![difference, contrast, evidence.signed(), level], 1);
+        let Evidence { difference, contrast, level, aligned, .. } = evidence.clone();
+        let planes = Tensor::cat(vec![difference, contrast, evidence.signed(), level, aligned], 1);
         self.static_in.linear(&[fold(planes, self.fold)])
     }
 

@@ -17,8 +17,8 @@ use qudi_sim::Result;
 pub struct Measured {
     /// The linear estimate in image units.
     pub u: Tensor<4>,
-    /// What classical methods make of it, `[bursts * frames, 3, height, width]`: the restored image, the merely merged
-    /// one and the deviation of the latter's noise, in image units.
+    /// What classical methods make of it, `[bursts * frames, planes, height, width]`
+    /// ([`GuidePlanes`](crate::measurement::GuidePlanes)), with the network's number of neighbours.
     pub guide: Tensor<4>,
     /// Numbers of sensor and light, `[bursts, 11]`.
     pub sensor: Tensor<2>,

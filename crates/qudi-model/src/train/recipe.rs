@@ -66,6 +66,8 @@ pub struct TrainConfig {
 pub struct PartsConfig {
     /// Bursts that are drawn in all and kept in memory; samples come back to them.
     pub bursts: u64,
+    /// Consecutive frames of each that are kept; the others only help to restore these.
+    pub kept: usize,
     /// Consecutive frames of a sample.
     pub frames: usize,
     /// Side of a sample in pixels.
@@ -178,6 +180,7 @@ impl Recipe {
             (
                 "train.parts",
                 (fewest..=data.frames).contains(&frames)
+                    && train.parts.is_none_or(|parts| (frames..=data.frames).contains(&parts.kept))
                     && side <= data.crop
                     && train.parts.is_none_or(|parts| (1..=1 << 20).contains(&parts.bursts)),
                 "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",

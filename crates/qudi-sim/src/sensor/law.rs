@@ -90,10 +90,21 @@ impl CountLaw {
         mean / total
     }
 
+    /// What the mean output approaches in endless light.
+    fn largest_mean(&self) -> f64 {
+        if self.response == Response::Binary || self.full_well.is_infinite() {
+            return f64::from(self.max_count);
+        }
+        let (low, high) = self.uncertain_outputs(self.full_well);
+        low as f64 + (low..high).map(|j| self.exceeds(j, self.full_well)).sum::<f64>()
+    }
+
     /// Expected detections per output frame whose mean output value is `mean`: the inverse of
-    /// [`CountLaw::mean`], kept between 0 and where half a count is left to saturation.
+    /// [`CountLaw::mean`], kept between 0 and where half a count is left to saturation, of the output or of the
+    /// full well.
     pub fn detections_for_mean(&self, mean: f64) -> f64 {
-        let target = mean.min(f64::from(self.max_count) - 0.5);
+        let largest = self.largest_mean();
+        let target = mean.min(largest - 0.5f64.min(0.5 * largest));
         let mut high = 1.0;
         while self.mean(high) < target && high < 1e9 {
             high *= 2.0;
@@ -258,6 +269,18 @@ mod tests {
                 assert!((back - detections).abs() < 1e-6, "{back} {detections}");
             }
             assert!(law.detections_for_mean(f64::from(law.max_count)).is_finite());
+        }
+    }
+
+    /// A full well that the output cannot fill saturates all the same.
+    #[test]
+    fn a_full_well_bounds_the_inverse() {
+        for (gain, most) in [(0.02, 4.0), (0.002, 0.5), (1.0, 7.0)] {
+            let mut law = law(3, gain, 0.2);
+            law.full_well = 200.0;
+            let detections = law.detections_for_mean(7.0);
+            assert!(detections < 300.0, "{gain}: {detections}");
+            assert!(law.mean(detections) < most, "{gain}: {}", law.mean(detections));
         }
     }
 

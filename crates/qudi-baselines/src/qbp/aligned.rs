@@ -1,0 +1,128 @@
+//! What every frame of a window has to say of one of them: the frames laid upon it, before anybody decides which to
+//! trust. A robust merge decides by a formula; a network that sees them all can learn to.
+
+use super::cubic::cubic;
+use super::{Finish, Guide, Merged, Merger, Pilots, Qbp};
+use crate::stabilizer::{Stabilizer, Transform};
+use crate::transform_denoise::{image, units};
+use qudi_sim::restore::{BurstView, Context};
+use qudi_sim::{Frame, Result};
+use rayon::prelude::*;
+
+/// Variance of the guide's errors, in that of one frame's noise, about.
+const ERROR: f32 = 0.1;
+
+/// Least variance of a count: what certainly counts nothing, or full scale, still differs from it by something.
+const LEAST_VARIANCE: f64 = 1e-4;
+
+/// A third round of alignment, on the guide.
+#[derive(Debug)]
+pub struct Alignment<'a> {
+    merger: Merger,
+    stabilizer: Stabilizer,
+    context: &'a Context,
+    /// Dark detections of an ordinary pixel.
+    ordinary: f64,
+}
+
+/// What is known of a frame. Deviations are those of the noise of one frame's counts where the guide is right.
+#[derive(Clone, Debug)]
+pub struct Aligned {
+    /// Aligned and merged: unbiased and still noisy, in image units.
+    pub merged: Frame,
+    /// Deviation of the merged frame's noise at each pixel, in image units.
+    pub noise: Frame,
+    /// Counts of the frame itself, then of its neighbours, nearest first, laid upon it: less what the guide expects of the
+    /// frame, in deviations. Zero past the ends of the window.
+    pub seen: Vec<Frame>,
+    /// What the guide expects of the neighbours, laid upon the frame: less what it expects of the frame, in deviations.
+    pub expected: Vec<Frame>,
+}
+
+impl<'a> Alignment<'a> {
+    /// Of the window that `guide` was found for.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
+    pub fn new(burst: BurstView<'_>, context: &'a Context, guide: &Guide) -> Result<Self> {
+        let ordinary = context.sensor.dark_per_frame()?;
+        let qbp = Qbp::new(Finish::Bm3d);
+        let mut merger = Merger::new(burst, context, qbp.block(context)?, qbp.settings.trust);
+        merger.follow(Pilots { frames: guide.means.clone(), error: ERROR });
+        let frames = burst.frames.len() as u32;
+        let stabilizer =
+            Stabilizer::new(Transform::Integral, &context.sensor, context.gain, frames);
+        Ok(Self { merger, stabilizer, context, ordinary })
+    }
+
+    /// What is known of frame `reference`, with so many neighbours.
+    pub fn of(&self, reference: usize, neighbours: usize) -> Aligned {
+        let Self { merger, stabilizer, context, ordinary } = self;
+        let (blocks, flow) = merger.flow(reference);
+        let Merged { counts, noises, .. } = merger.merge_along(&blocks, &flow);
+        let merged = image(&stabilizer.stabilized(&counts), stabilizer, context, *ordinary);
+
+        let mut nearest: Vec<usize> = (0..merger.frames.len()).collect();
+        nearest.sort_by_key(|&frame| (frame.abs_diff(reference), frame < reference));
+        nearest.truncate(neighbours + 1);
+        let guide = &merger.pilots.as_ref().expect("set at first").frames;
+        let here = merger.cropped(&guide[reference]);
+        let deviations = here.data.iter().map(|&mean| {
+            let variance = merger.moments.variance_at_mean(f64::from(mean));
+            variance.max(LEAST_VARIANCE).sqrt() as f32
+        });
+        let deviations: Vec<f32> = deviations.collect();
+        let less = |frame: Frame| {
+            let values = frame.data.iter().zip(&here.data).zip(&deviations);
+            let values = values.map(|((value, here), deviation)| (value - here) / deviation);
+            Frame { size: here.size, data: values.collect() }
+        };
+        let laid = |frames: &[Frame], places: &[usize], count: usize| {
+            let places = places.par_iter();
+            let laid = places.map(|&k| less(merger.laid(&frames[k], &flow[k], k == reference)));
+            let mut laid: Vec<Frame> = laid.collect();
+            laid.resize(count, Frame::filled(here.size, 0.0));
+            laid
+        };
+        Aligned {
+            noise: self.noise(&here, &noises),
+            seen: laid(&merger.frames, &nearest, neighbours + 1),
+            expected: laid(guide, &nearest[1..], neighbours),
+            merged,
+        }
+    }
+
+    /// Deviations in image units of merged counts whose mean is `means`: half of what separates the images one deviation
+    /// above and below, through the inverse of the transform; black is no bound.
+    fn noise(&self, means: &Frame, noises: &Frame) -> Frame {
+        let n = self.merger.frames.len() as f64;
+        let units = units(self.context);
+        let deviation = |(&mean, &noise): (&f32, &f32)| {
+            let z = self.stabilizer.transform(n * f64::from(mean));
+            let z = self.stabilizer.possible(z);
+            let one = self.stabilizer.deviation(z) * (n * f64::from(noise)).sqrt();
+            let span = self.stabilizer.invert(z + one) - self.stabilizer.invert(z - one);
+            (0.5 * span * units) as f32
+        };
+        let pairs = means.data.iter().zip(&noises.data);
+        Frame { size: means.size, data: pairs.map(deviation).collect() }
+    }
+}
+
+impl Merger {
+    /// `frame` laid upon the reference along the motion of every patch.
+    fn laid(&self, frame: &Frame, flow: &[[f32; 2]], reference: bool) -> Frame {
+        if reference {
+            return self.cropped(frame);
+        }
+        self.blended(|i| {
+            let (corner, d) = (self.grid.corner(i).map(|c| c as f32), flow[i]);
+            cubic(frame, [corner[0] + d[0], corner[1] + d[1]])
+        })
+    }
+
+    /// The part of `frame` within the window's size.
+    fn cropped(&self, frame: &Frame) -> Frame {
+        Frame::from_fn(self.size, |x, y| frame.row(y)[x])
+    }
+}
