@@ -3,7 +3,7 @@
 //!
 //!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED
 //!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED write BURST
-//!     qudi restore BURST.npy --sensor BURST.toml --ppp PPP -o RESTORED.npy
+//!     qudi restore BURST.npy --sensor BURST.toml --bits 3 --ppp PPP -o RESTORED.npy
 //!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED score RESTORED.npy
 //!
 //! FOLDER holds one image of means of 256 binary frames. The split is hypergeometric, so that input

@@ -12,6 +12,9 @@ use std::ops::Range;
 /// Brightest linear estimate, in image units: twice white.
 const BRIGHTEST: f64 = 2.0;
 
+/// Brightest restored image: where most of a scene is dark, what is bright is many times white at the usual exposure.
+pub(crate) const BRIGHTEST_IMAGE: f32 = 8.0;
+
 /// Planes of a burst, frame after frame, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Planes {
@@ -45,7 +48,7 @@ impl Planes {
 }
 
 /// What classical methods make of a burst, for a network to go on from; frame after frame, row-major. In this order: the
-/// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 2]; the counts of the
+/// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 8]; the counts of the
 /// frame and of its neighbours laid upon it, and what is expected of the neighbours, in deviations (see
 /// [`Aligned`]).
 #[derive(Clone, Debug, Default)]
@@ -82,7 +85,7 @@ impl GuidePlanes {
             let clean = guide.clean[frame].clone();
             let Aligned { merged, noise, seen, expected } = alignment.of(frame, neighbours);
             let images = [clean, merged, noise].into_iter().map(|mut image| {
-                image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
+                image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST_IMAGE));
                 image
             });
             for (plane, more) in planes.iter_mut().zip(images.chain(seen).chain(expected)) {

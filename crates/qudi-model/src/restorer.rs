@@ -1,7 +1,7 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
 use crate::config::{NetworkConfig, Part};
-use crate::measurement::{GuidePlanes, Planes, sensor_numbers};
+use crate::measurement::{BRIGHTEST_IMAGE, GuidePlanes, Planes, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
 use crate::noise::Noise;
 use crate::physics::LoopSensor;
@@ -149,7 +149,7 @@ impl QudiRestorer {
         *flows = Some(prediction.flows);
         let mut values = read(prediction.x0)?;
         for value in &mut values {
-            *value = value.clamp(-1.0, 1.0);
+            *value = value.clamp(-1.0, 2.0 * BRIGHTEST_IMAGE - 1.0);
         }
         Ok(values)
     }
