@@ -95,6 +95,22 @@ impl GuidePlanes {
         Ok(Self(planes))
     }
 
+    /// By how much the restored images are dimmed to look as those that networks learn from: 99 of 100 pixels below white.
+    pub(crate) fn dimming(&self) -> f32 {
+        let mut values = self.0[0].clone();
+        let place = values.len() * 99 / 100;
+        if place == 0 {
+            return 1.0;
+        }
+        let (_, bright, _) = values.select_nth_unstable_by(place, f32::total_cmp);
+        (1.0 / bright.max(f32::MIN_POSITIVE)).min(1.0)
+    }
+
+    /// The planes at another exposure: images `factor` times as bright; deviations stay.
+    pub(crate) fn dim(&mut self, factor: f32) {
+        self.0.iter_mut().take(IMAGES).flatten().for_each(|value| *value *= factor);
+    }
+
     /// Every plane changed by `f`.
     #[must_use]
     pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {
@@ -190,4 +206,23 @@ pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
         deviation(context.exposure),
     ]
     .map(|number| number as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bright_scenes_are_dimmed_and_others_are_not() {
+        let planes = |bright: f32| {
+            let image: Vec<f32> = (0..200).map(|i| if i < 10 { bright } else { 0.1 }).collect();
+            GuidePlanes(vec![image.clone(), image.clone(), image.clone(), image])
+        };
+        assert_eq!(planes(0.8).dimming(), 1.0);
+        assert_eq!(GuidePlanes::default().0.len(), 0);
+        let mut bright = planes(4.0);
+        assert_eq!(bright.dimming(), 0.25);
+        bright.dim(0.25);
+        assert_eq!((bright.0[0][0], bright.0[2][0], bright.0[3][0]), (1.0, 1.0, 4.0));
+    }
 }
