@@ -12,9 +12,6 @@ use std::ops::Range;
 /// Brightest linear estimate, in image units: twice white.
 const BRIGHTEST: f64 = 2.0;
 
-/// Brightest restored image: where most of a scene is dark, what is bright is many times white at the usual exposure.
-pub(crate) const BRIGHTEST_IMAGE: f32 = 8.0;
-
 /// Planes of a burst, frame after frame, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Planes {
@@ -48,7 +45,7 @@ impl Planes {
 }
 
 /// What classical methods make of a burst, for a network to go on from; frame after frame, row-major. In this order: the
-/// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 8]; the counts of the
+/// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 2]; the counts of the
 /// frame and of its neighbours laid upon it, and what is expected of the neighbours, in deviations (see
 /// [`Aligned`]).
 #[derive(Clone, Debug, Default)]
@@ -85,7 +82,7 @@ impl GuidePlanes {
             let clean = guide.clean[frame].clone();
             let Aligned { merged, noise, seen, expected } = alignment.of(frame, neighbours);
             let images = [clean, merged, noise].into_iter().map(|mut image| {
-                image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST_IMAGE));
+                image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
                 image
             });
             for (plane, more) in planes.iter_mut().zip(images.chain(seen).chain(expected)) {
@@ -93,22 +90,6 @@ impl GuidePlanes {
             }
         }
         Ok(Self(planes))
-    }
-
-    /// By how much the restored images are dimmed to look as those that networks learn from: 99 of 100 pixels below white.
-    pub(crate) fn dimming(&self) -> f32 {
-        let mut values = self.0[0].clone();
-        let place = values.len() * 99 / 100;
-        if place == 0 {
-            return 1.0;
-        }
-        let (_, bright, _) = values.select_nth_unstable_by(place, f32::total_cmp);
-        (1.0 / bright.max(f32::MIN_POSITIVE)).min(1.0)
-    }
-
-    /// The planes at another exposure: images `factor` times as bright; deviations stay.
-    pub(crate) fn dim(&mut self, factor: f32) {
-        self.0.iter_mut().take(IMAGES).flatten().for_each(|value| *value *= factor);
     }
 
     /// Every plane changed by `f`.
@@ -206,23 +187,4 @@ pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
         deviation(context.exposure),
     ]
     .map(|number| number as f32)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn bright_scenes_are_dimmed_and_others_are_not() {
-        let planes = |bright: f32| {
-            let image: Vec<f32> = (0..200).map(|i| if i < 10 { bright } else { 0.1 }).collect();
-            GuidePlanes(vec![image.clone(), image.clone(), image.clone(), image])
-        };
-        assert_eq!(planes(0.8).dimming(), 1.0);
-        assert_eq!(GuidePlanes::default().0.len(), 0);
-        let mut bright = planes(4.0);
-        assert_eq!(bright.dimming(), 0.25);
-        bright.dim(0.25);
-        assert_eq!((bright.0[0][0], bright.0[2][0], bright.0[3][0]), (1.0, 1.0, 4.0));
-    }
 }

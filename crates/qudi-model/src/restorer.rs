@@ -1,7 +1,7 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
 use crate::config::{NetworkConfig, Part};
-use crate::measurement::{BRIGHTEST_IMAGE, GuidePlanes, Planes, sensor_numbers};
+use crate::measurement::{GuidePlanes, Planes, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
 use crate::noise::Noise;
 use crate::physics::LoopSensor;
@@ -149,7 +149,7 @@ impl QudiRestorer {
         *flows = Some(prediction.flows);
         let mut values = read(prediction.x0)?;
         for value in &mut values {
-            *value = value.clamp(-1.0, 2.0 * BRIGHTEST_IMAGE - 1.0);
+            *value = value.clamp(-1.0, 1.0);
         }
         Ok(values)
     }
@@ -209,16 +209,10 @@ impl Restorer for QudiRestorer {
             height: burst.size.height.next_multiple_of(multiple),
             width: burst.size.width.next_multiple_of(multiple),
         };
-        // What is far brighter than the usual exposure says would be unlike anything learnt: the same photons, less exposed.
-        let mut guide = GuidePlanes::of(burst, context, self.config.pre.neighbours)?;
-        let dimming = guide.dimming();
-        guide.dim(dimming);
-        let exposure = context.exposure * f64::from(dimming);
-        let context = &Context { exposure, ..context.clone() };
         let planes = Planes::of(burst, context);
         let pad = |images: &[f32]| padded(images, burst.size, size);
         let planes = Planes { y: pad(&planes.y), u: pad(&planes.u) };
-        let guide = guide.map(pad);
+        let guide = GuidePlanes::of(burst, context, self.config.pre.neighbours)?.map(pad);
         let side = self.options.tile / multiple * multiple;
         let tiles = Tiles::new(size, side, (side / 8).next_multiple_of(multiple), multiple);
         let sensor = sensor_numbers(context);
@@ -231,7 +225,6 @@ impl Restorer for QudiRestorer {
             sum.add(&self.sample(&job, sample)?);
         }
         let images = |values: &[f32]| {
-            let values: Vec<f32> = values.iter().map(|value| value / dimming).collect();
             let images = values.chunks_exact(size.pixels());
             images.map(|image| cropped(image, size, burst.size)).collect()
         };
