@@ -156,8 +156,8 @@ struct Merged {
     counts: Frame,
     /// Variance of their noise, in that of one frame.
     noise: f64,
-    /// The same at every pixel.
-    noises: Frame,
+    /// The same of every patch.
+    noises: Vec<f32>,
 }
 
 /// Merges the frames of one window.
@@ -243,16 +243,11 @@ impl Merger {
     fn merge_along(&self, blocks: &Blocks, flow: &[Vec<[f32; 2]>]) -> Merged {
         let patches: Vec<_> =
             (0..self.grid.len()).into_par_iter().map(|i| self.patch(i, blocks, flow)).collect();
-        let noise = patches.iter().map(|(_, noise)| f64::from(*noise)).sum::<f64>();
-        let positive = |mut frame: Frame| {
-            frame.data.iter_mut().for_each(|v| *v = v.max(0.0));
-            frame
-        };
-        Merged {
-            counts: positive(self.blended(|i| patches[i].0)),
-            noise: noise / patches.len() as f64,
-            noises: positive(self.blended(|i| [[patches[i].1; SIDE]; SIDE])),
-        }
+        let mut counts = self.blended(|i| patches[i].0);
+        counts.data.iter_mut().for_each(|count| *count = count.max(0.0));
+        let noises: Vec<f32> = patches.into_iter().map(|(_, noise)| noise).collect();
+        let noise = noises.iter().map(|&noise| f64::from(noise)).sum::<f64>() / noises.len() as f64;
+        Merged { counts, noise, noises }
     }
 
     /// The frame that overlapping patches make, each of which fades out towards its borders.

@@ -2,6 +2,7 @@
 //! trust. A robust merge decides by a formula; a network that sees them all can learn to.
 
 use super::cubic::cubic;
+use super::dft::SIDE;
 use super::{Finish, Guide, Merged, Merger, Pilots, Qbp};
 use crate::stabilizer::{Stabilizer, Transform};
 use crate::transform_denoise::{image, units};
@@ -60,6 +61,7 @@ impl<'a> Alignment<'a> {
         let Self { merger, stabilizer, context, ordinary } = self;
         let (blocks, flow) = merger.flow(reference);
         let Merged { counts, noises, .. } = merger.merge_along(&blocks, &flow);
+        let noises = merger.blended(|i| [[noises[i]; SIDE]; SIDE]);
         let merged = image(&stabilizer.stabilized(&counts), stabilizer, context, *ordinary);
 
         let mut nearest: Vec<usize> = (0..merger.frames.len()).collect();

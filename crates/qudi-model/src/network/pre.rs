@@ -4,11 +4,12 @@ use super::evidence::Evidence;
 use super::layers::{Bias, CORRECTION, Conv2d};
 use super::resample::{fold, unfold};
 use crate::config::PreConfig;
+use crate::measurement::{GuidePlanes, IMAGES};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-/// Planes of the guide without neighbours.
-const PLANES: usize = 5;
+/// Planes that the guide's images become.
+const PLANES: usize = 4;
 
 /// Dense layers of a block.
 const LAYERS: usize = 3;
@@ -56,10 +57,11 @@ impl PreConfig {
     /// The pre-denoiser on folded planes, weights zero.
     pub fn init(&self, fold: usize, device: &Device) -> PreDenoiser {
         let (width, planes) = (self.width, fold * fold);
+        let inputs = PLANES + GuidePlanes::count(self.neighbours) - IMAGES;
         let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
         let block = |_| DenseBlock::zeros(width, self.growth, device);
         PreDenoiser {
-            static_in: conv([(PLANES + 2 * self.neighbours) * planes, width], 3, Bias::Yes),
+            static_in: conv([inputs * planes, width], 3, Bias::Yes),
             simulated_in: conv([2 * planes + 1, width], 3, Bias::No),
             blocks: (0..self.blocks).map(block).collect(),
             gather: conv([self.blocks * width, width], 1, Bias::Yes),
