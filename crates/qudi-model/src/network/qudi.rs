@@ -140,10 +140,16 @@ impl Qudi {
         self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
     }
 
-    /// The pre-denoised frames alone, before any simulated measurement.
-    pub fn denoise(&self, measured: &Measured) -> Tensor<4> {
-        let evidence = Evidence::new(&measured.guide);
-        self.pre_denoise(&self.pre.prepare(&evidence), &evidence, measured.frames, None).0
+    /// The pre-denoised frames alone, in image units, of bursts of `frames` frames and their guide ([`Measured`]): all
+    /// there is where the U-Net does not correct them ([`Self::generates`]).
+    pub fn denoise(
+        &self,
+        guide: &Tensor<4>,
+        frames: usize,
+        simulated: Option<&Simulated>,
+    ) -> Tensor<4> {
+        let evidence = Evidence::new(guide);
+        self.pre_denoise(&self.pre.prepare(&evidence), &evidence, frames, simulated).0
     }
 
     /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.
