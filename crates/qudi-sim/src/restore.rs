@@ -2,6 +2,7 @@
 
 mod average;
 mod consistency;
+mod exposure;
 mod frame_folder;
 mod mle;
 mod moving;
@@ -10,6 +11,7 @@ mod windows;
 
 pub use average::Average;
 pub use consistency::Consistency;
+pub use exposure::fitting_exposure;
 pub use frame_folder::{FrameFolder, MANIFEST};
 pub use mle::Mle;
 pub use moving::{LONGEST_HALF, half_of_least_risk, moving_sums};

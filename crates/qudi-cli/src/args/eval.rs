@@ -2,7 +2,7 @@
 
 use super::{Network, Reading, Shard};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
-use qudi_sim::{Size, USUAL_EXPOSURE};
+use qudi_sim::Size;
 use std::path::PathBuf;
 
 /// Compare methods on clips whose truth is known, or on a real capture: the same photons and frames for all
@@ -44,9 +44,9 @@ pub(crate) struct Eval {
     /// Seed; each clip gets one made from it and its name
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub(crate) seed: u64,
-    /// Mean image value that methods are told
-    #[arg(long, value_name = "VALUE", default_value_t = USUAL_EXPOSURE)]
-    pub(crate) exposure: f64,
+    /// Mean image value that methods are told [default: as `qudi restore` finds it in each capture]
+    #[arg(long, value_name = "VALUE")]
+    pub(crate) exposure: Option<f64>,
     /// Frames that neighbouring windows share, blended
     #[arg(long, value_name = "N", default_value_t = 3)]
     pub(crate) overlap: u64,

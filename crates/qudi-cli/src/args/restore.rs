@@ -2,7 +2,6 @@
 
 use super::{Network, Reading};
 use clap::{Args as ClapArgs, ValueHint};
-use qudi_sim::USUAL_EXPOSURE;
 use std::path::PathBuf;
 
 /// Restore video from a capture
@@ -32,9 +31,10 @@ pub(crate) struct Restore {
     /// Gain in DN per electron, for sensors whose gain follows the light [default: from the record]
     #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
     pub(crate) gain: Option<f64>,
-    /// Image value that PPP photons become: counts do not fix the brightness of a picture
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, default_value_t = USUAL_EXPOSURE)]
-    pub(crate) exposure: f64,
+    /// Image value that PPP photons become: counts do not fix the brightness of a picture [default: 0.45, or less where parts
+    /// of the scene would be brighter than white]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
+    pub(crate) exposure: Option<f64>,
     /// Seed of methods that draw
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) seed: u64,

@@ -1,8 +1,9 @@
 //! The light of a capture, from what is said, recorded or seen: what methods are told.
 
 use crate::error::{Fault, Result};
+use qudi_sim::USUAL_EXPOSURE;
 use qudi_sim::capture::{Capture, Summary};
-use qudi_sim::restore::Context;
+use qudi_sim::restore::{Context, LONGEST_HALF, fitting_exposure};
 use qudi_sim::sensor::Sensor;
 
 /// What the user says about it.
@@ -11,8 +12,8 @@ pub(crate) struct Stated {
     pub(crate) ppp: Option<f64>,
     /// DN/e-.
     pub(crate) gain: Option<f64>,
-    /// Image value that receives `ppp` photons.
-    pub(crate) exposure: f64,
+    /// Image value that receives `ppp` photons, unless the capture is to tell.
+    pub(crate) exposure: Option<f64>,
     pub(crate) seed: u64,
 }
 
@@ -22,13 +23,7 @@ pub(crate) fn context(
     capture: &mut Capture,
     sensor: &Sensor,
 ) -> Result<(Context, &'static str)> {
-    if !(stated.exposure.is_finite() && stated.exposure > 0.0) {
-        return Err(Fault::new(
-            format!("an exposure of {}", stated.exposure),
-            "--exposure",
-            "give the mean image value, between 0 and 1",
-        ));
-    }
+    checked_exposure(stated.exposure)?;
     let of_frames = capture.output_sensor(sensor)?;
     let recorded = capture.about().ppp.map(|ppp| ppp * f64::from(capture.summed()));
     let known_gain = stated.gain.or(capture.about().gain);
@@ -63,14 +58,45 @@ pub(crate) fn context(
     };
     let summed = of_frames.frames_summed as f32;
     let dark = capture.dark().map(|map| map.iter().map(|dark| dark * summed).collect());
-    let context = Context {
+    let mut context = Context {
         seed: stated.seed,
         first_frame: 0,
         ppp,
-        exposure: stated.exposure,
+        exposure: USUAL_EXPOSURE,
         sensor: of_frames,
         gain,
         dark,
     };
+    context.exposure = match stated.exposure {
+        Some(exposure) => exposure,
+        None => exposure_of(capture, &context)?,
+    };
     Ok((context, source))
+}
+
+/// What the user says of the exposure, if it can be.
+pub(crate) fn checked_exposure(stated: Option<f64>) -> Result<()> {
+    match stated {
+        Some(exposure) if !(exposure.is_finite() && exposure > 0.0) => Err(Fault::new(
+            format!("an exposure of {exposure}"),
+            "--exposure",
+            "give the mean image value, between 0 and 1",
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// What the capture says of it.
+pub(crate) fn exposure_of(capture: &mut Capture, context: &Context) -> Result<f64> {
+    let size = capture.size();
+    // Pipes have shown their first frames only.
+    let first = 2 * LONGEST_HALF as u64 + 1;
+    let frames =
+        if capture.forward_only() { capture.frames().min(first) } else { capture.frames() };
+    let read = |frame| {
+        let mut counts = vec![0; size.pixels()];
+        capture.read(frame, &mut counts)?;
+        Ok(counts)
+    };
+    Ok(fitting_exposure(size, frames, context, read)?)
 }

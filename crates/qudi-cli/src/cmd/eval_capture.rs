@@ -81,7 +81,7 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
         "gain": context.gain,
         "sensor": context.sensor,
         "seed": args.seed,
-        "exposure": args.exposure,
+        "exposure": context.exposure,
         "overlap": args.overlap,
     });
     Ok(Judged { rows, pictures, about, settings })

@@ -15,12 +15,15 @@ use qudi_sim::metrics::{
 use qudi_sim::npy::read_clip;
 use qudi_sim::output::Overwrite;
 use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION, beside};
-use qudi_sim::restore::{BurstView, Consistency, Context, RestoreSink, Windows, run as run_method};
+use qudi_sim::restore::{
+    BurstView, Consistency, Context, RestoreSink, Windows, fitting_exposure, run as run_method,
+};
 use qudi_sim::scene::Flow;
 use qudi_sim::sensor::Sensor;
 use qudi_sim::source::{Input, Sampling};
 use qudi_sim::{
-    Camera, Exposed, Frame, Light, PppDefinition, SimError, Simulation, Sink, Size, Start, simulate,
+    Camera, Exposed, Frame, Light, PppDefinition, SimError, Simulation, Sink, Size, Start,
+    USUAL_EXPOSURE, simulate,
 };
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
@@ -115,14 +118,21 @@ impl Clip {
                 .map_err(|e| Fault::new(e, path.display(), "report this as a bug"))?;
             writer.finish(&bytes, overwrite)?;
         }
-        let context = Context {
+        let mut context = Context {
             seed: args.seed,
             first_frame: 0,
             ppp: summary.light.ppp,
-            exposure: args.exposure,
+            exposure: USUAL_EXPOSURE,
             sensor: sensor.clone(),
             gain: summary.gain,
             dark: None,
+        };
+        context.exposure = match args.exposure {
+            Some(exposure) => exposure,
+            None => {
+                let read = |frame: u64| Ok(kept.counts[frame as usize].clone());
+                fitting_exposure(size, kept.counts.len() as u64, &context, read)?
+            }
         };
         let motion = if kept.flow.is_empty() {
             let estimate = || {

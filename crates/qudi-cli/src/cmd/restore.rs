@@ -254,7 +254,10 @@ fn describe(
     };
     let (ppp, exposure) = (context.ppp, context.exposure);
     let source = job.source;
-    line("light", format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {exposure}"));
+    line(
+        "light",
+        format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {exposure:.4}"),
+    );
     line("sensor", format!("{}, gain {:.4} DN/e-", context.sensor.name, context.gain));
     if resumed > 0 {
         line("resumed", format!("{resumed} frames were there already"));

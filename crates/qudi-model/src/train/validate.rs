@@ -7,7 +7,7 @@ use crate::restorer::{QudiRestorer, SampleOptions};
 use burn::tensor::Device;
 use qudi_sim::dataset::Pack;
 use qudi_sim::metrics::{gain_aligned_psnr, psnr, ssim};
-use qudi_sim::restore::{BurstView, Context, Restorer};
+use qudi_sim::restore::{BurstView, Context, Restorer, fitting_exposure};
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use qudi_sim::sensor::Sensor;
 use qudi_sim::{Camera, Frame, Light, Result, SimError, Size, USUAL_EXPOSURE};
@@ -142,7 +142,7 @@ impl Validator {
                 let mut camera = Camera::new(&self.sensor, size, light, SEED + number as u64)?;
                 let counts = (0..).zip(truth).map(|(t, frame)| camera.expose(t, &[frame]));
                 let counts: Vec<Vec<u16>> = counts.collect::<Result<_>>()?;
-                let context = Context {
+                let mut context = Context {
                     seed: SEED,
                     first_frame: 0,
                     ppp,
@@ -151,6 +151,8 @@ impl Validator {
                     gain: camera.gain(),
                     dark: None,
                 };
+                let read = |frame: u64| Ok(counts[frame as usize].clone());
+                context.exposure = fitting_exposure(size, counts.len() as u64, &context, read)?;
                 let restored =
                     restorer.restore(BurstView { size, frames: &counts }, &context)?.frames;
                 let mean = |of: fn(&Frame, &Frame) -> f64| {
