@@ -199,6 +199,7 @@ fn a_capture_is_judged_without_truth() {
         "c.npy --capture --frames 0",
         "scene:text --sum 3",
         "scene:text --gain 3",
+        "scene:text --exposure 0",
     ] {
         qudi(&folder).arg("eval").args(refused.split(' ')).assert().code(2);
     }

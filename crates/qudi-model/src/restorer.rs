@@ -200,7 +200,9 @@ impl QudiRestorer {
 
 /// Pictures in [-1, 1].
 fn possible(mut images: Vec<f32>) -> Vec<f32> {
-    images.iter_mut().for_each(|value| *value = value.clamp(-1.0, 1.0));
+    for value in &mut images {
+        *value = value.clamp(-1.0, 1.0);
+    }
     images
 }
 

@@ -1,6 +1,7 @@
 //! `qudi eval`: methods against known truth on the same photons, or on a real capture without one.
 
 use crate::args::{Eval, Global, Protocol};
+use crate::cmd::capture_light::checked_exposure;
 use crate::cmd::eval_capture::{Judged, judge};
 use crate::cmd::eval_clip::Clip;
 use crate::cmd::eval_html::html;
@@ -28,6 +29,7 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     {
         refuse_taken(path, overwrite)?;
     }
+    checked_exposure(args.exposure)?;
     if let Some(unknown) = args.method.iter().find(|name| !METHODS.contains(&name.as_str())) {
         return Err(Fault::new(
             format!("no method named `{unknown}`"),

@@ -127,12 +127,11 @@ impl Clip {
             gain: summary.gain,
             dark: None,
         };
-        context.exposure = match args.exposure {
-            Some(exposure) => exposure,
-            None => {
-                let read = |frame: u64| Ok(kept.counts[frame as usize].clone());
-                fitting_exposure(size, kept.counts.len() as u64, &context, read)?
-            }
+        context.exposure = if let Some(exposure) = args.exposure {
+            exposure
+        } else {
+            let read = |frame: u64| Ok(kept.counts[frame as usize].clone());
+            fitting_exposure(size, kept.counts.len() as u64, &context, read)?
         };
         let motion = if kept.flow.is_empty() {
             let estimate = || {
