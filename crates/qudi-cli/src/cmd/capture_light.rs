@@ -87,7 +87,7 @@ pub(crate) fn checked_exposure(stated: Option<f64>) -> Result<()> {
 }
 
 /// What the capture says of it.
-pub(crate) fn exposure_of(capture: &mut Capture, context: &Context) -> Result<f64> {
+fn exposure_of(capture: &mut Capture, context: &Context) -> Result<f64> {
     let size = capture.size();
     // Pipes have shown their first frames only.
     let first = 2 * LONGEST_HALF as u64 + 1;

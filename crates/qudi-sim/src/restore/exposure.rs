@@ -45,7 +45,6 @@ pub fn fitting_exposure(
 /// Photons per pixel and frame that a thousandth of the squares exceed.
 fn brightest(burst: BurstView<'_>, context: &Context) -> Result<f64> {
     let ordinary = context.sensor.dark_per_frame()?;
-    let law = CountLaw::new(&context.sensor, context.gain);
     let size = burst.size;
     let mut sums = vec![0u32; size.pixels()];
     for frame in burst.frames {
@@ -65,21 +64,19 @@ fn brightest(burst: BurstView<'_>, context: &Context) -> Result<f64> {
             let dark = pixels.iter().map(|(_, dark)| dark).sum::<f64>() / pixels.len() as f64;
             let total: f64 = pixels.iter().map(|&(sum, _)| f64::from(sum)).sum();
             let samples = (pixels.len() * burst.frames.len()) as u32;
-            squares.push(match context.sensor.response {
-                // So many binary samples tell far more light than one pixel's few.
-                Response::Binary => {
-                    context.sensor.estimate_flux(total, samples, context.gain, dark)
-                }
-                Response::Linear => {
-                    let detections = law.detections_for_mean(total / f64::from(samples));
-                    (detections - dark) / context.sensor.quantum_efficiency
-                }
-            });
+            let flux = context.sensor.estimate_flux(total, samples, context.gain, dark);
+            squares.push((flux, total / f64::from(samples), dark));
         }
     }
     let place = squares.len() - 1 - squares.len() / BRIGHTER;
-    let (_, &mut photons, _) = squares.select_nth_unstable_by(place, f64::total_cmp);
-    Ok(photons)
+    let (_, &mut (flux, mean, dark), _) =
+        squares.select_nth_unstable_by(place, |a, b| f64::total_cmp(&a.0, &b.0));
+    if context.sensor.response == Response::Binary {
+        return Ok(flux);
+    }
+    // What full scale cuts off, the law knows; asking it of every square takes seconds where counts are deep.
+    let law = CountLaw::new(&context.sensor, context.gain);
+    Ok((law.detections_for_mean(mean) - dark) / context.sensor.quantum_efficiency)
 }
 
 #[cfg(test)]
