@@ -13,7 +13,9 @@ mod grid;
 mod guide;
 mod hot;
 mod merge;
+mod paths;
 mod pyramid;
+mod velocity;
 
 use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
@@ -23,9 +25,10 @@ pub use aligned::{Aligned, Alignment};
 use blocks::Blocks;
 use cubic::{cubic, squares};
 use dft::SIDE;
-use grid::Grid;
+use grid::{Grid, inside};
 pub use guide::{Guide, TwoRounds};
 use merge::{Member, merge};
+use paths::Even;
 use pyramid::Pyramid;
 use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
 use qudi_sim::sensor::{CountLaw, CountMoments};
@@ -127,13 +130,16 @@ impl Restorer for Qbp {
     }
 }
 
+/// Displacements or velocities of patches, `[frame][patch]`, right and down in pixels.
+type Patchwise = Vec<Vec<[f32; 2]>>;
+
 /// The motion of every patch of one frame to every frame of its window.
 #[derive(Clone, Debug)]
 pub struct PatchFlow {
     /// Corners of the patches of 16 x 16 pixels, `(x, y)`.
     pub corners: Vec<[usize; 2]>,
     /// `[frame][patch]`, right and down in pixels.
-    pub flow: Vec<Vec<[f32; 2]>>,
+    pub flow: Patchwise,
 }
 
 impl PatchFlow {
@@ -175,6 +181,8 @@ struct Merger {
     pyramids: Vec<Pyramid>,
     /// Estimates of the frames' mean counts, if there are any.
     pilots: Option<Pilots>,
+    /// Even motion, which patches may follow.
+    even: Option<Even>,
 }
 
 /// What an earlier round made of the frames: motion is found in it, and what does not fit.
@@ -196,28 +204,37 @@ impl Merger {
         let pyramids =
             if block == 1 { frames.par_iter().map(Pyramid::new).collect() } else { Vec::new() };
         let grid = finest_grid(size);
-        Self { size: burst.size, frames, block, trust, moments, grid, pyramids, pilots: None }
+        let size = burst.size;
+        Self { size, frames, block, trust, moments, grid, pyramids, pilots: None, even: None }
     }
 
     /// The blocks around `reference`, and the motion of every patch to every frame.
-    fn flow(&self, reference: usize) -> (Blocks, Vec<Vec<[f32; 2]>>) {
+    fn flow(&self, reference: usize) -> (Blocks, Patchwise) {
         let blocks = Blocks::around(reference, self.frames.len(), self.block);
-        let single = |mean: f64| self.moments.variance_at_mean(mean) as f32;
         let own = self.pyramid(&blocks, blocks.reference);
-        let error = self.pilots.as_ref().map_or(1.0, |pilots| pilots.error);
-        let variance = error * single(self.frames[reference].mean());
-        let flows: Vec<Vec<[f32; 2]>> = (0..blocks.ranges.len())
+        let variance = self.matching_variance(reference);
+        let flows: Patchwise = (0..blocks.ranges.len())
             .into_par_iter()
             .map(|k| {
                 if k == blocks.reference {
                     return vec![[0.0; 2]; self.grid.len()];
                 }
                 let there = self.pyramid(&blocks, k);
-                align(&own, &there, variance / blocks.ranges[k].len() as f32)
+                align(&own, &there, (variance / blocks.ranges[k].len() as f32).max(1e-6))
             })
             .collect();
-        let flow = blocks.interpolate(&flows, reference);
+        let mut flow = blocks.interpolate(&flows, reference);
+        if let Some(even) = &self.even {
+            flow = self.likeliest(even, reference, flow);
+        }
         (blocks, flow)
+    }
+
+    /// Variance of the noise of two matched pixels' difference; above zero also for images without noise.
+    fn matching_variance(&self, reference: usize) -> f32 {
+        let error = self.pilots.as_ref().map_or(1.0, |pilots| pilots.error);
+        let single = self.moments.variance_at_mean(self.frames[reference].mean()) as f32;
+        (2.0 * (error * single)).max(1e-6)
     }
 
     fn pyramid(&self, blocks: &Blocks, k: usize) -> std::borrow::Cow<'_, Pyramid> {
@@ -272,9 +289,25 @@ impl Merger {
         Frame::from_fn(self.size, |x, y| sum.row(y)[x] / weights.row(y)[x])
     }
 
-    /// A patch between pixels. Bilinear as in the paper; what pilots have aligned deserves better.
-    fn sample(&self, image: &Frame, corner: [f32; 2]) -> dft::Patch {
-        if self.pilots.is_some() { cubic(image, corner) } else { sample(image, corner) }
+    /// Patch `i` displaced by `d`, between pixels. Bilinear as in the paper; what pilots have aligned deserves better, and
+    /// where it has left the image is what the pilot has of frame `own`.
+    fn sample(&self, image: &Frame, i: usize, d: [f32; 2], own: usize) -> dft::Patch {
+        let corner = self.grid.corner(i);
+        let at = [corner[0] as f32 + d[0], corner[1] as f32 + d[1]];
+        let Some(pilots) = &self.pilots else { return sample(image, at) };
+        let mut patch = cubic(image, at);
+        let (columns, rows) = (inside(at[0], image.size.width), inside(at[1], image.size.height));
+        if columns.len() * rows.len() < SIDE * SIDE {
+            for (y, row) in patch.iter_mut().enumerate() {
+                let instead = &pilots.frames[own].row(corner[1] + y)[corner[0]..];
+                for (x, (value, instead)) in row.iter_mut().zip(instead).enumerate() {
+                    if !columns.contains(&x) || !rows.contains(&y) {
+                        *value = *instead;
+                    }
+                }
+            }
+        }
+        patch
     }
 
     /// What such a patch, `part` of a pixel along a side, keeps of the noise's variance along that side.
@@ -288,14 +321,14 @@ impl Merger {
 
     /// Patch `i` of the reference, merged, and its noise.
     fn patch(&self, i: usize, blocks: &Blocks, flow: &[Vec<[f32; 2]>]) -> (dft::Patch, f32) {
-        let corner = self.grid.corner(i).map(|c| c as f32);
+        let own = blocks.ranges[blocks.reference].start;
         let member = |range: &std::ops::Range<usize>| {
             let share = 1.0 / range.len() as f32;
             let mut mean = [[0.0; SIDE]; SIDE];
             let mut noise = 0.0;
             for frame in range.clone() {
                 let d = flow[frame][i];
-                let warped = self.sample(&self.frames[frame], [corner[0] + d[0], corner[1] + d[1]]);
+                let warped = self.sample(&self.frames[frame], i, d, own);
                 for (mean, value) in mean.iter_mut().flatten().zip(warped.iter().flatten()) {
                     *mean += share * value;
                 }
@@ -305,8 +338,7 @@ impl Merger {
             }
             // Blocks have one frame where there are pilots.
             let pilot = self.pilots.as_ref().map(|pilots| {
-                let d = flow[range.start][i];
-                self.sample(&pilots.frames[range.start], [corner[0] + d[0], corner[1] + d[1]])
+                self.sample(&pilots.frames[range.start], i, flow[range.start][i], own)
             });
             Member { patch: mean, frames: range.len() as f32, noise, pilot }
         };

@@ -75,12 +75,10 @@ impl GuidePlanes {
         neighbours: usize,
         frames: Range<usize>,
     ) -> Result<Self> {
-        let guide = Guide::find(burst, context)?;
-        let alignment = Alignment::new(burst, context, &guide)?;
+        let alignment = Alignment::new(Guide::find(burst, context)?, context);
         let mut planes = vec![Vec::new(); Self::count(neighbours)];
         for frame in frames {
-            let clean = guide.clean[frame].clone();
-            let Aligned { merged, noise, seen, expected } = alignment.of(frame, neighbours);
+            let Aligned { clean, merged, noise, seen, expected } = alignment.of(frame, neighbours);
             let images = [clean, merged, noise].into_iter().map(|mut image| {
                 image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
                 image

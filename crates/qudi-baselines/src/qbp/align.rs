@@ -37,10 +37,8 @@ pub(super) fn finest_grid(size: qudi_sim::Size) -> Grid {
 }
 
 /// The displacement of every patch of `reference` in `other`, in pixels, right and down. `variance` is
-/// that of the noise of each one's counts.
+/// that of the noise of any two pixels' difference.
 pub(super) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<[f32; 2]> {
-    // Of any two pixels' difference, and for images without noise, too.
-    let variance = (2.0 * variance).max(1e-6);
     let mut parents: Option<(Grid, Vec<[isize; 2]>)> = None;
     for (number, (level, there)) in reference.levels.iter().zip(&other.levels).enumerate().rev() {
         let side = level.side;
@@ -75,7 +73,7 @@ pub(super) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<
     let refined: Vec<Refined> = flow
         .iter()
         .enumerate()
-        .map(|(i, start)| refine(image, there, grid.corner(i), *start, variance))
+        .map(|(i, start)| refine(image, there, grid.corner(i), start.map(|d| d as f32), variance))
         .collect();
     settle(&grid, &refined, variance)
 }
@@ -159,18 +157,18 @@ fn squared_difference(
 }
 
 /// A displacement and what is known of it.
-struct Refined {
+pub(super) struct Refined {
     flow: [f32; 2],
     /// Sums of squared slopes and their product: xx, xy, yy.
     slopes: [f32; 3],
 }
 
 /// Steps towards the displacement of least squared difference, from the slopes of the reference.
-fn refine(
+pub(super) fn refine(
     image: &Frame,
     there: &Frame,
     [x0, y0]: [usize; 2],
-    start: [isize; 2],
+    start: [f32; 2],
     variance: f32,
 ) -> Refined {
     let (width, height) = (image.size.width, image.size.height);
@@ -189,7 +187,7 @@ fn refine(
         }
     }
     let solve = Damped::new([xx, xy, yy], variance / (STEP_PRIOR * STEP_PRIOR));
-    let mut d = start.map(|d| d as f32);
+    let mut d = start;
     for _ in 0..STEPS {
         let moved = sample(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
         let (mut bx, mut by) = (0.0, 0.0);
@@ -203,8 +201,8 @@ fn refine(
         }
         let step = solve.solve([bx, by]);
         for k in 0..2 {
-            let from_start = d[k] - step[k] - start[k] as f32;
-            d[k] = start[k] as f32 + from_start.clamp(-REFINED, REFINED);
+            let from_start = d[k] - step[k] - start[k];
+            d[k] = start[k] + from_start.clamp(-REFINED, REFINED);
         }
     }
     Refined { flow: d, slopes: [xx, xy, yy] }
@@ -212,7 +210,7 @@ fn refine(
 
 /// Draws every patch towards the median of its neighbourhood, as far as its own slopes leave its
 /// motion open: flat patches move with their surroundings.
-fn settle(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> {
+pub(super) fn settle(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> {
     let mut flow: Vec<[f32; 2]> = refined.iter().map(|patch| patch.flow).collect();
     let ridge = variance / (NEIGHBOURS * NEIGHBOURS);
     for _ in 0..ROUNDS {

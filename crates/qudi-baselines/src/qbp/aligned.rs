@@ -1,13 +1,12 @@
 //! What every frame of a window has to say of one of them: the frames laid upon it, before anybody decides which to
 //! trust. A robust merge decides by a formula; a network that sees them all can learn to.
 
-use super::cubic::cubic;
 use super::dft::SIDE;
-use super::{Finish, Guide, Merged, Merger, Pilots, Qbp};
-use crate::stabilizer::{Stabilizer, Transform};
+use super::{Guide, Merged, Merger, Pilots};
+use crate::stabilizer::Stabilizer;
 use crate::transform_denoise::{image, units};
-use qudi_sim::restore::{BurstView, Context};
-use qudi_sim::{Frame, Result};
+use qudi_sim::Frame;
+use qudi_sim::restore::Context;
 use rayon::prelude::*;
 
 /// Variance of the guide's errors, in that of one frame's noise, about.
@@ -24,17 +23,20 @@ pub struct Alignment<'a> {
     context: &'a Context,
     /// Dark detections of an ordinary pixel.
     ordinary: f64,
+    clean: Vec<Frame>,
 }
 
 /// What is known of a frame. Deviations are those of the noise of one frame's counts where the guide is right.
 #[derive(Clone, Debug)]
 pub struct Aligned {
+    /// The guide's restored frame, in image units.
+    pub clean: Frame,
     /// Aligned and merged: unbiased and still noisy, in image units.
     pub merged: Frame,
     /// Deviation of the merged frame's noise at each pixel, in image units.
     pub noise: Frame,
     /// Counts of the frame itself, then of its neighbours, nearest first, laid upon it: less what the guide expects of the
-    /// frame, in deviations. Zero past the ends of the window.
+    /// frame, in deviations. Zero past the ends of the window and of the image.
     pub seen: Vec<Frame>,
     /// What the guide expects of the neighbours, laid upon the frame: less what it expects of the frame, in deviations.
     pub expected: Vec<Frame>,
@@ -42,23 +44,15 @@ pub struct Aligned {
 
 impl<'a> Alignment<'a> {
     /// Of the window that `guide` was found for.
-    ///
-    /// # Errors
-    /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
-    pub fn new(burst: BurstView<'_>, context: &'a Context, guide: &Guide) -> Result<Self> {
-        let ordinary = context.sensor.dark_per_frame()?;
-        let qbp = Qbp::new(Finish::Bm3d);
-        let mut merger = Merger::new(burst, context, qbp.block(context)?, qbp.settings.trust);
-        merger.follow(Pilots { frames: guide.means.clone(), error: ERROR });
-        let frames = burst.frames.len() as u32;
-        let stabilizer =
-            Stabilizer::new(Transform::Integral, &context.sensor, context.gain, frames);
-        Ok(Self { merger, stabilizer, context, ordinary })
+    pub fn new(guide: Guide, context: &'a Context) -> Self {
+        let Guide { clean, means, mut merger, stabilizer, ordinary } = guide;
+        merger.follow(Pilots { frames: means, error: ERROR });
+        Self { merger, stabilizer, context, ordinary, clean }
     }
 
     /// What is known of frame `reference`, with so many neighbours.
     pub fn of(&self, reference: usize, neighbours: usize) -> Aligned {
-        let Self { merger, stabilizer, context, ordinary } = self;
+        let Self { merger, stabilizer, context, ordinary, clean } = self;
         let (blocks, flow) = merger.flow(reference);
         let Merged { counts, noises, .. } = merger.merge_along(&blocks, &flow);
         let noises = merger.blended(|i| [[noises[i]; SIDE]; SIDE]);
@@ -81,12 +75,13 @@ impl<'a> Alignment<'a> {
         };
         let laid = |frames: &[Frame], places: &[usize], count: usize| {
             let places = places.par_iter();
-            let laid = places.map(|&k| less(merger.laid(&frames[k], &flow[k], k == reference)));
+            let laid = places.map(|&k| less(merger.laid(&frames[k], &flow[k], k, reference)));
             let mut laid: Vec<Frame> = laid.collect();
             laid.resize(count, Frame::filled(here.size, 0.0));
             laid
         };
         Aligned {
+            clean: clean[reference].clone(),
             noise: self.noise(&here, &noises),
             seen: laid(&merger.frames, &nearest, neighbours + 1),
             expected: laid(guide, &nearest[1..], neighbours),
@@ -112,15 +107,12 @@ impl<'a> Alignment<'a> {
 }
 
 impl Merger {
-    /// `frame` laid upon the reference along the motion of every patch.
-    fn laid(&self, frame: &Frame, flow: &[[f32; 2]], reference: bool) -> Frame {
-        if reference {
+    /// `frame`, number `k`, laid upon the reference along the motion of every patch; the guide's where it does not reach.
+    fn laid(&self, frame: &Frame, flow: &[[f32; 2]], k: usize, reference: usize) -> Frame {
+        if k == reference {
             return self.cropped(frame);
         }
-        self.blended(|i| {
-            let (corner, d) = (self.grid.corner(i).map(|c| c as f32), flow[i]);
-            cubic(frame, [corner[0] + d[0], corner[1] + d[1]])
-        })
+        self.blended(|i| self.sample(frame, i, flow[i], reference))
     }
 
     /// The part of `frame` within the window's size.

@@ -1,6 +1,15 @@
 //! Patches that cover an image.
 
+use super::dft::SIDE;
 use qudi_sim::Size;
+use std::ops::Range;
+
+/// Samples of a patch at `start`, along one axis, that lie in an image of `length` pixels.
+pub(super) fn inside(start: f32, length: usize) -> Range<usize> {
+    let first = (-0.5 - start).ceil().clamp(0.0, SIDE as f32);
+    let end = ((length as f32 - 0.5 - start).floor() + 1.0).clamp(first, SIDE as f32);
+    first as usize..end as usize
+}
 
 /// Corners of square patches, the last ones at the borders.
 #[derive(Clone, Debug)]
@@ -69,5 +78,22 @@ impl Grid {
             values[..n].sort_unstable_by(f32::total_cmp);
             0.5 * (values[(n - 1) / 2] + values[n / 2])
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_inside_are_counted_to_half_a_pixel() {
+        assert_eq!(inside(0.0, 40), 0..16);
+        assert_eq!(inside(-3.0, 40), 3..16);
+        assert_eq!(inside(-2.6, 40), 3..16);
+        assert_eq!(inside(-2.4, 40), 2..16);
+        assert_eq!(inside(24.4, 40), 0..16);
+        assert_eq!(inside(24.6, 40), 0..15);
+        assert_eq!(inside(38.0, 40), 0..2);
+        assert!(inside(60.0, 40).is_empty() && inside(-60.0, 40).is_empty());
     }
 }

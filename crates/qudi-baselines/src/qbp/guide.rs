@@ -2,6 +2,7 @@
 //! frames fit, far better than noisy frames can. Basic estimates that guide a second pass are BM3D's idea (Dabov et al.
 //! 2007, section III-B), here applied to the whole of quanta burst photography with BM3D.
 
+use super::paths::Even;
 use super::{Finish, Merged, Merger, Pilots, Qbp, QbpSettings, at_least};
 use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
@@ -22,12 +23,17 @@ const QUICK: Profile = Profile { radius: 8, step: [4, 3] };
 const THOROUGH: Profile = Profile { radius: 12, step: [4, 3] };
 
 /// The best classical estimate of a window, for a network to go on from.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Guide {
     /// Restored frames, in image units.
     pub clean: Vec<Frame>,
     /// The same in mean counts, at least as large as a patch.
     pub(super) means: Vec<Frame>,
+    /// What found them.
+    pub(super) merger: Merger,
+    pub(super) stabilizer: Stabilizer,
+    /// Dark detections of an ordinary pixel.
+    pub(super) ordinary: f64,
 }
 
 impl Guide {
@@ -44,6 +50,7 @@ impl Guide {
         let qbp = Qbp::new(Finish::Bm3d);
         let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
         let mut merger = Merger::new(burst, context, qbp.block(context)?, trust);
+        merger.even = Even::find(&merger);
         let round = |merger: &Merger, profile, assumed| {
             let restored = |frame: usize| {
                 let Merged { counts, noise, .. } = merger.merge(frame);
@@ -62,7 +69,8 @@ impl Guide {
         merger.follow(Pilots { frames, error: ERROR });
         let restored = round(&merger, THOROUGH, NOISE);
         let clean = restored.iter().map(|z| image(z, &stabilizer, context, ordinary)).collect();
-        Ok(Self { clean, means: means(&restored, size) })
+        let means = means(&restored, size);
+        Ok(Self { clean, means, merger, stabilizer, ordinary })
     }
 }
 

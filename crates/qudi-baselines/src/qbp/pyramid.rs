@@ -49,7 +49,7 @@ fn shrink(image: &Frame, size: Size, ratio: usize) -> Frame {
 }
 
 /// Binomial filter 1 4 6 4 1 both ways, borders repeated: without it single photons are matched.
-fn smooth(image: &Frame) -> Frame {
+pub(super) fn smooth(image: &Frame) -> Frame {
     const TAPS: [f32; 5] = [0.0625, 0.25, 0.375, 0.25, 0.0625];
     let Size { height, width } = image.size;
     let filtered = |source: &Frame, step: [usize; 2]| {
