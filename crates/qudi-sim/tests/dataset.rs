@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 fn source(name: &str, kind: SourceKind, from: &[&str]) -> SourceConfig {
     let from = from.iter().map(|&f| f.to_owned()).collect();
-    SourceConfig { name: name.into(), kind, from, weight: 1.0, stride: 2, speed: 2.0 }
+    SourceConfig { name: name.into(), kind, from, weight: 1.0, stride: 2, shrink: 1.0, speed: 2.0 }
 }
 
 fn config(source: Vec<SourceConfig>) -> DataConfig {
@@ -24,6 +24,13 @@ fn config(source: Vec<SourceConfig>) -> DataConfig {
 /// A value that tells clip, frame and pixel; at most 140.
 fn value(clip: u32, frame: u32, x: u32, y: u32) -> u8 {
     (20 + 7 * clip + 5 * frame + x + 2 * y) as u8
+}
+
+/// The mean of a clip, of 1.
+fn clip_mean(clip: u32) -> f64 {
+    let row = |t, y| (0..24).map(move |x| f64::from(value(clip, t, x, y)));
+    let values = (0..8).flat_map(|t| (0..20).flat_map(move |y| row(t, y)));
+    values.sum::<f64>() / (8.0 * 20.0 * 24.0) / 255.0
 }
 
 /// Two clips of eight frames and a still in a folder.
@@ -113,10 +120,7 @@ fn exposure_is_that_of_the_whole_clip() {
     let config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
     let path = pack(&config, folder.path()).unwrap();
     let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
-    let mean = (0..8)
-        .flat_map(|t| (0..20).flat_map(move |y| (0..24).map(move |x| f64::from(value(1, t, x, y)))))
-        .sum::<f64>()
-        / (8.0 * 20.0 * 24.0);
+    let mean = 255.0 * clip_mean(1);
     let mut factors = Vec::new();
     for k in 0..50 {
         let sample = dataset.sample(1, k).unwrap();
@@ -134,6 +138,34 @@ fn exposure_is_that_of_the_whole_clip() {
     let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
     let least = factors.iter().fold(9.0f64, |a, &b| a.min(b));
     assert!((0.6..0.7).contains(&least) && (1.3..=1.5).contains(&most), "{least} {most}");
+}
+
+/// Clips become smaller by factors between one and what the recipe says: their slopes steeper.
+#[test]
+fn samples_shrink_as_the_recipe_says() {
+    let folder = tempfile::tempdir().unwrap();
+    files(folder.path());
+    let mut config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
+    config.source[0].shrink = 1.25;
+    let path = pack(&config, folder.path()).unwrap();
+    let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
+    let mut factors = Vec::new();
+    for k in 0..100 {
+        let sample = dataset.sample(3, k).unwrap();
+        let frame = &sample.truth[0];
+        assert_eq!(frame.size.pixels(), 256);
+        // From one corner to the other the file's values rise by 1 + 2 for every step of both, or one against the other.
+        let at = |x: usize, y: usize| f64::from(frame.data[16 * y + x]);
+        let (across, down) = (at(15, 0) - at(0, 0), at(0, 15) - at(0, 0));
+        let level = 255.0 * (across.abs() + down.abs()) / 15.0;
+        let brightness = sample.context.exposure / clip_mean(1);
+        factors.push(level / 3.0 / brightness);
+    }
+    let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
+    let least = factors.iter().fold(9.0f64, |a, &b| a.min(b));
+    assert!((0.99..1.01).contains(&least) && (1.23..1.26).contains(&most), "{least} {most}");
+    config.source[0].shrink = 0.5;
+    assert!(config.checked().unwrap_err().to_string().contains("shrinks"));
 }
 
 /// Light is log-uniform, and the photons are those that it gives.

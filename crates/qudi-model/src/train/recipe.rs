@@ -257,6 +257,7 @@ impl Recipe {
                 from,
                 weight: 1.0,
                 stride: 1,
+                shrink: 1.0,
                 speed: 0.0,
             }],
         })

@@ -1,8 +1,10 @@
 //! What samples are drawn from, as recipes write it down.
 
 use crate::error::{Result, SimError};
+use crate::random::uniform;
 use crate::scene::{PROCEDURAL, ProceduralScene};
 use crate::sensor::Sensor;
+use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 /// The `[data]` part of a recipe.
@@ -66,6 +68,9 @@ pub struct SourceConfig {
     /// Longest step through a clip, in its frames: 2 also makes motion twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
+    /// Most that clips and stills are made smaller: a factor drawn log-uniformly between 1 and this.
+    #[serde(default = "one")]
+    pub shrink: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
     #[serde(default = "usual_speed")]
     pub speed: f64,
@@ -93,6 +98,13 @@ fn one_frame() -> usize {
 
 fn usual_speed() -> f64 {
     4.0
+}
+
+impl SourceConfig {
+    /// How many times smaller a sample is made.
+    pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
+        if self.shrink > 1.0 { self.shrink.powf(uniform(random)) } else { 1.0 }
+    }
 }
 
 impl LightRange {
@@ -189,6 +201,10 @@ impl DataConfig {
                     format!("has a speed of {}", source.speed),
                     "use 0 to 100 pixels per frame",
                 );
+            }
+            if !(1.0..=4.0).contains(&source.shrink) {
+                let what = format!("shrinks by {}", source.shrink);
+                return fault(&key, what, "use a factor from 1 to 4");
             }
             if source.kind == SourceKind::Scenes {
                 for name in &source.from {

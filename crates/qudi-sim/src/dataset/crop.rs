@@ -1,4 +1,4 @@
-//! A square cut from a frame, turned and mirrored.
+//! A square cut from a frame, turned, mirrored, and made smaller.
 
 use crate::frame::{Frame, Size};
 
@@ -25,9 +25,61 @@ impl Crop {
     }
 }
 
+/// A square picture at another side, not longer than its own: means over areas.
+pub(super) fn shrunk(square: Frame, side: usize) -> Frame {
+    let long = square.size.width;
+    if side == long {
+        return square;
+    }
+    // Along rows and transposed, twice.
+    let half = |rows: &[f32], count: usize| -> Vec<f32> {
+        let mut data = vec![0.0; side * count];
+        for (y, row) in rows.chunks_exact(long).enumerate() {
+            for x in 0..side {
+                data[x * count + y] = mean(row, x, side);
+            }
+        }
+        data
+    };
+    let data = half(&half(&square.data, long), side);
+    Frame { size: Size { height: side, width: side }, data }
+}
+
+/// The mean over place `x` of `side` equal parts of a row.
+fn mean(row: &[f32], x: usize, side: usize) -> f32 {
+    let length = row.len() as f32 / side as f32;
+    let (from, to) = (x as f32 * length, (x + 1) as f32 * length);
+    let first = from as usize;
+    let covered = |i: usize| (to.min((i + 1) as f32) - from.max(i as f32)).max(0.0);
+    let last = (to.ceil() as usize).min(row.len());
+    let sum: f32 = (first..last).map(|i| covered(i) * row[i]).sum();
+    sum / (first..last).map(covered).sum::<f32>()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn smaller_pictures_keep_slopes_means_and_white() {
+        let ramp = |side: usize| {
+            let size = Size { height: side, width: side };
+            let place = |i: usize| (i as f32 + 0.5) / side as f32;
+            Frame::from_fn(size, |x, y| 0.25 * place(x) + 0.75 * place(y))
+        };
+        for (long, side) in [(9, 9), (9, 8), (12, 6), (31, 20), (17, 5)] {
+            let (small, wanted) = (shrunk(ramp(long), side), ramp(side));
+            assert_eq!(small.size, wanted.size);
+            // Parts of a step of the ramp count as that step: up to a quarter of it is lost.
+            let most = 0.26 / long as f32;
+            for (a, b) in small.data.iter().zip(&wanted.data) {
+                assert!((a - b).abs() < most, "{long} -> {side}: {a} for {b}");
+            }
+            assert!((small.mean() - wanted.mean()).abs() < 1e-4);
+        }
+        let white = Frame::from_fn(Size { height: 31, width: 31 }, |_, _| 1.0);
+        assert!(shrunk(white, 19).data.iter().all(|&value| (value - 1.0).abs() < 1e-6));
+    }
 
     #[test]
     fn eight_turns_differ_and_keep_every_pixel() {

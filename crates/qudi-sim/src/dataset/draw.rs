@@ -1,7 +1,7 @@
 //! Drawing samples: a scene, a crop, a sensor, light, and fresh photons.
 
 use super::config::{DataConfig, SourceConfig, SourceKind};
-use super::crop::Crop;
+use super::crop::{Crop, shrunk};
 use super::pack::Pack;
 use crate::camera::Camera;
 use crate::error::{Result, SimError};
@@ -105,16 +105,12 @@ impl Dataset {
         let stride = 1 + below(longest.max(1), rng);
         let first = below(clip.frames - steps * stride, rng);
         let backward = rng.next_u64() & 1 == 1;
-        let side = self.config.crop;
-        let crop = Crop {
-            left: below(clip.size.width - side + 1, rng),
-            top: below(clip.size.height - side + 1, rng),
-            side,
-            turn: (rng.next_u64() & 7) as u8,
-        };
+        let factor = self.config.source[source].factor(rng);
+        let crop = cut(clip.size, enlarged(self.config.crop, factor), rng);
         let mut frames = Vec::with_capacity(steps + 1);
         for i in 0..=steps {
-            frames.push(crop.of(&pack.frame(number, first + i * stride)?));
+            let frame = crop.of(&pack.frame(number, first + i * stride)?);
+            frames.push(shrunk(frame, self.config.crop));
         }
         if backward {
             frames.reverse();
@@ -137,13 +133,9 @@ impl Dataset {
         // The scene shows the middle of the image: the part around the crop, with the way that it goes.
         let way = (speed * frames as f64 / 2.0).ceil() as usize + 4;
         let part = (side + 2 * way).min(clip.size.height).min(clip.size.width);
-        let cut = Crop {
-            left: below(clip.size.width - part + 1, rng),
-            top: below(clip.size.height - part + 1, rng),
-            side: part,
-            turn: (rng.next_u64() & 7) as u8,
-        };
-        let image = cut.of(&pack.frame(number, 0)?);
+        let factor = self.config.source[source].factor(rng);
+        let crop = cut(clip.size, enlarged(part, factor), rng);
+        let image = shrunk(crop.of(&pack.frame(number, 0)?), part);
         let scene = still_scene(image, motion, Size { height: side, width: side }, rng.next_u64());
         Ok((rendered(&scene, frames), clip.mean))
     }
@@ -158,6 +150,22 @@ impl Dataset {
         let frames = rendered(&scene, self.config.frames);
         let mean = frames.iter().map(Frame::mean).sum::<f64>() / frames.len() as f64;
         (frames, mean)
+    }
+}
+
+/// The side that shrinks to `side` by `factor`.
+fn enlarged(side: usize, factor: f64) -> usize {
+    (side as f64 * factor).round() as usize
+}
+
+/// Some square of an image of `size`, of `side` or as much as there is of it, turned somehow.
+fn cut(size: Size, side: usize, rng: &mut impl Rng) -> Crop {
+    let side = side.min(size.height).min(size.width);
+    Crop {
+        left: below(size.width - side + 1, rng),
+        top: below(size.height - side + 1, rng),
+        side,
+        turn: (rng.next_u64() & 7) as u8,
     }
 }
 
