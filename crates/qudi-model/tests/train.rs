@@ -4,8 +4,8 @@
 use burn::tensor::{Device, Tensor};
 use qudi_model::network::{Qudi, fill, parameters};
 use qudi_model::train::{
-    Adam, Batch, Bursts, Event, Feed, From, METRICS, Recipe, Run, StepReport, Trainer, WEIGHTS,
-    values,
+    Adam, Batch, Bursts, Event, Feed, Files, From, METRICS, Recipe, Run, StepReport, Trainer,
+    WEIGHTS, values,
 };
 use qudi_sim::SimError;
 use qudi_sim::dataset::Dataset;
@@ -43,7 +43,7 @@ fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Ve
 }
 
 fn open(folder: &Path, recipe: &Recipe, from: From) -> Result<Run, SimError> {
-    Run::open(folder, recipe, from, None, &[Device::flex()], None, None)
+    Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
 }
 
 fn learn(run: &mut Run, stop_after: u64) -> Result<(), SimError> {

@@ -22,6 +22,9 @@ pub(crate) struct Train {
     /// Decoded data in one file; made from --data if it is not there [default: pack.zip in the run's folder]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) pack: Option<PathBuf>,
+    /// Folder for the bursts of recipes with train.parts, with their guides: what lies there is not drawn again
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
+    pub(crate) bursts: Option<PathBuf>,
     /// Make the pack, and stop
     #[arg(long, requires = "pack")]
     pub(crate) cache_only: bool,

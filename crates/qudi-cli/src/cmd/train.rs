@@ -9,7 +9,7 @@ use crate::interrupt;
 use crate::report::Report;
 use qudi_model::checkpoint::load;
 use qudi_model::perceptual::fetch;
-use qudi_model::train::{From, RECIPE, Recipe, Run, Validation, WEIGHTS};
+use qudi_model::train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS};
 use qudi_sim::dataset::{Pack, write_pack};
 use qudi_sim::output::Overwrite;
 use serde_json::json;
@@ -30,19 +30,17 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
     let exists = Run::exists(&folder);
     check_folder(args, global, &folder, exists)?;
     let devices = args.device.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
-    std::fs::create_dir_all(&folder).map_err(|e| {
-        Fault::new(
-            format!("cannot make the run's folder: {e}"),
-            folder.display(),
-            "choose another with -o",
-        )
-    })?;
+    make_folder(&folder, "the run's folder", "choose another with -o")?;
     if let (true, Some(backbones)) = (args.fetch, &args.backbones) {
         for path in fetch(recipe.train.loss.term, backbones)? {
             report.remark(&format!("{} is there", path.display()));
         }
     }
     let pack = pack(args, &recipe, &folder, report)?;
+    if let Some(folder) = &args.bursts {
+        make_folder(folder, "the folder of bursts", "choose another with --bursts")?;
+    }
+    let files = Files { pack, bursts: args.bursts.clone() };
     let from = if args.resume {
         From::State
     } else {
@@ -53,7 +51,7 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
     let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
     let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
     let mut run =
-        Run::open(&folder, &recipe, from, pack, &list, args.backbones.as_deref(), commit)?;
+        Run::open(&folder, &recipe, from, files, &list, args.backbones.as_deref(), commit)?;
     write(&folder, ENVIRONMENT, environment(&devices).as_bytes())?;
     let mut watch = Watch::new(&recipe, &folder, report)?;
     let learnt = device::guarded("training", || {
@@ -87,6 +85,11 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
         .collect();
     let text = format!("{} after {steps} steps\n{}", weights.display(), told(&means));
     report.result(&text, || json!({"weights": weights, "steps": steps, "validation": quality}))
+}
+
+fn make_folder(folder: &Path, what: &str, help: &str) -> Result<()> {
+    std::fs::create_dir_all(folder)
+        .map_err(|e| Fault::new(format!("cannot make {what}: {e}"), folder.display(), help))
 }
 
 fn overwrite(global: &Global) -> Overwrite {

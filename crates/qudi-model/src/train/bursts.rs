@@ -1,13 +1,15 @@
 //! Bursts with their guides: drawn for every sample, or drawn once and cut into parts again and again.
 
+use super::kept::{KeptBurst, Shelf};
 use super::recipe::{PartsConfig, Recipe};
 use crate::config::Part;
-use crate::measurement::{GuidePlanes, IMAGES};
+use crate::measurement::GuidePlanes;
 use qudi_sim::dataset::{Dataset, Sample};
 use qudi_sim::restore::BurstView;
-use qudi_sim::{Frame, Result, Size, USUAL_EXPOSURE};
+use qudi_sim::{Result, Size, USUAL_EXPOSURE};
 use rand::rngs::ChaCha8Rng;
-use rand::{Rng, RngExt, SeedableRng};
+use rand::{RngExt, SeedableRng};
+use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 /// Frames of a burst and what classical methods make of all of them.
@@ -27,6 +29,7 @@ pub struct Bursts {
     neighbours: usize,
     exposure: bool,
     parts: Option<(PartsConfig, Kept)>,
+    shelf: Option<Arc<Shelf>>,
 }
 
 /// Bursts that all threads share, each computed by the first that needs it.
@@ -46,7 +49,17 @@ impl Bursts {
             neighbours: recipe.network.pre.neighbours,
             exposure: !recipe.network.lacks(Part::Exposure),
             parts: recipe.train.parts.map(keep),
+            shelf: None,
         }
+    }
+
+    /// Writes drawn bursts into `folder`, which exists, and reads those that lie there.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if the recipe keeps no bursts.
+    pub fn keep_in(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
+        let shelf = Some(Arc::new(Shelf::new(folder, recipe)?));
+        Ok(Self { shelf, ..self })
     }
 
     /// The same for another thread.
@@ -54,7 +67,8 @@ impl Bursts {
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the data cannot be opened again.
     pub fn again(&self) -> Result<Self> {
-        Ok(Self { dataset: self.dataset.again()?, parts: self.parts.clone(), ..*self })
+        let (dataset, shelf) = (self.dataset.again()?, self.shelf.clone());
+        Ok(Self { dataset, shelf, parts: self.parts.clone(), ..*self })
     }
 
     /// Sample `number`.
@@ -66,10 +80,23 @@ impl Bursts {
         let cell = &kept[place as usize];
         if cell.get().is_none() {
             // Two threads may draw the same one: they draw the same.
-            let drawn = self.draw(place, Some(parts.kept))?;
-            cell.get_or_init(|| KeptBurst::new(drawn));
+            let burst = self.kept(place, parts.kept)?;
+            cell.get_or_init(|| burst);
         }
         Ok(cell.get().expect("just filled").part(parts, &mut random))
+    }
+
+    /// Burst `number` from where bursts are kept, or drawn and kept there.
+    fn kept(&mut self, number: u64, frames: usize) -> Result<KeptBurst> {
+        let shelf = self.shelf.clone();
+        if let Some(burst) = shelf.as_ref().map(|shelf| shelf.take(number)).transpose()?.flatten() {
+            return Ok(burst);
+        }
+        let burst = KeptBurst::new(self.draw(number, Some(frames))?);
+        if let Some(shelf) = shelf {
+            shelf.put(number, &burst)?;
+        }
+        Ok(burst)
     }
 
     /// Burst `number`, or some of its frames.
@@ -92,87 +119,23 @@ impl Bursts {
     }
 }
 
-/// A burst in a third of the memory: planes of deviations in bytes, finer than any noise.
-#[derive(Debug)]
-struct KeptBurst {
-    size: Size,
-    sample: Sample,
-    images: Vec<Vec<f32>>,
-    deviations: Vec<Vec<i8>>,
-}
-
-/// Steps of a byte: a 64th of a deviation near zero, wider far from it.
-const STEPS: f32 = 32.0;
-
-fn compressed(deviation: f32) -> i8 {
-    (STEPS * (2.0 * deviation).asinh()).round() as i8
-}
-
-fn expanded(byte: i8) -> f32 {
-    0.5 * (f32::from(byte) / STEPS).sinh()
-}
-
-impl KeptBurst {
-    fn new(burst: Guided) -> Self {
-        let Guided { size, sample, guide: GuidePlanes(mut images) } = burst;
-        let deviations = images.split_off(IMAGES).into_iter();
-        let deviations = deviations.map(|plane| plane.into_iter().map(compressed).collect());
-        Self { size, sample, images, deviations: deviations.collect() }
-    }
-
-    /// Some frames, some square of them, turned and mirrored somehow.
-    fn part(&self, parts: PartsConfig, random: &mut impl Rng) -> Guided {
-        let (frames, side) = (parts.frames, parts.side);
-        let first = random.random_range(0..=self.sample.truth.len() - frames);
-        let top = random.random_range(0..=self.size.height - side);
-        let left = random.random_range(0..=self.size.width - side);
-        let [mirrored, flipped, turned]: [bool; 3] = std::array::from_fn(|_| random.random());
-        let places: Vec<usize> = (0..side * side)
-            .map(|place| {
-                let (y, x) = (place / side, place % side);
-                let (y, x) = if turned { (x, y) } else { (y, x) };
-                let y = if flipped { side - 1 - y } else { y };
-                let x = if mirrored { side - 1 - x } else { x };
-                (top + y) * self.size.width + left + x
-            })
-            .collect();
-        let size = Size { height: side, width: side };
-        let range = first..first + frames;
-        let truth = self.sample.truth[range.clone()].iter();
-        let truth = truth.map(|frame| Frame { size, data: picked(&frame.data, &places) }).collect();
-        let counts = &self.sample.counts[range.clone()];
-        let counts = counts.iter().map(|frame| picked(frame, &places)).collect();
-        let mut context = self.sample.context.clone();
-        context.seed = random.next_u64();
-        let pixels = self.size.pixels();
-        let place = |frame: usize| frame * pixels..(frame + 1) * pixels;
-        let image = |plane: &Vec<f32>| -> Vec<f32> {
-            range.clone().flat_map(|frame| picked(&plane[place(frame)], &places)).collect()
-        };
-        let deviation = |plane: &Vec<i8>| -> Vec<f32> {
-            let bytes = range.clone().flat_map(|frame| picked(&plane[place(frame)], &places));
-            bytes.map(expanded).collect()
-        };
-        let planes = self.images.iter().map(image).chain(self.deviations.iter().map(deviation));
-        let guide = GuidePlanes(planes.collect());
-        Guided { size, sample: Sample { truth, counts, context }, guide }
-    }
-}
-
-fn picked<T: Copy>(values: &[T], places: &[usize]) -> Vec<T> {
-    places.iter().map(|&place| values[place]).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn bursts(parts: &str) -> Bursts {
+    fn recipe(parts: &str) -> Recipe {
         let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.parts", parts)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
-        let recipe = Recipe::load("tiny", &changes).unwrap_or_else(|e| panic!("{e}"));
+        Recipe::load("tiny", &changes).unwrap_or_else(|e| panic!("{e}"))
+    }
+
+    fn of(recipe: &Recipe) -> Bursts {
         let dataset = Dataset::new(&recipe.data, None).unwrap_or_else(|e| panic!("{e}"));
-        Bursts::new(&recipe, dataset)
+        Bursts::new(recipe, dataset)
+    }
+
+    fn bursts(parts: &str) -> Bursts {
+        of(&recipe(parts))
     }
 
     fn sample(bursts: &mut Bursts, number: u64) -> Guided {
@@ -204,17 +167,6 @@ mod tests {
     }
 
     #[test]
-    fn bytes_are_finer_than_noise() {
-        for i in -800..=800 {
-            let deviation = i as f32 * 0.01;
-            let error = (expanded(compressed(deviation)) - deviation).abs();
-            assert!(error <= 0.008 + 0.016 * deviation.abs(), "{deviation}: {error}");
-        }
-        let far = [1e9, -1e9, f32::NAN].map(|value| expanded(compressed(value)));
-        assert!(far[0] > 13.0 && far[1] < -13.0 && far[2] == 0.0, "{far:?}");
-    }
-
-    #[test]
     fn kept_frames_know_the_others() {
         let mut bursts = bursts("{ bursts = 1, kept = 3, frames = 3, side = 32 }");
         let whole = bursts.draw(0, None).unwrap_or_else(|e| panic!("{e}"));
@@ -243,5 +195,56 @@ mod tests {
             seen.push(list);
         }
         assert!(seen[0] != seen[1] && seen[1] != seen[2]);
+    }
+
+    #[test]
+    fn bursts_on_disk_are_those_drawn() {
+        let recipe = recipe("{ bursts = 2, kept = 3, frames = 3, side = 16 }");
+        let folder = tempfile::tempdir().unwrap_or_else(|e| panic!("{e}"));
+        let keep = |recipe: &Recipe| {
+            of(recipe).keep_in(folder.path(), recipe).unwrap_or_else(|e| panic!("{e}"))
+        };
+        let same = |a: &Guided, b: &Guided| {
+            let (one, other) = (&a.sample.context, &b.sample.context);
+            a.guide.0 == b.guide.0
+                && a.sample.truth == b.sample.truth
+                && a.sample.counts == b.sample.counts
+                && one.seed == other.seed
+                && (one.ppp.to_bits(), one.exposure.to_bits(), one.gain.to_bits())
+                    == (other.ppp.to_bits(), other.exposure.to_bits(), other.gain.to_bits())
+                && one.sensor == other.sensor
+        };
+        let (mut drawn, mut first, mut second) = (of(&recipe), keep(&recipe), keep(&recipe));
+        for number in 0..6 {
+            let expected = sample(&mut drawn, number);
+            assert!(same(&expected, &sample(&mut first, number)), "written, sample {number}");
+            assert!(same(&expected, &sample(&mut second, number)), "read, sample {number}");
+        }
+        let list = std::fs::read_dir(folder.path()).unwrap_or_else(|e| panic!("{e}"));
+        let mut files: Vec<_> = list.map(|entry| entry.unwrap_or_else(|e| panic!("{e}"))).collect();
+        files.sort_by_key(std::fs::DirEntry::file_name);
+        let names: Vec<_> = files.iter().map(std::fs::DirEntry::file_name).collect();
+        assert_eq!(names, ["1-000000.safetensors", "1-000001.safetensors"]);
+
+        let mut other = recipe.clone();
+        other.data.source[0].speed = 1.0;
+        let error = (0..6).find_map(|number| keep(&other).sample(number).err());
+        assert!(error.is_some_and(|e| e.to_string().contains("something else")));
+        for file in files {
+            let bytes = std::fs::read(file.path()).unwrap_or_else(|e| panic!("{e}"));
+            for broken in [
+                &bytes[..bytes.len() - 1],
+                &bytes[..40],
+                &[],
+                &[&bytes[..], &[0; 1 << 17]].concat(),
+            ] {
+                std::fs::write(file.path(), broken).unwrap_or_else(|e| panic!("{e}"));
+                let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
+                assert!(error.is_some_and(|e| e.place().is_some()), "{} bytes", broken.len());
+            }
+            std::fs::write(file.path(), bytes).unwrap_or_else(|e| panic!("{e}"));
+        }
+        other.train.parts = None;
+        assert!(of(&other).keep_in(folder.path(), &other).is_err());
     }
 }

@@ -49,6 +49,16 @@ pub struct Run {
     commit: Option<String>,
 }
 
+/// Files that a run learns from.
+#[derive(Debug, Default)]
+pub struct Files {
+    /// Decoded clips and stills, for recipes that name any.
+    pub pack: Option<Pack>,
+    /// A folder, which exists, for bursts with their guides: those there are not drawn again. Only for recipes with
+    /// `train.parts`.
+    pub bursts: Option<PathBuf>,
+}
+
 /// Where a run starts.
 #[derive(Debug)]
 pub enum From {
@@ -75,13 +85,16 @@ impl Run {
         folder: &Path,
         recipe: &Recipe,
         from: From,
-        pack: Option<Pack>,
+        files: Files,
         devices: &[Device],
         backbones: Option<&Path>,
         commit: Option<String>,
     ) -> Result<Self> {
-        let validator = Validator::new(recipe, pack.as_ref())?;
-        let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, pack)?);
+        let validator = Validator::new(recipe, files.pack.as_ref())?;
+        let mut bursts = Bursts::new(recipe, Dataset::new(&recipe.data, files.pack)?);
+        if let Some(folder) = &files.bursts {
+            bursts = bursts.keep_in(folder, recipe)?;
+        }
         let trainer = match from {
             From::Start(network) => {
                 Trainer::new(recipe, network.map(|network| *network), devices, backbones)?
