@@ -76,6 +76,7 @@ impl Frame {
     }
 
     /// Row `y`.
+    #[inline]
     pub fn row(&self, y: usize) -> &[f32] {
         &self.data[y * self.size.width..(y + 1) * self.size.width]
     }

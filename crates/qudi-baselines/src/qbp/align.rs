@@ -256,7 +256,9 @@ pub(super) fn sample(image: &Frame, corner: [f32; 2]) -> [[f32; SIDE]; SIDE] {
     let mut around = [[0.0; SIDE + 1]; SIDE + 1];
     if x >= 0 && y >= 0 && x + side < width && y + side < height {
         for (r, row) in around.iter_mut().enumerate() {
-            row.copy_from_slice(&image.row(y as usize + r)[x as usize..=x as usize + SIDE]);
+            if let Some(source) = image.row(y as usize + r)[x as usize..].first_chunk() {
+                *row = *source;
+            }
         }
     } else {
         for (r, row) in around.iter_mut().enumerate() {

@@ -5,7 +5,7 @@
 //! is what the guide expects of the reference plus something unknown, the same in all frames, plus noise.
 
 use super::align::{Refined, refine, sample, settle};
-use super::dft::SIDE;
+use super::dft::{Patch, SIDE};
 use super::grid::{Grid, inside};
 use super::pyramid::smooth;
 use super::velocity::Coarse;
@@ -154,12 +154,14 @@ impl Judge<'_> {
         if best == 0 {
             return path;
         }
+        let own = self.own(corner.map(|c| c as f32));
+        let variance = self.variance(corner);
         for (k, d) in path.iter_mut().enumerate().filter(|(k, _)| *k != reference) {
             let first = paths[0][k];
             let [new, old] = [*d, first].map(|d| {
                 let mut sums = Sums::new();
-                self.add(corner.map(|c| c as f32), k, d, &mut sums);
-                sums.misfit(self.variance(corner), self.outside)
+                self.add(&own, k, d, &mut sums);
+                sums.misfit(variance, self.outside)
             });
             if new - old >= WORSE {
                 *d = first;
@@ -183,19 +185,24 @@ impl Judge<'_> {
         let mut cost = 0.0;
         for part in 0..self.window * self.window {
             let part = [part % self.window, part / self.window].map(|k| (k * SIDE) as f32 - margin);
-            let corner = [corner[0] as f32 + part[0], corner[1] as f32 + part[1]];
+            let own = self.own([corner[0] as f32 + part[0], corner[1] as f32 + part[1]]);
             let mut sums = Sums::new();
             for (k, &d) in path.iter().enumerate() {
-                self.add(corner, k, d, &mut sums);
+                self.add(&own, k, d, &mut sums);
             }
             cost += sums.misfit(variance, self.outside) - sums.common(self.known, variance);
         }
         cost
     }
 
+    /// The reference's own patch at `corner`.
+    fn own(&self, corner: [f32; 2]) -> Own {
+        Own { corner, patch: sample(self.template, corner) }
+    }
+
     /// Adds what frame `k`, displaced by `d`, has in a patch.
-    fn add(&self, corner: [f32; 2], k: usize, d: [f32; 2], sums: &mut Sums) {
-        let here = sample(self.template, corner);
+    fn add(&self, own: &Own, k: usize, d: [f32; 2], sums: &mut Sums) {
+        let Own { corner, patch: here } = own;
         let at = [corner[0] + d[0], corner[1] + d[1]];
         let there = sample(&self.frames[k], at);
         let size = self.template.size;
@@ -220,6 +227,12 @@ impl Judge<'_> {
             }
         }
     }
+}
+
+/// A patch of what the reference is taken for.
+struct Own {
+    corner: [f32; 2],
+    patch: Patch,
 }
 
 /// Sums over the frames of a path of what differs from the template, by pixel.
