@@ -236,7 +236,7 @@ mod tests {
                 &bytes[..bytes.len() - 1],
                 &bytes[..40],
                 &[],
-                &[&bytes[..], &[0; 1 << 17]].concat(),
+                &[&bytes[..], &vec![0; 1 << 17]].concat(),
             ] {
                 std::fs::write(file.path(), broken).unwrap_or_else(|e| panic!("{e}"));
                 let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
