@@ -171,7 +171,7 @@ def train(pack: Pack, minutes: float, rate: float, seed: int) -> nn.Module:
 
 @torch.no_grad()
 def restore(network: nn.Module, photons: Path, out: Path) -> None:
-    """The first eleven frames of every burst that `qudi eval --export-photons` wrote."""
+    """All bursts of eleven frames that `qudi eval --export-photons` wrote."""
     out.mkdir(exist_ok=True)
     for path in sorted(photons.glob("*.npy")):
         light = json.loads(path.with_name(path.name + ".json").read_text())["light"]
