@@ -70,12 +70,22 @@ pub(super) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<
     }
     let Some((grid, flow)) = parents else { return Vec::new() };
     let (image, there) = (&reference.levels[0].image, &other.levels[0].image);
-    let refined: Vec<Refined> = flow
-        .iter()
+    let starts = flow.iter().map(|start| start.map(|d| d as f32));
+    refined([image, there], &grid, starts, variance)
+}
+
+/// Displacements of all patches of the first image in the second, refined from `starts`; `variance` as in [`align`].
+pub(super) fn refined(
+    [image, there]: [&Frame; 2],
+    grid: &Grid,
+    starts: impl Iterator<Item = [f32; 2]>,
+    variance: f32,
+) -> Vec<[f32; 2]> {
+    let refined: Vec<Refined> = starts
         .enumerate()
-        .map(|(i, start)| refine(image, there, grid.corner(i), start.map(|d| d as f32), variance))
+        .map(|(i, start)| refine(image, there, grid.corner(i), start, variance))
         .collect();
-    settle(&grid, &refined, variance)
+    settle(grid, &refined, variance)
 }
 
 /// Medians of both components.
@@ -157,14 +167,14 @@ fn squared_difference(
 }
 
 /// A displacement and what is known of it.
-pub(super) struct Refined {
+struct Refined {
     flow: [f32; 2],
     /// Sums of squared slopes and their product: xx, xy, yy.
     slopes: [f32; 3],
 }
 
 /// Steps towards the displacement of least squared difference, from the slopes of the reference.
-pub(super) fn refine(
+fn refine(
     image: &Frame,
     there: &Frame,
     [x0, y0]: [usize; 2],
@@ -210,7 +220,7 @@ pub(super) fn refine(
 
 /// Draws every patch towards the median of its neighbourhood, as far as its own slopes leave its
 /// motion open: flat patches move with their surroundings.
-pub(super) fn settle(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> {
+fn settle(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> {
     let mut flow: Vec<[f32; 2]> = refined.iter().map(|patch| patch.flow).collect();
     let ridge = variance / (NEIGHBOURS * NEIGHBOURS);
     for _ in 0..ROUNDS {

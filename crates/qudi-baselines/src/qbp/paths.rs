@@ -4,7 +4,7 @@
 //! merged. Counts are independent from frame to frame. Paths are judged by the likelihood of all frames' counts: the patch
 //! is what the guide expects of the reference plus something unknown, the same in all frames, plus noise.
 
-use super::align::{Refined, refine, sample, settle};
+use super::align::{refined, sample};
 use super::dft::{Patch, SIDE};
 use super::grid::{Grid, inside};
 use super::pyramid::smooth;
@@ -114,18 +114,14 @@ impl Merger {
     fn refined(&self, flow: &Patchwise, reference: usize) -> Patchwise {
         let variance = self.matching_variance(reference);
         let image = |k: usize| &self.pyramids[k].levels[0].image;
-        let refined = |(k, flow): (usize, &Vec<[f32; 2]>)| {
+        let of = |(k, flow): (usize, &Vec<[f32; 2]>)| {
             if k == reference {
                 return flow.clone();
             }
-            let refined: Vec<Refined> = flow
-                .iter()
-                .enumerate()
-                .map(|(i, &d)| refine(image(reference), image(k), self.grid.corner(i), d, variance))
-                .collect();
-            settle(&self.grid, &refined, variance)
+            let images = [image(reference), image(k)];
+            refined(images, &self.grid, flow.iter().copied(), variance)
         };
-        flow.par_iter().enumerate().map(refined).collect()
+        flow.par_iter().enumerate().map(of).collect()
     }
 }
 

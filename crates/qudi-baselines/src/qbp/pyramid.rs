@@ -39,7 +39,7 @@ impl Pyramid {
 }
 
 /// Means of `ratio` x `ratio` pixels.
-fn shrink(image: &Frame, size: Size, ratio: usize) -> Frame {
+pub(super) fn shrink(image: &Frame, size: Size, ratio: usize) -> Frame {
     let scale = 1.0 / (ratio * ratio) as f32;
     Frame::from_fn(size, |x, y| {
         let rows = (y * ratio..(y + 1) * ratio).map(|row| image.row(row));

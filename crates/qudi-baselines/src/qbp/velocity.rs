@@ -7,6 +7,7 @@
 //! disparities. What is found is exhaustive and knows no start, unlike a search from coarse to fine.
 
 use super::grid::Grid;
+use super::pyramid::shrink;
 use qudi_sim::sensor::CountMoments;
 use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
@@ -49,7 +50,7 @@ impl Coarse {
         let size = frames[0].size;
         let size = Size { height: size.height / SHRINK, width: size.width / SHRINK };
         let frames: Vec<Frame> =
-            frames.par_iter().map(|frame| smoothed(&shrunk(frame, size))).collect();
+            frames.par_iter().map(|frame| smoothed(&shrink(frame, size, SHRINK))).collect();
         let share = 1.0 / frames.len() as f32;
         let variance = |p: usize| {
             let mean = share * frames.iter().map(|frame| frame.data[p]).sum::<f32>();
@@ -243,15 +244,6 @@ fn lowest(total: &[f32]) -> [f32; 2] {
         if bend <= 0.0 { 0.0 } else { (0.5 * (below - above) / bend).clamp(-0.5, 0.5) }
     };
     [at[0] + STEP * offset(best % ACROSS, 1), at[1] + STEP * offset(best / ACROSS, ACROSS)]
-}
-
-/// Means of squares of pixels.
-fn shrunk(frame: &Frame, size: Size) -> Frame {
-    Frame::from_fn(size, |x, y| {
-        let rows = (y * SHRINK..(y + 1) * SHRINK).map(|row| frame.row(row));
-        let sum: f32 = rows.map(|row| row[x * SHRINK..(x + 1) * SHRINK].iter().sum::<f32>()).sum();
-        sum / (SHRINK * SHRINK) as f32
-    })
 }
 
 /// The filter 1 2 1 both ways, borders repeated: shifts between pixels then change noise less.
