@@ -242,6 +242,14 @@ mod tests {
                 let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
                 assert!(error.is_some_and(|e| e.place().is_some()), "{} bytes", broken.len());
             }
+            let mut dark = bytes.clone();
+            let label = b"exposure = 0.";
+            let at = dark.windows(label.len()).position(|part| part == label);
+            let at = at.unwrap_or_else(|| panic!("no exposure in the label"));
+            dark[at..at + label.len()].copy_from_slice(b"exposure =-0.");
+            std::fs::write(file.path(), dark).unwrap_or_else(|e| panic!("{e}"));
+            let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
+            assert!(error.is_some_and(|e| e.to_string().contains("above 0")));
             std::fs::write(file.path(), bytes).unwrap_or_else(|e| panic!("{e}"));
         }
         other.train.parts = None;

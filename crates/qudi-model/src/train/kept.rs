@@ -222,6 +222,10 @@ impl Shelf {
                 "keep the bursts of another recipe, or of another version, in another folder";
             return Err(SimError::data("it was drawn for something else", &path, help));
         }
+        label.sensor.validate()?;
+        if ![label.ppp, label.exposure, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {
+            return Err(damaged("light and gain are no numbers above 0".to_owned()));
+        }
         let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(e.to_string()))?;
         let mut planes = Vec::new();
         for (name, kind) in self.tensors() {
