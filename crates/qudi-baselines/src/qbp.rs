@@ -15,6 +15,7 @@ mod hot;
 mod merge;
 mod paths;
 mod pyramid;
+mod steady;
 mod velocity;
 
 use crate::bm3d::Profile;
@@ -23,9 +24,9 @@ use crate::transform_denoise::{denoise, image};
 use align::{align, finest_grid, sample};
 pub use aligned::{Aligned, Alignment};
 use blocks::Blocks;
-use cubic::{cubic, squares};
+use cubic::{cubic_within, squares};
 use dft::SIDE;
-use grid::{Grid, inside};
+use grid::Grid;
 pub use guide::{Guide, TwoRounds};
 use merge::{Member, merge};
 use paths::Even;
@@ -34,6 +35,7 @@ use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
 use qudi_sim::sensor::{CountLaw, CountMoments};
 use qudi_sim::{Frame, Result, Size};
 use rayon::prelude::*;
+pub use steady::steadied;
 
 /// What follows the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -267,26 +269,9 @@ impl Merger {
         Merged { counts, noise, noises }
     }
 
-    /// The frame that overlapping patches make, each of which fades out towards its borders.
+    /// The frame that overlapping patches make.
     fn blended(&self, patch: impl Fn(usize) -> dft::Patch) -> Frame {
-        let mut sum = Frame::filled(self.frames[0].size, 0.0);
-        let mut weights = sum.clone();
-        let window: [f32; SIDE] = std::array::from_fn(|k| {
-            0.5 - 0.5 * (2.0 * std::f32::consts::PI * (k as f32 + 0.5) / SIDE as f32).cos()
-        });
-        let width = sum.size.width;
-        for i in 0..self.grid.len() {
-            let [x, y] = self.grid.corner(i);
-            for (r, row) in patch(i).iter().enumerate() {
-                for (c, value) in row.iter().enumerate() {
-                    let weight = window[r] * window[c];
-                    let at = (y + r) * width + x + c;
-                    sum.data[at] += weight * value;
-                    weights.data[at] += weight;
-                }
-            }
-        }
-        Frame::from_fn(self.size, |x, y| sum.row(y)[x] / weights.row(y)[x])
+        self.grid.blended(self.frames[0].size, self.size, patch)
     }
 
     /// Patch `i` displaced by `d`, between pixels. Bilinear as in the paper; what pilots have aligned deserves better, and
@@ -295,19 +280,7 @@ impl Merger {
         let corner = self.grid.corner(i);
         let at = [corner[0] as f32 + d[0], corner[1] as f32 + d[1]];
         let Some(pilots) = &self.pilots else { return sample(image, at) };
-        let mut patch = cubic(image, at);
-        let (columns, rows) = (inside(at[0], image.size.width), inside(at[1], image.size.height));
-        if columns.len() * rows.len() < SIDE * SIDE {
-            for (y, row) in patch.iter_mut().enumerate() {
-                let instead = &pilots.frames[own].row(corner[1] + y)[corner[0]..];
-                for (x, (value, instead)) in row.iter_mut().zip(instead).enumerate() {
-                    if !columns.contains(&x) || !rows.contains(&y) {
-                        *value = *instead;
-                    }
-                }
-            }
-        }
-        patch
+        cubic_within(image, at, &pilots.frames[own], corner)
     }
 
     /// What such a patch, `part` of a pixel along a side, keeps of the noise's variance along that side.

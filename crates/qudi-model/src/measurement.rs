@@ -90,6 +90,11 @@ impl GuidePlanes {
         Ok(Self(planes))
     }
 
+    /// Deviation of the noise of the merged frames, in image units.
+    pub(crate) fn noise(&self) -> &[f32] {
+        &self.0[IMAGES - 1]
+    }
+
     /// Every plane changed by `f`.
     #[must_use]
     pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {

@@ -2,6 +2,7 @@
 //! processing", IEEE TASSP 29(6), 1981), which keeps fine texture that bilinear means lose.
 
 use super::dft::{Patch, SIDE};
+use super::grid::inside;
 use qudi_sim::Frame;
 
 /// Weights of the samples at -1, 0, 1 and 2 for the place `part` between 0 and 1 (Keys 1981, eq. 15).
@@ -17,7 +18,7 @@ pub(super) fn squares(part: f32) -> f32 {
 }
 
 /// The patch whose corner is at `corner`, borders repeated.
-pub(super) fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
+fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     let (width, height) = (image.size.width as isize, image.size.height as isize);
     let [x, y] = corner.map(|c| c.floor() as isize - 1);
     let [across, down] = corner.map(|c| taps(c - c.floor()));
@@ -39,6 +40,23 @@ pub(super) fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     std::array::from_fn(|r| {
         std::array::from_fn(|c| weighted(down, [0, 1, 2, 3].map(|k| rows[r + k][c])))
     })
+}
+
+/// The same, but what lies outside the image is `own`'s at `corner`.
+pub(super) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [usize; 2]) -> Patch {
+    let mut patch = cubic(image, at);
+    let (columns, rows) = (inside(at[0], image.size.width), inside(at[1], image.size.height));
+    if columns.len() * rows.len() < SIDE * SIDE {
+        for (y, row) in patch.iter_mut().enumerate() {
+            let instead = &own.row(corner[1] + y)[corner[0]..];
+            for (x, (value, instead)) in row.iter_mut().zip(instead).enumerate() {
+                if !columns.contains(&x) || !rows.contains(&y) {
+                    *value = *instead;
+                }
+            }
+        }
+    }
+    patch
 }
 
 fn weighted(taps: [f32; 4], values: [f32; 4]) -> f32 {

@@ -1,7 +1,7 @@
 //! Patches that cover an image.
 
-use super::dft::SIDE;
-use qudi_sim::Size;
+use super::dft::{Patch, SIDE};
+use qudi_sim::{Frame, Size};
 use std::ops::Range;
 
 /// Samples of a patch at `start`, along one axis, that lie in an image of `length` pixels.
@@ -36,6 +36,28 @@ impl Grid {
     /// Corner of patch `i`.
     pub(super) fn corner(&self, i: usize) -> [usize; 2] {
         [self.xs[i % self.xs.len()], self.ys[i / self.xs.len()]]
+    }
+
+    /// The upper left part, of size `to`, of a frame of size `from` that overlapping patches make, each of which fades out
+    /// towards its borders.
+    pub(super) fn blended(&self, from: Size, to: Size, patch: impl Fn(usize) -> Patch) -> Frame {
+        let mut sum = Frame::filled(from, 0.0);
+        let mut weights = sum.clone();
+        let window: [f32; SIDE] = std::array::from_fn(|k| {
+            0.5 - 0.5 * (2.0 * std::f32::consts::PI * (k as f32 + 0.5) / SIDE as f32).cos()
+        });
+        for i in 0..self.len() {
+            let [x, y] = self.corner(i);
+            for (r, row) in patch(i).iter().enumerate() {
+                for (c, value) in row.iter().enumerate() {
+                    let weight = window[r] * window[c];
+                    let at = (y + r) * from.width + x + c;
+                    sum.data[at] += weight * value;
+                    weights.data[at] += weight;
+                }
+            }
+        }
+        Frame::from_fn(to, |x, y| sum.row(y)[x] / weights.row(y)[x])
     }
 
     /// The patch whose centre is nearest to `point`, and its neighbours left, right, above and below.
