@@ -78,6 +78,18 @@ fn a_burst_is_restored_and_gone_on_with() {
     assert!(String::from_utf8_lossy(&header[..128]).contains("(13, 32, 40)"));
 }
 
+/// The default weights' U-Net is silent, and their pre-denoiser has seen no simulated measurement.
+#[test]
+fn more_steps_change_nothing_where_nothing_is_generated() {
+    let folder = prepared("network-steps");
+    let restored = |steps: u32| {
+        let args = format!("restore b.npy --device cpu --steps {steps} -o {steps}.npy -q");
+        qudi(&folder).args(args.split_whitespace()).assert().success();
+        std::fs::read(folder.join(format!("{steps}.npy"))).unwrap()
+    };
+    assert!(restored(1) == restored(3));
+}
+
 #[test]
 fn what_does_not_fit_is_refused_in_three_parts() {
     let folder = prepared("network-refuse");

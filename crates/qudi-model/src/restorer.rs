@@ -122,7 +122,9 @@ impl QudiRestorer {
         let mut x0 = vec![0.0; x.len()];
         let nothing = x0.clone();
         let mut flows: Vec<Option<Flows>> = vec![None; job.tiles.count()];
-        for step in self.options.sampler.steps(&self.schedule, self.options.steps) {
+        // What generates nothing has seen no simulated measurement in training either: more steps would only disturb it.
+        let steps = if self.generates { self.options.steps } else { 1 };
+        for step in self.options.sampler.steps(&self.schedule, steps) {
             let simulated = if step.number == 1 || self.config.lacks(Part::Physics) {
                 None
             } else {
