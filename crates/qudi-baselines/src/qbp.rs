@@ -325,6 +325,14 @@ impl Merger {
     }
 }
 
+/// Up to `count` of so many frames, the nearest to `reference` first: itself, and of two as near the later one.
+fn nearest(frames: usize, reference: usize, count: usize) -> Vec<usize> {
+    let mut list: Vec<usize> = (0..frames).collect();
+    list.sort_by_key(|&frame| (frame.abs_diff(reference), frame < reference));
+    list.truncate(count);
+    list
+}
+
 /// Values of size `from` with the border repeated up to `size`.
 fn at_least(values: &[f32], from: Size, size: Size) -> Frame {
     Frame::from_fn(size, |x, y| values[y.min(from.height - 1) * from.width + x.min(from.width - 1)])

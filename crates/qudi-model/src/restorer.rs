@@ -115,6 +115,9 @@ impl QudiRestorer {
 
     /// One sample of a window whose planes are padded to `size`.
     fn sample(&self, job: &Job<'_>, sample: u64) -> Result<Vec<f32>> {
+        if !self.generates {
+            return self.denoised(job);
+        }
         let noise = Noise::new(job.context.seed, sample);
         let frames = || (job.context.first_frame..).take(job.frames);
         let pixels = job.size.pixels();
@@ -122,9 +125,7 @@ impl QudiRestorer {
         let mut x0 = vec![0.0; x.len()];
         let nothing = x0.clone();
         let mut flows: Vec<Option<Flows>> = vec![None; job.tiles.count()];
-        // What generates nothing has seen no simulated measurement in training either: more steps would only disturb it.
-        let steps = if self.generates { self.options.steps } else { 1 };
-        for step in self.options.sampler.steps(&self.schedule, steps) {
+        for step in self.options.sampler.steps(&self.schedule, self.options.steps) {
             let simulated = if step.number == 1 || self.config.lacks(Part::Physics) {
                 None
             } else {
@@ -162,9 +163,6 @@ impl QudiRestorer {
         step: &Step,
         flows: &mut Option<Flows>,
     ) -> Result<Vec<f32>> {
-        if !self.generates {
-            return self.denoise(job, number, simulated);
-        }
         let tensor = |images: &[f32]| self.tile(job, number, images);
         let fresh;
         let prepared = if let Some(prepared) = &job.prepared {
@@ -184,28 +182,22 @@ impl QudiRestorer {
         Ok(possible(read(prediction.x0)?))
     }
 
-    /// The same without what a U-Net that corrects nothing would take, frame by frame: most of the time and memory.
-    fn denoise(
-        &self,
-        job: &Job<'_>,
-        number: usize,
-        simulated: Option<&Planes>,
-    ) -> Result<Vec<f32>> {
+    /// The same without what a U-Net that corrects nothing would take, frame by frame: most of the time and memory. In one
+    /// step: such weights have seen no simulated measurement in training either, and more would only disturb them.
+    fn denoised(&self, job: &Job<'_>) -> Result<Vec<f32>> {
         let pixels = job.size.pixels();
-        let mut values = Vec::new();
-        for frame in 0..job.frames {
-            let of = |images: &[f32]| job.tiles.crop(number, &images[frame * pixels..][..pixels]);
-            let tensor = |images: &[f32]| to_tensor(of(images), job.tiles.tile, &self.device);
-            let guide = job.guide.map(of).to_tensor(job.tiles.tile, &self.device);
-            let simulated = simulated.map(|planes| Simulated {
-                y: tensor(&planes.y),
-                u: tensor(&planes.u),
-                exists: vec![true],
-            });
-            let d = self.network.denoise(&guide, 1, simulated.as_ref());
-            values.extend(read(d * 2.0 - 1.0)?);
+        let mut x0 = vec![0.0; job.frames * pixels];
+        for number in 0..job.tiles.count() {
+            let mut tile = Vec::new();
+            for frame in 0..job.frames {
+                let of =
+                    |images: &[f32]| job.tiles.crop(number, &images[frame * pixels..][..pixels]);
+                let guide = job.guide.map(of).to_tensor(job.tiles.tile, &self.device);
+                tile.extend(read(self.network.denoise(&guide, 1) * 2.0 - 1.0)?);
+            }
+            job.tiles.blend(number, &possible(tile), &mut x0);
         }
-        Ok(possible(values))
+        Ok(x0)
     }
 
     /// Tile `number` of images of the whole frame.

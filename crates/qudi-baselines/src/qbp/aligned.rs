@@ -2,7 +2,7 @@
 //! trust. A robust merge decides by a formula; a network that sees them all can learn to.
 
 use super::dft::SIDE;
-use super::{Guide, Merged, Merger, Pilots};
+use super::{Guide, Merged, Merger, Pilots, nearest};
 use crate::stabilizer::Stabilizer;
 use crate::transform_denoise::{image, units};
 use qudi_sim::Frame;
@@ -58,9 +58,7 @@ impl<'a> Alignment<'a> {
         let noises = merger.blended(|i| [[noises[i]; SIDE]; SIDE]);
         let merged = image(&stabilizer.stabilized(&counts), stabilizer, context, *ordinary);
 
-        let mut nearest: Vec<usize> = (0..merger.frames.len()).collect();
-        nearest.sort_by_key(|&frame| (frame.abs_diff(reference), frame < reference));
-        nearest.truncate(neighbours + 1);
+        let nearest = nearest(merger.frames.len(), reference, neighbours + 1);
         let guide = &merger.pilots.as_ref().expect("set at first").frames;
         let here = merger.cropped(&guide[reference]);
         let deviations = here.data.iter().map(|&mean| {

@@ -3,11 +3,11 @@
 //! noise.
 
 use super::align::{align, finest_grid};
-use super::at_least;
 use super::cubic::cubic_within;
 use super::dft::SIDE;
 use super::merge::{Member, merge};
 use super::pyramid::Pyramid;
+use super::{at_least, nearest};
 use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
 
@@ -33,11 +33,9 @@ pub fn steadied(frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
     let steady = |reference: usize| {
         let errors = &errors[reference];
         let matching = (2.0 * errors.mean() as f32).max(LEAST);
-        let mut nearest: Vec<usize> = (0..frames.len()).filter(|&k| k != reference).collect();
-        nearest.sort_by_key(|&k| (k.abs_diff(reference), k < reference));
-        nearest.truncate(NEAREST);
+        let others = &nearest(frames.len(), reference, NEAREST + 1)[1..];
         let flows =
-            nearest.iter().map(|&k| (k, align(&pyramids[reference], &pyramids[k], matching)));
+            others.iter().map(|&k| (k, align(&pyramids[reference], &pyramids[k], matching)));
         let flows: Vec<_> = flows.collect();
         let mut steady = grid.blended(large, size, |i| {
             let corner = grid.corner(i);

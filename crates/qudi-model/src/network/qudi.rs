@@ -140,16 +140,11 @@ impl Qudi {
         self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
     }
 
-    /// The pre-denoised frames alone, in image units, of bursts of `frames` frames and their guide ([`Measured`]): all
-    /// there is where the U-Net does not correct them ([`Self::generates`]).
-    pub fn denoise(
-        &self,
-        guide: &Tensor<4>,
-        frames: usize,
-        simulated: Option<&Simulated>,
-    ) -> Tensor<4> {
+    /// The pre-denoised frames alone, in image units, of bursts of `frames` frames and their guide ([`Measured`]), before any
+    /// simulated measurement: all there is where the U-Net does not correct them ([`Self::generates`]).
+    pub fn denoise(&self, guide: &Tensor<4>, frames: usize) -> Tensor<4> {
         let evidence = Evidence::new(guide);
-        self.pre_denoise(&self.pre.prepare(&evidence), &evidence, frames, simulated).0
+        self.pre_denoise(&self.pre.prepare(&evidence), &evidence, frames, None).0
     }
 
     /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.
