@@ -4,9 +4,11 @@
 //!
 //! Every frame of the window is the reference once. Binary and few-bit counts are treated alike.
 
+mod affine;
 mod align;
 mod aligned;
 mod blocks;
+mod camera;
 mod cubic;
 mod dft;
 mod grid;
@@ -24,6 +26,7 @@ use crate::transform_denoise::{denoise, image};
 use align::{align, finest_grid, sample};
 pub use aligned::{Aligned, Alignment};
 use blocks::Blocks;
+use camera::Camera;
 use cubic::{cubic_within, squares};
 use dft::SIDE;
 use grid::Grid;
@@ -185,6 +188,8 @@ struct Merger {
     pilots: Option<Pilots>,
     /// Even motion, which patches may follow.
     even: Option<Even>,
+    /// The camera's, which they may follow, too.
+    camera: Option<Camera>,
 }
 
 /// What an earlier round made of the frames: motion is found in it, and what does not fit.
@@ -207,7 +212,18 @@ impl Merger {
             if block == 1 { frames.par_iter().map(Pyramid::new).collect() } else { Vec::new() };
         let grid = finest_grid(size);
         let size = burst.size;
-        Self { size, frames, block, trust, moments, grid, pyramids, pilots: None, even: None }
+        Self {
+            size,
+            frames,
+            block,
+            trust,
+            moments,
+            grid,
+            pyramids,
+            pilots: None,
+            even: None,
+            camera: None,
+        }
     }
 
     /// The blocks around `reference`, and the motion of every patch to every frame.

@@ -2,6 +2,7 @@
 //! frames fit, far better than noisy frames can. Basic estimates that guide a second pass are BM3D's idea (Dabov et al.
 //! 2007, section III-B), here applied to the whole of quanta burst photography with BM3D.
 
+use super::camera::Camera;
 use super::paths::Even;
 use super::{Finish, Merged, Merger, Pilots, Qbp, QbpSettings, at_least};
 use crate::bm3d::Profile;
@@ -17,6 +18,9 @@ const NOISE: f64 = 1.0;
 
 /// Variance of the first round's errors, in that of one frame's noise, about.
 const ERROR: f32 = 0.3;
+
+/// Variance of a pilot's errors, in the same, when the camera's motion is found: its squares are of many pixels.
+const SHIFTED: f32 = 0.05;
 
 /// BM3D for the pilots, and for the result: half the time and more is saved for less than 0.1 dB (docs/results.md).
 const QUICK: Profile = Profile { radius: 8, step: [4, 3] };
@@ -51,6 +55,7 @@ impl Guide {
         let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
         let mut merger = Merger::new(burst, context, qbp.block(context)?, trust);
         merger.even = Even::find(&merger);
+        merger.camera = Camera::find(&merger.frames, &merger.moments, 1.0);
         let round = |merger: &Merger, profile, assumed| {
             let restored = |frame: usize| {
                 let Merged { counts, noise, .. } = merger.merge(frame);
@@ -97,6 +102,7 @@ impl Merger {
     pub(super) fn follow(&mut self, pilots: Pilots) {
         self.pyramids = pilots.frames.par_iter().map(super::Pyramid::new).collect();
         (self.block, self.trust) = (1, TRUST);
+        self.camera = Camera::find(&pilots.frames, &self.moments, SHIFTED);
         self.pilots = Some(pilots);
     }
 }

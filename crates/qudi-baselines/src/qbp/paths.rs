@@ -75,7 +75,7 @@ fn carried(grid: &Grid, velocities: &[[f32; 2]], i: usize, time: f32) -> [f32; 2
 }
 
 impl Merger {
-    /// For every patch the likeliest of the paths in `flow`, of even motion, and of that refined on the pilots.
+    /// For every patch the likeliest of the paths in `flow`, of even motion, of the camera's, and of both refined on the pilots.
     pub(super) fn likeliest(&self, even: &Even, reference: usize, flow: Patchwise) -> Patchwise {
         let count = self.frames.len();
         let time = |k: usize| k as f32 - reference as f32;
@@ -84,8 +84,20 @@ impl Merger {
             .map(|k| velocities.iter().map(|v| v.map(|v| v * time(k))).collect())
             .collect();
         let mut choices = vec![flow, straight];
+        let camera = self.camera.as_ref().map(|camera| {
+            let half = 0.5 * (SIDE - 1) as f32;
+            let centres: Vec<[f32; 2]> = (0..self.grid.len())
+                .map(|i| self.grid.corner(i).map(|corner| corner as f32 + half))
+                .collect();
+            let path =
+                |k| centres.iter().map(|&at| camera.displacement(at, reference, k)).collect();
+            (0..count).map(path).collect::<Patchwise>()
+        });
         if self.pilots.is_some() {
             choices.push(self.refined(&choices[1], reference));
+            choices.extend(camera.map(|path| self.refined(&path, reference)));
+        } else {
+            choices.extend(camera);
         }
         let pilot = self.pilots.as_ref().map(|pilots| smooth(&pilots.frames[reference]));
         let stage = usize::from(pilot.is_some());
