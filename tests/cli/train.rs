@@ -97,6 +97,20 @@ fn runs_are_gone_on_with_and_never_lost() {
         "train tiny -o wide --init run/weights.safetensors --set network.unet.width=16 {QUICK}"
     );
     refused(&folder, &wide, &["other sizes"]);
+    // A round more goes on from what the others restore; two more have nothing to go on from.
+    let rounds = |weights: &str, rounds: usize, to: &str| {
+        format!("train tiny -o {to} --init {weights} --set network.pre.rounds={rounds} {QUICK}")
+    };
+    refused(&folder, &rounds("run/weights.safetensors", 3, "third"), &["other sizes"]);
+    run(&folder, &rounds("run/weights.safetensors", 2, "second"));
+    run(&folder, &rounds("second/weights.safetensors", 3, "third"));
+    run(&folder, "simulate scene:text --size 48x32 --frames 3 --sensor qudi-paper -o b.npy -q");
+    let restored = |weights: &str, to: &str| {
+        run(&folder, &format!("restore b.npy --weights {weights} --device cpu -o {to} -q"));
+        std::fs::read(folder.join(to)).unwrap()
+    };
+    let first = restored("run/weights.safetensors", "first.npy");
+    assert!(restored("third/weights.safetensors", "third.npy") != first);
 }
 
 #[test]

@@ -13,8 +13,6 @@ mod stabilizer;
 mod transform_denoise;
 
 pub use bm3d::bm3d;
-pub use qbp::{
-    Aligned, Alignment, Finish, Guide, PatchFlow, Qbp, QbpSettings, TwoRounds, steadied,
-};
+pub use qbp::{Aligned, Alignment, Finish, Guide, PatchFlow, Qbp, QbpSettings, TwoRounds};
 pub use stabilizer::{Stabilizer, Transform};
 pub use transform_denoise::TransformDenoise;

@@ -38,7 +38,6 @@ use qudi_sim::restore::{BurstView, Context, LONGEST_HALF, Restored, Restorer};
 use qudi_sim::sensor::{CountLaw, CountMoments};
 use qudi_sim::{Frame, Result, Size};
 use rayon::prelude::*;
-pub use steady::steadied;
 
 /// What follows the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

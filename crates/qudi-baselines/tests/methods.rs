@@ -109,7 +109,7 @@ fn neighbours_are_seen_in_deviations() {
     let light = Light { ppp: 3.25, exposure: still.mean() };
     let mut camera = Camera::new(&sensor, size, light, 9).unwrap();
     let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
-    let context = context(sensor, 3.25);
+    let context = Context { exposure: still.mean(), ..context(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
     let guide = Guide::find(burst, &context).unwrap();
     let aligned = Alignment::new(guide, &context).of(2, 8);
@@ -126,6 +126,18 @@ fn neighbours_are_seen_in_deviations() {
         assert!((0.55..1.1).contains(&seen) && expected < 0.2, "{seen}, expected {expected}");
     }
     assert!(aligned.seen[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
+
+    // The truth in the guide's place shows it as well: what it expects is what the camera counts.
+    let guide = Guide::find(burst, &context).unwrap();
+    let aligned = Alignment::new(guide, &context).on(vec![still.clone(); 7]).of(2, 8);
+    assert_eq!(aligned.clean, still);
+    let own = deviation(&aligned.seen[0]);
+    assert!((0.95..1.05).contains(&own), "{own}");
+    let mean = aligned.seen[0].mean();
+    assert!(mean.abs() < 0.06, "{mean}");
+    let differences = aligned.expected[..6].iter().map(deviation).fold(0.0, f64::max);
+    // On a smooth slope a path may be a little off.
+    assert!(differences < 0.02, "{differences}");
 }
 
 #[test]

@@ -50,6 +50,18 @@ pub struct PreConfig {
     pub growth: usize,
     /// Frames around each that are laid upon it and seen, the nearest ones.
     pub neighbours: usize,
+    /// Pre-denoisers, one after the other: all but the first see the frames aligned by what the one before restored.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub rounds: usize,
+}
+
+fn one() -> usize {
+    1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_one(rounds: &usize) -> bool {
+    *rounds == 1
 }
 
 /// Channels of the spatio-temporal features on three levels.
@@ -162,6 +174,7 @@ impl NetworkConfig {
             ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
             ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
             ("pre.neighbours", self.pre.neighbours <= 64, "must be at most 64"),
+            ("pre.rounds", (1..=4).contains(&self.pre.rounds), "must be from 1 to 4"),
             ("pre.blocks", (1..=64).contains(&self.pre.blocks), "must be from 1 to 64"),
             ("features", widths(&[self.features.low, self.features.high].concat()), SIZES),
             ("flow.scale", matches!(self.flow.scale, 1 | 2 | 4 | 8), "must be 1, 2, 4 or 8"),

@@ -14,6 +14,8 @@ mod cases;
 pub mod checkpoint;
 pub mod config;
 mod cost;
+pub mod draft;
+mod layout;
 pub mod measurement;
 pub mod network;
 pub mod noise;

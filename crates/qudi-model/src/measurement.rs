@@ -1,5 +1,6 @@
 //! What the network is told of a burst: counts, their linear estimate, and the sensor in numbers.
 
+use crate::draft::Draft;
 use crate::network::SENSOR_NUMBERS;
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
@@ -10,7 +11,7 @@ use qudi_sim::{Result, Size};
 use std::ops::Range;
 
 /// Brightest linear estimate, in image units: twice white.
-const BRIGHTEST: f64 = 2.0;
+pub(crate) const BRIGHTEST: f64 = 2.0;
 
 /// Planes of a burst, frame after frame, row-major.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,6 +45,25 @@ impl Planes {
     }
 }
 
+/// The frames of a captured burst laid upon each other: by the classical guide, then by what each of `drafts` restores, the
+/// pre-denoisers of a network before its last one.
+///
+/// # Errors
+/// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown, or the drafts' device fails.
+pub fn aligned<'a>(
+    burst: BurstView<'_>,
+    context: &'a Context,
+    neighbours: usize,
+    drafts: &[Draft],
+) -> Result<Alignment<'a>> {
+    let mut alignment = Alignment::new(Guide::find(burst, context)?, context);
+    for draft in drafts {
+        let better = draft.restore(&alignment, neighbours)?;
+        alignment = alignment.on(better);
+    }
+    Ok(alignment)
+}
+
 /// What classical methods make of a burst, for a network to go on from; frame after frame, row-major. In this order: the
 /// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 2]; the counts of the
 /// frame and of its neighbours laid upon it, and what is expected of the neighbours, in deviations (see
@@ -60,34 +80,23 @@ impl GuidePlanes {
         IMAGES + 2 * neighbours + 1
     }
 
-    /// The guide of a captured burst.
-    ///
-    /// # Errors
-    /// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown.
-    pub fn of(burst: BurstView<'_>, context: &Context, neighbours: usize) -> Result<Self> {
-        Self::of_frames(burst, context, neighbours, 0..burst.frames.len())
+    /// Those of some frames of an aligned window.
+    pub fn of(alignment: &Alignment<'_>, neighbours: usize, frames: Range<usize>) -> Self {
+        let mut planes = Self::default();
+        for frame in frames {
+            planes.extend(Self::of_frame(alignment.of(frame, neighbours)));
+        }
+        planes
     }
 
-    /// The guide of some frames of a captured burst, found in all of them.
-    pub(crate) fn of_frames(
-        burst: BurstView<'_>,
-        context: &Context,
-        neighbours: usize,
-        frames: Range<usize>,
-    ) -> Result<Self> {
-        let alignment = Alignment::new(Guide::find(burst, context)?, context);
-        let mut planes = vec![Vec::new(); Self::count(neighbours)];
-        for frame in frames {
-            let Aligned { clean, merged, noise, seen, expected } = alignment.of(frame, neighbours);
-            let images = [clean, merged, noise].into_iter().map(|mut image| {
-                image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
-                image
-            });
-            for (plane, more) in planes.iter_mut().zip(images.chain(seen).chain(expected)) {
-                plane.extend(more.data);
-            }
-        }
-        Ok(Self(planes))
+    /// The planes of one frame.
+    pub(crate) fn of_frame(frame: Aligned) -> Self {
+        let Aligned { clean, merged, noise, seen, expected } = frame;
+        let images = [clean, merged, noise].into_iter().map(|mut image| {
+            image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
+            image
+        });
+        Self(images.chain(seen).chain(expected).map(|plane| plane.data).collect())
     }
 
     /// Deviation of the noise of the merged frames, in image units.

@@ -200,7 +200,7 @@ fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> T
         let (d, flows) = network.denoise_and_align(&network.prepare(measured));
         (d, Some(flows))
     } else {
-        (network.denoise(&measured.guide, measured.frames), None)
+        (network.denoise(&measured.guide), None)
     };
     let pre = relative_reconstruction(example)(d);
     let flow = flows.map(|flows| flows.misfit(example.truth.clone(), measured.frames));

@@ -1,24 +1,22 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
 use crate::config::{NetworkConfig, Part};
-use crate::measurement::{GuidePlanes, Planes, sensor_numbers};
+use crate::draft::{Draft, settled};
+use crate::layout::Layout;
+use crate::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
 use crate::noise::Noise;
 use crate::physics::LoopSensor;
 use crate::sampler::{Sampler, Step, TIMES};
 use crate::schedule::NoiseSchedule;
 use crate::tensor::{read, to_tensor};
-use crate::tiles::Tiles;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_baselines::steadied;
+use qudi_baselines::Alignment;
 use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
-use qudi_sim::{Frame, Result, SimError, Size};
+use qudi_sim::{Frame, Result, SimError};
 
 /// Fewest frames that the fusion makes sense of.
 pub const FEWEST_FRAMES: usize = 3;
-
-/// Deviation of the errors that a pre-denoised frame does not share with the next one, in that of the merged frame's noise.
-const UNSHARED: f32 = 0.4;
 
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,6 +41,7 @@ impl Default for SampleOptions {
 #[derive(Debug)]
 pub struct QudiRestorer {
     network: Qudi,
+    drafts: Vec<Draft>,
     /// Whether its U-Net says anything.
     generates: bool,
     config: NetworkConfig,
@@ -87,27 +86,25 @@ impl QudiRestorer {
             return Err(SimError::request(what, "--tile", help));
         }
         let schedule = NoiseSchedule::cosine(TIMES);
+        let drafts = Draft::all(&network, config, device);
         let (config, device) = (config.clone(), device.clone());
-        Ok(Self { network, generates, config, schedule, options, device, window })
+        Ok(Self { network, drafts, generates, config, schedule, options, device, window })
     }
 
     /// A window whose planes are padded to what the network wants.
     fn job<'a>(&self, burst: BurstView<'_>, context: &'a Context) -> Result<Job<'a>> {
         let frames = burst.frames.len();
-        let multiple = self.config.multiple();
-        let size = Size {
-            height: burst.size.height.next_multiple_of(multiple),
-            width: burst.size.width.next_multiple_of(multiple),
-        };
+        let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
         let planes = Planes::of(burst, context);
-        let pad = |images: &[f32]| padded(images, burst.size, size);
-        let planes = Planes { y: pad(&planes.y), u: pad(&planes.u) };
-        let guide = GuidePlanes::of(burst, context, self.config.pre.neighbours)?.map(pad);
-        let side = self.options.tile / multiple * multiple;
-        let tiles = Tiles::new(size, side, (side / 8).next_multiple_of(multiple), multiple);
+        let planes = Planes { y: layout.padded(&planes.y), u: layout.padded(&planes.u) };
+        let neighbours = self.config.pre.neighbours;
+        let alignment = aligned(burst, context, neighbours, &self.drafts)?;
+        let guide = GuidePlanes::of(&alignment, neighbours, 0..frames);
+        let guide = guide.map(|plane| layout.padded(plane));
         let sensor = sensor_numbers(context);
-        let mut job = Job { context, sensor, planes, guide, frames, size, tiles, prepared: None };
-        if self.generates && job.tiles.count() == 1 {
+        let prepared = None;
+        let mut job = Job { context, sensor, planes, alignment, guide, frames, layout, prepared };
+        if self.generates && job.layout.tiles.count() == 1 {
             job.prepared = Some(self.prepare(&job, 0));
         }
         Ok(job)
@@ -115,16 +112,14 @@ impl QudiRestorer {
 
     /// One sample of a window whose planes are padded to `size`.
     fn sample(&self, job: &Job<'_>, sample: u64) -> Result<Vec<f32>> {
-        if !self.generates {
-            return self.denoised(job);
-        }
         let noise = Noise::new(job.context.seed, sample);
         let frames = || (job.context.first_frame..).take(job.frames);
-        let pixels = job.size.pixels();
+        let (size, tiles) = (job.layout.size, &job.layout.tiles);
+        let pixels = size.pixels();
         let mut x: Vec<f32> = frames().flat_map(|frame| noise.frame(frame, 0, pixels)).collect();
         let mut x0 = vec![0.0; x.len()];
         let nothing = x0.clone();
-        let mut flows: Vec<Option<Flows>> = vec![None; job.tiles.count()];
+        let mut flows: Vec<Option<Flows>> = vec![None; tiles.count()];
         for step in self.options.sampler.steps(&self.schedule, self.options.steps) {
             let simulated = if step.number == 1 || self.config.lacks(Part::Physics) {
                 None
@@ -132,7 +127,7 @@ impl QudiRestorer {
                 let sensor = LoopSensor::at(job.context, step.time, TIMES);
                 let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
                 let seed = noise.photon_seed(step.number);
-                Some(sensor.measure(&images, job.size, job.context.first_frame, seed)?)
+                Some(sensor.measure(&images, size, job.context.first_frame, seed)?)
             };
             if self.config.flow.steps.contains(&step.number) {
                 flows.fill(None);
@@ -142,13 +137,24 @@ impl QudiRestorer {
             for (number, flows) in flows.iter_mut().enumerate() {
                 let tile =
                     self.predict(job, number, simulated.as_ref(), &x, given, &step, flows)?;
-                job.tiles.blend(number, &tile, &mut next);
+                tiles.blend(number, &tile, &mut next);
             }
             x0 = next;
             let fresh = frames().flat_map(|frame| noise.frame(frame, step.number, pixels));
             step.advance(&mut x, &x0, fresh);
         }
         Ok(x0)
+    }
+
+    /// What the U-Net corrects nothing of, without what it would take: most of the time and memory. In one step: such weights
+    /// have seen no simulated measurement in training either, and more would only disturb them. Fusion has no part in it: the
+    /// frames, each denoised for itself, are steadied afterwards.
+    fn denoised(&self, job: &Job<'_>) -> Result<Vec<Frame>> {
+        let denoise = |guide: &Tensor<4>| self.network.denoise(guide);
+        let frames = job.layout.denoised(&job.guide, &self.device, denoise)?;
+        let [frames, noises] =
+            [&frames[..], job.guide.noise()].map(|images| job.layout.frames(images));
+        Ok(settled(&job.alignment, frames, noises, 1.0))
     }
 
     /// The network's clean image of one tile, in [-1, 1].
@@ -182,36 +188,20 @@ impl QudiRestorer {
         Ok(possible(read(prediction.x0)?))
     }
 
-    /// The same without what a U-Net that corrects nothing would take, frame by frame: most of the time and memory. In one
-    /// step: such weights have seen no simulated measurement in training either, and more would only disturb them.
-    fn denoised(&self, job: &Job<'_>) -> Result<Vec<f32>> {
-        let pixels = job.size.pixels();
-        let mut x0 = vec![0.0; job.frames * pixels];
-        for number in 0..job.tiles.count() {
-            let mut tile = Vec::new();
-            for frame in 0..job.frames {
-                let of =
-                    |images: &[f32]| job.tiles.crop(number, &images[frame * pixels..][..pixels]);
-                let guide = job.guide.map(of).to_tensor(job.tiles.tile, &self.device);
-                tile.extend(read(self.network.denoise(&guide, 1) * 2.0 - 1.0)?);
-            }
-            job.tiles.blend(number, &possible(tile), &mut x0);
-        }
-        Ok(x0)
-    }
-
     /// Tile `number` of images of the whole frame.
     fn tile(&self, job: &Job<'_>, number: usize, images: &[f32]) -> Tensor<4> {
-        to_tensor(job.tiles.crop(number, images), job.tiles.tile, &self.device)
+        let tiles = &job.layout.tiles;
+        to_tensor(tiles.crop(number, images), tiles.tile, &self.device)
     }
 
     fn prepare(&self, job: &Job<'_>, number: usize) -> Prepared {
         let tensor = |images: &[f32]| self.tile(job, number, images);
-        let guide = job.guide.map(|images| job.tiles.crop(number, images));
+        let tiles = &job.layout.tiles;
+        let guide = job.guide.map(|images| tiles.crop(number, images));
         let sensor = TensorData::new(job.sensor.to_vec(), [1, SENSOR_NUMBERS]);
         self.network.prepare(&Measured {
             u: tensor(&job.planes.u),
-            guide: guide.to_tensor(job.tiles.tile, &self.device),
+            guide: guide.to_tensor(tiles.tile, &self.device),
             sensor: Tensor::from_data(sensor, &self.device),
             frames: job.frames,
         })
@@ -232,10 +222,10 @@ struct Job<'a> {
     /// The sensor in numbers: the same for all tiles and steps.
     sensor: [f32; SENSOR_NUMBERS],
     planes: Planes,
+    alignment: Alignment<'a>,
     guide: GuidePlanes,
     frames: usize,
-    size: Size,
-    tiles: Tiles,
+    layout: Layout,
     /// Kept for all steps where there is one tile only: it takes memory.
     prepared: Option<Prepared>,
 }
@@ -259,27 +249,16 @@ impl Restorer for QudiRestorer {
             ));
         }
         let job = self.job(burst, context)?;
-        let size = job.size;
+        if !self.generates {
+            return Ok(Restored { frames: self.denoised(&job)?, std: None });
+        }
         let mut sum = Moments::default();
         for sample in 0..self.options.samples as u64 {
             sum.add(&self.sample(&job, sample)?);
         }
-        let images = |values: &[f32]| -> Vec<Frame> {
-            let images = values.chunks_exact(size.pixels());
-            images.map(|image| cropped(image, size, burst.size)).collect()
-        };
-        let mut restored = images(&sum.mean());
-        if !self.generates {
-            // Fusion has no part in these: each frame was denoised for itself.
-            let errors = |noise: &f32| (UNSHARED * noise).powi(2);
-            let errors: Vec<f32> = job.guide.noise().iter().map(errors).collect();
-            restored = steadied(&restored, &images(&errors));
-            let values = restored.iter_mut().flat_map(|frame| &mut frame.data);
-            values.for_each(|value| *value = value.min(1.0));
-        }
         Ok(Restored {
-            frames: restored,
-            std: (self.options.samples > 1).then(|| images(&sum.deviation())),
+            frames: job.layout.frames(&sum.mean()),
+            std: (self.options.samples > 1).then(|| job.layout.frames(&sum.deviation())),
         })
     }
 }
@@ -316,33 +295,11 @@ impl Moments {
     }
 }
 
-/// Images mirrored at their lower and right edges.
-fn padded(images: &[f32], from: Size, to: Size) -> Vec<f32> {
-    // 0 1 2 3 2 1 0 1 2 ...: the edge itself is not repeated.
-    let mirror = |place: usize, length: usize| {
-        let period = (2 * length - 2).max(1);
-        let place = place % period;
-        if place < length { place } else { period - place }
-    };
-    let mut values = Vec::with_capacity(images.len() / from.pixels() * to.pixels());
-    for image in images.chunks_exact(from.pixels()) {
-        for y in 0..to.height {
-            let row = mirror(y, from.height) * from.width;
-            values.extend((0..to.width).map(|x| image[row + mirror(x, from.width)]));
-        }
-    }
-    values
-}
-
-fn cropped(image: &[f32], from: Size, to: Size) -> Frame {
-    let rows = image.chunks_exact(from.width).take(to.height);
-    Frame { size: to, data: rows.flat_map(|row| &row[..to.width]).copied().collect() }
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use qudi_sim::Size;
     use qudi_sim::sensor::Sensor;
 
     /// Initial weights correct nothing; what is left out for them must not be missed, with tiles and several steps either.
@@ -358,16 +315,20 @@ mod tests {
             Context { seed: 1, first_frame: 0, ppp: 3.25, exposure: 0.3, sensor, gain, dark: None };
         let (config, device) = (NetworkConfig::preset("tiny").unwrap(), Device::flex());
         let options = SampleOptions { steps: 2, tile: 32, ..SampleOptions::default() };
-        let restored = |generates: bool| {
-            let network = config.init(2, &device);
-            let restorer = QudiRestorer::new(network, &config, 11, options, &device).unwrap();
-            assert!(!restorer.generates);
-            let restorer = QudiRestorer { generates, ..restorer };
-            let job = restorer.job(BurstView { size, frames: &counts }, &context).unwrap();
-            restorer.sample(&job, 0).unwrap()
-        };
-        for (short, whole) in restored(false).iter().zip(&restored(true)) {
-            assert!((short - whole).abs() < 1e-5, "{short} and {whole}");
+        let network = config.init(2, &device);
+        let mut restorer = QudiRestorer::new(network, &config, 11, options, &device).unwrap();
+        assert!(!restorer.generates);
+        let burst = BurstView { size, frames: &counts };
+        let short = restorer.restore(burst, &context).unwrap().frames;
+        restorer.generates = true;
+        let whole = restorer.restore(burst, &context).unwrap().frames;
+        let job = restorer.job(burst, &context).unwrap();
+        let noises = job.layout.frames(job.guide.noise());
+        let whole = settled(&job.alignment, whole, noises, 1.0);
+        for (short, whole) in short.iter().zip(&whole) {
+            for (short, whole) in short.data.iter().zip(&whole.data) {
+                assert!((short - whole).abs() < 1e-5, "{short} and {whole}");
+            }
         }
     }
 }

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::{Device, Tensor};
+use qudi_model::checkpoint::load;
 use qudi_model::network::{Qudi, fill, parameters};
 use qudi_model::train::{
     Adam, Batch, Bursts, Event, Feed, Files, From, METRICS, Recipe, Run, StepReport, Trainer,
@@ -35,7 +36,7 @@ fn weights(network: &Qudi) -> Vec<f32> {
 }
 
 fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Vec<StepReport>) {
-    let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, None).unwrap());
+    let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let mut feed = Feed::new(recipe, &bursts, 0, workers).unwrap();
     let mut trainer = Trainer::new(recipe, None, devices, None).unwrap();
     let steps = (0..3).map(|_| trainer.step(&mut feed).unwrap()).collect();
@@ -236,11 +237,44 @@ fn the_pre_denoiser_learns_from_parts() {
     }
 }
 
+/// What an earlier round has learnt stays as it was, bit for bit, in the average of weights, too; a run that stopped goes on
+/// with the same bursts.
+#[test]
+fn drafts_do_not_learn() {
+    let recipe = recipe(&[("network.pre.rounds", "2")]);
+    let start = recipe.network.init(1, &Device::flex());
+    let start = fill(start, |_, shape| {
+        let count = shape.iter().product::<usize>();
+        (0..count).map(|i| 0.03 * ((i * 37 % 101) as f32 / 50.0 - 1.0)).collect()
+    });
+    let split = |network: &Qudi| -> [Vec<f32>; 2] {
+        let names = parameters(network).into_iter().map(|(name, _)| name);
+        let lists = names.zip(values(network)).map(|(name, values)| {
+            (name.starts_with("drafts."), values.into_data().try_into_vec::<f32>().unwrap())
+        });
+        let (drafts, others): (Vec<_>, Vec<_>) = lists.partition(|(draft, _)| *draft);
+        [drafts, others].map(|lists| lists.into_iter().flat_map(|(_, values)| values).collect())
+    };
+    let [drafts, others] = split(&start);
+    assert!(!drafts.is_empty() && drafts.len() < others.len());
+    let folders = [0, 1].map(|_| tempfile::tempdir().unwrap());
+    let [whole, parts] = [0, 1].map(|i| folders[i].path());
+    let from = || From::Start(Some(Box::new(start.clone())));
+    learn(&mut open(whole, &recipe, from()).unwrap(), u64::MAX).unwrap();
+    assert!(learn(&mut open(parts, &recipe, from()).unwrap(), 2).is_err());
+    learn(&mut open(parts, &recipe, From::State).unwrap(), u64::MAX).unwrap();
+    let [whole, parts] =
+        [whole, parts].map(|folder| load(&folder.join(WEIGHTS), &Device::flex()).unwrap().0);
+    let [kept, learnt] = split(&whole);
+    assert!(kept == drafts && learnt != others);
+    assert_eq!(weights(&whole), weights(&parts));
+}
+
 /// A network that has gone wrong stops the run before it spoils the state, and the term is named.
 #[test]
 fn no_number_stops_the_run() {
     let recipe = recipe(&[]);
-    let bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap());
+    let bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let broken = recipe.network.init(1, &Device::flex());
     let broken = fill(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
@@ -274,7 +308,7 @@ fn recipes_say_what_is_wrong_with_them() {
     assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);
     let recipe = load("data.sensor.0.ppp", "[3.25, 9.75]").unwrap();
     assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
-    let mut bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap());
+    let mut bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
     assert_eq!(again.len(), 2);
 }

@@ -5,7 +5,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_model::config::NetworkConfig;
-use qudi_model::measurement::{GuidePlanes, Planes, sensor_numbers};
+use qudi_model::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS};
 use qudi_model::noise::Noise;
 use qudi_model::objective::{
@@ -53,7 +53,11 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     };
     let view = BurstView { size, frames: &counts };
     let planes = Planes::of(view, &context);
-    let guide = GuidePlanes::of(view, &context, tiny().pre.neighbours).unwrap();
+    let guide = GuidePlanes::of(
+        &aligned(view, &context, tiny().pre.neighbours, &[]).unwrap(),
+        tiny().pre.neighbours,
+        0..view.frames.len(),
+    );
     let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
     let measured = Measured {
         u: to_tensor(planes.u, size, device),

@@ -2,12 +2,14 @@
 //! trust. A robust merge decides by a formula; a network that sees them all can learn to.
 
 use super::dft::SIDE;
-use super::{Guide, Merged, Merger, Pilots, nearest};
+use super::steady::steadied;
+use super::{Blocks, Guide, Merged, Merger, Patchwise, Pilots, at_least, nearest};
 use crate::stabilizer::Stabilizer;
 use crate::transform_denoise::{image, units};
 use qudi_sim::Frame;
 use qudi_sim::restore::Context;
 use rayon::prelude::*;
+use std::sync::OnceLock;
 
 /// Variance of the guide's errors, in that of one frame's noise, about.
 const ERROR: f32 = 0.1;
@@ -24,6 +26,8 @@ pub struct Alignment<'a> {
     /// Dark detections of an ordinary pixel.
     ordinary: f64,
     clean: Vec<Frame>,
+    /// The motion of the patches of each frame to all frames, found when first asked for.
+    flows: Vec<OnceLock<Patchwise>>,
 }
 
 /// What is known of a frame. Deviations are those of the noise of one frame's counts where the guide is right.
@@ -47,14 +51,40 @@ impl<'a> Alignment<'a> {
     pub fn new(guide: Guide, context: &'a Context) -> Self {
         let Guide { clean, means, mut merger, stabilizer, ordinary } = guide;
         merger.follow(Pilots { frames: means, error: ERROR });
-        Self { merger, stabilizer, context, ordinary, clean }
+        let flows = clean.iter().map(|_| OnceLock::new()).collect();
+        Self { merger, stabilizer, context, ordinary, clean, flows }
+    }
+
+    /// Once more, on better frames of the window in image units.
+    #[must_use]
+    pub fn on(mut self, clean: Vec<Frame>) -> Self {
+        let units = units(self.context);
+        let size = self.merger.frames[0].size;
+        let means = clean.iter().map(|frame| {
+            let mean = |(i, &image): (usize, &f32)| {
+                let detections = f64::from(image) / units + self.context.dark_of(i, self.ordinary);
+                self.merger.moments.at(detections).0 as f32
+            };
+            let means: Vec<f32> = frame.data.iter().enumerate().map(mean).collect();
+            at_least(&means, frame.size, size)
+        });
+        let frames = means.collect();
+        self.merger.follow(Pilots { frames, error: ERROR });
+        let flows = clean.iter().map(|_| OnceLock::new()).collect();
+        Self { clean, flows, ..self }
+    }
+
+    /// Frames of the window.
+    pub fn frames(&self) -> usize {
+        self.clean.len()
     }
 
     /// What is known of frame `reference`, with so many neighbours.
     pub fn of(&self, reference: usize, neighbours: usize) -> Aligned {
-        let Self { merger, stabilizer, context, ordinary, clean } = self;
-        let (blocks, flow) = merger.flow(reference);
-        let Merged { counts, noises, .. } = merger.merge_along(&blocks, &flow);
+        let Self { merger, stabilizer, context, ordinary, clean, .. } = self;
+        let flow = self.flow(reference);
+        let blocks = Blocks::around(reference, merger.frames.len(), merger.block);
+        let Merged { counts, noises, .. } = merger.merge_along(&blocks, flow);
         let noises = merger.blended(|i| [[noises[i]; SIDE]; SIDE]);
         let merged = image(&stabilizer.stabilized(&counts), stabilizer, context, *ordinary);
 
@@ -85,6 +115,18 @@ impl<'a> Alignment<'a> {
             expected: laid(guide, &nearest[1..], neighbours),
             merged,
         }
+    }
+
+    /// `frames`, restored ones of this window in image units, each merged with its neighbours along their motion: each was
+    /// denoised for itself and errs in its own way. `errors` are the variances of the errors that they do not share, pixel by
+    /// pixel, about. One of each for every frame.
+    pub fn steadied(&self, frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
+        let flows: Vec<&Patchwise> = (0..frames.len()).map(|frame| self.flow(frame)).collect();
+        steadied(frames, errors, &flows)
+    }
+
+    fn flow(&self, reference: usize) -> &Patchwise {
+        self.flows[reference].get_or_init(|| self.merger.flow(reference).1)
     }
 
     /// Deviations in image units of merged counts whose mean is `means`: half of what separates the images one deviation

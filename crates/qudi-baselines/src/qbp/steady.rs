@@ -2,12 +2,11 @@
 //! steadier. The frames stand for the counts in the robust merge (Hasinoff et al. 2016, section 5), their errors for the
 //! noise.
 
-use super::align::{align, finest_grid};
+use super::align::finest_grid;
 use super::cubic::cubic_within;
 use super::dft::SIDE;
 use super::merge::{Member, merge};
-use super::pyramid::Pyramid;
-use super::{at_least, nearest};
+use super::{Patchwise, at_least, nearest};
 use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
 
@@ -15,28 +14,23 @@ use rayon::prelude::*;
 const NEAREST: usize = 6;
 
 /// Squared difference, in that which errors make, at which a frame counts half.
-const TRUST: f32 = 1.0;
+const TRUST: f32 = 2.0;
 
 /// Least variance of errors: what has none must not divide by zero.
 const LEAST: f32 = 1e-8;
 
-/// The restored frames of a window, each merged with its neighbours along their motion. `errors` are the variances of the errors
-/// that the frames do not share, pixel by pixel, about; frames of the same size, one for each.
-pub fn steadied(frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
+/// The restored frames of a window, each merged with its neighbours along `flows`, `[frame]` to all frames. `errors` are the
+/// variances of the errors that the frames do not share, pixel by pixel, about; frames of the same size, one for each.
+pub(super) fn steadied(frames: &[Frame], errors: &[Frame], flows: &[&Patchwise]) -> Vec<Frame> {
     let Some(size) = frames.first().map(|frame| frame.size) else { return Vec::new() };
     let large = Size { height: size.height.max(SIDE), width: size.width.max(SIDE) };
     let [frames, errors] = [frames, errors].map(|list| -> Vec<Frame> {
         list.par_iter().map(|frame| at_least(&frame.data, size, large)).collect()
     });
-    let pyramids: Vec<Pyramid> = frames.par_iter().map(Pyramid::new).collect();
     let grid = finest_grid(large);
     let steady = |reference: usize| {
-        let errors = &errors[reference];
-        let matching = (2.0 * errors.mean() as f32).max(LEAST);
+        let (errors, flows) = (&errors[reference], flows[reference]);
         let others = &nearest(frames.len(), reference, NEAREST + 1)[1..];
-        let flows =
-            others.iter().map(|&k| (k, align(&pyramids[reference], &pyramids[k], matching)));
-        let flows: Vec<_> = flows.collect();
         let mut steady = grid.blended(large, size, |i| {
             let corner = grid.corner(i);
             let member = |k: usize, d: [f32; 2]| {
@@ -44,7 +38,7 @@ pub fn steadied(frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
                 let patch = cubic_within(&frames[k], at, &frames[reference], corner);
                 Member { patch, frames: 1.0, noise: 1.0, pilot: None }
             };
-            let others = flows.iter().map(|(k, flow)| member(*k, flow[i]));
+            let others = others.iter().map(|&k| member(k, flows[k][i]));
             let members: Vec<_> =
                 std::iter::once(member(reference, [0.0; 2])).chain(others).collect();
             let rows = corner[1]..corner[1] + SIDE;
@@ -61,6 +55,8 @@ pub fn steadied(frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::align::align;
+    use super::super::pyramid::Pyramid;
     use super::*;
     use rand::rngs::ChaCha8Rng;
     use rand::{RngExt, SeedableRng};
@@ -80,6 +76,22 @@ mod tests {
         let half = 3.0f32.sqrt() * error;
         let values = frame.data.iter().map(|v| v + rng.random_range(-half..half));
         Frame { size: frame.size, data: values.collect() }
+    }
+
+    /// Along the motion that patches of the frames themselves are matched by.
+    fn steadied(frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
+        let large = |frame: &Frame| {
+            let Size { height, width } = frame.size;
+            let size = Size { height: height.max(SIDE), width: width.max(SIDE) };
+            Pyramid::new(&at_least(&frame.data, frame.size, size))
+        };
+        let pyramids: Vec<Pyramid> = frames.iter().map(large).collect();
+        let variance = |error: &Frame| (2.0 * error.mean() as f32).max(LEAST);
+        let flows = pyramids.iter().zip(errors).map(|(here, error)| {
+            pyramids.iter().map(|there| align(here, there, variance(error))).collect()
+        });
+        let flows: Vec<Patchwise> = flows.collect();
+        super::steadied(frames, errors, &flows.iter().collect::<Vec<_>>())
     }
 
     fn squared_error(a: &Frame, b: &Frame) -> f32 {

@@ -31,7 +31,7 @@ pub(crate) struct Train {
     /// Go on from the run's last state
     #[arg(long, conflicts_with_all = ["cache_only", "init"])]
     pub(crate) resume: bool,
-    /// Start from these weights instead of random ones
+    /// Start from these weights instead of random ones: of the same network, or of one with a round less
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) init: Option<PathBuf>,
     /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1

@@ -7,7 +7,7 @@ use crate::device::{self, Opened};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
-use qudi_model::checkpoint::load;
+use qudi_model::checkpoint::{Description, load};
 use qudi_model::perceptual::fetch;
 use qudi_model::train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS};
 use qudi_sim::dataset::{Pack, write_pack};
@@ -190,12 +190,16 @@ fn initial(
     recipe: &Recipe,
     device: &Opened,
 ) -> Result<Box<qudi_model::network::Qudi>> {
-    let (network, description) = load(path, &device.device)?;
-    if description.network != recipe.network {
+    let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
+    if sizes.pre.rounds + 1 == recipe.network.pre.rounds {
+        network = network.with_round_more();
+        sizes.pre.rounds += 1;
+    }
+    if sizes != recipe.network {
         return Err(Fault::new(
             "these weights are for a network of other sizes than the recipe's",
             path.display(),
-            "choose the recipe that they were trained with, or its [network] table",
+            "choose the recipe that they were trained with, its [network] table, or that with one round more",
         ));
     }
     Ok(Box::new(network))

@@ -80,6 +80,14 @@ impl PreDenoiser {
         self.static_in.linear(&[fold(planes, self.fold)])
     }
 
+    /// The pre-denoised frames alone, in image units, before any simulated measurement, from their guide.
+    pub fn denoise(&self, guide: &Tensor<4>) -> Tensor<4> {
+        let evidence = Evidence::new(guide);
+        let nothing = evidence.clean.zeros_like().repeat_dim(1, 2);
+        let flag = nothing.clone().narrow(1, 0, 1).narrow(2, 0, 1).narrow(3, 0, 1);
+        self.forward(self.prepare(&evidence), &evidence, nothing, flag).0
+    }
+
     /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.
     /// `prepared` as from [`Self::prepare`] of the same `evidence`, whose restored image is corrected; `simulated` are
     /// `y_sim` and `u_sim`, `flag` says of every image whether they exist, `[images, 1, 1, 1]`.

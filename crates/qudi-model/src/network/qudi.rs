@@ -75,6 +75,8 @@ pub struct Prediction {
 /// See the module.
 #[derive(Module, Debug)]
 pub struct Qudi {
+    /// Pre-denoisers of the rounds before the last: they make what the guide is found from, and learn no more.
+    drafts: Vec<PreDenoiser>,
     pre: PreDenoiser,
     low: LowFeatures,
     high: HighFeatures,
@@ -93,8 +95,10 @@ impl NetworkConfig {
 
     /// The network without weights: it takes no memory yet.
     pub(crate) fn shell(&self, device: &Device) -> Qudi {
+        let pre = |_| self.pre.init(self.fold, device);
         Qudi {
-            pre: self.pre.init(self.fold, device),
+            drafts: (1..self.pre.rounds).map(pre).collect(),
+            pre: pre(0),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
             flow: self.flow.init(self.lacks(Part::Flow), device),
@@ -140,11 +144,28 @@ impl Qudi {
         self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
     }
 
-    /// The pre-denoised frames alone, in image units, of bursts of `frames` frames and their guide ([`Measured`]), before any
-    /// simulated measurement: all there is where the U-Net does not correct them ([`Self::generates`]).
-    pub fn denoise(&self, guide: &Tensor<4>, frames: usize) -> Tensor<4> {
-        let evidence = Evidence::new(guide);
-        self.pre_denoise(&self.pre.prepare(&evidence), &evidence, frames, None).0
+    /// The pre-denoised frames alone, in image units, of frames and their guide ([`Measured`]), before any simulated
+    /// measurement: all there is where the U-Net does not correct them ([`Self::generates`]).
+    pub fn denoise(&self, guide: &Tensor<4>) -> Tensor<4> {
+        self.pre.denoise(guide)
+    }
+
+    /// What a burst's guide goes through before this network sees it, in their order.
+    pub fn drafts(&self) -> &[PreDenoiser] {
+        &self.drafts
+    }
+
+    /// The network with other drafts, as many as it has.
+    #[must_use]
+    pub(crate) fn with_drafts(self, drafts: Vec<PreDenoiser>) -> Self {
+        Self { drafts, ..self }
+    }
+
+    /// The network for one round more, whose last pre-denoiser starts as a copy of what becomes a draft.
+    #[must_use]
+    pub fn with_round_more(mut self) -> Self {
+        self.drafts.push(self.pre.clone());
+        self
     }
 
     /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.

@@ -3,7 +3,8 @@
 use super::kept::{KeptBurst, Shelf};
 use super::recipe::{PartsConfig, Recipe};
 use crate::config::Part;
-use crate::measurement::GuidePlanes;
+use crate::draft::Draft;
+use crate::measurement::{GuidePlanes, aligned};
 use qudi_sim::dataset::{Dataset, Sample};
 use qudi_sim::restore::BurstView;
 use qudi_sim::{Result, Size, USUAL_EXPOSURE};
@@ -29,6 +30,7 @@ pub struct Bursts {
     neighbours: usize,
     exposure: bool,
     parts: Option<(PartsConfig, Kept)>,
+    drafts: Vec<Draft>,
     shelf: Option<Arc<Shelf>>,
 }
 
@@ -36,8 +38,8 @@ pub struct Bursts {
 type Kept = Arc<Vec<OnceLock<KeptBurst>>>;
 
 impl Bursts {
-    /// Those of a recipe.
-    pub fn new(recipe: &Recipe, dataset: Dataset) -> Self {
+    /// Those of a recipe, with the drafts of the network that learns.
+    pub fn new(recipe: &Recipe, dataset: Dataset, drafts: Vec<Draft>) -> Self {
         let keep = |parts: PartsConfig| {
             let kept = (0..parts.bursts).map(|_| OnceLock::new()).collect();
             (parts, Arc::new(kept))
@@ -49,6 +51,7 @@ impl Bursts {
             neighbours: recipe.network.pre.neighbours,
             exposure: !recipe.network.lacks(Part::Exposure),
             parts: recipe.train.parts.map(keep),
+            drafts,
             shelf: None,
         }
     }
@@ -58,7 +61,7 @@ impl Bursts {
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the recipe keeps no bursts.
     pub fn keep_in(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
-        let shelf = Some(Arc::new(Shelf::new(folder, recipe)?));
+        let shelf = Some(Arc::new(Shelf::new(folder, recipe, &self.drafts)?));
         Ok(Self { shelf, ..self })
     }
 
@@ -68,7 +71,8 @@ impl Bursts {
     /// [`SimError`](qudi_sim::SimError) if the data cannot be opened again.
     pub fn again(&self) -> Result<Self> {
         let (dataset, shelf) = (self.dataset.again()?, self.shelf.clone());
-        Ok(Self { dataset, shelf, parts: self.parts.clone(), ..*self })
+        let (drafts, parts) = (self.drafts.clone(), self.parts.clone());
+        Ok(Self { dataset, parts, drafts, shelf, ..*self })
     }
 
     /// Sample `number`.
@@ -112,7 +116,8 @@ impl Bursts {
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let guide = GuidePlanes::of_frames(view, &sample.context, self.neighbours, range.clone())?;
+        let alignment = aligned(view, &sample.context, self.neighbours, &self.drafts)?;
+        let guide = GuidePlanes::of(&alignment, self.neighbours, range.clone());
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
         Ok(Guided { size, sample, guide })
@@ -131,7 +136,7 @@ mod tests {
 
     fn of(recipe: &Recipe) -> Bursts {
         let dataset = Dataset::new(&recipe.data, None).unwrap_or_else(|e| panic!("{e}"));
-        Bursts::new(recipe, dataset)
+        Bursts::new(recipe, dataset, Vec::new())
     }
 
     fn bursts(parts: &str) -> Bursts {
@@ -252,6 +257,15 @@ mod tests {
             assert!(error.is_some_and(|e| e.to_string().contains("above 0")));
             std::fs::write(file.path(), bytes).unwrap_or_else(|e| panic!("{e}"));
         }
+        // What other weights restored is something else, too.
+        let device = burn::tensor::Device::flex();
+        let network = recipe.network.init(1, &device).with_round_more();
+        let drafts = Draft::all(&network, &recipe.network, &device);
+        let drafted = Bursts { drafts, ..of(&recipe) };
+        let mut drafted = drafted.keep_in(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
+        let error = (0..6).find_map(|number| drafted.sample(number).err());
+        assert!(error.is_some_and(|e| e.to_string().contains("something else")));
+
         other.train.parts = None;
         assert!(of(&other).keep_in(folder.path(), &other).is_err());
     }

@@ -3,6 +3,7 @@
 use super::bursts::Guided;
 use super::recipe::{PartsConfig, Recipe};
 use crate::config::Part;
+use crate::draft::Draft;
 use crate::measurement::{GuidePlanes, IMAGES};
 use qudi_sim::dataset::Sample;
 use qudi_sim::output::{Overwrite, PendingFile};
@@ -107,6 +108,9 @@ struct Drawn<'a> {
     kept: usize,
     neighbours: usize,
     exposure: bool,
+    /// Hashes of the drafts' weights.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    drafts: Vec<String>,
 }
 
 /// What a file tells besides its planes.
@@ -126,7 +130,7 @@ const KEY: &str = "burst";
 const HEADER: usize = 1 << 16;
 
 impl Shelf {
-    pub(super) fn new(folder: &Path, recipe: &Recipe) -> Result<Self> {
+    pub(super) fn new(folder: &Path, recipe: &Recipe, drafts: &[Draft]) -> Result<Self> {
         let Some(parts) = recipe.train.parts else {
             let what = "the recipe draws every sample anew";
             return Err(SimError::request(what, "train.parts", "bursts are kept only for parts"));
@@ -138,6 +142,7 @@ impl Shelf {
             kept: parts.kept,
             neighbours: recipe.network.pre.neighbours,
             exposure: !recipe.network.lacks(Part::Exposure),
+            drafts: drafts.iter().map(Draft::sha256).collect::<Result<_>>()?,
         };
         Ok(Self {
             folder: folder.to_owned(),

@@ -8,6 +8,7 @@ use super::trainer::{StepReport, Trainer};
 use super::validate::{Validation, Validator};
 use crate::checkpoint::{Description, Precision, save};
 use crate::config::{NetworkConfig, PRESETS};
+use crate::draft::Draft;
 use crate::network::Qudi;
 use burn::tensor::Device;
 use qudi_sim::dataset::{Dataset, Pack};
@@ -91,16 +92,18 @@ impl Run {
         commit: Option<String>,
     ) -> Result<Self> {
         let validator = Validator::new(recipe, files.pack.as_ref())?;
-        let mut bursts = Bursts::new(recipe, Dataset::new(&recipe.data, files.pack)?);
-        if let Some(folder) = &files.bursts {
-            bursts = bursts.keep_in(folder, recipe)?;
-        }
         let trainer = match from {
             From::Start(network) => {
                 Trainer::new(recipe, network.map(|network| *network), devices, backbones)?
             }
             From::State => Trainer::resume(folder, recipe, devices, backbones)?,
         };
+        let dataset = Dataset::new(&recipe.data, files.pack)?;
+        let drafts = Draft::all(&trainer.averaged(), &recipe.network, &devices[0]);
+        let mut bursts = Bursts::new(recipe, dataset, drafts);
+        if let Some(folder) = &files.bursts {
+            bursts = bursts.keep_in(folder, recipe)?;
+        }
         let run = Self {
             folder: folder.to_owned(),
             recipe: recipe.clone(),

@@ -133,7 +133,10 @@ impl Trainer {
 
     /// The network with averaged weights, for use.
     pub fn averaged(&self) -> Qudi {
-        with_values(self.network.valid(), self.average.clone())
+        let network = self.network.valid();
+        // Drafts do not learn, and an average of equal numbers is not always that number.
+        let drafts = network.drafts().to_vec();
+        with_values(network, self.average.clone()).with_drafts(drafts)
     }
 
     /// Takes one step.

@@ -1,0 +1,80 @@
+//! How images lie before the network: mirrored at their edges up to what it wants, in tiles, and back.
+
+use crate::measurement::GuidePlanes;
+use crate::tensor::read;
+use crate::tiles::Tiles;
+use burn::tensor::{Device, Tensor};
+use qudi_sim::{Frame, Result, Size};
+
+/// See the module.
+#[derive(Debug)]
+pub(crate) struct Layout {
+    /// Of the images.
+    from: Size,
+    /// Of the images, padded.
+    pub(crate) size: Size,
+    /// Of the padded images.
+    pub(crate) tiles: Tiles,
+}
+
+impl Layout {
+    /// For images of size `from` and a network that wants multiples of `multiple`, in tiles of about `side` pixels.
+    pub(crate) fn new(from: Size, multiple: usize, side: usize) -> Self {
+        let size = Size {
+            height: from.height.next_multiple_of(multiple),
+            width: from.width.next_multiple_of(multiple),
+        };
+        let side = side / multiple * multiple;
+        let overlap = (side / 8).next_multiple_of(multiple);
+        Self { from, size, tiles: Tiles::new(size, side, overlap, multiple) }
+    }
+
+    /// Images mirrored at their lower and right edges.
+    pub(crate) fn padded(&self, images: &[f32]) -> Vec<f32> {
+        let Self { from, size, .. } = self;
+        // 0 1 2 3 2 1 0 1 2 ...: the edge itself is not repeated.
+        let mirror = |place: usize, length: usize| {
+            let period = (2 * length - 2).max(1);
+            let place = place % period;
+            if place < length { place } else { period - place }
+        };
+        let mut values = Vec::with_capacity(images.len() / from.pixels() * size.pixels());
+        for image in images.chunks_exact(from.pixels()) {
+            for y in 0..size.height {
+                let row = mirror(y, from.height) * from.width;
+                values.extend((0..size.width).map(|x| image[row + mirror(x, from.width)]));
+            }
+        }
+        values
+    }
+
+    /// Padded images as they were before.
+    pub(crate) fn frames(&self, images: &[f32]) -> Vec<Frame> {
+        let cropped = |image: &[f32]| {
+            let rows = image.chunks_exact(self.size.width).take(self.from.height);
+            let values = rows.flat_map(|row| &row[..self.from.width]).copied();
+            Frame { size: self.from, data: values.collect() }
+        };
+        images.chunks_exact(self.size.pixels()).map(cropped).collect()
+    }
+
+    /// What `denoise` makes of every frame of a padded guide for itself, in image units.
+    pub(crate) fn denoised(
+        &self,
+        guide: &GuidePlanes,
+        device: &Device,
+        denoise: impl Fn(&Tensor<4>) -> Tensor<4>,
+    ) -> Result<Vec<f32>> {
+        let (tiles, pixels) = (&self.tiles, self.size.pixels());
+        let frames = guide.noise().len() / pixels;
+        let mut all = vec![0.0; frames * pixels];
+        for number in 0..tiles.count() {
+            for (frame, image) in all.chunks_exact_mut(pixels).enumerate() {
+                let part = |images: &[f32]| tiles.crop(number, &images[frame * pixels..][..pixels]);
+                let guide = guide.map(part).to_tensor(tiles.tile, device);
+                tiles.blend(number, &read(denoise(&guide))?, image);
+            }
+        }
+        Ok(all)
+    }
+}
