@@ -47,7 +47,7 @@ impl Draft {
     /// The frames of a window, restored and steadied, in image units.
     ///
     /// # Errors
-    /// [`SimError`](qudi_sim::SimError) if the device fails.
+    /// [`SimError`] if the device fails.
     pub fn restore(&self, alignment: &Alignment<'_>, neighbours: usize) -> Result<Vec<Frame>> {
         let frame = |number: usize| {
             let aligned = alignment.of(number, neighbours);
