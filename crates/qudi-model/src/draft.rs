@@ -5,12 +5,9 @@ use crate::config::NetworkConfig;
 use crate::layout::Layout;
 use crate::measurement::{BRIGHTEST, GuidePlanes};
 use crate::network::{PreDenoiser, Qudi};
-use crate::tensor::read;
-use burn::module::{Module, ModuleVisitor, Param};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use qudi_baselines::Alignment;
-use qudi_sim::{Frame, Result, SimError};
-use sha2::{Digest, Sha256};
+use qudi_sim::{Frame, Result};
 
 /// Deviation of the errors that a pre-denoised frame does not share with the next one, in that of the merged frame's noise.
 const UNSHARED: f32 = 0.4;
@@ -37,17 +34,14 @@ impl Draft {
         network.drafts().iter().map(draft).collect()
     }
 
-    /// Hash of its weights.
-    pub(crate) fn sha256(&self) -> Result<String> {
-        let mut hash = Weights { hash: Sha256::new(), error: None };
-        self.denoiser.visit(&mut hash);
-        hash.error.map_or_else(|| Ok(format!("{:x}", hash.hash.finalize())), Err)
+    pub(crate) fn denoiser(&self) -> &PreDenoiser {
+        &self.denoiser
     }
 
     /// The frames of a window, restored and steadied, in image units.
     ///
     /// # Errors
-    /// [`SimError`] if the device fails.
+    /// [`SimError`](qudi_sim::SimError) if the device fails.
     pub fn restore(&self, alignment: &Alignment<'_>, neighbours: usize) -> Result<Vec<Frame>> {
         let frame = |number: usize| {
             let aligned = alignment.of(number, neighbours);
@@ -83,19 +77,4 @@ pub(crate) fn settled(
     let frames = changed(frames, &possible);
     let errors = changed(noises, &|noise| (UNSHARED * noise).powi(2));
     changed(alignment.steadied(&frames, &errors), &possible)
-}
-
-/// Weights in the order of the network, hashed.
-struct Weights {
-    hash: Sha256,
-    error: Option<SimError>,
-}
-
-impl ModuleVisitor for Weights {
-    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        match read(param.val()) {
-            Ok(values) => values.iter().for_each(|value| self.hash.update(value.to_le_bytes())),
-            Err(error) => self.error = Some(error),
-        }
-    }
 }

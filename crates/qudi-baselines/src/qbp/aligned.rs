@@ -49,15 +49,21 @@ pub struct Aligned {
 impl<'a> Alignment<'a> {
     /// Of the window that `guide` was found for.
     pub fn new(guide: Guide, context: &'a Context) -> Self {
-        let Guide { clean, means, mut merger, stabilizer, ordinary } = guide;
-        merger.follow(Pilots { frames: means, error: ERROR });
+        let Guide { clean, means, merger, stabilizer, ordinary } = guide;
+        let (none, flows) = (Vec::new(), Vec::new());
+        Self { merger, stabilizer, context, ordinary, clean: none, flows }.led_by(clean, means)
+    }
+
+    /// Goes by restored frames, in image units and in mean counts.
+    fn led_by(mut self, clean: Vec<Frame>, means: Vec<Frame>) -> Self {
+        self.merger.follow(Pilots { frames: means, error: ERROR });
         let flows = clean.iter().map(|_| OnceLock::new()).collect();
-        Self { merger, stabilizer, context, ordinary, clean, flows }
+        Self { clean, flows, ..self }
     }
 
     /// Once more, on better frames of the window in image units.
     #[must_use]
-    pub fn on(mut self, clean: Vec<Frame>) -> Self {
+    pub fn on(self, clean: Vec<Frame>) -> Self {
         let units = units(self.context);
         let size = self.merger.frames[0].size;
         let means = clean.iter().map(|frame| {
@@ -68,10 +74,8 @@ impl<'a> Alignment<'a> {
             let means: Vec<f32> = frame.data.iter().enumerate().map(mean).collect();
             at_least(&means, frame.size, size)
         });
-        let frames = means.collect();
-        self.merger.follow(Pilots { frames, error: ERROR });
-        let flows = clean.iter().map(|_| OnceLock::new()).collect();
-        Self { clean, flows, ..self }
+        let means = means.collect();
+        self.led_by(clean, means)
     }
 
     /// Frames of the window.

@@ -6,6 +6,7 @@
 
 use super::affine::{Affine, Freedom, centre};
 use super::pyramid::{shrink, smooth};
+use super::velocity::lowest_between;
 use qudi_sim::sensor::CountMoments;
 use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
@@ -106,11 +107,7 @@ fn shift(here: &Frame, there: &Frame, variance: &Frame) -> [f32; 2] {
         if place == 0 || place + 1 == ACROSS as usize {
             return whole;
         }
-        // The lowest point of the parabola through three costs.
-        let (before, after) = (costs[best - step], costs[best + step]);
-        let bend = before + after - 2.0 * costs[best];
-        let part = 0.5 * (before - after) / bend;
-        if bend > 0.0 && part.is_finite() { whole + part.clamp(-0.5, 0.5) } else { whole }
+        whole + lowest_between([costs[best - step], costs[best], costs[best + step]])
     };
     let across = ACROSS as usize;
     [along(best % across, 1), along(best / across, across)]
@@ -163,8 +160,8 @@ fn registered(frames: &[Frame], maps: &[Affine], freedom: Freedom) -> Vec<Affine
             if count > 0.5 { (sum - own[0]) / count } else { f32::NAN }
         });
         let others: Vec<f32> = others.collect();
-        let mut map = *map;
-        for _ in 0..STEPS {
+        let Some(mut map) = map.stepped(&laid[k], &others, size, freedom) else { return *map };
+        for _ in 1..STEPS {
             let Some(next) = map.stepped(&map.laid(frame), &others, size, freedom) else { break };
             map = next;
         }

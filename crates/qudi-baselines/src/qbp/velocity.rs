@@ -239,11 +239,17 @@ fn lowest(total: &[f32]) -> [f32; 2] {
         if k == 0 || k + 1 == ACROSS {
             return 0.0;
         }
-        let (below, above) = (total[best - step], total[best + step]);
-        let bend = below - 2.0 * total[best] + above;
-        if bend <= 0.0 { 0.0 } else { (0.5 * (below - above) / bend).clamp(-0.5, 0.5) }
+        lowest_between([total[best - step], total[best], total[best + step]])
     };
     [at[0] + STEP * offset(best % ACROSS, 1), at[1] + STEP * offset(best / ACROSS, ACROSS)]
+}
+
+/// Where the parabola through the least of costs and its neighbours is lowest, in steps from it.
+pub(super) fn lowest_between([below, least, above]: [f32; 3]) -> f32 {
+    let bend = below - 2.0 * least + above;
+    let part = 0.5 * (below - above) / bend;
+    // Costs may be infinite.
+    if bend > 0.0 && part.is_finite() { part.clamp(-0.5, 0.5) } else { 0.0 }
 }
 
 /// The filter 1 2 1 both ways, borders repeated: shifts between pixels then change noise less.

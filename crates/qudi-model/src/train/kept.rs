@@ -2,9 +2,11 @@
 
 use super::bursts::Guided;
 use super::recipe::{PartsConfig, Recipe};
+use super::values::values;
 use crate::config::Part;
 use crate::draft::Draft;
 use crate::measurement::{GuidePlanes, IMAGES};
+use crate::tensor::read;
 use qudi_sim::dataset::Sample;
 use qudi_sim::output::{Overwrite, PendingFile};
 use qudi_sim::restore::Context;
@@ -13,6 +15,7 @@ use qudi_sim::{Frame, Result, SimError, Size};
 use rand::{Rng, RngExt};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -113,6 +116,15 @@ struct Drawn<'a> {
     drafts: Vec<String>,
 }
 
+/// Hash of a draft's weights.
+fn sha256(draft: &Draft) -> Result<String> {
+    let mut hash = Sha256::new();
+    for list in values(draft.denoiser()) {
+        read(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
+    }
+    Ok(format!("{:x}", hash.finalize()))
+}
+
 /// What a file tells besides its planes.
 #[derive(Serialize, Deserialize)]
 struct Label {
@@ -142,7 +154,7 @@ impl Shelf {
             kept: parts.kept,
             neighbours: recipe.network.pre.neighbours,
             exposure: !recipe.network.lacks(Part::Exposure),
-            drafts: drafts.iter().map(Draft::sha256).collect::<Result<_>>()?,
+            drafts: drafts.iter().map(sha256).collect::<Result<_>>()?,
         };
         Ok(Self {
             folder: folder.to_owned(),

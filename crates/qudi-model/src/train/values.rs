@@ -5,7 +5,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor};
 
 /// The values of all parameters, `[values]` each, outside autodiff.
-pub fn values(network: &Qudi) -> Vec<Tensor<1>> {
+pub fn values<M: Module>(network: &M) -> Vec<Tensor<1>> {
     let mut collect = Collect { gradients: None, list: Vec::new() };
     network.visit(&mut collect);
     collect.list
