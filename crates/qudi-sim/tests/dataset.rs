@@ -12,7 +12,16 @@ use std::path::{Path, PathBuf};
 
 fn source(name: &str, kind: SourceKind, from: &[&str]) -> SourceConfig {
     let from = from.iter().map(|&f| f.to_owned()).collect();
-    SourceConfig { name: name.into(), kind, from, weight: 1.0, stride: 2, shrink: 1.0, speed: 2.0 }
+    SourceConfig {
+        name: name.into(),
+        kind,
+        from,
+        weight: 1.0,
+        stride: 2,
+        shrink: 1.0,
+        speed: 2.0,
+        rest: 0.0,
+    }
 }
 
 fn config(source: Vec<SourceConfig>) -> DataConfig {
@@ -166,6 +175,25 @@ fn samples_shrink_as_the_recipe_says() {
     assert!((0.99..1.01).contains(&least) && (1.23..1.26).contains(&most), "{least} {most}");
     config.source[0].shrink = 0.5;
     assert!(config.checked().unwrap_err().to_string().contains("shrinks"));
+}
+
+/// As many stills rest as the recipe says, all frames alike; the others move.
+#[test]
+fn stills_rest_as_often_as_the_recipe_says() {
+    let folder = tempfile::tempdir().unwrap();
+    files(folder.path());
+    let mut config = config(vec![source("stills", SourceKind::Stills, &["stills"])]);
+    config.source[0].rest = 0.3;
+    let path = pack(&config, folder.path()).unwrap();
+    let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
+    let mut resting = 0;
+    for k in 0..200 {
+        let truth = dataset.sample(4, k).unwrap().truth;
+        resting += usize::from(truth.iter().all(|frame| frame.data == truth[0].data));
+    }
+    assert!((45..75).contains(&resting), "{resting} of 200");
+    config.source[0].rest = 1.1;
+    assert!(config.checked().unwrap_err().to_string().contains("at rest"));
 }
 
 /// Light is log-uniform, and the photons are those that it gives.

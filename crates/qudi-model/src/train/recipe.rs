@@ -259,6 +259,7 @@ impl Recipe {
                 stride: 1,
                 shrink: 1.0,
                 speed: 0.0,
+                rest: 0.0,
             }],
         })
     }

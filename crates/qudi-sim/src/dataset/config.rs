@@ -74,6 +74,9 @@ pub struct SourceConfig {
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
     #[serde(default = "usual_speed")]
     pub speed: f64,
+    /// Share of stills' samples in which nothing moves.
+    #[serde(default)]
+    pub rest: f64,
 }
 
 /// What a source holds.
@@ -201,6 +204,10 @@ impl DataConfig {
                     format!("has a speed of {}", source.speed),
                     "use 0 to 100 pixels per frame",
                 );
+            }
+            if !(0.0..=1.0).contains(&source.rest) {
+                let what = format!("has a share of {} at rest", source.rest);
+                return fault(&key, what, "use a share from 0 to 1");
             }
             if !(1.0..=4.0).contains(&source.shrink) {
                 let what = format!("shrinks by {}", source.shrink);

@@ -124,12 +124,16 @@ impl Dataset {
         let clip = pack.clips()[number].clone();
         let (side, frames) = (self.config.crop, self.config.frames);
         let (angle, speed) = (TAU * uniform(rng), self.config.source[source].speed * uniform(rng));
-        let motion = StillMotion {
+        let mut motion = StillMotion {
             pan: [speed * angle.cos(), speed * angle.sin()],
             rotate: 1.5 * (uniform(rng) - 0.5),
             zoom: 1.0 + 0.02 * (uniform(rng) - 0.5),
             layers: below(4, rng) as u32,
         };
+        let rest = self.config.source[source].rest;
+        if rest > 0.0 && uniform(rng) < rest {
+            motion = StillMotion::default();
+        }
         // The scene shows the middle of the image: the part around the crop, with the way that it goes.
         let way = (speed * frames as f64 / 2.0).ceil() as usize + 4;
         let part = (side + 2 * way).min(clip.size.height).min(clip.size.width);
