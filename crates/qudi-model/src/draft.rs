@@ -12,23 +12,22 @@ use qudi_sim::{Frame, Result};
 /// Deviation of the errors that a pre-denoised frame does not share with the next one, in that of the merged frame's noise.
 const UNSHARED: f32 = 0.4;
 
-/// Side of the tiles that it works on, in pixels.
-const TILE: usize = 512;
-
 /// The pre-denoiser of a round before the last one.
 #[derive(Clone, Debug)]
 pub struct Draft {
     denoiser: PreDenoiser,
     fold: usize,
+    tile: usize,
     device: Device,
 }
 
 impl Draft {
-    /// Those of a network of sizes `config` whose weights are on `device`, in their order.
-    pub fn all(network: &Qudi, config: &NetworkConfig, device: &Device) -> Vec<Self> {
+    /// Those of a network of sizes `config` whose weights are on `device`, in their order; they see tiles of `tile` pixels.
+    pub fn all(network: &Qudi, config: &NetworkConfig, tile: usize, device: &Device) -> Vec<Self> {
         let draft = |denoiser: &PreDenoiser| Self {
             denoiser: denoiser.clone(),
             fold: config.fold,
+            tile,
             device: device.clone(),
         };
         network.drafts().iter().map(draft).collect()
@@ -46,7 +45,7 @@ impl Draft {
         let frame = |number: usize| {
             let aligned = alignment.of(number, neighbours);
             let noise = aligned.noise.clone();
-            let layout = Layout::new(noise.size, self.fold, TILE);
+            let layout = Layout::new(noise.size, self.fold, self.tile);
             let guide = GuidePlanes::of_frame(aligned).map(|plane| layout.padded(plane));
             let image =
                 layout.denoised(&guide, &self.device, |guide| self.denoiser.denoise(guide))?;
@@ -77,4 +76,47 @@ pub(crate) fn settled(
     let frames = changed(frames, &possible);
     let errors = changed(noises, &|noise| (UNSHARED * noise).powi(2));
     changed(alignment.steadied(&frames, &errors), &possible)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::network::fill;
+    use qudi_baselines::Guide;
+    use qudi_sim::Size;
+    use qudi_sim::restore::{BurstView, Context};
+    use qudi_sim::sensor::Sensor;
+
+    /// What lies far from the borders of a tile does not know of them.
+    #[test]
+    fn drafts_see_tiles_of_the_size_asked_for() {
+        let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
+        let gain = sensor.gain_at(3.25).unwrap_or_else(|e| panic!("{e}"));
+        let (seed, first_frame, dark) = (1, 0, None);
+        let context = Context { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark };
+        let size = Size { height: 48, width: 80 };
+        let count = |i: usize| ((i * 7 + i / size.width) % 8) as u16;
+        let frames: Vec<Vec<u16>> =
+            (0..3).map(|t| (0..size.pixels()).map(|i| count(i + 13 * t)).collect()).collect();
+        let burst = BurstView { size, frames: &frames };
+        let device = Device::flex();
+        let config = NetworkConfig::preset("tiny").unwrap_or_else(|e| panic!("{e}"));
+        let network = fill(config.init(1, &device), |_, shape| {
+            let count: usize = shape.iter().product();
+            (0..count).map(|i| 0.05 * (i as f32).sin()).collect()
+        });
+        let network = network.with_round_more();
+        let [whole, tiled] = [512, 32].map(|tile| {
+            let guide = Guide::find(burst, &context).unwrap_or_else(|e| panic!("{e}"));
+            let alignment = Alignment::new(guide, &context);
+            let draft = Draft::all(&network, &config, tile, &device).remove(0);
+            draft.restore(&alignment, config.pre.neighbours).unwrap_or_else(|e| panic!("{e}"))
+        });
+        let pairs = |x: std::ops::Range<usize>| {
+            let at = |x: usize| (whole[1].row(4)[x], tiled[1].row(4)[x]);
+            x.map(at).collect::<Vec<_>>()
+        };
+        assert_ne!(whole, tiled);
+        assert!(pairs(0..6).iter().all(|(a, b)| (a - b).abs() < 1e-3), "{:?}", pairs(0..6));
+    }
 }

@@ -18,6 +18,9 @@ use qudi_sim::{Frame, Result, SimError};
 /// Fewest frames that the fusion makes sense of.
 pub const FEWEST_FRAMES: usize = 3;
 
+/// Usual side of the tiles that networks see, in pixels.
+pub const TILE: usize = 512;
+
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleOptions {
@@ -33,7 +36,7 @@ pub struct SampleOptions {
 
 impl Default for SampleOptions {
     fn default() -> Self {
-        Self { steps: 1, sampler: Sampler::Ddim, samples: 1, tile: 512 }
+        Self { steps: 1, sampler: Sampler::Ddim, samples: 1, tile: TILE }
     }
 }
 
@@ -86,7 +89,7 @@ impl QudiRestorer {
             return Err(SimError::request(what, "--tile", help));
         }
         let schedule = NoiseSchedule::cosine(TIMES);
-        let drafts = Draft::all(&network, config, device);
+        let drafts = Draft::all(&network, config, options.tile, device);
         let (config, device) = (config.clone(), device.clone());
         Ok(Self { network, drafts, generates, config, schedule, options, device, window })
     }

@@ -2,6 +2,7 @@
 
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_model::restorer::TILE;
 use std::path::PathBuf;
 
 /// The network, for the method `qudi`.
@@ -25,7 +26,7 @@ pub(crate) struct Network {
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub(crate) device: String,
     /// Side of the tiles that the network sees at once, in pixels: memory grows with its square
-    #[arg(long, value_name = "PIXELS", default_value_t = 512)]
+    #[arg(long, value_name = "PIXELS", default_value_t = TILE)]
     pub(crate) tile: usize,
 }
 

@@ -127,6 +127,7 @@ impl Bursts {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::restorer::TILE;
 
     fn recipe(parts: &str) -> Recipe {
         let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.parts", parts)];
@@ -260,7 +261,7 @@ mod tests {
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
         let network = recipe.network.init(1, &device).with_round_more();
-        let drafts = Draft::all(&network, &recipe.network, &device);
+        let drafts = Draft::all(&network, &recipe.network, TILE, &device);
         let drafted = Bursts { drafts, ..of(&recipe) };
         let mut drafted = drafted.keep_in(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
         let error = (0..6).find_map(|number| drafted.sample(number).err());

@@ -10,6 +10,7 @@ use crate::checkpoint::{Description, Precision, save};
 use crate::config::{NetworkConfig, PRESETS};
 use crate::draft::Draft;
 use crate::network::Qudi;
+use crate::restorer::TILE;
 use burn::tensor::Device;
 use qudi_sim::dataset::{Dataset, Pack};
 use qudi_sim::output::{Overwrite, PendingFile};
@@ -99,7 +100,7 @@ impl Run {
             From::State => Trainer::resume(folder, recipe, devices, backbones)?,
         };
         let dataset = Dataset::new(&recipe.data, files.pack)?;
-        let drafts = Draft::all(&trainer.averaged(), &recipe.network, &devices[0]);
+        let drafts = Draft::all(&trainer.averaged(), &recipe.network, TILE, &devices[0]);
         let mut bursts = Bursts::new(recipe, dataset, drafts);
         if let Some(folder) = &files.bursts {
             bursts = bursts.keep_in(folder, recipe)?;
