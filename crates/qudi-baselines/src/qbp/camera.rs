@@ -11,14 +11,19 @@ use qudi_sim::sensor::CountMoments;
 use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
 
-/// Levels, coarse to fine: pixels of the frames along a side of a pixel, and what is found there.
-const LEVELS: [(usize, Freedom); 2] = [(4, Freedom::Shift), (2, Freedom::Affine)];
+/// Pixels of the frames along a side of a pixel where squares vote.
+const VOTES: usize = 4;
 
-/// Farthest shift from one frame to the next, in pixels of the coarse level, and shifts along each axis.
+/// The same where frames are registered, coarse to fine, and what is found there. The first is coarser than that of the votes,
+/// which are wrong by some pixels where something else has more contrast.
+const LEVELS: [(usize, Freedom); 3] =
+    [(8, Freedom::Shift), (4, Freedom::Shift), (2, Freedom::Affine)];
+
+/// Farthest shift from one frame to the next, in pixels of the votes' level, and shifts along each axis.
 const FARTHEST: isize = 8;
 const ACROSS: isize = 2 * FARTHEST + 1;
 
-/// Least side of the coarse level.
+/// Least side of that level.
 const SMALLEST: usize = 12;
 
 /// Side of the squares that vote, in the same, and nats that each has at most.
@@ -42,17 +47,16 @@ impl Camera {
     /// few or too small to tell.
     pub(super) fn find(frames: &[Frame], moments: &CountMoments, error: f32) -> Option<Self> {
         let whole = frames.first()?.size;
-        let (ratio, _) = LEVELS[0];
-        let size = Size { height: whole.height / ratio, width: whole.width / ratio };
+        let size = Size { height: whole.height / VOTES, width: whole.width / VOTES };
         if frames.len() < 3 || size.height.min(size.width) < SMALLEST {
             return None;
         }
-        let small: Vec<Frame> = frames.par_iter().map(|frame| shrink(frame, size, ratio)).collect();
+        let small: Vec<Frame> = frames.par_iter().map(|frame| shrink(frame, size, VOTES)).collect();
         let share = 1.0 / small.len() as f32;
         let variance = Frame::from_fn(size, |x, y| {
             let mean = share * small.iter().map(|frame| frame.row(y)[x]).sum::<f32>();
             let variance = moments.variance_at_mean(f64::from(mean)) as f32;
-            error * variance.max(1e-4) / (ratio * ratio) as f32
+            error * variance.max(1e-4) / (VOTES * VOTES) as f32
         });
         let shifts: Vec<[f32; 2]> =
             small.windows(2).map(|pair| shift(&pair[0], &pair[1], &variance)).collect();
@@ -64,7 +68,7 @@ impl Camera {
             [0, 1].map(|axis| sign * along(axis))
         };
         let mut maps: Vec<Affine> = (0..frames.len()).map(|k| Affine::shift(sum(k))).collect();
-        let mut last = ratio;
+        let mut last = VOTES;
         for (ratio, freedom) in LEVELS {
             let times = last as f32 / ratio as f32;
             maps = maps.into_iter().map(|map| map.finer(times)).collect();

@@ -20,8 +20,19 @@ const KNOWN: [f32; 2] = [0.0, 6.0];
 /// Side of the windows that judge before there is a guide, in patches, and then.
 const WINDOW: [usize; 2] = [2, 1];
 
-/// By how much a frame may fit worse on an even path, in noise's variances: else something came in between.
-const WORSE: f32 = 50.0;
+/// By how much a frame may fit worse on a chosen path, in noise's variances: else something came in between.
+const WORSE: f32 = 100.0;
+
+/// Prices of paths once there are pilots, in the same. Pilots hold the noise of the counts that judge paths found in them, and
+/// the more freely one was found, the more of that noise it fits: then noise is merged with itself.
+mod price {
+    pub(super) const MATCHED: f32 = 200.0;
+    pub(super) const EVEN: f32 = 200.0;
+    pub(super) const EVEN_REFINED: f32 = 150.0;
+    pub(super) const CAMERA_REFINED: f32 = 100.0;
+    pub(super) const CAMERA: f32 = 0.0;
+    pub(super) const REST: f32 = 0.0;
+}
 
 /// Price of each pixel that leaves the image, in the same, before there is a guide and then.
 const OUTSIDE: [f32; 2] = [10.0, 0.1];
@@ -75,30 +86,11 @@ fn carried(grid: &Grid, velocities: &[[f32; 2]], i: usize, time: f32) -> [f32; 2
 }
 
 impl Merger {
-    /// For every patch the likeliest of the paths in `flow`, of even motion, of the camera's, and of both refined on the pilots.
+    /// For every patch the likeliest of the paths in `flow`, of even motion and of the camera's; once there are pilots, of both
+    /// refined on these, and of rest, too.
     pub(super) fn likeliest(&self, even: &Even, reference: usize, flow: Patchwise) -> Patchwise {
         let count = self.frames.len();
-        let time = |k: usize| k as f32 - reference as f32;
-        let velocities = &even.velocities[reference];
-        let straight: Patchwise = (0..count)
-            .map(|k| velocities.iter().map(|v| v.map(|v| v * time(k))).collect())
-            .collect();
-        let mut choices = vec![flow, straight];
-        let camera = self.camera.as_ref().map(|camera| {
-            let half = 0.5 * (SIDE - 1) as f32;
-            let centres: Vec<[f32; 2]> = (0..self.grid.len())
-                .map(|i| self.grid.corner(i).map(|corner| corner as f32 + half))
-                .collect();
-            let path =
-                |k| centres.iter().map(|&at| camera.displacement(at, reference, k)).collect();
-            (0..count).map(path).collect::<Patchwise>()
-        });
-        if self.pilots.is_some() {
-            choices.push(self.refined(&choices[1], reference));
-            choices.extend(camera.map(|path| self.refined(&path, reference)));
-        } else {
-            choices.extend(camera);
-        }
+        let choices = self.choices(even, reference, flow);
         let pilot = self.pilots.as_ref().map(|pilots| smooth(&pilots.frames[reference]));
         let stage = usize::from(pilot.is_some());
         let judge = Judge {
@@ -112,14 +104,48 @@ impl Merger {
         let paths: Vec<Vec<[f32; 2]>> = (0..self.grid.len())
             .into_par_iter()
             .map(|i| {
-                let paths: Vec<Vec<[f32; 2]>> = choices
-                    .iter()
-                    .map(|choice| choice.iter().map(|patches| patches[i]).collect())
-                    .collect();
+                let path = |choice: &Patchwise| choice.iter().map(|patches| patches[i]).collect();
+                let paths: Vec<(f32, Vec<[f32; 2]>)> =
+                    choices.iter().map(|(price, choice)| (*price, path(choice))).collect();
                 judge.likeliest(self.grid.corner(i), reference, &paths)
             })
             .collect();
         (0..count).map(|k| paths.iter().map(|path| path[k]).collect()).collect()
+    }
+
+    /// Paths to choose among, and what they cost beforehand; what was matched comes first.
+    fn choices(&self, even: &Even, reference: usize, flow: Patchwise) -> Vec<(f32, Patchwise)> {
+        let count = self.frames.len();
+        let time = |k: usize| k as f32 - reference as f32;
+        let velocities = &even.velocities[reference];
+        let straight: Patchwise = (0..count)
+            .map(|k| velocities.iter().map(|v| v.map(|v| v * time(k))).collect())
+            .collect();
+        let camera = self.camera.as_ref().map(|camera| {
+            let half = 0.5 * (SIDE - 1) as f32;
+            let centres: Vec<[f32; 2]> = (0..self.grid.len())
+                .map(|i| self.grid.corner(i).map(|corner| corner as f32 + half))
+                .collect();
+            let path =
+                |k| centres.iter().map(|&at| camera.displacement(at, reference, k)).collect();
+            (0..count).map(path).collect::<Patchwise>()
+        });
+        if self.pilots.is_none() {
+            return [flow, straight].into_iter().chain(camera).map(|path| (0.0, path)).collect();
+        }
+        let rest = vec![vec![[0.0; 2]; self.grid.len()]; count];
+        let refined = self.refined(&straight, reference);
+        let mut choices = vec![
+            (price::MATCHED, flow),
+            (price::EVEN, straight),
+            (price::EVEN_REFINED, refined),
+            (price::REST, rest),
+        ];
+        if let Some(path) = camera {
+            choices.push((price::CAMERA_REFINED, self.refined(&path, reference)));
+            choices.push((price::CAMERA, path));
+        }
+        choices
     }
 
     /// Displacements refined on the pilots.
@@ -154,18 +180,19 @@ impl Judge<'_> {
         &self,
         corner: [usize; 2],
         reference: usize,
-        paths: &[Vec<[f32; 2]>],
+        paths: &[(f32, Vec<[f32; 2]>)],
     ) -> Vec<[f32; 2]> {
-        let costs: Vec<f32> = paths.iter().map(|path| self.cost(corner, path)).collect();
+        let costs: Vec<f32> =
+            paths.iter().map(|(price, path)| price + self.cost(corner, path)).collect();
         let best = (0..paths.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0);
-        let mut path = paths[best].clone();
+        let mut path = paths[best].1.clone();
         if best == 0 {
             return path;
         }
         let own = self.own(corner.map(|c| c as f32));
         let variance = self.variance(corner);
         for (k, d) in path.iter_mut().enumerate().filter(|(k, _)| *k != reference) {
-            let first = paths[0][k];
+            let first = paths[0].1[k];
             let [new, old] = [*d, first].map(|d| {
                 let mut sums = Sums::new();
                 self.add(&own, k, d, &mut sums);
@@ -364,6 +391,27 @@ mod tests {
         let before = error(&merger, &before, moved);
         let after = error(&merger, &merger.flow(5).1, moved);
         assert!(before < 0.3 && after < before + 0.05, "{before} before, {after} px after");
+    }
+
+    /// Pilots of a scene at rest that hold a fifth of their frames' counts, smoothed: matching follows the noise of these,
+    /// which judges paths, too.
+    #[test]
+    fn noise_that_pilots_hold_does_not_move_them() {
+        let moved = |_: f32| [0.0, 0.0];
+        let (mut merger, mut pilots) = merger(3.25, moved);
+        let smooth = |k: usize| smooth(&smooth(&merger.frames[k]));
+        let noise: Vec<Frame> = (0..11).map(smooth).collect();
+        for (pilot, counts) in pilots.frames.iter_mut().zip(&noise) {
+            for (value, count) in pilot.data.iter_mut().zip(&counts.data) {
+                *value += 0.2 * (count - *value);
+            }
+        }
+        merger.follow(pilots);
+        merger.camera = None;
+        let before = matched(&mut merger);
+        let before = error(&merger, &before, moved);
+        let after = error(&merger, &merger.flow(5).1, moved);
+        assert!(after < 0.1 * before, "{before} before, {after} px after");
     }
 
     #[test]
