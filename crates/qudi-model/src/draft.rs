@@ -5,7 +5,7 @@ use crate::config::NetworkConfig;
 use crate::layout::Layout;
 use crate::measurement::{BRIGHTEST, GuidePlanes};
 use crate::network::{PreDenoiser, Qudi};
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use qudi_baselines::Alignment;
 use qudi_sim::{Frame, Result};
 
@@ -42,19 +42,30 @@ impl Draft {
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the device fails.
     pub fn restore(&self, alignment: &Alignment<'_>, neighbours: usize) -> Result<Vec<Frame>> {
-        let frame = |number: usize| {
-            let aligned = alignment.of(number, neighbours);
-            let noise = aligned.noise.clone();
-            let layout = Layout::new(noise.size, self.fold, self.tile);
-            let guide = GuidePlanes::of_frame(aligned).map(|plane| layout.padded(plane));
-            let image =
-                layout.denoised(&guide, &self.device, |guide| self.denoiser.denoise(guide))?;
-            Ok((layout.frames(&image).remove(0), noise))
-        };
-        let frames = (0..alignment.frames()).map(frame).collect::<Result<Vec<_>>>()?;
-        let (frames, noises): (Vec<Frame>, Vec<Frame>) = frames.into_iter().unzip();
+        let layout = Layout::new(alignment.size(), self.fold, self.tile);
+        let denoise = |guide: &Tensor<4>| self.denoiser.denoise(guide);
+        let (frames, noises) = denoised(alignment, neighbours, &layout, &self.device, denoise)?;
         Ok(settled(alignment, frames, noises, BRIGHTEST as f32))
     }
+}
+
+/// What `denoise` makes of the frames of a window, one by one, and the deviations of the merged frames' noise.
+pub(crate) fn denoised(
+    alignment: &Alignment<'_>,
+    neighbours: usize,
+    layout: &Layout,
+    device: &Device,
+    denoise: impl Fn(&Tensor<4>) -> Tensor<4>,
+) -> Result<(Vec<Frame>, Vec<Frame>)> {
+    let frame = |number: usize| {
+        let aligned = alignment.of(number, neighbours);
+        let noise = aligned.noise.clone();
+        let guide = GuidePlanes::of_frame(aligned).map(|plane| layout.padded(plane));
+        let image = layout.denoised(&guide, device, &denoise)?;
+        Ok((layout.frames(&image).remove(0), noise))
+    };
+    let frames = (0..alignment.frames()).map(frame).collect::<Result<Vec<_>>>()?;
+    Ok(frames.into_iter().unzip())
 }
 
 /// Frames of a window that were denoised each for itself, steadied, in [0, `brightest`]; `noises` are the deviations of the

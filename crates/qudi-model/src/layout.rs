@@ -58,23 +58,19 @@ impl Layout {
         images.chunks_exact(self.size.pixels()).map(cropped).collect()
     }
 
-    /// What `denoise` makes of every frame of a padded guide for itself, in image units.
+    /// What `denoise` makes of a frame, in image units, from its padded guide.
     pub(crate) fn denoised(
         &self,
         guide: &GuidePlanes,
         device: &Device,
         denoise: impl Fn(&Tensor<4>) -> Tensor<4>,
     ) -> Result<Vec<f32>> {
-        let (tiles, pixels) = (&self.tiles, self.size.pixels());
-        let frames = guide.noise().len() / pixels;
-        let mut all = vec![0.0; frames * pixels];
+        let tiles = &self.tiles;
+        let mut image = vec![0.0; self.size.pixels()];
         for number in 0..tiles.count() {
-            for (frame, image) in all.chunks_exact_mut(pixels).enumerate() {
-                let part = |images: &[f32]| tiles.crop(number, &images[frame * pixels..][..pixels]);
-                let guide = guide.map(part).to_tensor(tiles.tile, device);
-                tiles.blend(number, &read(denoise(&guide))?, image);
-            }
+            let guide = guide.map(|plane| tiles.crop(number, plane)).to_tensor(tiles.tile, device);
+            tiles.blend(number, &read(denoise(&guide))?, &mut image);
         }
-        Ok(all)
+        Ok(image)
     }
 }

@@ -99,11 +99,6 @@ impl GuidePlanes {
         Self(images.chain(seen).chain(expected).map(|plane| plane.data).collect())
     }
 
-    /// Deviation of the noise of the merged frames, in image units.
-    pub(crate) fn noise(&self) -> &[f32] {
-        &self.0[IMAGES - 1]
-    }
-
     /// Every plane changed by `f`.
     #[must_use]
     pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {

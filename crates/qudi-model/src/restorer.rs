@@ -1,7 +1,7 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
 use crate::config::{NetworkConfig, Part};
-use crate::draft::{Draft, settled};
+use crate::draft::{Draft, denoised, settled};
 use crate::layout::Layout;
 use crate::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
@@ -11,7 +11,6 @@ use crate::sampler::{Sampler, Step, TIMES};
 use crate::schedule::NoiseSchedule;
 use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_baselines::Alignment;
 use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
 use qudi_sim::{Frame, Result, SimError};
 
@@ -106,7 +105,7 @@ impl QudiRestorer {
         let guide = guide.map(|plane| layout.padded(plane));
         let sensor = sensor_numbers(context);
         let prepared = None;
-        let mut job = Job { context, sensor, planes, alignment, guide, frames, layout, prepared };
+        let mut job = Job { context, sensor, planes, guide, frames, layout, prepared };
         if self.generates && job.layout.tiles.count() == 1 {
             job.prepared = Some(self.prepare(&job, 0));
         }
@@ -152,12 +151,13 @@ impl QudiRestorer {
     /// What the U-Net corrects nothing of, without what it would take: most of the time and memory. In one step: such weights
     /// have seen no simulated measurement in training either, and more would only disturb them. Fusion has no part in it: the
     /// frames, each denoised for itself, are steadied afterwards.
-    fn denoised(&self, job: &Job<'_>) -> Result<Vec<Frame>> {
+    fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Vec<Frame>> {
+        let neighbours = self.config.pre.neighbours;
+        let alignment = aligned(burst, context, neighbours, &self.drafts)?;
+        let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
         let denoise = |guide: &Tensor<4>| self.network.denoise(guide);
-        let frames = job.layout.denoised(&job.guide, &self.device, denoise)?;
-        let [frames, noises] =
-            [&frames[..], job.guide.noise()].map(|images| job.layout.frames(images));
-        Ok(settled(&job.alignment, frames, noises, 1.0))
+        let (frames, noises) = denoised(&alignment, neighbours, &layout, &self.device, denoise)?;
+        Ok(settled(&alignment, frames, noises, 1.0))
     }
 
     /// The network's clean image of one tile, in [-1, 1].
@@ -225,7 +225,6 @@ struct Job<'a> {
     /// The sensor in numbers: the same for all tiles and steps.
     sensor: [f32; SENSOR_NUMBERS],
     planes: Planes,
-    alignment: Alignment<'a>,
     guide: GuidePlanes,
     frames: usize,
     layout: Layout,
@@ -251,10 +250,10 @@ impl Restorer for QudiRestorer {
                 format!("it needs at least {FEWEST_FRAMES}, better {}", self.window),
             ));
         }
-        let job = self.job(burst, context)?;
         if !self.generates {
-            return Ok(Restored { frames: self.denoised(&job)?, std: None });
+            return Ok(Restored { frames: self.denoised(burst, context)?, std: None });
         }
+        let job = self.job(burst, context)?;
         let mut sum = Moments::default();
         for sample in 0..self.options.samples as u64 {
             sum.add(&self.sample(&job, sample)?);
@@ -325,9 +324,10 @@ mod tests {
         let short = restorer.restore(burst, &context).unwrap().frames;
         restorer.generates = true;
         let whole = restorer.restore(burst, &context).unwrap().frames;
-        let job = restorer.job(burst, &context).unwrap();
-        let noises = job.layout.frames(job.guide.noise());
-        let whole = settled(&job.alignment, whole, noises, 1.0);
+        let neighbours = config.pre.neighbours;
+        let alignment = aligned(burst, &context, neighbours, &[]).unwrap();
+        let noises = (0..counts.len()).map(|frame| alignment.of(frame, neighbours).noise).collect();
+        let whole = settled(&alignment, whole, noises, 1.0);
         for (short, whole) in short.iter().zip(&whole) {
             for (short, whole) in short.data.iter().zip(&whole.data) {
                 assert!((short - whole).abs() < 1e-5, "{short} and {whole}");

@@ -6,8 +6,8 @@ use super::steady::steadied;
 use super::{Blocks, Guide, Merged, Merger, Patchwise, Pilots, at_least, nearest};
 use crate::stabilizer::Stabilizer;
 use crate::transform_denoise::{image, units};
-use qudi_sim::Frame;
 use qudi_sim::restore::Context;
+use qudi_sim::{Frame, Size};
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
@@ -76,6 +76,11 @@ impl<'a> Alignment<'a> {
         });
         let means = means.collect();
         self.led_by(clean, means)
+    }
+
+    /// Size of the frames.
+    pub fn size(&self) -> Size {
+        self.merger.size
     }
 
     /// Frames of the window.
