@@ -420,6 +420,18 @@ class Middle(nn.Module):
         return self.second(x, emb)
 
 
+def preconditioned(
+    base: Tensor, x_t: Tensor, deviation: Tensor, t: Tensor, frames: int
+) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """x_t around `base` in deviations, and what makes the prediction of a correction."""
+    bars = torch.as_tensor(alpha_bar())[t.to("cpu").long()].to(base)
+    signal, noise = (root.sqrt().repeat_interleave(frames)[:, None, None, None] for root in (bars, 1 - bars))
+    error = 0.6 * deviation
+    scale = ((signal * error) ** 2 + noise**2).sqrt()
+    residual = (x_t - signal * base) / scale
+    return residual, lambda out: base + error * (signal * error / scale * residual + noise / scale * out)
+
+
 class UNet(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
@@ -465,7 +477,8 @@ class UNet(nn.Module):
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
         clean, deviation, difference, _, level = evidence(guide)
-        images = [2 * d - 1, x_t, x0_prev, 2 * clean - 1, difference, level]
+        residual, prediction = preconditioned(2 * d - 1, x_t, deviation, t, frames)
+        images = [2 * d - 1, residual, x0_prev, 2 * clean - 1, difference, level]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
         for k, level in enumerate(self.encoder):
@@ -482,8 +495,7 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        correction = F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
-        return 2 * d - 1 + 0.6 * deviation * correction
+        return prediction(F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold))
 
 
 class Qudi(nn.Module):

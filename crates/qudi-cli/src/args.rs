@@ -10,7 +10,7 @@ mod train;
 
 pub(crate) use convert::{Calibrate, Convert};
 pub(crate) use eval::{Bench, Eval, External, Protocol};
-pub(crate) use network::{Network, SamplerName};
+pub(crate) use network::{Network, SamplerName, SpacingName};
 pub(crate) use reading::Reading;
 pub(crate) use restore::{Restore, Shard};
 pub(crate) use simulate::Simulate;

@@ -11,6 +11,7 @@ mod golden_tests;
 mod layers;
 mod lucas_kanade;
 mod pre;
+mod precondition;
 mod qudi;
 mod resample;
 mod unet;

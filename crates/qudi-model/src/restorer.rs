@@ -8,7 +8,7 @@ use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated,
 use crate::noise::Noise;
 use crate::physics::LoopSensor;
 use crate::sampler::{Sampler, Step, TIMES};
-use crate::schedule::NoiseSchedule;
+use crate::schedule::{NoiseSchedule, Spacing};
 use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
@@ -23,8 +23,11 @@ pub const TILE: usize = 512;
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleOptions {
-    /// Reverse steps: 1 is the mean of all pictures that fit, more are sharper.
+    /// Reverse steps: 0 is no diffusion but the pre-denoised frames, steadied; 1 the mean of all pictures that fit; more are
+    /// sharper.
     pub steps: usize,
+    /// How their times lie.
+    pub spacing: Spacing,
     /// How noise leaves.
     pub sampler: Sampler,
     /// Pictures drawn; their mean is the result, their deviation its uncertainty.
@@ -35,7 +38,13 @@ pub struct SampleOptions {
 
 impl Default for SampleOptions {
     fn default() -> Self {
-        Self { steps: 1, sampler: Sampler::Ddim, samples: 1, tile: TILE }
+        Self {
+            steps: 1,
+            spacing: Spacing::default(),
+            sampler: Sampler::Ddim,
+            samples: 1,
+            tile: TILE,
+        }
     }
 }
 
@@ -44,8 +53,10 @@ impl Default for SampleOptions {
 pub struct QudiRestorer {
     network: Qudi,
     drafts: Vec<Draft>,
-    /// Whether its U-Net says anything.
+    /// Whether its U-Net says anything, and is asked.
     generates: bool,
+    /// Whether its pre-denoiser looks at simulated measurements.
+    denoises_anew: bool,
     config: NetworkConfig,
     schedule: NoiseSchedule,
     options: SampleOptions,
@@ -66,20 +77,25 @@ impl QudiRestorer {
         options: SampleOptions,
         device: &Device,
     ) -> Result<Self> {
-        if !(1..=TIMES).contains(&options.steps) {
+        if options.steps > TIMES {
             let what = format!("{} reverse steps", options.steps);
-            return Err(SimError::request(what, "--steps", format!("use 1 to {TIMES}")));
+            return Err(SimError::request(what, "--steps", format!("use 0 to {TIMES}")));
         }
         if options.samples == 0 {
             return Err(SimError::request("no samples at all", "--samples", "draw at least 1"));
         }
-        let generates = network.generates()?;
-        if options.samples > 1 && !generates {
+        let learnt = network.generates()?;
+        if options.samples > 1 && !learnt {
             return Err(SimError::request(
                 "these weights make the same picture of any noise: samples would not differ",
                 "--samples",
                 "leave it out, or use weights that learnt with train.loss.prediction above 0 (docs/training.md)",
             ));
+        }
+        let generates = learnt && options.steps > 0;
+        if options.samples > 1 && !generates {
+            let what = "samples do not differ where nothing is diffused";
+            return Err(SimError::request(what, "--samples", "take some, as --steps 10"));
         }
         let smallest = 4 * config.multiple();
         if options.tile < smallest {
@@ -87,10 +103,21 @@ impl QudiRestorer {
             let help = format!("this network needs at least {smallest}");
             return Err(SimError::request(what, "--tile", help));
         }
+        let denoises_anew = network.denoises_anew()?;
         let schedule = NoiseSchedule::cosine(TIMES);
         let drafts = Draft::all(&network, config, options.tile, device);
         let (config, device) = (config.clone(), device.clone());
-        Ok(Self { network, drafts, generates, config, schedule, options, device, window })
+        Ok(Self {
+            network,
+            drafts,
+            generates,
+            denoises_anew,
+            config,
+            schedule,
+            options,
+            device,
+            window,
+        })
     }
 
     /// A window whose planes are padded to what the network wants.
@@ -122,7 +149,8 @@ impl QudiRestorer {
         let mut x0 = vec![0.0; x.len()];
         let nothing = x0.clone();
         let mut flows: Vec<Option<Flows>> = vec![None; tiles.count()];
-        for step in self.options.sampler.steps(&self.schedule, self.options.steps) {
+        let SampleOptions { sampler, steps, spacing, .. } = self.options;
+        for step in sampler.steps(&self.schedule, steps, spacing) {
             let simulated = if step.number == 1 || self.config.lacks(Part::Physics) {
                 None
             } else {
@@ -148,9 +176,9 @@ impl QudiRestorer {
         Ok(x0)
     }
 
-    /// What the U-Net corrects nothing of, without what it would take: most of the time and memory. In one step: such weights
-    /// have seen no simulated measurement in training either, and more would only disturb them. Fusion has no part in it: the
-    /// frames, each denoised for itself, are steadied afterwards.
+    /// What the pre-denoiser makes of the frames, without what the U-Net would take: most of the time and memory. Before any
+    /// simulated measurement: where the U-Net has not learnt, none was seen in training. Fusion has no part in it: the frames,
+    /// each denoised for itself, are steadied afterwards.
     fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Vec<Frame>> {
         let neighbours = self.config.pre.neighbours;
         let alignment = aligned(burst, context, neighbours, &self.drafts)?;
@@ -202,12 +230,13 @@ impl QudiRestorer {
         let tiles = &job.layout.tiles;
         let guide = job.guide.map(|images| tiles.crop(number, images));
         let sensor = TensorData::new(job.sensor.to_vec(), [1, SENSOR_NUMBERS]);
-        self.network.prepare(&Measured {
+        let prepared = self.network.prepare(&Measured {
             u: tensor(&job.planes.u),
             guide: guide.to_tensor(tiles.tile, &self.device),
             sensor: Tensor::from_data(sensor, &self.device),
             frames: job.frames,
-        })
+        });
+        if self.denoises_anew { prepared } else { self.network.denoise_once(prepared) }
     }
 }
 
@@ -304,7 +333,7 @@ mod tests {
     use qudi_sim::Size;
     use qudi_sim::sensor::Sensor;
 
-    /// Initial weights correct nothing; what is left out for them must not be missed, with tiles and several steps either.
+    /// Initial weights correct nothing; what is left out for them must not be missed in one step, with tiles either.
     #[test]
     fn a_silent_u_net_is_not_missed() {
         let size = Size { height: 24, width: 48 };
@@ -316,7 +345,7 @@ mod tests {
         let context =
             Context { seed: 1, first_frame: 0, ppp: 3.25, exposure: 0.3, sensor, gain, dark: None };
         let (config, device) = (NetworkConfig::preset("tiny").unwrap(), Device::flex());
-        let options = SampleOptions { steps: 2, tile: 32, ..SampleOptions::default() };
+        let options = SampleOptions { steps: 1, tile: 32, ..SampleOptions::default() };
         let network = config.init(2, &device);
         let mut restorer = QudiRestorer::new(network, &config, 11, options, &device).unwrap();
         assert!(!restorer.generates);

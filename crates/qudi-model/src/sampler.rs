@@ -3,7 +3,7 @@
 //! The network predicts the clean image `x0`; what a step makes of it is a weighted sum, so that samplers are
 //! lists of weights.
 
-use crate::schedule::NoiseSchedule;
+use crate::schedule::{NoiseSchedule, Spacing};
 
 /// Diffusion times of training.
 pub const TIMES: usize = 1000;
@@ -34,9 +34,10 @@ pub struct Step {
 }
 
 impl Sampler {
-    /// The reverse steps, first to last; `count` is taken into `1..=1000`. After the last, `x` is the prediction.
-    pub fn steps(self, schedule: &NoiseSchedule, count: usize) -> Vec<Step> {
-        let times = schedule.sampling_times(count);
+    /// The reverse steps, first to last: `count`, taken into `1..=1000`, or fewer where their times would be the same. After
+    /// the last, `x` is the prediction.
+    pub fn steps(self, schedule: &NoiseSchedule, count: usize, spacing: Spacing) -> Vec<Step> {
+        let times = schedule.sampling_times(count, spacing);
         let pairs = times.windows(2).enumerate();
         pairs
             .filter_map(|(i, pair)| {

@@ -9,6 +9,16 @@ const OFFSET: f64 = 0.008;
 /// Largest noise share of one step.
 const MAX_BETA: f64 = 0.999;
 
+/// How the times of sampling lie (Song et al. 2021, "DDIM", appendix D.2).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Spacing {
+    /// Evenly, as in the paper: of ten times one is low enough to show what a good start has left wrong.
+    Linear,
+    /// The denser the less noise there is.
+    #[default]
+    Quadratic,
+}
+
 /// Noise levels of the diffusion times `0..len`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NoiseSchedule {
@@ -50,18 +60,22 @@ impl NoiseSchedule {
     }
 
     /// The times that a sampler with `steps` steps visits, last first, and `None` (clean) at the
-    /// end: `linspace(-1, T - 1, steps + 1)` reversed and rounded half to even, as in DDIM
-    /// samplers. `steps` is taken into `1..=T`.
-    pub fn sampling_times(&self, steps: usize) -> Vec<Option<usize>> {
+    /// end: `T s - 1` or `T s^2 - 1` for `s` from 1 to 0, rounded half to even, each once. `steps` is taken
+    /// into `1..=T`.
+    pub fn sampling_times(&self, steps: usize, spacing: Spacing) -> Vec<Option<usize>> {
         let steps = steps.clamp(1, self.len());
-        (0..=steps)
-            .rev()
-            .map(|i| {
-                let t = -1.0 + self.len() as f64 * i as f64 / steps as f64;
-                let t = t.round_ties_even();
-                (t >= 0.0).then_some(t as usize)
-            })
-            .collect()
+        let time = |i: usize| {
+            let share = i as f64 / steps as f64;
+            let share = match spacing {
+                Spacing::Linear => share,
+                Spacing::Quadratic => share * share,
+            };
+            let t = (self.len() as f64 * share - 1.0).round_ties_even();
+            (t >= 0.0).then_some(t as usize)
+        };
+        let mut times: Vec<_> = (0..=steps).rev().map(time).collect();
+        times.dedup();
+        times
     }
 }
 
@@ -99,8 +113,24 @@ mod tests {
             .into_iter()
             .chain([None])
             .collect();
-        assert_eq!(schedule.sampling_times(10), expected);
-        assert_eq!(schedule.sampling_times(1), [Some(999), None]);
-        assert_eq!(schedule.sampling_times(5000).len(), 1001);
+        assert_eq!(schedule.sampling_times(10, Spacing::Linear), expected);
+        for spacing in [Spacing::Linear, Spacing::Quadratic] {
+            assert_eq!(schedule.sampling_times(1, spacing), [Some(999), None]);
+        }
+        assert_eq!(schedule.sampling_times(5000, Spacing::Linear).len(), 1001);
+    }
+
+    #[test]
+    fn quadratic_times_are_dense_where_noise_is_little() {
+        let schedule = NoiseSchedule::cosine(1000);
+        let expected: Vec<_> = [999, 809, 639, 489, 359, 249, 159, 89, 39, 9]
+            .map(Some)
+            .into_iter()
+            .chain([None])
+            .collect();
+        assert_eq!(schedule.sampling_times(10, Spacing::Quadratic), expected);
+        // Of a thousand many would be the same.
+        let all = schedule.sampling_times(1000, Spacing::Quadratic);
+        assert!(all.windows(2).all(|pair| pair[0] > pair[1]), "{all:?}");
     }
 }

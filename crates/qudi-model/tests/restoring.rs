@@ -140,7 +140,7 @@ fn what_makes_no_sense_is_refused() {
     assert!(error.to_string().contains("2 frames") && error.help().is_some(), "{error}");
     let config = NetworkConfig::preset("tiny").unwrap();
     for options in [
-        SampleOptions { steps: 0, ..quick() },
+        SampleOptions { steps: 0, samples: 2, ..quick() },
         SampleOptions { steps: 1001, ..quick() },
         SampleOptions { samples: 0, ..quick() },
         SampleOptions { tile: 8, ..quick() },

@@ -70,7 +70,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
             "width": args.size.width,
             "frames": args.frames,
             "rounds": args.rounds,
-            "steps": args.network.steps,
+            "steps": args.network.steps(),
             "networks": all,
         })
     })
@@ -219,7 +219,7 @@ fn describe(all: &[Figures], args: &Bench, device: &Opened) -> String {
          forward and backward on {CROP}",
         args.frames,
         args.size,
-        args.network.steps,
+        args.network.steps(),
         device.name,
         rayon::current_num_threads(),
         args.rounds

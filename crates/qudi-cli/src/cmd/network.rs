@@ -1,6 +1,6 @@
 //! The network behind `--method qudi`: weights, device, options.
 
-use crate::args::{Network, SamplerName};
+use crate::args::{Network, SamplerName, SpacingName};
 use crate::device;
 use crate::error::{Fault, Result};
 use crate::memory::available_bytes;
@@ -8,6 +8,7 @@ use crate::weights::Weights;
 use qudi_model::checkpoint::Description;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
 use qudi_model::sampler::Sampler;
+use qudi_model::schedule::Spacing;
 use qudi_sim::Size;
 use qudi_sim::restore::{Context, Restorer};
 use qudi_sim::sensor::Sensor;
@@ -30,15 +31,21 @@ pub(crate) fn restorer(
     let (config, window) = (&description.network, description.window);
     let sampling = sample_options(options);
     let restorer = QudiRestorer::new(network, config, window, sampling, &device.device)?;
-    let steps = options.steps;
-    let choice =
-        format!(" in {steps} step{} on {}", if steps == 1 { "" } else { "s" }, device.name);
-    Ok((Box::new(restorer), choice))
+    let steps = match options.steps() {
+        0 => String::new(),
+        1 => " in 1 step".to_owned(),
+        steps => format!(" in {steps} steps"),
+    };
+    Ok((Box::new(restorer), format!("{steps} on {}", device.name)))
 }
 
 pub(crate) fn sample_options(options: &Network) -> SampleOptions {
     SampleOptions {
-        steps: options.steps,
+        steps: options.steps(),
+        spacing: match options.spacing {
+            SpacingName::Linear => Spacing::Linear,
+            SpacingName::Quadratic => Spacing::Quadratic,
+        },
         sampler: match options.sampler {
             SamplerName::Ddim => Sampler::Ddim,
             SamplerName::Ancestral => Sampler::Ancestral,

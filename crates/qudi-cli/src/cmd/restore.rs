@@ -231,7 +231,8 @@ fn network_settings(method: &str, options: &Network) -> Result<Option<Value>> {
     Ok(Some(json!({
         "weights": weights.to_string(),
         "weights_sha256": weights.sha256()?,
-        "steps": options.steps,
+        "steps": options.steps(),
+        "spacing": format!("{:?}", options.spacing).to_lowercase(),
         "sampler": format!("{:?}", options.sampler).to_lowercase(),
         "samples": options.samples,
         "tile": options.tile,

@@ -12,7 +12,7 @@ use crate::config::NetworkConfig;
 use crate::measurement::{GuidePlanes, sensor_numbers};
 use crate::objective::reconstruction;
 use crate::sampler::{Sampler, TIMES};
-use crate::schedule::NoiseSchedule;
+use crate::schedule::{NoiseSchedule, Spacing};
 use crate::tensor::{read, to_tensor};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::activation::silu;
@@ -335,7 +335,7 @@ fn steps() {
     let schedule = NoiseSchedule::cosine(TIMES);
     for (name, sampler) in [("ddim", Sampler::Ddim), ("ancestral", Sampler::Ancestral)] {
         let expected = file.f64s(name);
-        let steps = sampler.steps(&schedule, 10);
+        let steps = sampler.steps(&schedule, 10, Spacing::Linear);
         assert_eq!(steps.len(), 10);
         for (step, expected) in steps.iter().zip(expected.chunks_exact(3)) {
             let got = [step.clean, step.noisy, step.sigma];
@@ -379,7 +379,7 @@ fn sampling() {
         let mut x0 = vec![0.0; count];
         let mut flows = None;
         let (expected_x, expected_x0) = (file.f32s("x"), file.f32s("x0"));
-        for step in sampler.steps(&schedule, 10) {
+        for step in sampler.steps(&schedule, 10, Spacing::Linear) {
             let k = step.number;
             let again = k.checked_sub(2).map(|n| {
                 let counts = &simulated[n * count..(n + 1) * count];

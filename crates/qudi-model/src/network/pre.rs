@@ -5,8 +5,10 @@ use super::layers::{Bias, CORRECTION, Conv2d};
 use super::resample::{fold, unfold};
 use crate::config::PreConfig;
 use crate::measurement::{GuidePlanes, IMAGES};
+use crate::tensor::read;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_sim::Result;
 
 /// Planes that the guide's images become.
 const PLANES: usize = 4;
@@ -73,6 +75,11 @@ impl PreConfig {
 }
 
 impl PreDenoiser {
+    /// Whether simulated measurements have any weight.
+    pub(super) fn sees_simulated(&self) -> Result<bool> {
+        Ok(read(self.simulated_in.weights())?.iter().any(|&weight| weight != 0.0))
+    }
+
     /// What does not depend on the step: `[images, width, h, w]`.
     pub(super) fn prepare(&self, evidence: &Evidence) -> Tensor<4> {
         let Evidence { difference, contrast, level, aligned, .. } = evidence.clone();

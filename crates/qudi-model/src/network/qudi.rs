@@ -59,6 +59,8 @@ pub struct Prepared {
     /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`.
     variance: Tensor<4>,
     frames: usize,
+    /// The pre-denoised frames and their features, where no simulated measurement changes them ([`Qudi::denoise_once`]).
+    denoised: Option<(Tensor<4>, Tensor<4>)>,
 }
 
 /// What the network says.
@@ -130,7 +132,25 @@ impl Qudi {
             variance: mean_variance(&measured.sensor, measured.frames),
             u,
             frames: measured.frames,
+            denoised: None,
         }
+    }
+
+    /// Whether simulated measurements change the pre-denoised frames. They do not where the pre-denoiser has learnt before the
+    /// rest.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_sim::SimError) if the device fails.
+    pub fn denoises_anew(&self) -> Result<bool> {
+        self.pre.sees_simulated()
+    }
+
+    /// Denoises once for all steps; only where [`Self::denoises_anew`] is false.
+    #[must_use]
+    pub fn denoise_once(&self, prepared: Prepared) -> Prepared {
+        let Prepared { pre, evidence, frames, .. } = &prepared;
+        let denoised = self.pre_denoise(pre, evidence, *frames, None);
+        Prepared { denoised: Some(denoised), ..prepared }
     }
 
     /// Predicts the clean frames. `flows` are those of an earlier step; estimated if there are none.
@@ -218,7 +238,9 @@ impl Qudi {
         let frames = prepared.frames;
         let u = prepared.u.clone();
         let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
-        let (d, features) = self.pre_denoise(&prepared.pre, &prepared.evidence, frames, simulated);
+        let (d, features) = prepared.denoised.clone().unwrap_or_else(|| {
+            self.pre_denoise(&prepared.pre, &prepared.evidence, frames, simulated)
+        });
         done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
         done("low");

@@ -4,7 +4,8 @@ use super::attention::Attention;
 use super::embedding::{SENSOR_NUMBERS, sinusoids};
 use super::evidence::Evidence;
 use super::features::Pyramid;
-use super::layers::{Bias, CORRECTION, Conv2d, GroupNorm, Linear};
+use super::layers::{Bias, Conv2d, GroupNorm, Linear};
+use super::precondition::Preconditioned;
 use super::resample::{fold, repeat, unfold};
 use crate::config::{FusionConfig, UNetConfig};
 use crate::tensor::read;
@@ -177,8 +178,9 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// The prediction, `[images, 1, H, W]` in [-1, 1]: `base`, corrected. `x_t`, `x0_prev` and `base`, the pre-denoised
-    /// image, are in [-1, 1], too; `times` one number for each burst; `sensor` as from [`Self::prepare`].
+    /// The prediction, `[images, 1, H, W]` in [-1, 1]: `base`, corrected by the noisy image and what the U-Net sees in it.
+    /// `x_t`, `x0_prev` and `base`, the pre-denoised image, are in [-1, 1], too; `times` one number for each burst; `sensor`
+    /// as from [`Self::prepare`].
     #[allow(clippy::too_many_arguments)] // one for every box of docs/network.md that leads here
     pub(super) fn forward(
         &self,
@@ -192,7 +194,9 @@ impl UNet {
     ) -> Tensor<4> {
         let embedding = silu(self.embed(times, sensor));
         let Evidence { difference, level, .. } = evidence.clone();
-        let planes = vec![base.clone(), x_t, x0_prev, evidence.signed(), difference, level];
+        let noisy = Preconditioned::new(base.clone(), x_t, &evidence.deviation, times);
+        let seen = noisy.residual.clone();
+        let planes = vec![base, seen, x0_prev, evidence.signed(), difference, level];
         let mut x = self.inp.linear(&[fold(Tensor::cat(planes, 1), self.fold)]);
         let mut skips = Vec::new();
         let mut fused = fused.into_iter();
@@ -223,8 +227,6 @@ impl UNet {
                 x = self.up[k - 1].linear(&[repeat(x)]);
             }
         }
-        let correction = unfold(self.out.linear(&[self.norm.silu(x)]), self.fold);
-        // A deviation spans twice as much in [-1, 1].
-        base + correction * evidence.deviation.clone() * (2.0 * CORRECTION)
+        noisy.prediction(unfold(self.out.linear(&[self.norm.silu(x)]), self.fold))
     }
 }

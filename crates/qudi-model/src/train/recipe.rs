@@ -105,7 +105,7 @@ pub struct ValidationConfig {
     pub sensor: String,
     /// Photons per pixel and frame.
     pub ppp: Vec<f64>,
-    /// Reverse steps.
+    /// Reverse steps; 0 judges the pre-denoiser.
     pub steps: usize,
     /// Training steps between validations.
     pub every: u64,
@@ -224,11 +224,10 @@ impl Recipe {
                 && !validation.ppp.is_empty()
                 && validation.ppp.iter().all(|&ppp| ppp > 0.0 && ppp < 1e6)
                 && validation.every > 0
-                && validation.steps > 0
                 && !validation.from.is_empty();
             if !good {
                 return Err(SimError::request(
-                    "the validation cannot be done: it wants clips, 3 frames, 16 pixels, light, steps above 0",
+                    "the validation cannot be done: it wants clips, 3 frames, 16 pixels, light",
                     "validation",
                     "correct the recipe",
                 ));

@@ -1,0 +1,330 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy", "safetensors", "torch"]
+# ///
+"""Trains all of a network but its pre-denoisers in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16,
+which is several times as fast on processors with matrix units (docs/results.md, "The diffusion").
+
+    qudi train small --pack small.zip --init W.safetensors -o runs/x --bursts kept    # draws and keeps the bursts
+    python scripts/reference/train_unet.py W.safetensors kept unet.safetensors --minutes 60
+    qudi publish unet.safetensors -o small.safetensors
+
+Bursts must have been drawn with the drafts of W, and with more than one frame kept.
+"""
+
+import argparse
+import json
+import math
+import struct
+import time
+import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from network import Qudi
+from safetensors import safe_open
+from safetensors.torch import save_file
+from schedule import T as TIMES
+from schedule import alpha_bar
+from torch import Tensor, nn
+
+TYPES = {"F32": np.dtype("<f4"), "U16": np.dtype("<u2"), "I8": np.dtype("i1")}
+STEPS = 32.0  # of a byte (crates/qudi-model/src/train/kept.rs)
+LEAST_ERROR, VARIATION = 1e-4, 0.01  # crates/qudi-model/src/objective.rs
+STRIDE = TIMES // 10  # between the first pass and the second
+WARMUP, CLIP, EMA = 200, 1.0, 0.999  # configs/small.toml
+HELD = 13  # one burst of so many is not learnt from
+SQUARE = 160  # side of what is seen of those
+
+
+class Sensor:
+    """A sensor and its light, `factor` times as much as in the capture (crates/qudi-model/src/physics.rs)."""
+
+    def __init__(self, label: dict, factor: float = 1.0) -> None:
+        about, self.ppp, self.exposure = label["sensor"], label["ppp"], label["exposure"]
+        self.binary, self.frames = about["response"] == "binary", about["frames_summed"]
+        self.efficiency, self.read_noise = about["quantum_efficiency"], about["read_noise"]
+        dark = about["dark"]
+        dark = float(dark.removesuffix("/s")) / about["fps"] if isinstance(dark, str) else dark
+        if self.binary:
+            before, self.frames = self.frames, max(1, round(self.frames * factor))
+            self.ppp *= self.frames / before
+            self.gain, self.full_well, self.full_scale = label["gain"], 1, self.frames
+        else:
+            self.ppp *= factor
+            self.gain, self.full_well = label["gain"] / factor, round(about["full_well"] * factor)
+            self.full_scale = 2 ** about["bits"] - 1
+        self.dark = dark * self.frames
+        counts = np.arange(self.full_scale + 1.0)
+        if self.binary:
+            detections = -self.frames * np.log1p(-np.minimum(counts, max(self.frames - 1, 0.5)) / self.frames)
+        else:
+            detections = counts / self.gain
+        photons = np.maximum(detections - self.dark, 0) / self.efficiency
+        self.linear = np.minimum(photons * self.exposure / self.ppp, 2).astype(np.float32)
+
+    def rate(self, image: np.ndarray | float) -> np.ndarray:
+        """Detections expected per output frame."""
+        return self.efficiency * np.asarray(image, np.float64) * self.ppp / self.exposure + self.dark
+
+    def deviation(self, image: float) -> float:
+        """Of the linear estimate, by the count's exact law."""
+        rate = max(float(self.rate(image)), 1e-12)
+        if self.binary:
+            hit = -math.expm1(-rate / self.frames)
+            count = range(self.frames + 1)
+            chances = np.array([math.comb(self.frames, k) * hit**k * (1 - hit) ** (self.frames - k) for k in count])
+        else:
+            electrons = range(self.full_well + 1)
+            weight = np.array([math.exp(k * math.log(rate) - rate - math.lgamma(k + 1)) for k in electrons])
+            weight[-1] += 1 - weight.sum()
+            edges = (np.arange(self.full_scale) + 0.5) / self.gain
+            spread = self.read_noise * math.sqrt(2)
+            below = np.array([[0.5 * math.erfc((k - edge) / spread) for edge in edges] for k in electrons])
+            chances = weight @ np.diff(below, prepend=0, append=1)
+        values = self.linear.astype(np.float64)
+        return math.sqrt(max(chances @ (values - chances @ values) ** 2, 0))
+
+    def numbers(self) -> list[float]:
+        """As the network is told of it (docs/network.md, "Inputs")."""
+        deviations = [math.log10(max(self.deviation(image), 1e-4)) for image in (0.0, self.exposure)]
+        light = [math.log10(max(self.ppp, 1e-6)), self.exposure, self.efficiency, self.dark, self.read_noise]
+        depth = [math.log10(max(self.gain, 1e-6)), math.log2(self.full_scale + 1) / 8]
+        return light + depth + [float(self.binary), math.log2(self.frames) / 8] + deviations
+
+    def measure(self, image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Counts over full scale and linear estimates of images in [0, 1]."""
+        rate = self.rate(image)
+        if self.binary:
+            counts = rng.binomial(self.frames, -np.expm1(-rate / self.frames))
+        else:
+            electrons = np.minimum(rng.poisson(rate), self.full_well) + rng.normal(0, self.read_noise, rate.shape)
+            counts = np.clip(np.rint(self.gain * electrons), 0, self.full_scale).astype(np.int64)
+        return (counts / self.full_scale).astype(np.float32), self.linear[counts]
+
+
+@dataclass
+class Part:
+    """Squares of all frames of a burst: guide [frames, planes, side, side], truth and linear estimate [frames, 1, side, side]."""
+
+    guide: np.ndarray
+    truth: np.ndarray
+    u: np.ndarray
+
+
+class Burst:
+    """A kept burst, read where it is needed."""
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            (length,) = struct.unpack("<Q", file.read(8))
+            header = json.loads(file.read(length))
+        raw = np.memmap(path, np.uint8, "r")
+
+        def plane(name: str) -> np.ndarray:
+            about = header[name]
+            first, last = (8 + length + offset for offset in about["data_offsets"])
+            kind = TYPES[about["dtype"]]
+            return np.frombuffer(raw, kind, (last - first) // kind.itemsize, first).reshape(about["shape"])
+
+        def planes(kind: str) -> list[np.ndarray]:
+            return [plane(f"{kind}.{k}") for k in range(sum(name.startswith(f"{kind}.") for name in header))]
+
+        self.label = tomllib.loads(header["__metadata__"]["burst"])
+        self.truth, self.counts = plane("truth"), plane("counts")
+        self.images, self.deviations = planes("image"), planes("deviation")
+        self.sensor = Sensor(self.label)
+        self.numbers = self.sensor.numbers()
+
+    def square(self, top: int, left: int, side: int) -> Part:
+        place = (slice(None), slice(top, top + side), slice(left, left + side))
+        images = np.stack([plane[place] for plane in self.images], 1)
+        deviations = np.stack([plane[place] for plane in self.deviations], 1).astype(np.float32)
+        guide = np.concatenate([images, 0.5 * np.sinh(deviations / STEPS)], 1)
+        return Part(guide, self.truth[place][:, None], self.sensor.linear[self.counts[place]][:, None])
+
+    def part(self, side: int, rng: np.random.Generator) -> Part:
+        """Some square, turned and mirrored somehow."""
+        height, width = self.truth.shape[1:]
+        part = self.square(rng.integers(height - side + 1), rng.integers(width - side + 1), side)
+        flipped, mirrored, turned = rng.random(3) < 0.5
+        for name, planes in vars(part).items():
+            planes = planes[..., ::-1, :] if flipped else planes
+            planes = planes[..., ::-1] if mirrored else planes
+            setattr(part, name, np.ascontiguousarray(planes.swapaxes(-1, -2) if turned else planes))
+        return part
+
+
+@dataclass
+class Batch:
+    bursts: list[Burst]
+    guide: Tensor
+    truth: Tensor
+    u: Tensor
+    noise: Tensor
+    sensor: Tensor
+    times: np.ndarray
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, bursts: list[Burst], parts: list[Part], times: np.ndarray, rng: np.random.Generator) -> "Batch":
+        joined = lambda name: torch.from_numpy(np.concatenate([getattr(part, name) for part in parts]))
+        noise = torch.from_numpy(rng.standard_normal(joined("truth").shape, dtype=np.float32))
+        sensor = torch.tensor([burst.numbers for burst in bursts], dtype=torch.float32)
+        return cls(bursts, joined("guide"), joined("truth"), joined("u"), noise, sensor, times, rng)
+
+
+class Trainer:
+    def __init__(self, weights: str) -> None:
+        with safe_open(weights, "pt") as file:
+            self.about = json.loads(file.metadata()["qudi"])
+            self.tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+        # Pre-denoisers stay as they are, and have seen no simulated measurement.
+        self.tensors["pre.simulated_in.weight"].zero_()
+        self.network = Qudi(self.about["network"])
+        own = {name: value for name, value in self.tensors.items() if not name.startswith("drafts.")}
+        self.network.load_state_dict(own)
+        self.network.pre.requires_grad_(False)
+        for module in self.network.modules():
+            if isinstance(module, nn.Conv2d):
+                module.to(memory_format=torch.channels_last)
+        self.learning = {name: value for name, value in self.network.named_parameters() if value.requires_grad}
+        self.mean = {name: value.detach().clone() for name, value in self.learning.items()}
+        self.bars = torch.from_numpy(alpha_bar().astype(np.float32))
+
+    def noisy(self, batch: Batch, times: np.ndarray) -> Tensor:
+        frames = len(batch.truth) // len(times)
+        bars = self.bars[times].repeat_interleave(frames)[:, None, None, None]
+        return (2 * batch.truth - 1) * bars.sqrt() + batch.noise * (1 - bars).sqrt()
+
+    def predicted(
+        self, batch: Batch, times: np.ndarray, x0_prev: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
+    ) -> Tensor:
+        frames = len(batch.truth) // len(times)
+        x_t, t = self.noisy(batch, times), torch.from_numpy(times)
+        with torch.autocast("cpu", torch.bfloat16):
+            x0, *_ = self.network(batch.u, batch.guide, y_sim, u_sim, flag, x_t, x0_prev, t, batch.sensor, frames)
+        return x0.float()
+
+    def loss(self, batch: Batch, first_pass: bool) -> Tensor:
+        times, frames = batch.times, len(batch.truth) // len(batch.times)
+        nothing = torch.zeros_like(batch.truth)
+        before, flag = (nothing, nothing, nothing), torch.zeros(len(times))
+        if first_pass and (times < TIMES - 1).any():
+            earlier = np.minimum(times + STRIDE, TIMES - 1)
+            with torch.no_grad():
+                x0 = self.predicted(batch, earlier, *before, flag).clamp(-1, 1).numpy()
+            y_sim, u_sim = np.zeros_like(x0), np.zeros_like(x0)
+            for number, (burst, t) in enumerate(zip(batch.bursts, times)):
+                part = slice(number * frames, (number + 1) * frames)
+                if t == TIMES - 1:
+                    x0[part] = 0
+                    continue
+                sensor = Sensor(burst.label, 10 ** (1 - t / TIMES))
+                y_sim[part], u_sim[part] = sensor.measure((x0[part] + 1) / 2, batch.rng)
+            before = tuple(map(torch.from_numpy, (x0, y_sim, u_sim)))
+            flag = torch.from_numpy((times < TIMES - 1).astype(np.float32))
+        square = (batch.guide[:, :1] - batch.truth).square().unflatten(0, (-1, frames)).mean((1, 2, 3, 4))
+        scale = square.clamp(min=LEAST_ERROR).sqrt().repeat_interleave(frames)[:, None, None, None]
+        error = ((self.predicted(batch, times, *before, flag) + 1) / 2 - batch.truth) / scale
+        variation = sum(error.diff(dim=axis).abs().mean() for axis in (2, 3))
+        return error.square().mean() + VARIATION * variation
+
+    def swap(self) -> None:
+        """Exchanges weights and mean weights."""
+        with torch.no_grad():
+            for name, value in self.learning.items():
+                kept = value.detach().clone()
+                value.copy_(self.mean[name])
+                self.mean[name] = kept
+
+    def average(self, step: int) -> None:
+        keep = min(EMA, 1 - 10 / (step + 10))
+        with torch.no_grad():
+            for name, value in self.learning.items():
+                self.mean[name].lerp_(value, 1 - keep)
+
+    @torch.no_grad()
+    def gain(self, bursts: list[Burst], time: int) -> float:
+        """Mean gain of the prediction at `time` over the pre-denoised frames, in dB, without any earlier estimate."""
+        gains = []
+        for burst in bursts:
+            rng = np.random.default_rng(1)
+            batch = Batch.of([burst], [burst.square(16, 16, SQUARE)], np.array([time]), rng)
+            nothing = torch.zeros_like(batch.truth)
+            x0 = self.predicted(batch, batch.times, nothing, nothing, nothing, torch.zeros(1))
+            d, _ = self.network.pre(batch.guide, nothing, nothing, torch.zeros(1))
+            errors = [(image.clamp(0, 1) - batch.truth).square().mean().item() for image in (d, (x0 + 1) / 2)]
+            gains.append(10 * math.log10(errors[0] / errors[1]))
+        return float(np.mean(gains))
+
+    def write(self, path: Path, steps: int) -> None:
+        tensors = {**self.tensors, **{name: value.contiguous() for name, value in self.mean.items()}}
+        partial = path.with_suffix(".part")
+        metadata = {"qudi": json.dumps({**self.about, "steps": steps}, separators=(",", ":"))}
+        save_file(tensors, partial, metadata)
+        partial.rename(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("weights")
+    parser.add_argument("bursts", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--minutes", type=float, default=60)
+    parser.add_argument("--rate", type=float, default=1.5e-3)
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--side", type=int, default=96)
+    parser.add_argument("--start", type=float, default=0.1, help="share of bursts at the time where sampling begins")
+    parser.add_argument("--first", type=float, default=0.75, help="share of batches with an earlier estimate")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    bursts = [Burst(path) for path in sorted(args.bursts.glob("*.safetensors"))]
+    held, bursts = bursts[::HELD], [burst for number, burst in enumerate(bursts) if number % HELD]
+    trainer = Trainer(args.weights)
+    weights = list(trainer.learning.values())
+    optimizer = torch.optim.Adam(weights, args.rate)
+
+    def draw(step: int) -> tuple[Batch, bool]:
+        rng = np.random.default_rng([args.seed, step])
+        drawn = [bursts[rng.integers(len(bursts))] for _ in range(args.batch)]
+        parts = [burst.part(args.side, rng) for burst in drawn]
+        late = lambda: int(TIMES * rng.random() ** 2)
+        times = np.array([TIMES - 1 if rng.random() < args.start else late() for _ in drawn])
+        return Batch.of(drawn, parts, times, rng), rng.random() < args.first
+
+    start, step, losses, told = time.monotonic(), 0, [], 0.0
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(draw, 1)
+        while (gone := (time.monotonic() - start) / 60 / args.minutes) < 1:
+            step += 1
+            batch, first_pass = following.result()
+            following = reader.submit(draw, step + 1)
+            for group in optimizer.param_groups:
+                group["lr"] = args.rate * min(1, step / WARMUP) * 0.5 * (1 + math.cos(math.pi * gone))
+            value = trainer.loss(batch, first_pass)
+            optimizer.zero_grad()
+            value.backward()
+            nn.utils.clip_grad_norm_(weights, CLIP)
+            losses.append(value.item())
+            if not math.isfinite(losses[-1]):
+                raise SystemExit(f"step {step}: the loss is no number; {args.out} holds the last good weights")
+            optimizer.step()
+            trainer.average(step)
+            if gone - told > 0.1:
+                told = gone
+                trainer.write(args.out, step)
+                trainer.swap()
+                gains = ", ".join(f"{trainer.gain(held, t):.3f} dB at {t}" for t in (TIMES - 1, 50))
+                trainer.swap()
+                minutes = (time.monotonic() - start) / 60
+                print(f"{minutes:.0f} min, step {step}, loss {np.mean(losses):.4f}, gain {gains}", flush=True)
+                losses.clear()
+    trainer.write(args.out, step)
+
+
+if __name__ == "__main__":
+    main()
