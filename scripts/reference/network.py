@@ -172,6 +172,18 @@ class PreDenoiser(nn.Module):
         return clean + 0.3 * deviation * F.pixel_shuffle(self.out(g), self.fold), g
 
 
+class ErrorHead(nn.Module):
+    def __init__(self, config: dict):
+        super().__init__()
+        width, self.fold = config["pre"]["width"], config["fold"]
+        self.enter = conv(width, width // 2, 3)
+        self.out = conv(width // 2, self.fold**2, 3)
+
+    def forward(self, g: Tensor, guide: Tensor) -> Tensor:
+        ratio = self.out(F.relu(self.enter(g))).clamp(-5, 3).exp()
+        return 0.3 * evidence(guide)[1] * F.pixel_shuffle(ratio, self.fold)
+
+
 class Features(nn.Module):
     """The two strided layers; the first differs."""
 
@@ -502,6 +514,8 @@ class Qudi(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
         self.pre = PreDenoiser(config)
+        if config["pre"].get("error"):
+            self.error = ErrorHead(config)
         self.low = Low(config)
         self.high = High(config)
         self.flow = Flow(config)

@@ -349,6 +349,17 @@ def pre_file() -> File:
     return file
 
 
+def error_file() -> File:
+    file = File("error", 128)
+    config = variant(network.load("tiny"), pre={"error": True})
+    module = network.ErrorHead(config)
+    guide = spread((6, network.guide_planes(config), 12, 20), *GUIDE)
+    inputs = {"g": spread((6, config["pre"]["width"], 6, 10), *CENTRED), "guide": guide}
+    run = lambda **x: {"deviation": module(**x)}
+    file.case("error", run, inputs, module, "error", {"config": config}, ("guide",))
+    return file
+
+
 def feature_file() -> File:
     file = File("features", 128)
     config = network.load("tiny")
@@ -544,6 +555,7 @@ FILES: dict[str, Callable[[], File]] = {
     "resample": resample_file,
     "blocks": block_file,
     "pre": pre_file,
+    "error": error_file,
     "features": feature_file,
     "flow": flow_file,
     "fusion": fusion_file,

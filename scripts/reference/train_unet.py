@@ -188,6 +188,8 @@ class Trainer:
         own = {name: value for name, value in self.tensors.items() if not name.startswith("drafts.")}
         self.network.load_state_dict(own)
         self.network.pre.requires_grad_(False)
+        if self.about["network"]["pre"].get("error"):
+            self.network.error.requires_grad_(False)
         for module in self.network.modules():
             if isinstance(module, nn.Conv2d):
                 module.to(memory_format=torch.channels_last)

@@ -78,6 +78,24 @@ fn a_burst_is_restored_and_gone_on_with() {
     assert!(String::from_utf8_lossy(&header[..128]).contains("(13, 32, 40)"));
 }
 
+/// The built-in weights tell how far their frames may be off; the frames are the same.
+#[test]
+fn errors_are_told_beside_the_frames() {
+    let folder = prepared("network-errors");
+    let run = |args: &str| qudi(&folder).args(args.split_whitespace()).assert().success();
+    run("restore b.npy -o s.npy --deviation d.npy -q");
+    run("restore b.npy -o t.npy -q");
+    let [frames, alone, deviations] =
+        ["s.npy", "t.npy", "d.npy"].map(|name| std::fs::read(folder.join(name)).unwrap());
+    assert!(frames == alone);
+    assert_eq!(deviations.len(), frames.len());
+    let values = deviations[deviations.len() - 13 * 32 * 40 * 4..].chunks_exact(4);
+    let values: Vec<f32> = values.map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    assert!(values.iter().all(|&value| value > 0.0 && value < 1.0));
+    refused(&folder, "restore b.npy -o u.npy --deviation e.npy --steps 1", &["--steps 0"]);
+    refused(&folder, "restore b.npy -o u.npy --deviation e.npy --method guide", &["--method qudi"]);
+}
+
 /// These weights' U-Net is silent, and their pre-denoiser has seen no simulated measurement.
 #[test]
 fn more_steps_change_nothing_where_nothing_is_generated() {

@@ -111,6 +111,20 @@ fn runs_are_gone_on_with_and_never_lost() {
     };
     let first = restored("run/weights.safetensors", "first.npy");
     assert!(restored("third/weights.safetensors", "third.npy") != first);
+    // To tell errors is learnt beside what has been learnt.
+    let told = "--set network.pre.error=true --set train.loss.pre=0 --set train.loss.prediction=0";
+    let told = format!("{told} --set train.loss.flow=0");
+    run(&folder, &format!("train tiny -o told --init run/weights.safetensors {told} {QUICK}"));
+    let same = restored("told/weights.safetensors", "told.npy");
+    let values = |npy: &[u8]| -> Vec<f32> {
+        let pixels = npy[npy.len() - 3 * 48 * 32 * 4..].chunks_exact(4);
+        pixels.map(|value| f32::from_le_bytes(value.try_into().unwrap())).collect()
+    };
+    let pairs = values(&first).into_iter().zip(values(&same));
+    // But for rounding in the mean of weights that stay.
+    assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
+    let report = std::fs::read_to_string(folder.join("told/report.html")).unwrap();
+    assert!(report.contains("errors told"));
 }
 
 #[test]

@@ -53,6 +53,9 @@ pub struct PreConfig {
     /// Pre-denoisers, one after the other: all but the first see the frames aligned by what the one before restored.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub rounds: usize,
+    /// Whether the last of them tells how far its frames may be off.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub error: bool,
 }
 
 fn one() -> usize {
@@ -62,6 +65,11 @@ fn one() -> usize {
 #[allow(clippy::trivially_copy_pass_by_ref)]
 fn is_one(rounds: &usize) -> bool {
     *rounds == 1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_false(switch: &bool) -> bool {
+    !switch
 }
 
 /// Channels of the spatio-temporal features on three levels.

@@ -43,29 +43,41 @@ impl Draft {
     /// [`SimError`](qudi_sim::SimError) if the device fails.
     pub fn restore(&self, alignment: &Alignment<'_>, neighbours: usize) -> Result<Vec<Frame>> {
         let layout = Layout::new(alignment.size(), self.fold, self.tile);
-        let denoise = |guide: &Tensor<4>| self.denoiser.denoise(guide);
-        let (frames, noises) = denoised(alignment, neighbours, &layout, &self.device, denoise)?;
+        let denoise = |guide: &Tensor<4>| vec![self.denoiser.denoise(guide)];
+        let Denoised { frames, noises, .. } =
+            denoised(alignment, neighbours, &layout, &self.device, denoise)?;
         Ok(settled(alignment, frames, noises, BRIGHTEST as f32))
     }
 }
 
-/// What `denoise` makes of the frames of a window, one by one, and the deviations of the merged frames' noise.
+/// A window's frames, denoised each for itself, in image units.
+#[derive(Default)]
+pub(crate) struct Denoised {
+    pub(crate) frames: Vec<Frame>,
+    /// Deviations of their errors; none where the network does not tell them.
+    pub(crate) errors: Vec<Frame>,
+    /// Deviations of the merged frames' noise.
+    pub(crate) noises: Vec<Frame>,
+}
+
+/// What `denoise` makes of the frames of a window, one by one: the frame, and the deviation of its errors if it tells it.
 pub(crate) fn denoised(
     alignment: &Alignment<'_>,
     neighbours: usize,
     layout: &Layout,
     device: &Device,
-    denoise: impl Fn(&Tensor<4>) -> Tensor<4>,
-) -> Result<(Vec<Frame>, Vec<Frame>)> {
-    let frame = |number: usize| {
+    denoise: impl Fn(&Tensor<4>) -> Vec<Tensor<4>>,
+) -> Result<Denoised> {
+    let mut all = Denoised::default();
+    for number in 0..alignment.frames() {
         let aligned = alignment.of(number, neighbours);
-        let noise = aligned.noise.clone();
+        all.noises.push(aligned.noise.clone());
         let guide = GuidePlanes::of_frame(aligned).map(|plane| layout.padded(plane));
-        let image = layout.denoised(&guide, device, &denoise)?;
-        Ok((layout.frames(&image).remove(0), noise))
-    };
-    let frames = (0..alignment.frames()).map(frame).collect::<Result<Vec<_>>>()?;
-    Ok(frames.into_iter().unzip())
+        let mut images = layout.denoised(&guide, device, &denoise)?.into_iter();
+        all.frames.extend(images.next());
+        all.errors.extend(images.next());
+    }
+    Ok(all)
 }
 
 /// Frames of a window that were denoised each for itself, steadied, in [0, `brightest`]; `noises` are the deviations of the

@@ -58,19 +58,23 @@ impl Layout {
         images.chunks_exact(self.size.pixels()).map(cropped).collect()
     }
 
-    /// What `denoise` makes of a frame, in image units, from its padded guide.
+    /// What `denoise` makes of a frame, in image units, from its padded guide: one image or several, cropped.
     pub(crate) fn denoised(
         &self,
         guide: &GuidePlanes,
         device: &Device,
-        denoise: impl Fn(&Tensor<4>) -> Tensor<4>,
-    ) -> Result<Vec<f32>> {
+        denoise: impl Fn(&Tensor<4>) -> Vec<Tensor<4>>,
+    ) -> Result<Vec<Frame>> {
         let tiles = &self.tiles;
-        let mut image = vec![0.0; self.size.pixels()];
+        let mut images: Vec<Vec<f32>> = Vec::new();
         for number in 0..tiles.count() {
             let guide = guide.map(|plane| tiles.crop(number, plane)).to_tensor(tiles.tile, device);
-            tiles.blend(number, &read(denoise(&guide))?, &mut image);
+            let parts = denoise(&guide);
+            images.resize(parts.len(), vec![0.0; self.size.pixels()]);
+            for (part, image) in parts.into_iter().zip(&mut images) {
+                tiles.blend(number, &read(part)?, image);
+            }
         }
-        Ok(image)
+        Ok(images.iter().flat_map(|image| self.frames(image)).collect())
     }
 }

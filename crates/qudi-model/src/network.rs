@@ -2,6 +2,7 @@
 
 mod attention;
 mod embedding;
+mod error;
 mod evidence;
 mod features;
 mod flow;
@@ -19,6 +20,7 @@ mod variance;
 mod weights;
 
 pub use embedding::SENSOR_NUMBERS;
+
 pub use features::{HighFeatures, LowFeatures, Pyramid};
 pub use flow::{Flow, Flows};
 pub use fusion::Fusion;

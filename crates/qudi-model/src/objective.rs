@@ -122,6 +122,8 @@ pub struct Terms {
     pub perceptual: Option<Tensor<1>>,
     /// How far neighbours warped along the flows are from the truth; computed only where it has a weight.
     pub flow: Option<Tensor<1>>,
+    /// How well the pre-denoiser knows its errors, if it tells them; its weight is 1, for nothing else learns from it.
+    pub error: Option<Tensor<1>>,
 }
 
 /// A diffusion time to train at, from two uniform numbers in [0, 1): the share `start` of all where sampling begins, the
@@ -190,26 +192,50 @@ pub fn terms(
     if let Some(term) = &flow {
         total = total + term.clone() * weights.flow;
     }
-    Ok(Terms { total, prediction, pre, perceptual, flow })
+    // Told, too, of frames before any simulated measurement.
+    let error = network.tells_errors().then(|| network.denoise(&example.measured.guide));
+    let error = error.and_then(|(d, deviation)| told(example, &d, deviation));
+    if let Some(term) = &error {
+        total = total + term.clone();
+    }
+    Ok(Terms { total, prediction, pre, perceptual, flow, error })
 }
 
 /// The terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no weight: a first stage, at
 /// a fifth of the cost or less, for what must work before the rest can learn from it.
 fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> Terms {
     let measured = example.measured;
-    let (d, flows) = if weights.flow > 0.0 {
+    let (d, deviation, flows) = if weights.flow > 0.0 {
         let (d, flows) = network.denoise_and_align(&network.prepare(measured));
-        (d, Some(flows))
+        let told = network.tells_errors().then(|| network.denoise(&measured.guide).1);
+        (d, told.flatten(), Some(flows))
     } else {
-        (network.denoise(&measured.guide), None)
+        let (d, deviation) = network.denoise(&measured.guide);
+        (d, deviation, None)
     };
+    let error = told(example, &d, deviation);
     let pre = relative_reconstruction(example)(d);
     let flow = flows.map(|flows| flows.misfit(example.truth.clone(), measured.frames));
     let mut total = pre.clone() * weights.pre;
     if let Some(term) = &flow {
         total = total + term.clone() * weights.flow;
     }
-    Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow }
+    if let Some(term) = &error {
+        total = total + term.clone();
+    }
+    Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow, error }
+}
+
+/// [`surprise`] at the errors of pre-denoised frames, from which no gradient goes into the frames.
+fn told(example: &Example<'_>, d: &Tensor<4>, deviation: Option<Tensor<4>>) -> Option<Tensor<1>> {
+    deviation.map(|deviation| surprise(d.clone().detach() - example.truth.clone(), deviation))
+}
+
+/// Mean negative logarithm of the density of errors under a normal law of these deviations, but for a constant: least where
+/// the deviations are those of the errors (Kendall and Gal 2017, eq. 5). Same shapes, result `[1]`.
+pub fn surprise(error: Tensor<4>, deviation: Tensor<4>) -> Tensor<1> {
+    let square = (error / deviation.clone()).powi_scalar(2);
+    (square * 0.5 + deviation.log()).mean()
 }
 
 /// The network's own estimate, without gradient, and its simulated measurement. Bursts at the last time have

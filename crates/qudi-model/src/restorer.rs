@@ -1,7 +1,7 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
 use crate::config::{NetworkConfig, Part};
-use crate::draft::{Draft, denoised, settled};
+use crate::draft::{Denoised, Draft, denoised, settled};
 use crate::layout::Layout;
 use crate::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
@@ -12,10 +12,13 @@ use crate::schedule::{NoiseSchedule, Spacing};
 use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
-use qudi_sim::{Frame, Result, SimError};
+use qudi_sim::{Result, SimError};
 
 /// Fewest frames that the fusion makes sense of.
 pub const FEWEST_FRAMES: usize = 3;
+
+/// Largest deviation that a value in [0, 1] can have (Popoviciu 1935).
+const MOST_ERROR: f32 = 0.5;
 
 /// Usual side of the tiles that networks see, in pixels.
 pub const TILE: usize = 512;
@@ -179,13 +182,21 @@ impl QudiRestorer {
     /// What the pre-denoiser makes of the frames, without what the U-Net would take: most of the time and memory. Before any
     /// simulated measurement: where the U-Net has not learnt, none was seen in training. Fusion has no part in it: the frames,
     /// each denoised for itself, are steadied afterwards.
-    fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Vec<Frame>> {
+    fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
         let neighbours = self.config.pre.neighbours;
         let alignment = aligned(burst, context, neighbours, &self.drafts)?;
         let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
-        let denoise = |guide: &Tensor<4>| self.network.denoise(guide);
-        let (frames, noises) = denoised(&alignment, neighbours, &layout, &self.device, denoise)?;
-        Ok(settled(&alignment, frames, noises, 1.0))
+        let denoise = |guide: &Tensor<4>| {
+            let (d, error) = self.network.denoise(guide);
+            std::iter::once(d).chain(error).collect()
+        };
+        let Denoised { frames, mut errors, noises } =
+            denoised(&alignment, neighbours, &layout, &self.device, denoise)?;
+        for error in errors.iter_mut().flat_map(|frame| &mut frame.data) {
+            *error = error.min(MOST_ERROR);
+        }
+        let frames = settled(&alignment, frames, noises, 1.0);
+        Ok(Restored { frames, std: (!errors.is_empty()).then_some(errors) })
     }
 
     /// The network's clean image of one tile, in [-1, 1].
@@ -280,7 +291,7 @@ impl Restorer for QudiRestorer {
             ));
         }
         if !self.generates {
-            return Ok(Restored { frames: self.denoised(burst, context)?, std: None });
+            return self.denoised(burst, context);
         }
         let job = self.job(burst, context)?;
         let mut sum = Moments::default();

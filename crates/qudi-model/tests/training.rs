@@ -9,7 +9,7 @@ use qudi_model::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS};
 use qudi_model::noise::Noise;
 use qudi_model::objective::{
-    Example, FirstPass, LossWeights, Switches, Terms, terms, training_time,
+    Example, FirstPass, LossWeights, Switches, Terms, surprise, terms, training_time,
 };
 use qudi_model::tensor::to_tensor;
 use qudi_model::train::{Adam, gradients, values, with_values};
@@ -117,6 +117,53 @@ fn the_first_stage_is_a_part_of_the_whole() {
     // Other layers of the two lie behind last layers that start at zero.
     assert!(!idle("pre.out") && !idle("flow.levels.0.layers.4"));
     assert!(idle("unet.") && idle("fusion.") && idle("low.") && idle("high."));
+}
+
+/// The layers that tell errors learn from the frames' errors, and nothing else learns from that.
+#[test]
+fn errors_are_told_without_changing_frames() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let mut config = tiny();
+    config.pre.error = true;
+    let network = config.init(3, &device);
+    let terms_of = |prediction: f32| {
+        let weights = LossWeights { prediction, pre: 0.0, ..LossWeights::default() };
+        let example = Example {
+            measured: &burst.measured,
+            truth: burst.truth.clone(),
+            contexts: std::slice::from_ref(&burst.context),
+            noise: burst.truth.zeros_like(),
+            times: &[500],
+        };
+        terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap()
+    };
+    let (part, whole) = (terms_of(0.0), terms_of(1.0));
+    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
+    let [told, again] = [&part, &whole].map(|terms| value(terms.error.as_ref().unwrap()));
+    assert_eq!(told, again);
+    assert_eq!(told, value(&part.total));
+    let grads = part.total.backward();
+    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut without);
+    let idle = |part: &str| without.names.iter().any(|name| name.starts_with(part));
+    // What enters lies behind a last layer that starts at zero.
+    assert!(!idle("error.out") && idle("error.enter") && idle("pre.out"));
+}
+
+/// Least where the deviations are those of the errors: 0.5 and their logarithm.
+#[test]
+fn surprise_is_least_where_deviations_are_right() {
+    let device = Device::flex();
+    let noise: Vec<f32> = Noise::new(5, 1).frame(0, 0, 64 * 64).collect();
+    let scale = (noise.iter().map(|n| n * n).sum::<f32>() / noise.len() as f32).sqrt();
+    let of = |deviation: f32| {
+        let errors = noise.iter().map(|n| 0.2 * n / scale).collect();
+        let errors = to_tensor(errors, Size { height: 64, width: 64 }, &device);
+        surprise(errors.clone(), errors.ones_like() * deviation).into_scalar::<f32>()
+    };
+    assert!((of(0.2) - (0.5 + 0.2f32.ln())).abs() < 1e-5, "{}", of(0.2));
+    assert!(of(0.2) < of(0.19) && of(0.2) < of(0.21));
 }
 
 /// Names of parameters whose gradient is missing or zero.

@@ -55,7 +55,7 @@ pub struct Context {
 pub struct Restored {
     /// One per frame of the window, in image units.
     pub frames: Vec<Frame>,
-    /// Deviation of each pixel over samples, for methods that draw them.
+    /// Deviation of each pixel's error, for methods that tell it.
     pub std: Option<Vec<Frame>>,
 }
 

@@ -22,7 +22,7 @@ pub(crate) struct Network {
     /// How noise leaves
     #[arg(long, value_name = "NAME", default_value = "ddim")]
     pub(crate) sampler: SamplerName,
-    /// Pictures drawn; the result is their mean, --deviation their spread
+    /// Pictures drawn; the result is their mean, --deviation their spread [with --steps above 0]
     #[arg(long, value_name = "K", default_value_t = 1)]
     pub(crate) samples: usize,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info --devices`)

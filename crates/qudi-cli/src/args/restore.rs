@@ -53,7 +53,7 @@ pub(crate) struct Restore {
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
-    /// Write the deviation of every pixel over the samples (--samples K), .npy
+    /// Write how far every pixel may be off, .npy: the deviation of its error that the network tells, or that over --samples K
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) deviation: Option<PathBuf>,
     #[command(flatten)]

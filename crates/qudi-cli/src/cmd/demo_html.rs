@@ -17,8 +17,8 @@ pub(crate) fn html(png: &[u8], shown: &[Shown], foot: &str) -> String {
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>qudi demo</title>\n<style>{STYLE}</style></head><body>\n\
 <h1>Seeing in the dark, photon by photon</h1>\n\
 <p>Above: what the sensor counted in one frame, and the middle frame that each method made of eleven such frames, at the \
-truth's brightness. Below: errors, four times brighter, and the uncertainty of the last method: how its result varies where \
-photons are drawn again from that result.</p>\n\
+truth's brightness. Below: errors, four times brighter, and the uncertainty of the last method: the deviation of its \
+errors that it expects, or, if it tells none, how its result varies where photons are drawn again from that result.</p>\n\
 <img alt=\"counts, methods, truth; errors and uncertainty\" src=\"data:image/png;base64,{}\">\n<table><thead><tr>",
         STANDARD.encode(png)
     );

@@ -1,6 +1,7 @@
-//! The deviation over samples, written beside the frames.
+//! How far each pixel may be off, written beside the frames: what the network tells of its errors, or the deviation over
+//! samples.
 
-use crate::args::Restore;
+use crate::args::{Network, Restore};
 use crate::error::{Fault, Result};
 use qudi_sim::Frame;
 use qudi_sim::capture::Capture;
@@ -10,6 +11,11 @@ use std::path::Path;
 /// A `.npy` file of deviations, float32 `[frames, height, width]`, or none.
 #[derive(Debug)]
 pub(crate) struct Deviation(Option<ArrayWriter>);
+
+/// Whether the network, asked so, tells its errors without samples.
+pub(crate) fn tells_errors(network: &Network) -> Result<bool> {
+    Ok(network.steps() == 0 && network.weights().describe()?.network.pre.error)
+}
 
 impl Deviation {
     /// The file that was asked for. `finished` frames were there already; theirs would be missing.
@@ -21,11 +27,15 @@ impl Deviation {
         overwrite: Overwrite,
     ) -> Result<Self> {
         let Some(path) = &args.deviation else { return Ok(Self(None)) };
-        if method != "qudi" || args.network.samples < 2 {
+        if method != "qudi" {
+            let what = format!("{method} does not tell how far it may be off");
+            return Err(Fault::new(what, "--deviation", "use --method qudi"));
+        }
+        if args.network.samples < 2 && !tells_errors(&args.network)? {
             return Err(Fault::new(
                 "there is no deviation of one sample",
                 "--deviation",
-                "draw several with --samples K (method qudi)",
+                "draw several with --samples K, or none with --steps 0 if the weights tell errors (`qudi info FILE`)",
             ));
         }
         if path.extension() != Some("npy".as_ref()) {

@@ -195,11 +195,16 @@ fn initial(
         network = network.with_round_more();
         sizes.pre.rounds += 1;
     }
+    if recipe.network.pre.error && !sizes.pre.error {
+        let fresh = recipe.network.init(recipe.train.seed, &device.device);
+        network = network.with_error_of(fresh);
+        sizes.pre.error = true;
+    }
     if sizes != recipe.network {
         return Err(Fault::new(
             "these weights are for a network of other sizes than the recipe's",
             path.display(),
-            "choose the recipe that they were trained with, its [network] table, or that with one round more",
+            "choose the recipe that they were trained with, its [network] table, or that with one round more or with errors told",
         ));
     }
     Ok(Box::new(network))

@@ -41,7 +41,11 @@ pub(crate) fn page(
         Curve { name: key.to_owned(), points: thinned(&points.collect::<Vec<_>>()) }
     };
     let losses = ["total", "prediction", "pre", "perceptual", "flow"].map(curve);
-    let losses = losses.into_iter().filter(|curve| curve.points.iter().any(|p| p.1 > 0.0));
+    // With errors told, whose term is a logarithm, the total may be negative.
+    let shown = |curve: &Curve| {
+        curve.points.iter().all(|p| p.1 >= 0.0) && curve.points.iter().any(|p| p.1 > 0.0)
+    };
+    let losses = losses.into_iter().filter(shown);
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>qudi train</title>\n<style>{STYLE}</style></head><body>\n<h1>qudi train</h1>\n"
     );
@@ -56,6 +60,10 @@ pub(crate) fn page(
         page += &shares(&steps);
     }
     page += &plot("Loss (logarithmic)", &losses.collect::<Vec<_>>(), true);
+    let error = curve("error");
+    if error.points.iter().any(|p| p.1 != 0.0) {
+        page += &plot("Negative log-likelihood of the errors told", &[error], false);
+    }
     let validations: Vec<&Value> = of_kind("validation").collect();
     for (key, title) in
         [("psnr_a", "Gain-aligned PSNR on the validation clips, dB"), ("ssim", "SSIM")]

@@ -83,6 +83,7 @@ impl<'a> Watch<'a> {
             ("loss/pre", step.loss.pre),
             ("loss/perceptual", step.loss.perceptual),
             ("loss/flow", step.loss.flow),
+            ("loss/error", step.loss.error),
             ("train/rate", step.rate),
             ("train/norm", step.norm),
         ];

@@ -175,6 +175,21 @@ fn pre_denoiser() {
     }
 }
 
+#[test]
+fn error_head() {
+    let file = File::open("error");
+    for device in devices() {
+        let case = file.case("error");
+        let config = config(&case);
+        let head = config.pre.init_error(config.fold, &device).unwrap();
+        let head = weighted(head, "error");
+        let guide: Tensor<4> = case.input("guide", &device);
+        let g: Tensor<4> = case.input("g", &device).require_grad();
+        let deviation = head.forward(g.clone(), &Evidence::new(&guide));
+        check(&case, &[("deviation", deviation)], &[("g", &g)], &head, "error");
+    }
+}
+
 fn pyramid(name: &str, levels: Pyramid) -> Vec<(String, Tensor<4>)> {
     (0..).zip(levels).map(|(k, level)| (format!("{name}_{k}"), level)).collect()
 }

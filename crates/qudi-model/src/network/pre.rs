@@ -89,10 +89,14 @@ impl PreDenoiser {
 
     /// The pre-denoised frames alone, in image units, before any simulated measurement, from their guide.
     pub fn denoise(&self, guide: &Tensor<4>) -> Tensor<4> {
-        let evidence = Evidence::new(guide);
+        self.denoise_seen(&Evidence::new(guide)).0
+    }
+
+    /// [`Self::denoise`] of what a guide says, and features.
+    pub(super) fn denoise_seen(&self, evidence: &Evidence) -> (Tensor<4>, Tensor<4>) {
         let nothing = evidence.clean.zeros_like().repeat_dim(1, 2);
         let flag = nothing.clone().narrow(1, 0, 1).narrow(2, 0, 1).narrow(3, 0, 1);
-        self.forward(self.prepare(&evidence), &evidence, nothing, flag).0
+        self.forward(self.prepare(evidence), evidence, nothing, flag)
     }
 
     /// The pre-denoised frames in image units, `[images, 1, H, W]`, and features `[images, width, h, w]`.

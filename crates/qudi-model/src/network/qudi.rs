@@ -1,5 +1,6 @@
 //! The whole network: pre-denoiser, features, flow, fusion, U-Net.
 
+use super::error::ErrorHead;
 use super::evidence::Evidence;
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
@@ -80,6 +81,7 @@ pub struct Qudi {
     /// Pre-denoisers of the rounds before the last: they make what the guide is found from, and learn no more.
     drafts: Vec<PreDenoiser>,
     pre: PreDenoiser,
+    error: Option<ErrorHead>,
     low: LowFeatures,
     high: HighFeatures,
     flow: Flow,
@@ -101,6 +103,7 @@ impl NetworkConfig {
         Qudi {
             drafts: (1..self.pre.rounds).map(pre).collect(),
             pre: pre(0),
+            error: self.pre.init_error(self.fold, device),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
             flow: self.flow.init(self.lacks(Part::Flow), device),
@@ -165,9 +168,24 @@ impl Qudi {
     }
 
     /// The pre-denoised frames alone, in image units, of frames and their guide ([`Measured`]), before any simulated
-    /// measurement: all there is where the U-Net does not correct them ([`Self::generates`]).
-    pub fn denoise(&self, guide: &Tensor<4>) -> Tensor<4> {
-        self.pre.denoise(guide)
+    /// measurement: all there is where the U-Net does not correct them ([`Self::generates`]). With the deviation of their
+    /// errors, `[images, 1, height, width]`, where the network tells it ([`Self::tells_errors`]); no gradient goes from that
+    /// to anything but its own layers.
+    pub fn denoise(&self, guide: &Tensor<4>) -> (Tensor<4>, Option<Tensor<4>>) {
+        let evidence = Evidence::new(guide);
+        let (d, features) = self.pre.denoise_seen(&evidence);
+        (d, self.error.as_ref().map(|head| head.forward(features.detach(), &evidence)))
+    }
+
+    /// Whether the network tells how far its frames may be off.
+    pub fn tells_errors(&self) -> bool {
+        self.error.is_some()
+    }
+
+    /// The network with the layers of another one of the same sizes that tell its errors.
+    #[must_use]
+    pub fn with_error_of(self, other: Self) -> Self {
+        Self { error: other.error, ..self }
     }
 
     /// What a burst's guide goes through before this network sees it, in their order.

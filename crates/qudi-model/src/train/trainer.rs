@@ -33,6 +33,8 @@ pub struct Losses {
     pub perceptual: f64,
     /// Of the flows.
     pub flow: f64,
+    /// Of the errors that the pre-denoiser tells.
+    pub error: f64,
 }
 
 /// What a step did.
@@ -250,11 +252,13 @@ impl Trainer {
             pre: number_of(&terms.pre)?,
             perceptual: optional(&terms.perceptual)?,
             flow: optional(&terms.flow)?,
+            error: optional(&terms.error)?,
         };
         self.check("the loss of the prediction", loss.prediction)?;
         self.check("the loss of the pre-denoised frames", loss.pre)?;
         self.check("the perceptual loss", loss.perceptual)?;
         self.check("the misfit of the flows", loss.flow)?;
+        self.check("the errors told", loss.error)?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let gradients = gradients(network, &terms.total.backward());
@@ -294,6 +298,7 @@ impl Losses {
         self.pre += share * other.pre;
         self.perceptual += share * other.perceptual;
         self.flow += share * other.flow;
+        self.error += share * other.error;
     }
 }
 
