@@ -433,12 +433,11 @@ class Middle(nn.Module):
 
 
 def preconditioned(
-    base: Tensor, x_t: Tensor, deviation: Tensor, t: Tensor, frames: int
+    base: Tensor, x_t: Tensor, error: Tensor, t: Tensor, frames: int
 ) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
     """x_t around `base` in deviations, and what makes the prediction of a correction."""
     bars = torch.as_tensor(alpha_bar())[t.to("cpu").long()].to(base)
     signal, noise = (root.sqrt().repeat_interleave(frames)[:, None, None, None] for root in (bars, 1 - bars))
-    error = 0.6 * deviation
     scale = ((signal * error) ** 2 + noise**2).sqrt()
     residual = (x_t - signal * base) / scale
     return residual, lambda out: base + error * (signal * error / scale * residual + noise / scale * out)
@@ -486,10 +485,12 @@ class UNet(nn.Module):
         t: Tensor,
         sensor: Tensor,
         frames: int,
+        error: Tensor | None = None,
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
         clean, deviation, difference, _, level = evidence(guide)
-        residual, prediction = preconditioned(2 * d - 1, x_t, deviation, t, frames)
+        error = 0.6 * deviation if error is None else 2 * error
+        residual, prediction = preconditioned(2 * d - 1, x_t, error, t, frames)
         images = [2 * d - 1, residual, x0_prev, 2 * clean - 1, difference, level]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
@@ -543,7 +544,8 @@ class Qudi(nn.Module):
         if flows is None:
             flows = self.flow(d, guide[:, :1].detach(), mean_variance(sensor, frames), frames)
         fused = self.fusion(low, high, g, flows, frames)
-        return self.unet(x_t, x0_prev, guide, d, fused, t, sensor, frames), d, flows
+        error = self.error(g.detach(), guide).detach() if hasattr(self, "error") else None
+        return self.unet(x_t, x0_prev, guide, d, fused, t, sensor, frames, error), d, flows
 
 
 # The loss (without the perceptual term)

@@ -6,7 +6,7 @@ use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_model::config::NetworkConfig;
 use qudi_model::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
-use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS};
+use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, fill, parameters};
 use qudi_model::noise::Noise;
 use qudi_model::objective::{
     Example, FirstPass, LossWeights, Switches, Terms, surprise, terms, training_time,
@@ -16,6 +16,7 @@ use qudi_model::train::{Adam, gradients, values, with_values};
 use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::sensor::Sensor;
 use qudi_sim::{Camera, Frame, Light, Size};
+use std::collections::HashMap;
 
 /// A burst of a moving disk, its truth and its light.
 struct Burst {
@@ -149,6 +150,48 @@ fn errors_are_told_without_changing_frames() {
     let idle = |part: &str| without.names.iter().any(|name| name.starts_with(part));
     // What enters lies behind a last layer that starts at zero.
     assert!(!idle("error.out") && idle("error.enter") && idle("pre.out"));
+}
+
+/// The U-Net's corrections are as large as errors are told to be; at first as without telling.
+#[test]
+fn told_errors_scale_the_diffusion() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let prediction = |error: bool, bias: f32| {
+        let mut config = tiny();
+        config.pre.error = error;
+        let mut network = config.init(3, &device);
+        if error {
+            let told = |name: &str, shape: &[usize]| {
+                let initial = vec![bias; shape.iter().product()];
+                (name == "error.out.bias").then_some(initial)
+            };
+            let kept = values_by_name(&network);
+            network = fill(network, |name, shape| {
+                told(name, shape).unwrap_or_else(|| kept[name].clone())
+            });
+        }
+        let example = Example {
+            measured: &burst.measured,
+            truth: burst.truth.clone(),
+            contexts: std::slice::from_ref(&burst.context),
+            noise: burst.truth.ones_like(),
+            times: &[100],
+        };
+        let weights = LossWeights::default();
+        let terms = terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap();
+        terms.prediction.into_scalar::<f32>()
+    };
+    let without = prediction(false, 0.0);
+    assert!((prediction(true, 0.0) - without).abs() < 1e-5 * without);
+    assert!((prediction(true, 1.0) - without).abs() > 1e-3 * without);
+}
+
+fn values_by_name(network: &Qudi) -> HashMap<String, Vec<f32>> {
+    let names = parameters(network).into_iter().map(|(name, _)| name);
+    let lists =
+        values(network).into_iter().map(|list| list.into_data().try_to_vec::<f32>().unwrap());
+    names.zip(lists).collect()
 }
 
 /// Least where the deviations are those of the errors: 0.5 and their logarithm.

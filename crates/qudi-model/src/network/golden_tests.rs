@@ -284,6 +284,7 @@ fn u_net() {
             let (base, images) = (d.clone() * 2.0 - 1.0, [x_t.clone(), x0_prev.clone()]);
             let (evidence, frames) = (Evidence::new(&guide), case.number("frames"));
             let sensor = unet.prepare(sensor);
+            let base = [base, evidence.deviation.clone() * 0.6];
             let x0 = unet.forward(base, images, &evidence, fused.clone(), &times, sensor, frames);
             let inputs = [
                 ("x_t", &x_t),

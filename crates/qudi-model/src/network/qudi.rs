@@ -5,6 +5,7 @@ use super::evidence::Evidence;
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
+use super::layers::CORRECTION;
 use super::pre::PreDenoiser;
 use super::unet::UNet;
 use super::variance::mean_variance;
@@ -220,6 +221,14 @@ impl Qudi {
         self.flow.forward(d, clean, prepared.variance.clone(), prepared.frames)
     }
 
+    /// Deviation of the pre-denoised frames' errors in image units: as told, else some tenths of the merged frames' noise.
+    fn errors(&self, features: &Tensor<4>, evidence: &Evidence) -> Tensor<4> {
+        match &self.error {
+            Some(head) => head.forward(features.clone().detach(), evidence).detach(),
+            None => evidence.deviation.clone() * CORRECTION,
+        }
+    }
+
     /// The pre-denoised frames and their features.
     fn pre_denoise(
         &self,
@@ -266,10 +275,13 @@ impl Qudi {
         done("high");
         let flows = flows.unwrap_or_else(|| self.estimate_flow(prepared, d.clone()));
         done("flow");
+        let evidence = &prepared.evidence;
+        // A deviation spans twice as much in [-1, 1].
+        let error = self.errors(&features, evidence) * 2.0;
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
         let images = [state.x_t.clone(), state.x0_prev.clone()];
-        let (base, evidence) = (d.clone() * 2.0 - 1.0, &prepared.evidence);
+        let base = [d.clone() * 2.0 - 1.0, error];
         let sensor = prepared.sensor.clone();
         let x0 = self.unet.forward(base, images, evidence, fused, &state.times, sensor, frames);
         done("unet");

@@ -179,12 +179,12 @@ impl UNet {
     }
 
     /// The prediction, `[images, 1, H, W]` in [-1, 1]: `base`, corrected by the noisy image and what the U-Net sees in it.
-    /// `x_t`, `x0_prev` and `base`, the pre-denoised image, are in [-1, 1], too; `times` one number for each burst; `sensor`
-    /// as from [`Self::prepare`].
+    /// `x_t`, `x0_prev` and `base`, the pre-denoised image, with the deviation of its errors, are in [-1, 1], too; `times` one
+    /// number for each burst; `sensor` as from [`Self::prepare`].
     #[allow(clippy::too_many_arguments)] // one for every box of docs/network.md that leads here
     pub(super) fn forward(
         &self,
-        base: Tensor<4>,
+        [base, error]: [Tensor<4>; 2],
         [x_t, x0_prev]: [Tensor<4>; 2],
         evidence: &Evidence,
         fused: Pyramid,
@@ -194,7 +194,7 @@ impl UNet {
     ) -> Tensor<4> {
         let embedding = silu(self.embed(times, sensor));
         let Evidence { difference, level, .. } = evidence.clone();
-        let noisy = Preconditioned::new(base.clone(), x_t, &evidence.deviation, times);
+        let noisy = Preconditioned::new(base.clone(), x_t, error, times);
         let seen = noisy.residual.clone();
         let planes = vec![base, seen, x0_prev, evidence.signed(), difference, level];
         let mut x = self.inp.linear(&[fold(Tensor::cat(planes, 1), self.fold)]);
