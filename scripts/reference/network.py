@@ -223,8 +223,8 @@ class High(Features):
         self.fold = config["fold"]
         self.first = conv3d(2 * self.fold**2, widths[0])
 
-    def forward(self, x_t: Tensor, x0_prev: Tensor, frames: int) -> list[Tensor]:
-        moving = F.pixel_unshuffle(torch.cat([x_t, x0_prev], 1), self.fold)
+    def forward(self, residual: Tensor, earlier: Tensor, frames: int) -> list[Tensor]:
+        moving = F.pixel_unshuffle(torch.cat([residual, earlier], 1), self.fold)
         return self.rest(F.relu(self.first(volume(moving, frames))))
 
 
@@ -432,15 +432,22 @@ class Middle(nn.Module):
         return self.second(x, emb)
 
 
-def preconditioned(
-    base: Tensor, x_t: Tensor, error: Tensor, t: Tensor, frames: int
-) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    """x_t around `base` in deviations, and what makes the prediction of a correction."""
-    bars = torch.as_tensor(alpha_bar())[t.to("cpu").long()].to(base)
-    signal, noise = (root.sqrt().repeat_interleave(frames)[:, None, None, None] for root in (bars, 1 - bars))
-    scale = ((signal * error) ** 2 + noise**2).sqrt()
-    residual = (x_t - signal * base) / scale
-    return residual, lambda out: base + error * (signal * error / scale * residual + noise / scale * out)
+class Preconditioned:
+    """Images in numbers of unit variance around the pre-denoised frames `base`, all in [-1, 1], at the times of the noisy ones."""
+
+    def __init__(self, base: Tensor, x_t: Tensor, x0_prev: Tensor, flag: Tensor, error: Tensor, t: Tensor, frames: int):
+        bars = torch.as_tensor(alpha_bar())[t.to("cpu").long()].to(base)
+        each = lambda x: x.repeat_interleave(frames)[:, None, None, None]
+        signal, noise = each(bars.sqrt()), each((1 - bars).sqrt())
+        left = signal * error
+        scale = (left**2 + noise**2).sqrt()
+        self.base, self.known, self.unknown = base, error * left / scale, error * noise / scale
+        self.residual = (x_t - signal * base) / scale
+        self.earlier = ((x0_prev - base) / error).clamp(-5, 5) * each(flag.to(base))
+        self.clarity = (left / noise).log().clamp(-4, 4) / 2
+
+    def prediction(self, out: Tensor) -> Tensor:
+        return self.base + self.known * self.residual + self.unknown * out
 
 
 class UNet(nn.Module):
@@ -476,22 +483,11 @@ class UNet(nn.Module):
         return time + self.sensor_out(F.silu(self.sensor_in(sensor)))
 
     def forward(
-        self,
-        x_t: Tensor,
-        x0_prev: Tensor,
-        guide: Tensor,
-        d: Tensor,
-        fused: list[Tensor],
-        t: Tensor,
-        sensor: Tensor,
-        frames: int,
-        error: Tensor | None = None,
+        self, noisy: Preconditioned, guide: Tensor, fused: list[Tensor], t: Tensor, sensor: Tensor, frames: int
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
-        clean, deviation, difference, _, level = evidence(guide)
-        error = 0.6 * deviation if error is None else 2 * error
-        residual, prediction = preconditioned(2 * d - 1, x_t, error, t, frames)
-        images = [2 * d - 1, residual, x0_prev, 2 * clean - 1, difference, level]
+        clean, _, difference, _, _ = evidence(guide)
+        images = [noisy.base, noisy.residual, noisy.earlier, 2 * clean - 1, difference, noisy.clarity]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
         for k, level in enumerate(self.encoder):
@@ -508,7 +504,7 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        return prediction(F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold))
+        return noisy.prediction(F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold))
 
 
 class Qudi(nn.Module):
@@ -539,13 +535,34 @@ class Qudi(nn.Module):
     ) -> tuple[Tensor, Tensor, Flows]:
         """x0 in [-1, 1] (not clipped), d in image units, and the flows, new unless given."""
         d, g = self.pre(guide, y_sim, u_sim, flag)
+        noisy = Preconditioned(2 * d - 1, x_t, x0_prev, flag, 2 * self.errors(g, guide), t, frames)
+        x0, flows = self.correct(noisy, u, u_sim, guide, d, g, t, sensor, frames, flows)
+        return x0, d, flows
+
+    def errors(self, g: Tensor, guide: Tensor) -> Tensor:
+        """Deviation of the pre-denoised frames' errors, in image units."""
+        return self.error(g, guide).detach() if hasattr(self, "error") else 0.3 * evidence(guide)[1]
+
+    def correct(
+        self,
+        noisy: Preconditioned,
+        u: Tensor,
+        u_sim: Tensor,
+        guide: Tensor,
+        d: Tensor,
+        g: Tensor,
+        t: Tensor,
+        sensor: Tensor,
+        frames: int,
+        flows: Flows | None = None,
+    ) -> tuple[Tensor, Flows]:
+        """What follows the pre-denoiser."""
         low = self.low(u, u_sim, d, frames)
-        high = self.high(x_t, x0_prev, frames)
+        high = self.high(noisy.residual, noisy.earlier, frames)
         if flows is None:
             flows = self.flow(d, guide[:, :1].detach(), mean_variance(sensor, frames), frames)
         fused = self.fusion(low, high, g, flows, frames)
-        error = self.error(g.detach(), guide).detach() if hasattr(self, "error") else None
-        return self.unet(x_t, x0_prev, guide, d, fused, t, sensor, frames, error), d, flows
+        return self.unet(noisy, guide, fused, t, sensor, frames), flows
 
 
 # The loss (without the perceptual term)

@@ -369,7 +369,7 @@ def feature_file() -> File:
     about = {"config": config, "frames": 3}
     run = lambda **x: {f"low_{k}": value for k, value in enumerate(low(**x, frames=3))}
     file.case("low", run, inputs, low, "low", about)
-    inputs = {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
+    inputs = {"residual": spread(shape), "earlier": spread(shape, *CENTRED)}
     run = lambda **x: {f"high_{k}": value for k, value in enumerate(high(**x, frames=3))}
     file.case("high", run, inputs, high, "high", about)
     return file
@@ -428,7 +428,7 @@ def unet_file() -> File:
     for name, config in (("tiny", tiny), ("all", full)):
         module = network.UNet(config)
         shape = (6, 1, 16, 24)
-        inputs = {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
+        inputs = {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED), "flag": given([1, 0])}
         inputs |= {"d": spread(shape, *COUNTS), "guide": spread((6, network.guide_planes(config), 16, 24), *GUIDE)}
         for k, width in enumerate(config["fusion"]["widths"]):
             scale = config["fold"] << k
@@ -437,7 +437,9 @@ def unet_file() -> File:
 
         def run(**x: Tensor) -> Tensors:
             fused = [x.pop(f"fused_{k}") for k in range(3)]
-            return {"x0": module(**x, fused=fused, frames=3)}
+            images = [2 * x["d"] - 1, x["x_t"], x["x0_prev"], x["flag"]]
+            noisy = network.Preconditioned(*images, 0.6 * network.evidence(x["guide"])[1], x["t"], 3)
+            return {"x0": module(noisy, x["guide"], fused, x["t"], x["sensor"], 3)}
 
         file.case(name, run, inputs, module, "unet", {"config": config, "frames": 3})
     return file

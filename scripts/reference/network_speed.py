@@ -62,7 +62,9 @@ def inputs(config: dict, frames: int, size: int, batch: int) -> dict[str, Tensor
 def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: int) -> dict[str, dict]:
     measured = [x[name] for name in ("guide", "y_sim", "u_sim", "flag")]
     d, g = model.pre(*measured)
-    low, high = model.low(x["u"], x["u_sim"], d, frames), model.high(x["x_t"], x["x0_prev"], frames)
+    images = (2 * d - 1, x["x_t"], x["x0_prev"], x["flag"])
+    noisy = network.Preconditioned(*images, 2 * model.errors(g, x["guide"]), x["t"], frames)
+    low, high = model.low(x["u"], x["u_sim"], d, frames), model.high(noisy.residual, noisy.earlier, frames)
     variance = network.mean_variance(x["sensor"], frames)
     clean = x["guide"][:, :1]
     flows = model.flow(d, clean, variance, frames)
@@ -70,10 +72,10 @@ def per_block(model: network.Qudi, x: dict[str, Tensor], frames: int, rounds: in
     blocks = {
         "pre": lambda: model.pre(*measured),
         "low": lambda: model.low(x["u"], x["u_sim"], d, frames),
-        "high": lambda: model.high(x["x_t"], x["x0_prev"], frames),
+        "high": lambda: model.high(noisy.residual, noisy.earlier, frames),
         "flow": lambda: model.flow(d, clean, variance, frames),
         "fusion": lambda: model.fusion(low, high, g, flows, frames),
-        "unet": lambda: model.unet(x["x_t"], x["x0_prev"], x["guide"], d, fused, x["t"], x["sensor"], frames),
+        "unet": lambda: model.unet(noisy, x["guide"], fused, x["t"], x["sensor"], frames),
     }
     return {name: times(run, rounds) for name, run in blocks.items()}
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from network import Qudi
+from network import Preconditioned, Qudi
 from safetensors import safe_open
 from safetensors.torch import save_file
 from schedule import T as TIMES
@@ -33,9 +33,9 @@ from torch import Tensor, nn
 
 TYPES = {"F32": np.dtype("<f4"), "U16": np.dtype("<u2"), "I8": np.dtype("i1")}
 STEPS = 32.0  # of a byte (crates/qudi-model/src/train/kept.rs)
-LEAST_ERROR, VARIATION = 1e-4, 0.01  # crates/qudi-model/src/objective.rs
-STRIDE = TIMES // 10  # between the first pass and the second
+LEAST_UNIT = 0.004  # crates/qudi-model/src/objective.rs
 WARMUP, CLIP, EMA = 200, 1.0, 0.999  # configs/small.toml
+NOISE, SPREAD = 0.08, 0.6  # crates/qudi-model/src/objective.rs
 HELD = 13  # one burst of so many is not learnt from
 SQUARE = 160  # side of what is seen of those
 
@@ -104,6 +104,16 @@ class Sensor:
             electrons = np.minimum(rng.poisson(rate), self.full_well) + rng.normal(0, self.read_noise, rate.shape)
             counts = np.clip(np.rint(self.gain * electrons), 0, self.full_scale).astype(np.int64)
         return (counts / self.full_scale).astype(np.float32), self.linear[counts]
+
+
+def earlier_time(t: int) -> int:
+    """The time before `t` in ten steps of quadratic spacing."""
+    return min(round(TIMES * (math.sqrt((t + 1) / TIMES) + 0.1) ** 2) - 1, TIMES - 1)
+
+
+def time_of(noise: float) -> int:
+    """The time of noise of this deviation."""
+    return int(np.abs(1 - alpha_bar() - noise**2).argmin())
 
 
 @dataclass
@@ -177,6 +187,11 @@ class Batch:
         return cls(bursts, joined("guide"), joined("truth"), joined("u"), noise, sensor, times, rng)
 
 
+def unknown(batch: Batch, x0: Tensor, unit: Tensor) -> Tensor:
+    """Mean squared error in what one unit of the U-Net's output changes."""
+    return ((x0 - (2 * batch.truth - 1)) / unit.clamp(min=LEAST_UNIT)).square().mean()
+
+
 class Trainer:
     def __init__(self, weights: str) -> None:
         with safe_open(weights, "pt") as file:
@@ -202,38 +217,44 @@ class Trainer:
         bars = self.bars[times].repeat_interleave(frames)[:, None, None, None]
         return (2 * batch.truth - 1) * bars.sqrt() + batch.noise * (1 - bars).sqrt()
 
+    def denoised(self, batch: Batch) -> tuple[Tensor, ...]:
+        """Pre-denoised frames, their features, and the deviation of their errors."""
+        nothing = torch.zeros_like(batch.truth)
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            d, g = self.network.pre(batch.guide, nothing, nothing, torch.zeros(len(batch.times)))
+            return d, g, self.network.errors(g, batch.guide)
+
     def predicted(
-        self, batch: Batch, times: np.ndarray, x0_prev: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
-    ) -> Tensor:
+        self, batch: Batch, seen: tuple[Tensor, ...], times: np.ndarray, x0_prev: Tensor, u_sim: Tensor, flag: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The prediction, and what one unit of the U-Net's output changes in it."""
         frames = len(batch.truth) // len(times)
-        x_t, t = self.noisy(batch, times), torch.from_numpy(times)
+        x_t, t, (d, g, error) = self.noisy(batch, times), torch.from_numpy(times), seen
+        noisy = Preconditioned(2 * d - 1, x_t, x0_prev, flag, 2 * error, t, frames)
         with torch.autocast("cpu", torch.bfloat16):
-            x0, *_ = self.network(batch.u, batch.guide, y_sim, u_sim, flag, x_t, x0_prev, t, batch.sensor, frames)
-        return x0.float()
+            x0, _ = self.network.correct(noisy, batch.u, u_sim, batch.guide, d, g, t, batch.sensor, frames)
+        return x0.float(), noisy.unknown
 
     def loss(self, batch: Batch, first_pass: bool) -> Tensor:
         times, frames = batch.times, len(batch.truth) // len(batch.times)
-        nothing = torch.zeros_like(batch.truth)
-        before, flag = (nothing, nothing, nothing), torch.zeros(len(times))
+        nothing, seen = torch.zeros_like(batch.truth), self.denoised(batch)
+        before, flag = (nothing, nothing), torch.zeros(len(times))
         if first_pass and (times < TIMES - 1).any():
-            earlier = np.minimum(times + STRIDE, TIMES - 1)
+            earlier = np.array([earlier_time(t) for t in times])
             with torch.no_grad():
-                x0 = self.predicted(batch, earlier, *before, flag).clamp(-1, 1).numpy()
-            y_sim, u_sim = np.zeros_like(x0), np.zeros_like(x0)
+                x0 = self.predicted(batch, seen, earlier, *before, flag)[0].clamp(-1, 1).numpy()
+            u_sim = np.zeros_like(x0)
             for number, (burst, t) in enumerate(zip(batch.bursts, times)):
                 part = slice(number * frames, (number + 1) * frames)
                 if t == TIMES - 1:
                     x0[part] = 0
                     continue
                 sensor = Sensor(burst.label, 10 ** (1 - t / TIMES))
-                y_sim[part], u_sim[part] = sensor.measure((x0[part] + 1) / 2, batch.rng)
-            before = tuple(map(torch.from_numpy, (x0, y_sim, u_sim)))
+                u_sim[part] = sensor.measure((x0[part] + 1) / 2, batch.rng)[1]
+            before = tuple(map(torch.from_numpy, (x0, u_sim)))
             flag = torch.from_numpy((times < TIMES - 1).astype(np.float32))
-        square = (batch.guide[:, :1] - batch.truth).square().unflatten(0, (-1, frames)).mean((1, 2, 3, 4))
-        scale = square.clamp(min=LEAST_ERROR).sqrt().repeat_interleave(frames)[:, None, None, None]
-        error = ((self.predicted(batch, times, *before, flag) + 1) / 2 - batch.truth) / scale
-        variation = sum(error.diff(dim=axis).abs().mean() for axis in (2, 3))
-        return error.square().mean() + VARIATION * variation
+        x0, unit = self.predicted(batch, seen, times, *before, flag)
+        return unknown(batch, x0, unit)
 
     def swap(self) -> None:
         """Exchanges weights and mean weights."""
@@ -250,18 +271,19 @@ class Trainer:
                 self.mean[name].lerp_(value, 1 - keep)
 
     @torch.no_grad()
-    def gain(self, bursts: list[Burst], time: int) -> float:
-        """Mean gain of the prediction at `time` over the pre-denoised frames, in dB, without any earlier estimate."""
-        gains = []
+    def judged(self, bursts: list[Burst], time: int) -> str:
+        """Mean gain of the prediction at `time` over the pre-denoised frames, without any earlier estimate, and the loss."""
+        judged = []
         for burst in bursts:
             rng = np.random.default_rng(1)
             batch = Batch.of([burst], [burst.square(16, 16, SQUARE)], np.array([time]), rng)
             nothing = torch.zeros_like(batch.truth)
-            x0 = self.predicted(batch, batch.times, nothing, nothing, nothing, torch.zeros(1))
-            d, _ = self.network.pre(batch.guide, nothing, nothing, torch.zeros(1))
-            errors = [(image.clamp(0, 1) - batch.truth).square().mean().item() for image in (d, (x0 + 1) / 2)]
-            gains.append(10 * math.log10(errors[0] / errors[1]))
-        return float(np.mean(gains))
+            seen = self.denoised(batch)
+            x0, unit = self.predicted(batch, seen, batch.times, nothing, nothing, torch.zeros(1))
+            errors = [(image.clamp(0, 1) - batch.truth).square().mean().item() for image in (seen[0], (x0 + 1) / 2)]
+            judged.append((10 * math.log10(errors[0] / errors[1]), unknown(batch, x0, unit).item()))
+        gain, loss = np.mean(judged, 0)
+        return f"{gain:.3f} dB and {loss:.4f} at {time}"
 
     def write(self, path: Path, steps: int) -> None:
         tensors = {**self.tensors, **{name: value.contiguous() for name, value in self.mean.items()}}
@@ -280,8 +302,8 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1.5e-3)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--side", type=int, default=96)
-    parser.add_argument("--start", type=float, default=0.1, help="share of bursts at the time where sampling begins")
-    parser.add_argument("--first", type=float, default=0.75, help="share of batches with an earlier estimate")
+    parser.add_argument("--start", type=float, default=0.05, help="share of bursts at the time where sampling begins")
+    parser.add_argument("--first", type=float, default=0.5, help="share of batches with an earlier estimate")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     bursts = [Burst(path) for path in sorted(args.bursts.glob("*.safetensors"))]
@@ -294,7 +316,8 @@ def main() -> None:
         rng = np.random.default_rng([args.seed, step])
         drawn = [bursts[rng.integers(len(bursts))] for _ in range(args.batch)]
         parts = [burst.part(args.side, rng) for burst in drawn]
-        late = lambda: int(TIMES * rng.random() ** 2)
+        share = lambda: (chance := rng.random()) / (1 - chance)
+        late = lambda: time_of(min(NOISE * share() ** SPREAD, 1))
         times = np.array([TIMES - 1 if rng.random() < args.start else late() for _ in drawn])
         return Batch.of(drawn, parts, times, rng), rng.random() < args.first
 
@@ -320,7 +343,7 @@ def main() -> None:
                 told = gone
                 trainer.write(args.out, step)
                 trainer.swap()
-                gains = ", ".join(f"{trainer.gain(held, t):.3f} dB at {t}" for t in (TIMES - 1, 50))
+                gains = ", ".join(trainer.judged(held, time) for time in (TIMES - 1, 150, 50, 10))
                 trainer.swap()
                 minutes = (time.monotonic() - start) / 60
                 print(f"{minutes:.0f} min, step {step}, loss {np.mean(losses):.4f}, gain {gains}", flush=True)

@@ -1,5 +1,6 @@
-//! What training minimises (DESIGN 4.8): squared error and differences of gradients, of the prediction and of
-//! the pre-denoised frames, relative to the error of the guide.
+//! What training minimises: squared error and differences of gradients of the pre-denoised frames, relative to the error of the
+//! guide (DESIGN 4.8), and the squared error of the prediction in units of what is unknown of every pixel (Karras et al. 2022,
+//! table 1, "EDM": their weight `1 / c_out^2`).
 
 use crate::measurement::Planes;
 use crate::network::{Measured, Qudi, Simulated, State};
@@ -18,6 +19,13 @@ const VARIATION: f32 = 0.01;
 
 /// Least squared error that a guide counts with: better ones leave nothing to learn.
 const LEAST_ERROR: f32 = 1e-4;
+
+/// Least deviation that a pixel's error is counted in, in [-1, 1]: half a step of 8 bits.
+const LEAST_UNIT: f32 = 0.004;
+
+/// Median deviation of the noise of diffusion to train at, in [-1, 1], and how far it spreads: what pre-denoisers leave wrong.
+const NOISE: f64 = 0.08;
+const SPREAD: f64 = 0.6;
 
 /// [`reconstruction`] of an example's images, with errors in the root of the guide's mean squared error over the burst: else
 /// a few dark bursts, whose errors are thirty times those of bright ones, would be all that matters.
@@ -81,9 +89,6 @@ pub fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
     error.powi_scalar(2).mean() + variation * VARIATION
 }
 
-/// Time steps between the reverse steps of sampling, which training imitates.
-const STRIDE: usize = TIMES / 10;
-
 /// Bursts to learn from.
 #[derive(Clone, Debug)]
 pub struct Example<'a> {
@@ -114,7 +119,7 @@ pub enum FirstPass {
 pub struct Terms {
     /// The weighted sum.
     pub total: Tensor<1>,
-    /// Of the prediction; about 1 where it is no better than the guide.
+    /// Of the prediction; about 1 where it knows no more than the deviations told of every pixel's error.
     pub prediction: Tensor<1>,
     /// Of the pre-denoised frames.
     pub pre: Tensor<1>,
@@ -127,10 +132,20 @@ pub struct Terms {
 }
 
 /// A diffusion time to train at, from two uniform numbers in [0, 1): the share `start` of all where sampling begins, the
-/// others the more the less noise there is. Above 300, noise hides all that the pre-denoiser leaves wrong, and what is to be
-/// learnt is the same as at the start.
+/// others where noise is about as large as what pre-denoisers leave wrong, by a log-logistic law. In much more noise all of
+/// that is hidden, in much less nothing is.
 pub fn training_time(kind: f64, place: f64, start: f64) -> usize {
-    if kind < start { TIMES - 1 } else { (TIMES as f64 * place * place) as usize }
+    if kind < start {
+        return TIMES - 1;
+    }
+    NoiseSchedule::cosine(TIMES).time_of(NOISE * (place / (1.0 - place)).powf(SPREAD))
+}
+
+/// The time before `time` in ten steps of quadratic spacing, which training imitates.
+fn earlier(time: usize) -> usize {
+    let times = TIMES as f64;
+    let share = ((time + 1) as f64 / times).sqrt() + 0.1;
+    ((times * share * share).round() as usize - 1).min(TIMES - 1)
 }
 
 /// The loss of `network`, which is on an autodiff device, on an example on the same device.
@@ -163,26 +178,25 @@ pub fn terms(
         let noise = level(|a| (1.0 - a).sqrt()).expand([images, 1, height, width]);
         clean.clone() * signal + example.noise.clone() * noise
     };
-    let (x0_prev, simulated) = match first_pass {
+    let (x0_prev, known, simulated) = match first_pass {
         // Where sampling begins, nothing comes before.
         FirstPass::Yes(seed) if example.times.iter().any(|&t| t < TIMES - 1) => {
-            let earlier: Vec<usize> =
-                example.times.iter().map(|t| (t + STRIDE).min(TIMES - 1)).collect();
+            let earlier: Vec<usize> = example.times.iter().map(|&t| earlier(t)).collect();
             let x_t = noisy(&earlier);
             let (x0_prev, simulated) = estimate(network, example, x_t, earlier, seed)?;
-            let x0_prev = if switches.self_conditioning { x0_prev } else { clean.zeros_like() };
-            (x0_prev, simulated.filter(|_| switches.physics))
+            let known = simulated.exists.iter().map(|&exists| exists && switches.self_conditioning);
+            (x0_prev, known.collect(), Some(simulated).filter(|_| switches.physics))
         }
-        _ => (clean.zeros_like(), None),
+        _ => (clean.zeros_like(), vec![false; example.times.len()], None),
     };
-    let state = State { x_t: noisy(example.times), x0_prev, times: example.times.to_vec() };
+    let state = State { x_t: noisy(example.times), x0_prev, known, times: example.times.to_vec() };
     let prepared = network.prepare(example.measured);
     let result = network.forward(&prepared, simulated.as_ref(), &state, None);
+    let unknown = (result.x0.clone() - clean.clone()) / result.unit.clamp_min(LEAST_UNIT);
+    let prediction = unknown.powi_scalar(2).mean();
     let image = (result.x0 + 1.0) * 0.5;
-    let judge = relative_reconstruction(example);
-    let prediction = judge(image.clone());
     let perceptual = perceptual.map(|term| term.loss(image, example.truth.clone()));
-    let pre = judge(result.d);
+    let pre = relative_reconstruction(example)(result.d);
     let mut total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     if let Some(term) = &perceptual {
         total = total + term.clone() * weights.perceptual;
@@ -246,7 +260,7 @@ fn estimate(
     x_t: Tensor<4>,
     earlier: Vec<usize>,
     seed: u64,
-) -> Result<(Tensor<4>, Option<Simulated>)> {
+) -> Result<(Tensor<4>, Simulated)> {
     let device = example.truth.device();
     let measured = Measured {
         u: example.measured.u.clone().inner(),
@@ -256,7 +270,8 @@ fn estimate(
     };
     let network = network.valid();
     let x_t = x_t.inner();
-    let state = State { x0_prev: x_t.zeros_like(), x_t, times: earlier };
+    let known = vec![false; earlier.len()];
+    let state = State { x0_prev: x_t.zeros_like(), x_t, known, times: earlier };
     let prediction = network.forward(&network.prepare(&measured), None, &state, None);
     let [_, _, height, width] = example.truth.dims();
     let size = Size { height, width };
@@ -287,5 +302,5 @@ fn estimate(
     }
     let tensor = |values| to_tensor(values, size, &device);
     let simulated = Simulated { y: tensor(planes.y), u: tensor(planes.u), exists };
-    Ok((tensor(x0), Some(simulated)))
+    Ok((tensor(x0), simulated))
 }

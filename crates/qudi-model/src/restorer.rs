@@ -150,7 +150,6 @@ impl QudiRestorer {
         let pixels = size.pixels();
         let mut x: Vec<f32> = frames().flat_map(|frame| noise.frame(frame, 0, pixels)).collect();
         let mut x0 = vec![0.0; x.len()];
-        let nothing = x0.clone();
         let mut flows: Vec<Option<Flows>> = vec![None; tiles.count()];
         let SampleOptions { sampler, steps, spacing, .. } = self.options;
         for step in sampler.steps(&self.schedule, steps, spacing) {
@@ -165,11 +164,10 @@ impl QudiRestorer {
             if self.config.flow.steps.contains(&step.number) {
                 flows.fill(None);
             }
-            let given = if self.config.lacks(Part::SelfConditioning) { &nothing } else { &x0 };
             let mut next = vec![0.0; x.len()];
             for (number, flows) in flows.iter_mut().enumerate() {
-                let tile =
-                    self.predict(job, number, simulated.as_ref(), &x, given, &step, flows)?;
+                let images = [&x, &x0].map(Vec::as_slice);
+                let tile = self.predict(job, number, simulated.as_ref(), images, &step, flows)?;
                 tiles.blend(number, &tile, &mut next);
             }
             x0 = next;
@@ -199,15 +197,13 @@ impl QudiRestorer {
         Ok(Restored { frames, std: (!errors.is_empty()).then_some(errors) })
     }
 
-    /// The network's clean image of one tile, in [-1, 1].
-    #[allow(clippy::too_many_arguments)]
+    /// The network's clean image of one tile, in [-1, 1], from the noisy images and the estimate before.
     fn predict(
         &self,
         job: &Job<'_>,
         number: usize,
         simulated: Option<&Planes>,
-        x: &[f32],
-        x0: &[f32],
+        [x, x0]: [&[f32]; 2],
         step: &Step,
         flows: &mut Option<Flows>,
     ) -> Result<Vec<f32>> {
@@ -224,7 +220,13 @@ impl QudiRestorer {
             u: tensor(&planes.u),
             exists: vec![true],
         });
-        let state = State { x_t: tensor(x), x0_prev: tensor(x0), times: vec![step.time] };
+        let known = step.number > 1 && !self.config.lacks(Part::SelfConditioning);
+        let state = State {
+            x_t: tensor(x),
+            x0_prev: tensor(x0),
+            known: vec![known],
+            times: vec![step.time],
+        };
         let prediction = self.network.forward(prepared, simulated.as_ref(), &state, flows.take());
         *flows = Some(prediction.flows);
         Ok(possible(read(prediction.x0)?))

@@ -59,6 +59,12 @@ impl NoiseSchedule {
         t.map_or(1.0, |t| self.alpha_bar[t])
     }
 
+    /// The first time whose noise has at least this deviation, or the last.
+    pub fn time_of(&self, noise: f64) -> usize {
+        let time = self.alpha_bar.partition_point(|bar| 1.0 - bar < noise * noise);
+        time.min(self.len() - 1)
+    }
+
     /// The times that a sampler with `steps` steps visits, last first, and `None` (clean) at the
     /// end: `T s - 1` or `T s^2 - 1` for `s` from 1 to 0, rounded half to even, each once. `steps` is taken
     /// into `1..=T`.
@@ -103,6 +109,16 @@ mod tests {
         let levels: Vec<f64> = (0..1000).map(|t| schedule.alpha_bar(Some(t))).collect();
         assert!(levels.windows(2).all(|pair| pair[1] < pair[0]));
         assert!(levels[0] > 0.999 && levels[999] < 1e-4);
+    }
+
+    #[test]
+    fn times_are_found_by_their_noise() {
+        let schedule = NoiseSchedule::cosine(1000);
+        for time in [0, 50, 500, 999] {
+            let noise = (1.0 - schedule.alpha_bar(Some(time))).sqrt();
+            assert!(schedule.time_of(noise).abs_diff(time) <= 1);
+        }
+        assert_eq!([0.0, 2.0].map(|noise| schedule.time_of(noise)), [0, 999]);
     }
 
     #[test]

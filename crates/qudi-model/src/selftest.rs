@@ -182,7 +182,7 @@ fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let simulated = Simulated { y: image(24), u: image(25), exists: vec![true] };
     let x_t = values(26, [4, 1, 32, 48], &device).require_grad();
     let x0_prev = values(27, [4, 1, 32, 48], &device);
-    let state = State { x_t: x_t.clone(), x0_prev, times: vec![500] };
+    let state = State { x_t: x_t.clone(), x0_prev, known: vec![true], times: vec![500] };
     let prepared = network.prepare(&measured);
     let prediction = network.forward(&prepared, Some(&simulated), &state, None);
     let loss = reconstruction((prediction.x0.clone() + 1.0) * 0.5, image(28));

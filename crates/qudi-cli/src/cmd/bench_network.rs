@@ -150,7 +150,8 @@ fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) ->
     let guide = image().repeat_dim(1, GuidePlanes::count(config.pre.neighbours));
     let measured = Measured { u: image(), guide, sensor, frames };
     let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
-    (measured, simulated, State { x_t: image(), x0_prev: image(), times: vec![500] })
+    let state = State { x_t: image(), x0_prev: image(), known: vec![true], times: vec![500] };
+    (measured, simulated, state)
 }
 
 /// Seconds of the preparation and of every block of one step.

@@ -77,9 +77,9 @@ impl LowFeatures {
 }
 
 impl HighFeatures {
-    /// `x_t`, `x0_prev`: `[images, 1, H, W]`.
-    pub fn forward(&self, x_t: Tensor<4>, x0_prev: Tensor<4>, frames: usize) -> Pyramid {
-        let planes = fold(Tensor::cat(vec![x_t, x0_prev], 1), self.fold);
+    /// `residual`, `earlier`: the noisy image and the estimate before it around the pre-denoised one, `[images, 1, H, W]`.
+    pub fn forward(&self, residual: Tensor<4>, earlier: Tensor<4>, frames: usize) -> Pyramid {
+        let planes = fold(Tensor::cat(vec![residual, earlier], 1), self.fold);
         let full = self.first.relu(planes, frames);
         let half = self.half.halve_relu(full.clone(), frames);
         let quarter = self.quarter.halve_relu(half.clone(), frames);

@@ -5,6 +5,7 @@ use super::attention::Attention;
 use super::evidence::Evidence;
 use super::flow::Flows;
 use super::pre::DenseBlock;
+use super::precondition::Preconditioned;
 use super::unet::ResidualBlock;
 use super::{Measured, Pyramid, SENSOR_NUMBERS, Simulated, State, fill, resample};
 use crate::cases::{self, Case, File, parameter};
@@ -214,9 +215,11 @@ fn features() {
         check(&case, &named(&levels), &inputs, &low, "low");
         let case = file.case("high");
         let high = weighted(sizes.features.init_high(sizes.fold, &device), "high");
-        let [x_t, x0_prev] = ["x_t", "x0_prev"].map(|name| input(&case, name));
-        let levels = pyramid("high", high.forward(x_t.clone(), x0_prev.clone(), frames));
-        check(&case, &named(&levels), &[("x_t", &x_t), ("x0_prev", &x0_prev)], &high, "high");
+        let names = ["residual", "earlier"];
+        let [residual, earlier] = names.map(|name| input(&case, name));
+        let levels = pyramid("high", high.forward(residual.clone(), earlier.clone(), frames));
+        let inputs = [(names[0], &residual), (names[1], &earlier)];
+        check(&case, &named(&levels), &inputs, &high, "high");
     }
 }
 
@@ -281,11 +284,14 @@ fn u_net() {
             let fused = ["fused_0", "fused_1", "fused_2"].map(input);
             let times: Vec<usize> = case.values("t").iter().map(|&t| t as usize).collect();
             let sensor: Tensor<2> = case.input("sensor", &device);
-            let (base, images) = (d.clone() * 2.0 - 1.0, [x_t.clone(), x0_prev.clone()]);
             let (evidence, frames) = (Evidence::new(&guide), case.number("frames"));
+            let known = case.values("flag").iter().map(|&flag| flag > 0.0).collect();
+            let (x, x0) = (x_t.clone(), x0_prev.clone());
+            let state = State { x_t: x, x0_prev: x0, known, times: times.clone() };
+            let error = evidence.deviation.clone() * 0.6;
+            let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, error, &state);
             let sensor = unet.prepare(sensor);
-            let base = [base, evidence.deviation.clone() * 0.6];
-            let x0 = unet.forward(base, images, &evidence, fused.clone(), &times, sensor, frames);
+            let x0 = unet.forward(noisy, &evidence, fused.clone(), &times, sensor, frames);
             let inputs = [
                 ("x_t", &x_t),
                 ("x0_prev", &x0_prev),
@@ -315,10 +321,11 @@ fn whole_network() {
             sensor: case.input("sensor", &device),
             frames: case.number("frames"),
         };
-        let exists = case.values("flag").iter().map(|&flag| flag > 0.0).collect();
+        let exists: Vec<bool> = case.values("flag").iter().map(|&flag| flag > 0.0).collect();
+        let known = exists.clone();
         let simulated = Simulated { y: y_sim.clone(), u: u_sim.clone(), exists };
         let times = case.values("t").iter().map(|&t| t as usize).collect();
-        let state = State { x_t: x_t.clone(), x0_prev: x0_prev.clone(), times };
+        let state = State { x_t: x_t.clone(), x0_prev: x0_prev.clone(), known, times };
         let prepared = network.prepare(&measured);
         let prediction = network.forward(&prepared, Some(&simulated), &state, None);
         case.check_output("x0", prediction.x0.clone().inner());
@@ -408,6 +415,7 @@ fn sampling() {
             let state = State {
                 x_t: to_tensor(x.clone(), size, &device),
                 x0_prev: to_tensor(x0, size, &device),
+                known: vec![k > 1],
                 times: vec![step.time],
             };
             let result = network.forward(&prepared, again.as_ref(), &state, flows.take());

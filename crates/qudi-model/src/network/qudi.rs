@@ -7,6 +7,7 @@ use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
 use super::layers::CORRECTION;
 use super::pre::PreDenoiser;
+use super::precondition::Preconditioned;
 use super::unet::UNet;
 use super::variance::mean_variance;
 use crate::config::{NetworkConfig, Part};
@@ -44,8 +45,10 @@ pub struct Simulated {
 pub struct State {
     /// The noisy image, `[bursts * frames, 1, height, width]`.
     pub x_t: Tensor<4>,
-    /// The previous estimate of the clean image, in [-1, 1]; zero at first.
+    /// The previous estimate of the clean image, in [-1, 1].
     pub x0_prev: Tensor<4>,
+    /// For every burst, whether it has one.
+    pub known: Vec<bool>,
     /// Diffusion time of every burst.
     pub times: Vec<usize>,
 }
@@ -70,6 +73,8 @@ pub struct Prepared {
 pub struct Prediction {
     /// The clean image, about in [-1, 1].
     pub x0: Tensor<4>,
+    /// Deviation of what would be unknown of it if errors of the pre-denoised frames were white.
+    pub unit: Tensor<4>,
     /// The pre-denoised frames, in image units.
     pub d: Tensor<4>,
     /// The flows that were used.
@@ -271,20 +276,19 @@ impl Qudi {
         done("pre");
         let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
         done("low");
-        let high = self.high.forward(state.x_t.clone(), state.x0_prev.clone(), frames);
-        done("high");
-        let flows = flows.unwrap_or_else(|| self.estimate_flow(prepared, d.clone()));
-        done("flow");
         let evidence = &prepared.evidence;
         // A deviation spans twice as much in [-1, 1].
         let error = self.errors(&features, evidence) * 2.0;
+        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, error, state);
+        let high = self.high.forward(noisy.residual.clone(), noisy.earlier.clone(), frames);
+        done("high");
+        let flows = flows.unwrap_or_else(|| self.estimate_flow(prepared, d.clone()));
+        done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
-        let images = [state.x_t.clone(), state.x0_prev.clone()];
-        let base = [d.clone() * 2.0 - 1.0, error];
-        let sensor = prepared.sensor.clone();
-        let x0 = self.unet.forward(base, images, evidence, fused, &state.times, sensor, frames);
+        let (unit, sensor) = (noisy.unknown.clone(), prepared.sensor.clone());
+        let x0 = self.unet.forward(noisy, evidence, fused, &state.times, sensor, frames);
         done("unet");
-        Prediction { x0, d, flows }
+        Prediction { x0, unit, d, flows }
     }
 }

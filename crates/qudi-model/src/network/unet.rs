@@ -178,14 +178,11 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// The prediction, `[images, 1, H, W]` in [-1, 1]: `base`, corrected by the noisy image and what the U-Net sees in it.
-    /// `x_t`, `x0_prev` and `base`, the pre-denoised image, with the deviation of its errors, are in [-1, 1], too; `times` one
-    /// number for each burst; `sensor` as from [`Self::prepare`].
-    #[allow(clippy::too_many_arguments)] // one for every box of docs/network.md that leads here
+    /// The prediction, `[images, 1, H, W]` in [-1, 1]: the pre-denoised image, corrected by the noisy one and what the U-Net sees
+    /// in it; `times` one number for each burst; `sensor` as from [`Self::prepare`].
     pub(super) fn forward(
         &self,
-        [base, error]: [Tensor<4>; 2],
-        [x_t, x0_prev]: [Tensor<4>; 2],
+        noisy: Preconditioned,
         evidence: &Evidence,
         fused: Pyramid,
         times: &[usize],
@@ -193,10 +190,9 @@ impl UNet {
         frames: usize,
     ) -> Tensor<4> {
         let embedding = silu(self.embed(times, sensor));
-        let Evidence { difference, level, .. } = evidence.clone();
-        let noisy = Preconditioned::new(base.clone(), x_t, error, times);
-        let seen = noisy.residual.clone();
-        let planes = vec![base, seen, x0_prev, evidence.signed(), difference, level];
+        let Preconditioned { base, residual, earlier, clarity, .. } = noisy.clone();
+        let (restored, difference) = (evidence.signed(), evidence.difference.clone());
+        let planes = vec![base, residual, earlier, restored, difference, clarity];
         let mut x = self.inp.linear(&[fold(Tensor::cat(planes, 1), self.fold)]);
         let mut skips = Vec::new();
         let mut fused = fused.into_iter();
