@@ -4,13 +4,13 @@
 # ///
 """A plain regression network of the size of `small`, to compare with: eleven frames in, eleven out, in one pass.
 
-    python scripts/reference/plain.py train small.pack.zip plain.pt --minutes 60
+    python scripts/reference/plain.py train small.pack.zip plain.pt --steps 25000
     qudi eval VAL --frames 11 --method average --ppp 3.25,9.75,26 --export-photons photons
     python scripts/reference/plain.py restore plain.pt photons out
     qudi eval VAL --frames 11 --method qudi --ppp 3.25,9.75,26 --external plain=out
 
 A U-Net that sees the frames of a window as channels, with neither guide nor alignment, and learns with an absolute loss on the
-clips and stills of the pack that `qudi train small --cache-only` makes. It is told sensor, light and exposure.
+clips and stills of the pack that `qudi train small --cache-only` makes. It is told sensor, light and exposure. `--ppp 3.25 3.25` teaches it one level alone.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import json
 import math
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,6 @@ from torch import Tensor, nn
 
 FRAMES, SIDE, BATCH = 11, 96, 8
 QE, DARK, READ_NOISE, FULL_WELL, FULL_SCALE = 0.8, 1.6, 0.2, 200, 7  # configs/sensors/qudi-paper.toml
-PPP = (0.5, 30.0)
 
 
 class Plain(nn.Module):
@@ -46,6 +46,10 @@ class Plain(nn.Module):
         self.wider = nn.ModuleList(nn.ConvTranspose2d(b, a, 2, stride=2) for a, b in zip(widths, widths[1:]))
         self.up = nn.ModuleList(block(2 * a, a) for a in widths[:-1])
         self.last = nn.Conv2d(widths[0], FRAMES * fold * fold, 3, padding=1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_in" if isinstance(module, nn.Conv2d) else "fan_out")
+                nn.init.zeros_(module.bias)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
@@ -137,34 +141,42 @@ def estimate(y: Tensor, ppp: float, exposure: float) -> tuple[Tensor, Tensor]:
     return u, torch.tensor([math.log(ppp) / 3, math.log(ppp / exposure) / 3])
 
 
-def train(pack: Pack, minutes: float, rate: float, seed: int) -> nn.Module:
+def batch(pack: Pack, light: tuple[float, float], rng: np.random.Generator) -> tuple[Tensor, ...]:
+    """Linear estimates, what is told besides, and the truth."""
+    bursts = []
+    for _ in range(BATCH):
+        truth, exposure = pack.sample(rng)
+        ppp = light[0] * (light[1] / light[0]) ** rng.random()
+        u, told = estimate(torch.from_numpy(counts(truth, ppp, exposure, rng)), ppp, exposure)
+        bursts.append((u, told, torch.from_numpy(truth)))
+    return tuple(torch.stack(list(part)) for part in zip(*bursts))
+
+
+def train(pack: Pack, steps: int, light: tuple[float, float], rate: float, seed: int) -> nn.Module:
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    network = Plain()
+    network = Plain().to(memory_format=torch.channels_last)
     print(f"{sum(p.numel() for p in network.parameters())} parameters")
     averaged = torch.optim.swa_utils.AveragedModel(network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.999))
     adam = torch.optim.Adam(network.parameters(), lr=rate)
-    start, step, recent = time.monotonic(), 0, []
-    while (done := (time.monotonic() - start) / (60 * minutes)) < 1:
-        bursts = []
-        for _ in range(BATCH):
-            truth, exposure = pack.sample(rng)
-            ppp = PPP[0] * (PPP[1] / PPP[0]) ** rng.random()
-            u, told = estimate(torch.from_numpy(counts(truth, ppp, exposure, rng)), ppp, exposure)
-            bursts.append((u, told, torch.from_numpy(truth)))
-        u, told, truth = (torch.stack(list(part)) for part in zip(*bursts))
+    worker = ThreadPoolExecutor(1)
+    next_batch = worker.submit(batch, pack, light, rng)
+    start, recent = time.monotonic(), []
+    for step in range(1, steps + 1):
+        u, told, truth = next_batch.result()
+        next_batch = worker.submit(batch, pack, light, rng)
         for group in adam.param_groups:
-            group["lr"] = rate * min((step + 1) / 200, 0.5 + 0.5 * math.cos(math.pi * done))
-        loss = (network(u, told) - truth).abs().mean()
+            group["lr"] = rate * min(step / 200, 0.5 + 0.5 * math.cos(math.pi * step / steps))
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = (network(u, told).float() - truth).abs().mean()
         adam.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         adam.step()
         averaged.update_parameters(network)
         recent.append(loss.item())
-        step += 1
         if step % 200 == 0:
-            print(f"step {step}, {60 * minutes * done:.0f} s: {np.mean(recent):.5f}", flush=True)
+            print(f"step {step}, {time.monotonic() - start:.0f} s: {np.mean(recent):.5f}", flush=True)
             recent.clear()
     return averaged.module
 
@@ -191,7 +203,8 @@ def main() -> None:
     one = commands.add_parser("train")
     one.add_argument("pack")
     one.add_argument("weights")
-    one.add_argument("--minutes", type=float, default=60)
+    one.add_argument("--steps", type=int, default=25000)
+    one.add_argument("--ppp", type=float, nargs=2, default=(0.5, 30.0))
     one.add_argument("--rate", type=float, default=1e-3)
     one.add_argument("--seed", type=int, default=1)
     two = commands.add_parser("restore")
@@ -200,7 +213,7 @@ def main() -> None:
     two.add_argument("out", type=Path)
     args = parser.parse_args()
     if args.command == "train":
-        network = train(Pack(args.pack), args.minutes, args.rate, args.seed)
+        network = train(Pack(args.pack), args.steps, args.ppp, args.rate, args.seed)
         torch.save(network.state_dict(), args.weights)
     else:
         network = Plain()

@@ -35,7 +35,7 @@ TYPES = {"F32": np.dtype("<f4"), "U16": np.dtype("<u2"), "I8": np.dtype("i1")}
 STEPS = 32.0  # of a byte (crates/qudi-model/src/train/kept.rs)
 LEAST_UNIT = 0.004  # crates/qudi-model/src/objective.rs
 WARMUP, CLIP, EMA = 200, 1.0, 0.999  # configs/small.toml
-NOISE, SPREAD = 0.08, 0.6  # crates/qudi-model/src/objective.rs
+NOISE, SPREAD = 0.08, 0.6  # crates/qudi-model/src/schedule.rs
 HELD = 13  # one burst of so many is not learnt from
 SQUARE = 160  # side of what is seen of those
 
@@ -107,7 +107,7 @@ class Sensor:
 
 
 def earlier_time(t: int) -> int:
-    """The time before `t` in ten steps of quadratic spacing."""
+    """The time of the estimate before `t`: a tenth of all further, by their roots."""
     return min(round(TIMES * (math.sqrt((t + 1) / TIMES) + 0.1) ** 2) - 1, TIMES - 1)
 
 

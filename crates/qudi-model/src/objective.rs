@@ -23,10 +23,6 @@ const LEAST_ERROR: f32 = 1e-4;
 /// Least deviation that a pixel's error is counted in, in [-1, 1]: half a step of 8 bits.
 const LEAST_UNIT: f32 = 0.004;
 
-/// Median deviation of the noise of diffusion to train at, in [-1, 1], and how far it spreads: what pre-denoisers leave wrong.
-const NOISE: f64 = 0.08;
-const SPREAD: f64 = 0.6;
-
 /// [`reconstruction`] of an example's images, with errors in the root of the guide's mean squared error over the burst: else
 /// a few dark bursts, whose errors are thirty times those of bright ones, would be all that matters.
 fn relative_reconstruction(example: &Example<'_>) -> impl Fn(Tensor<4>) -> Tensor<1> + use<> {
@@ -132,16 +128,15 @@ pub struct Terms {
 }
 
 /// A diffusion time to train at, from two uniform numbers in [0, 1): the share `start` of all where sampling begins, the
-/// others where noise is about as large as what pre-denoisers leave wrong, by a log-logistic law. In much more noise all of
-/// that is hidden, in much less nothing is.
+/// others by [`NoiseSchedule::time_at`].
 pub fn training_time(kind: f64, place: f64, start: f64) -> usize {
     if kind < start {
         return TIMES - 1;
     }
-    NoiseSchedule::cosine(TIMES).time_of(NOISE * (place / (1.0 - place)).powf(SPREAD))
+    NoiseSchedule::cosine(TIMES).time_at(place)
 }
 
-/// The time before `time` in ten steps of quadratic spacing, which training imitates.
+/// The time of the estimate before `time`: a tenth of all further, by their roots.
 fn earlier(time: usize) -> usize {
     let times = TIMES as f64;
     let share = ((time + 1) as f64 / times).sqrt() + 0.1;

@@ -9,14 +9,20 @@ const OFFSET: f64 = 0.008;
 /// Largest noise share of one step.
 const MAX_BETA: f64 = 0.999;
 
-/// How the times of sampling lie (Song et al. 2021, "DDIM", appendix D.2).
+/// Deviation of the noise, in an image from -1 to 1, that hides half of what pre-denoisers usually leave wrong.
+const NOISE: f64 = 0.08;
+
+/// How far times lie from that one: the scale of the logarithm of their noise.
+const SPREAD: f64 = 0.6;
+
+/// How the times of sampling lie.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Spacing {
     /// Evenly, as in the paper: of ten times one is low enough to show what a good start has left wrong.
     Linear,
-    /// The denser the less noise there is.
+    /// As densely as training draws them ([`NoiseSchedule::time_at`]), after the first.
     #[default]
-    Quadratic,
+    Learnt,
 }
 
 /// Noise levels of the diffusion times `0..len`.
@@ -65,19 +71,25 @@ impl NoiseSchedule {
         time.min(self.len() - 1)
     }
 
+    /// The time at a place in (0, 1) of the log-logistic law by which training draws times: most where noise is about as
+    /// large as what pre-denoisers leave wrong. In much more noise all of that is hidden, in much less nothing is.
+    pub fn time_at(&self, place: f64) -> usize {
+        self.time_of(NOISE * (place / (1.0 - place)).powf(SPREAD))
+    }
+
     /// The times that a sampler with `steps` steps visits, last first, and `None` (clean) at the
-    /// end: `T s - 1` or `T s^2 - 1` for `s` from 1 to 0, rounded half to even, each once. `steps` is taken
-    /// into `1..=T`.
+    /// end, each once: the last and quantiles of their law, or `T s - 1` for `s` from 1 to 0, rounded half to even.
+    /// `steps` is taken into `1..=T`.
     pub fn sampling_times(&self, steps: usize, spacing: Spacing) -> Vec<Option<usize>> {
         let steps = steps.clamp(1, self.len());
-        let time = |i: usize| {
-            let share = i as f64 / steps as f64;
-            let share = match spacing {
-                Spacing::Linear => share,
-                Spacing::Quadratic => share * share,
-            };
-            let t = (self.len() as f64 * share - 1.0).round_ties_even();
-            (t >= 0.0).then_some(t as usize)
+        let time = |i: usize| match spacing {
+            _ if i == steps => self.len().checked_sub(1),
+            _ if i == 0 => None,
+            Spacing::Learnt => Some(self.time_at((i as f64 - 0.5) / (steps as f64 - 1.0))),
+            Spacing::Linear => {
+                let t = (self.len() as f64 * i as f64 / steps as f64 - 1.0).round_ties_even();
+                (t >= 0.0).then_some(t as usize)
+            }
         };
         let mut times: Vec<_> = (0..=steps).rev().map(time).collect();
         times.dedup();
@@ -130,23 +142,24 @@ mod tests {
             .chain([None])
             .collect();
         assert_eq!(schedule.sampling_times(10, Spacing::Linear), expected);
-        for spacing in [Spacing::Linear, Spacing::Quadratic] {
+        for spacing in [Spacing::Linear, Spacing::Learnt] {
             assert_eq!(schedule.sampling_times(1, spacing), [Some(999), None]);
         }
         assert_eq!(schedule.sampling_times(5000, Spacing::Linear).len(), 1001);
     }
 
     #[test]
-    fn quadratic_times_are_dense_where_noise_is_little() {
+    fn learnt_times_are_dense_where_noise_is_little() {
         let schedule = NoiseSchedule::cosine(1000);
-        let expected: Vec<_> = [999, 809, 639, 489, 359, 249, 159, 89, 39, 9]
+        let expected: Vec<_> = [999, 282, 128, 83, 59, 44, 31, 22, 13, 4]
             .map(Some)
             .into_iter()
             .chain([None])
             .collect();
-        assert_eq!(schedule.sampling_times(10, Spacing::Quadratic), expected);
+        assert_eq!(schedule.sampling_times(10, Spacing::Learnt), expected);
+        assert_eq!(schedule.sampling_times(2, Spacing::Learnt), [Some(999), Some(44), None]);
         // Of a thousand many would be the same.
-        let all = schedule.sampling_times(1000, Spacing::Quadratic);
+        let all = schedule.sampling_times(1000, Spacing::Learnt);
         assert!(all.windows(2).all(|pair| pair[0] > pair[1]), "{all:?}");
     }
 }

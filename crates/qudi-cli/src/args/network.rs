@@ -17,7 +17,7 @@ pub(crate) struct Network {
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
     /// How the times of these steps lie
-    #[arg(long, value_name = "NAME", default_value = "quadratic")]
+    #[arg(long, value_name = "NAME", default_value = "learnt")]
     pub(crate) spacing: SpacingName,
     /// How noise leaves
     #[arg(long, value_name = "NAME", default_value = "ddim")]
@@ -50,8 +50,8 @@ impl Network {
 pub(crate) enum SpacingName {
     /// Evenly, as in the paper
     Linear,
-    /// The denser the less noise there is: sharper pictures in as many steps
-    Quadratic,
+    /// As densely as training drew them, by how much noise there is: sharper pictures in as many steps
+    Learnt,
 }
 
 /// Samplers.

@@ -44,7 +44,7 @@ pub(crate) fn sample_options(options: &Network) -> SampleOptions {
         steps: options.steps(),
         spacing: match options.spacing {
             SpacingName::Linear => Spacing::Linear,
-            SpacingName::Quadratic => Spacing::Quadratic,
+            SpacingName::Learnt => Spacing::Learnt,
         },
         sampler: match options.sampler {
             SamplerName::Ddim => Sampler::Ddim,
