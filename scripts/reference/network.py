@@ -121,9 +121,14 @@ def mean_variance(sensor: Tensor, frames: int) -> Tensor:
     return variance.repeat_interleave(frames)[:, None, None, None]
 
 
+def laid(config: dict) -> int:
+    """Frames laid upon each, those of two motions counted twice."""
+    return config["pre"]["neighbours"] * config["pre"].get("motions", 1)
+
+
 def guide_planes(config: dict) -> int:
     """Channels of a guide: three images, counts of the frame and of its neighbours, expectations of the neighbours."""
-    return 4 + 2 * config["pre"]["neighbours"]
+    return 4 + 2 * laid(config)
 
 
 def aligned(guide: Tensor) -> Tensor:
@@ -142,28 +147,68 @@ def evidence(guide: Tensor) -> tuple[Tensor, ...]:
     return clean, deviation, difference, contrast, deviation.log() + 3
 
 
+class Trust(nn.Module):
+    """Says pixel by pixel how far each neighbour is to be trusted, and merges the counts so weighed."""
+
+    def __init__(self, config: dict):
+        super().__init__()
+        self.fold, width = config["fold"], config["pre"]["trust"]
+        cells = self.fold**2
+        self.around = conv(5 * cells, width, 3)
+        self.neighbour = conv(2 * cells, width, 3, bias=False)
+        self.inner = conv(width, width, 3)
+        self.out = conv(width, cells, 3)
+
+    def forward(self, frame: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
+        """What is seen of a frame, its folded planes [B*N, 5 f f, h, w], and counts and expectations of its neighbours
+        [B*N, K, H, W]: the merged counts, how many they are, and what the neighbours have in common."""
+        images, neighbours = seen.shape[:2]
+        each = lambda x: x.unflatten(0, (images, neighbours))
+        pairs = F.pixel_unshuffle(torch.stack([seen, expected], 2).flatten(0, 1), self.fold)
+        around = self.around(frame).repeat_interleave(neighbours, 0)
+        told = F.relu(self.inner(F.relu(self.neighbour(pairs) + around)))
+        weight = each(torch.sigmoid(self.out(told)))
+        own, others = frame[:, -self.fold**2 :], each(pairs[:, : self.fold**2])
+        merged = (own + (weight * others).sum(1)) / (1 + weight.square().sum(1)).sqrt()
+        return torch.cat([merged, (1 + weight.sum(1)).log(), each(told).mean(1)], 1)
+
+
 class PreDenoiser(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
         self.fold = config["fold"]
         cells, pre = self.fold**2, config["pre"]
-        width = pre["width"]
+        self.laid, width = laid(config), pre["width"]
         self.static_in = conv((guide_planes(config) + 1) * cells, width, 3)
+        if pre.get("trust"):
+            self.trust = Trust(config)
+            self.trusted_in = conv(2 * cells + pre["trust"], width, 3, bias=False)
         self.simulated_in = conv(2 * cells + 1, width, 3, bias=False)
         self.blocks = nn.ModuleList(DenseBlock(width, pre["growth"]) for _ in range(pre["blocks"]))
         self.gather = conv(pre["blocks"] * width, width, 1)
         self.spread = conv(width, width, 3)
         self.out = conv(width, cells, 3)
 
+    def prepare(self, guide: Tensor) -> Tensor:
+        """What no simulated measurement changes."""
+        clean, _, difference, contrast, level = evidence(guide)
+        planes = [difference, contrast, 2 * clean - 1, level, aligned(guide)]
+        static = F.pixel_unshuffle(torch.cat(planes, 1), self.fold)
+        s = self.static_in(static)
+        if hasattr(self, "trust"):
+            seen, expected = planes[4].split([self.laid + 1, self.laid], 1)
+            s = s + self.trusted_in(self.trust(static[:, : 5 * self.fold**2], seen[:, 1:], expected))
+        return s
+
     def forward(
         self, guide: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
     ) -> tuple[Tensor, Tensor]:
-        clean, deviation, difference, contrast, level = evidence(guide)
-        static = F.pixel_unshuffle(torch.cat([difference, contrast, 2 * clean - 1, level, aligned(guide)], 1), self.fold)
+        clean, deviation, *_ = evidence(guide)
+        s = self.prepare(guide)
         simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
         frames = len(guide) // len(flag)
-        plane = flag.to(guide).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *static.shape[2:])
-        s = self.static_in(static) + self.simulated_in(torch.cat([simulated, plane], 1))
+        plane = flag.to(guide).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *s.shape[2:])
+        s = s + self.simulated_in(torch.cat([simulated, plane], 1))
         x, outputs = s, []
         for block in self.blocks:
             x = block(x)

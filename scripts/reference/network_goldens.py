@@ -333,9 +333,9 @@ COUNTS, LINEAR, CENTRED = (0.5, 0.5), (0.6, 0.6), (0.0, 0.9)
 GUIDE = (0.55, 0.45)
 
 
-def pre_file() -> File:
-    file = File("pre", 128)
-    config = network.load("tiny")
+def pre_file(name: str = "pre", **settings: int) -> File:
+    file = File(name, 128)
+    config = variant(network.load("tiny"), pre=settings)
     module = network.PreDenoiser(config)
     shape = (6, 1, 12, 20)
     measured = {"guide": spread((6, network.guide_planes(config), 12, 20), *GUIDE)}
@@ -557,6 +557,7 @@ FILES: dict[str, Callable[[], File]] = {
     "resample": resample_file,
     "blocks": block_file,
     "pre": pre_file,
+    "pre_trust": lambda: pre_file("pre_trust", motions=2, trust=4),
     "error": error_file,
     "features": feature_file,
     "flow": flow_file,

@@ -13,6 +13,6 @@ mod stabilizer;
 mod transform_denoise;
 
 pub use bm3d::bm3d;
-pub use qbp::{Aligned, Alignment, Finish, Guide, PatchFlow, Qbp, QbpSettings, TwoRounds};
+pub use qbp::{Aligned, Alignment, Along, Finish, Guide, PatchFlow, Qbp, QbpSettings, TwoRounds};
 pub use stabilizer::{Stabilizer, Transform};
 pub use transform_denoise::TransformDenoise;

@@ -24,7 +24,7 @@ use crate::bm3d::Profile;
 use crate::stabilizer::{Stabilizer, Transform};
 use crate::transform_denoise::{denoise, image};
 use align::{align, finest_grid, sample};
-pub use aligned::{Aligned, Alignment};
+pub use aligned::{Aligned, Alignment, Along};
 use blocks::Blocks;
 use camera::Camera;
 use cubic::{cubic_within, squares};
@@ -227,6 +227,13 @@ impl Merger {
 
     /// The blocks around `reference`, and the motion of every patch to every frame.
     fn flow(&self, reference: usize) -> (Blocks, Patchwise) {
+        let (blocks, matched) = self.matched(reference);
+        let flow = self.likeliest(reference, &matched).unwrap_or(matched);
+        (blocks, flow)
+    }
+
+    /// The same as matched frame by frame, whatever other paths are likelier.
+    fn matched(&self, reference: usize) -> (Blocks, Patchwise) {
         let blocks = Blocks::around(reference, self.frames.len(), self.block);
         let own = self.pyramid(&blocks, blocks.reference);
         let variance = self.matching_variance(reference);
@@ -240,10 +247,7 @@ impl Merger {
                 align(&own, &there, (variance / blocks.ranges[k].len() as f32).max(1e-6))
             })
             .collect();
-        let mut flow = blocks.interpolate(&flows, reference);
-        if let Some(even) = &self.even {
-            flow = self.likeliest(even, reference, flow);
-        }
+        let flow = blocks.interpolate(&flows, reference);
         (blocks, flow)
     }
 

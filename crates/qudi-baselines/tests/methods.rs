@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_baselines::{
-    Aligned, Alignment, Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds,
+    Aligned, Alignment, Along, Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds,
 };
 use qudi_sim::metrics::gain_aligned_psnr;
 use qudi_sim::restore::{Average, BurstView, Context, Restorer};
@@ -76,7 +76,8 @@ fn the_second_round_beats_the_first() {
         let first = Qbp::new(Finish::Bm3d).restore(burst, &context).unwrap().frames;
         let guide = Guide::find(burst, &context).unwrap();
         let alignment = Alignment::new(guide, &context);
-        let aligned: Vec<Aligned> = (0..truth.len()).map(|frame| alignment.of(frame, 10)).collect();
+        let aligned: Vec<Aligned> =
+            (0..truth.len()).map(|frame| alignment.of(frame, 10, Along::Likeliest)).collect();
         let merged: Vec<Frame> = aligned.iter().map(|aligned| aligned.merged.clone()).collect();
         let clean: Vec<Frame> = aligned.iter().map(|aligned| aligned.clean.clone()).collect();
         let [first, second, merged] =
@@ -112,7 +113,7 @@ fn neighbours_are_seen_in_deviations() {
     let context = Context { exposure: still.mean(), ..context(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
     let guide = Guide::find(burst, &context).unwrap();
-    let aligned = Alignment::new(guide, &context).of(2, 8);
+    let aligned = Alignment::new(guide, &context).of(2, 8, Along::Likeliest);
     assert_eq!((aligned.seen.len(), aligned.expected.len()), (9, 8));
     let deviation = |frame: &Frame| {
         let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
@@ -129,7 +130,8 @@ fn neighbours_are_seen_in_deviations() {
 
     // The truth in the guide's place shows it as well: what it expects is what the camera counts.
     let guide = Guide::find(burst, &context).unwrap();
-    let aligned = Alignment::new(guide, &context).on(vec![still.clone(); 7]).of(2, 8);
+    let aligned =
+        Alignment::new(guide, &context).on(vec![still.clone(); 7]).of(2, 8, Along::Likeliest);
     assert_eq!(aligned.clean, still);
     let own = deviation(&aligned.seen[0]);
     assert!((0.95..1.05).contains(&own), "{own}");

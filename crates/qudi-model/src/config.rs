@@ -1,5 +1,7 @@
 //! Sizes of the network, read from TOML; the presets.
 
+use crate::measurement::Laid;
+use qudi_baselines::Along;
 use qudi_sim::{Result, SimError};
 use serde::{Deserialize, Serialize};
 
@@ -50,12 +52,26 @@ pub struct PreConfig {
     pub growth: usize,
     /// Frames around each that are laid upon it and seen, the nearest ones.
     pub neighbours: usize,
+    /// Motions along which each is laid upon it: the likeliest, or with 2 that and the one matched for it alone.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub motions: usize,
+    /// Channels of the layers that weigh neighbours pixel by pixel; 0 if neighbours are only added up.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub trust: usize,
     /// Pre-denoisers, one after the other: all but the first see the frames aligned by what the one before restored.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub rounds: usize,
     /// Whether the last of them tells how far its frames may be off.
     #[serde(default, skip_serializing_if = "is_false")]
     pub error: bool,
+}
+
+impl PreConfig {
+    /// The frames that are laid upon each.
+    pub fn laid(&self) -> Laid {
+        let along = if self.motions == 1 { Along::Likeliest } else { Along::Both };
+        Laid { neighbours: self.neighbours, along }
+    }
 }
 
 fn one() -> usize {
@@ -65,6 +81,11 @@ fn one() -> usize {
 #[allow(clippy::trivially_copy_pass_by_ref)]
 fn is_one(rounds: &usize) -> bool {
     *rounds == 1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_zero(number: &usize) -> bool {
+    *number == 0
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref)]
@@ -182,6 +203,8 @@ impl NetworkConfig {
             ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
             ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
             ("pre.neighbours", self.pre.neighbours <= 64, "must be at most 64"),
+            ("pre.motions", (1..=2).contains(&self.pre.motions), "must be 1 or 2"),
+            ("pre.trust", self.pre.trust <= 4096, "must be at most 4096"),
             ("pre.rounds", (1..=4).contains(&self.pre.rounds), "must be from 1 to 4"),
             ("pre.blocks", (1..=64).contains(&self.pre.blocks), "must be from 1 to 64"),
             ("features", widths(&[self.features.low, self.features.high].concat()), SIZES),

@@ -3,7 +3,7 @@
 
 use crate::config::NetworkConfig;
 use crate::layout::Layout;
-use crate::measurement::{BRIGHTEST, GuidePlanes};
+use crate::measurement::{BRIGHTEST, GuidePlanes, Laid};
 use crate::network::{PreDenoiser, Qudi};
 use burn::tensor::{Device, Tensor};
 use qudi_baselines::Alignment;
@@ -41,11 +41,11 @@ impl Draft {
     ///
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the device fails.
-    pub fn restore(&self, alignment: &Alignment<'_>, neighbours: usize) -> Result<Vec<Frame>> {
+    pub fn restore(&self, alignment: &Alignment<'_>, laid: Laid) -> Result<Vec<Frame>> {
         let layout = Layout::new(alignment.size(), self.fold, self.tile);
         let denoise = |guide: &Tensor<4>| vec![self.denoiser.denoise(guide)];
         let Denoised { frames, noises, .. } =
-            denoised(alignment, neighbours, &layout, &self.device, denoise)?;
+            denoised(alignment, laid, &layout, &self.device, denoise)?;
         Ok(settled(alignment, frames, noises, BRIGHTEST as f32))
     }
 }
@@ -63,14 +63,14 @@ pub(crate) struct Denoised {
 /// What `denoise` makes of the frames of a window, one by one: the frame, and the deviation of its errors if it tells it.
 pub(crate) fn denoised(
     alignment: &Alignment<'_>,
-    neighbours: usize,
+    laid: Laid,
     layout: &Layout,
     device: &Device,
     denoise: impl Fn(&Tensor<4>) -> Vec<Tensor<4>>,
 ) -> Result<Denoised> {
     let mut all = Denoised::default();
     for number in 0..alignment.frames() {
-        let aligned = alignment.of(number, neighbours);
+        let aligned = laid.of(alignment, number);
         all.noises.push(aligned.noise.clone());
         let guide = GuidePlanes::of_frame(aligned).map(|plane| layout.padded(plane));
         let mut images = layout.denoised(&guide, device, &denoise)?.into_iter();
@@ -133,7 +133,7 @@ mod tests {
             let guide = Guide::find(burst, &context).unwrap_or_else(|e| panic!("{e}"));
             let alignment = Alignment::new(guide, &context);
             let draft = Draft::all(&network, &config, tile, &device).remove(0);
-            draft.restore(&alignment, config.pre.neighbours).unwrap_or_else(|e| panic!("{e}"))
+            draft.restore(&alignment, config.pre.laid()).unwrap_or_else(|e| panic!("{e}"))
         });
         let pairs = |x: std::ops::Range<usize>| {
             let at = |x: usize| (whole[1].row(4)[x], tiled[1].row(4)[x]);

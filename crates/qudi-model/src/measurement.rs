@@ -4,7 +4,7 @@ use crate::draft::Draft;
 use crate::network::SENSOR_NUMBERS;
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
-use qudi_baselines::{Aligned, Alignment, Guide};
+use qudi_baselines::{Aligned, Alignment, Along, Guide};
 use qudi_sim::restore::{BurstView, Context};
 use qudi_sim::sensor::{CountLaw, Response, Sensor};
 use qudi_sim::{Result, Size};
@@ -45,6 +45,30 @@ impl Planes {
     }
 }
 
+/// Which frames are laid upon each.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Laid {
+    /// So many, the nearest ones.
+    pub neighbours: usize,
+    /// Once, or along two motions each.
+    pub along: Along,
+}
+
+impl Laid {
+    /// How many planes that makes.
+    pub fn frames(self) -> usize {
+        match self.along {
+            Along::Likeliest => self.neighbours,
+            Along::Both => 2 * self.neighbours,
+        }
+    }
+
+    /// What is known of a frame of an aligned window.
+    pub(crate) fn of(self, alignment: &Alignment<'_>, frame: usize) -> Aligned {
+        alignment.of(frame, self.neighbours, self.along)
+    }
+}
+
 /// The frames of a captured burst laid upon each other: by the classical guide, then by what each of `drafts` restores, the
 /// pre-denoisers of a network before its last one.
 ///
@@ -53,12 +77,12 @@ impl Planes {
 pub fn aligned<'a>(
     burst: BurstView<'_>,
     context: &'a Context,
-    neighbours: usize,
+    laid: Laid,
     drafts: &[Draft],
 ) -> Result<Alignment<'a>> {
     let mut alignment = Alignment::new(Guide::find(burst, context)?, context);
     for draft in drafts {
-        let better = draft.restore(&alignment, neighbours)?;
+        let better = draft.restore(&alignment, laid)?;
         alignment = alignment.on(better);
     }
     Ok(alignment)
@@ -75,16 +99,16 @@ pub struct GuidePlanes(pub(crate) Vec<Vec<f32>>);
 pub(crate) const IMAGES: usize = 3;
 
 impl GuidePlanes {
-    /// Planes with so many neighbours.
-    pub fn count(neighbours: usize) -> usize {
-        IMAGES + 2 * neighbours + 1
+    /// Planes with such frames laid upon each.
+    pub fn count(laid: Laid) -> usize {
+        IMAGES + 2 * laid.frames() + 1
     }
 
     /// Those of some frames of an aligned window.
-    pub fn of(alignment: &Alignment<'_>, neighbours: usize, frames: Range<usize>) -> Self {
+    pub fn of(alignment: &Alignment<'_>, laid: Laid, frames: Range<usize>) -> Self {
         let mut planes = Self::default();
         for frame in frames {
-            planes.extend(Self::of_frame(alignment.of(frame, neighbours)));
+            planes.extend(Self::of_frame(laid.of(alignment, frame)));
         }
         planes
     }

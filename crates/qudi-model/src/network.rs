@@ -15,6 +15,7 @@ mod pre;
 mod precondition;
 mod qudi;
 mod resample;
+mod trust;
 mod unet;
 mod variance;
 mod weights;

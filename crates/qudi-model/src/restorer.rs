@@ -129,9 +129,9 @@ impl QudiRestorer {
         let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
         let planes = Planes::of(burst, context);
         let planes = Planes { y: layout.padded(&planes.y), u: layout.padded(&planes.u) };
-        let neighbours = self.config.pre.neighbours;
-        let alignment = aligned(burst, context, neighbours, &self.drafts)?;
-        let guide = GuidePlanes::of(&alignment, neighbours, 0..frames);
+        let laid = self.config.pre.laid();
+        let alignment = aligned(burst, context, laid, &self.drafts)?;
+        let guide = GuidePlanes::of(&alignment, laid, 0..frames);
         let guide = guide.map(|plane| layout.padded(plane));
         let sensor = sensor_numbers(context);
         let prepared = None;
@@ -181,15 +181,15 @@ impl QudiRestorer {
     /// simulated measurement: where the U-Net has not learnt, none was seen in training. Fusion has no part in it: the frames,
     /// each denoised for itself, are steadied afterwards.
     fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
-        let neighbours = self.config.pre.neighbours;
-        let alignment = aligned(burst, context, neighbours, &self.drafts)?;
+        let laid = self.config.pre.laid();
+        let alignment = aligned(burst, context, laid, &self.drafts)?;
         let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
         let denoise = |guide: &Tensor<4>| {
             let (d, error) = self.network.denoise(guide);
             std::iter::once(d).chain(error).collect()
         };
         let Denoised { frames, mut errors, noises } =
-            denoised(&alignment, neighbours, &layout, &self.device, denoise)?;
+            denoised(&alignment, laid, &layout, &self.device, denoise)?;
         for error in errors.iter_mut().flat_map(|frame| &mut frame.data) {
             *error = error.min(MOST_ERROR);
         }
@@ -366,9 +366,9 @@ mod tests {
         let short = restorer.restore(burst, &context).unwrap().frames;
         restorer.generates = true;
         let whole = restorer.restore(burst, &context).unwrap().frames;
-        let neighbours = config.pre.neighbours;
-        let alignment = aligned(burst, &context, neighbours, &[]).unwrap();
-        let noises = (0..counts.len()).map(|frame| alignment.of(frame, neighbours).noise).collect();
+        let laid = config.pre.laid();
+        let alignment = aligned(burst, &context, laid, &[]).unwrap();
+        let noises = (0..counts.len()).map(|frame| laid.of(&alignment, frame).noise).collect();
         let whole = settled(&alignment, whole, noises, 1.0);
         for (short, whole) in short.iter().zip(&whole) {
             for (short, whole) in short.data.iter().zip(&whole.data) {

@@ -170,7 +170,7 @@ fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let config = NetworkConfig::preset("tiny")?;
     let network = config.init(1, &device);
     let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
-    let planes = GuidePlanes::count(config.pre.neighbours);
+    let planes = GuidePlanes::count(config.pre.laid());
     let mut guide = vec![image(29), image(30), image(31) * 0.5 + 0.2];
     guide.extend((guide.len()..planes).map(|plane| image(29 + plane as u32)));
     let measured = Measured {

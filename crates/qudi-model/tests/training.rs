@@ -55,8 +55,8 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let view = BurstView { size, frames: &counts };
     let planes = Planes::of(view, &context);
     let guide = GuidePlanes::of(
-        &aligned(view, &context, tiny().pre.neighbours, &[]).unwrap(),
-        tiny().pre.neighbours,
+        &aligned(view, &context, tiny().pre.laid(), &[]).unwrap(),
+        tiny().pre.laid(),
         0..view.frames.len(),
     );
     let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);

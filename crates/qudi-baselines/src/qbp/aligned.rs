@@ -27,7 +27,24 @@ pub struct Alignment<'a> {
     ordinary: f64,
     clean: Vec<Frame>,
     /// The motion of the patches of each frame to all frames, found when first asked for.
-    flows: Vec<OnceLock<Patchwise>>,
+    flows: Vec<OnceLock<Motion>>,
+}
+
+/// The motion of the patches of a frame to all frames.
+#[derive(Clone, Debug)]
+struct Motion {
+    likeliest: Patchwise,
+    /// Frame by frame, whatever other paths are likelier.
+    matched: Patchwise,
+}
+
+/// Along what neighbours are laid upon a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Along {
+    /// The likeliest paths of their patches.
+    Likeliest,
+    /// These, and once more the paths as matched frame by frame: freer, and fitting the noise of what they were matched on.
+    Both,
 }
 
 /// What is known of a frame. Deviations are those of the noise of one frame's counts where the guide is right.
@@ -39,10 +56,10 @@ pub struct Aligned {
     pub merged: Frame,
     /// Deviation of the merged frame's noise at each pixel, in image units.
     pub noise: Frame,
-    /// Counts of the frame itself, then of its neighbours, nearest first, laid upon it: less what the guide expects of the
-    /// frame, in deviations. Zero past the ends of the window and of the image.
+    /// Counts of the frame itself, then of its neighbours, nearest first, laid upon it, for each way of [`Along`]: less what
+    /// the guide expects of the frame, in deviations. Zero past the ends of the window and of the image.
     pub seen: Vec<Frame>,
-    /// What the guide expects of the neighbours, laid upon the frame: less what it expects of the frame, in deviations.
+    /// What the guide expects of the neighbours, laid upon the frame likewise: less what it expects of the frame, in deviations.
     pub expected: Vec<Frame>,
 }
 
@@ -88,10 +105,11 @@ impl<'a> Alignment<'a> {
         self.clean.len()
     }
 
-    /// What is known of frame `reference`, with so many neighbours.
-    pub fn of(&self, reference: usize, neighbours: usize) -> Aligned {
+    /// What is known of frame `reference`, with so many neighbours laid upon it.
+    pub fn of(&self, reference: usize, neighbours: usize, along: Along) -> Aligned {
         let Self { merger, stabilizer, context, ordinary, clean, .. } = self;
-        let flow = self.flow(reference);
+        let motion = self.motion(reference);
+        let flow = &motion.likeliest;
         let blocks = Blocks::around(reference, merger.frames.len(), merger.block);
         let Merged { counts, noises, .. } = merger.merge_along(&blocks, flow);
         let noises = merger.blended(|i| [[noises[i]; SIDE]; SIDE]);
@@ -110,18 +128,24 @@ impl<'a> Alignment<'a> {
             let values = values.map(|((value, here), deviation)| (value - here) / deviation);
             Frame { size: here.size, data: values.collect() }
         };
-        let laid = |frames: &[Frame], places: &[usize], count: usize| {
-            let places = places.par_iter();
-            let laid = places.map(|&k| less(merger.laid(&frames[k], &flow[k], k, reference)));
+        let laid = |frames: &[Frame], flow: &Patchwise| {
+            let places = nearest[1..].par_iter();
+            let laid = places.map(|&k| less(merger.laid(&frames[k], &flow[k], reference)));
             let mut laid: Vec<Frame> = laid.collect();
-            laid.resize(count, Frame::filled(here.size, 0.0));
+            laid.resize(neighbours, Frame::filled(here.size, 0.0));
             laid
         };
+        let ways = match along {
+            Along::Likeliest => vec![flow],
+            Along::Both => vec![flow, &motion.matched],
+        };
+        let own = less(merger.cropped(&merger.frames[reference]));
+        let seen = ways.iter().flat_map(|flow| laid(&merger.frames, flow));
         Aligned {
             clean: clean[reference].clone(),
             noise: self.noise(&here, &noises),
-            seen: laid(&merger.frames, &nearest, neighbours + 1),
-            expected: laid(guide, &nearest[1..], neighbours),
+            seen: std::iter::once(own).chain(seen).collect(),
+            expected: ways.iter().flat_map(|flow| laid(guide, flow)).collect(),
             merged,
         }
     }
@@ -130,12 +154,17 @@ impl<'a> Alignment<'a> {
     /// denoised for itself and errs in its own way. `errors` are the variances of the errors that they do not share, pixel by
     /// pixel, about. One of each for every frame.
     pub fn steadied(&self, frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
-        let flows: Vec<&Patchwise> = (0..frames.len()).map(|frame| self.flow(frame)).collect();
+        let flows: Vec<&Patchwise> =
+            (0..frames.len()).map(|frame| &self.motion(frame).likeliest).collect();
         steadied(frames, errors, &flows)
     }
 
-    fn flow(&self, reference: usize) -> &Patchwise {
-        self.flows[reference].get_or_init(|| self.merger.flow(reference).1)
+    fn motion(&self, reference: usize) -> &Motion {
+        self.flows[reference].get_or_init(|| {
+            let (_, matched) = self.merger.matched(reference);
+            let likeliest = self.merger.likeliest(reference, &matched);
+            Motion { likeliest: likeliest.unwrap_or_else(|| matched.clone()), matched }
+        })
     }
 
     /// Deviations in image units of merged counts whose mean is `means`: half of what separates the images one deviation
@@ -156,11 +185,8 @@ impl<'a> Alignment<'a> {
 }
 
 impl Merger {
-    /// `frame`, number `k`, laid upon the reference along the motion of every patch; the guide's where it does not reach.
-    fn laid(&self, frame: &Frame, flow: &[[f32; 2]], k: usize, reference: usize) -> Frame {
-        if k == reference {
-            return self.cropped(frame);
-        }
+    /// `frame` laid upon the reference along the motion of every patch; the guide's where it does not reach.
+    fn laid(&self, frame: &Frame, flow: &[[f32; 2]], reference: usize) -> Frame {
         self.blended(|i| self.sample(frame, i, flow[i], reference))
     }
 

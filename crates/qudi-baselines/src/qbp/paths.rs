@@ -87,8 +87,9 @@ fn carried(grid: &Grid, velocities: &[[f32; 2]], i: usize, time: f32) -> [f32; 2
 
 impl Merger {
     /// For every patch the likeliest of the paths in `flow`, of even motion and of the camera's; once there are pilots, of both
-    /// refined on these, and of rest, too.
-    pub(super) fn likeliest(&self, even: &Even, reference: usize, flow: Patchwise) -> Patchwise {
+    /// refined on these, and of rest, too. Nothing where even motion was not looked for.
+    pub(super) fn likeliest(&self, reference: usize, flow: &Patchwise) -> Option<Patchwise> {
+        let even = self.even.as_ref()?;
         let count = self.frames.len();
         let choices = self.choices(even, reference, flow);
         let pilot = self.pilots.as_ref().map(|pilots| smooth(&pilots.frames[reference]));
@@ -110,11 +111,12 @@ impl Merger {
                 judge.likeliest(self.grid.corner(i), reference, &paths)
             })
             .collect();
-        (0..count).map(|k| paths.iter().map(|path| path[k]).collect()).collect()
+        Some((0..count).map(|k| paths.iter().map(|path| path[k]).collect()).collect())
     }
 
     /// Paths to choose among, and what they cost beforehand; what was matched comes first.
-    fn choices(&self, even: &Even, reference: usize, flow: Patchwise) -> Vec<(f32, Patchwise)> {
+    fn choices(&self, even: &Even, reference: usize, flow: &Patchwise) -> Vec<(f32, Patchwise)> {
+        let flow = flow.clone();
         let count = self.frames.len();
         let time = |k: usize| k as f32 - reference as f32;
         let velocities = &even.velocities[reference];
@@ -364,18 +366,11 @@ mod tests {
         errors.iter().sum::<f32>() / errors.len() as f32
     }
 
-    fn matched(merger: &mut Merger) -> Patchwise {
-        let even = merger.even.take();
-        let (_, flow) = merger.flow(5);
-        merger.even = even;
-        flow
-    }
-
     #[test]
     fn faint_texture_follows_what_all_frames_agree_on() {
         let moved = |t: f32| [1.7 * t, -0.9 * t];
-        let (mut merger, _) = merger(3.25, moved);
-        let before = matched(&mut merger);
+        let (merger, _) = merger(3.25, moved);
+        let before = merger.matched(5).1;
         let before = error(&merger, &before, moved);
         let after = error(&merger, &merger.flow(5).1, moved);
         assert!(after < 0.5 * before, "{before} before, {after} px after");
@@ -387,7 +382,7 @@ mod tests {
         let moved = |t: f32| [0.25 * (t - 5.0) * (t - 5.0), 0.0];
         let (mut merger, pilots) = merger(100.0, moved);
         merger.follow(pilots);
-        let before = matched(&mut merger);
+        let before = merger.matched(5).1;
         let before = error(&merger, &before, moved);
         let after = error(&merger, &merger.flow(5).1, moved);
         assert!(before < 0.3 && after < before + 0.05, "{before} before, {after} px after");
@@ -408,7 +403,7 @@ mod tests {
         }
         merger.follow(pilots);
         merger.camera = None;
-        let before = matched(&mut merger);
+        let before = merger.matched(5).1;
         let before = error(&merger, &before, moved);
         let after = error(&merger, &merger.flow(5).1, moved);
         assert!(after < 0.1 * before, "{before} before, {after} px after");

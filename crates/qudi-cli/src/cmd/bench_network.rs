@@ -147,7 +147,7 @@ type Inputs = (Measured, Simulated, State);
 fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) -> Inputs {
     let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
     let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
-    let guide = image().repeat_dim(1, GuidePlanes::count(config.pre.neighbours));
+    let guide = image().repeat_dim(1, GuidePlanes::count(config.pre.laid()));
     let measured = Measured { u: image(), guide, sensor, frames };
     let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
     let state = State { x_t: image(), x0_prev: image(), known: vec![true], times: vec![500] };

@@ -153,7 +153,16 @@ fn small_blocks() {
 
 #[test]
 fn pre_denoiser() {
-    let file = File::open("pre");
+    pre_denoiser_as_in("pre");
+}
+
+#[test]
+fn pre_denoiser_that_weighs_neighbours() {
+    pre_denoiser_as_in("pre_trust");
+}
+
+fn pre_denoiser_as_in(file: &str) {
+    let file = File::open(file);
     for device in devices() {
         for case in file.cases() {
             let config = config(&case);
@@ -391,7 +400,7 @@ fn sampling() {
         };
         let (_, u) = planes(&file.bytes("counts"), &file.f32s("u_table"));
         let sensor = Tensor::<1>::from_floats(sensor.as_slice(), &device).unsqueeze();
-        let channels = GuidePlanes::count(config.pre.neighbours);
+        let channels = GuidePlanes::count(config.pre.laid());
         let shape = [frames, channels, size.height, size.width];
         let guide = TensorData::new(file.f32s("guide"), shape);
         let guide = Tensor::from_data(guide, &device);

@@ -102,6 +102,12 @@ impl Conv2d {
         self.call(inputs, Options { addend: Some(addend), ..Options::default() })
     }
 
+    /// The sum and an addend, cut at zero.
+    pub(super) fn add_relu(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
+        let activation = Activation::Relu;
+        self.call(inputs, Options { addend: Some(addend), activation, ..Options::default() })
+    }
+
     /// The sum, cut at zero.
     pub(super) fn relu(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options { activation: Activation::Relu, ..Options::default() })

@@ -3,6 +3,7 @@
 use super::evidence::Evidence;
 use super::layers::{Bias, CORRECTION, Conv2d};
 use super::resample::{fold, unfold};
+use super::trust::{FRAME, Trust};
 use crate::config::PreConfig;
 use crate::measurement::{GuidePlanes, IMAGES};
 use crate::tensor::read;
@@ -47,6 +48,8 @@ impl DenseBlock {
 #[derive(Module, Debug)]
 pub struct PreDenoiser {
     static_in: Conv2d,
+    trust: Option<Trust>,
+    trusted_in: Option<Conv2d>,
     simulated_in: Conv2d,
     blocks: Vec<DenseBlock>,
     gather: Conv2d,
@@ -59,11 +62,13 @@ impl PreConfig {
     /// The pre-denoiser on folded planes, weights zero.
     pub fn init(&self, fold: usize, device: &Device) -> PreDenoiser {
         let (width, planes) = (self.width, fold * fold);
-        let inputs = PLANES + GuidePlanes::count(self.neighbours) - IMAGES;
+        let inputs = PLANES + GuidePlanes::count(self.laid()) - IMAGES;
         let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
         let block = |_| DenseBlock::zeros(width, self.growth, device);
         PreDenoiser {
             static_in: conv([inputs * planes, width], 3, Bias::Yes),
+            trust: self.init_trust(fold, device),
+            trusted_in: (self.trust > 0).then(|| conv([self.trusted(fold), width], 3, Bias::No)),
             simulated_in: conv([2 * planes + 1, width], 3, Bias::No),
             blocks: (0..self.blocks).map(block).collect(),
             gather: conv([self.blocks * width, width], 1, Bias::Yes),
@@ -84,7 +89,11 @@ impl PreDenoiser {
     pub(super) fn prepare(&self, evidence: &Evidence) -> Tensor<4> {
         let Evidence { difference, contrast, level, aligned, .. } = evidence.clone();
         let planes = Tensor::cat(vec![difference, contrast, evidence.signed(), level, aligned], 1);
-        self.static_in.linear(&[fold(planes, self.fold)])
+        let planes = fold(planes, self.fold);
+        let seen = self.static_in.linear(std::slice::from_ref(&planes));
+        let (Some(trust), Some(trusted_in)) = (&self.trust, &self.trusted_in) else { return seen };
+        let frame = planes.narrow(1, 0, FRAME * self.fold * self.fold);
+        trusted_in.add(&[trust.forward(&frame, evidence)], seen)
     }
 
     /// The pre-denoised frames alone, in image units, before any simulated measurement, from their guide.

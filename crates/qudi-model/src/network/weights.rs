@@ -70,8 +70,14 @@ pub(super) fn initial(seed: u64, name: &str, shape: &[usize]) -> Vec<f32> {
         return vec![if is_norm { 1.0 } else { 0.0 }; count];
     }
     let in_unet = name.starts_with("unet.");
-    let last =
-        ["conv2.weight", "project.weight", "unet.out.weight", "pre.out.weight", "error.out.weight"];
+    let last = [
+        "conv2.weight",
+        "project.weight",
+        "unet.out.weight",
+        "pre.out.weight",
+        "trust.out.weight",
+        "error.out.weight",
+    ];
     let draft = name.starts_with("drafts.") && name.ends_with(".out.weight");
     if last.iter().any(|last| name.ends_with(last)) || name.ends_with("layers.4.weight") || draft {
         return vec![0.0; count];

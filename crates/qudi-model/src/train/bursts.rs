@@ -4,7 +4,7 @@ use super::kept::{KeptBurst, Shelf};
 use super::recipe::{PartsConfig, Recipe};
 use crate::config::Part;
 use crate::draft::Draft;
-use crate::measurement::{GuidePlanes, aligned};
+use crate::measurement::{GuidePlanes, Laid, aligned};
 use qudi_sim::dataset::{Dataset, Sample};
 use qudi_sim::restore::BurstView;
 use qudi_sim::{Result, Size, USUAL_EXPOSURE};
@@ -27,7 +27,7 @@ pub struct Bursts {
     dataset: Dataset,
     seed: u64,
     crop: usize,
-    neighbours: usize,
+    laid: Laid,
     exposure: bool,
     parts: Option<(PartsConfig, Kept)>,
     drafts: Vec<Draft>,
@@ -48,7 +48,7 @@ impl Bursts {
             dataset,
             seed: recipe.train.seed,
             crop: recipe.data.crop,
-            neighbours: recipe.network.pre.neighbours,
+            laid: recipe.network.pre.laid(),
             exposure: !recipe.network.lacks(Part::Exposure),
             parts: recipe.train.parts.map(keep),
             drafts,
@@ -116,8 +116,8 @@ impl Bursts {
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let alignment = aligned(view, &sample.context, self.neighbours, &self.drafts)?;
-        let guide = GuidePlanes::of(&alignment, self.neighbours, range.clone());
+        let alignment = aligned(view, &sample.context, self.laid, &self.drafts)?;
+        let guide = GuidePlanes::of(&alignment, self.laid, range.clone());
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
         Ok(Guided { size, sample, guide })

@@ -5,7 +5,7 @@ use super::recipe::{PartsConfig, Recipe};
 use super::values::values;
 use crate::config::Part;
 use crate::draft::Draft;
-use crate::measurement::{GuidePlanes, IMAGES};
+use crate::measurement::{GuidePlanes, IMAGES, Laid};
 use crate::tensor::read;
 use qudi_sim::dataset::Sample;
 use qudi_sim::output::{Overwrite, PendingFile};
@@ -99,7 +99,7 @@ pub(super) struct Shelf {
     drawn: String,
     /// Frames, height, width.
     shape: [usize; 3],
-    neighbours: usize,
+    laid: Laid,
 }
 
 /// What decides a burst, its number aside.
@@ -110,6 +110,7 @@ struct Drawn<'a> {
     seed: u64,
     kept: usize,
     neighbours: usize,
+    motions: usize,
     exposure: bool,
     /// Hashes of the drafts' weights.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -153,6 +154,7 @@ impl Shelf {
             seed: recipe.train.seed,
             kept: parts.kept,
             neighbours: recipe.network.pre.neighbours,
+            motions: recipe.network.pre.motions,
             exposure: !recipe.network.lacks(Part::Exposure),
             drafts: drafts.iter().map(sha256).collect::<Result<_>>()?,
         };
@@ -161,7 +163,7 @@ impl Shelf {
             seed: recipe.train.seed,
             drawn: serde_json::to_string(&drawn).expect("plain data"),
             shape: [parts.kept.min(recipe.data.frames), recipe.data.crop, recipe.data.crop],
-            neighbours: recipe.network.pre.neighbours,
+            laid: recipe.network.pre.laid(),
         })
     }
 
@@ -173,7 +175,7 @@ impl Shelf {
     fn tensors(&self) -> Vec<(String, Dtype)> {
         let mut list = vec![("truth".to_owned(), Dtype::F32), ("counts".to_owned(), Dtype::U16)];
         list.extend((0..IMAGES).map(|i| (format!("image.{i}"), Dtype::F32)));
-        let deviations = GuidePlanes::count(self.neighbours) - IMAGES;
+        let deviations = GuidePlanes::count(self.laid) - IMAGES;
         list.extend((0..deviations).map(|i| (format!("deviation.{i}"), Dtype::I8)));
         list
     }
