@@ -3,7 +3,7 @@
 use super::evidence::Evidence;
 use super::layers::{Bias, CORRECTION, Conv2d};
 use super::resample::{fold, unfold};
-use super::trust::{FRAME, Trust};
+use super::trust::Trust;
 use crate::config::PreConfig;
 use crate::measurement::{GuidePlanes, IMAGES};
 use crate::tensor::read;
@@ -92,8 +92,7 @@ impl PreDenoiser {
         let planes = fold(planes, self.fold);
         let seen = self.static_in.linear(std::slice::from_ref(&planes));
         let (Some(trust), Some(trusted_in)) = (&self.trust, &self.trusted_in) else { return seen };
-        let frame = planes.narrow(1, 0, FRAME * self.fold * self.fold);
-        trusted_in.add(&[trust.forward(&frame, evidence)], seen)
+        trusted_in.add(&[trust.forward(&planes)], seen)
     }
 
     /// The pre-denoised frames alone, in image units, before any simulated measurement, from their guide.

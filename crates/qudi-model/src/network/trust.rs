@@ -1,16 +1,14 @@
 //! How far each neighbour is to be trusted, pixel by pixel. A layer that sees all neighbours at once can only add them up; which of
 //! them shows the same thing is a question to each of them.
 
-use super::evidence::Evidence;
 use super::layers::{Bias, Conv2d};
-use super::resample::fold;
 use crate::config::PreConfig;
 use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 
 /// Planes of a frame that decide together with a neighbour's two.
-pub(super) const FRAME: usize = 5;
+const FRAME: usize = 5;
 
 /// See the module.
 #[derive(Module, Debug)]
@@ -44,21 +42,20 @@ impl PreConfig {
 
 impl Trust {
     /// The counts of a frame and of its neighbours, weighed and merged, in deviations; the logarithm of how many they are; and
-    /// what the neighbours have in common. `frame`: the folded planes of the frame alone, its counts last, `[images,
-    /// FRAME * fold^2, h, w]`; result `[images, 2 fold^2 + width, h, w]`.
-    pub(super) fn forward(&self, frame: &Tensor<4>, evidence: &Evidence) -> Tensor<4> {
-        let planes = self.fold * self.fold;
-        let own = frame.clone().narrow(1, (FRAME - 1) * planes, planes);
-        let around = self.around.linear(std::slice::from_ref(frame));
-        let neighbours = (evidence.aligned.dims()[1] - 1) / 2;
+    /// what the neighbours have in common. `planes`, folded: those of the frame alone, its counts last, then the counts of `K`
+    /// neighbours and what is expected of them, `[images, (FRAME + 2 K) * fold^2, h, w]`; result `[images, 2 fold^2 + width, h, w]`.
+    pub(super) fn forward(&self, planes: &Tensor<4>) -> Tensor<4> {
+        let cells = self.fold * self.fold;
+        let plane = |at| planes.clone().narrow(1, at * cells, cells);
+        let own = plane(FRAME - 1);
+        let around = self.around.linear(&[planes.clone().narrow(1, 0, FRAME * cells)]);
+        let neighbours = (planes.dims()[1] / cells - FRAME) / 2;
         let mut merged = own.clone();
         let mut frames = own.ones_like();
         let mut noise = own.ones_like();
         let mut common = around.zeros_like();
         for k in 0..neighbours {
-            let plane = |at| evidence.aligned.clone().narrow(1, at, 1);
-            let seen = fold(plane(1 + k), self.fold);
-            let expected = fold(plane(1 + neighbours + k), self.fold);
+            let [seen, expected] = [k, neighbours + k].map(|k| plane(FRAME + k));
             let told = self.neighbour.add_relu(&[seen.clone(), expected], around.clone());
             let told = self.inner.relu(&[told]);
             let weight = sigmoid(self.out.linear(std::slice::from_ref(&told)));
