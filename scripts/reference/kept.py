@@ -141,4 +141,6 @@ def kept(folder: Path) -> tuple[list[Burst], list[Burst]]:
     """The bursts of a folder to learn from, and those held back, which more bursts do not change."""
     paths = sorted(folder.glob("*.safetensors"))
     held = [int(path.stem.rpartition("-")[2]) % HELD == 0 for path in paths]
+    if all(held) or not any(held):
+        raise SystemExit(f"{folder}: {len(paths)} bursts, {sum(held)} to be held back (number a multiple of {HELD}): draw more")
     return [Burst(p) for p, h in zip(paths, held) if not h], [Burst(p) for p, h in zip(paths, held) if h]

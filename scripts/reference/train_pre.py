@@ -14,7 +14,6 @@ to them: what is new starts without any say. Where the recipe has two motions (`
 """
 
 import argparse
-import json
 import math
 import time
 import tomllib
@@ -24,13 +23,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from kept import Burst, Part, kept
+from mean_weights import MeanWeights
 from network import PreDenoiser, laid
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 VARIATION, LEAST_ERROR = 0.01, 1e-4  # crates/qudi-model/src/objective.rs
-WARMUP, CLIP, EMA = 200, 1.0, 0.999  # configs/small.toml
+WARMUP, CLIP = 200, 1.0  # configs/small.toml
 SEEN = 176  # side of what is seen of bursts held back
 
 Tensors = dict[str, Tensor]
@@ -64,11 +62,9 @@ def part_of(tensors: Tensors, prefix: str) -> Tensors:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-class Trainer:
+class Trainer(MeanWeights):
     def __init__(self, weights: str, sizes: Path | None) -> None:
-        with safe_open(weights, "pt") as file:
-            self.about = json.loads(file.metadata()["qudi"])
-            self.tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+        super().__init__(weights)
         before = self.about["network"]
         config = {**before, "pre": tomllib.loads(sizes.read_text())["network"]["pre"]} if sizes else before
         rounds = ["pre.", *(f"drafts.{k}." for k in range(config["pre"].get("rounds", 1) - 1))]
@@ -76,14 +72,15 @@ class Trainer:
             larger = grown(part_of(self.tensors, prefix), before, config)
             self.tensors |= {prefix + name: value for name, value in larger.items()}
         self.about["network"] = config
+        if config != before:
+            self.about["preset"] = None
         # It has seen no simulated measurement.
         self.tensors["pre.simulated_in.weight"].zero_()
         self.network = PreDenoiser(config)
         self.network.load_state_dict(part_of(self.tensors, "pre."))
         self.network.to(memory_format=torch.channels_last)
         self.network.simulated_in.requires_grad_(False)
-        self.learning = {name: value for name, value in self.network.named_parameters() if value.requires_grad}
-        self.mean = {name: value.detach().clone() for name, value in self.learning.items()}
+        self.learn(self.network, "pre")
 
     def denoised(self, guide: Tensor) -> Tensor:
         nothing = torch.zeros_like(guide[:, :1])
@@ -96,20 +93,6 @@ class Trainer:
         error = (self.denoised(guide) - truth) / before.sqrt()
         variation = error.diff(dim=3).abs().mean() + error.diff(dim=2).abs().mean()
         return error.square().mean() + VARIATION * variation
-
-    def swap(self) -> None:
-        """Exchanges weights and mean weights."""
-        with torch.no_grad():
-            for name, value in self.learning.items():
-                now = value.detach().clone()
-                value.copy_(self.mean[name])
-                self.mean[name] = now
-
-    def average(self, step: int) -> None:
-        keep = min(EMA, 1 - 10 / (step + 10))
-        with torch.no_grad():
-            for name, value in self.learning.items():
-                self.mean[name].lerp_(value, 1 - keep)
 
     @torch.no_grad()
     def gain(self, bursts: list[Burst]) -> float:
@@ -124,14 +107,6 @@ class Trainer:
             before, after = ((image.clamp(0, 1) - truth).square().mean((1, 2, 3)) for image in images)
             gains.append(10 * (before / after).log10().mean().item())
         return float(np.mean(gains))
-
-    def write(self, path: Path, steps: int) -> None:
-        own = {f"pre.{name}": value.contiguous() for name, value in self.mean.items()}
-        tensors = {name: value.contiguous() for name, value in (self.tensors | own).items()}
-        partial = path.with_suffix(".part")
-        metadata = {"qudi": json.dumps({**self.about, "steps": steps}, separators=(",", ":"))}
-        save_file(tensors, partial, metadata)
-        partial.rename(path)
 
 
 def main() -> None:

@@ -13,7 +13,6 @@ Bursts must have been drawn with the drafts of W, and with more than one frame k
 """
 
 import argparse
-import json
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -23,15 +22,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from kept import Burst, Part, Sensor, kept
+from mean_weights import MeanWeights
 from network import Preconditioned, Qudi
-from safetensors import safe_open
-from safetensors.torch import save_file
 from schedule import T as TIMES
 from schedule import alpha_bar
 from torch import Tensor, nn
 
 LEAST_UNIT = 0.004  # crates/qudi-model/src/objective.rs
-WARMUP, CLIP, EMA = 200, 1.0, 0.999  # configs/small.toml
+WARMUP, CLIP = 200, 1.0  # configs/small.toml
 NOISE, SPREAD = 0.08, 0.6  # crates/qudi-model/src/schedule.rs
 SQUARE = 160  # side of what is seen of bursts held back
 
@@ -70,11 +68,9 @@ def unknown(batch: Batch, x0: Tensor, unit: Tensor) -> Tensor:
     return ((x0 - (2 * batch.truth - 1)) / unit.clamp(min=LEAST_UNIT)).square().mean()
 
 
-class Trainer:
+class Trainer(MeanWeights):
     def __init__(self, weights: str) -> None:
-        with safe_open(weights, "pt") as file:
-            self.about = json.loads(file.metadata()["qudi"])
-            self.tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+        super().__init__(weights)
         # Pre-denoisers stay as they are, and have seen no simulated measurement.
         self.tensors["pre.simulated_in.weight"].zero_()
         self.network = Qudi(self.about["network"])
@@ -86,8 +82,7 @@ class Trainer:
         for module in self.network.modules():
             if isinstance(module, nn.Conv2d):
                 module.to(memory_format=torch.channels_last)
-        self.learning = {name: value for name, value in self.network.named_parameters() if value.requires_grad}
-        self.mean = {name: value.detach().clone() for name, value in self.learning.items()}
+        self.learn(self.network)
         self.bars = torch.from_numpy(alpha_bar().astype(np.float32))
 
     def noisy(self, batch: Batch, times: np.ndarray) -> Tensor:
@@ -134,20 +129,6 @@ class Trainer:
         x0, unit = self.predicted(batch, seen, times, *before, flag)
         return unknown(batch, x0, unit)
 
-    def swap(self) -> None:
-        """Exchanges weights and mean weights."""
-        with torch.no_grad():
-            for name, value in self.learning.items():
-                kept = value.detach().clone()
-                value.copy_(self.mean[name])
-                self.mean[name] = kept
-
-    def average(self, step: int) -> None:
-        keep = min(EMA, 1 - 10 / (step + 10))
-        with torch.no_grad():
-            for name, value in self.learning.items():
-                self.mean[name].lerp_(value, 1 - keep)
-
     @torch.no_grad()
     def judged(self, bursts: list[Burst], time: int) -> str:
         """Mean gain of the prediction at `time` over the pre-denoised frames, without any earlier estimate, and the loss."""
@@ -162,13 +143,6 @@ class Trainer:
             judged.append((10 * math.log10(errors[0] / errors[1]), unknown(batch, x0, unit).item()))
         gain, loss = np.mean(judged, 0)
         return f"{gain:.3f} dB and {loss:.4f} at {time}"
-
-    def write(self, path: Path, steps: int) -> None:
-        tensors = {**self.tensors, **{name: value.contiguous() for name, value in self.mean.items()}}
-        partial = path.with_suffix(".part")
-        metadata = {"qudi": json.dumps({**self.about, "steps": steps}, separators=(",", ":"))}
-        save_file(tensors, partial, metadata)
-        partial.rename(path)
 
 
 def main() -> None:

@@ -1,0 +1,47 @@
+"""Weights that learn, their running mean, and the file that both come from and the mean goes to."""
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+EMA = 0.999  # configs/small.toml
+
+
+class MeanWeights:
+    """Reads a weight file. What of it learns is told by `learn`; what does not is written as it was."""
+
+    def __init__(self, weights: str) -> None:
+        with safe_open(weights, "pt") as file:
+            self.about = json.loads(file.metadata()["qudi"])
+            self.tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+
+    def learn(self, module: nn.Module, prefix: str = "") -> None:
+        """The parameters of `module` that take gradients, by their names in the file."""
+        named = module.named_parameters(prefix)
+        self.learning: dict[str, Tensor] = {name: value for name, value in named if value.requires_grad}
+        self.mean = {name: value.detach().clone() for name, value in self.learning.items()}
+
+    def swap(self) -> None:
+        """Exchanges weights and mean weights."""
+        with torch.no_grad():
+            for name, value in self.learning.items():
+                kept = value.detach().clone()
+                value.copy_(self.mean[name])
+                self.mean[name] = kept
+
+    def average(self, step: int) -> None:
+        keep = min(EMA, 1 - 10 / (step + 10))
+        with torch.no_grad():
+            for name, value in self.learning.items():
+                self.mean[name].lerp_(value, 1 - keep)
+
+    def write(self, path: Path, steps: int) -> None:
+        tensors = {name: value.contiguous() for name, value in (self.tensors | self.mean).items()}
+        partial = path.with_suffix(".part")
+        metadata = {"qudi": json.dumps({**self.about, "steps": steps}, separators=(",", ":"))}
+        save_file(tensors, partial, metadata)
+        partial.rename(path)
