@@ -19,9 +19,9 @@ class MeanWeights:
             self.about = json.loads(file.metadata()["qudi"])
             self.tensors = {name: file.get_tensor(name).float() for name in file.keys()}
 
-    def learn(self, module: nn.Module, prefix: str = "") -> None:
+    def learn(self, module: nn.Module) -> None:
         """The parameters of `module` that take gradients, by their names in the file."""
-        named = module.named_parameters(prefix)
+        named = module.named_parameters()
         self.learning: dict[str, Tensor] = {name: value for name, value in named if value.requires_grad}
         self.mean = {name: value.detach().clone() for name, value in self.learning.items()}
 

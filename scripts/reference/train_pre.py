@@ -2,14 +2,14 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Trains the last pre-denoiser of a network in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16. All
-other weights stay as they are.
+"""Trains a pre-denoiser of a network in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16. The last one
+learns together with what tells its errors. All other weights stay as they are.
 
     qudi train small --pack small.zip --init W.safetensors -o runs/x --bursts kept    # draws and keeps the bursts
     python scripts/reference/train_pre.py W.safetensors kept pre.safetensors --minutes 60
     qudi publish pre.safetensors -o small.safetensors
 
-Bursts must have been drawn with the drafts of W. With `--sizes RECIPE.toml` pre-denoisers of W that are smaller than that recipe's grow
+Bursts must have been drawn with the drafts of W, or with `network.pre.rounds=1` to train its first draft (`--draft`). With `--sizes RECIPE.toml` pre-denoisers of W that are smaller than that recipe's grow
 to them: what is new starts without any say. Where the recipe has two motions (`network.pre.motions`) the bursts must have them, too.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from kept import Burst, Part, kept
 from mean_weights import MeanWeights
-from network import PreDenoiser, laid
+from network import ErrorHead, PreDenoiser, laid
 from torch import Tensor, nn
 
 VARIATION, LEAST_ERROR = 0.01, 1e-4  # crates/qudi-model/src/objective.rs
@@ -63,7 +63,7 @@ def part_of(tensors: Tensors, prefix: str) -> Tensors:
 
 
 class Trainer(MeanWeights):
-    def __init__(self, weights: str, sizes: Path | None) -> None:
+    def __init__(self, weights: str, sizes: Path | None, draft: bool = False) -> None:
         super().__init__(weights)
         before = self.about["network"]
         config = {**before, "pre": tomllib.loads(sizes.read_text())["network"]["pre"]} if sizes else before
@@ -74,25 +74,35 @@ class Trainer(MeanWeights):
         self.about["network"] = config
         if config != before:
             self.about["preset"] = None
+        prefix = "drafts.0." if draft else "pre."
         # It has seen no simulated measurement.
-        self.tensors["pre.simulated_in.weight"].zero_()
-        self.network = PreDenoiser(config)
-        self.network.load_state_dict(part_of(self.tensors, "pre."))
-        self.network.to(memory_format=torch.channels_last)
+        self.tensors[prefix + "simulated_in.weight"].zero_()
+        self.network, self.error = PreDenoiser(config), None
+        self.network.load_state_dict(part_of(self.tensors, prefix))
         self.network.simulated_in.requires_grad_(False)
-        self.learn(self.network, "pre")
+        learning = nn.ModuleDict({"drafts": nn.ModuleList([self.network])} if draft else {"pre": self.network})
+        if config["pre"].get("error") and not draft:
+            self.error = ErrorHead(config)
+            self.error.load_state_dict(part_of(self.tensors, "error."))
+            learning["error"] = self.error
+        learning.to(memory_format=torch.channels_last)
+        self.learn(learning)
 
-    def denoised(self, guide: Tensor) -> Tensor:
+    def denoised(self, guide: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Frames, and the deviation told of their errors, which changes no frame."""
         nothing = torch.zeros_like(guide[:, :1])
         with torch.autocast("cpu", torch.bfloat16):
-            return self.network(guide, nothing, nothing, torch.zeros(len(guide)))[0].float()
+            d, g = self.network(guide, nothing, nothing, torch.zeros(len(guide)))
+            return d.float(), self.error(g.detach(), guide).float() if self.error else None
 
-    def loss(self, guide: Tensor, truth: Tensor) -> Tensor:
-        """Relative to the guide's error (crates/qudi-model/src/objective.rs)."""
+    def loss(self, guide: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+        """Relative to the guide's error; and the surprise at the errors (crates/qudi-model/src/objective.rs)."""
         before = (guide[:, :1] - truth).square().mean((1, 2, 3), keepdim=True).clamp(min=LEAST_ERROR)
-        error = (self.denoised(guide) - truth) / before.sqrt()
+        d, told = self.denoised(guide)
+        error = (d - truth) / before.sqrt()
         variation = error.diff(dim=3).abs().mean() + error.diff(dim=2).abs().mean()
-        return error.square().mean() + VARIATION * variation
+        surprise = ((d.detach() - truth).square() / (2 * told**2) + told.log()).mean() if self.error else torch.zeros(())
+        return error.square().mean() + VARIATION * variation, surprise
 
     @torch.no_grad()
     def gain(self, bursts: list[Burst]) -> float:
@@ -103,7 +113,7 @@ class Trainer(MeanWeights):
             side = min(SEEN, height, width)
             part = burst.square((height - side) // 2, (width - side) // 2, side, slice(None, None, 5))
             guide, truth = torch.from_numpy(part.guide), torch.from_numpy(part.truth.copy())
-            images = guide[:, :1], self.denoised(guide)
+            images = guide[:, :1], self.denoised(guide)[0]
             before, after = ((image.clamp(0, 1) - truth).square().mean((1, 2, 3)) for image in images)
             gains.append(10 * (before / after).log10().mean().item())
         return float(np.mean(gains))
@@ -114,6 +124,7 @@ def main() -> None:
     parser.add_argument("weights")
     parser.add_argument("bursts", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--draft", action="store_true", help="train the first draft, not the last pre-denoiser")
     parser.add_argument("--sizes", type=Path, help="a recipe whose pre-denoisers are larger")
     parser.add_argument("--validation", type=Path, help="bursts of other clips, kept likewise, to see how far it has come")
     parser.add_argument("--minutes", type=float, default=60)
@@ -124,26 +135,27 @@ def main() -> None:
     args = parser.parse_args()
     bursts, held = kept(args.bursts)
     others = [Burst(path) for path in sorted(args.validation.glob("*.safetensors"))] if args.validation else []
-    trainer = Trainer(args.weights, args.sizes)
-    weights = list(trainer.learning.values())
-    optimizer = torch.optim.Adam(weights, args.rate)
+    trainer = Trainer(args.weights, args.sizes, args.draft)
+    # Each with gradients of its own: neither shortens the other's steps.
+    learning = [list(module.parameters()) for module in (trainer.network, trainer.error) if module]
+    optimizer = torch.optim.Adam(trainer.learning.values(), args.rate)
 
     def draw(step: int) -> tuple[Tensor, Tensor]:
         rng = np.random.default_rng([args.seed, step])
         parts: list[Part] = [bursts[rng.integers(len(bursts))].frame(args.side, rng) for _ in range(args.batch)]
         return tuple(torch.from_numpy(np.concatenate([getattr(p, name) for p in parts])) for name in ("guide", "truth"))
 
-    start, step, losses, told = time.monotonic(), 0, [], -1.0
+    start, step, losses, said = time.monotonic(), 0, [], -1.0
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(draw, 1)
         while (gone := (time.monotonic() - start) / 60 / args.minutes) < 1:
-            if gone - told > 0.07:
-                told = gone
+            if gone - said > 0.07:
+                said = gone
                 trainer.swap()
                 gains = [f"{trainer.gain(list):.3f} dB" for list in (held, others) if list]
                 trainer.swap()
                 trainer.write(args.out, step)
-                loss = f"{np.mean(losses):.4f}" if losses else "none yet"
+                loss = " and ".join(f"{value:.4f}" for value in np.mean(losses, 0)) if losses else "none yet"
                 print(f"{gone * args.minutes:.1f} min, step {step}, loss {loss}, gain {', '.join(gains)}", flush=True)
                 losses.clear()
                 bursts, _ = kept(args.bursts)  # there may be more by now
@@ -152,12 +164,13 @@ def main() -> None:
             following = reader.submit(draw, step + 1)
             for group in optimizer.param_groups:
                 group["lr"] = args.rate * min(1, step / WARMUP) * 0.5 * (1 + math.cos(math.pi * gone))
-            value = trainer.loss(*batch)
+            loss, surprise = trainer.loss(*batch)
             optimizer.zero_grad()
-            value.backward()
-            nn.utils.clip_grad_norm_(weights, CLIP)
-            losses.append(value.item())
-            if not math.isfinite(losses[-1]):
+            (loss + surprise).backward()
+            for parameters in learning:
+                nn.utils.clip_grad_norm_([p for p in parameters if p.grad is not None], CLIP)
+            losses.append((loss.item(), surprise.item()))
+            if not np.isfinite(losses[-1]).all():
                 raise SystemExit(f"step {step}: the loss is no number; {args.out} holds the last good weights")
             optimizer.step()
             trainer.average(step)

@@ -130,12 +130,12 @@ class Trainer(MeanWeights):
         return unknown(batch, x0, unit)
 
     @torch.no_grad()
-    def judged(self, bursts: list[Burst], time: int) -> str:
-        """Mean gain of the prediction at `time` over the pre-denoised frames, without any earlier estimate, and the loss."""
+    def judged(self, bursts: list[Burst], time: int, frames: int) -> str:
+        """Mean gain of the prediction at `time` over the pre-denoised first frames, without any earlier estimate, and the loss."""
         judged = []
         for burst in bursts:
             rng = np.random.default_rng(1)
-            batch = Batch.of([burst], [burst.square(16, 16, SQUARE)], np.array([time]), rng)
+            batch = Batch.of([burst], [burst.square(16, 16, SQUARE, slice(frames))], np.array([time]), rng)
             nothing = torch.zeros_like(batch.truth)
             seen = self.denoised(batch)
             x0, unit = self.predicted(batch, seen, batch.times, nothing, nothing, torch.zeros(1))
@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1.5e-3)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--side", type=int, default=96)
+    parser.add_argument("--frames", type=int, default=6, help="frames seen of each burst, one after the other")
     parser.add_argument("--start", type=float, default=0.05, help="share of bursts at the time where sampling begins")
     parser.add_argument("--first", type=float, default=0.5, help="share of batches with an earlier estimate")
     parser.add_argument("--seed", type=int, default=1)
@@ -166,7 +167,8 @@ def main() -> None:
     def draw(step: int) -> tuple[Batch, bool]:
         rng = np.random.default_rng([args.seed, step])
         drawn = [bursts[rng.integers(len(bursts))] for _ in range(args.batch)]
-        parts = [burst.part(args.side, rng) for burst in drawn]
+        first = [rng.integers(max(len(burst.truth) - args.frames, 0) + 1) for burst in drawn]
+        parts = [burst.part(args.side, rng, slice(k, k + args.frames)) for burst, k in zip(drawn, first)]
         share = lambda: (chance := rng.random()) / (1 - chance)
         late = lambda: time_of(min(NOISE * share() ** SPREAD, 1))
         times = np.array([TIMES - 1 if rng.random() < args.start else late() for _ in drawn])
@@ -194,7 +196,7 @@ def main() -> None:
                 told = gone
                 trainer.write(args.out, step)
                 trainer.swap()
-                gains = ", ".join(trainer.judged(held, time) for time in (TIMES - 1, 150, 50, 10))
+                gains = ", ".join(trainer.judged(held, time, args.frames) for time in (TIMES - 1, 150, 50, 10))
                 trainer.swap()
                 minutes = (time.monotonic() - start) / 60
                 print(f"{minutes:.0f} min, step {step}, loss {np.mean(losses):.4f}, gain {gains}", flush=True)
