@@ -66,14 +66,15 @@ class Trainer(MeanWeights):
     def __init__(self, weights: str, sizes: Path | None, draft: bool = False) -> None:
         super().__init__(weights)
         before = self.about["network"]
-        config = {**before, "pre": tomllib.loads(sizes.read_text())["network"]["pre"]} if sizes else before
+        recipe = tomllib.loads(sizes.read_text())["network"] if sizes else before
+        config = {**before, "pre": recipe["pre"]}
         rounds = ["pre.", *(f"drafts.{k}." for k in range(config["pre"].get("rounds", 1) - 1))]
         for prefix in rounds:
             larger = grown(part_of(self.tensors, prefix), before, config)
             self.tensors |= {prefix + name: value for name, value in larger.items()}
         self.about["network"] = config
-        if config != before:
-            self.about["preset"] = None
+        if sizes:
+            self.about["preset"] = sizes.stem if config == recipe else None
         prefix = "drafts.0." if draft else "pre."
         # It has seen no simulated measurement.
         self.tensors[prefix + "simulated_in.weight"].zero_()

@@ -192,7 +192,7 @@ def main() -> None:
                 raise SystemExit(f"step {step}: the loss is no number; {args.out} holds the last good weights")
             optimizer.step()
             trainer.average(step)
-            if gone - told > 0.1:
+            if gone - told > 0.2:
                 told = gone
                 trainer.write(args.out, step)
                 trainer.swap()
