@@ -126,6 +126,11 @@ def laid(config: dict) -> int:
     return config["pre"]["neighbours"] * config["pre"].get("motions", 1)
 
 
+def of_drafts(config: dict) -> dict:
+    """For the pre-denoisers before the last one: they do not see single pixels' motion."""
+    return {**config, "pre": {**config["pre"], "motions": min(2, config["pre"].get("motions", 1))}}
+
+
 def guide_planes(config: dict) -> int:
     """Channels of a guide: three images, counts of the frame and of its neighbours, expectations of the neighbours."""
     return 4 + 2 * laid(config)

@@ -9,8 +9,8 @@
     python scripts/reference/plain.py restore plain.pt photons out
     qudi eval VAL --frames 11 --method qudi --ppp 3.25,9.75,26 --external plain=out
 
-A U-Net that sees the frames of a window as channels, with neither guide nor alignment, and learns with an absolute loss on the
-clips and stills of the pack that `qudi train small --cache-only` makes. It is told sensor, light and exposure. `--ppp 3.25 3.25` teaches it one level alone.
+A U-Net that sees the frames of a window as channels, with neither guide nor alignment, and learns with an absolute loss, relative to the
+error of the mean frame that it corrects so that every light level counts, on the clips and stills of the pack that `qudi train small --cache-only` makes. It is told sensor, light and exposure. `--ppp 3.25 3.25` teaches it one level alone.
 """
 
 import argparse
@@ -152,7 +152,7 @@ def batch(pack: Pack, light: tuple[float, float], rng: np.random.Generator) -> t
     return tuple(torch.stack(list(part)) for part in zip(*bursts))
 
 
-def train(pack: Pack, steps: int, light: tuple[float, float], rate: float, seed: int) -> nn.Module:
+def train(pack: Pack, steps: int, light: tuple[float, float], rate: float, seed: int, weights: str) -> None:
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     network = Plain().to(memory_format=torch.channels_last)
@@ -167,8 +167,10 @@ def train(pack: Pack, steps: int, light: tuple[float, float], rate: float, seed:
         next_batch = worker.submit(batch, pack, light, rng)
         for group in adam.param_groups:
             group["lr"] = rate * min(step / 200, 0.5 + 0.5 * math.cos(math.pi * step / steps))
+        mean = (u.mean(1, keepdim=True) - truth).abs().mean((1, 2, 3))
         with torch.autocast("cpu", torch.bfloat16):
-            loss = (network(u, told).float() - truth).abs().mean()
+            error = (network(u, told).float() - truth).abs().mean((1, 2, 3))
+        loss = (error / mean).mean()
         adam.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -178,7 +180,8 @@ def train(pack: Pack, steps: int, light: tuple[float, float], rate: float, seed:
         if step % 200 == 0:
             print(f"step {step}, {time.monotonic() - start:.0f} s: {np.mean(recent):.5f}", flush=True)
             recent.clear()
-    return averaged.module
+        if step % 2000 == 0 or step == steps:
+            torch.save(averaged.module.state_dict(), weights)
 
 
 @torch.no_grad()
@@ -205,7 +208,7 @@ def main() -> None:
     one.add_argument("weights")
     one.add_argument("--steps", type=int, default=25000)
     one.add_argument("--ppp", type=float, nargs=2, default=(0.5, 30.0))
-    one.add_argument("--rate", type=float, default=1e-3)
+    one.add_argument("--rate", type=float, default=6e-4)
     one.add_argument("--seed", type=int, default=1)
     two = commands.add_parser("restore")
     two.add_argument("weights")
@@ -213,8 +216,7 @@ def main() -> None:
     two.add_argument("out", type=Path)
     args = parser.parse_args()
     if args.command == "train":
-        network = train(Pack(args.pack), args.steps, args.ppp, args.rate, args.seed)
-        torch.save(network.state_dict(), args.weights)
+        train(Pack(args.pack), args.steps, args.ppp, args.rate, args.seed, args.weights)
     else:
         network = Plain()
         network.load_state_dict(torch.load(args.weights, weights_only=True))

@@ -24,12 +24,13 @@ import numpy as np
 import torch
 from kept import Burst, Part, kept
 from mean_weights import MeanWeights
-from network import ErrorHead, PreDenoiser, laid
+from network import ErrorHead, PreDenoiser, laid, of_drafts
 from torch import Tensor, nn
 
 VARIATION, LEAST_ERROR = 0.01, 1e-4  # crates/qudi-model/src/objective.rs
 WARMUP, CLIP = 200, 1.0  # configs/small.toml
 SEEN = 176  # side of what is seen of bursts held back
+MOST = 16  # of which so many are seen
 
 Tensors = dict[str, Tensor]
 
@@ -69,16 +70,17 @@ class Trainer(MeanWeights):
         recipe = tomllib.loads(sizes.read_text())["network"] if sizes else before
         config = {**before, "pre": recipe["pre"]}
         rounds = ["pre.", *(f"drafts.{k}." for k in range(config["pre"].get("rounds", 1) - 1))]
-        for prefix in rounds:
-            larger = grown(part_of(self.tensors, prefix), before, config)
-            self.tensors |= {prefix + name: value for name, value in larger.items()}
+        prefix = "drafts.0." if draft else "pre."
+        for name in rounds:
+            of = (lambda c: c) if name == "pre." else of_drafts
+            larger = grown(part_of(self.tensors, name), of(before), of(config))
+            self.tensors |= {name + key: value for key, value in larger.items()}
         self.about["network"] = config
         if sizes:
             self.about["preset"] = sizes.stem if config == recipe else None
-        prefix = "drafts.0." if draft else "pre."
         # It has seen no simulated measurement.
         self.tensors[prefix + "simulated_in.weight"].zero_()
-        self.network, self.error = PreDenoiser(config), None
+        self.network, self.error = PreDenoiser(of_drafts(config) if draft else config), None
         self.network.load_state_dict(part_of(self.tensors, prefix))
         self.network.simulated_in.requires_grad_(False)
         learning = nn.ModuleDict({"drafts": nn.ModuleList([self.network])} if draft else {"pre": self.network})
@@ -135,6 +137,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     bursts, held = kept(args.bursts)
+    held = held[:: math.ceil(len(held) / MOST)]
     others = [Burst(path) for path in sorted(args.validation.glob("*.safetensors"))] if args.validation else []
     trainer = Trainer(args.weights, args.sizes, args.draft)
     # Each with gradients of its own: neither shortens the other's steps.

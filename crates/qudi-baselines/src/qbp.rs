@@ -9,6 +9,7 @@ mod align;
 mod aligned;
 mod blocks;
 mod camera;
+mod closest;
 mod cubic;
 mod dft;
 mod grid;

@@ -133,6 +133,19 @@ fn neighbours_are_seen_in_deviations() {
     let aligned =
         Alignment::new(guide, &context).on(vec![still.clone(); 7]).of(2, 8, Along::Likeliest);
     assert_eq!(aligned.clean, still);
+    let thrice = Alignment::new(Guide::find(burst, &context).unwrap(), &context)
+        .on(vec![still.clone(); 7])
+        .of(2, 8, Along::Pixels);
+    assert_eq!((thrice.seen.len(), thrice.expected.len()), (25, 24));
+    assert_eq!(
+        (&thrice.seen[..9], &thrice.expected[..8]),
+        (&aligned.seen[..], &aligned.expected[..])
+    );
+    for (seen, expected) in thrice.seen[17..23].iter().zip(&thrice.expected[16..]) {
+        let (seen, expected) = (deviation(seen), deviation(expected));
+        assert!((0.55..1.1).contains(&seen) && expected < 0.1, "{seen}, expected {expected}");
+    }
+    assert!(thrice.seen[23..].iter().chain(&thrice.expected[22..]).all(|f| deviation(f) == 0.0));
     let own = deviation(&aligned.seen[0]);
     assert!((0.95..1.05).contains(&own), "{own}");
     let mean = aligned.seen[0].mean();

@@ -52,7 +52,8 @@ pub struct PreConfig {
     pub growth: usize,
     /// Frames around each that are laid upon it and seen, the nearest ones.
     pub neighbours: usize,
-    /// Motions along which each is laid upon it: the likeliest, or with 2 that and the one matched for it alone.
+    /// Motions along which each is laid upon it: the likeliest; with 2 also the one matched for it alone; with 3 also whichever fits
+    /// best pixel by pixel.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub motions: usize,
     /// Channels of the layers that weigh neighbours pixel by pixel; 0 if neighbours are only added up.
@@ -67,9 +68,18 @@ pub struct PreConfig {
 }
 
 impl PreConfig {
+    /// Those of the pre-denoisers before the last one: what a guide shows of single pixels is too poor to follow them.
+    pub fn of_drafts(&self) -> Self {
+        Self { motions: self.motions.min(2), ..self.clone() }
+    }
+
     /// The frames that are laid upon each.
     pub fn laid(&self) -> Laid {
-        let along = if self.motions == 1 { Along::Likeliest } else { Along::Both };
+        let along = match self.motions {
+            1 => Along::Likeliest,
+            2 => Along::Both,
+            _ => Along::Pixels,
+        };
         Laid { neighbours: self.neighbours, along }
     }
 }
@@ -203,7 +213,7 @@ impl NetworkConfig {
             ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
             ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
             ("pre.neighbours", self.pre.neighbours <= 64, "must be at most 64"),
-            ("pre.motions", (1..=2).contains(&self.pre.motions), "must be 1 or 2"),
+            ("pre.motions", (1..=3).contains(&self.pre.motions), "must be 1, 2 or 3"),
             ("pre.trust", self.pre.trust <= 4096, "must be at most 4096"),
             ("pre.rounds", (1..=4).contains(&self.pre.rounds), "must be from 1 to 4"),
             ("pre.blocks", (1..=64).contains(&self.pre.blocks), "must be from 1 to 64"),

@@ -104,30 +104,46 @@ pub(crate) fn settled(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::PreConfig;
+    use crate::measurement::{IMAGES, aligned};
     use crate::network::fill;
     use qudi_baselines::Guide;
     use qudi_sim::Size;
     use qudi_sim::restore::{BurstView, Context};
     use qudi_sim::sensor::Sensor;
 
-    /// What lies far from the borders of a tile does not know of them.
-    #[test]
-    fn drafts_see_tiles_of_the_size_asked_for() {
+    const SIZE: Size = Size { height: 48, width: 80 };
+
+    fn context() -> Context {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let gain = sensor.gain_at(3.25).unwrap_or_else(|e| panic!("{e}"));
         let (seed, first_frame, dark) = (1, 0, None);
-        let context = Context { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark };
-        let size = Size { height: 48, width: 80 };
-        let count = |i: usize| ((i * 7 + i / size.width) % 8) as u16;
-        let frames: Vec<Vec<u16>> =
-            (0..3).map(|t| (0..size.pixels()).map(|i| count(i + 13 * t)).collect()).collect();
-        let burst = BurstView { size, frames: &frames };
-        let device = Device::flex();
-        let config = NetworkConfig::preset("tiny").unwrap_or_else(|e| panic!("{e}"));
-        let network = fill(config.init(1, &device), |_, shape| {
+        Context { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark }
+    }
+
+    /// Three frames.
+    fn counts() -> Vec<Vec<u16>> {
+        let count = |i: usize| ((i * 7 + i / SIZE.width) % 8) as u16;
+        (0..3).map(|t| (0..SIZE.pixels()).map(|i| count(i + 13 * t)).collect()).collect()
+    }
+
+    /// The sizes of `tiny`, and some network that has learnt something.
+    fn network(motions: usize, rounds: usize) -> (NetworkConfig, Qudi) {
+        let mut config = NetworkConfig::preset("tiny").unwrap_or_else(|e| panic!("{e}"));
+        config.pre = PreConfig { motions, rounds, ..config.pre };
+        let network = fill(config.init(1, &Device::flex()), |_, shape| {
             let count: usize = shape.iter().product();
             (0..count).map(|i| 0.05 * (i as f32).sin()).collect()
         });
+        (config, network)
+    }
+
+    /// What lies far from the borders of a tile does not know of them.
+    #[test]
+    fn drafts_see_tiles_of_the_size_asked_for() {
+        let (context, frames, device) = (context(), counts(), Device::flex());
+        let burst = BurstView { size: SIZE, frames: &frames };
+        let (config, network) = network(1, 1);
         let network = network.with_round_more();
         let [whole, tiled] = [512, 32].map(|tile| {
             let guide = Guide::find(burst, &context).unwrap_or_else(|e| panic!("{e}"));
@@ -141,5 +157,19 @@ mod tests {
         };
         assert_ne!(whole, tiled);
         assert!(pairs(0..6).iter().all(|(a, b)| (a - b).abs() < 1e-3), "{:?}", pairs(0..6));
+    }
+    #[test]
+    fn only_the_last_round_sees_pixels_go_their_own_ways() {
+        let (context, frames, device) = (context(), counts(), Device::flex());
+        let burst = BurstView { size: SIZE, frames: &frames };
+        let (config, network) = network(3, 2);
+        let drafts = Draft::all(&network, &config, 512, &device);
+        let laid = config.pre.laid();
+        let alignment = aligned(burst, &context, laid, &drafts).unwrap_or_else(|e| panic!("{e}"));
+        let guide = GuidePlanes::of(&alignment, laid, 1..2).to_tensor(SIZE, &device);
+        let inputs = IMAGES + 1 + 6 * config.pre.neighbours;
+        assert_eq!(guide.dims(), [1, inputs, SIZE.height, SIZE.width]);
+        let (frame, _) = network.denoise(&guide);
+        assert_eq!(frame.dims(), [1, 1, SIZE.height, SIZE.width]);
     }
 }

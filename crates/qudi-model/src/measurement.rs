@@ -50,17 +50,20 @@ impl Planes {
 pub struct Laid {
     /// So many, the nearest ones.
     pub neighbours: usize,
-    /// Once, or along two motions each.
+    /// Along which motions.
     pub along: Along,
 }
 
 impl Laid {
+    /// What the pre-denoisers before the last one see.
+    fn of_drafts(self) -> Self {
+        let along = if self.along == Along::Likeliest { self.along } else { Along::Both };
+        Self { along, ..self }
+    }
+
     /// How many planes that makes.
     pub fn frames(self) -> usize {
-        match self.along {
-            Along::Likeliest => self.neighbours,
-            Along::Both => 2 * self.neighbours,
-        }
+        self.along.motions() * self.neighbours
     }
 
     /// What is known of a frame of an aligned window.
@@ -82,7 +85,7 @@ pub fn aligned<'a>(
 ) -> Result<Alignment<'a>> {
     let mut alignment = Alignment::new(Guide::find(burst, context)?, context);
     for draft in drafts {
-        let better = draft.restore(&alignment, laid)?;
+        let better = draft.restore(&alignment, laid.of_drafts())?;
         alignment = alignment.on(better);
     }
     Ok(alignment)

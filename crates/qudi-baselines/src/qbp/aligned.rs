@@ -45,6 +45,19 @@ pub enum Along {
     Likeliest,
     /// These, and once more the paths as matched frame by frame: freer, and fitting the noise of what they were matched on.
     Both,
+    /// Both, and pixel by pixel along whichever of the motions around fits best: freer still.
+    Pixels,
+}
+
+impl Along {
+    /// How often each neighbour is laid upon the frame.
+    pub fn motions(self) -> usize {
+        match self {
+            Self::Likeliest => 1,
+            Self::Both => 2,
+            Self::Pixels => 3,
+        }
+    }
 }
 
 /// What is known of a frame. Deviations are those of the noise of one frame's counts where the guide is right.
@@ -128,24 +141,31 @@ impl<'a> Alignment<'a> {
             let values = values.map(|((value, here), deviation)| (value - here) / deviation);
             Frame { size: here.size, data: values.collect() }
         };
-        let laid = |frames: &[Frame], flow: &Patchwise| {
-            let places = nearest[1..].par_iter();
-            let laid = places.map(|&k| less(merger.laid(&frames[k], &flow[k], reference)));
-            let mut laid: Vec<Frame> = laid.collect();
-            laid.resize(neighbours, Frame::filled(here.size, 0.0));
-            laid
-        };
-        let ways = match along {
-            Along::Likeliest => vec![flow],
-            Along::Both => vec![flow, &motion.matched],
-        };
-        let own = less(merger.cropped(&merger.frames[reference]));
-        let seen = ways.iter().flat_map(|flow| laid(&merger.frames, flow));
+        let mut seen = vec![less(merger.cropped(&merger.frames[reference]))];
+        let mut expected = Vec::new();
+        for way in 0..along.motions() {
+            let laid = |&k: &usize| match way {
+                2 => merger.closest(reference, k, [flow, &motion.matched]),
+                _ => {
+                    let flow = if way == 0 { flow } else { &motion.matched };
+                    [&merger.frames, guide].map(|list| merger.laid(&list[k], &flow[k], reference))
+                }
+            };
+            let laid: Vec<_> = nearest[1..].par_iter().map(|k| laid(k).map(less)).collect();
+            for [counts, pilot] in laid {
+                seen.push(counts);
+                expected.push(pilot);
+            }
+            for list in [&mut seen, &mut expected] {
+                let missing = neighbours + 1 - nearest.len();
+                list.extend(vec![Frame::filled(here.size, 0.0); missing]);
+            }
+        }
         Aligned {
             clean: clean[reference].clone(),
             noise: self.noise(&here, &noises),
-            seen: std::iter::once(own).chain(seen).collect(),
-            expected: ways.iter().flat_map(|flow| laid(guide, flow)).collect(),
+            seen,
+            expected,
             merged,
         }
     }

@@ -22,24 +22,30 @@ fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     let (width, height) = (image.size.width as isize, image.size.height as isize);
     let [x, y] = corner.map(|c| c.floor() as isize - 1);
     let [across, down] = corner.map(|c| taps(c - c.floor()));
+    // Plain loops over whole rows, which compilers turn into vectors.
     let mut rows = [[0.0f32; SIDE]; SIDE + 3];
+    let within = x >= 0 && x + (SIDE as isize) + 3 <= width;
     for (r, row) in (y..).zip(&mut rows) {
         let source = image.row(r.clamp(0, height - 1) as usize);
         let mut around = [0.0f32; SIDE + 3];
-        if x >= 0 && x + (SIDE as isize) + 3 <= width {
+        if within {
             around.copy_from_slice(&source[x as usize..x as usize + SIDE + 3]);
         } else {
             for (c, value) in (x..).zip(&mut around) {
                 *value = source[c.clamp(0, width - 1) as usize];
             }
         }
-        for (c, value) in row.iter_mut().enumerate() {
-            *value = weighted(across, [0, 1, 2, 3].map(|k| around[c + k]));
+        for c in 0..SIDE {
+            row[c] = weighted(across, [around[c], around[c + 1], around[c + 2], around[c + 3]]);
         }
     }
-    std::array::from_fn(|r| {
-        std::array::from_fn(|c| weighted(down, [0, 1, 2, 3].map(|k| rows[r + k][c])))
-    })
+    let mut patch = [[0.0f32; SIDE]; SIDE];
+    for (r, row) in patch.iter_mut().enumerate() {
+        for c in 0..SIDE {
+            row[c] = weighted(down, [rows[r][c], rows[r + 1][c], rows[r + 2][c], rows[r + 3][c]]);
+        }
+    }
+    patch
 }
 
 /// The same, but what lies outside the image is `own`'s at `corner`.
@@ -60,7 +66,7 @@ pub(super) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [us
 }
 
 fn weighted(taps: [f32; 4], values: [f32; 4]) -> f32 {
-    taps.iter().zip(values).map(|(tap, value)| tap * value).sum()
+    taps[0] * values[0] + taps[1] * values[1] + taps[2] * values[2] + taps[3] * values[3]
 }
 
 #[cfg(test)]

@@ -191,7 +191,9 @@ fn initial(
     device: &Opened,
 ) -> Result<Box<qudi_model::network::Qudi>> {
     let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
-    if sizes.pre.rounds + 1 == recipe.network.pre.rounds {
+    // Its last pre-denoiser becomes a draft, which sees no motion of single pixels.
+    let draft = sizes.pre == sizes.pre.of_drafts();
+    if sizes.pre.rounds + 1 == recipe.network.pre.rounds && draft {
         network = network.with_round_more();
         sizes.pre.rounds += 1;
     }

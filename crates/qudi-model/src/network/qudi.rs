@@ -105,10 +105,10 @@ impl NetworkConfig {
 
     /// The network without weights: it takes no memory yet.
     pub(crate) fn shell(&self, device: &Device) -> Qudi {
-        let pre = |_| self.pre.init(self.fold, device);
+        let draft = |_| self.pre.of_drafts().init(self.fold, device);
         Qudi {
-            drafts: (1..self.pre.rounds).map(pre).collect(),
-            pre: pre(0),
+            drafts: (1..self.pre.rounds).map(draft).collect(),
+            pre: self.pre.init(self.fold, device),
             error: self.pre.init_error(self.fold, device),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
