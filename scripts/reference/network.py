@@ -123,7 +123,8 @@ def mean_variance(sensor: Tensor, frames: int) -> Tensor:
 
 def laid(config: dict) -> int:
     """Frames laid upon each, those of two motions counted twice."""
-    return config["pre"]["neighbours"] * config["pre"].get("motions", 1)
+    motions, rounds = config["pre"].get("motions", 1), config["pre"].get("rounds", 1)
+    return config["pre"]["neighbours"] * (motions if rounds > 1 else min(2, motions))
 
 
 def of_drafts(config: dict) -> dict:

@@ -53,7 +53,7 @@ pub struct PreConfig {
     /// Frames around each that are laid upon it and seen, the nearest ones.
     pub neighbours: usize,
     /// Motions along which each is laid upon it: the likeliest; with 2 also the one matched for it alone; with 3 also whichever fits
-    /// best pixel by pixel.
+    /// best pixel by pixel, but only on frames that a draft has restored.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub motions: usize,
     /// Channels of the layers that weigh neighbours pixel by pixel; 0 if neighbours are only added up.
@@ -77,8 +77,8 @@ impl PreConfig {
     pub fn laid(&self) -> Laid {
         let along = match self.motions {
             1 => Along::Likeliest,
-            2 => Along::Both,
-            _ => Along::Pixels,
+            3 if self.rounds > 1 => Along::Pixels,
+            _ => Along::Both,
         };
         Laid { neighbours: self.neighbours, along }
     }

@@ -144,7 +144,7 @@ mod tests {
         let (context, frames, device) = (context(), counts(), Device::flex());
         let burst = BurstView { size: SIZE, frames: &frames };
         let (config, network) = network(1, 1);
-        let network = network.with_round_more();
+        let network = network.with_round_more(0);
         let [whole, tiled] = [512, 32].map(|tile| {
             let guide = Guide::find(burst, &context).unwrap_or_else(|e| panic!("{e}"));
             let alignment = Alignment::new(guide, &context);
@@ -158,6 +158,34 @@ mod tests {
         assert_ne!(whole, tiled);
         assert!(pairs(0..6).iter().all(|(a, b)| (a - b).abs() < 1e-3), "{:?}", pairs(0..6));
     }
+    /// On a first round's frames, and its weights, silent for what is new.
+    #[test]
+    fn a_round_more_sees_more() {
+        let device = Device::flex();
+        let (before, network) = network(3, 1);
+        let after = PreConfig { rounds: 2, ..before.pre.clone() };
+        let more = after.laid().frames() - before.pre.laid().frames();
+        assert_eq!(more, before.pre.neighbours);
+        let planes = |laid: Laid, fill: &dyn Fn(usize) -> f32| {
+            let plane = |k| Tensor::<4>::full([1, 1, 16, 16], fill(k), &device);
+            Tensor::cat((0..GuidePlanes::count(laid)).map(plane).collect(), 1)
+        };
+        let few = before.pre.laid().frames();
+        // What is known already, and something else in the new planes: counts, then expectations.
+        let old = |k: usize| 0.1 + 0.01 * k as f32;
+        let new = |k: usize| match k {
+            k if k < IMAGES + 1 + few => old(k),
+            k if k < IMAGES + 1 + few + more => 0.7,
+            k if k < IMAGES + 1 + 2 * few + more => old(k - more),
+            _ => -0.4,
+        };
+        let first = network.denoise(&planes(before.pre.laid(), &old)).0;
+        let network = network.with_round_more(more);
+        let second = network.denoise(&planes(after.laid(), &new)).0;
+        let difference: f32 = (first - second).abs().max().into_scalar();
+        assert!(difference < 1e-6, "{difference}");
+    }
+
     #[test]
     fn only_the_last_round_sees_pixels_go_their_own_ways() {
         let (context, frames, device) = (context(), counts(), Device::flex());

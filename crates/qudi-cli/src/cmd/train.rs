@@ -191,11 +191,13 @@ fn initial(
     device: &Opened,
 ) -> Result<Box<qudi_model::network::Qudi>> {
     let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
-    // Its last pre-denoiser becomes a draft, which sees no motion of single pixels.
-    let draft = sizes.pre == sizes.pre.of_drafts();
-    if sizes.pre.rounds + 1 == recipe.network.pre.rounds && draft {
-        network = network.with_round_more();
+    if sizes.pre.rounds + 1 == recipe.network.pre.rounds && sizes.pre.rounds == 1 {
+        let before = sizes.pre.laid().frames();
         sizes.pre.rounds += 1;
+        network = network.with_round_more(sizes.pre.laid().frames() - before);
+    } else if sizes.pre.rounds + 1 == recipe.network.pre.rounds && sizes.pre.motions < 3 {
+        sizes.pre.rounds += 1;
+        network = network.with_round_more(0);
     }
     if recipe.network.pre.error && !sizes.pre.error {
         let fresh = recipe.network.init(recipe.train.seed, &device.device);

@@ -82,6 +82,21 @@ impl Conv2d {
         }
     }
 
+    /// With `more` inputs after the first `at` ones, without any weight.
+    pub(super) fn with_silent(self, at: usize, more: usize) -> Self {
+        if more == 0 {
+            return self;
+        }
+        let weight = self.weights();
+        let [outputs, inputs, rows, columns] = weight.dims();
+        let silent = Tensor::zeros([outputs, more, rows, columns], &weight.device());
+        let mut parts = vec![weight.clone().narrow(1, 0, at), silent];
+        if at < inputs {
+            parts.push(weight.narrow(1, at, inputs - at));
+        }
+        Self { weight: Param::from_tensor(Tensor::cat(parts, 1)), ..self }
+    }
+
     /// Its weights, `[outputs, inputs, rows, columns]`.
     pub(super) fn weights(&self) -> Tensor<4> {
         self.weight.val()

@@ -80,6 +80,17 @@ impl PreConfig {
 }
 
 impl PreDenoiser {
+    /// Seeing so many more frames laid upon each, after those that it sees: silent in the first layer, but weighed like the others.
+    pub(super) fn seeing_more(self, frames: usize) -> Self {
+        let planes = self.fold * self.fold;
+        let inputs = self.static_in.weights().dims()[1];
+        let laid = (inputs / planes - PLANES - 1) / 2;
+        let more = frames * planes;
+        // Expectations come last.
+        let static_in = self.static_in.with_silent(inputs, more);
+        Self { static_in: static_in.with_silent(inputs - laid * planes, more), ..self }
+    }
+
     /// Whether simulated measurements have any weight.
     pub(super) fn sees_simulated(&self) -> Result<bool> {
         Ok(read(self.simulated_in.weights())?.iter().any(|&weight| weight != 0.0))

@@ -205,10 +205,12 @@ impl Qudi {
         Self { drafts, ..self }
     }
 
-    /// The network for one round more, whose last pre-denoiser starts as a copy of what becomes a draft.
+    /// The network for one round more, whose last pre-denoiser starts as a copy of what becomes a draft, and sees `more` frames laid
+    /// upon each besides, which have no say yet.
     #[must_use]
-    pub fn with_round_more(mut self) -> Self {
+    pub fn with_round_more(mut self, more: usize) -> Self {
         self.drafts.push(self.pre.clone());
+        self.pre = self.pre.seeing_more(more);
         self
     }
 

@@ -260,7 +260,7 @@ mod tests {
         }
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
-        let network = recipe.network.init(1, &device).with_round_more();
+        let network = recipe.network.init(1, &device).with_round_more(0);
         let drafts = Draft::all(&network, &recipe.network, TILE, &device);
         let drafted = Bursts { drafts, ..of(&recipe) };
         let mut drafted = drafted.keep_in(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));

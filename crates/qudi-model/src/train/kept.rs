@@ -154,7 +154,7 @@ impl Shelf {
             seed: recipe.train.seed,
             kept: parts.kept,
             neighbours: recipe.network.pre.neighbours,
-            motions: recipe.network.pre.motions,
+            motions: recipe.network.pre.laid().along.motions(),
             exposure: !recipe.network.lacks(Part::Exposure),
             drafts: drafts.iter().map(sha256).collect::<Result<_>>()?,
         };
