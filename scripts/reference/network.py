@@ -122,14 +122,14 @@ def mean_variance(sensor: Tensor, frames: int) -> Tensor:
 
 
 def laid(config: dict) -> int:
-    """Frames laid upon each, those of two motions counted twice."""
+    """Frames laid upon each, counted once for each motion: single pixels' is seen after a first round only."""
     motions, rounds = config["pre"].get("motions", 1), config["pre"].get("rounds", 1)
     return config["pre"]["neighbours"] * (motions if rounds > 1 else min(2, motions))
 
 
 def of_drafts(config: dict) -> dict:
-    """For the pre-denoisers before the last one: they do not see single pixels' motion."""
-    return {**config, "pre": {**config["pre"], "motions": min(2, config["pre"].get("motions", 1))}}
+    """For the pre-denoisers before the last one: they see what an only one sees."""
+    return {**config, "pre": {**config["pre"], "rounds": 1}}
 
 
 def guide_planes(config: dict) -> int:

@@ -72,8 +72,8 @@ class Trainer(MeanWeights):
         rounds = ["pre.", *(f"drafts.{k}." for k in range(config["pre"].get("rounds", 1) - 1))]
         prefix = "drafts.0." if draft else "pre."
         for name in rounds:
-            of = (lambda c: c) if name == "pre." else of_drafts
-            larger = grown(part_of(self.tensors, name), of(before), of(config))
+            sizes_of = [before, config] if name == "pre." else [of_drafts(before), of_drafts(config)]
+            larger = grown(part_of(self.tensors, name), *sizes_of)
             self.tensors |= {name + key: value for key, value in larger.items()}
         self.about["network"] = config
         if sizes:

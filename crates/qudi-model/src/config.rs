@@ -68,15 +68,17 @@ pub struct PreConfig {
 }
 
 impl PreConfig {
-    /// Those of the pre-denoisers before the last one: what a guide shows of single pixels is too poor to follow them.
+    /// Those of the pre-denoisers before the last one: what they see is what an only one sees.
+    #[must_use]
     pub fn of_drafts(&self) -> Self {
-        Self { motions: self.motions.min(2), ..self.clone() }
+        Self { rounds: 1, ..self.clone() }
     }
 
     /// The frames that are laid upon each.
     pub fn laid(&self) -> Laid {
         let along = match self.motions {
             1 => Along::Likeliest,
+            // What a guide shows of single pixels is too poor to follow them.
             3 if self.rounds > 1 => Along::Pixels,
             _ => Along::Both,
         };

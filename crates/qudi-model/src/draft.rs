@@ -16,6 +16,7 @@ const UNSHARED: f32 = 0.4;
 #[derive(Clone, Debug)]
 pub struct Draft {
     denoiser: PreDenoiser,
+    laid: Laid,
     fold: usize,
     tile: usize,
     device: Device,
@@ -26,6 +27,7 @@ impl Draft {
     pub fn all(network: &Qudi, config: &NetworkConfig, tile: usize, device: &Device) -> Vec<Self> {
         let draft = |denoiser: &PreDenoiser| Self {
             denoiser: denoiser.clone(),
+            laid: config.pre.of_drafts().laid(),
             fold: config.fold,
             tile,
             device: device.clone(),
@@ -41,11 +43,11 @@ impl Draft {
     ///
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if the device fails.
-    pub fn restore(&self, alignment: &Alignment<'_>, laid: Laid) -> Result<Vec<Frame>> {
+    pub fn restore(&self, alignment: &Alignment<'_>) -> Result<Vec<Frame>> {
         let layout = Layout::new(alignment.size(), self.fold, self.tile);
         let denoise = |guide: &Tensor<4>| vec![self.denoiser.denoise(guide)];
         let Denoised { frames, noises, .. } =
-            denoised(alignment, laid, &layout, &self.device, denoise)?;
+            denoised(alignment, self.laid, &layout, &self.device, denoise)?;
         Ok(settled(alignment, frames, noises, BRIGHTEST as f32))
     }
 }
@@ -149,7 +151,7 @@ mod tests {
             let guide = Guide::find(burst, &context).unwrap_or_else(|e| panic!("{e}"));
             let alignment = Alignment::new(guide, &context);
             let draft = Draft::all(&network, &config, tile, &device).remove(0);
-            draft.restore(&alignment, config.pre.laid()).unwrap_or_else(|e| panic!("{e}"))
+            draft.restore(&alignment).unwrap_or_else(|e| panic!("{e}"))
         });
         let pairs = |x: std::ops::Range<usize>| {
             let at = |x: usize| (whole[1].row(4)[x], tiled[1].row(4)[x]);
@@ -193,8 +195,8 @@ mod tests {
         let (config, network) = network(3, 2);
         let drafts = Draft::all(&network, &config, 512, &device);
         let laid = config.pre.laid();
-        let alignment = aligned(burst, &context, laid, &drafts).unwrap_or_else(|e| panic!("{e}"));
-        let guide = GuidePlanes::of(&alignment, laid, 1..2).to_tensor(SIZE, &device);
+        let alignment = aligned(burst, &context, &drafts).unwrap_or_else(|e| panic!("{e}"));
+        let guide = GuidePlanes::of(&alignment, laid, 1..2).into_tensor(SIZE, &device);
         let inputs = IMAGES + 1 + 6 * config.pre.neighbours;
         assert_eq!(guide.dims(), [1, inputs, SIZE.height, SIZE.width]);
         let (frame, _) = network.denoise(&guide);

@@ -68,7 +68,8 @@ impl Layout {
         let tiles = &self.tiles;
         let mut images: Vec<Vec<f32>> = Vec::new();
         for number in 0..tiles.count() {
-            let guide = guide.map(|plane| tiles.crop(number, plane)).to_tensor(tiles.tile, device);
+            let guide = guide.map(|plane| tiles.crop(number, plane));
+            let guide = guide.into_tensor(tiles.tile, device);
             let parts = denoise(&guide);
             images.resize(parts.len(), vec![0.0; self.size.pixels()]);
             for (part, image) in parts.into_iter().zip(&mut images) {

@@ -55,12 +55,6 @@ pub struct Laid {
 }
 
 impl Laid {
-    /// What the pre-denoisers before the last one see.
-    fn of_drafts(self) -> Self {
-        let along = if self.along == Along::Likeliest { self.along } else { Along::Both };
-        Self { along, ..self }
-    }
-
     /// How many planes that makes.
     pub fn frames(self) -> usize {
         self.along.motions() * self.neighbours
@@ -80,12 +74,11 @@ impl Laid {
 pub fn aligned<'a>(
     burst: BurstView<'_>,
     context: &'a Context,
-    laid: Laid,
     drafts: &[Draft],
 ) -> Result<Alignment<'a>> {
     let mut alignment = Alignment::new(Guide::find(burst, context)?, context);
     for draft in drafts {
-        let better = draft.restore(&alignment, laid.of_drafts())?;
+        let better = draft.restore(&alignment)?;
         alignment = alignment.on(better);
     }
     Ok(alignment)
@@ -141,8 +134,8 @@ impl GuidePlanes {
     }
 
     /// The planes as channels, `[frames, planes, height, width]`.
-    pub fn to_tensor(&self, size: Size, device: &Device) -> Tensor<4> {
-        let planes = self.0.iter().map(|plane| to_tensor(plane.clone(), size, device));
+    pub fn into_tensor(self, size: Size, device: &Device) -> Tensor<4> {
+        let planes = self.0.into_iter().map(|plane| to_tensor(plane, size, device));
         Tensor::cat(planes.collect(), 1)
     }
 }

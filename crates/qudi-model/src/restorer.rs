@@ -130,14 +130,16 @@ impl QudiRestorer {
         let planes = Planes::of(burst, context);
         let planes = Planes { y: layout.padded(&planes.y), u: layout.padded(&planes.u) };
         let laid = self.config.pre.laid();
-        let alignment = aligned(burst, context, laid, &self.drafts)?;
+        let alignment = aligned(burst, context, &self.drafts)?;
         let guide = GuidePlanes::of(&alignment, laid, 0..frames);
         let guide = guide.map(|plane| layout.padded(plane));
         let sensor = sensor_numbers(context);
         let prepared = None;
         let mut job = Job { context, sensor, planes, guide, frames, layout, prepared };
         if self.generates && job.layout.tiles.count() == 1 {
-            job.prepared = Some(self.prepare(&job, 0));
+            // The one tile is all there is: nobody asks for its guide again.
+            let guide = std::mem::take(&mut job.guide);
+            job.prepared = Some(self.prepare(&job, 0, guide));
         }
         Ok(job)
     }
@@ -182,7 +184,7 @@ impl QudiRestorer {
     /// each denoised for itself, are steadied afterwards.
     fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
         let laid = self.config.pre.laid();
-        let alignment = aligned(burst, context, laid, &self.drafts)?;
+        let alignment = aligned(burst, context, &self.drafts)?;
         let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
         let denoise = |guide: &Tensor<4>| {
             let (d, error) = self.network.denoise(guide);
@@ -212,7 +214,8 @@ impl QudiRestorer {
         let prepared = if let Some(prepared) = &job.prepared {
             prepared
         } else {
-            fresh = self.prepare(job, number);
+            let guide = job.guide.map(|images| job.layout.tiles.crop(number, images));
+            fresh = self.prepare(job, number, guide);
             &fresh
         };
         let simulated = simulated.map(|planes| Simulated {
@@ -238,14 +241,13 @@ impl QudiRestorer {
         to_tensor(tiles.crop(number, images), tiles.tile, &self.device)
     }
 
-    fn prepare(&self, job: &Job<'_>, number: usize) -> Prepared {
+    /// What does not depend on the step, of tile `number`, whose guide is `guide`.
+    fn prepare(&self, job: &Job<'_>, number: usize, guide: GuidePlanes) -> Prepared {
         let tensor = |images: &[f32]| self.tile(job, number, images);
-        let tiles = &job.layout.tiles;
-        let guide = job.guide.map(|images| tiles.crop(number, images));
         let sensor = TensorData::new(job.sensor.to_vec(), [1, SENSOR_NUMBERS]);
         let prepared = self.network.prepare(&Measured {
             u: tensor(&job.planes.u),
-            guide: guide.to_tensor(tiles.tile, &self.device),
+            guide: guide.into_tensor(job.layout.tiles.tile, &self.device),
             sensor: Tensor::from_data(sensor, &self.device),
             frames: job.frames,
         });
@@ -267,6 +269,7 @@ struct Job<'a> {
     /// The sensor in numbers: the same for all tiles and steps.
     sensor: [f32; SENSOR_NUMBERS],
     planes: Planes,
+    /// Nothing once all is prepared.
     guide: GuidePlanes,
     frames: usize,
     layout: Layout,
@@ -367,7 +370,7 @@ mod tests {
         restorer.generates = true;
         let whole = restorer.restore(burst, &context).unwrap().frames;
         let laid = config.pre.laid();
-        let alignment = aligned(burst, &context, laid, &[]).unwrap();
+        let alignment = aligned(burst, &context, &[]).unwrap();
         let noises = (0..counts.len()).map(|frame| laid.of(&alignment, frame).noise).collect();
         let whole = settled(&alignment, whole, noises, 1.0);
         for (short, whole) in short.iter().zip(&whole) {

@@ -55,14 +55,14 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let view = BurstView { size, frames: &counts };
     let planes = Planes::of(view, &context);
     let guide = GuidePlanes::of(
-        &aligned(view, &context, tiny().pre.laid(), &[]).unwrap(),
+        &aligned(view, &context, &[]).unwrap(),
         tiny().pre.laid(),
         0..view.frames.len(),
     );
     let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
     let measured = Measured {
         u: to_tensor(planes.u, size, device),
-        guide: guide.to_tensor(size, device),
+        guide: guide.into_tensor(size, device),
         sensor: Tensor::from_data(numbers, device),
         frames,
     };

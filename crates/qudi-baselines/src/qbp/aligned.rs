@@ -144,22 +144,22 @@ impl<'a> Alignment<'a> {
         let mut seen = vec![less(merger.cropped(&merger.frames[reference]))];
         let mut expected = Vec::new();
         for way in 0..along.motions() {
+            let along = |flow: &Patchwise, k: usize| {
+                [&merger.frames, guide].map(|list| merger.laid(&list[k], &flow[k], reference))
+            };
             let laid = |&k: &usize| match way {
-                2 => merger.closest(reference, k, [flow, &motion.matched]),
-                _ => {
-                    let flow = if way == 0 { flow } else { &motion.matched };
-                    [&merger.frames, guide].map(|list| merger.laid(&list[k], &flow[k], reference))
-                }
+                0 => along(flow, k),
+                1 => along(&motion.matched, k),
+                _ => merger.closest(reference, k, [flow, &motion.matched]),
             };
             let laid: Vec<_> = nearest[1..].par_iter().map(|k| laid(k).map(less)).collect();
             for [counts, pilot] in laid {
                 seen.push(counts);
                 expected.push(pilot);
             }
-            for list in [&mut seen, &mut expected] {
-                let missing = neighbours + 1 - nearest.len();
-                list.extend(vec![Frame::filled(here.size, 0.0); missing]);
-            }
+            let end = (way + 1) * neighbours;
+            seen.resize(1 + end, Frame::filled(here.size, 0.0));
+            expected.resize(end, Frame::filled(here.size, 0.0));
         }
         Aligned {
             clean: clean[reference].clone(),

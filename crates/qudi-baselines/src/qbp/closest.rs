@@ -28,7 +28,7 @@ impl Merger {
         let doubt = AREA * RELUCTANCE * self.matching_variance(reference);
         let flows = flows.map(|flow| &flow[k]);
         let patch = |i: usize| {
-            let here = self.own(&pilots[reference], i);
+            let here = self.sample(&pilots[reference], i, [0.0; 2], reference);
             let motions = self.motions_around(i, flows);
             let mut least = [[f32::INFINITY; SIDE]; SIDE];
             let mut best = [[[0.0; SIDE]; SIDE]; 2];
@@ -36,19 +36,20 @@ impl Merger {
                 let there = self.sample(&pilots[k], i, d, reference);
                 let mut misfit = misfit(&here, &there);
                 self.deny_outside(&mut misfit, i, d);
-                let doubt = if number == 0 { 0.0 } else { doubt };
-                let better = |y: usize, x: usize, least: &Patch| misfit[y][x] + doubt < least[y][x];
-                let any = number == 0
-                    || (0..SIDE)
-                        .any(|y| (0..SIDE).fold(false, |any, x| any | better(y, x, &least)));
-                if !any {
-                    continue;
+                let own = number == 0;
+                if !own {
+                    misfit.iter_mut().flatten().for_each(|value| *value += doubt);
+                    let mut pairs = misfit.iter().flatten().zip(least.iter().flatten());
+                    // Most motions fit no pixel better, and then nobody asks for their counts.
+                    if !pairs.any(|(value, least)| value < least) {
+                        continue;
+                    }
                 }
                 let counts = self.sample(&self.frames[k], i, d, reference);
                 for y in 0..SIDE {
                     for x in 0..SIDE {
-                        if number == 0 || better(y, x, &least) {
-                            least[y][x] = misfit[y][x] + doubt;
+                        if own || misfit[y][x] < least[y][x] {
+                            least[y][x] = misfit[y][x];
                             best[0][y][x] = counts[y][x];
                             best[1][y][x] = there[y][x];
                         }
@@ -61,26 +62,12 @@ impl Merger {
         [0, 1].map(|image| self.blended(|i| patches[i][image]))
     }
 
-    /// Patch `i` of a frame as it lies.
-    fn own(&self, frame: &Frame, i: usize) -> Patch {
-        let [x, y] = self.grid.corner(i);
-        let mut patch = [[0.0; SIDE]; SIDE];
-        for (r, row) in patch.iter_mut().enumerate() {
-            row.copy_from_slice(&frame.row(y + r)[x..x + SIDE]);
-        }
-        patch
-    }
-
     /// The motions of patch `i`, of those that touch it, and rest; each once.
     fn motions_around(&self, i: usize, flows: [&Vec<[f32; 2]>; 2]) -> Vec<[f32; 2]> {
-        let (columns, rows) = (self.grid.xs.len(), self.grid.ys.len());
-        let (x, y) = (i % columns, i / columns);
-        let near = (y.saturating_sub(1)..(y + 2).min(rows))
-            .flat_map(|row| (x.saturating_sub(1)..(x + 2).min(columns)).map(move |c| (row, c)))
-            .map(|(row, column)| row * columns + column);
-        let patches: Vec<usize> = std::iter::once(i).chain(near).collect();
         let mut motions: Vec<[f32; 2]> = Vec::with_capacity(20);
-        let all = flows.iter().flat_map(|flow| patches.iter().map(|&patch| flow[patch]));
+        let all = flows.iter().flat_map(|flow| {
+            std::iter::once(i).chain(self.grid.touching(i)).map(|patch| flow[patch])
+        });
         for d in all.chain(std::iter::once([0.0; 2])) {
             let known = |m: &[f32; 2]| (m[0] - d[0]).abs() < SAME && (m[1] - d[1]).abs() < SAME;
             if !motions.iter().any(known) {

@@ -82,19 +82,24 @@ impl Grid {
         ]
     }
 
-    /// Medians of both components over the 3 x 3 patches around patch `i`.
-    pub(super) fn median_around(&self, flow: &[[f32; 2]], i: usize) -> [f32; 2] {
+    /// The 3 x 3 patches around patch `i` and itself, as far as there are so many.
+    pub(super) fn touching(&self, i: usize) -> impl Iterator<Item = usize> + use<> {
         let (columns, rows) = (self.xs.len(), self.ys.len());
         let (x, y) = (i % columns, i / columns);
+        (y.saturating_sub(1)..(y + 2).min(rows)).flat_map(move |row| {
+            (x.saturating_sub(1)..(x + 2).min(columns)).map(move |column| row * columns + column)
+        })
+    }
+
+    /// Medians of both components over the 3 x 3 patches around patch `i`.
+    pub(super) fn median_around(&self, flow: &[[f32; 2]], i: usize) -> [f32; 2] {
         let mut near = [[0.0f32; 9]; 2];
         let mut n = 0;
-        for row in y.saturating_sub(1)..(y + 2).min(rows) {
-            for column in x.saturating_sub(1)..(x + 2).min(columns) {
-                for k in 0..2 {
-                    near[k][n] = flow[row * columns + column][k];
-                }
-                n += 1;
+        for patch in self.touching(i) {
+            for k in 0..2 {
+                near[k][n] = flow[patch][k];
             }
+            n += 1;
         }
         near.map(|mut values| {
             if n == values.len() {

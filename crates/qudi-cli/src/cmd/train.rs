@@ -191,13 +191,12 @@ fn initial(
     device: &Opened,
 ) -> Result<Box<qudi_model::network::Qudi>> {
     let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
-    if sizes.pre.rounds + 1 == recipe.network.pre.rounds && sizes.pre.rounds == 1 {
-        let before = sizes.pre.laid().frames();
+    let seen = sizes.pre.laid();
+    // What sees more than a draft does cannot become one.
+    let draft = seen == sizes.pre.of_drafts().laid();
+    if sizes.pre.rounds + 1 == recipe.network.pre.rounds && draft {
         sizes.pre.rounds += 1;
-        network = network.with_round_more(sizes.pre.laid().frames() - before);
-    } else if sizes.pre.rounds + 1 == recipe.network.pre.rounds && sizes.pre.motions < 3 {
-        sizes.pre.rounds += 1;
-        network = network.with_round_more(0);
+        network = network.with_round_more(sizes.pre.laid().frames() - seen.frames());
     }
     if recipe.network.pre.error && !sizes.pre.error {
         let fresh = recipe.network.init(recipe.train.seed, &device.device);

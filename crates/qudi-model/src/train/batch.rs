@@ -83,7 +83,7 @@ impl Batch {
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
         Measured {
             u: to_tensor(self.u.clone(), self.size, device),
-            guide: self.guide.to_tensor(self.size, device),
+            guide: self.guide.clone().into_tensor(self.size, device),
             sensor: Tensor::from_data(numbers, device),
             frames: self.frames,
         }

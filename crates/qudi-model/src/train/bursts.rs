@@ -116,7 +116,7 @@ impl Bursts {
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let alignment = aligned(view, &sample.context, self.laid, &self.drafts)?;
+        let alignment = aligned(view, &sample.context, &self.drafts)?;
         let guide = GuidePlanes::of(&alignment, self.laid, range.clone());
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
