@@ -29,6 +29,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 FRAMES, SIDE, BATCH = 11, 96, 8
+LEAST_ERROR = 0.01  # what is dark and at rest would outweigh all else
 QE, DARK, READ_NOISE, FULL_WELL, FULL_SCALE = 0.8, 1.6, 0.2, 200, 7  # configs/sensors/qudi-paper.toml
 
 
@@ -167,7 +168,7 @@ def train(pack: Pack, steps: int, light: tuple[float, float], rate: float, seed:
         next_batch = worker.submit(batch, pack, light, rng)
         for group in adam.param_groups:
             group["lr"] = rate * min(step / 200, 0.5 + 0.5 * math.cos(math.pi * step / steps))
-        mean = (u.mean(1, keepdim=True) - truth).abs().mean((1, 2, 3))
+        mean = (u.mean(1, keepdim=True) - truth).abs().mean((1, 2, 3)).clamp(min=LEAST_ERROR)
         with torch.autocast("cpu", torch.bfloat16):
             error = (network(u, told).float() - truth).abs().mean((1, 2, 3))
         loss = (error / mean).mean()

@@ -5,7 +5,7 @@
 """Trains a pre-denoiser of a network in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16. The last one
 learns together with what tells its errors. All other weights stay as they are.
 
-    qudi train small --pack small.zip --init W.safetensors -o runs/x --bursts kept    # draws and keeps the bursts
+    qudi train small --pack small.zip --init W.safetensors --bursts kept --draw-only
     python scripts/reference/train_pre.py W.safetensors kept pre.safetensors --minutes 60
     qudi publish pre.safetensors -o small.safetensors
 

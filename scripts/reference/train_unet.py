@@ -5,7 +5,7 @@
 """Trains all of a network but its pre-denoisers in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16,
 which is several times as fast on processors with matrix units (docs/results.md, "The diffusion").
 
-    qudi train small --pack small.zip --init W.safetensors -o runs/x --bursts kept    # draws and keeps the bursts
+    qudi train small --pack small.zip --init W.safetensors --bursts kept --draw-only
     python scripts/reference/train_unet.py W.safetensors kept unet.safetensors --minutes 60
     qudi publish unet.safetensors -o small.safetensors
 

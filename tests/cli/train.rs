@@ -131,6 +131,28 @@ fn runs_are_gone_on_with_and_never_lost() {
 }
 
 #[test]
+fn all_bursts_can_be_drawn_before_learning() {
+    let folder = scratch("train-draw");
+    let parts = format!("{QUICK} --set train.parts={{bursts=5,kept=3,frames=3,side=16}}");
+    run(&folder, &format!("train tiny --bursts kept --draw-only --workers 2 {parts}"));
+    let names: Vec<_> = (0..5).map(|number| format!("1-{number:06}.safetensors")).collect();
+    assert_eq!(listing(&folder.join("kept")), names);
+    // What is there stays; what is missing comes back as it was.
+    let path = |number: usize| folder.join("kept").join(&names[number]);
+    let [before, kept] = [3, 4].map(|number| std::fs::read(path(number)).unwrap());
+    let written = |number: usize| std::fs::metadata(path(number)).unwrap().modified().unwrap();
+    let at = written(4);
+    std::fs::remove_file(path(3)).unwrap();
+    run(&folder, &format!("train tiny --bursts kept --draw-only {parts}"));
+    assert!(std::fs::read(path(3)).unwrap() == before && written(4) == at);
+    run(&folder, &format!("train tiny --bursts kept -o run {parts}"));
+    assert!(std::fs::read(path(4)).unwrap() == kept);
+    refused(&folder, "train tiny --bursts kept --draw-only", &["train.parts"]);
+    let other = format!("train tiny --bursts kept --draw-only {parts} --set data.crop=40");
+    refused(&folder, &other, &["something else"]);
+}
+
+#[test]
 fn impossible_trainings_are_refused() {
     let folder = scratch("train-refused");
     for (args, words) in [

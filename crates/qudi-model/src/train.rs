@@ -6,6 +6,7 @@
 mod adam;
 mod batch;
 mod bursts;
+mod draw;
 mod feed;
 mod kept;
 mod learning_rate;
@@ -19,6 +20,7 @@ mod values;
 pub use adam::Adam;
 pub use batch::Batch;
 pub use bursts::Bursts;
+pub use draw::draw_bursts;
 pub use feed::Feed;
 pub use learning_rate::learning_rate;
 pub use recipe::{LossConfig, PartsConfig, Recipe, TrainConfig, ValidationConfig};

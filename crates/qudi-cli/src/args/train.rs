@@ -14,7 +14,7 @@ pub(crate) struct Train {
     /// The recipe: tiny, small, base, paper, or a .toml file [default with --resume: the run's own]
     pub(crate) recipe: Option<String>,
     /// Folder of the run
-    #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present = "cache_only")]
+    #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present_any = ["cache_only", "draw_only"])]
     pub(crate) output: Option<PathBuf>,
     /// Folder that the recipe's files lie in
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
@@ -28,8 +28,11 @@ pub(crate) struct Train {
     /// Make the pack, and stop
     #[arg(long, requires = "pack")]
     pub(crate) cache_only: bool,
+    /// Draw all bursts of a recipe with train.parts into --bursts, and stop
+    #[arg(long, requires = "bursts", conflicts_with_all = ["cache_only", "output"])]
+    pub(crate) draw_only: bool,
     /// Go on from the run's last state
-    #[arg(long, conflicts_with_all = ["cache_only", "init"])]
+    #[arg(long, conflicts_with_all = ["cache_only", "draw_only", "init"])]
     pub(crate) resume: bool,
     /// Start from these weights instead of random ones: of the same network, or of one with a round less
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]

@@ -9,7 +9,7 @@ use crate::interrupt;
 use crate::report::Report;
 use qudi_model::checkpoint::{Description, load};
 use qudi_model::perceptual::fetch;
-use qudi_model::train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS};
+use qudi_model::train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bursts};
 use qudi_sim::dataset::{Pack, write_pack};
 use qudi_sim::output::Overwrite;
 use serde_json::json;
@@ -26,6 +26,9 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
         let text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
         return report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}));
     }
+    if args.draw_only {
+        return draw_only(args, &recipe, report);
+    }
     let folder = args.output.clone().unwrap_or_default();
     let exists = Run::exists(&folder);
     check_folder(args, global, &folder, exists)?;
@@ -36,11 +39,7 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
             report.remark(&format!("{} is there", path.display()));
         }
     }
-    let pack = pack(args, &recipe, &folder, report)?;
-    if let Some(folder) = &args.bursts {
-        make_folder(folder, "the folder of bursts", "choose another with --bursts")?;
-    }
-    let files = Files { pack, bursts: args.bursts.clone() };
+    let files = files(args, &recipe, &folder, report)?;
     let from = if args.resume {
         From::State
     } else {
@@ -85,6 +84,49 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
         .collect();
     let text = format!("{} after {steps} steps\n{}", weights.display(), told(&means));
     report.result(&text, || json!({"weights": weights, "steps": steps, "validation": quality}))
+}
+
+/// All bursts of a recipe, for other programs, or before anything learns from them.
+fn draw_only(args: &Train, recipe: &Recipe, report: &Report) -> Result<()> {
+    let opened = device::open(args.device.first().map_or("auto", String::as_str))?;
+    let folder = args.bursts.clone().unwrap_or_default();
+    let files = files(args, recipe, &folder, report)?;
+    let network = match &args.init {
+        Some(path) => *initial(path, recipe, &opened)?,
+        None => recipe.network.init(recipe.train.seed, &opened.device),
+    };
+    let mut bar = report.bar();
+    let mut bursts = 0;
+    let drawn = device::guarded("drawing", || {
+        let workers = args.workers.get();
+        draw_bursts(recipe, &network, files, &opened.device, workers, &mut |[done, all]| {
+            bursts = all;
+            bar.update("drawing", done, Some(all));
+            interrupt::check()
+        })
+    });
+    match drawn {
+        Ok(Err(qudi_sim::SimError::Interrupted)) => {
+            let text = format!("stopped: the same command goes on in {}", folder.display());
+            return Err(Fault::Stopped(text));
+        }
+        Ok(drawn) => drawn?,
+        Err(problem) => {
+            let what = format!("the device failed: {problem}");
+            return Err(Fault::new(what, "--device", "lower data.crop, or take cpu"));
+        }
+    }
+    let text = format!("{}: {bursts} bursts", folder.display());
+    report.result(&text, || json!({"folder": folder, "bursts": bursts}))
+}
+
+/// What the recipe learns from; made first if it is not there.
+fn files(args: &Train, recipe: &Recipe, folder: &Path, report: &Report) -> Result<Files> {
+    if let Some(folder) = &args.bursts {
+        make_folder(folder, "the folder of bursts", "choose another with --bursts")?;
+    }
+    let pack = pack(args, recipe, folder, report)?;
+    Ok(Files { pack, bursts: args.bursts.clone() })
 }
 
 fn make_folder(folder: &Path, what: &str, help: &str) -> Result<()> {

@@ -7,10 +7,13 @@ use crate::draft::Draft;
 use crate::measurement::{GuidePlanes, Laid, aligned};
 use qudi_sim::dataset::{Dataset, Sample};
 use qudi_sim::restore::BurstView;
-use qudi_sim::{Result, Size, USUAL_EXPOSURE};
+use qudi_sim::{Result, SimError, Size, USUAL_EXPOSURE};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
+use std::ops::ControlFlow;
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, OnceLock};
 
 /// Frames of a burst and what classical methods make of all of them.
@@ -101,6 +104,43 @@ impl Bursts {
             shelf.put(number, &burst)?;
         }
         Ok(burst)
+    }
+
+    /// Every burst that is to be kept, on `workers` threads.
+    pub(super) fn draw_all(
+        &self,
+        workers: usize,
+        on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
+    ) -> Result<()> {
+        let Some((PartsConfig { bursts: all, kept, .. }, _)) = self.parts else {
+            let what = "the recipe draws every sample anew";
+            return Err(SimError::request(what, "train.parts", "bursts are kept only for parts"));
+        };
+        let next = AtomicU64::new(0);
+        // Threads stop where nobody hears of their bursts any more.
+        let (sender, receiver) = sync_channel(1);
+        std::thread::scope(|scope| {
+            for _ in 0..workers.max(1) {
+                let (mut bursts, sender, next) = (self.again()?, sender.clone(), &next);
+                scope.spawn(move || {
+                    loop {
+                        let number = next.fetch_add(1, Ordering::Relaxed);
+                        let mut drawn = || bursts.kept(number, kept).map(drop);
+                        if number >= all || sender.send(drawn()).is_err() {
+                            break;
+                        }
+                    }
+                });
+            }
+            drop(sender);
+            for (done, drawn) in (1..).zip(receiver) {
+                drawn?;
+                if on([done, all]).is_break() {
+                    return Err(SimError::Interrupted);
+                }
+            }
+            Ok(())
+        })
     }
 
     /// Burst `number`, or some of its frames.
