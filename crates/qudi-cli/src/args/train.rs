@@ -10,6 +10,7 @@ use std::path::PathBuf;
 /// folder gets the recipe, metrics, pictures, weights.safetensors for `qudi restore --weights`, and the state that
 /// --resume goes on from, exactly.
 #[derive(Debug, ClapArgs)]
+#[expect(clippy::struct_excessive_bools, reason = "switches of a command line")]
 pub(crate) struct Train {
     /// The recipe: tiny, small, base, paper, or a .toml file [default with --resume: the run's own]
     pub(crate) recipe: Option<String>,
