@@ -106,16 +106,13 @@ impl Bursts {
         Ok(burst)
     }
 
-    /// Every burst that is to be kept, on `workers` threads.
+    /// Every burst that is to be kept, on `workers` threads: none of a recipe that keeps none.
     pub(super) fn draw_all(
         &self,
         workers: usize,
         on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
     ) -> Result<()> {
-        let Some((PartsConfig { bursts: all, kept, .. }, _)) = self.parts else {
-            let what = "the recipe draws every sample anew";
-            return Err(SimError::request(what, "train.parts", "bursts are kept only for parts"));
-        };
+        let Some((PartsConfig { bursts: all, kept, .. }, _)) = self.parts else { return Ok(()) };
         let next = AtomicU64::new(0);
         // Threads stop where nobody hears of their bursts any more.
         let (sender, receiver) = sync_channel(1);
