@@ -2,6 +2,7 @@
 
 use burn::tensor::{Device, Tensor};
 use std::cell::Cell;
+use std::thread::LocalKey;
 
 /// Whether tensors of this device are computed by the flex backend.
 pub fn is_flex(device: &Device) -> bool {
@@ -27,16 +28,27 @@ thread_local! {
     static STOCK: Cell<bool> = const { Cell::new(false) };
 }
 
+/// Sets a thread's variable until it is dropped, also by a panic.
+pub(crate) struct Switch<T: Copy + 'static> {
+    variable: &'static LocalKey<Cell<T>>,
+    before: T,
+}
+
+impl<T: Copy> Switch<T> {
+    pub(crate) fn turn(variable: &'static LocalKey<Cell<T>>, value: T) -> Self {
+        Self { variable, before: variable.replace(value) }
+    }
+}
+
+impl<T: Copy> Drop for Switch<T> {
+    fn drop(&mut self) {
+        self.variable.set(self.before);
+    }
+}
+
 /// Runs `run` with Burn's stock operations in place of our own on this thread: what ours are checked against.
 pub fn with_stock_operations<T>(run: impl FnOnce() -> T) -> T {
-    /// Puts the switch back, also when `run` panics.
-    struct Restore(bool);
-    impl Drop for Restore {
-        fn drop(&mut self) {
-            STOCK.set(self.0);
-        }
-    }
-    let _restore = Restore(STOCK.replace(true));
+    let _switch = Switch::turn(&STOCK, true);
     run()
 }
 

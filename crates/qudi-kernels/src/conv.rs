@@ -26,6 +26,7 @@ mod weight_gradient;
 pub use geometry::Geometry;
 
 use crate::backend::is_native;
+use crate::precision::{ComputePrecision, Reduced, with_precision};
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
@@ -71,6 +72,10 @@ pub fn conv_2d(
     bias: Tensor<1>,
     options: Options,
 ) -> Tensor<4> {
+    if let Some(numbers) = Reduced::of(&inputs[0]) {
+        let sum = |inputs: &[_], weight, zeros, options| conv_2d(inputs, weight, zeros, options);
+        return reduced(numbers, inputs, weight, bias, options, sum);
+    }
     let [outputs, channels, rows, columns] = weight.dims();
     if is_native(&inputs[0]) {
         let weight = weight.reshape([outputs, channels, 1, rows, columns]);
@@ -95,6 +100,11 @@ pub fn conv_3d(
     frames: usize,
     options: Options,
 ) -> Tensor<4> {
+    if let Some(numbers) = Reduced::of(&inputs[0]) {
+        let sum =
+            |inputs: &[_], weight, zeros, options| conv_3d(inputs, weight, zeros, frames, options);
+        return reduced(numbers, inputs, weight, bias, options, sum);
+    }
     if is_native(&inputs[0]) {
         return native(inputs, weight, bias, frames, options);
     }
@@ -108,6 +118,26 @@ pub fn conv_3d(
     let output = conv3d(bursts.swap_dims(1, 2), weight, Some(bias), stock); // [B, O, N, h, w]
     let [_, _, _, height, width] = output.dims();
     finish(output.swap_dims(1, 2).reshape([images, outputs, height, width]), options)
+}
+
+/// A convolution whose products have fewer bits; what follows them has all.
+fn reduced<const D: usize>(
+    numbers: Reduced,
+    inputs: &[Tensor<4>],
+    weight: Tensor<D>,
+    bias: Tensor<1>,
+    options: Options,
+    sum: impl FnOnce(&[Tensor<4>], Tensor<D>, Tensor<1>, Options) -> Tensor<4>,
+) -> Tensor<4> {
+    let narrow: Vec<_> = inputs.iter().map(|input| numbers.narrow(input.clone())).collect();
+    let zeros = numbers.narrow(bias.zeros_like().detach());
+    let alone = Options { stride: options.stride, ..Options::default() };
+    // Numbers that are only rounded have 32 bits again and must not be taken for new ones.
+    let sum = with_precision(ComputePrecision::F32, || {
+        sum(&narrow, numbers.narrow(weight), zeros, alone)
+    });
+    let outputs = bias.dims()[0];
+    finish(numbers.widen(sum) + bias.reshape([1, outputs, 1, 1]), options)
 }
 
 fn joined(inputs: &[Tensor<4>]) -> Tensor<4> {

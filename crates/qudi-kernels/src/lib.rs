@@ -14,10 +14,12 @@ mod exp;
 #[cfg(feature = "flex")]
 mod flex;
 pub mod group_norm;
+mod precision;
 #[cfg(feature = "flex")]
 mod uninitialised;
 mod warp;
 
 pub use attention::attention;
 pub use backend::{is_flex, with_stock_operations};
+pub use precision::{ComputePrecision, with_precision};
 pub use warp::warp;

@@ -29,3 +29,5 @@ pub mod selftest;
 pub mod tensor;
 pub mod tiles;
 pub mod train;
+
+pub use qudi_kernels::{ComputePrecision, with_precision};

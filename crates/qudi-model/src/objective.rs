@@ -11,6 +11,7 @@ use crate::schedule::NoiseSchedule;
 use crate::tensor::{read, to_tensor};
 use burn::module::Module;
 use burn::tensor::Tensor;
+use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_sim::restore::Context;
 use qudi_sim::{Result, SimError, Size};
 
@@ -190,7 +191,10 @@ pub fn terms(
     let unknown = (result.x0.clone() - clean.clone()) / result.unit.clamp_min(LEAST_UNIT);
     let prediction = unknown.powi_scalar(2).mean();
     let image = (result.x0 + 1.0) * 0.5;
-    let perceptual = perceptual.map(|term| term.loss(image, example.truth.clone()));
+    // Statistics are differences of large numbers.
+    let perceptual = perceptual.map(|term| {
+        with_precision(ComputePrecision::F32, || term.loss(image, example.truth.clone()))
+    });
     let pre = relative_reconstruction(example)(result.d);
     let mut total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     if let Some(term) = &perceptual {

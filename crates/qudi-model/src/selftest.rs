@@ -10,28 +10,55 @@ use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
-use qudi_kernels::{warp, with_stock_operations};
+use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
 use qudi_sim::Result;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
-pub const TOLERANCE: f32 = 2e-3;
+const TOLERANCE: f32 = 2e-3;
+
+/// Largest error that is rounding where numbers have eight bits.
+const BF16_TOLERANCE: f32 = 2e-2;
 
 /// One check.
 #[derive(Clone, Copy, Debug)]
 pub struct Check {
     /// What is checked.
     pub name: &'static str,
+    /// Numbers that convolutions multiply on the device; the reference's have 32 bits.
+    precision: ComputePrecision,
     run: fn(&Device) -> Result<Vec<Vec<f32>>>,
 }
 
 impl Check {
+    const fn exact(name: &'static str, run: fn(&Device) -> Result<Vec<Vec<f32>>>) -> Self {
+        Self { name, precision: ComputePrecision::F32, run }
+    }
+
+    const fn reduced(
+        name: &'static str,
+        precision: ComputePrecision,
+        run: fn(&Device) -> Result<Vec<Vec<f32>>>,
+    ) -> Self {
+        Self { name, precision, run }
+    }
+
+    /// Whether the device has such numbers at all.
+    pub fn is_possible(&self, device: &Device) -> bool {
+        self.precision.is_supported(device)
+    }
+
+    /// Largest error that is rounding.
+    pub fn tolerance(&self) -> f32 {
+        if self.precision == ComputePrecision::Bf16 { BF16_TOLERANCE } else { TOLERANCE }
+    }
+
     /// Largest difference between the device's results and those of Burn's stock operations on `reference`, in
     /// terms of the largest value.
     ///
     /// # Errors
     /// [`SimError`](qudi_sim::SimError) if a device fails.
     pub fn error(&self, device: &Device, reference: &Device) -> Result<f32> {
-        let got = (self.run)(device)?;
+        let got = with_precision(self.precision, || (self.run)(device))?;
         let expected = with_stock_operations(|| (self.run)(reference))?;
         let mut worst = 0f32;
         for (got, expected) in got.iter().zip(&expected) {
@@ -51,19 +78,27 @@ impl Check {
 
 /// All checks, cheap ones first.
 pub const CHECKS: &[Check] = &[
-    Check { name: "arithmetic", run: arithmetic },
-    Check { name: "joining and slicing", run: joining },
-    Check { name: "warp", run: warping },
-    Check { name: "group norm", run: normalising },
-    Check { name: "matrix product", run: products },
-    Check { name: "softmax", run: attention },
-    Check { name: "convolution 3x3", run: |device| convolution(device, 3, 1) },
-    Check { name: "convolution 1x1", run: |device| convolution(device, 1, 1) },
-    Check { name: "convolution 7x7", run: |device| convolution(device, 7, 1) },
-    Check { name: "convolution, stride 2", run: |device| convolution(device, 3, 2) },
-    Check { name: "convolution 5x5x5", run: |device| convolution_3d(device, 1) },
-    Check { name: "convolution 5x5x5 / 2", run: |device| convolution_3d(device, 2) },
-    Check { name: "network", run: network },
+    Check::exact("arithmetic", arithmetic),
+    Check::exact("joining and slicing", joining),
+    Check::exact("warp", warping),
+    Check::exact("group norm", normalising),
+    Check::exact("matrix product", products),
+    Check::exact("softmax", attention),
+    Check::exact("convolution 3x3", |device| convolution(device, 3, 1)),
+    Check::exact("convolution 1x1", |device| convolution(device, 1, 1)),
+    Check::exact("convolution 7x7", |device| convolution(device, 7, 1)),
+    Check::exact("convolution, stride 2", |device| convolution(device, 3, 2)),
+    Check::exact("convolution 5x5x5", |device| convolution_3d(device, 1)),
+    Check::exact("convolution 5x5x5 / 2", |device| convolution_3d(device, 2)),
+    Check::reduced("convolution 3x3, f16", ComputePrecision::F16, linear),
+    Check::reduced("convolution 5x5x5, f16", ComputePrecision::F16, |device| {
+        convolution_3d(device, 1)
+    }),
+    Check::reduced("convolution 3x3, bf16", ComputePrecision::Bf16, linear),
+    Check::reduced("convolution 5x5x5, bf16", ComputePrecision::Bf16, |device| {
+        convolution_3d(device, 1)
+    }),
+    Check::exact("network", network),
 ];
 
 /// Repeatable values in [-1, 1).
@@ -145,11 +180,20 @@ fn attention(device: &Device) -> Result<Vec<Vec<f32>>> {
 }
 
 fn convolution(device: &Device, kernel: usize, stride: usize) -> Result<Vec<Vec<f32>>> {
+    let options = Options { stride, activation: Activation::Relu, ..Options::default() };
+    convolution_with(device, kernel, options)
+}
+
+/// Without a ReLU: what is rounded may be on its other side.
+fn linear(device: &Device) -> Result<Vec<Vec<f32>>> {
+    convolution_with(device, 3, Options::default())
+}
+
+fn convolution_with(device: &Device, kernel: usize, options: Options) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
     let x = values(13, [2, 6, 24, 36], &device).require_grad();
     let weight = values(14, [8, 6, kernel, kernel], &device).require_grad();
     let bias = values(15, [8], &device);
-    let options = Options { stride, activation: Activation::Relu, ..Options::default() };
     let output = conv_2d(std::slice::from_ref(&x), weight.clone(), bias, options);
     with_gradients(output, &[x, weight])
 }

@@ -2,6 +2,7 @@
 
 use super::{Network, Reading, Shard};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_model::ComputePrecision;
 use qudi_sim::Size;
 use std::path::PathBuf;
 
@@ -101,8 +102,32 @@ pub(crate) struct Bench {
     /// Instead of methods, measure networks of these sizes with random weights: tiny, small, base, paper
     #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
     pub(crate) preset: Vec<String>,
+    /// Numbers that convolutions of these networks multiply, as with train.precision
+    #[arg(long, value_name = "NAME", default_value = "f32", requires = "preset")]
+    pub(crate) precision: PrecisionName,
     #[command(flatten)]
     pub(crate) network: Network,
+}
+
+/// Precisions of products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum PrecisionName {
+    /// 32 bits
+    F32,
+    /// 16 bits, 11 of them for the value
+    F16,
+    /// 16 bits, 8 of them for the value
+    Bf16,
+}
+
+impl PrecisionName {
+    pub(crate) fn precision(self) -> ComputePrecision {
+        match self {
+            Self::F32 => ComputePrecision::F32,
+            Self::F16 => ComputePrecision::F16,
+            Self::Bf16 => ComputePrecision::Bf16,
+        }
+    }
 }
 
 /// How a clip becomes photons, and which frames count.

@@ -14,6 +14,7 @@ use qudi_model::measurement::GuidePlanes;
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State};
 use qudi_model::objective::reconstruction;
 use qudi_model::restorer::QudiRestorer;
+use qudi_model::with_precision;
 use qudi_sim::Size;
 use qudi_sim::restore::{BurstView, Restorer};
 use serde::Serialize;
@@ -54,17 +55,25 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         return Err(Fault::new("nothing to measure", "--rounds, --frames", help));
     }
     let device = device::open(&args.network.device)?;
+    let precision = args.precision.precision();
+    if !precision.is_supported(&device.device) {
+        let what = format!("{} cannot compute with {precision} numbers", device.name);
+        return Err(Fault::new(what, "--precision", "ask for another, or another --device"));
+    }
     let mut bar = report.bar();
     let mut all = Vec::new();
     for preset in &args.preset {
         let config = NetworkConfig::preset(preset)?;
-        all.push(measure(preset, config, args, &device, &mut bar)?);
+        let figures =
+            with_precision(precision, || measure(preset, config, args, &device, &mut bar))?;
+        all.push(figures);
     }
     drop(bar);
     report.result(&describe(&all, args, &device), || {
         json!({
             "program": format!("qudi {}", env!("CARGO_PKG_VERSION")),
             "device": device.name,
+            "precision": precision,
             "threads": rayon::current_num_threads(),
             "height": args.size.height,
             "width": args.size.width,
@@ -216,13 +225,14 @@ fn describe(all: &[Figures], args: &Bench, device: &Opened) -> String {
     }
     let _ = writeln!(
         text,
-        "\n{} frames of {}, {} steps, on {}, {} threads; medians of {} rounds after one of warm-up; \
+        "\n{} frames of {}, {} steps, on {}, {} threads, {}; medians of {} rounds after one of warm-up; \
          forward and backward on {CROP}",
         args.frames,
         args.size,
         args.network.steps(),
         device.name,
         rayon::current_num_threads(),
+        args.precision.precision(),
         args.rounds
     );
     text

@@ -2,6 +2,7 @@
 
 use crate::config::{NetworkConfig, PRESETS};
 use crate::perceptual::PerceptualKind;
+use qudi_kernels::ComputePrecision;
 use qudi_sim::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 use qudi_sim::{Result, SimError};
 use serde::{Deserialize, Serialize};
@@ -48,6 +49,9 @@ pub struct TrainConfig {
     pub warmup: u64,
     /// Largest norm of a step's gradient; longer ones are shortened.
     pub clip: f64,
+    /// Numbers that convolutions multiply.
+    #[serde(default)]
+    pub precision: ComputePrecision,
     /// Share of the average of weights that a step keeps.
     pub ema: f64,
     /// Share of the samples at the time where sampling begins: where nothing but the photons helps.

@@ -13,6 +13,7 @@ use crate::perceptual::{Perceptual, PerceptualKind};
 use crate::tensor::read;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_sim::{Result, SimError, Size};
 use rand::rngs::ChaCha8Rng;
 use rand::{Rng, SeedableRng};
@@ -95,6 +96,10 @@ impl Trainer {
         let Some(main) = devices.first() else {
             return Err(SimError::request("no device", "--device", "name at least one"));
         };
+        let precision = recipe.train.precision;
+        if let Some(device) = devices.iter().find(|device| !precision.is_supported(device)) {
+            return Err(unsupported(precision, device));
+        }
         let mut learner = recipe.network.init(recipe.train.seed, main);
         if let Some(network) = network {
             learner = with_values(learner, values(&network));
@@ -228,6 +233,27 @@ impl Trainer {
 
     /// One batch through `network`, on device `number`.
     fn pass(&self, network: &Qudi, batch: &Batch, number: usize) -> Result<Pass> {
+        let precision = self.recipe.train.precision;
+        with_precision(precision, || {
+            let (last, larger) = loss_scales(precision).split_last().expect("at least one");
+            for &scale in larger {
+                let pass = self.scaled_pass(network, batch, number, scale)?;
+                if norm(&pass.gradients)?.is_finite() {
+                    return Ok(pass);
+                }
+            }
+            self.scaled_pass(network, batch, number, *last)
+        })
+    }
+
+    /// One batch; gradients are `scale` times as large on their way back.
+    fn scaled_pass(
+        &self,
+        network: &Qudi,
+        batch: &Batch,
+        number: usize,
+        scale: f32,
+    ) -> Result<Pass> {
         let start = Instant::now();
         let device = &self.devices[number];
         let measured = batch.measured(device);
@@ -261,7 +287,10 @@ impl Trainer {
         self.check("the errors told", loss.error)?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let gradients = gradients(network, &terms.total.backward());
+        let mut gradients = gradients(network, &(terms.total * scale).backward());
+        if scale != 1.0 {
+            gradients = gradients.into_iter().map(|gradient| gradient / scale).collect();
+        }
         let backward_s = start.elapsed().as_secs_f64();
         Ok(Pass { gradients, loss, forward_s, backward_s })
     }
@@ -300,6 +329,24 @@ impl Losses {
         self.flow += share * other.flow;
         self.error += share * other.error;
     }
+}
+
+/// What losses are multiplied by before their gradients are computed, and divided by after (Micikevicius et al. 2018, section
+/// 3.2): else gradients are below what numbers of a precision can tell from zero. The first that none is too large with; chosen
+/// for every batch anew, so that nothing depends on the batches before. All are powers of two: they round nothing.
+fn loss_scales(precision: ComputePrecision) -> &'static [f32] {
+    match precision {
+        ComputePrecision::F32 | ComputePrecision::Bf16 => &[1.0],
+        ComputePrecision::F16 => &[4096.0, 64.0, 1.0],
+    }
+}
+
+fn unsupported(precision: ComputePrecision, device: &Device) -> SimError {
+    SimError::request(
+        format!("{device:?} cannot compute with {precision} numbers"),
+        "train.precision",
+        "set it to \"f16\", which most graphics cards have, or \"f32\", which all devices have",
+    )
 }
 
 /// Euclidean norm over all lists.
