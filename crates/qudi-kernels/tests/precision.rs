@@ -4,7 +4,7 @@
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 
-use burn::tensor::{Device, Tensor, TensorData, bf16, f16};
+use burn::tensor::{Device, Tensor, TensorData, bf16};
 use cases::uniform;
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::{ComputePrecision, with_precision, with_stock_operations};
@@ -12,12 +12,9 @@ use qudi_kernels::{ComputePrecision, with_precision, with_stock_operations};
 const IMAGES: [usize; 4] = [4, 3, 10, 13];
 const OUTPUTS: usize = 5;
 
-type Round = fn(f32) -> f32;
-
-const PRECISIONS: [(ComputePrecision, Round); 2] = [
-    (ComputePrecision::F16, |x| f16::from_f32(x).to_f32()),
-    (ComputePrecision::Bf16, |x| bf16::from_f32(x).to_f32()),
-];
+fn round(x: f32) -> f32 {
+    bf16::from_f32(x).to_f32()
+}
 
 fn tensor<const D: usize>(shape: [usize; D], seed: usize, device: &Device) -> Tensor<D> {
     let values = uniform(&format!("precision {seed}"), shape.iter().product());
@@ -25,7 +22,7 @@ fn tensor<const D: usize>(shape: [usize; D], seed: usize, device: &Device) -> Te
     Tensor::from_data(TensorData::new(values, shape), device)
 }
 
-fn rounded<const D: usize>(x: Tensor<D>, round: Round) -> Tensor<D> {
+fn rounded<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let values: Vec<f32> = list(x.clone()).into_iter().map(round).collect();
     Tensor::from_data(TensorData::new(values, x.dims()), &x.device())
 }
@@ -67,41 +64,39 @@ fn run(
 #[test]
 fn products_have_fewer_bits_and_all_else_has_32() {
     let device = Device::flex().autodiff();
-    for (precision, round) in PRECISIONS {
-        for (kernel, stride) in [([1, 3, 3], 1), ([1, 3, 3], 2), ([1, 1, 1], 1), ([3, 5, 5], 1)] {
-            let [frames, rows, columns] = kernel;
-            let x = tensor(IMAGES, 1, &device);
-            let weight = tensor([OUTPUTS, IMAGES[1], frames, rows, columns], 2, &device);
-            let bias = tensor([OUTPUTS], 3, &device);
-            let grid = [IMAGES[0], OUTPUTS, IMAGES[2].div_ceil(stride), IMAGES[3].div_ceil(stride)];
-            let (addend, cotangent) = (tensor(grid, 4, &device), tensor(grid, 5, &device));
-            let got = with_precision(precision, || {
-                let images = [x.clone(), addend.clone(), cotangent.clone()];
-                run(images, weight.clone(), bias.clone(), stride)
-            });
-            let nothing = addend.zeros_like();
-            let images = [rounded(x, round), nothing, rounded(cotangent.clone(), round)];
-            let zeros = bias.zeros_like();
-            let [sum, of_x, of_weight, ..] = run(images, rounded(weight, round), zeros, stride);
-            let [bias, addend, cotangent] = [list(bias), list(addend), list(cotangent)];
-            let plane = grid[2] * grid[3];
-            let expected = sum
-                .into_iter()
-                .enumerate()
-                .map(|(place, sum)| round(sum) + bias[place / plane % OUTPUTS] + addend[place]);
-            let about = format!("{precision:?}, {kernel:?}, {stride}");
-            assert_eq!(got[0], expected.collect::<Vec<_>>(), "{about}");
-            assert_eq!(got[1], of_x.into_iter().map(round).collect::<Vec<_>>(), "{about}");
-            assert_eq!(got[2], of_weight.into_iter().map(round).collect::<Vec<_>>(), "{about}");
-            let mut of_bias = vec![0.0; OUTPUTS];
-            for (place, value) in cotangent.iter().enumerate() {
-                of_bias[place / plane % OUTPUTS] += value;
-            }
-            for (got, expected) in got[3].iter().zip(of_bias) {
-                assert!((got - expected).abs() < 1e-4, "{got} and {expected}: {about}");
-            }
-            assert_eq!(got[4], cotangent, "{about}");
+    for (kernel, stride) in [([1, 3, 3], 1), ([1, 3, 3], 2), ([1, 1, 1], 1), ([3, 5, 5], 1)] {
+        let [frames, rows, columns] = kernel;
+        let x = tensor(IMAGES, 1, &device);
+        let weight = tensor([OUTPUTS, IMAGES[1], frames, rows, columns], 2, &device);
+        let bias = tensor([OUTPUTS], 3, &device);
+        let grid = [IMAGES[0], OUTPUTS, IMAGES[2].div_ceil(stride), IMAGES[3].div_ceil(stride)];
+        let (addend, cotangent) = (tensor(grid, 4, &device), tensor(grid, 5, &device));
+        let got = with_precision(ComputePrecision::Bf16, || {
+            let images = [x.clone(), addend.clone(), cotangent.clone()];
+            run(images, weight.clone(), bias.clone(), stride)
+        });
+        let nothing = addend.zeros_like();
+        let images = [rounded(x), nothing, rounded(cotangent.clone())];
+        let zeros = bias.zeros_like();
+        let [sum, of_x, of_weight, ..] = run(images, rounded(weight), zeros, stride);
+        let [bias, addend, cotangent] = [list(bias), list(addend), list(cotangent)];
+        let plane = grid[2] * grid[3];
+        let expected = sum
+            .into_iter()
+            .enumerate()
+            .map(|(place, sum)| round(sum) + bias[place / plane % OUTPUTS] + addend[place]);
+        let about = format!("{kernel:?}, {stride}");
+        assert_eq!(got[0], expected.collect::<Vec<_>>(), "{about}");
+        assert_eq!(got[1], of_x.into_iter().map(round).collect::<Vec<_>>(), "{about}");
+        assert_eq!(got[2], of_weight.into_iter().map(round).collect::<Vec<_>>(), "{about}");
+        let mut of_bias = vec![0.0; OUTPUTS];
+        for (place, value) in cotangent.iter().enumerate() {
+            of_bias[place / plane % OUTPUTS] += value;
         }
+        for (got, expected) in got[3].iter().zip(of_bias) {
+            assert!((got - expected).abs() < 1e-4, "{got} and {expected}: {about}");
+        }
+        assert_eq!(got[4], cotangent, "{about}");
     }
 }
 
@@ -112,21 +107,20 @@ fn rounding_is_what_numbers_of_16_bits_do() {
     let images = || [IMAGES, IMAGES, IMAGES].map(|shape| tensor(shape, 6, &device));
     let weight = || tensor([IMAGES[1], IMAGES[1], 1, 3, 3], 7, &device);
     let bias = || tensor([IMAGES[1]], 8, &device);
-    for (precision, least) in [(ComputePrecision::F16, 5e-4), (ComputePrecision::Bf16, 4e-3)] {
-        let ours = with_precision(precision, || run(images(), weight(), bias(), 1));
-        let stock = with_stock_operations(|| {
-            with_precision(precision, || run(images(), weight(), bias(), 1))
-        });
-        let exact = run(images(), weight(), bias(), 1);
-        let worst = |a: &[f32], b: &[f32]| {
-            let scale = b.iter().fold(0f32, |scale, value| scale.max(value.abs()));
-            a.iter().zip(b).fold(0f32, |worst, (a, b)| worst.max((a - b).abs())) / scale
-        };
-        for part in 0..3 {
-            let (apart, off) = (worst(&ours[part], &stock[part]), worst(&ours[part], &exact[part]));
-            assert!(apart < 10.0 * least, "{precision:?}, part {part}: {apart}");
-            assert!(off > 0.1 * least && off < 4.0 * least, "{precision:?}, part {part}: {off}");
-        }
+    let least = 4e-3;
+    let ours = with_precision(ComputePrecision::Bf16, || run(images(), weight(), bias(), 1));
+    let stock = with_stock_operations(|| {
+        with_precision(ComputePrecision::Bf16, || run(images(), weight(), bias(), 1))
+    });
+    let exact = run(images(), weight(), bias(), 1);
+    let worst = |a: &[f32], b: &[f32]| {
+        let scale = b.iter().fold(0f32, |scale, value| scale.max(value.abs()));
+        a.iter().zip(b).fold(0f32, |worst, (a, b)| worst.max((a - b).abs())) / scale
+    };
+    for part in 0..3 {
+        let (apart, off) = (worst(&ours[part], &stock[part]), worst(&ours[part], &exact[part]));
+        assert!(apart < 10.0 * least, "part {part}: {apart}");
+        assert!(off > 0.1 * least && off < 4.0 * least, "part {part}: {off}");
     }
 }
 

@@ -65,7 +65,6 @@ impl Check {
     pub fn verdict(&self, error: f32) -> Verdict {
         let (right, rough) = match self.precision {
             ComputePrecision::F32 => (TOLERANCE, TOLERANCE),
-            ComputePrecision::F16 => (TOLERANCE, SUMS * TOLERANCE),
             ComputePrecision::Bf16 => (BF16_TOLERANCE, SUMS * BF16_TOLERANCE),
         };
         if error < right {
@@ -115,10 +114,6 @@ pub const CHECKS: &[Check] = &[
     Check::exact("convolution, stride 2", |device| convolution(device, 3, 2)),
     Check::exact("convolution 5x5x5", |device| convolution_3d(device, 1)),
     Check::exact("convolution 5x5x5 / 2", |device| convolution_3d(device, 2)),
-    Check::reduced("convolution 3x3, f16", ComputePrecision::F16, linear),
-    Check::reduced("convolution 5x5x5, f16", ComputePrecision::F16, |device| {
-        convolution_3d(device, 1)
-    }),
     Check::reduced("convolution 3x3, bf16", ComputePrecision::Bf16, linear),
     Check::reduced("convolution 5x5x5, bf16", ComputePrecision::Bf16, |device| {
         convolution_3d(device, 1)

@@ -284,37 +284,28 @@ fn no_number_stops_the_run() {
     assert_eq!(trainer.step_number(), 0);
 }
 
-/// Numbers of 16 bits change a step by their rounding; gradients that one scale makes too large are computed with a smaller one.
+/// Numbers of 16 bits change a step by their rounding.
 #[test]
 fn products_may_have_16_bits() {
-    let few = |precision: &str, weight: &str| {
-        let changes = [("train.precision", precision), ("train.loss.flow", weight)];
-        trained(&recipe(&changes), &[Device::flex()], 1)
-    };
-    for weight in ["30", "3e6"] {
-        let (exact_weights, exact) = few("f32", weight);
-        for (precision, tolerance) in [("f16", 5e-3), ("bf16", 5e-2)] {
-            let (weights, got) = few(precision, weight);
-            assert!(weights != exact_weights, "{precision}, {weight}: nothing was rounded");
-            let off = |got: f64, exact: f64| (got / exact - 1.0).abs();
-            let norm = off(got[0].norm, exact[0].norm);
-            assert!(norm > 0.0 && norm < tolerance, "{precision}, {weight}: {norm}");
-            let total = off(got[2].loss.total, exact[2].loss.total);
-            assert!(total < 10.0 * tolerance, "{precision}, {weight}: {total}");
-        }
-    }
+    let few =
+        |precision: &str| trained(&recipe(&[("train.precision", precision)]), &[Device::flex()], 1);
+    let (exact_weights, exact) = few("f32");
+    let (weights, got) = few("bf16");
+    assert!(weights != exact_weights, "nothing was rounded");
+    let off = |got: f64, exact: f64| (got / exact - 1.0).abs();
+    let norm = off(got[0].norm, exact[0].norm);
+    assert!(norm > 0.0 && norm < 0.05, "{norm}");
+    let total = off(got[2].loss.total, exact[2].loss.total);
+    assert!(total < 0.05, "{total}");
 }
 
 #[test]
 fn a_device_without_such_numbers_is_refused() {
     #[allow(deprecated)] // asked for by name
     let device = Device::ndarray();
-    for precision in ["f16", "bf16"] {
-        let error =
-            Trainer::new(&recipe(&[("train.precision", precision)]), None, &[device.clone()], None);
-        let text = error.unwrap_err().to_string();
-        assert!(text.contains(precision), "{text}");
-    }
+    let recipe = recipe(&[("train.precision", "bf16")]);
+    let text = Trainer::new(&recipe, None, &[device], None).unwrap_err().to_string();
+    assert!(text.contains("bf16"), "{text}");
 }
 
 #[test]

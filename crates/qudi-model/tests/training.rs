@@ -256,23 +256,19 @@ fn gradients_reach_every_parameter() {
     assert!(without.names.is_empty(), "no gradient: {}", without.names.join(", "));
 }
 
-/// How far all gradients are from those of single precision, in terms of their norm.
 #[test]
 fn gradients_in_16_bits_are_those_in_32() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 64, width: 64 }, 5, &device);
     let mut network = tiny().init(3, &device);
     let mut optimizer = Adam::new(&values(&network));
-    let of = |network: &Qudi, precision, scale: f32| {
+    let of = |network: &Qudi, precision| {
         with_precision(precision, || {
-            let total = loss(network, &burst, 10).total * scale;
-            let lists = gradients(network, &total.backward());
-            let lists = lists.into_iter().map(|list| list / scale);
-            lists.collect::<Vec<_>>()
+            gradients(network, &loss(network, &burst, 10).total.backward())
         })
     };
     for _ in 0..10 {
-        let gradients = of(&network, ComputePrecision::F32, 1.0);
+        let gradients = of(&network, ComputePrecision::F32);
         let moved = optimizer.step(values(&network), gradients, 1.0, 1e-3);
         network = with_values(network, moved);
     }
@@ -280,18 +276,11 @@ fn gradients_in_16_bits_are_those_in_32() {
         let squares = lists.iter().map(|list| list.clone().powi_scalar(2).sum());
         squares.map(|square| square.into_scalar::<f32>()).sum::<f32>().sqrt()
     };
-    let exact = of(&network, ComputePrecision::F32, 1.0);
-    let off = |precision, scale| {
-        let lists = of(&network, precision, scale).into_iter().zip(exact.clone());
-        norm(&lists.map(|(a, b)| a - b).collect::<Vec<_>>()) / norm(&exact)
-    };
-    let bf16 = off(ComputePrecision::Bf16, 1.0);
-    assert!(bf16 > 1e-3 && bf16 < 0.05, "bf16: {bf16}");
-    let f16 = off(ComputePrecision::F16, 4096.0);
-    assert!(f16 > 1e-4 && f16 < 0.01, "f16: {f16}");
-    // A thousand times as many pixels in a mean: what losses are scaled for.
-    let unscaled = off(ComputePrecision::F16, 0.001);
-    assert!(unscaled > 0.1, "f16 of small numbers: {unscaled}");
+    let exact = of(&network, ComputePrecision::F32);
+    let apart = of(&network, ComputePrecision::Bf16).into_iter().zip(&exact);
+    let apart: Vec<_> = apart.map(|(a, b)| a - b.clone()).collect();
+    let off = norm(&apart) / norm(&exact);
+    assert!(off > 1e-3 && off < 0.05, "{off}");
 }
 
 #[test]

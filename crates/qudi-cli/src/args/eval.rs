@@ -114,8 +114,6 @@ pub(crate) struct Bench {
 pub(crate) enum PrecisionName {
     /// 32 bits
     F32,
-    /// 16 bits, 11 of them for the value
-    F16,
     /// 16 bits, 8 of them for the value
     Bf16,
 }
@@ -124,7 +122,6 @@ impl PrecisionName {
     pub(crate) fn precision(self) -> ComputePrecision {
         match self {
             Self::F32 => ComputePrecision::F32,
-            Self::F16 => ComputePrecision::F16,
             Self::Bf16 => ComputePrecision::Bf16,
         }
     }

@@ -233,27 +233,6 @@ impl Trainer {
 
     /// One batch through `network`, on device `number`.
     fn pass(&self, network: &Qudi, batch: &Batch, number: usize) -> Result<Pass> {
-        let precision = self.recipe.train.precision;
-        with_precision(precision, || {
-            let (last, larger) = loss_scales(precision).split_last().expect("at least one");
-            for &scale in larger {
-                let pass = self.scaled_pass(network, batch, number, scale)?;
-                if norm(&pass.gradients)?.is_finite() {
-                    return Ok(pass);
-                }
-            }
-            self.scaled_pass(network, batch, number, *last)
-        })
-    }
-
-    /// One batch; gradients are `scale` times as large on their way back.
-    fn scaled_pass(
-        &self,
-        network: &Qudi,
-        batch: &Batch,
-        number: usize,
-        scale: f32,
-    ) -> Result<Pass> {
         let start = Instant::now();
         let device = &self.devices[number];
         let measured = batch.measured(device);
@@ -268,8 +247,10 @@ impl Trainer {
             FirstPass::Yes(random.next_u64())
         };
         let example = batch.example(&measured);
-        let terms =
-            terms(network, &example, first_pass, weights, switches, self.perceptual.get(number))?;
+        let perceptual = self.perceptual.get(number);
+        let terms = with_precision(self.recipe.train.precision, || {
+            terms(network, &example, first_pass, weights, switches, perceptual)
+        })?;
         let number_of = |term: &Tensor<1>| Ok(f64::from(read(term.clone())?[0]));
         let optional = |term: &Option<Tensor<1>>| term.as_ref().map_or(Ok(0.0), number_of);
         let loss = Losses {
@@ -287,10 +268,7 @@ impl Trainer {
         self.check("the errors told", loss.error)?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let mut gradients = gradients(network, &(terms.total * scale).backward());
-        if scale != 1.0 {
-            gradients = gradients.into_iter().map(|gradient| gradient / scale).collect();
-        }
+        let gradients = gradients(network, &terms.total.backward());
         let backward_s = start.elapsed().as_secs_f64();
         Ok(Pass { gradients, loss, forward_s, backward_s })
     }
@@ -331,21 +309,11 @@ impl Losses {
     }
 }
 
-/// What losses are multiplied by before their gradients are computed, and divided by after (Micikevicius et al. 2018, section
-/// 3.2): else gradients are below what numbers of a precision can tell from zero. The first that none is too large with; chosen
-/// for every batch anew, so that nothing depends on the batches before. All are powers of two: they round nothing.
-fn loss_scales(precision: ComputePrecision) -> &'static [f32] {
-    match precision {
-        ComputePrecision::F32 | ComputePrecision::Bf16 => &[1.0],
-        ComputePrecision::F16 => &[4096.0, 64.0, 1.0],
-    }
-}
-
 fn unsupported(precision: ComputePrecision, device: &Device) -> SimError {
     SimError::request(
         format!("{device:?} cannot compute with {precision} numbers"),
         "train.precision",
-        "set it to \"f16\", which most graphics cards have, or \"f32\", which all devices have",
+        "set it to \"f32\", which all devices have",
     )
 }
 
