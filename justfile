@@ -9,12 +9,12 @@ ci:
 
 # The test suite
 test:
-    cargo test --workspace
+    cargo test --workspace --features qudi-cli/remote
 
 # Formatting and lints
 lint:
     cargo fmt --all --check
-    cargo clippy --workspace --all-targets -- -D warnings
+    cargo clippy --workspace --all-targets --features qudi-cli/remote -- -D warnings
 
 # API documentation
 doc:

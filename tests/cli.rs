@@ -11,6 +11,9 @@ mod eval;
 mod network;
 #[path = "cli/outputs.rs"]
 mod outputs;
+#[cfg(feature = "remote")]
+#[path = "cli/remote.rs"]
+mod remote;
 #[path = "cli/restore.rs"]
 mod restore;
 #[path = "cli/train.rs"]

@@ -92,6 +92,8 @@ pub(crate) enum Command {
     Eval(Box<Eval>),
     Bench(Box<Bench>),
     Selftest(Selftest),
+    #[cfg(feature = "remote")]
+    Serve(Serve),
     Convert(Box<Convert>),
     Calibrate(Box<Calibrate>),
     Demo(Demo),
@@ -115,6 +117,21 @@ pub(crate) struct Selftest {
     /// Checks whose names contain one of these
     #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
     pub(crate) only: Vec<String>,
+}
+
+/// Let other machines compute on this one's devices, with --device ws://HOST:PORT there, until Ctrl-C
+///
+/// Operations and tensors cross the network unencrypted, so serve within a network that you trust. Where others can reach it, server
+/// and clients need the same word in QUDI_TOKEN. Both must be of the same version.
+#[cfg(feature = "remote")]
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Serve {
+    /// Devices to serve, as for train
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
+    pub(crate) device: Vec<String>,
+    /// Where to listen; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:4001")]
+    pub(crate) listen: std::net::SocketAddr,
 }
 
 /// See what the camera sees, and what every method makes of it: a built-in scene in one picture and one page

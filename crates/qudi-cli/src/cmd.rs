@@ -25,6 +25,8 @@ pub(crate) mod restore;
 mod restore_deviation;
 mod restore_output;
 pub(crate) mod selftest;
+#[cfg(feature = "remote")]
+pub(crate) mod serve;
 pub(crate) mod simulate;
 mod tiff_samples;
 pub(crate) mod train;

@@ -42,6 +42,9 @@ pub(crate) fn list() -> Vec<Listed> {
 /// Opens a device by name and computes something small on it.
 pub(crate) fn open(name: &str) -> Result<Opened> {
     let name = if name == "auto" { best() } else { name.to_owned() };
+    if name.starts_with("ws://") {
+        return open_remote(name);
+    }
     let (backend, number) = match name.split_once(':') {
         None => (name.as_str(), Some(0)),
         Some((backend, number)) => (backend, number.parse::<usize>().ok()),
@@ -73,6 +76,20 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
             "check its driver with `qudi selftest`, or use --device cpu",
         )),
     }
+}
+
+#[cfg(feature = "remote")]
+fn open_remote(name: String) -> Result<Opened> {
+    Ok(Opened { device: crate::remote::connect(&name)?, name })
+}
+
+#[cfg(not(feature = "remote"))]
+fn open_remote(name: String) -> Result<Opened> {
+    Err(Fault::new(
+        "this build knows no other machines' devices",
+        name,
+        "build it with `--features remote`",
+    ))
 }
 
 /// The first real graphics card, or the processor.

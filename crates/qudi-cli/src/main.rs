@@ -7,6 +7,8 @@ mod error;
 mod interrupt;
 mod keys;
 mod memory;
+#[cfg(feature = "remote")]
+mod remote;
 mod report;
 mod settings;
 mod weights;
@@ -57,6 +59,8 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Eval(eval) => cmd::eval::run(eval, &args.global, report),
         Command::Bench(bench) => cmd::bench::run(bench, &args.global, report),
         Command::Selftest(selftest) => cmd::selftest::run(selftest, report),
+        #[cfg(feature = "remote")]
+        Command::Serve(serve) => cmd::serve::run(serve, report),
         Command::Convert(convert) => cmd::convert::run(convert, &args.global, report),
         Command::Calibrate(calibrate) => cmd::calibrate::run(calibrate, &args.global, report),
         Command::Demo(demo) => cmd::demo::run(demo, &args.global, report),
