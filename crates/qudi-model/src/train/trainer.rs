@@ -85,7 +85,7 @@ impl Trainer {
     /// them in turn. `backbones` is the folder of the perceptual term's weights.
     ///
     /// # Errors
-    /// [`SimError`] if the perceptual term cannot be loaded.
+    /// [`SimError`] if the perceptual term cannot be loaded, or a device lacks the numbers of `train.precision`.
     pub fn new(
         recipe: &Recipe,
         network: Option<Qudi>,
