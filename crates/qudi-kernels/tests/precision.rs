@@ -45,9 +45,9 @@ fn run(
     let [outputs, channels, frames, rows, columns] = weight.dims();
     let output = if frames == 1 {
         let weight = weight.clone().reshape([outputs, channels, rows, columns]);
-        conv_2d(&[x.clone()], weight, bias.clone(), options)
+        conv_2d(std::slice::from_ref(&x), weight, bias.clone(), options)
     } else {
-        conv_3d(&[x.clone()], weight.clone(), bias.clone(), 2, options)
+        conv_3d(std::slice::from_ref(&x), weight.clone(), bias.clone(), 2, options)
     };
     let grads = (output.clone() * cotangent).sum().backward();
     [
@@ -132,7 +132,7 @@ fn single_precision_comes_back() {
     let weight = tensor([2, IMAGES[1], 3, 3], 10, &device);
     let conv = || {
         let bias = Tensor::zeros([2], &device);
-        list(conv_2d(&[x.clone()], weight.clone(), bias, Options::default()).inner())
+        list(conv_2d(std::slice::from_ref(&x), weight.clone(), bias, Options::default()).inner())
     };
     let exact = conv();
     let (reduced, within) = with_precision(ComputePrecision::Bf16, || {
