@@ -6,6 +6,9 @@ use burn::tensor::Device;
 use burn::tensor::DeviceType;
 use std::sync::OnceLock;
 
+/// How names of other machines' devices begin.
+pub(crate) const REMOTE: &str = "ws://";
+
 /// A device that `--device` can name.
 #[derive(Debug)]
 pub(crate) struct Listed {
@@ -42,7 +45,7 @@ pub(crate) fn list() -> Vec<Listed> {
 /// Opens a device by name and computes something small on it.
 pub(crate) fn open(name: &str) -> Result<Opened> {
     let name = if name == "auto" { best() } else { name.to_owned() };
-    if name.starts_with("ws://") {
+    if name.starts_with(REMOTE) {
         return open_remote(name);
     }
     let (backend, number) = match name.split_once(':') {

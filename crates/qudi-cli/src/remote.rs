@@ -1,6 +1,7 @@
 //! Devices of other machines, through Burn's remote backend over WebSocket: their servers run every operation, this program
 //! draws data and reads results. Nothing is encrypted.
 
+use crate::device::REMOTE;
 use crate::error::{Fault, Result};
 use burn::remote::{ConnectError, RemoteHost};
 use burn::server::{RemoteServer, TokenAuthorizer, WebSocketTransport};
@@ -10,19 +11,16 @@ use std::net::{SocketAddr, TcpListener};
 /// The environment variable with the word that server and clients share. Arguments can be read by everybody on a machine.
 const TOKEN: &str = "QUDI_TOKEN";
 
-/// How names of such devices begin.
-pub(crate) const SCHEME: &str = "ws://";
-
 /// Connects to a device named `ws://HOST:PORT`, or `ws://HOST:PORT/1` for the second that is served there.
 pub(crate) fn connect(name: &str) -> Result<Device> {
-    let address = name.strip_prefix(SCHEME).unwrap_or(name).trim_end_matches('/');
+    let address = name.strip_prefix(REMOTE).unwrap_or(name).trim_end_matches('/');
     let (address, number) = match address.split_once('/') {
         None => (address, Some(0)),
         Some((address, number)) => (address, number.parse::<u32>().ok()),
     };
     let help = "write ws://HOST:PORT, or ws://HOST:PORT/1 for the second device there";
     let number = number.ok_or_else(|| Fault::new("no number of a device", name, help))?;
-    let host = RemoteHost::websocket(&format!("{SCHEME}{address}"));
+    let host = RemoteHost::websocket(&format!("{REMOTE}{address}"));
     let host = match token() {
         Some(token) => host.with_credential(token),
         None => host,

@@ -14,10 +14,10 @@ use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations
 use qudi_sim::Result;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
-const TOLERANCE: f32 = 2e-3;
+pub const TOLERANCE: f32 = 2e-3;
 
 /// Largest error that is rounding where the numbers that are multiplied have eight bits.
-const BF16_TOLERANCE: f32 = 2e-2;
+pub const BF16_TOLERANCE: f32 = 2e-2;
 
 /// How much larger errors are where sums have no more bits than what is multiplied.
 const SUMS: f32 = 10.0;

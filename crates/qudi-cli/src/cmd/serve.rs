@@ -13,8 +13,8 @@ pub(crate) fn run(args: &Serve, report: &Report) -> Result<()> {
     let devices = opened.into_iter().map(|device| device.device).collect();
     remote::serve(devices, args.listen, |address| {
         let list = names.iter().enumerate().map(|(number, name)| match number {
-            0 => format!("{}{address}: {name}", remote::SCHEME),
-            number => format!("{}{address}/{number}: {name}", remote::SCHEME),
+            0 => format!("{}{address}: {name}", device::REMOTE),
+            number => format!("{}{address}/{number}: {name}", device::REMOTE),
         });
         let text = list.collect::<Vec<_>>().join("\n");
         report.result(&text, || json!({"address": address.to_string(), "devices": names}))
