@@ -4,11 +4,13 @@ use crate::network::refused;
 use crate::outputs::{qudi, scratch};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
 /// A server that ends with the test.
 struct Server {
     process: Child,
+    /// Open as long as it runs: it ends when nobody can read what it says.
+    _output: BufReader<ChildStdout>,
     /// `ws://127.0.0.1:PORT`
     name: String,
 }
@@ -29,9 +31,10 @@ fn serve(devices: &str, token: &str) -> Server {
         .spawn()
         .unwrap();
     let mut line = String::new();
-    BufReader::new(process.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let mut output = BufReader::new(process.stdout.take().unwrap());
+    output.read_line(&mut line).unwrap();
     let name = line.trim().strip_suffix(": cpu").unwrap().to_owned();
-    Server { process, name }
+    Server { process, _output: output, name }
 }
 
 fn weights(folder: &Path, run: &str, devices: &str) -> Vec<u8> {
@@ -47,7 +50,7 @@ fn loss(folder: &Path, run: &str) -> f64 {
     let metrics = std::fs::read_to_string(folder.join(run).join("metrics.jsonl")).unwrap();
     let lines =
         metrics.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
-    lines.filter_map(|line| line["total"].as_f64()).last().unwrap()
+    lines.filter_map(|line| line["total"].as_f64()).next_back().unwrap()
 }
 
 /// One server, and two that share the batches: the same bits. Kernels are Burn's own there, not ours.

@@ -10,10 +10,8 @@ pub fn is_flex(device: &Device) -> bool {
     {
         use burn::backend::DispatchDevice;
         match device.as_dispatch() {
-            DispatchDevice::Flex(_) => true,
             DispatchDevice::Autodiff(device) => matches!(**device, DispatchDevice::Flex(_)),
-            #[allow(unreachable_patterns)] // with other backends compiled in there are more
-            _ => false,
+            device => matches!(device, DispatchDevice::Flex(_)),
         }
     }
     #[cfg(not(feature = "flex"))]
