@@ -26,8 +26,8 @@ doc:
 
 # Nanoseconds per pixel of the camera, seconds per window of the classical methods
 bench:
-    cargo bench -p qudi-sim
-    cargo bench -p qudi-baselines
+    cargo bench -p qudi-core
+    cargo bench -p qudi-burst
 
 # The picture of the README
 picture:

@@ -2,7 +2,7 @@
 //!
 //! Any result is fine, except a panic, a hang, or memory beyond libFuzzer's limit.
 
-use qudi_sim::capture::{Capture, ReadOptions};
+use qudi_io::capture::{Capture, ReadOptions};
 
 /// Frames read from each file.
 const FRAMES: u64 = 4;

@@ -2,13 +2,13 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy", "scipy", "pillow", "bm3d"]
 # ///
-"""The `bm3d` package (non-commercial licence: only ever an oracle) and SciPy's laws beside qudi-baselines.
+"""The `bm3d` package (non-commercial licence: only ever an oracle) and SciPy's laws beside qudi-burst.
 
     python scripts/reference/baselines.py golden tests/golden/baselines
     python scripts/reference/baselines.py compare target/release/examples/denoise THREADS FOLDER...
     python scripts/reference/baselines.py restore PHOTONS OUT
 
-`golden` writes what crates/qudi-baselines/tests compare with. `compare` denoises the top left 256 x 256
+`golden` writes what crates/qudi-burst/tests compare with. `compare` denoises the top left 256 x 256
 pixels of every eighth image of each folder with both programs, in turns, and prints mean PSNR and seconds.
 `restore` denoises every frame of the bursts that `qudi eval --export-photons PHOTONS` wrote: generalized
 Anscombe, BM3D, closed-form inverse; score it with `qudi eval --external numpy=OUT`.

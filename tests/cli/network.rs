@@ -2,10 +2,10 @@
 
 use crate::outputs::{listing, qudi, scratch};
 use burn::tensor::Device;
+use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, Precision, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::fill;
-use qudi_sim::output::Overwrite;
 use std::path::{Path, PathBuf};
 
 /// A folder with a burst and untrained weights of the smallest network.

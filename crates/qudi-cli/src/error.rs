@@ -1,6 +1,6 @@
 //! Errors of the command line: what happened, where, what to do.
 
-use qudi_sim::SimError;
+use qudi_core::SimError;
 use std::fmt::Display;
 use std::io;
 

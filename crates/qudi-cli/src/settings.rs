@@ -3,8 +3,8 @@
 use crate::args::Global;
 use crate::error::{Fault, Result};
 use crate::keys::KEYS;
-use qudi_sim::nearest::nearest;
-use qudi_sim::sensor::{Sensor, load_document, merge_documents};
+use qudi_core::nearest::nearest;
+use qudi_core::sensor::{Sensor, load_document, merge_documents};
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 use std::path::Path;

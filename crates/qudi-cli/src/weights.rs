@@ -2,9 +2,9 @@
 
 use crate::error::{Fault, Result};
 use burn::tensor::Device;
+use qudi_core::SimError;
 use qudi_model::checkpoint::{Description, describe, describe_bytes, load, load_bytes};
 use qudi_model::network::Qudi;
-use qudi_sim::SimError;
 use sha2::{Digest, Sha256};
 use std::fmt;
 use std::path::{Path, PathBuf};

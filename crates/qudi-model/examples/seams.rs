@@ -6,13 +6,13 @@
 #![allow(clippy::print_stdout, clippy::unwrap_used)]
 
 use burn::tensor::Device;
+use qudi_core::metrics::psnr;
+use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Camera, Frame, Light, Size};
 use qudi_model::checkpoint::load;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
-use qudi_sim::metrics::psnr;
-use qudi_sim::restore::{BurstView, Context, Restorer};
 use qudi_sim::scene::{Procedural, ProceduralScene};
-use qudi_sim::sensor::Sensor;
-use qudi_sim::{Camera, Frame, Light, Size};
 use std::path::PathBuf;
 
 /// A simulated burst of moving leaves: counts, truth, light.

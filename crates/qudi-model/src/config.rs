@@ -1,8 +1,8 @@
 //! Sizes of the network, read from TOML; the presets.
 
 use crate::measurement::Laid;
-use qudi_baselines::Along;
-use qudi_sim::{Result, SimError};
+use qudi_burst::Along;
+use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
 
 /// Sizes of the whole network (docs/network.md).

@@ -3,7 +3,7 @@
 use crate::config::NetworkConfig;
 use crate::network::parameters;
 use burn::tensor::Device;
-use qudi_sim::Size;
+use qudi_core::Size;
 
 impl NetworkConfig {
     /// Number of parameters.

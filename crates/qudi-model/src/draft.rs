@@ -2,12 +2,12 @@
 //! and what its neighbours look like, far better than a classical guide. Each round has a pre-denoiser of its own.
 
 use crate::config::NetworkConfig;
-use crate::layout::Layout;
 use crate::measurement::{BRIGHTEST, GuidePlanes, Laid};
 use crate::network::{PreDenoiser, Qudi};
+use crate::restorer::layout::Layout;
 use burn::tensor::{Device, Tensor};
-use qudi_baselines::Alignment;
-use qudi_sim::{Frame, Result};
+use qudi_burst::Alignment;
+use qudi_core::{Frame, Result};
 
 /// Deviation of the errors that a pre-denoised frame does not share with the next one, in that of the merged frame's noise.
 const UNSHARED: f32 = 0.4;
@@ -35,14 +35,15 @@ impl Draft {
         network.drafts().iter().map(draft).collect()
     }
 
-    pub(crate) fn denoiser(&self) -> &PreDenoiser {
+    /// The pre-denoiser of the draft.
+    pub fn denoiser(&self) -> &PreDenoiser {
         &self.denoiser
     }
 
     /// The frames of a window, restored and steadied, in image units.
     ///
     /// # Errors
-    /// [`SimError`](qudi_sim::SimError) if the device fails.
+    /// [`SimError`](qudi_core::SimError) if the device fails.
     pub fn restore(&self, alignment: &Alignment<'_>) -> Result<Vec<Frame>> {
         let layout = Layout::new(alignment.size(), self.fold, self.tile);
         let denoise = |guide: &Tensor<4>| vec![self.denoiser.denoise(guide)];
@@ -109,10 +110,10 @@ mod tests {
     use crate::config::PreConfig;
     use crate::measurement::{IMAGES, aligned};
     use crate::network::fill;
-    use qudi_baselines::Guide;
-    use qudi_sim::Size;
-    use qudi_sim::restore::{BurstView, Context};
-    use qudi_sim::sensor::Sensor;
+    use qudi_burst::Guide;
+    use qudi_core::Size;
+    use qudi_core::restorer::{BurstView, Context};
+    use qudi_core::sensor::Sensor;
 
     const SIZE: Size = Size { height: 48, width: 80 };
 

@@ -4,10 +4,10 @@ use crate::draft::Draft;
 use crate::network::SENSOR_NUMBERS;
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
-use qudi_baselines::{Aligned, Alignment, Along, Guide};
-use qudi_sim::restore::{BurstView, Context};
-use qudi_sim::sensor::{CountLaw, Response, Sensor};
-use qudi_sim::{Result, Size};
+use qudi_burst::{Aligned, Alignment, Along, Guide};
+use qudi_core::restorer::{BurstView, Context};
+use qudi_core::sensor::{CountLaw, Response, Sensor};
+use qudi_core::{Result, Size};
 use std::ops::Range;
 
 /// Brightest linear estimate, in image units: twice white.
@@ -70,7 +70,7 @@ impl Laid {
 /// pre-denoisers of a network before its last one.
 ///
 /// # Errors
-/// [`SimError`](qudi_sim::SimError) if the sensor's dark rate is unknown, or the drafts' device fails.
+/// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown, or the drafts' device fails.
 pub fn aligned<'a>(
     burst: BurstView<'_>,
     context: &'a Context,
@@ -89,10 +89,10 @@ pub fn aligned<'a>(
 /// frame and of its neighbours laid upon it, and what is expected of the neighbours, in deviations (see
 /// [`Aligned`]).
 #[derive(Clone, Debug, Default)]
-pub struct GuidePlanes(pub(crate) Vec<Vec<f32>>);
+pub struct GuidePlanes(pub Vec<Vec<f32>>);
 
 /// Planes in image units.
-pub(crate) const IMAGES: usize = 3;
+pub const IMAGES: usize = 3;
 
 impl GuidePlanes {
     /// Planes with such frames laid upon each.

@@ -1,18 +1,21 @@
 //! Quanta Diffusion as a method: windows of counts in, clean frames and their deviation out.
 
+pub(crate) mod layout;
+pub mod tiles;
+
 use crate::config::{NetworkConfig, Part};
+use crate::diffusion::noise::Noise;
+use crate::diffusion::physics::LoopSensor;
+use crate::diffusion::sampler::{Sampler, Step, TIMES};
+use crate::diffusion::schedule::{NoiseSchedule, Spacing};
 use crate::draft::{Denoised, Draft, denoised, settled};
-use crate::layout::Layout;
 use crate::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
 use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated, State};
-use crate::noise::Noise;
-use crate::physics::LoopSensor;
-use crate::sampler::{Sampler, Step, TIMES};
-use crate::schedule::{NoiseSchedule, Spacing};
+use crate::restorer::layout::Layout;
 use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
-use qudi_sim::{Result, SimError};
+use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::{Result, SimError};
 
 /// Fewest frames that the fusion makes sense of.
 pub const FEWEST_FRAMES: usize = 3;
@@ -346,8 +349,8 @@ impl Moments {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
-    use qudi_sim::Size;
-    use qudi_sim::sensor::Sensor;
+    use qudi_core::Size;
+    use qudi_core::sensor::Sensor;
 
     /// Initial weights correct nothing; what is left out for them must not be missed in one step, with tiles either.
     #[test]

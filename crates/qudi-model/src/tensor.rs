@@ -1,7 +1,7 @@
 //! The only bridge between images in memory and tensors.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_sim::{Result, SimError, Size};
+use qudi_core::{Result, SimError, Size};
 
 /// Images as a tensor, `[images, 1, height, width]`. `values` holds whole images, row-major.
 pub fn to_tensor(values: Vec<f32>, size: Size, device: &Device) -> Tensor<4> {

@@ -2,10 +2,10 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
+use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, Precision, describe, load, load_bytes, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::{Qudi, fill, parameters};
-use qudi_sim::output::Overwrite;
 use std::path::{Path, PathBuf};
 
 fn description() -> Description {

@@ -1,11 +1,11 @@
 //! The measurement inside the loop: exact distribution, same counts everywhere, and what the planes say.
 #![allow(clippy::unwrap_used)]
 
+use qudi_core::Size;
+use qudi_core::restorer::{BurstView, Context};
+use qudi_core::sensor::{CountLaw, FullWell, Gain, Sensor};
+use qudi_model::diffusion::physics::LoopSensor;
 use qudi_model::measurement::Planes;
-use qudi_model::physics::LoopSensor;
-use qudi_sim::Size;
-use qudi_sim::restore::{BurstView, Context};
-use qudi_sim::sensor::{CountLaw, FullWell, Gain, Sensor};
 
 const SIZE: Size = Size { height: 128, width: 256 };
 
@@ -90,7 +90,7 @@ fn the_same_estimate_gives_the_same_counts() {
 fn the_linear_estimate_is_unbiased_in_image_units() {
     // Without read noise and with light far from saturation the mean estimate is the image.
     let mut context = context("qudi-paper", 3.25, 1);
-    context.sensor.dark = qudi_sim::sensor::DarkRate::PerFrame(0.0);
+    context.sensor.dark = qudi_core::sensor::DarkRate::PerFrame(0.0);
     context.sensor.bits = 8;
     context.gain = 10.0;
     context.sensor.gain = Gain::Fixed(10.0);

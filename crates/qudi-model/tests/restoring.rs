@@ -2,13 +2,13 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
+use qudi_core::Size;
+use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::sensor::Sensor;
 use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::network::fill;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
-use qudi_model::sampler::Sampler;
-use qudi_sim::Size;
-use qudi_sim::restore::{BurstView, Context, Restored, Restorer};
-use qudi_sim::sensor::Sensor;
 
 fn context(seed: u64, first_frame: u64) -> Context {
     let sensor = Sensor::load("qudi-paper").unwrap();

@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
+use qudi_core::Size;
 use qudi_model::tensor::{read, to_tensor};
-use qudi_sim::Size;
 
 #[test]
 fn images_become_tensors_and_come_back() {

@@ -17,7 +17,8 @@ pub use procedural::{PROCEDURAL, Procedural, ProceduralScene};
 pub use shape::Shape;
 pub use still::{StillMotion, still_scene};
 
-use crate::frame::{Frame, Size};
+use qudi_core::flow::Flow;
+use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 
 /// One moving surface.
@@ -38,19 +39,6 @@ pub struct Scene {
     pub size: Size,
     /// Back to front.
     pub layers: Vec<Layer>,
-}
-
-/// Where the surface seen at each pixel goes, in pixels.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Flow {
-    /// Rows and columns.
-    pub size: Size,
-    /// Horizontal displacement, `[height * width]`.
-    pub dx: Vec<f32>,
-    /// Vertical displacement, `[height * width]`.
-    pub dy: Vec<f32>,
-    /// Whether the surface is inside the frame and not hidden at the target time.
-    pub visible: Vec<bool>,
 }
 
 impl Scene {

@@ -2,13 +2,14 @@
 //!
 //! Memory holds one exposure at a time, however long the clip.
 
-use crate::camera::Camera;
-use crate::error::{Result, SimError};
-use crate::frame::{Frame, Size};
-use crate::light::{Checksum, ClipStatistics, Light, PppDefinition, resolve_light};
-use crate::scene::Flow;
-use crate::sensor::{PixelMaps, Sensor};
-use crate::source::{Input, Sampling};
+use crate::clip::{Input, Sampling};
+use qudi_core::Camera;
+use qudi_core::Checksum;
+use qudi_core::flow::Flow;
+use qudi_core::sensor::{PixelMaps, Sensor};
+use qudi_core::{ClipStatistics, Light, PppDefinition, resolve_light};
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
 

@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used)]
 
 use proptest::prelude::*;
-use qudi_sim::sensor::{DarkRate, Sensor};
-use qudi_sim::{Camera, Frame, Light, Size};
+use qudi_core::sensor::{DarkRate, Sensor};
+use qudi_core::{Camera, Frame, Light, Size};
 
 fn expose(sensor: &Sensor, size: Size, seed: u64, threads: usize, frames: u64) -> Vec<Vec<u16>> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

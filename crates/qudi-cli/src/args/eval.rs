@@ -2,8 +2,8 @@
 
 use super::{Network, Reading, Shard};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_core::Size;
 use qudi_model::ComputePrecision;
-use qudi_sim::Size;
 use std::path::PathBuf;
 
 /// Compare methods on clips whose truth is known, or on a real capture: the same photons and frames for all

@@ -2,8 +2,8 @@
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args as ClapArgs, ValueHint};
-use qudi_sim::Size;
-use qudi_sim::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+use qudi_core::Size;
+use qudi_io::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 use serde::de::DeserializeOwned;
 use std::path::PathBuf;
 

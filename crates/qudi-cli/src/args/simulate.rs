@@ -1,7 +1,7 @@
 //! Options of `qudi simulate`.
 
 use clap::{Args as ClapArgs, ValueHint};
-use qudi_sim::Size;
+use qudi_core::Size;
 use std::path::PathBuf;
 
 /// Turn video, images or synthetic scenes into photon counts

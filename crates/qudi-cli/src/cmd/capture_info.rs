@@ -4,11 +4,12 @@ use crate::args::{Global, Info};
 use crate::cmd::info::{origin, record_document};
 use crate::error::{Fault, Result};
 use crate::report::Report;
-use qudi_sim::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
-use qudi_sim::output::{Overwrite, Picture, refuse_taken};
-use qudi_sim::record::Described;
-use qudi_sim::sensor::Sensor;
-use qudi_sim::{Frame, linear_to_srgb};
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Frame, linear_to_srgb};
+use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
+use qudi_io::record::Described;
+use qudi_io::writer::Picture;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -121,7 +122,7 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
     if let Some(packing) = about.packing {
         line("packing", describe_packing(packing, summary.bit_order));
     }
-    if about.orient != qudi_sim::capture::Orientation::Raw {
+    if about.orient != qudi_io::capture::Orientation::Raw {
         line("turned", about.orient.name().to_owned());
     }
     if let Some(fps) = capture.fps() {
@@ -169,7 +170,7 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
 
 fn describe_packing(packing: Packing, check: Option<BitOrderCheck>) -> String {
     let axis = match packing.axis {
-        qudi_sim::capture::PackAxis::Height => "height",
+        qudi_io::capture::PackAxis::Height => "height",
         _ => "width",
     };
     let order = packing.order;

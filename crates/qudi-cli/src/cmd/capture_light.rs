@@ -1,10 +1,12 @@
 //! The light of a capture, from what is said, recorded or seen: what methods are told.
 
 use crate::error::{Fault, Result};
-use qudi_sim::USUAL_EXPOSURE;
-use qudi_sim::capture::{Capture, Summary};
-use qudi_sim::restore::{Context, LONGEST_HALF, fitting_exposure};
-use qudi_sim::sensor::Sensor;
+use qudi_core::USUAL_EXPOSURE;
+use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::restorer::Context;
+use qudi_core::sensor::Sensor;
+use qudi_core::windows::LONGEST_HALF;
+use qudi_io::capture::{Capture, Summary};
 
 /// What the user says about it.
 pub(crate) struct Stated {

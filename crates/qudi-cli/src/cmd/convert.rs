@@ -5,11 +5,11 @@ use crate::cmd::capture_info::remarks;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::{Bar, Report};
-use qudi_sim::SimError;
-use qudi_sim::burst::{BurstFormat, BurstWriter};
-use qudi_sim::capture::{Capture, MaskChoice, ReadOptions};
-use qudi_sim::output::{Overwrite, refuse_taken};
-use qudi_sim::record::{BurstLayout, Conversion, VERSION};
+use qudi_core::SimError;
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_io::burst::{BurstFormat, BurstWriter};
+use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_io::record::{BurstLayout, Conversion, VERSION};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -138,7 +138,7 @@ fn largest_count(capture: &mut Capture) -> Result<u16> {
 
 /// The formats that captures are read from.
 pub(crate) fn formats(report: &Report) -> Result<()> {
-    use qudi_sim::capture::FORMATS;
+    use qudi_io::codec::FORMATS;
     let width = FORMATS.iter().map(|format| format.name.len()).max().unwrap_or(0) + 2;
     let lines: Vec<String> =
         FORMATS.iter().map(|f| format!("{:width$}{}\n", f.name, f.title)).collect();

@@ -7,16 +7,18 @@ use crate::cmd::network;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::{Bar, Report};
-use qudi_baselines::{Finish, Qbp, TwoRounds};
-use qudi_sim::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
-use qudi_sim::output::{Overwrite, PendingFile, Picture};
-use qudi_sim::restore::{Average, BurstView, Context, Restored, Restorer};
-use qudi_sim::scene::{Procedural, ProceduralScene, Scene};
-use qudi_sim::sensor::Sensor;
-use qudi_sim::{
+use qudi_burst::Average;
+use qudi_burst::{Finish, Qbp, TwoRounds};
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
+use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::sensor::Sensor;
+use qudi_core::{
     Camera, ClipStatistics, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE,
     resolve_light,
 };
+use qudi_io::writer::Picture;
+use qudi_sim::scene::{Procedural, ProceduralScene, Scene};
 use serde_json::json;
 use std::fmt::Write;
 use std::path::PathBuf;

@@ -11,9 +11,9 @@ use crate::cmd::methods::METHODS;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
-use qudi_sim::capture::{MaskChoice, ReadOptions};
-use qudi_sim::output::{Overwrite, PendingFile, refuse_taken};
-use qudi_sim::sensor::Sensor;
+use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
+use qudi_core::sensor::Sensor;
+use qudi_io::capture::{MaskChoice, ReadOptions};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -92,7 +92,7 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
     }
     if let Some(folder) = &args.export_photons {
         std::fs::create_dir_all(folder)
-            .map_err(|e| qudi_sim::SimError::io("create the folder", folder, e))?;
+            .map_err(|e| qudi_core::SimError::io("create the folder", folder, e))?;
     }
     let mut rows: Vec<Row> = Vec::new();
     let names: Vec<&String> =

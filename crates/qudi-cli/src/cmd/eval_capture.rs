@@ -11,10 +11,13 @@ use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::memory::Peak;
 use crate::report::Report;
-use qudi_sim::Frame;
-use qudi_sim::capture::{Capture, MaskChoice};
-use qudi_sim::restore::{Consistency, Context, RestoreSink, Windows, run as run_method};
-use qudi_sim::sensor::Sensor;
+use qudi_core::Frame;
+use qudi_core::metrics::Consistency;
+use qudi_core::restorer::Context;
+use qudi_core::sensor::Sensor;
+use qudi_core::windows::Windows;
+use qudi_io::capture::{Capture, MaskChoice};
+use qudi_io::restore::{RestoreSink, run as run_method};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::time::Instant;
@@ -158,7 +161,7 @@ struct Watch<'a> {
 }
 
 impl RestoreSink for Watch<'_> {
-    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         let chi_square = Some(self.consistency.add(restored, counts, self.context)?);
         self.frames.push(FrameScore { chi_square, ..FrameScore::default() });
         if number == self.shown {

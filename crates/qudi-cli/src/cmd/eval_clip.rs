@@ -7,24 +7,23 @@ use crate::cmd::methods::method;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::memory::Peak;
-use qudi_sim::burst::{BurstFormat, BurstWriter};
-use qudi_sim::capture::Capture;
-use qudi_sim::metrics::{
-    best_gain, estimate_flow, gain_aligned_psnr, gaussian_ssim, psnr, ssim, warping_error,
-};
-use qudi_sim::npy::read_clip;
-use qudi_sim::output::Overwrite;
-use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION, beside};
-use qudi_sim::restore::{
-    BurstView, Consistency, Context, RestoreSink, Windows, fitting_exposure, run as run_method,
-};
-use qudi_sim::scene::Flow;
-use qudi_sim::sensor::Sensor;
-use qudi_sim::source::{Input, Sampling};
-use qudi_sim::{
-    Camera, Exposed, Frame, Light, PppDefinition, SimError, Simulation, Sink, Size, Start,
-    USUAL_EXPOSURE, simulate,
-};
+use qudi_burst::motion::{estimate_flow, warping_error};
+use qudi_core::atomic_file::Overwrite;
+use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::flow::Flow;
+use qudi_core::metrics::Consistency;
+use qudi_core::metrics::{best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim};
+use qudi_core::npy::read_clip;
+use qudi_core::restorer::{BurstView, Context};
+use qudi_core::sensor::Sensor;
+use qudi_core::windows::Windows;
+use qudi_core::{Camera, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE};
+use qudi_io::burst::{BurstFormat, BurstWriter};
+use qudi_io::capture::Capture;
+use qudi_io::record::{BurstLayout, ClipDigest, Record, VERSION, beside};
+use qudi_io::restore::{RestoreSink, run as run_method};
+use qudi_sim::clip::{Input, Sampling};
+use qudi_sim::{Exposed, Simulation, Sink, Start, simulate};
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
@@ -178,7 +177,7 @@ struct Kept {
 }
 
 impl Sink for Kept {
-    fn start(&mut self, _: Start) -> qudi_sim::Result<()> {
+    fn start(&mut self, _: Start) -> qudi_core::Result<()> {
         Ok(())
     }
 
@@ -186,7 +185,7 @@ impl Sink for Kept {
         &mut self,
         exposed: Exposed<'_>,
         flow: &dyn Fn() -> Option<Flow>,
-    ) -> qudi_sim::Result<()> {
+    ) -> qudi_core::Result<()> {
         self.counts.push(exposed.counts.to_vec());
         self.truth.push(exposed.truth.clone());
         self.flow.extend(flow());
@@ -400,7 +399,7 @@ impl ExposedClip {
 struct Collected(Vec<Frame>);
 
 impl RestoreSink for Collected {
-    fn frame(&mut self, _: u64, restored: &Frame, _: &[u16]) -> qudi_sim::Result<()> {
+    fn frame(&mut self, _: u64, restored: &Frame, _: &[u16]) -> qudi_core::Result<()> {
         self.0.push(restored.clone());
         Ok(())
     }

@@ -5,7 +5,7 @@ use crate::cmd::eval_table::columns;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::{ExtendedColorType, ImageEncoder};
-use qudi_sim::Frame;
+use qudi_core::Frame;
 use std::fmt::Write;
 
 /// Largest side of the pictures: a crop from the middle.

@@ -1,7 +1,7 @@
 //! Figures of methods: of a frame, of a clip, of all clips. What needs a truth is absent without one.
 
-use qudi_sim::Frame;
-use qudi_sim::metrics::Statistics;
+use qudi_core::Frame;
+use qudi_core::metrics::Statistics;
 use serde::Serialize;
 
 /// Figures of one frame.

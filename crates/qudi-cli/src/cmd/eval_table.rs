@@ -1,7 +1,7 @@
 //! The figures of `qudi eval` as text, Markdown and CSV.
 
 use crate::cmd::eval_score::{FlowKind, FrameScore, Row};
-use qudi_sim::metrics::Statistics;
+use qudi_core::metrics::Statistics;
 use std::fmt::Write;
 
 /// Columns, in order.

@@ -6,8 +6,8 @@ use crate::error::{Fault, Result};
 use crate::report::Report;
 use crate::weights::Weights;
 use burn::tensor::Device;
-use qudi_sim::record::Described;
-use qudi_sim::sensor::{PRESETS, Response, Sensor, preset};
+use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
+use qudi_io::record::Described;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -49,7 +49,7 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
 
 fn sensors(report: &Report) -> Result<()> {
     let sensors =
-        PRESETS.iter().map(|p| Sensor::load(p.name)).collect::<qudi_sim::Result<Vec<_>>>()?;
+        PRESETS.iter().map(|p| Sensor::load(p.name)).collect::<qudi_core::Result<Vec<_>>>()?;
     let mut text = format!(
         "{:<15}{:<8}{:>4}{:>8}{:>9}{:>7}{:>8}  summary\n",
         "name", "kind", "bits", "QE", "dark", "read", "fps"

@@ -3,8 +3,8 @@
 use crate::args::Light;
 use crate::error::{Fault, Result};
 use crate::report::Report;
-use qudi_sim::sensor::Sensor;
-use qudi_sim::{Spectrum, ppp_from_lux, sensor_lux};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Spectrum, ppp_from_lux, sensor_lux};
 use serde_json::json;
 use std::fmt::Write;
 

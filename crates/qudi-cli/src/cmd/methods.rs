@@ -3,10 +3,11 @@
 use crate::args::Network;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
-use qudi_baselines::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
+use qudi_burst::{Average, Mle};
+use qudi_burst::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
+use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_io::capture::Capture;
 use qudi_model::restorer::FEWEST_FRAMES;
-use qudi_sim::capture::Capture;
-use qudi_sim::restore::{Average, BurstView, Context, Mle, Restorer};
 
 /// All methods.
 pub(crate) const METHODS: &[&str] =

@@ -5,13 +5,13 @@ use crate::device;
 use crate::error::{Fault, Result};
 use crate::memory::available_bytes;
 use crate::weights::Weights;
+use qudi_core::Size;
+use qudi_core::restorer::{Context, Restorer};
+use qudi_core::sensor::Sensor;
 use qudi_model::checkpoint::Description;
+use qudi_model::diffusion::sampler::Sampler;
+use qudi_model::diffusion::schedule::Spacing;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
-use qudi_model::sampler::Sampler;
-use qudi_model::schedule::Spacing;
-use qudi_sim::Size;
-use qudi_sim::restore::{Context, Restorer};
-use qudi_sim::sensor::Sensor;
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const TOLERATED: f64 = 10.0;

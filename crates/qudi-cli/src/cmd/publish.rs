@@ -5,9 +5,9 @@ use crate::error::{Fault, Result};
 use crate::report::Report;
 use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
+use qudi_core::SimError;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_model::checkpoint::{Precision, save};
-use qudi_sim::SimError;
-use qudi_sim::output::{Overwrite, PendingFile};
 use serde_json::json;
 
 pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()> {

@@ -3,9 +3,10 @@
 
 use crate::args::{Network, Restore};
 use crate::error::{Fault, Result};
-use qudi_sim::Frame;
-use qudi_sim::capture::Capture;
-use qudi_sim::output::{ArrayWriter, Overwrite};
+use qudi_core::Frame;
+use qudi_core::atomic_file::Overwrite;
+use qudi_io::capture::Capture;
+use qudi_io::writer::ArrayWriter;
 use std::path::Path;
 
 /// A `.npy` file of deviations, float32 `[frames, height, width]`, or none.
@@ -55,7 +56,7 @@ impl Deviation {
         Ok(Self(Some(ArrayWriter::create(path, overwrite, "<f4", &shape)?)))
     }
 
-    pub(crate) fn push(&mut self, deviation: &Frame) -> qudi_sim::Result<()> {
+    pub(crate) fn push(&mut self, deviation: &Frame) -> qudi_core::Result<()> {
         let values = deviation.data.iter().copied();
         self.0.as_mut().map_or(Ok(()), |writer| writer.push_f32(values))
     }

@@ -2,10 +2,13 @@
 
 use crate::cmd::restore_deviation::Deviation;
 use crate::error::{Fault, Result};
-use qudi_sim::capture::Capture;
-use qudi_sim::output::{FramesWriter, Overwrite, Picture, TiffSamples, refuse_taken};
-use qudi_sim::restore::{Consistency, Context, FrameFolder, RestoreSink};
-use qudi_sim::{Frame, SimError, Size};
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::metrics::Consistency;
+use qudi_core::restorer::Context;
+use qudi_core::{Frame, SimError, Size};
+use qudi_io::capture::Capture;
+use qudi_io::restore::{FrameFolder, RestoreSink};
+use qudi_io::writer::{FramesWriter, Picture, TiffSamples};
 use serde_json::Value;
 use std::io::Write;
 use std::ops::Range;
@@ -89,11 +92,11 @@ pub(crate) struct Sink<'a> {
 }
 
 impl RestoreSink for Sink<'_> {
-    fn deviation(&mut self, _: u64, deviation: &Frame) -> qudi_sim::Result<()> {
+    fn deviation(&mut self, _: u64, deviation: &Frame) -> qudi_core::Result<()> {
         self.deviation.push(deviation)
     }
 
-    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         // What a reader of the file will see is what is judged.
         let seen = match &mut *self.output {
             Output::Folder(folder) => Some(folder.push(number, restored)?),
@@ -143,7 +146,7 @@ impl Misfit {
         }
     }
 
-    fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_sim::Result<()> {
+    fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         if self.keep_latest || self.shown.contains(&self.judged) {
             if self.keep_latest {
                 self.pictures.truncate(self.shown.len());

@@ -6,7 +6,7 @@ use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
 use burn::tensor::Device;
-use qudi_model::selftest::{BF16_TOLERANCE, CHECKS, TOLERANCE, Verdict};
+use qudi_train::selftest::{BF16_TOLERANCE, CHECKS, TOLERANCE, Verdict};
 use serde_json::json;
 use std::fmt::Write;
 use std::time::Instant;

@@ -6,15 +6,15 @@ use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
 use crate::settings::{Flag, Settings};
-use qudi_sim::burst::{BurstFormat, BurstWriter, write_npy_stream};
-use qudi_sim::output::{
-    ArrayWriter, FramesWriter, GifPreview, Overwrite, PendingFile, TiffSamples, refuse_taken,
-};
-use qudi_sim::record::{BurstLayout, ClipDigest, Record, VERSION};
-use qudi_sim::scene::Flow;
-use qudi_sim::sensor::Sensor;
-use qudi_sim::source::{Input, Sampling};
-use qudi_sim::{Exposed, SimError, Simulation, Sink, Stage, Start, Summary, simulate};
+use qudi_core::SimError;
+use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
+use qudi_core::flow::Flow;
+use qudi_core::sensor::Sensor;
+use qudi_io::burst::{BurstFormat, BurstWriter, write_npy_stream};
+use qudi_io::record::{BurstLayout, ClipDigest, Record, VERSION};
+use qudi_io::writer::{ArrayWriter, FramesWriter, GifPreview, TiffSamples};
+use qudi_sim::clip::{Input, Sampling};
+use qudi_sim::{Exposed, Simulation, Sink, Stage, Start, Summary, simulate};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::hash::{BuildHasher, RandomState};
@@ -257,7 +257,7 @@ impl<'a> Outputs<'a> {
 }
 
 impl Sink for Outputs<'_> {
-    fn start(&mut self, start: Start) -> qudi_sim::Result<()> {
+    fn start(&mut self, start: Start) -> qudi_core::Result<()> {
         let (args, overwrite) = (self.args, self.overwrite);
         if args.output == "-" {
             let stream = write_npy_stream(
@@ -295,7 +295,7 @@ impl Sink for Outputs<'_> {
         &mut self,
         exposed: Exposed<'_>,
         flow: &dyn Fn() -> Option<Flow>,
-    ) -> qudi_sim::Result<()> {
+    ) -> qudi_core::Result<()> {
         if let Some(burst) = &mut self.burst {
             burst.push(exposed.counts)?;
         }

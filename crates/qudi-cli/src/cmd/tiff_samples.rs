@@ -1,7 +1,7 @@
 //! Samples of a `.tif` of images, as `--float` asks for.
 
 use crate::error::{Fault, Result};
-use qudi_sim::output::TiffSamples;
+use qudi_io::writer::TiffSamples;
 use std::path::Path;
 
 /// Samples for the output `path`.

@@ -7,11 +7,11 @@ use crate::device::{self, Opened};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
+use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, load};
-use qudi_model::perceptual::fetch;
-use qudi_model::train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bursts};
-use qudi_sim::dataset::{Pack, write_pack};
-use qudi_sim::output::Overwrite;
+use qudi_train::dataset::{Pack, write_pack};
+use qudi_train::perceptual::fetch;
+use qudi_train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bursts};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -60,7 +60,7 @@ pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> 
     let last = watch.finish()?;
     match learnt {
         Ok(Ok(())) => {}
-        Ok(Err(qudi_sim::SimError::Interrupted)) => {
+        Ok(Err(qudi_core::SimError::Interrupted)) => {
             let text = format!("stopped after step {step} of {steps}: --resume goes on");
             return Err(Fault::Stopped(text));
         }
@@ -106,7 +106,7 @@ fn draw_only(args: &Train, recipe: &Recipe, report: &Report) -> Result<()> {
         })
     });
     match drawn {
-        Ok(Err(qudi_sim::SimError::Interrupted)) => {
+        Ok(Err(qudi_core::SimError::Interrupted)) => {
             let text = format!("stopped: the same command goes on in {}", folder.display());
             return Err(Fault::Stopped(text));
         }
@@ -183,7 +183,7 @@ fn check_folder(args: &Train, global: &Global, folder: &Path, exists: bool) -> R
         for name in ["state", "state.old", "state.new"] {
             let _ = std::fs::remove_dir_all(folder.join(name));
         }
-        let _ = std::fs::remove_file(folder.join(qudi_model::train::METRICS));
+        let _ = std::fs::remove_file(folder.join(qudi_train::METRICS));
     }
     Ok(())
 }

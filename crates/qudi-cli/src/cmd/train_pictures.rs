@@ -1,9 +1,9 @@
 //! What a validation looks like: counts, restored frame and truth of every clip, side by side.
 
-use qudi_model::train::ValidationClip;
-use qudi_sim::Frame;
-use qudi_sim::metrics::best_gain;
-use qudi_sim::output::Picture;
+use qudi_core::Frame;
+use qudi_core::metrics::best_gain;
+use qudi_io::writer::Picture;
+use qudi_train::ValidationClip;
 
 /// One row for every clip at the least light.
 pub(crate) fn strip(clips: &[ValidationClip]) -> Picture {

@@ -9,7 +9,7 @@ use crate::measurement::{GuidePlanes, IMAGES};
 use crate::tensor::read;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use qudi_sim::Result;
+use qudi_core::Result;
 
 /// Planes that the guide's images become.
 const PLANES: usize = 4;

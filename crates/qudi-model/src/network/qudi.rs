@@ -7,13 +7,13 @@ use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
 use super::layers::CORRECTION;
 use super::pre::PreDenoiser;
-use super::precondition::Preconditioned;
 use super::unet::UNet;
 use super::variance::mean_variance;
 use crate::config::{NetworkConfig, Part};
+use crate::diffusion::precondition::Preconditioned;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_sim::Result;
+use qudi_core::Result;
 
 /// What was measured, `[bursts * frames, 1, height, width]`.
 #[derive(Clone, Debug)]
@@ -104,7 +104,7 @@ impl NetworkConfig {
     }
 
     /// The network without weights: it takes no memory yet.
-    pub(crate) fn shell(&self, device: &Device) -> Qudi {
+    pub fn shell(&self, device: &Device) -> Qudi {
         let draft = |_| self.pre.of_drafts().init(self.fold, device);
         Qudi {
             drafts: (1..self.pre.rounds).map(draft).collect(),
@@ -124,7 +124,7 @@ impl Qudi {
     /// learnt: the U-Net's correction starts at zero.
     ///
     /// # Errors
-    /// [`SimError`](qudi_sim::SimError) if the device fails.
+    /// [`SimError`](qudi_core::SimError) if the device fails.
     pub fn generates(&self) -> Result<bool> {
         self.unet.corrects()
     }
@@ -149,7 +149,7 @@ impl Qudi {
     /// rest.
     ///
     /// # Errors
-    /// [`SimError`](qudi_sim::SimError) if the device fails.
+    /// [`SimError`](qudi_core::SimError) if the device fails.
     pub fn denoises_anew(&self) -> Result<bool> {
         self.pre.sees_simulated()
     }
@@ -201,7 +201,7 @@ impl Qudi {
 
     /// The network with other drafts, as many as it has.
     #[must_use]
-    pub(crate) fn with_drafts(self, drafts: Vec<PreDenoiser>) -> Self {
+    pub fn with_drafts(self, drafts: Vec<PreDenoiser>) -> Self {
         Self { drafts, ..self }
     }
 

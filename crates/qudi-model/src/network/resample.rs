@@ -11,7 +11,7 @@ pub(super) fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
 }
 
 /// Squares of `fold` pixels become channels: `[images, c, h * fold, w * fold]` to `[images, c * fold * fold, h, w]`.
-pub(crate) fn fold(x: Tensor<4>, fold: usize) -> Tensor<4> {
+pub fn fold(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
     }
@@ -41,7 +41,7 @@ pub(super) fn unfold(x: Tensor<4>, fold: usize) -> Tensor<4> {
 }
 
 /// Means of 2 x 2 pixels.
-pub(crate) fn halve(x: Tensor<4>) -> Tensor<4> {
+pub fn halve(x: Tensor<4>) -> Tensor<4> {
     avg_pool2d(x, AvgPoolOptions::new([2, 2]))
 }
 

@@ -5,14 +5,14 @@ use super::embedding::{SENSOR_NUMBERS, sinusoids};
 use super::evidence::Evidence;
 use super::features::Pyramid;
 use super::layers::{Bias, Conv2d, GroupNorm, Linear};
-use super::precondition::Preconditioned;
 use super::resample::{fold, repeat, unfold};
 use crate::config::{FusionConfig, UNetConfig};
+use crate::diffusion::precondition::Preconditioned;
 use crate::tensor::read;
 use burn::module::Module;
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_sim::Result;
+use qudi_core::Result;
 
 /// Images that the U-Net sees besides the fused features.
 const PLANES: usize = 6;

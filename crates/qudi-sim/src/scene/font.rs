@@ -1,6 +1,6 @@
 //! A 5 x 7 dot-matrix font for moving text and for the labels of pictures.
 
-use crate::frame::Frame;
+use qudi_core::Frame;
 
 /// Columns of a glyph.
 pub const GLYPH_WIDTH: usize = 5;

@@ -1,6 +1,6 @@
 //! Surfaces of layers.
 
-use crate::frame::{Frame, Size};
+use qudi_core::{Frame, Size};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 

@@ -2,8 +2,8 @@
 
 use super::font::Line;
 use super::{Layer, Motion, Paint, Scene, Shape};
-use crate::frame::Size;
-use crate::random::{Domain, Streams, uniform};
+use qudi_core::Size;
+use qudi_core::random::{Domain, Streams, uniform};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;

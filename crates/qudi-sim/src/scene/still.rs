@@ -1,8 +1,8 @@
 //! A still image set in motion: pan, rotation, zoom, and cut-outs moving before it.
 
 use super::{Layer, Motion, Paint, Scene, Shape};
-use crate::frame::{Frame, Size};
-use crate::random::{Domain, Streams, uniform};
+use qudi_core::random::{Domain, Streams, uniform};
+use qudi_core::{Frame, Size};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 

@@ -1,0 +1,112 @@
+//! Blocks of consecutive frames around a reference frame, and the motion of each frame from that
+//! of the blocks.
+
+use std::ops::Range;
+
+/// Consecutive blocks that cover a window.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Blocks {
+    pub(crate) ranges: Vec<Range<usize>>,
+    /// The block with the reference frame in its middle.
+    pub(crate) reference: usize,
+}
+
+impl Blocks {
+    /// Blocks of `length` frames (odd) out of `frames`, one of them around `reference`; those at the ends
+    /// may be shorter.
+    pub(crate) fn around(reference: usize, frames: usize, length: usize) -> Self {
+        let half = length / 2;
+        let own = reference.saturating_sub(half)..(reference + half + 1).min(frames);
+        let mut before = Vec::new();
+        let mut end = own.start;
+        while end > 0 {
+            let start = end.saturating_sub(length);
+            before.push(start..end);
+            end = start;
+        }
+        before.reverse();
+        let number = before.len();
+        let mut ranges = before;
+        let mut start = own.end;
+        ranges.push(own);
+        while start < frames {
+            let end = (start + length).min(frames);
+            ranges.push(start..end);
+            start = end;
+        }
+        Self { ranges, reference: number }
+    }
+
+    /// The motion of every patch to every frame, `[frame][patch]`: linear between the middles of blocks,
+    /// and beyond them. The reference block's motion is zero at `reference`.
+    pub(crate) fn interpolate(
+        &self,
+        flows: &[Vec<[f32; 2]>],
+        reference: usize,
+    ) -> Vec<Vec<[f32; 2]>> {
+        let middle = |k: usize| {
+            let range = &self.ranges[k];
+            if k == self.reference {
+                reference as f32
+            } else {
+                0.5 * (range.start + range.end - 1) as f32
+            }
+        };
+        let last = self.ranges.len() - 1;
+        let frames = self.ranges[last].end;
+        let of_frame = |frame: usize| {
+            let time = frame as f32;
+            let above = (1..last).find(|&k| middle(k) >= time).unwrap_or(last);
+            let below = above.saturating_sub(1);
+            if above == below || middle(below) == time {
+                return flows[below].clone();
+            }
+            let part = (time - middle(below)) / (middle(above) - middle(below));
+            let between = |(a, b): (&[f32; 2], &[f32; 2])| {
+                std::array::from_fn(|k| a[k] + part * (b[k] - a[k]))
+            };
+            flows[below].iter().zip(&flows[above]).map(between).collect()
+        };
+        (0..frames).map(of_frame).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blocks_cover_the_window_once() {
+        for frames in 1..14 {
+            for reference in 0..frames {
+                for length in [1, 3, 5] {
+                    let blocks = Blocks::around(reference, frames, length);
+                    let covered: Vec<usize> = blocks.ranges.iter().cloned().flatten().collect();
+                    assert_eq!(covered, (0..frames).collect::<Vec<_>>());
+                    assert!(blocks.ranges[blocks.reference].contains(&reference));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn even_motion_is_even_in_every_frame() {
+        for (reference, length) in [(5, 3), (0, 3), (10, 5), (4, 1)] {
+            let blocks = Blocks::around(reference, 11, length);
+            // 2 pixels per frame, as the blocks' middles show it.
+            let flows: Vec<Vec<[f32; 2]>> = (0..blocks.ranges.len())
+                .map(|k| {
+                    let range = &blocks.ranges[k];
+                    let middle = 0.5 * (range.start + range.end - 1) as f32;
+                    let from = if k == blocks.reference { 0.0 } else { middle - reference as f32 };
+                    vec![[2.0 * from, -from]]
+                })
+                .collect();
+            for (frame, flow) in blocks.interpolate(&flows, reference).iter().enumerate() {
+                let expected = frame as f32 - reference as f32;
+                assert!((flow[0][0] - 2.0 * expected).abs() < 1e-4, "{reference} {frame}");
+                assert!((flow[0][1] + expected).abs() < 1e-4);
+            }
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! Discrete Fourier transform of 16 x 16 patches, sixteen columns at a time.
+
+use std::f32::consts::PI;
+use std::sync::LazyLock;
+
+/// Side of a patch in pixels (Ma et al. 2020, section 5).
+pub(crate) const SIDE: usize = 16;
+
+/// Samples of a patch, by row.
+pub(crate) type Patch = [[f32; SIDE]; SIDE];
+
+/// Coefficients of a patch; transposed, which nothing here minds.
+#[derive(Clone, Debug)]
+pub(crate) struct Spectrum {
+    pub(crate) re: Patch,
+    pub(crate) im: Patch,
+}
+
+/// Cosine and sine of `-2 pi k / 16`.
+static TWIDDLES: LazyLock<[(f32, f32); SIDE / 2]> = LazyLock::new(|| {
+    std::array::from_fn(|k| {
+        let (sin, cos) = (-2.0 * PI * k as f32 / SIDE as f32).sin_cos();
+        (cos, sin)
+    })
+});
+
+/// The transform, not normalised: white noise of variance v has `256 v` per coefficient.
+pub(crate) fn forward(patch: &Patch) -> Spectrum {
+    let mut spectrum = Spectrum { re: *patch, im: [[0.0; SIDE]; SIDE] };
+    columns(&mut spectrum);
+    transpose(&mut spectrum);
+    columns(&mut spectrum);
+    spectrum
+}
+
+/// The real part of the inverse.
+pub(crate) fn inverse(mut spectrum: Spectrum) -> Patch {
+    // The inverse is the transform with both parts exchanged, before and after.
+    std::mem::swap(&mut spectrum.re, &mut spectrum.im);
+    columns(&mut spectrum);
+    transpose(&mut spectrum);
+    columns(&mut spectrum);
+    let scale = 1.0 / (SIDE * SIDE) as f32;
+    spectrum.im.map(|row| row.map(|v| v * scale))
+}
+
+/// Radix-2 transform (Cooley and Tukey 1965) down all columns.
+fn columns(Spectrum { re, im }: &mut Spectrum) {
+    for i in 0..SIDE {
+        let j = ((i as u8).reverse_bits() >> 4) as usize;
+        if i < j {
+            re.swap(i, j);
+            im.swap(i, j);
+        }
+    }
+    let mut half = 1;
+    while half < SIDE {
+        for start in (0..SIDE).step_by(2 * half) {
+            for k in 0..half {
+                let (cos, sin) = TWIDDLES[k * (SIDE / 2) / half];
+                let (a, b) = (start + k, start + k + half);
+                for x in 0..SIDE {
+                    let turned_re = re[b][x] * cos - im[b][x] * sin;
+                    let turned_im = re[b][x] * sin + im[b][x] * cos;
+                    (re[a][x], re[b][x]) = (re[a][x] + turned_re, re[a][x] - turned_re);
+                    (im[a][x], im[b][x]) = (im[a][x] + turned_im, im[a][x] - turned_im);
+                }
+            }
+        }
+        half *= 2;
+    }
+}
+
+fn transpose(Spectrum { re, im }: &mut Spectrum) {
+    for part in [re, im] {
+        let old = *part;
+        *part = std::array::from_fn(|y| std::array::from_fn(|x| old[x][y]));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_is_the_definition_and_has_an_inverse() {
+        let patch: Patch =
+            std::array::from_fn(|y| std::array::from_fn(|x| ((x * 5 + y * y * 3) % 17) as f32));
+        let spectrum = forward(&patch);
+        for (u, v) in [(0, 0), (1, 0), (3, 7), (15, 9)] {
+            let (mut re, mut im) = (0.0, 0.0);
+            for (y, row) in patch.iter().enumerate() {
+                for (x, value) in row.iter().enumerate() {
+                    let (sin, cos) = (-2.0 * PI * (u * x + v * y) as f32 / 16.0).sin_cos();
+                    re += value * cos;
+                    im += value * sin;
+                }
+            }
+            // Transposed: the column index runs along u.
+            assert!((spectrum.re[u][v] - re).abs() < 0.02, "{u} {v}");
+            assert!((spectrum.im[u][v] - im).abs() < 0.02, "{u} {v}");
+        }
+        for (a, b) in inverse(spectrum).iter().flatten().zip(patch.iter().flatten()) {
+            assert!((a - b).abs() < 1e-4);
+        }
+    }
+}

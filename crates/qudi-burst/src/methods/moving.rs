@@ -1,0 +1,117 @@
+//! Moving sums of frames, and how many frames they should span.
+
+use qudi_core::restorer::{BurstView, Context};
+use qudi_core::sensor::{CountLaw, CountMoments};
+use qudi_core::windows::LONGEST_HALF;
+
+/// Sums of the frames within `half` of each frame, and how many those are; the window's ends have
+/// fewer.
+pub fn moving_sums(burst: BurstView<'_>, half: usize, mut f: impl FnMut(&[u32], u32)) {
+    let n = burst.frames.len();
+    let mut sums = vec![0u32; burst.size.pixels()];
+    let (mut from, mut to) = (0, 0);
+    for frame in 0..n {
+        let (low, high) = (frame.saturating_sub(half), (frame + half + 1).min(n));
+        while to < high {
+            for (sum, &count) in sums.iter_mut().zip(&burst.frames[to]) {
+                *sum += u32::from(count);
+            }
+            to += 1;
+        }
+        while from < low {
+            for (sum, &count) in sums.iter_mut().zip(&burst.frames[from]) {
+                *sum -= u32::from(count);
+            }
+            from += 1;
+        }
+        f(&sums, (high - low) as u32);
+    }
+}
+
+/// Frames on either side whose mean has the least risk on windows of the clip, if `noise_left` of
+/// the variance of a mean is left by what follows (1 if nothing does).
+///
+/// With `y` a frame's counts and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y`
+/// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise; the
+/// sensor says what `Var y` is.
+pub fn half_of_least_risk(samples: &[BurstView<'_>], context: &Context, noise_left: f64) -> usize {
+    let moments = CountMoments::new(&CountLaw::new(&context.sensor, context.gain));
+    let risk = |burst: BurstView<'_>, variances: &[f64], half: usize| -> f64 {
+        let (mut total, mut frame) = (0.0, 0);
+        moving_sums(burst, half, |sums, n| {
+            let n = f64::from(n);
+            for (&sum, &own) in sums.iter().zip(&burst.frames[frame]) {
+                total += (f64::from(sum) / n - f64::from(own)).powi(2);
+            }
+            total += ((1.0 + noise_left) / n - 1.0) * variances[frame];
+            frame += 1;
+        });
+        total
+    };
+    let full = f64::from(context.sensor.max_count());
+    let mut risks = [0.0; LONGEST_HALF + 1];
+    for burst in samples {
+        // From the longest mean: short ones of few bits lie at the ends, where nothing varies.
+        let mut variances = Vec::with_capacity(burst.frames.len());
+        moving_sums(*burst, LONGEST_HALF, |sums, n| {
+            let n = f64::from(n);
+            let of = |&sum: &u32| unbiased_variance(&moments, f64::from(sum) / n, n, full);
+            variances.push(sums.iter().map(of).sum());
+        });
+        for (half, total) in risks.iter_mut().enumerate() {
+            *total += risk(*burst, &variances, half);
+        }
+    }
+    (0..risks.len()).min_by(|&a, &b| risks[a].total_cmp(&risks[b])).unwrap_or(0)
+}
+
+/// Variance of a count where the mean of `n` of them is `mean`. The variance bends over the mean
+/// (`p (1 - p)` of binary frames), and the mean is uncertain by `variance / n`: to second order.
+fn unbiased_variance(moments: &CountMoments, mean: f64, n: f64, full: f64) -> f64 {
+    let step = full / 16.0;
+    let at = mean.clamp(step, full - step);
+    let [low, middle, high] = [at - step, at, at + step].map(|m| moments.variance_at_mean(m));
+    let bend = (low - 2.0 * middle + high) / (step * step);
+    moments.variance_at_mean(mean) / (1.0 + 0.5 * bend / n).max(0.5)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_core::Light;
+    use qudi_core::sensor::Sensor;
+    use qudi_core::{Frame, Size};
+
+    /// Single binary frames of a still scene, too: none of them shows that it varies.
+    #[test]
+    fn still_scenes_want_all_frames() {
+        let size = Size { height: 48, width: 64 };
+        let scene = Frame::from_fn(size, |x, y| 0.2 + 0.01 * ((x + 2 * y) % 50) as f32);
+        let light = Light { ppp: 1.0, exposure: 0.45 };
+        for name in ["qudi-paper", "spad512s"] {
+            let sensor = Sensor::load(name).unwrap();
+            let mut camera = qudi_core::Camera::new(&sensor, size, light, 1).unwrap();
+            let frames: Vec<Vec<u16>> =
+                (0..11).map(|t| camera.expose(t, &[&scene]).unwrap()).collect();
+            let gain = camera.gain();
+            let context = Context {
+                seed: 0,
+                first_frame: 0,
+                ppp: light.ppp,
+                exposure: light.exposure,
+                sensor,
+                gain,
+                dark: None,
+            };
+            for noise_left in [1.0, 0.1] {
+                let half = half_of_least_risk(
+                    &[BurstView { size, frames: &frames }],
+                    &context,
+                    noise_left,
+                );
+                // 7 frames or more: from there on hardly anything is to be won.
+                assert!(half >= 3, "{name}, {noise_left} left: {half}");
+            }
+        }
+    }
+}

@@ -1,0 +1,227 @@
+//! Affine maps between frames, and steps towards the one that lays a frame upon another.
+
+use qudi_core::{Frame, Size};
+
+/// Mean squared residual around a pixel, in the noise's variance, at which it counts a quarter; and how far that is taken from.
+const TRUST: f32 = 1.4;
+const RADIUS: usize = 2;
+
+/// Deviation of a step at the image's border, in pixels, if nothing is seen.
+const PRIOR: f32 = 0.5;
+
+/// Longest step there.
+const LONGEST: f64 = 2.0;
+
+/// Fewest pixels that two frames share.
+const FEWEST: usize = 64;
+
+/// Weight that keeps slopes as they are.
+const STIFF: f64 = 1e9;
+
+/// Which numbers of a map a step may change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Freedom {
+    /// The constants.
+    Shift,
+    /// All.
+    Affine,
+}
+
+/// Numbers of an affine map.
+const NUMBERS: usize = 6;
+
+/// For each coordinate its constant and its slopes along x and y; places in pixels from the centre of the image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Affine([[f32; 3]; 2]);
+
+impl Affine {
+    pub(crate) fn shift([x, y]: [f32; 2]) -> Self {
+        Self([[x, 1.0, 0.0], [y, 0.0, 1.0]])
+    }
+
+    /// Where a place goes.
+    pub(crate) fn of(self, [x, y]: [f32; 2]) -> [f32; 2] {
+        self.0.map(|[constant, along, across]| constant + along * x + across * y)
+    }
+
+    /// Where what is at a place has come from.
+    pub(crate) fn inverse_of(self, [x, y]: [f32; 2]) -> [f32; 2] {
+        let [[u, a, b], [v, c, d]] = self.0;
+        let determinant = a * d - b * c;
+        let (x, y) = (x - u, y - v);
+        [(d * x - b * y) / determinant, (a * y - c * x) / determinant]
+    }
+
+    /// The same between images whose pixels are `times` smaller.
+    pub(crate) fn finer(mut self, times: f32) -> Self {
+        for numbers in &mut self.0 {
+            numbers[0] *= times;
+        }
+        self
+    }
+
+    /// `frame` laid upon the image that this maps from, bilinear between pixels; no number where it does not reach.
+    pub(crate) fn laid(self, frame: &Frame) -> Vec<f32> {
+        let size = frame.size;
+        let centre = centre(size);
+        let value = |i: usize| {
+            let place = [(i % size.width) as f32, (i / size.width) as f32];
+            let [x, y] = self.of([place[0] - centre[0], place[1] - centre[1]]);
+            between(frame, x + centre[0], y + centre[1])
+        };
+        (0..size.pixels()).map(value).collect()
+    }
+
+    /// A step of Gauss and Newton (Lucas and Kanade 1981) towards the map that lays a frame upon `template`, robustly: what
+    /// moves otherwise hardly counts, however strong its contrast. `values` are the frame laid upon it by this map, both of size
+    /// `size`; nothing if they have too little in common.
+    pub(crate) fn stepped(
+        self,
+        values: &[f32],
+        template: &[f32],
+        size: Size,
+        freedom: Freedom,
+    ) -> Option<Self> {
+        let differences = values.iter().zip(template).map(|(value, wanted)| (value - wanted).abs());
+        let mut known: Vec<f32> = differences.clone().filter(|d| d.is_finite()).collect();
+        if known.len() < FEWEST {
+            return None;
+        }
+        let half = known.len() / 2;
+        let median = *known.select_nth_unstable_by(half, f32::total_cmp).1;
+        let misfit = mean_squares(&differences.collect::<Vec<f32>>(), size);
+        let variance = (median / 0.6745).powi(2).max(1e-12);
+        let centre = centre(size);
+        let border = centre[0].max(centre[1]);
+        let mut normal = [[0.0f64; NUMBERS]; NUMBERS];
+        let mut pull = [0.0f64; NUMBERS];
+        for y in 1..size.height - 1 {
+            for x in 1..size.width - 1 {
+                let i = y * size.width + x;
+                let residual = values[i] - template[i];
+                let across = 0.5 * (template[i + 1] - template[i - 1]);
+                let down = 0.5 * (template[i + size.width] - template[i - size.width]);
+                if (residual + across + down).is_nan() {
+                    continue;
+                }
+                let excess = misfit[i] / (TRUST * variance);
+                let weight = 1.0 / (1.0 + excess * excess);
+                let weight = f64::from(weight * weight);
+                let from = [(x as f32 - centre[0]) / border, (y as f32 - centre[1]) / border];
+                let slopes = [across, down].map(|s| [s, s * from[0], s * from[1]].map(f64::from));
+                let slopes = slopes.as_flattened();
+                for (p, slope) in slopes.iter().enumerate() {
+                    pull[p] += weight * slope * f64::from(residual);
+                    for (q, other) in slopes.iter().enumerate().take(p + 1) {
+                        normal[p][q] += weight * slope * other;
+                    }
+                }
+            }
+        }
+        for (p, row) in normal.iter_mut().enumerate() {
+            let slope = p % 3 > 0;
+            let stiff = if slope && freedom == Freedom::Shift { STIFF } else { 0.0 };
+            row[p] += f64::from(variance / (PRIOR * PRIOR)) + stiff;
+        }
+        let step = solved(normal, pull)?;
+        let mut next = self;
+        for (numbers, step) in next.0.iter_mut().zip(step.chunks_exact(3)) {
+            for (p, (number, step)) in numbers.iter_mut().zip(step).enumerate() {
+                let unit = if p == 0 { 1.0 } else { border };
+                *number -= step.clamp(-LONGEST, LONGEST) as f32 / unit;
+            }
+        }
+        Some(next)
+    }
+}
+
+/// The place that maps are about.
+pub(crate) fn centre(size: Size) -> [f32; 2] {
+    [size.width, size.height].map(|side| 0.5 * (side as f32 - 1.0))
+}
+
+/// Means of squares around every pixel, of those that are numbers.
+fn mean_squares(values: &[f32], size: Size) -> Vec<f32> {
+    let Size { height, width } = size;
+    let near = |at: usize, length: usize| at.saturating_sub(RADIUS)..(at + RADIUS + 1).min(length);
+    let sum = |list: &mut dyn Iterator<Item = [f32; 2]>| {
+        list.fold([0.0f32; 2], |sum, more| [sum[0] + more[0], sum[1] + more[1]])
+    };
+    let squares = values.iter().map(|v| if v.is_finite() { [v * v, 1.0] } else { [0.0; 2] });
+    let squares: Vec<[f32; 2]> = squares.collect();
+    let rows = (0..values.len()).map(|i| {
+        let row = &squares[i / width * width..][..width];
+        sum(&mut row[near(i % width, width)].iter().copied())
+    });
+    let rows: Vec<[f32; 2]> = rows.collect();
+    let means = (0..values.len()).map(|i| {
+        let column = near(i / width, height).map(|y| rows[y * width + i % width]);
+        let [sum, count] = sum(&mut { column });
+        sum / count.max(1.0)
+    });
+    means.collect()
+}
+
+/// Bilinear between pixels, no number outside.
+fn between(frame: &Frame, x: f32, y: f32) -> f32 {
+    let Size { height, width } = frame.size;
+    if !(x >= 0.0 && y >= 0.0 && x < (width - 1) as f32 && y < (height - 1) as f32) {
+        return f32::NAN;
+    }
+    let (left, top) = (x as usize, y as usize);
+    let [upper, lower] = [top, top + 1].map(|row| {
+        let pair = &frame.row(row)[left..left + 2];
+        pair[0] + (x - left as f32) * (pair[1] - pair[0])
+    });
+    upper + (y - top as f32) * (lower - upper)
+}
+
+/// The solution of a symmetric positive system whose lower half is given, by Cholesky's factors.
+fn solved(mut matrix: [[f64; NUMBERS]; NUMBERS], mut x: [f64; NUMBERS]) -> Option<[f64; NUMBERS]> {
+    for p in 0..NUMBERS {
+        for q in 0..=p {
+            let sum: f64 = (0..q).map(|r| matrix[p][r] * matrix[q][r]).sum();
+            let rest = matrix[p][q] - sum;
+            if p > q {
+                matrix[p][q] = rest / matrix[q][q];
+            } else if rest > 0.0 {
+                matrix[p][p] = rest.sqrt();
+            } else {
+                return None;
+            }
+        }
+        let sum: f64 = (0..p).map(|r| matrix[p][r] * x[r]).sum();
+        x[p] = (x[p] - sum) / matrix[p][p];
+    }
+    for p in (0..NUMBERS).rev() {
+        let sum: f64 = (p + 1..NUMBERS).map(|r| matrix[r][p] * x[r]).sum();
+        x[p] = (x[p] - sum) / matrix[p][p];
+    }
+    Some(x)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_goes_somewhere_came_from_there() {
+        let map = Affine([[3.0, 1.02, -0.03], [-2.0, 0.05, 0.97]]);
+        for place in [[0.0, 0.0], [40.0, -25.0], [-17.5, 60.0]] {
+            let back = map.inverse_of(map.of(place));
+            assert!(back.iter().zip(&place).all(|(a, b)| (a - b).abs() < 1e-4), "{back:?}");
+        }
+    }
+
+    #[test]
+    fn systems_are_solved() {
+        let row =
+            |p: usize| std::array::from_fn(|q| if p == q { 4.0 } else { 1.0 / (p + q) as f64 });
+        let matrix: [[f64; NUMBERS]; NUMBERS] = std::array::from_fn(row);
+        let wanted: [f64; NUMBERS] = std::array::from_fn(|p| p as f64 - 2.5);
+        let right = matrix.map(|row| row.iter().zip(&wanted).map(|(a, x)| a * x).sum());
+        let found = solved(matrix, right).unwrap_or_else(|| panic!("it is positive"));
+        assert!(found.iter().zip(&wanted).all(|(a, b)| (a - b).abs() < 1e-12), "{found:?}");
+        assert!(solved([[0.0; NUMBERS]; NUMBERS], right).is_none());
+    }
+}

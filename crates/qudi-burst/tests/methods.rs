@@ -1,0 +1,207 @@
+//! All methods on moving scenes, on any number of threads, and on input that nobody wants.
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use qudi_burst::Average;
+use qudi_burst::{
+    Aligned, Alignment, Along, Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds,
+};
+use qudi_core::metrics::gain_aligned_psnr;
+use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Camera, Frame, Light, Size};
+use qudi_sim::scene::{Procedural, ProceduralScene};
+
+fn methods() -> Vec<Box<dyn Restorer>> {
+    vec![
+        Box::new(TransformDenoise::new(Transform::Integral, 1)),
+        Box::new(TransformDenoise::new(Transform::Anscombe, 5)),
+        Box::new(TransformDenoise::new(Transform::Identity, 1)),
+        Box::new(Qbp::new(Finish::Plain)),
+        Box::new(Qbp::new(Finish::Bm3d)),
+        Box::new(TwoRounds),
+    ]
+}
+
+fn context(sensor: Sensor, ppp: f64) -> Context {
+    let gain = sensor.gain_at(ppp).unwrap();
+    Context { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+}
+
+/// A window of a scene in motion, and its truth.
+fn exposed(size: Size, sensor: &Sensor, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>) {
+    let scene = Procedural { kind: ProceduralScene::Text, size, seed: 2, speed: 2.0 }.scene();
+    let mut camera = Camera::new(sensor, size, Light { ppp, exposure: 0.45 }, 5).unwrap();
+    let truth: Vec<Frame> = (0..frames).map(|t| scene.render(t as f64)).collect();
+    let counts =
+        truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
+    (counts, truth)
+}
+
+fn mean_psnr(images: &[Frame], truth: &[Frame]) -> f64 {
+    let total: f64 = images.iter().zip(truth).map(|(i, t)| gain_aligned_psnr(i, t)).sum();
+    total / truth.len() as f64
+}
+
+#[test]
+fn every_method_beats_the_average_of_a_moving_scene() {
+    let size = Size { height: 96, width: 112 };
+    let mut spad = Sensor::load("spad512s").unwrap();
+    spad.frames_summed = 7;
+    for sensor in [Sensor::load("qudi-paper").unwrap(), spad] {
+        let (counts, truth) = exposed(size, &sensor, 6.0, 11);
+        let context = context(sensor, 6.0);
+        let burst = BurstView { size, frames: &counts };
+        let naive = mean_psnr(&Average.restore(burst, &context).unwrap().frames, &truth);
+        for mut method in methods() {
+            let restored = method.restore(burst, &context).unwrap().frames;
+            let found = mean_psnr(&restored, &truth);
+            let name = method.name();
+            println!("{} {name}: {found:.2} dB, average {naive:.2} dB", context.sensor.name);
+            // A sum of 11 is no better than the average where everything moves.
+            let margin = if name == "transform-denoise" { 0.0 } else { 0.5 };
+            assert!(found > naive + margin, "{name}: {found} dB, average {naive} dB");
+        }
+    }
+}
+
+#[test]
+fn the_second_round_beats_the_first() {
+    let size = Size { height: 96, width: 112 };
+    // Single binary frames of so little light show the second round no more than the first.
+    let cases = [("qudi-paper", 3.25, 0.1), ("qudi-paper", 26.0, 1.0), ("swissspad2", 0.5, -0.1)];
+    for (name, ppp, margin) in cases {
+        let sensor = Sensor::load(name).unwrap();
+        let (counts, truth) = exposed(size, &sensor, ppp, 11);
+        let context = context(sensor, ppp);
+        let burst = BurstView { size, frames: &counts };
+        let first = Qbp::new(Finish::Bm3d).restore(burst, &context).unwrap().frames;
+        let guide = Guide::find(burst, &context).unwrap();
+        let alignment = Alignment::new(guide, &context);
+        let aligned: Vec<Aligned> =
+            (0..truth.len()).map(|frame| alignment.of(frame, 10, Along::Likeliest)).collect();
+        let merged: Vec<Frame> = aligned.iter().map(|aligned| aligned.merged.clone()).collect();
+        let clean: Vec<Frame> = aligned.iter().map(|aligned| aligned.clean.clone()).collect();
+        let [first, second, merged] =
+            [&first, &clean, &merged].map(|frames| mean_psnr(frames, &truth));
+        println!("{name} at {ppp} PPP: {first:.2} dB, {second:.2} dB, merged {merged:.2} dB");
+        assert!(second > first + margin, "{name}: {first} dB, then {second} dB");
+        assert!(second > merged, "{name}: BM3D makes {second} dB of {merged} dB");
+        // Half of all normal errors are within 0.6745 deviations; ghosts, which no noise explains, are few.
+        let errors = aligned.iter().zip(&truth).flat_map(|(aligned, truth)| {
+            let Aligned { merged, noise, .. } = aligned;
+            let pixels = merged.data.iter().zip(&noise.data).zip(&truth.data);
+            pixels.map(|((m, s), t)| ((m - t) / s).abs()).collect::<Vec<_>>()
+        });
+        let mut errors: Vec<f32> = errors.collect();
+        errors.sort_unstable_by(f32::total_cmp);
+        let deviation = errors[errors.len() / 2] / 0.6745;
+        println!("errors of the merged frames: {deviation:.2} of the stated deviation");
+        assert!((0.8..1.4).contains(&deviation), "{name}: {deviation}");
+    }
+}
+
+/// Counts of a scene at rest, less what the guide expects of them, are noise of deviation one, the frame's own as much as
+/// its neighbours'; what is expected of these hardly differs. Past the ends of the window there is nothing.
+#[test]
+fn neighbours_are_seen_in_deviations() {
+    let size = Size { height: 48, width: 64 };
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let still =
+        Frame::from_fn(size, |x, y| 0.25 + 0.4 * (x as f32 / 64.0) + 0.2 * (y as f32 / 48.0));
+    let light = Light { ppp: 3.25, exposure: still.mean() };
+    let mut camera = Camera::new(&sensor, size, light, 9).unwrap();
+    let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
+    let context = Context { exposure: still.mean(), ..context(sensor, 3.25) };
+    let burst = BurstView { size, frames: &counts };
+    let guide = Guide::find(burst, &context).unwrap();
+    let aligned = Alignment::new(guide, &context).of(2, 8, Along::Likeliest);
+    assert_eq!((aligned.seen.len(), aligned.expected.len()), (9, 8));
+    let deviation = |frame: &Frame| {
+        let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
+        (squares / frame.data.len() as f64).sqrt()
+    };
+    let own = deviation(&aligned.seen[0]);
+    assert!((0.9..1.1).contains(&own), "{own}");
+    for (seen, expected) in aligned.seen[1..7].iter().zip(&aligned.expected) {
+        // Between pixels some of the noise averages out.
+        let (seen, expected) = (deviation(seen), deviation(expected));
+        assert!((0.55..1.1).contains(&seen) && expected < 0.2, "{seen}, expected {expected}");
+    }
+    assert!(aligned.seen[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
+
+    // The truth in the guide's place shows it as well: what it expects is what the camera counts.
+    let guide = Guide::find(burst, &context).unwrap();
+    let aligned =
+        Alignment::new(guide, &context).on(vec![still.clone(); 7]).of(2, 8, Along::Likeliest);
+    assert_eq!(aligned.clean, still);
+    let thrice = Alignment::new(Guide::find(burst, &context).unwrap(), &context)
+        .on(vec![still.clone(); 7])
+        .of(2, 8, Along::Pixels);
+    assert_eq!((thrice.seen.len(), thrice.expected.len()), (25, 24));
+    assert_eq!(
+        (&thrice.seen[..9], &thrice.expected[..8]),
+        (&aligned.seen[..], &aligned.expected[..])
+    );
+    for (seen, expected) in thrice.seen[17..23].iter().zip(&thrice.expected[16..]) {
+        let (seen, expected) = (deviation(seen), deviation(expected));
+        assert!((0.55..1.1).contains(&seen) && expected < 0.1, "{seen}, expected {expected}");
+    }
+    assert!(thrice.seen[23..].iter().chain(&thrice.expected[22..]).all(|f| deviation(f) == 0.0));
+    let own = deviation(&aligned.seen[0]);
+    assert!((0.95..1.05).contains(&own), "{own}");
+    let mean = aligned.seen[0].mean();
+    assert!(mean.abs() < 0.06, "{mean}");
+    let differences = aligned.expected[..6].iter().map(deviation).fold(0.0, f64::max);
+    // On a smooth slope a path may be a little off.
+    assert!(differences < 0.02, "{differences}");
+}
+
+#[test]
+fn threads_do_not_change_a_bit() {
+    let size = Size { height: 48, width: 64 };
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let (counts, _) = exposed(size, &sensor, 9.75, 5);
+    let context = context(sensor, 9.75);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let burst = BurstView { size, frames: &counts };
+        pool.install(|| -> Vec<Vec<Frame>> {
+            methods().iter_mut().map(|m| m.restore(burst, &context).unwrap().frames).collect()
+        })
+    };
+    assert_eq!(on(1), on(2));
+}
+
+/// One frame, tiny frames, none or all of the light: every pixel of every frame is a number.
+#[test]
+fn odd_input_gives_pictures() {
+    for name in ["qudi-paper", "swissspad2", "qis4-gj"] {
+        let sensor = Sensor::load(name).unwrap();
+        let most = sensor.max_count();
+        let context = context(sensor, 3.25);
+        for (height, width) in [(1, 1), (5, 9), (16, 16), (17, 40)] {
+            let size = Size { height, width };
+            for (count, frames) in [(0, 1), (most, 1), (0, 3), (most, 3), (most / 2, 12)] {
+                let counts = vec![vec![count; size.pixels()]; frames];
+                for mut method in methods() {
+                    let burst = BurstView { size, frames: &counts };
+                    let restored = method.restore(burst, &context).unwrap().frames;
+                    assert_eq!(restored.len(), frames);
+                    for frame in restored {
+                        assert_eq!(frame.size, size);
+                        let (least, largest) = frame
+                            .data
+                            .iter()
+                            .fold((f32::MAX, f32::MIN), |(a, b), &v| (a.min(v), b.max(v)));
+                        let case = format!("{name} {} {size} {count} x {frames}", method.name());
+                        assert!(frame.data.iter().all(|v| v.is_finite() && *v >= 0.0), "{case}");
+                        assert!(
+                            largest - least < 0.02 * largest.max(1e-3),
+                            "{case}: {least} {largest}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+}

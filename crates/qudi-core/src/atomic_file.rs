@@ -1,0 +1,203 @@
+//! Unfinished files and folders; dropped before `finish`, they leave nothing behind.
+
+use crate::error::{Result, SimError};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use tempfile::{NamedTempFile, TempDir};
+
+/// What to do if the name is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Overwrite {
+    /// Refuse.
+    No,
+    /// Replace a file; a folder only if it holds `owned`, which our folders do.
+    Yes,
+}
+
+/// A file that appears under its name only when finished.
+#[derive(Debug)]
+pub struct PendingFile {
+    writer: BufWriter<NamedTempFile>,
+    path: PathBuf,
+    overwrite: Overwrite,
+}
+
+/// The folder of `path`, `.` for a bare name.
+fn parent(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// Refuses a name that is taken, before any work is done for it.
+///
+/// # Errors
+/// [`SimError::Data`] if it exists and may not be overwritten.
+pub fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
+    if overwrite == Overwrite::No && path.symlink_metadata().is_ok() {
+        return Err(SimError::data(
+            "the output exists already",
+            path,
+            "choose another name, or overwrite it with --force",
+        ));
+    }
+    Ok(())
+}
+
+impl PendingFile {
+    /// Starts a file beside where it will be.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken or the folder cannot be written.
+    pub fn create(path: &Path, overwrite: Overwrite) -> Result<Self> {
+        refuse_taken(path, overwrite)?;
+        if path.is_dir() {
+            return Err(SimError::data("the output is a folder", path, "name a file"));
+        }
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(".qudi-").suffix(".tmp");
+        // Temporary files are private by default; results get the permissions of any new file.
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        let file = builder
+            .tempfile_in(parent(path))
+            .map_err(|e| SimError::io("create the output", path, e))?;
+        Ok(Self {
+            writer: BufWriter::with_capacity(1 << 18, file),
+            path: path.to_owned(),
+            overwrite,
+        })
+    }
+
+    /// Writes a file whose bytes are all there.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken, or the file cannot be written.
+    pub fn write_whole(path: &Path, bytes: &[u8], overwrite: Overwrite) -> Result<()> {
+        let mut file = Self::create(path, overwrite)?;
+        file.write_all(bytes).map_err(|e| file.fault(e))?;
+        file.finish()
+    }
+
+    /// The name it will have.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Wraps an error of writing into this file.
+    pub fn fault(&self, e: std::io::Error) -> SimError {
+        SimError::io("write", &self.path, e)
+    }
+
+    /// The file itself, everything written so far flushed.
+    /// The open file, everything written so far flushed to it.
+    ///
+    /// # Errors
+    /// If it cannot be written.
+    pub fn flushed(&mut self) -> std::io::Result<&mut File> {
+        self.writer.flush()?;
+        Ok(self.writer.get_mut().as_file_mut())
+    }
+
+    /// Flushes to disk and gives the file its name.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full or the folder is gone.
+    pub fn finish(self) -> Result<()> {
+        let path = self.path;
+        let fault = |e: std::io::Error| SimError::io("write", &path, e);
+        let file = self.writer.into_inner().map_err(|e| fault(e.into_error()))?;
+        file.as_file().sync_all().map_err(fault)?;
+        // Whoever took the name since the start keeps it.
+        let named = match self.overwrite {
+            Overwrite::Yes => file.persist(&path),
+            Overwrite::No => file.persist_noclobber(&path),
+        };
+        named.map(drop).map_err(|e| fault(e.error))
+    }
+}
+
+impl Write for PendingFile {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.writer.write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.writer.flush()
+    }
+}
+
+impl std::io::Seek for PendingFile {
+    fn seek(&mut self, position: std::io::SeekFrom) -> std::io::Result<u64> {
+        self.writer.seek(position)
+    }
+}
+
+/// A folder that appears under its name only when finished.
+#[derive(Debug)]
+pub struct PendingFolder {
+    folder: TempDir,
+    path: PathBuf,
+    overwrite: Overwrite,
+}
+
+impl PendingFolder {
+    /// Starts a folder beside where it will be. To be overwritten, a folder must hold `owned`, the
+    /// file that marks it as ours, or be empty.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken or the parent folder cannot be written.
+    pub fn create(path: &Path, overwrite: Overwrite, owned: &str) -> Result<Self> {
+        refuse_taken(path, overwrite)?;
+        let foreign = path.symlink_metadata().is_ok()
+            && !path.join(owned).is_file()
+            && !std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_none());
+        if foreign {
+            return Err(SimError::data(
+                format!("the output exists and was not made by this program (no {owned} in it)"),
+                path,
+                "choose another name, or remove it yourself",
+            ));
+        }
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(".qudi-").suffix(".tmp");
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
+        let folder = builder
+            .tempdir_in(parent(path))
+            .map_err(|e| SimError::io("create the output", path, e))?;
+        Ok(Self { folder, path: path.to_owned(), overwrite })
+    }
+
+    /// The name of a file inside, for writing.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// The name it will have.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Gives the folder its name.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if that fails.
+    pub fn finish(self) -> Result<()> {
+        let fault = |e| SimError::io("rename the finished folder to", &self.path, e);
+        if self.overwrite == Overwrite::Yes && self.path.is_dir() {
+            // The old folder steps aside first, and comes back if the new one cannot take its place.
+            let aside = self.folder.path().with_extension("old");
+            std::fs::rename(&self.path, &aside).map_err(fault)?;
+            if let Err(e) = std::fs::rename(self.folder.path(), &self.path) {
+                let _ = std::fs::rename(&aside, &self.path);
+                return Err(fault(e));
+            }
+            std::fs::remove_dir_all(&aside).map_err(fault)?;
+        } else {
+            std::fs::rename(self.folder.path(), &self.path).map_err(fault)?;
+        }
+        // The temporary name is gone; there is nothing left to clean up.
+        let _ = self.folder.keep();
+        Ok(())
+    }
+}

@@ -1,0 +1,141 @@
+//! How bright a picture to make of photons that do not tell: as scenes usually are, unless it would not fit.
+
+use crate::error::Result;
+use crate::frame::Size;
+use crate::light::USUAL_EXPOSURE;
+use crate::restorer::{BurstView, Context};
+use crate::sensor::{CountLaw, Response};
+use crate::windows::LONGEST_HALF;
+
+/// Side of the squares over which photons are counted, in pixels: single ones are mostly noise.
+const SIDE: usize = 8;
+
+/// The square's brightest and darkest pixels that do not count, one in so many each: hot and dead ones.
+const TRIMMED: usize = 16;
+
+/// Squares that may be brighter than what fits: one in so many.
+const BRIGHTER: usize = 1000;
+
+/// What the brightest square of the others becomes: what moves, or is smaller than a square, is brighter still.
+const BRIGHT: f64 = 0.75;
+
+/// The image value that should receive `context.ppp` photons, whatever `context.exposure` says: [`USUAL_EXPOSURE`], or less
+/// where parts of the scene would be brighter than white. Looks at the first, the middle and the last 11 of the
+/// `frames` frames that `read` knows, in this order.
+///
+/// # Errors
+/// [`SimError`](crate::SimError) if the sensor's dark rate is unknown, and what `read` returns.
+pub fn fitting_exposure(
+    size: Size,
+    frames: u64,
+    context: &Context,
+    mut read: impl FnMut(u64) -> Result<Vec<u16>>,
+) -> Result<f64> {
+    let length = frames.min(2 * LONGEST_HALF as u64 + 1);
+    let mut starts = vec![0, (frames - length) / 2, frames - length];
+    starts.dedup();
+    let mut exposure = USUAL_EXPOSURE;
+    for start in starts {
+        let frames = (start..start + length).map(&mut read).collect::<Result<Vec<_>>>()?;
+        let bright = brightest(BurstView { size, frames: &frames }, context)?;
+        exposure = exposure.min(BRIGHT * context.ppp / bright.max(f64::MIN_POSITIVE));
+    }
+    Ok(exposure)
+}
+
+/// Photons per pixel and frame that a thousandth of the squares exceed.
+fn brightest(burst: BurstView<'_>, context: &Context) -> Result<f64> {
+    let ordinary = context.sensor.dark_per_frame()?;
+    let size = burst.size;
+    let mut sums = vec![0u32; size.pixels()];
+    for frame in burst.frames {
+        sums.iter_mut().zip(frame).for_each(|(sum, &count)| *sum += u32::from(count));
+    }
+    let mut squares = Vec::new();
+    for top in (0..size.height).step_by(SIDE) {
+        for left in (0..size.width).step_by(SIDE) {
+            let rows = top..(top + SIDE).min(size.height);
+            let columns = left..(left + SIDE).min(size.width);
+            let places = rows.flat_map(|y| columns.clone().map(move |x| y * size.width + x));
+            let mut pixels: Vec<(u32, f64)> =
+                places.map(|i| (sums[i], context.dark_of(i, ordinary))).collect();
+            pixels.sort_unstable_by_key(|&(sum, _)| sum);
+            let trimmed = pixels.len() / TRIMMED;
+            let pixels = &pixels[trimmed..pixels.len() - trimmed];
+            let dark = pixels.iter().map(|(_, dark)| dark).sum::<f64>() / pixels.len() as f64;
+            let total: f64 = pixels.iter().map(|&(sum, _)| f64::from(sum)).sum();
+            let samples = (pixels.len() * burst.frames.len()) as u32;
+            let flux = context.sensor.estimate_flux(total, samples, context.gain, dark);
+            squares.push((flux, total / f64::from(samples), dark));
+        }
+    }
+    let place = squares.len() - 1 - squares.len() / BRIGHTER;
+    let (_, &mut (flux, mean, dark), _) =
+        squares.select_nth_unstable_by(place, |a, b| f64::total_cmp(&a.0, &b.0));
+    if context.sensor.response == Response::Binary {
+        return Ok(flux);
+    }
+    // What full scale cuts off, the law knows; asking it of every square takes seconds where counts are deep.
+    let law = CountLaw::new(&context.sensor, context.gain);
+    Ok((law.detections_for_mean(mean) - dark) / context.sensor.quantum_efficiency)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::Camera;
+    use crate::frame::Frame;
+    use crate::light::Light;
+    use crate::sensor::Sensor;
+
+    const SIZE: Size = Size { height: 64, width: 80 };
+
+    /// What is told for 11 frames of a scene whose mean gets `ppp` photons, and every `hot`-th pixel of which counts the most.
+    fn told(scene: &Frame, sensor: &str, ppp: f64, hot: usize) -> f64 {
+        let sensor = Sensor::load(sensor).unwrap();
+        let light = Light { ppp, exposure: scene.mean() };
+        let mut camera = Camera::new(&sensor, SIZE, light, 5).unwrap();
+        let context = Context {
+            seed: 0,
+            first_frame: 0,
+            ppp,
+            exposure: f64::NAN,
+            gain: camera.gain(),
+            dark: None,
+            sensor,
+        };
+        fitting_exposure(SIZE, 30, &context, |t| {
+            let mut counts = camera.expose(t, &[scene])?;
+            counts.iter_mut().step_by(hot).for_each(|count| *count = context.sensor.max_count());
+            Ok(counts)
+        })
+        .unwrap()
+    }
+
+    /// A fifth of the scene three times as bright as the rest.
+    fn lamp(brightest: f32) -> Frame {
+        Frame::from_fn(SIZE, |x, _| if x < 16 { brightest } else { brightest / 3.0 })
+    }
+
+    #[test]
+    fn scenes_that_fit_are_exposed_as_usual() {
+        let even = Frame::from_fn(SIZE, |x, _| 0.5 + 0.004 * x as f32);
+        assert_eq!(told(&even, "qudi-paper", 3.25, usize::MAX), USUAL_EXPOSURE);
+        assert_eq!(told(&even, "spad512s", 0.3, usize::MAX), USUAL_EXPOSURE);
+        // Hot pixels are not the scene's.
+        assert_eq!(told(&even, "spad512s", 0.05, 131), USUAL_EXPOSURE);
+    }
+
+    #[test]
+    fn the_brightest_stays_below_white() {
+        for (sensor, ppp) in [("qudi-paper", 2.0), ("qudi-paper", 26.0), ("spad512s", 2.0)] {
+            // The scene's mean is 0.467 where its brightest is 1; what is told does not depend on the scale, and
+            // is 0.35 but for the noise of the brightest square.
+            for brightest in [1.0, 0.2] {
+                let exposure = told(&lamp(brightest), sensor, ppp, usize::MAX);
+                assert!((0.29..0.37).contains(&exposure), "{sensor} {ppp} {brightest}: {exposure}");
+            }
+        }
+    }
+}

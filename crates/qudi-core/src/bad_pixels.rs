@@ -1,0 +1,215 @@
+//! Hot and dead pixels: found in a capture, and repaired before anything else looks at it.
+
+use crate::frame::Size;
+use std::fmt::Write as _;
+
+/// A hot pixel outshines its brightest good neighbours by this factor ...
+const HOT_FACTOR: f64 = 2.0;
+
+/// ... and by this many standard deviations of their counts.
+const HOT_SIGMAS: f64 = 8.0;
+
+/// A dead pixel is silent where all its neighbours but two count more than this: chance does that
+/// once in e^18 pixels, and black parts of a scene are larger.
+const DEAD_EXPECTED: f64 = 18.0;
+
+/// Pixels of a neighbourhood, 5 x 5 around the pixel.
+const REACH: isize = 2;
+
+/// Bad pixels of an array, as indices in rising order.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct BadPixels {
+    /// Pixels that fire without light.
+    pub hot: Vec<usize>,
+    /// Pixels that never fire.
+    pub dead: Vec<usize>,
+}
+
+impl BadPixels {
+    /// Looks for isolated pixels far off their neighbourhood in the `sums` of `frames` frames.
+    /// Counts per frame go up to `max_count` (1 for binary frames, whose rates are unbent first).
+    ///
+    /// Optics spread even a star over several pixels; a single one that is twice as bright as the
+    /// second brightest around it is a defect.
+    pub fn find(sums: &[u32], size: Size, frames: u64, max_count: Option<u16>) -> Self {
+        let trials = frames as f64 * f64::from(max_count.unwrap_or(u16::MAX));
+        // Detections: binary counts saturate, and a hot pixel among bright ones hides there.
+        let detections: Vec<f64> = sums
+            .iter()
+            .map(|&sum| match max_count {
+                Some(1) => -trials * (-(f64::from(sum)).min(trials - 0.5) / trials).ln_1p(),
+                _ => f64::from(sum),
+            })
+            .collect();
+        let mut bad = Self::default();
+        let mut around = Vec::with_capacity(24);
+        for i in 0..size.pixels() {
+            neighbours(i, size, REACH, |j| around.push(detections[j]));
+            around.sort_by(f64::total_cmp);
+            let n = around.len();
+            if n >= 5 {
+                // The very brightest may be a defect itself.
+                let bright = around[n - 2];
+                let noise = (bright + 1.0).sqrt();
+                if detections[i] > HOT_FACTOR * bright
+                    && detections[i] > bright + HOT_SIGMAS * noise
+                {
+                    bad.hot.push(i);
+                } else if sums[i] == 0 && around[2] > DEAD_EXPECTED {
+                    bad.dead.push(i);
+                }
+            }
+            around.clear();
+        }
+        bad
+    }
+
+    /// Number of bad pixels.
+    /// The number of repaired pixels.
+    pub fn len(&self) -> usize {
+        self.hot.len() + self.dead.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// For each pixel whether it is bad.
+    pub fn mask(&self, size: Size) -> Vec<bool> {
+        let mut mask = vec![false; size.pixels()];
+        for &i in self.hot.iter().chain(&self.dead) {
+            mask[i] = true;
+        }
+        mask
+    }
+
+    /// In words.
+    pub fn describe(&self, size: Size) -> String {
+        let mut text = String::new();
+        let percent = |n: usize| 100.0 * n as f64 / size.pixels() as f64;
+        let (hot, dead) = (self.hot.len(), self.dead.len());
+        let _ =
+            write!(text, "{hot} hot ({:.3} %), {dead} dead ({:.3} %)", percent(hot), percent(dead));
+        text
+    }
+}
+
+/// Calls `f` with the pixels within `reach` of pixel `i`, itself left out.
+fn neighbours(i: usize, size: Size, reach: isize, mut f: impl FnMut(usize)) {
+    let (y, x) = ((i / size.width) as isize, (i % size.width) as isize);
+    let (height, width) = (size.height as isize, size.width as isize);
+    for ny in (y - reach).max(0)..(y + reach + 1).min(height) {
+        for nx in (x - reach).max(0)..(x + reach + 1).min(width) {
+            if (ny, nx) != (y, x) {
+                f((ny * width + nx) as usize);
+            }
+        }
+    }
+}
+
+/// Replaces bad pixels from good ones around them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Repair {
+    /// Bad pixel and its nearest good neighbours.
+    pixels: Vec<(usize, Vec<usize>)>,
+}
+
+impl Repair {
+    /// Plans the repair of the pixels set in `mask`; in clusters the search widens.
+    pub fn new(mask: &[bool], size: Size) -> Self {
+        let widest = size.height.max(size.width) as isize;
+        let good = |i: usize| -> Vec<usize> {
+            let mut found = Vec::new();
+            let mut reach = 1;
+            while found.is_empty() && reach <= widest {
+                neighbours(i, size, reach, |j| {
+                    if !mask[j] {
+                        found.push(j);
+                    }
+                });
+                reach *= 2;
+            }
+            found
+        };
+        let bad = mask.iter().enumerate().filter(|(_, bad)| **bad);
+        let pixels = bad.map(|(i, _)| (i, good(i))).filter(|(_, good)| !good.is_empty());
+        Self { pixels: pixels.collect() }
+    }
+
+    /// The number of repaired pixels.
+    pub fn len(&self) -> usize {
+        self.pixels.len()
+    }
+
+    /// Copies one good neighbour, another one in each frame: the noise stays that of a count
+    /// (Ma et al. 2020, whose code does the same with one draw for all pixels).
+    pub fn frame(&self, frame: u64, counts: &mut [u16]) {
+        for (i, good) in &self.pixels {
+            let pick = scramble(frame ^ (*i as u64) << 32) % good.len() as u64;
+            counts[*i] = counts[good[pick as usize]];
+        }
+    }
+
+    /// Puts the mean of the good neighbours, which is what many frames of [`Repair::frame`] tend to.
+    pub fn sums(&self, sums: &mut [u32]) {
+        for (i, good) in &self.pixels {
+            let total: u64 = good.iter().map(|&j| u64::from(sums[j])).sum();
+            let n = good.len() as u64;
+            sums[*i] = ((total + n / 2) / n) as u32;
+        }
+    }
+}
+
+/// A fixed choice that looks random (SplitMix64's finaliser, Steele et al. 2014).
+pub fn scramble(mut z: u64) -> u64 {
+    z = z.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ z >> 31
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clusters_are_repaired_from_outside() {
+        let size = Size { height: 5, width: 5 };
+        let mut mask = vec![false; 25];
+        for i in [6, 7, 8, 11, 12, 13, 16, 17, 18] {
+            mask[i] = true;
+        }
+        let repair = Repair::new(&mask, size);
+        let mut counts: Vec<u16> = mask.iter().map(|&bad| if bad { 99 } else { 3 }).collect();
+        repair.frame(4, &mut counts);
+        assert_eq!(counts, vec![3; 25]);
+        let mut sums: Vec<u32> = mask.iter().map(|&bad| if bad { 99 } else { 3 }).collect();
+        repair.sums(&mut sums);
+        assert_eq!(sums, vec![3; 25]);
+    }
+
+    #[test]
+    fn frames_pick_different_neighbours_and_their_mean_is_the_sum() {
+        let size = Size { height: 3, width: 3 };
+        let mut mask = vec![false; 9];
+        mask[4] = true;
+        let repair = Repair::new(&mask, size);
+        let source: Vec<u16> = vec![0, 10, 20, 30, 0, 40, 50, 60, 70];
+        let mut total = 0u64;
+        for frame in 0..10_000 {
+            let mut counts = source.clone();
+            repair.frame(frame, &mut counts);
+            total += u64::from(counts[4]);
+        }
+        let mut sums: Vec<u32> = source.iter().map(|&c| u32::from(c) * 10_000).collect();
+        repair.sums(&mut sums);
+        assert!((total as f64 / f64::from(sums[4]) - 1.0).abs() < 0.02, "{total} {}", sums[4]);
+    }
+
+    #[test]
+    fn a_fully_bad_array_is_left_alone() {
+        let size = Size { height: 2, width: 2 };
+        assert_eq!(Repair::new(&[true; 4], size).len(), 0);
+    }
+}

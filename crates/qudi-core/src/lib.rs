@@ -1,0 +1,45 @@
+//! The photon and the image: frames, sensors, light, cameras, metrics, and what every method of restoration gets.
+//!
+//! A [`Camera`], which is a [`sensor::Sensor`] under a certain [`Light`], turns [`Frame`]s in [0, 1] into photon
+//! counts. A [`restorer::Restorer`] turns counts into frames, and [`metrics`] compare them with the truth.
+//!
+//! ```
+//! use qudi_core::{Camera, Frame, Light, Size, sensor::Sensor};
+//!
+//! let size = Size::new(32, 48, "example")?;
+//! let scene = Frame::filled(size, 0.45);
+//! let sensor = Sensor::load("qudi-paper")?;
+//! let light = Light { ppp: 3.25, exposure: 0.45 };
+//! let mut camera = Camera::new(&sensor, size, light, 7)?;
+//! let counts = camera.expose(0, &[&scene])?;
+//! assert!(counts.iter().all(|&count| count <= sensor.max_count()));
+//! # Ok::<(), qudi_core::SimError>(())
+//! ```
+#![warn(missing_docs)]
+
+pub mod atomic_file;
+pub mod auto_exposure;
+pub mod bad_pixels;
+mod camera;
+pub mod error;
+pub mod flow;
+mod frame;
+mod light;
+pub mod metrics;
+pub mod natural_order;
+pub mod nearest;
+pub mod npy;
+pub mod random;
+pub mod restorer;
+pub mod sensor;
+mod transfer;
+pub mod windows;
+
+pub use camera::Camera;
+pub use error::{Result, SimError};
+pub use frame::{Frame, Size};
+pub use light::{
+    Checksum, ClipStatistics, Light, PppDefinition, Spectrum, USUAL_EXPOSURE, ppp_from_lux,
+    resolve_light, sensor_lux,
+};
+pub use transfer::{Transfer, linear_to_srgb, srgb_to_linear};

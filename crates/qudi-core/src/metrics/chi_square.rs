@@ -1,0 +1,63 @@
+//! Does the result explain the photons? The restored frames are measured again by the sensor's law,
+//! and compared with the counts: `chi^2 = (y - E y)^2 / Var y`, 1 on average where the image is
+//! right, above where it invents or blurs, below where it follows the noise.
+
+use crate::error::Result;
+use crate::frame::{Frame, Size};
+use crate::restorer::Context;
+use crate::sensor::{CountLaw, CountMoments};
+
+/// Variances below this (in DN^2) tell nothing: a black pixel of a noiseless sensor.
+const LEAST_VARIANCE: f64 = 1e-6;
+
+/// Reduced chi-square of a restored clip, with a map.
+#[derive(Clone, Debug)]
+pub struct Consistency {
+    moments: CountMoments,
+    size: Size,
+    map: Vec<f64>,
+    frames: u64,
+}
+
+impl Consistency {
+    /// For frames of `size` of the context's sensor.
+    pub fn new(size: Size, context: &Context) -> Self {
+        let law = CountLaw::new(&context.sensor, context.gain);
+        let moments = CountMoments::new(&law);
+        Self { moments, size, map: vec![0.0; size.pixels()], frames: 0 }
+    }
+
+    /// Compares one frame with its counts, and gives its own mean.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the sensor's dark rate is unknown.
+    pub fn add(&mut self, restored: &Frame, counts: &[u16], context: &Context) -> Result<f64> {
+        let ordinary = context.sensor.dark_per_frame()?;
+        let photons = context.photons_per_unit() * context.sensor.quantum_efficiency;
+        let mut total = 0.0;
+        for (i, (&image, &count)) in restored.data.iter().zip(counts).enumerate() {
+            let detections = f64::from(image).max(0.0) * photons + context.dark_of(i, ordinary);
+            let (mean, variance) = self.moments.at(detections);
+            if variance > LEAST_VARIANCE {
+                let misfit = (f64::from(count) - mean).powi(2) / variance;
+                self.map[i] += misfit;
+                total += misfit;
+            }
+        }
+        self.frames += 1;
+        Ok(total / self.map.len() as f64)
+    }
+
+    /// Mean over all pixels and frames; `None` before the first frame.
+    pub fn chi_square(&self) -> Option<f64> {
+        let mean = self.map.iter().sum::<f64>() / self.map.len() as f64;
+        (self.frames > 0).then(|| mean / self.frames as f64)
+    }
+
+    /// Mean over frames, `[height][width]`.
+    pub fn map(&self) -> Frame {
+        let scale = 1.0 / self.frames.max(1) as f64;
+        let data = self.map.iter().map(|&sum| (sum * scale) as f32).collect();
+        Frame { size: self.size, data }
+    }
+}

@@ -1,0 +1,69 @@
+//! The path that every method takes: windows of a burst in, restored frames out.
+
+use crate::error::Result;
+use crate::frame::{Frame, Size};
+use crate::sensor::Sensor;
+
+/// Counts of consecutive frames, `[frames][height][width]`.
+#[derive(Clone, Copy, Debug)]
+pub struct BurstView<'a> {
+    /// Frame size.
+    pub size: Size,
+    /// The frames.
+    pub frames: &'a [Vec<u16>],
+}
+
+/// What a method knows besides the counts.
+#[derive(Clone, Debug)]
+pub struct Context {
+    /// Seed of any random draws.
+    pub seed: u64,
+    /// Number of the window's first frame in the capture.
+    pub first_frame: u64,
+    /// Incident photons per pixel and frame, where the image is `exposure`.
+    pub ppp: f64,
+    /// Image value that receives `ppp` photons.
+    pub exposure: f64,
+    /// The sensor of these frames, `frames_summed` included.
+    pub sensor: Sensor,
+    /// Its gain in DN/e-.
+    pub gain: f64,
+    /// Dark electrons per frame of every pixel, where a map is known.
+    pub dark: Option<Vec<f32>>,
+}
+
+/// Restored frames of a window.
+#[derive(Clone, Debug)]
+pub struct Restored {
+    /// One per frame of the window, in image units.
+    pub frames: Vec<Frame>,
+    /// Deviation of each pixel's error, for methods that tell it.
+    pub std: Option<Vec<Frame>>,
+}
+
+/// A method: turns all frames of a window into images at once.
+pub trait Restorer {
+    /// Its name in tables and on the command line.
+    fn name(&self) -> &'static str;
+
+    /// Frames that it wants at once; shorter captures come as one shorter window.
+    fn window(&self) -> usize;
+
+    /// Restores every frame of `burst`.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the method cannot work with this burst.
+    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored>;
+}
+
+impl Context {
+    /// Incident photons per unit of image value.
+    pub fn photons_per_unit(&self) -> f64 {
+        self.ppp / self.exposure
+    }
+
+    /// Dark electrons per frame of pixel `i`; `ordinary` where no map is known.
+    pub fn dark_of(&self, i: usize, ordinary: f64) -> f64 {
+        self.dark.as_ref().map_or(ordinary, |map| f64::from(map[i]))
+    }
+}

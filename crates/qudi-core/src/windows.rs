@@ -1,0 +1,149 @@
+//! A long capture as overlapping windows, and their results as one clip.
+
+use crate::error::{Result, SimError};
+use crate::frame::Frame;
+use std::collections::VecDeque;
+use std::ops::Range;
+
+/// Most frames on either side: a window of 11.
+pub const LONGEST_HALF: usize = 5;
+
+/// Windows of equal length over a number of frames; the last one is moved to end with the capture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Windows {
+    frames: u64,
+    length: u64,
+    stride: u64,
+}
+
+impl Windows {
+    /// Windows of `length` frames, each sharing `overlap` with the one before.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] if the overlap is no shorter than the window.
+    pub fn new(frames: u64, length: u64, overlap: u64) -> Result<Self> {
+        if length == 0 || overlap >= length {
+            return Err(SimError::request(
+                format!("windows of {length} frames that share {overlap}"),
+                "--window, --overlap",
+                "windows are longer than their overlap",
+            ));
+        }
+        Ok(Self { frames, length, stride: length - overlap })
+    }
+
+    /// The same windows over another number of frames.
+    #[must_use]
+    pub fn over(self, frames: u64) -> Self {
+        Self { frames, ..self }
+    }
+
+    /// Number of windows.
+    pub fn count(&self) -> u64 {
+        (self.frames - self.held()).div_ceil(self.stride) + 1
+    }
+
+    /// Frames of window `number`.
+    pub fn range(&self, number: u64) -> Range<u64> {
+        let start = (number * self.stride).min(self.frames - self.held());
+        start..start + self.held()
+    }
+
+    /// One past the last frame of window `number`, if there are that many.
+    pub fn nominal_end(&self, number: u64) -> u64 {
+        number.saturating_mul(self.stride).saturating_add(self.length)
+    }
+
+    /// Frames of every window.
+    fn held(&self) -> u64 {
+        self.length.min(self.frames)
+    }
+
+    /// The first window that holds `frame`.
+    pub fn first_with(&self, frame: u64) -> u64 {
+        (0..self.count()).find(|&n| self.range(n).end > frame).unwrap_or(0)
+    }
+}
+
+/// Blends overlapping windows frame by frame: over an overlap of `n` frames the new window's weight
+/// grows linearly from `1 / (n + 1)` to `n / (n + 1)`.
+#[derive(Debug, Default)]
+pub struct CrossFade {
+    /// Number of the first waiting frame.
+    first: u64,
+    waiting: VecDeque<Frame>,
+}
+
+impl CrossFade {
+    /// Takes the result of the window that starts at frame `start`.
+    pub fn push(&mut self, start: u64, frames: Vec<Frame>) {
+        if self.waiting.is_empty() {
+            self.first = start;
+        }
+        let shared = (self.first + self.waiting.len() as u64 - start) as usize;
+        let from = self.waiting.len() - shared;
+        let mut frames = frames.into_iter();
+        for (i, (old, new)) in self.waiting.iter_mut().skip(from).zip(&mut frames).enumerate() {
+            let weight = (i + 1) as f32 / (shared + 1) as f32;
+            for (old, new) in old.data.iter_mut().zip(new.data) {
+                *old += weight * (new - *old);
+            }
+        }
+        self.waiting.extend(frames);
+    }
+
+    /// The next frame before `until`, the start of the next window, with its number.
+    pub fn pop(&mut self, until: u64) -> Option<(u64, Frame)> {
+        if self.first >= until {
+            return None;
+        }
+        let frame = self.waiting.pop_front()?;
+        self.first += 1;
+        Some((self.first - 1, frame))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::Size;
+
+    #[test]
+    fn windows_cover_every_frame_and_end_with_the_capture() {
+        for frames in 1..60 {
+            let windows = Windows::new(frames, 11, 3).unwrap();
+            let mut next = 0;
+            for n in 0..windows.count() {
+                let range = windows.range(n);
+                assert!(range.start <= next && range.end > next || n == 0, "{frames}: {range:?}");
+                assert_eq!(range.end - range.start, frames.min(11));
+                next = range.end;
+            }
+            assert_eq!(next, frames);
+            for frame in 0..frames {
+                let first = windows.first_with(frame);
+                assert!(windows.range(first).contains(&frame));
+                assert!(first == 0 || !windows.range(first - 1).contains(&frame));
+            }
+        }
+        assert!(Windows::new(20, 3, 3).is_err());
+    }
+
+    /// Windows whose pixels hold a value of their own: overlaps rise evenly from one to the next.
+    #[test]
+    fn overlaps_fade_evenly_and_frames_come_in_order() {
+        let size = Size { height: 1, width: 2 };
+        let windows = Windows::new(19, 11, 3).unwrap();
+        assert_eq!((windows.count(), windows.range(1)), (2, 8..19));
+        let (mut fade, mut out) = (CrossFade::default(), Vec::new());
+        for n in 0..2 {
+            fade.push(windows.range(n).start, vec![Frame::filled(size, n as f32); 11]);
+            let until = if n == 0 { 8 } else { 19 };
+            out.extend(std::iter::from_fn(|| fade.pop(until)));
+        }
+        let numbers: Vec<u64> = out.iter().map(|(n, _)| *n).collect();
+        assert_eq!(numbers, (0..19).collect::<Vec<_>>());
+        let values: Vec<f32> = out.iter().map(|(_, frame)| frame.data[0]).collect();
+        assert_eq!(values[7..12], [0.0, 0.25, 0.5, 0.75, 1.0]);
+    }
+}

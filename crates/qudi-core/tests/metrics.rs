@@ -1,0 +1,28 @@
+//! PSNR and SSIM against scikit-image: `tests/golden/metrics`, made by
+//! `scripts/reference/metrics.py`.
+#![allow(clippy::unwrap_used)]
+
+use qudi_core::metrics::{gain_aligned_psnr, gaussian_ssim, psnr, ssim};
+use qudi_core::npy::read_image;
+use std::path::Path;
+
+#[test]
+fn figures_are_those_of_scikit_image() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/metrics");
+    let text = std::fs::read_to_string(folder.join("figures.json")).unwrap();
+    let figures: serde_json::Value = serde_json::from_str(&text).unwrap();
+    for (name, expected) in figures.as_object().unwrap() {
+        let image = |what: &str| read_image(&folder.join(format!("{name}-{what}.npy"))).unwrap();
+        let (estimate, truth) = (image("estimate"), image("truth"));
+        let found = [
+            ("psnr", psnr(&estimate, &truth)),
+            ("psnr_a", gain_aligned_psnr(&estimate, &truth)),
+            ("ssim", ssim(&estimate, &truth).unwrap()),
+            ("ssim_g", gaussian_ssim(&estimate, &truth).unwrap()),
+        ];
+        for (metric, value) in found {
+            let expected = expected[metric].as_f64().unwrap();
+            assert!((value - expected).abs() < 1e-6, "{name} {metric}: {value} {expected}");
+        }
+    }
+}

@@ -1,0 +1,53 @@
+//! Counts as a folder of gray PNG files: `frame_000000.png`, ...
+
+use image::{ImageBuffer, Luma};
+use qudi_core::Size;
+use qudi_core::atomic_file::{Overwrite, PendingFolder};
+use qudi_core::{Result, SimError};
+use std::path::Path;
+
+pub(crate) struct PngFolder {
+    folder: PendingFolder,
+    size: Size,
+    deep: bool,
+    frames: usize,
+}
+
+impl PngFolder {
+    /// The record's name; it also marks the folder as ours.
+    pub(crate) const RECORD: &str = "burst.json";
+
+    pub(crate) fn create(
+        path: &Path,
+        size: Size,
+        max_count: u16,
+        overwrite: Overwrite,
+    ) -> Result<Self> {
+        let folder = PendingFolder::create(path, overwrite, Self::RECORD)?;
+        Ok(Self { folder, size, deep: max_count > 255, frames: 0 })
+    }
+
+    pub(crate) fn push(&mut self, counts: &[u16]) -> Result<()> {
+        let name = format!("frame_{:06}.png", self.frames);
+        self.frames += 1;
+        let (width, height) = (self.size.width as u32, self.size.height as u32);
+        let file = self.folder.file(&name);
+        let saved = if self.deep {
+            let image = ImageBuffer::<Luma<u16>, _>::from_raw(width, height, counts);
+            image.expect("the camera's size").save(&file)
+        } else {
+            let bytes: Vec<u8> = counts.iter().map(|&c| c as u8).collect();
+            let image = ImageBuffer::<Luma<u8>, _>::from_raw(width, height, bytes);
+            image.expect("the camera's size").save(&file)
+        };
+        saved.map_err(|e| {
+            SimError::io("write a frame into", self.folder.path(), std::io::Error::other(e))
+        })
+    }
+
+    pub(crate) fn finish(self, record: &[u8]) -> Result<()> {
+        std::fs::write(self.folder.file(Self::RECORD), record)
+            .map_err(|e| SimError::io("write the record of", self.folder.path(), e))?;
+        self.folder.finish()
+    }
+}

@@ -1,0 +1,454 @@
+//! Captures of real (and simulated) single-photon cameras, in every format of the field.
+//!
+//! The way of the data: a path is recognised ([`codec::FORMATS`]) and opened as native frames
+//! ([`CountFrames`]); a [`Capture`] turns and crops them, sums them, and repairs bad pixels, so that
+//! nothing downstream sees a raw file. Memory holds a few frames, however long the capture is.
+
+pub(crate) mod about;
+pub(crate) mod bit_order;
+pub(crate) mod byte_kind;
+mod calibrate;
+pub(crate) mod levels;
+pub(crate) mod options;
+pub(crate) mod pipe;
+mod pixel_map;
+pub(crate) mod probe;
+pub(crate) mod raw_look;
+mod summary;
+mod view;
+
+pub use about::{About, Certainty, Packing};
+pub use bit_order::{SURE, bit_order_evidence};
+pub use calibrate::{Calibration, calibrate};
+pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+pub use summary::{BitOrderCheck, Summary};
+
+use crate::codec;
+use crate::frames::{CountFrames, memory};
+use pipe::{FIRST_WINDOW, STDIN};
+use qudi_core::Size;
+use qudi_core::bad_pixels::{self, BadPixels, Repair};
+use qudi_core::sensor::{Response, Sensor};
+use qudi_core::{Result, SimError};
+use std::io::Read;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use view::View;
+
+/// Frames looked at for statistics at most.
+pub const MOST_LOOKS: u64 = 1000;
+
+/// A capture, read as output frames: turned, cropped, summed, repaired.
+pub struct Capture {
+    path: PathBuf,
+    about: About,
+    native: Box<dyn CountFrames>,
+    view: View,
+    /// Native frames in use; of a pipe, those that have arrived.
+    range: Range<u64>,
+    /// One past the last native frame asked for.
+    end: Option<u64>,
+    /// Whether no more frames come.
+    complete: bool,
+    sum: u32,
+    repair: Repair,
+    bad: BadPixels,
+    /// Dark electrons per native frame and pixel of the view, if known.
+    dark: Option<Vec<f32>>,
+    stored: Vec<u16>,
+    stored_sums: Vec<u32>,
+}
+
+impl std::fmt::Debug for Capture {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Capture")
+            .field("path", &self.path)
+            .field("about", &self.about)
+            .finish_non_exhaustive()
+    }
+}
+
+/// What the user says of the depth, unless the file knows better.
+fn state_depth(about: &mut About, bits: u8) -> Result<()> {
+    if !(1..=16).contains(&bits) {
+        return Err(SimError::request(
+            format!("{bits} bits"),
+            "--bits",
+            "counts have 1 to 16 bits",
+        ));
+    }
+    let max = ((1u32 << bits) - 1) as u16;
+    match about.max_count {
+        Some(known) if known != max => Err(SimError::request(
+            format!("{bits} bits, where the file has counts up to {known}"),
+            "--bits",
+            "leave it out: the file knows its depth",
+        )),
+        _ => {
+            about.max_count = Some(max);
+            Ok(())
+        }
+    }
+}
+
+impl Capture {
+    /// Opens the capture at `path`. `sensor` is asked for its dark map and its bad pixels, if
+    /// `options` name none.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read, is of no known format, or an option does not fit.
+    pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
+        let (native, about) = codec::open(path, options)?;
+        Self::assemble(path, native, about, options, sensor)
+    }
+
+    /// The capture that comes out of `reader`: a `.npy`, or raw frames that `options` name. Each frame
+    /// comes once: [`Capture::reach`] waits for more, and statistics see the first window.
+    ///
+    /// # Errors
+    /// As [`Capture::open`].
+    pub fn from_pipe(
+        reader: impl Read + Send + 'static,
+        options: &ReadOptions,
+        sensor: Option<&Sensor>,
+    ) -> Result<Self> {
+        let (native, about) = codec::open_pipe(Box::new(reader), options)?;
+        Self::assemble(Path::new(STDIN), native, about, options, sensor)
+    }
+
+    fn assemble(
+        path: &Path,
+        mut native: Box<dyn CountFrames>,
+        mut about: About,
+        options: &ReadOptions,
+        sensor: Option<&Sensor>,
+    ) -> Result<Self> {
+        if let Some(bits) = options.bits {
+            state_depth(&mut about, bits)?;
+        }
+        about.binary |= about.max_count == Some(1);
+        if let Some(orient) = options.orient {
+            about.orient = orient;
+        }
+        let stored = native.size();
+        let view = View::new(stored, about.orient, about.vendor, options.crop)?;
+        let sum = options.sum.unwrap_or(1);
+        let start = options.start.unwrap_or(0);
+        native.release(start);
+        let window = start.saturating_add(FIRST_WINDOW.saturating_mul(sum.max(1).into()));
+        let there = native.reach(window.min(options.end.unwrap_or(window)), &mut about.remarks)?;
+        let frames = native.length().unwrap_or(u64::MAX);
+        let range = start..options.end.unwrap_or(frames).min(there);
+        if range.start >= range.end || options.end.is_some_and(|end| end > frames) {
+            let range = start..options.end.unwrap_or(frames);
+            return Err(SimError::request(
+                format!("frames {} to {} of {frames}", range.start, range.end),
+                "--start, --end",
+                format!("frames count from 0; --end is one past the last, at most {frames}"),
+            ));
+        }
+        if sum == 0 || u64::from(sum) > range.end - range.start {
+            return Err(SimError::request(
+                format!("{sum} frames summed into one, of {}", range.end - range.start),
+                "--sum",
+                "sum between 1 and all frames",
+            ));
+        }
+        if about.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX))
+        {
+            return Err(SimError::request(
+                format!("sums of {sum} frames do not fit into 16 bits"),
+                "--sum",
+                "counts go up to 65535: sum fewer frames",
+            ));
+        }
+        let mut capture = Self {
+            path: path.to_owned(),
+            about,
+            view,
+            range,
+            end: options.end,
+            complete: false,
+            sum,
+            repair: Repair::default(),
+            bad: BadPixels::default(),
+            dark: None,
+            stored: vec![0; stored.pixels()],
+            stored_sums: Vec::new(),
+            native,
+        };
+        capture.note_end();
+        pixel_map::plan(&mut capture, options, sensor)?;
+        Ok(capture)
+    }
+
+    /// Output frames of `sensor` that are in memory already, `[frames][height * width]`.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] if there are none, or one has another size.
+    pub fn in_memory(
+        name: &str,
+        size: Size,
+        frames: Vec<Vec<u16>>,
+        sensor: &Sensor,
+    ) -> Result<Self> {
+        let place = Path::new(name);
+        if frames.is_empty() || frames.iter().any(|frame| frame.len() != size.pixels()) {
+            return Err(SimError::request(
+                format!("{} frames, not all of {size}", frames.len()),
+                place.display(),
+                "give at least one frame, all of one size",
+            ));
+        }
+        let mut about = About::new("memory", "counts in memory");
+        about.max_count = Some(sensor.max_count());
+        about.binary = sensor.response == Response::Binary;
+        about.sensor = Some(sensor.clone());
+        Ok(Self {
+            path: place.to_owned(),
+            about,
+            view: View { size, from: None },
+            range: 0..frames.len() as u64,
+            end: None,
+            complete: true,
+            sum: 1,
+            repair: Repair::default(),
+            bad: BadPixels::default(),
+            dark: None,
+            stored: vec![0; size.pixels()],
+            stored_sums: Vec::new(),
+            native: Box::new(memory::MemoryFrames { size, frames }),
+        })
+    }
+
+    /// What is known about it.
+    pub fn about(&self) -> &About {
+        &self.about
+    }
+
+    /// Where it lies.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Size of the turned and cropped frames.
+    pub fn size(&self) -> Size {
+        self.view.size
+    }
+
+    /// Output frames; of a pipe, those that have arrived.
+    pub fn frames(&self) -> u64 {
+        self.native_frames() / u64::from(self.sum)
+    }
+
+    /// Output frames in all; `None` as long as a pipe has not told.
+    pub fn length(&self) -> Option<u64> {
+        let end = match (self.native.length(), self.end) {
+            (Some(length), Some(end)) => length.min(end),
+            (length, _) => length?,
+        };
+        Some((end - self.range.start) / u64::from(self.sum))
+    }
+
+    /// Waits until there are `frames` output frames, or no more come; gives how many there are.
+    ///
+    /// # Errors
+    /// [`SimError`] if a pipe fails, or ends inside a frame.
+    pub fn reach(&mut self, frames: u64) -> Result<u64> {
+        if !self.complete {
+            let native = frames.saturating_mul(self.sum.into()).saturating_add(self.range.start);
+            let native = native.min(self.end.unwrap_or(native));
+            let there = self.native.reach(native, &mut self.about.remarks)?;
+            self.range.end = there.min(self.end.unwrap_or(there));
+            self.note_end();
+        }
+        Ok(self.frames())
+    }
+
+    /// Says that no output frame before `frame` is read again, so that a pipe need not keep it.
+    pub fn release(&mut self, frame: u64) {
+        self.native.release(self.range.start + frame * u64::from(self.sum));
+    }
+
+    /// Notes whether the end has come, and what is to be said of it.
+    fn note_end(&mut self) {
+        let ended = self.native.length() == Some(self.range.end);
+        self.complete = ended || self.end == Some(self.range.end);
+        if !self.complete {
+            return;
+        }
+        if let Some(end) = self.end.filter(|&end| end > self.range.end) {
+            let text =
+                format!("the pipe ended after {} frames, before --end {end}", self.range.end);
+            self.about.remarks.push(text);
+        }
+        let left_over = self.native_frames() % u64::from(self.sum);
+        if left_over > 0 {
+            let text = format!("the last {left_over} frames fill no sum of {}", self.sum);
+            self.about.remarks.push(text);
+        }
+    }
+
+    /// Native frames in use.
+    pub fn native_frames(&self) -> u64 {
+        self.range.end - self.range.start
+    }
+
+    /// Native frames summed into each output frame.
+    pub fn summed(&self) -> u32 {
+        self.sum
+    }
+
+    /// Largest possible count of an output frame, if known.
+    pub fn max_count(&self) -> Option<u16> {
+        self.about.max_count.map(|max| (u32::from(max) * self.sum) as u16)
+    }
+
+    /// The sensor whose output frames these are: `sensor`, summing as many binary frames as one
+    /// count does here.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] if the depth is unknown or is not that sensor's, or if frames of a
+    /// linear sensor are summed, which no sensor does.
+    pub fn output_sensor(&self, sensor: &Sensor) -> Result<Sensor> {
+        let place = self.path.display();
+        let linear = sensor.response == Response::Linear;
+        if linear && self.sum > 1 {
+            return Err(SimError::request(
+                format!("sums of {} frames of `{}`, a linear sensor", self.sum, sensor.name),
+                "--sum",
+                "only binary frames are summed: leave it out",
+            ));
+        }
+        match self.max_count() {
+            _ if linear && self.about.binary => Err(SimError::request(
+                format!("binary frames, and `{}` is a linear sensor", sensor.name),
+                place,
+                "name the sensor that took them, as in --sensor swissspad2",
+            )),
+            Some(max) if linear && max != sensor.max_count() => Err(SimError::request(
+                format!(
+                    "counts up to {max}, and those of `{}` reach {}",
+                    sensor.name,
+                    sensor.max_count()
+                ),
+                place,
+                "name the sensor that took them, or the depth with --bits",
+            )),
+            Some(max) if !linear => Ok(Sensor { frames_summed: u32::from(max), ..sensor.clone() }),
+            None if !linear => Err(SimError::request(
+                "how many binary frames a count sums is not known",
+                place,
+                "say the depth of counts with --bits (3 for sums of 7), or --levels for scaled means",
+            )),
+            _ => Ok(sensor.clone()),
+        }
+    }
+
+    /// Output frames per second, if known.
+    pub fn fps(&self) -> Option<f64> {
+        self.about.fps.map(|fps| fps / f64::from(self.sum))
+    }
+
+    /// Dark electrons per native frame of every pixel, if a map is known.
+    pub fn dark(&self) -> Option<&[f32]> {
+        self.dark.as_deref()
+    }
+
+    /// Pixels that are repaired: named ones, or found ones.
+    pub fn bad_pixels(&self) -> &BadPixels {
+        &self.bad
+    }
+
+    /// Whether going back means to start over, or is impossible.
+    pub fn forward_only(&self) -> bool {
+        self.native.forward_only()
+    }
+
+    /// Reads output frame `frame`, bad pixels repaired.
+    ///
+    /// # Errors
+    /// [`SimError`] if the file cannot be read, or a sum does not fit into 16 bits.
+    pub fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        self.check(frame..frame + 1)?;
+        if self.sum == 1 {
+            self.native.read(self.range.start + frame, &mut self.stored)?;
+            self.view.apply(&self.stored, counts);
+        } else {
+            let mut sums = vec![0; self.size().pixels()];
+            self.stored_total(frame..frame + 1, &mut sums)?;
+            for (count, sum) in counts.iter_mut().zip(sums) {
+                *count = u16::try_from(sum).map_err(|_| {
+                    SimError::request(
+                        format!("frame {frame} sums to {sum}, which does not fit into 16 bits"),
+                        "--sum",
+                        "sum fewer frames",
+                    )
+                })?;
+            }
+        }
+        self.repair.frame(frame, counts);
+        Ok(())
+    }
+
+    /// Copies packed frames as they are, from `first` on: rows of whole bytes, the first pixel in the
+    /// highest bit. `false` if they have to be read one by one: turned, summed, repaired, or stored
+    /// otherwise.
+    ///
+    /// # Errors
+    /// [`SimError`] if the file cannot be read.
+    pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
+        let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.len() == 0;
+        if !untouched || self.about.packing.is_none() {
+            return Ok(false);
+        }
+        let frame_bytes = self.size().height * self.size().width.div_ceil(8);
+        self.check(first..first + (bytes.len() / frame_bytes) as u64)?;
+        self.native.copy_packed(self.range.start + first, bytes)
+    }
+
+    /// Sums output frames, bad pixels repaired.
+    ///
+    /// # Errors
+    /// [`SimError`] if the file cannot be read.
+    pub fn total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
+        self.stored_total(frames, sums)?;
+        self.repair.sums(sums);
+        Ok(())
+    }
+
+    /// Sums as they are, turned and cropped only.
+    fn stored_total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
+        self.check(frames.clone())?;
+        let native = |frame: u64| self.range.start + frame * u64::from(self.sum);
+        let range = native(frames.start)..native(frames.end);
+        self.stored_sums.clear();
+        self.stored_sums.resize(self.stored.len(), 0);
+        self.native.add(range, &mut self.stored_sums)?;
+        self.view.apply(&self.stored_sums, sums);
+        Ok(())
+    }
+
+    fn check(&self, frames: Range<u64>) -> Result<()> {
+        if frames.start <= frames.end && frames.end <= self.frames() {
+            return Ok(());
+        }
+        Err(SimError::request(
+            format!("frames {} to {} of {}", frames.start, frames.end, self.frames()),
+            self.path.display(),
+            "ask for frames of the capture",
+        ))
+    }
+
+    /// Output frames to look at for statistics: one from each of equally long stretches, not all at
+    /// the same place in theirs, since lamps flicker; or the first frames, where going through the
+    /// whole file would take long.
+    pub fn looks(&self) -> Vec<u64> {
+        let looks = self.frames().min(MOST_LOOKS);
+        if self.forward_only() {
+            return (0..looks).collect();
+        }
+        let start = |i: u64| (u128::from(i) * u128::from(self.frames()) / u128::from(looks)) as u64;
+        (0..looks).map(|i| start(i) + bad_pixels::scramble(i) % (start(i + 1) - start(i))).collect()
+    }
+}

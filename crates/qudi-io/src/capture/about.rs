@@ -1,0 +1,96 @@
+//! What is known about a capture, and how.
+
+use super::options::{BitOrder, Orientation, PackAxis};
+use qudi_core::sensor::Sensor;
+use serde::Serialize;
+
+/// How sure a format is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Certainty {
+    /// It could be; so could others.
+    Possible,
+    /// Name, size and content agree.
+    Likely,
+    /// The file says so itself, or the user did.
+    Certain,
+}
+
+impl Certainty {
+    /// As a word.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Possible => "possible",
+            Self::Likely => "likely",
+            Self::Certain => "certain",
+        }
+    }
+}
+
+/// Description of an opened capture.
+#[derive(Clone, Debug, Serialize)]
+pub struct About {
+    /// Name of the format.
+    pub format: &'static str,
+    /// The format in words.
+    pub title: &'static str,
+    /// How sure that is.
+    pub certainty: Certainty,
+    /// What speaks for it.
+    pub evidence: Vec<String>,
+    /// Largest possible count of a native frame, if the file says.
+    pub max_count: Option<u16>,
+    /// Whether counts are sums of `max_count` binary frames (or one of them).
+    pub binary: bool,
+    /// How bits are packed, if they are.
+    pub packing: Option<Packing>,
+    /// Native frames per second, if the file says.
+    pub fps: Option<f64>,
+    /// The orientation that stored frames need to be seen as the camera's own software shows them.
+    pub vendor: Orientation,
+    /// The orientation in use.
+    pub orient: Orientation,
+    /// The sensor, if a record beside the file names it.
+    #[serde(skip)]
+    pub sensor: Option<Sensor>,
+    /// Its gain in DN/e-, if a record says.
+    pub gain: Option<f64>,
+    /// Incident photons per pixel and native frame, if a record says.
+    pub ppp: Option<f64>,
+    /// The camera preset that this format belongs to.
+    pub preset: Option<&'static str>,
+    /// What the user should know.
+    pub remarks: Vec<String>,
+}
+
+/// Eight pixels to the byte.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Packing {
+    /// Along which axis.
+    pub axis: PackAxis,
+    /// Which pixel comes first.
+    pub order: BitOrder,
+}
+
+impl About {
+    /// A description with nothing but names; the rest is filled in by the format.
+    pub(crate) fn new(format: &'static str, title: &'static str) -> Self {
+        Self {
+            format,
+            title,
+            certainty: Certainty::Certain,
+            evidence: Vec::new(),
+            max_count: None,
+            binary: false,
+            packing: None,
+            fps: None,
+            vendor: Orientation::Raw,
+            orient: Orientation::Raw,
+            sensor: None,
+            gain: None,
+            ppp: None,
+            preset: None,
+            remarks: Vec::new(),
+        }
+    }
+}

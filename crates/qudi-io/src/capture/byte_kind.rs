@@ -1,0 +1,75 @@
+//! Whether bytes without a header are packed bits or counts.
+
+/// What a sample of bytes looks like.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ByteKind {
+    /// Every bit of a byte is set equally often: eight pixels.
+    Packed,
+    /// Low bits differ from high ones, or high ones are never set: one sample.
+    Counts,
+    /// As `Counts`, in pairs with the high byte second.
+    WideCounts,
+    /// All zero, or too few set bits.
+    Unclear,
+}
+
+/// Set bits needed to compare their rates.
+const FEWEST: u64 = 400;
+
+/// In packed captures the columns of each bit see the same scene; their rates agree closely.
+const SPREAD: f64 = 0.25;
+
+impl ByteKind {
+    pub(crate) fn of(bytes: &[u8]) -> Self {
+        let total: u64 = bytes.iter().map(|b| u64::from(b.count_ones())).sum();
+        if total < FEWEST {
+            return Self::Unclear;
+        }
+        let set = |bit: u32, odd: Option<usize>| {
+            let chosen = bytes.iter().enumerate().filter(|(i, _)| odd.is_none_or(|o| i % 2 == o));
+            chosen.filter(|(_, b)| *b >> bit & 1 == 1).count() as f64
+        };
+        let rates: Vec<f64> = (0..8).map(|bit| set(bit, None)).collect();
+        let mean = total as f64 / 8.0;
+        let noise = 4.0 / mean.sqrt();
+        if rates.iter().all(|rate| (rate / mean - 1.0).abs() < SPREAD + noise) {
+            return Self::Packed;
+        }
+        // Samples of 9 to 12 bits: nothing above bit 3 of the high byte, much in the low byte.
+        let high: f64 = (4..8).map(|bit| set(bit, Some(1))).sum();
+        let low: f64 = (0..8).map(|bit| set(bit, Some(0))).sum();
+        let odd: f64 = (0..8).map(|bit| set(bit, Some(1))).sum();
+        if high == 0.0 && odd < 0.5 * low { Self::WideCounts } else { Self::Counts }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_core::random::{Domain, Streams, uniform};
+
+    fn bytes(mut f: impl FnMut(&mut dyn FnMut() -> f64) -> u8) -> Vec<u8> {
+        let mut rng = Streams::new(3).row(Domain::Pattern, 0, 0);
+        let mut draw = || uniform(&mut rng);
+        (0..100_000).map(|_| f(&mut draw)).collect()
+    }
+
+    #[test]
+    fn bits_and_counts_are_told_apart() {
+        for rate in [0.01, 0.1, 0.5, 0.9] {
+            let packed = bytes(|u| (0..8).fold(0, |b, i| b | u8::from(u() < rate) << i));
+            assert_eq!(ByteKind::of(&packed), ByteKind::Packed, "{rate}");
+        }
+        for top in [2.0, 8.0, 16.0, 64.0, 200.0] {
+            let counts = bytes(|u| (u() * u() * top) as u8);
+            assert_eq!(ByteKind::of(&counts), ByteKind::Counts, "{top}");
+        }
+        let mut odd = false;
+        let wide = bytes(|u| {
+            odd = !odd;
+            if odd { (u() * 256.0) as u8 } else { (u() * 3.0) as u8 }
+        });
+        assert_eq!(ByteKind::of(&wide), ByteKind::WideCounts);
+        assert_eq!(ByteKind::of(&[0; 1000]), ByteKind::Unclear);
+    }
+}

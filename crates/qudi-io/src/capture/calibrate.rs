@@ -1,0 +1,211 @@
+//! Calibration from a dark capture: dark rate of every pixel, hot pixels, read noise.
+
+use super::Capture;
+use qudi_core::Size;
+use qudi_core::bad_pixels::BadPixels;
+use qudi_core::sensor::{CountLaw, Response, Sensor};
+use qudi_core::{Result, SimError};
+
+/// A hot pixel is this many times darker than the array's bulk, unless a threshold is given.
+const HOT_FACTOR: f64 = 10.0;
+
+/// ... and by this many standard deviations of its counts.
+const HOT_SIGMAS: f64 = 6.0;
+
+/// Frames summed at once: 16-bit counts of so many frames fit into 32 bits.
+const CHUNK: u64 = 4096;
+
+/// Read noise is looked for between these values, in e-.
+const READ_NOISE: (f64, f64) = (0.01, 30.0);
+
+/// What a dark capture says about a camera.
+#[derive(Clone, Debug)]
+pub struct Calibration {
+    /// Size of the maps.
+    pub size: Size,
+    /// Frames used.
+    pub frames: u64,
+    /// Dark electrons per native frame, `[height * width]`.
+    pub dark: Vec<f32>,
+    /// Their median; where most pixels never fired, the mean of the darkest nine tenths.
+    pub bulk: f64,
+    /// Hot pixels.
+    pub bad: BadPixels,
+    /// Dark rate beyond which a pixel was called hot, per native frame.
+    pub threshold: f64,
+    /// Read noise in e- of the ordinary pixels, for linear sensors.
+    pub read_noise: Option<f64>,
+}
+
+/// Measures `capture`, taken with the shutter closed. `gain` is in DN/e- and needed for linear
+/// sensors; `hot` is a threshold in dark electrons per native frame.
+///
+/// # Errors
+/// [`SimError`] if the capture cannot be read, is no dark one, or the gain is unknown.
+pub fn calibrate(
+    capture: &mut Capture,
+    sensor: &Sensor,
+    gain: Option<f64>,
+    hot: Option<f64>,
+    on: &mut dyn FnMut(u64, u64) -> std::ops::ControlFlow<()>,
+) -> Result<Calibration> {
+    let binary = sensor.response == Response::Binary;
+    let size = capture.size();
+    let native = u64::from(capture.summed())
+        * u64::from(if binary { capture.about.max_count.unwrap_or(1) } else { 1 });
+    if !binary && capture.summed() > 1 {
+        return Err(SimError::request(
+            "a sum of frames cannot tell read noise from dark counts",
+            "--sum",
+            "leave it out",
+        ));
+    }
+    let mut sums = vec![0u64; size.pixels()];
+    let mut piece = vec![0u32; size.pixels()];
+    let frames = capture.frames();
+    for first in (0..frames).step_by(CHUNK as usize) {
+        if on(first, frames).is_break() {
+            return Err(SimError::Interrupted);
+        }
+        capture.total(first..(first + CHUNK).min(frames), &mut piece)?;
+        for (sum, &piece) in sums.iter_mut().zip(&piece) {
+            *sum += u64::from(piece);
+        }
+    }
+    let trials = (frames * native) as f64;
+    if binary {
+        let rate = |&sum: &u64| -(-(sum as f64).min(trials - 0.5) / trials).ln_1p();
+        let rates: Vec<f64> = sums.iter().map(rate).collect();
+        return finish(capture, size, frames, &rates, trials, hot, None);
+    }
+    let gain = gain.ok_or_else(|| {
+        SimError::request(
+            format!("the gain of `{}` follows the light, and a dark capture has none", sensor.name),
+            "--gain",
+            "give the gain of this capture in DN per electron",
+        )
+    })?;
+    let means: Vec<f64> = sums.iter().map(|&sum| sum as f64 / trials).collect();
+    let read_noise = fit_read_noise(capture, sensor, gain, &means)?;
+    let law = CountLaw::new(&Sensor { read_noise, ..sensor.clone() }, gain);
+    let rates = invert(&law, &means);
+    finish(capture, size, frames, &rates, trials, hot, Some(read_noise))
+}
+
+/// Detections of each mean, by interpolation in a table of means.
+fn invert(law: &CountLaw, means: &[f64]) -> Vec<f64> {
+    const STEPS: usize = 2048;
+    let highest = means.iter().copied().fold(0.0, f64::max);
+    let most = law.detections_for_mean(highest).max(1e-6);
+    // Finer where it is dark: most pixels are there.
+    let detections = |i: usize| most * (i as f64 / STEPS as f64).powi(2);
+    let table: Vec<f64> = (0..=STEPS).map(|i| law.mean(detections(i))).collect();
+    let interpolate = |&mean: &f64| {
+        let above = table.partition_point(|&m| m < mean).clamp(1, STEPS);
+        let (low, high) = (table[above - 1], table[above]);
+        let part = if high > low { ((mean - low) / (high - low)).clamp(0.0, 1.0) } else { 0.0 };
+        detections(above - 1) + part * (detections(above) - detections(above - 1))
+    };
+    means.iter().map(interpolate).collect()
+}
+
+fn finish(
+    capture: &Capture,
+    size: Size,
+    frames: u64,
+    rates: &[f64],
+    trials: f64,
+    hot: Option<f64>,
+    read_noise: Option<f64>,
+) -> Result<Calibration> {
+    let mut sorted = rates.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let median = sorted[sorted.len() / 2];
+    let darkest = &sorted[..(sorted.len() * 9).div_ceil(10)];
+    let trimmed = darkest.iter().sum::<f64>() / darkest.len() as f64;
+    let bulk = if median > 0.0 { median } else { trimmed };
+    let ninth = sorted[(sorted.len() - 1) * 9 / 10];
+    if ninth > 0.5 && read_noise.is_none() {
+        return Err(SimError::data(
+            format!("a tenth of the pixels count more than {ninth:.2} dark electrons per frame"),
+            capture.path(),
+            "calibrate from a capture with the shutter closed",
+        ));
+    }
+    let threshold = hot.unwrap_or(HOT_FACTOR * bulk);
+    let hot = (0..rates.len())
+        .filter(|&i| {
+            let expected = bulk * trials;
+            let significant = rates[i] * trials > expected + HOT_SIGMAS * (expected + 1.0).sqrt();
+            rates[i] > threshold && significant
+        })
+        .collect();
+    Ok(Calibration {
+        size,
+        frames,
+        dark: rates.iter().map(|&rate| rate as f32).collect(),
+        bulk,
+        bad: BadPixels { hot, dead: Vec::new() },
+        threshold,
+        read_noise,
+    })
+}
+
+/// Maximum-likelihood read noise of the ordinary pixels: those whose mean lies in the middle, so
+/// that one dark rate describes them all.
+fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f64]) -> Result<f64> {
+    let mut sorted = means.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let n = sorted.len();
+    let (low, high) = (sorted[n * 3 / 10], sorted[n * 7 / 10]);
+    let chosen: Vec<usize> = (0..n).filter(|&i| (low..=high).contains(&means[i])).collect();
+    let mut histogram = vec![0u64; usize::from(sensor.max_count()) + 1];
+    let mut counts = vec![0u16; n];
+    for frame in capture.looks() {
+        capture.read(frame, &mut counts)?;
+        for &i in &chosen {
+            let Some(bin) = histogram.get_mut(usize::from(counts[i])) else {
+                return Err(SimError::data(
+                    format!(
+                        "a count of {}, where `{}` reaches {}",
+                        counts[i],
+                        sensor.name,
+                        sensor.max_count()
+                    ),
+                    capture.path(),
+                    "give the sensor that took it: --sensor, or --bits",
+                ));
+            };
+            *bin += 1;
+        }
+    }
+    let total: u64 = histogram.iter().sum();
+    let mean = histogram.iter().enumerate().map(|(y, &n)| y as f64 * n as f64).sum::<f64>();
+    let mean = mean / total.max(1) as f64;
+    let unlikelihood = |ln_noise: f64| {
+        let law = CountLaw::new(&Sensor { read_noise: ln_noise.exp(), ..sensor.clone() }, gain);
+        let probabilities = law.probabilities(law.detections_for_mean(mean));
+        let log = |(&n, p): (&u64, &f64)| if n > 0 { n as f64 * p.max(1e-300).ln() } else { 0.0 };
+        -histogram.iter().zip(&probabilities).map(log).sum::<f64>()
+    };
+    Ok(minimum(unlikelihood, READ_NOISE.0.ln(), READ_NOISE.1.ln()).exp())
+}
+
+/// Golden-section search.
+fn minimum(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64) -> f64 {
+    let golden = 0.5 * (5f64.sqrt() - 1.0);
+    let (mut a, mut b) = (high - golden * (high - low), low + golden * (high - low));
+    let (mut fa, mut fb) = (f(a), f(b));
+    for _ in 0..40 {
+        if fa < fb {
+            (high, b, fb) = (b, a, fa);
+            a = high - golden * (high - low);
+            fa = f(a);
+        } else {
+            (low, a, fa) = (a, b, fb);
+            b = low + golden * (high - low);
+            fb = f(b);
+        }
+    }
+    0.5 * (low + high)
+}

@@ -1,0 +1,125 @@
+//! Which pixels of a capture are bad, and how dark each one is: from files, or from the capture.
+
+use super::options::{MaskChoice, ReadOptions};
+use super::{Capture, MOST_LOOKS};
+use crate::codec::read_mat_map;
+use qudi_core::Frame;
+use qudi_core::Transfer;
+use qudi_core::bad_pixels::{BadPixels, Repair};
+use qudi_core::npy::read_image;
+use qudi_core::sensor::Sensor;
+use qudi_core::{Result, SimError};
+use qudi_sim::clip::read_still;
+use std::path::Path;
+
+/// Pixels darker than this are called hot where a map says no more (Ma et al. 2020 use 50 to 100).
+const HOT_PER_SECOND: f32 = 100.0;
+
+/// Finds out what is to be repaired, and the dark rates.
+pub(crate) fn plan(
+    capture: &mut Capture,
+    options: &ReadOptions,
+    sensor: Option<&Sensor>,
+) -> Result<()> {
+    let calibrated = match &options.dcr {
+        Some(path) if path.extension().is_some_and(|e| e == "toml") => {
+            Some(Sensor::load(&path.to_string_lossy())?)
+        }
+        _ => None,
+    };
+    let sensor = calibrated.as_ref().or(sensor);
+    let mut named = None;
+    if let Some(sensor) = sensor {
+        if let Some(map) = &sensor.defects.dark_map {
+            capture.dark = Some(load(capture, Path::new(map))?.data);
+        }
+        if let Some(map) = &sensor.defects.bad_pixels {
+            named = Some(nonzero(&load(capture, Path::new(map))?));
+        }
+    }
+    if let Some(path) = options.dcr.as_ref().filter(|_| calibrated.is_none()) {
+        let rates = load(capture, path)?;
+        let hot = (0..rates.data.len()).filter(|&i| rates.data[i] > HOT_PER_SECOND).collect();
+        named = Some(BadPixels { hot, dead: Vec::new() });
+        match capture.about.fps.or(sensor.and_then(|sensor| sensor.fps)) {
+            Some(fps) => {
+                capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
+            }
+            None => capture.about.remarks.push(
+                "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a --sensor knows its rate)"
+                    .to_owned(),
+            ),
+        }
+    }
+    capture.bad = match (&options.mask, named) {
+        (MaskChoice::None, _) => BadPixels::default(),
+        (MaskChoice::File(path), _) => nonzero(&load(capture, path)?),
+        (MaskChoice::Auto, Some(named)) => named,
+        (MaskChoice::Auto, None) => find(capture)?,
+    };
+    let size = capture.size();
+    capture.repair = Repair::new(&capture.bad.mask(size), size);
+    if capture.repair.len() < capture.bad.len() {
+        return Err(SimError::request(
+            "every pixel is bad",
+            "--mask",
+            "a mask is nonzero at bad pixels only; use --mask none to repair none",
+        ));
+    }
+    Ok(())
+}
+
+/// Looks for hot and dead pixels in the capture itself.
+fn find(capture: &mut Capture) -> Result<BadPixels> {
+    let size = capture.size();
+    let mut sums = vec![0u32; size.pixels()];
+    let mut one = vec![0u32; size.pixels()];
+    let looks = capture.looks();
+    debug_assert!(looks.len() as u64 <= MOST_LOOKS);
+    for &frame in &looks {
+        capture.stored_total(frame..frame + 1, &mut one)?;
+        for (sum, one) in sums.iter_mut().zip(&one) {
+            *sum += one;
+        }
+    }
+    let native = looks.len() as u64 * u64::from(capture.sum);
+    Ok(BadPixels::find(&sums, size, native, capture.about.max_count))
+}
+
+fn nonzero(map: &Frame) -> BadPixels {
+    let hot = (0..map.data.len()).filter(|&i| map.data[i] != 0.0).collect();
+    BadPixels { hot, dead: Vec::new() }
+}
+
+/// A map of the frames in use; one of the stored frames is turned and cropped like them.
+fn load(capture: &Capture, path: &Path) -> Result<Frame> {
+    let map = read(path)?;
+    let (size, stored) = (capture.size(), capture.native.size());
+    if map.size == size {
+        return Ok(map);
+    }
+    if map.size == stored {
+        let mut turned = Frame::filled(size, 0.0);
+        capture.view.apply(&map.data, &mut turned.data);
+        return Ok(turned);
+    }
+    Err(SimError::data(
+        format!("a map of {} for frames of {size}, stored as {stored}", map.size),
+        path,
+        "use a map of the same camera and the same part of the array",
+    ))
+}
+
+fn read(path: &Path) -> Result<Frame> {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    match extension.as_str() {
+        "npy" => read_image(path),
+        "mat" => read_mat_map(path, "dcr"),
+        "png" | "tif" | "tiff" => read_still(path, Transfer::AsIs),
+        _ => Err(SimError::data(
+            "not a map of pixels",
+            path,
+            "maps are .npy, .mat (variable `dcr`), .png or .tif; a sensor file ends in .toml",
+        )),
+    }
+}

@@ -1,0 +1,164 @@
+//! A first look at a path, shared by all formats that try to recognise it.
+
+use super::raw_look::RawLook;
+use qudi_core::natural_order::natural_order;
+use qudi_core::{Result, SimError};
+use std::cell::OnceCell;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// Bytes looked at from the start of a file.
+const HEAD: u64 = 4096;
+
+/// Bytes looked at from the middle of a file.
+const SAMPLE: u64 = 1 << 20;
+
+/// No capture has more files.
+const MOST_FILES: usize = 4_000_000;
+
+/// SwissSPAD2 spreads its files over two levels of folders.
+const DEPTH: usize = 3;
+
+/// What a path looks like.
+#[derive(Debug)]
+pub(crate) struct Probe {
+    pub(crate) path: PathBuf,
+    pub(crate) is_folder: bool,
+    /// Bytes of a file.
+    pub(crate) length: u64,
+    /// Lower case, without the dot.
+    pub(crate) extension: String,
+    /// The first bytes of a file.
+    pub(crate) head: Vec<u8>,
+    files: OnceCell<Vec<PathBuf>>,
+    /// Filled by [`RawLook::at`], which several formats ask.
+    pub(crate) raw_look: OnceCell<Option<RawLook>>,
+}
+
+impl Probe {
+    /// Looks at `path`.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if it cannot be read.
+    pub(crate) fn new(path: &Path) -> Result<Self> {
+        let io = |e| SimError::io("open the capture", path, e);
+        let about = std::fs::metadata(path).map_err(io)?;
+        let mut head = Vec::new();
+        if about.is_file() {
+            File::open(path).map_err(io)?.take(HEAD).read_to_end(&mut head).map_err(io)?;
+            if head.is_empty() {
+                return Err(SimError::data("the file is empty", path, "copy or export it again"));
+            }
+        } else if !about.is_dir() {
+            return Err(SimError::data(
+                "neither a file nor a folder",
+                path,
+                "store the capture in a file first, or pipe it into `qudi restore -`",
+            ));
+        }
+        Ok(Self {
+            path: path.to_owned(),
+            is_folder: about.is_dir(),
+            length: about.len(),
+            extension: path.extension().unwrap_or_default().to_string_lossy().to_lowercase(),
+            head,
+            files: OnceCell::new(),
+            raw_look: OnceCell::new(),
+        })
+    }
+
+    /// File name without its extension.
+    pub(crate) fn stem(&self) -> String {
+        stem(&self.path)
+    }
+
+    /// Whether it is a file with one of these extensions.
+    pub(crate) fn has_extension(&self, extensions: &[&str]) -> bool {
+        !self.is_folder && extensions.contains(&self.extension.as_str())
+    }
+
+    /// The file itself, or the files of the folder with this extension, in the order of their
+    /// numbers.
+    pub(crate) fn files(&self, extensions: &[&str]) -> Result<Vec<PathBuf>> {
+        if !self.is_folder {
+            return Ok(vec![self.path.clone()]);
+        }
+        if self.files.get().is_none() {
+            let mut files = Vec::new();
+            list(&self.path, DEPTH, &mut files)?;
+            let relative =
+                |p: &Path| p.strip_prefix(&self.path).unwrap_or(p).to_string_lossy().into_owned();
+            files.sort_by_cached_key(|p| Natural(relative(p)));
+            let _ = self.files.set(files);
+        }
+        let matches = |path: &&PathBuf| {
+            let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+            extensions.contains(&extension.as_str())
+        };
+        Ok(self.files.get().into_iter().flatten().filter(matches).cloned().collect())
+    }
+
+    /// Bytes from the middle of a file, at a multiple of `align` bytes.
+    pub(crate) fn middle(&self, align: u64) -> Result<Vec<u8>> {
+        let path = if self.is_folder {
+            self.files(&["bin"])?.into_iter().next().unwrap_or_default()
+        } else {
+            self.path.clone()
+        };
+        let io = |e| SimError::io("read", &path, e);
+        let mut file = File::open(&path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let from = (length / 2).saturating_sub(SAMPLE / 2) / align * align;
+        let mut bytes = Vec::new();
+        file.seek(SeekFrom::Start(from)).map_err(io)?;
+        file.take(SAMPLE).read_to_end(&mut bytes).map_err(io)?;
+        Ok(bytes)
+    }
+}
+
+pub(crate) fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
+    let io = |e| SimError::io("list the folder", folder, e);
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let path = entry.map_err(io)?.path();
+        let hidden = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
+        if hidden {
+            continue;
+        }
+        if path.is_dir() {
+            if depth > 1 {
+                list(&path, depth - 1, files)?;
+            }
+        } else if path.is_file() {
+            // A named pipe would keep the reader waiting for ever.
+            files.push(path);
+        }
+        if files.len() > MOST_FILES {
+            return Err(SimError::data(
+                format!("more than {MOST_FILES} files"),
+                folder,
+                "name the folder of one capture",
+            ));
+        }
+    }
+    Ok(())
+}
+
+#[derive(PartialEq, Eq)]
+struct Natural(String);
+
+impl Ord for Natural {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        natural_order(&self.0, &other.0)
+    }
+}
+
+impl PartialOrd for Natural {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}

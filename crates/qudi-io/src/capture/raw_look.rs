@@ -1,0 +1,120 @@
+//! What headerless `.bin` files of 512-pixel cameras look like: name, length, bits.
+
+use super::bit_order::{SURE, bit_order_evidence, standard_errors};
+use super::byte_kind::ByteKind;
+use super::options::BitOrder;
+use super::probe::{Probe, stem};
+use crate::frames::bit_sums::{MOST_FRAMES, add_packed};
+use qudi_core::Size;
+use qudi_core::{Result, SimError};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// A frame of 512 x 512 bits; also two half-array frames of 256 x 512.
+pub(crate) const FRAME: usize = 32_768;
+
+/// Length of every SwissSPAD2 file.
+pub(crate) const SWISSSPAD_FILE: u64 = 8 << 20;
+
+/// Whose habit a file name follows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Habit {
+    /// `RAW00000.bin`, or anything in `acq00000/`.
+    Spad512s,
+    /// `filename12.bin`, or files of 8 MiB in numbered folders.
+    SwissSpad2,
+    /// Any other.
+    Unknown,
+}
+
+/// What a `.bin` file, or the first one of a folder, looks like.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct RawLook {
+    pub(crate) habit: Habit,
+    pub(crate) length: u64,
+    pub(crate) kind: ByteKind,
+    /// `Some` if the picture tells which bit comes first.
+    pub(crate) order: Option<BitOrder>,
+    /// `Some(true)` if rows alternate as in a full SwissSPAD2 array.
+    pub(crate) full_array: Option<bool>,
+}
+
+impl RawLook {
+    /// Looks at the first `.bin` file of `probe`, if there is one.
+    pub(crate) fn at(probe: &Probe) -> Result<Option<Self>> {
+        if let Some(look) = probe.raw_look.get() {
+            return Ok(*look);
+        }
+        let look = Self::new(probe)?;
+        Ok(*probe.raw_look.get_or_init(|| look))
+    }
+
+    fn new(probe: &Probe) -> Result<Option<Self>> {
+        if !(probe.is_folder || probe.has_extension(&["bin", "raw"])) {
+            return Ok(None);
+        }
+        let Some(path) = probe.files(&["bin"])?.into_iter().next() else { return Ok(None) };
+        let io = |e| SimError::io("read", &path, e);
+        let file = File::open(&path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let mut bytes = Vec::new();
+        file.take(SWISSSPAD_FILE).read_to_end(&mut bytes).map_err(io)?;
+        bytes.truncate(bytes.len() / FRAME * FRAME);
+        let (order, full_array) = pictures(&bytes);
+        let kind = ByteKind::of(&bytes[..bytes.len().min(1 << 20)]);
+        Ok(Some(Self { habit: habit(&path), length, kind, order, full_array }))
+    }
+}
+
+fn habit(path: &Path) -> Habit {
+    let name = stem(path);
+    let numbered = |text: &str, prefix: &str| {
+        text.strip_prefix(prefix).is_some_and(|rest| {
+            !rest.is_empty()
+                && rest.trim_start_matches('_').chars().all(|c| c.is_ascii_digit() || c == '.')
+        })
+    };
+    let folder = path.parent().map(stem).unwrap_or_default();
+    if numbered(&name, "RAW") || name.starts_with("RAW_") || numbered(&folder, "acq") {
+        Habit::Spad512s
+    } else if numbered(&name, "filename") || numbered(&folder, "") {
+        Habit::SwissSpad2
+    } else {
+        Habit::Unknown
+    }
+}
+
+/// Bit order and arrangement of rows of 64 bytes, from the sum of some frames.
+fn pictures(bytes: &[u8]) -> (Option<BitOrder>, Option<bool>) {
+    let size = Size { height: 512, width: 512 };
+    let mut sums = vec![0u32; size.pixels()];
+    for frames in bytes.chunks(MOST_FRAMES * FRAME) {
+        add_packed(frames, FRAME, BitOrder::Msb, &mut sums);
+    }
+    let msb = bit_order_evidence(&sums, size);
+    let order = (msb.abs() > SURE).then_some(if msb > 0.0 { BitOrder::Msb } else { BitOrder::Lsb });
+    // Next rows against rows after next, in units of 16 rows by 16 columns.
+    let roots: Vec<f32> = sums.iter().map(|&sum| (sum as f32).sqrt()).collect();
+    let mut units = Vec::new();
+    for y in (0..496).step_by(16) {
+        for x in (0..512).step_by(16) {
+            let unit: f32 = (y..y + 16)
+                .map(|y| {
+                    let row =
+                        |dy: usize| roots[(y + dy).min(511) * 512 + x..][..16].iter().sum::<f32>();
+                    (row(0) - row(1)).abs() - (row(0) - row(2)).abs()
+                })
+                .sum();
+            units.push(f64::from(unit));
+        }
+    }
+    let alternating = standard_errors(&units).unwrap_or(0.0);
+    let full = if alternating > SURE {
+        Some(true)
+    } else {
+        // Without structure neither arrangement shows.
+        (order.is_some() && alternating < 0.5 * SURE).then_some(false)
+    };
+    (order, full)
+}

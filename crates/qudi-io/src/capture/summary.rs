@@ -1,0 +1,229 @@
+//! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
+
+use super::Capture;
+use super::bit_order::{SURE, bit_order_evidence};
+use super::options::{BitOrder, PackAxis};
+use qudi_core::PppDefinition;
+use qudi_core::Result;
+use qudi_core::sensor::{CountLaw, DarkRate, Response, Sensor};
+use qudi_core::{Frame, Size};
+use serde::Serialize;
+
+/// Statistics of at most [`MOST_LOOKS`](super::MOST_LOOKS) output frames.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Frames looked at.
+    pub looks: u64,
+    /// Mean count per pixel and output frame, bad pixels repaired.
+    pub mean: f64,
+    /// Samples of each count; the last entry counts the largest seen.
+    pub histogram: Vec<u64>,
+    /// Fraction of samples at the largest possible count, if that is known.
+    pub saturated: Option<f64>,
+    /// Photons per pixel and output frame: incident, detected, DN. Absent without a known sensor.
+    pub ppp: Ppp,
+    /// Whether the picture agrees with the bit order in use; packed captures only.
+    pub bit_order: Option<BitOrderCheck>,
+    /// Sum of the frames looked at, repaired.
+    pub sums: Vec<u32>,
+}
+
+/// Photons per pixel and output frame in their three meanings.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Ppp {
+    /// Photons that fell on a pixel.
+    pub incident: Option<f64>,
+    /// Electrons or avalanches, dark ones included, also those that saturation hid.
+    pub detected: Option<f64>,
+    /// Mean output value.
+    pub dn: f64,
+}
+
+impl Ppp {
+    /// One of them.
+    pub fn get(&self, definition: PppDefinition) -> Option<f64> {
+        match definition {
+            PppDefinition::Incident => self.incident,
+            PppDefinition::Detected => self.detected,
+            PppDefinition::Dn => Some(self.dn),
+        }
+    }
+}
+
+/// What the picture says about the order of bits.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct BitOrderCheck {
+    /// Evidence for the order in use, in standard errors; negative: against it.
+    pub evidence: f64,
+    /// The order that the picture shows, if it shows one.
+    pub seen: Option<BitOrder>,
+}
+
+impl Summary {
+    /// Looks at `capture`. `sensor` turns counts into photons; `gain` is its gain in DN/e-, for
+    /// sensors whose own rule follows the light.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_core::SimError) if the file cannot be read.
+    pub fn measure(
+        capture: &mut Capture,
+        sensor: Option<&Sensor>,
+        gain: Option<f64>,
+    ) -> Result<Self> {
+        let size = capture.size();
+        let looks = capture.looks();
+        let mut sums = vec![0u32; size.pixels()];
+        let mut counts = vec![0u16; size.pixels()];
+        let mut histogram = vec![0u64; 1 << 16];
+        for &frame in &looks {
+            capture.read(frame, &mut counts)?;
+            for (sum, &count) in sums.iter_mut().zip(&counts) {
+                *sum += u32::from(count);
+                histogram[usize::from(count)] += 1;
+            }
+        }
+        let largest = histogram.iter().rposition(|&n| n > 0).unwrap_or(0);
+        histogram.truncate(largest + 1);
+        let samples = looks.len() as f64 * size.pixels() as f64;
+        let total: f64 = sums.iter().map(|&sum| f64::from(sum)).sum();
+        let saturated = capture
+            .max_count()
+            .map(|max| histogram.get(usize::from(max)).map_or(0.0, |&n| n as f64 / samples));
+        let looked = looks.len() as u64;
+        let bit_order = check_bit_order(capture, &looks)?;
+        let ppp = ppp(capture, &sums, looked, sensor, gain)?;
+        Ok(Self {
+            looks: looked,
+            mean: total / samples,
+            histogram,
+            saturated,
+            ppp,
+            bit_order,
+            sums,
+        })
+    }
+
+    /// The mean picture in linear light, response inverted and dark counts subtracted where
+    /// `sensor` is known; white is the 99.5th percentile.
+    pub fn picture(&self, capture: &Capture, sensor: Option<&Sensor>, gain: Option<f64>) -> Frame {
+        let size = capture.size();
+        let frames = self.looks as u32 * capture.sum;
+        let mut data = match native_sensor(capture, sensor) {
+            Some(sensor) => {
+                let gain = gain.or(sensor.fixed_gain()).unwrap_or(1.0);
+                let dark = sensor.dark_per_frame().unwrap_or(0.0);
+                let summed = f64::from(sensor.frames_summed);
+                let light = |(i, &sum): (usize, &u32)| {
+                    let dark = capture.dark.as_ref().map_or(dark, |map| f64::from(map[i]) * summed);
+                    sensor.estimate_flux(f64::from(sum), frames, gain, dark) as f32
+                };
+                self.sums.iter().enumerate().map(light).collect()
+            }
+            None => self.sums.iter().map(|&sum| sum as f32).collect::<Vec<_>>(),
+        };
+        let mut sorted = data.clone();
+        sorted.sort_by(f32::total_cmp);
+        let white = sorted[(sorted.len() - 1) * 995 / 1000].max(f32::MIN_POSITIVE);
+        for value in &mut data {
+            *value = (*value / white).min(1.0);
+        }
+        Frame { size, data }
+    }
+}
+
+/// The sensor of native frames: `sensor`, or an ideal binary one if no more is known; summing as
+/// many binary frames as the capture's counts do.
+fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
+    let about = &capture.about;
+    let known = match sensor {
+        Some(sensor) => sensor.clone(),
+        None if about.binary => {
+            let mut ideal = Sensor::load("swissspad2").ok()?;
+            (ideal.dark, ideal.quantum_efficiency) = (DarkRate::PerFrame(0.0), 1.0);
+            ideal
+        }
+        None => return None,
+    };
+    match (known.response, about.max_count) {
+        (Response::Binary, Some(max)) => Some(Sensor { frames_summed: u32::from(max), ..known }),
+        _ => Some(known),
+    }
+}
+
+/// Compares pixels across byte boundaries, in the frames as they are stored.
+fn check_bit_order(capture: &mut Capture, looks: &[u64]) -> Result<Option<BitOrderCheck>> {
+    let Some(packing) = capture.about.packing else { return Ok(None) };
+    let stored = capture.native.size();
+    let mut sums = vec![0u32; stored.pixels()];
+    for &look in looks {
+        let first = capture.range.start + look * u64::from(capture.sum);
+        capture.native.add(first..first + u64::from(capture.sum), &mut sums)?;
+    }
+    let evidence = match packing.axis {
+        PackAxis::Height => {
+            let turned = Size { height: stored.width, width: stored.height };
+            let columns: Vec<u32> = (0..stored.pixels())
+                .map(|i| sums[i % stored.height * stored.width + i / stored.height])
+                .collect();
+            bit_order_evidence(&columns, turned)
+        }
+        _ => bit_order_evidence(&sums, stored),
+    };
+    let seen = match evidence {
+        e if e > SURE => Some(packing.order),
+        e if e < -SURE => Some(packing.order.reversed()),
+        _ => None,
+    };
+    Ok(Some(BitOrderCheck { evidence, seen }))
+}
+
+/// Photons per pixel and output frame.
+fn ppp(
+    capture: &Capture,
+    sums: &[u32],
+    looks: u64,
+    sensor: Option<&Sensor>,
+    gain: Option<f64>,
+) -> Result<Ppp> {
+    let looks = looks as f64;
+    let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / sums.len() as f64 / looks;
+    let Some(native) = native_sensor(capture, sensor) else {
+        return Ok(Ppp { incident: None, detected: None, dn });
+    };
+    let per_frame = f64::from(capture.sum);
+    let detected = if native.response == Response::Binary {
+        let n = f64::from(native.frames_summed) * per_frame;
+        let trials = n * looks;
+        let light = |mean: f64| -n * (-(mean * looks).min(trials - 0.5) / trials).ln_1p();
+        Some(light_of_blocks(sums, capture.size(), looks, light))
+    } else {
+        gain.or(native.fixed_gain()).map(|gain| {
+            CountLaw::new(&native, gain).detections_for_mean(dn / per_frame) * per_frame
+        })
+    };
+    let dark = match &capture.dark {
+        Some(map) => {
+            let mean = map.iter().map(|&d| f64::from(d)).sum::<f64>() / map.len() as f64;
+            mean * f64::from(native.frames_summed)
+        }
+        None => native.dark_per_frame()?,
+    };
+    let incident = detected
+        .filter(|_| sensor.is_some())
+        .map(|detected| ((detected - dark * per_frame) / native.quantum_efficiency).max(0.0));
+    Ok(Ppp { incident, detected, dn })
+}
+
+/// Mean light over the picture: the response of binary pixels bends, so that bright and dark parts
+/// are unbent apart; block by block, since single pixels have counted too little.
+fn light_of_blocks(sums: &[u32], size: Size, looks: f64, light: impl Fn(f64) -> f64) -> f64 {
+    const BLOCK: usize = 8;
+    let (down, across) = (size.height.div_ceil(BLOCK), size.width.div_ceil(BLOCK));
+    let mut blocks = vec![(0u64, 0u32); down * across];
+    for (i, &sum) in sums.iter().enumerate() {
+        let block = &mut blocks[i / size.width / BLOCK * across + i % size.width / BLOCK];
+        *block = (block.0 + u64::from(sum), block.1 + 1);
+    }
+    let total = |&(sum, n): &(u64, u32)| light(sum as f64 / f64::from(n) / looks) * f64::from(n);
+    blocks.iter().map(total).sum::<f64>() / size.pixels() as f64
+}

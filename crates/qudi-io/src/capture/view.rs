@@ -1,0 +1,108 @@
+//! Turning and cropping frames: where each pixel of the result comes from.
+
+use super::options::{Crop, Orientation};
+use qudi_core::Size;
+use qudi_core::{Result, SimError};
+
+/// A turned and cropped frame.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct View {
+    pub(crate) size: Size,
+    /// Stored pixel of each pixel; absent if they are the same.
+    pub(crate) from: Option<Vec<u32>>,
+}
+
+impl View {
+    /// `vendor` is what [`Orientation::Vendor`] means for this format.
+    pub(crate) fn new(
+        stored: Size,
+        orient: Orientation,
+        vendor: Orientation,
+        crop: Option<Crop>,
+    ) -> Result<Self> {
+        let orient = if orient == Orientation::Vendor { vendor } else { orient };
+        let quarter =
+            matches!(orient, Orientation::Rot90 | Orientation::Rot270 | Orientation::Transpose);
+        let turned =
+            if quarter { Size { height: stored.width, width: stored.height } } else { stored };
+        let crop =
+            crop.unwrap_or(Crop { top: 0, bottom: turned.height, left: 0, right: turned.width });
+        if crop.bottom > turned.height || crop.right > turned.width {
+            return Err(SimError::request(
+                format!("rows and columns {crop} of a frame of {turned}"),
+                "--crop",
+                "the crop applies to the turned frame, and ends inside it",
+            ));
+        }
+        let size = Size { height: crop.bottom - crop.top, width: crop.right - crop.left };
+        if size == stored && matches!(orient, Orientation::Raw | Orientation::Vendor) {
+            return Ok(Self { size, from: None });
+        }
+        let (last_row, last_column) = (stored.height - 1, stored.width - 1);
+        let mut from = Vec::with_capacity(size.pixels());
+        for y in crop.top..crop.bottom {
+            for x in crop.left..crop.right {
+                let (row, column) = match orient {
+                    Orientation::Raw | Orientation::Vendor => (y, x),
+                    Orientation::Rot90 => (x, last_column - y),
+                    Orientation::Rot180 => (last_row - y, last_column - x),
+                    Orientation::Rot270 => (last_row - x, y),
+                    Orientation::FlipH => (y, last_column - x),
+                    Orientation::FlipV => (last_row - y, x),
+                    Orientation::Transpose => (x, y),
+                };
+                from.push((row * stored.width + column) as u32);
+            }
+        }
+        Ok(Self { size, from: Some(from) })
+    }
+
+    /// The view of a stored image.
+    pub(crate) fn apply<T: Copy>(&self, stored: &[T], out: &mut [T]) {
+        match &self.from {
+            None => out.copy_from_slice(stored),
+            Some(from) => {
+                for (pixel, &i) in out.iter_mut().zip(from) {
+                    *pixel = stored[i as usize];
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn turn(orient: Orientation, crop: Option<&str>) -> Vec<Vec<u8>> {
+        let stored = Size { height: 2, width: 3 };
+        let crop = crop.map(|text| text.parse().unwrap());
+        let view = View::new(stored, orient, Orientation::Rot90, crop).unwrap();
+        let mut out = vec![0; view.size.pixels()];
+        view.apply(b"abcdef", &mut out);
+        out.chunks(view.size.width).map(<[u8]>::to_vec).collect()
+    }
+
+    /// numpy: rot90([[a,b,c],[d,e,f]]) is [[c,f],[b,e],[a,d]].
+    #[test]
+    fn quarter_turns_are_numpys() {
+        assert_eq!(turn(Orientation::Raw, None), [b"abc", b"def"]);
+        assert_eq!(turn(Orientation::Rot90, None), [b"cf", b"be", b"ad"]);
+        assert_eq!(turn(Orientation::Vendor, None), [b"cf", b"be", b"ad"]);
+        assert_eq!(turn(Orientation::Rot180, None), [b"fed", b"cba"]);
+        assert_eq!(turn(Orientation::Rot270, None), [b"da", b"eb", b"fc"]);
+        assert_eq!(turn(Orientation::FlipH, None), [b"cba", b"fed"]);
+        assert_eq!(turn(Orientation::FlipV, None), [b"def", b"abc"]);
+        assert_eq!(turn(Orientation::Transpose, None), [b"ad", b"be", b"cf"]);
+    }
+
+    #[test]
+    fn crops_apply_to_the_turned_frame() {
+        assert_eq!(turn(Orientation::Rot90, Some("1:3,0:1")), [b"b", b"a"]);
+        assert_eq!(turn(Orientation::Raw, Some("0:2,1:3")), [b"bc", b"ef"]);
+        let stored = Size { height: 2, width: 3 };
+        let outside = Some("0:3,0:3".parse().unwrap());
+        assert!(View::new(stored, Orientation::Raw, Orientation::Raw, outside).is_err());
+        assert!("3:1,0:2".parse::<Crop>().is_err() && "1:2".parse::<Crop>().is_err());
+    }
+}

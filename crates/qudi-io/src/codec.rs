@@ -1,0 +1,188 @@
+//! Every format that captures come in: one file and one line each.
+
+mod array;
+#[cfg(feature = "hdf5")]
+mod hdf5;
+mod images;
+mod mat;
+mod npy;
+mod npz;
+mod piped;
+mod qvga;
+mod raw;
+
+mod spad512s;
+mod sparse;
+mod swissspad2;
+mod tiff;
+mod video;
+mod visionsim;
+
+pub(crate) use piped::open_pipe;
+
+use crate::capture::about::{About, Certainty};
+use crate::capture::options::ReadOptions;
+use crate::capture::probe::Probe;
+use crate::frames::CountFrames;
+use qudi_core::{Result, SimError};
+use std::path::Path;
+
+/// One way to store a capture.
+#[derive(Debug)]
+pub struct Format {
+    /// Name, as `--format` takes it.
+    pub name: &'static str,
+    /// In words.
+    pub title: &'static str,
+    /// Whether a path is of this format, and why.
+    probe: fn(&Probe) -> Result<Option<Match>>,
+    /// Opens it.
+    open: fn(&Probe, &ReadOptions, &mut About) -> Result<Box<dyn CountFrames>>,
+}
+
+/// How well a path fits a format.
+pub(crate) struct Match {
+    certainty: Certainty,
+    evidence: Vec<String>,
+}
+
+impl Match {
+    fn new(certainty: Certainty, evidence: &[&str]) -> Self {
+        Self { certainty, evidence: evidence.iter().map(|&e| e.to_owned()).collect() }
+    }
+}
+
+/// All formats. To add one: a file in `formats/`, a line here, a row in `docs/formats.md`.
+pub const FORMATS: &[Format] = &[
+    npy::FORMAT,
+    npy::COMPRESSED,
+    npz::FORMAT,
+    visionsim::FORMAT,
+    swissspad2::HALF,
+    swissspad2::FULL,
+    spad512s::BINARY,
+    spad512s::BYTES,
+    spad512s::WORDS,
+    sparse::FORMAT,
+    qvga::FORMAT,
+    tiff::FORMAT,
+    images::FORMAT,
+    mat::FORMAT,
+    #[cfg(feature = "hdf5")]
+    hdf5::FORMAT,
+    video::FORMAT,
+    raw::BITS,
+    raw::BYTES,
+    raw::WORDS,
+];
+
+/// Opens `path` in the format that `options` name, or in the one it fits best.
+pub(crate) fn open(path: &Path, options: &ReadOptions) -> Result<(Box<dyn CountFrames>, About)> {
+    let probe = Probe::new(path)?;
+    if let Some(name) = &options.format {
+        let format = by_name(name)?;
+        let mut about = About::new(format.name, format.title);
+        about.evidence.push("--format".to_owned());
+        return Ok(((format.open)(&probe, options, &mut about)?, about));
+    }
+    let mut found = Vec::new();
+    for format in FORMATS {
+        if let Some(fit) = (format.probe)(&probe)? {
+            found.push((format, fit));
+        }
+    }
+    let Some(best) = found.iter().map(|(_, fit)| fit.certainty).max() else {
+        return Err(unknown(&probe));
+    };
+    found.retain(|(_, fit)| fit.certainty == best);
+    if found.len() > 1 || best == Certainty::Possible {
+        return Err(ambiguous(&probe, &found));
+    }
+    let (format, fit) = found.remove(0);
+    let mut about = About::new(format.name, format.title);
+    about.certainty = fit.certainty;
+    about.evidence = fit.evidence;
+    Ok(((format.open)(&probe, options, &mut about)?, about))
+}
+
+fn by_name(name: &str) -> Result<&'static Format> {
+    FORMATS.iter().find(|format| format.name == name).ok_or_else(|| {
+        let names: Vec<_> = FORMATS.iter().map(|format| format.name).collect();
+        let hint = qudi_core::nearest::nearest(name, &names)
+            .map_or(String::new(), |n| format!("did you mean `{n}`?  "));
+        SimError::request(
+            format!("no format named `{name}`"),
+            "--format",
+            format!("{hint}there are {}", names.join(", ")),
+        )
+    })
+}
+
+fn unknown(probe: &Probe) -> SimError {
+    let hdf5 = probe.head.starts_with(b"\x89HDF\r\n\x1a\n")
+        || probe.head.get(512..520).is_some_and(|magic| magic == b"\x89HDF\r\n\x1a\n");
+    if hdf5 {
+        return SimError::data(
+            "an HDF5 file (or MATLAB 7.3), and this build reads none",
+            &probe.path,
+            "build with --features hdf5, or save it in Python: numpy.save('capture.npy', h5py.File(NAME)[DATASET])",
+        );
+    }
+    let what = if probe.is_folder {
+        "the folder holds no capture in a known format"
+    } else {
+        "no known format"
+    };
+    if let Some(inside) = inside(probe) {
+        return SimError::data(what, &probe.path, format!("name one capture, as {inside}"));
+    }
+    SimError::data(
+        what,
+        &probe.path,
+        "`qudi info --formats` lists what is read; a file without header is read with --format raw-bits, raw-u8 or raw-u16 and --size HxW",
+    )
+}
+
+/// Something in a folder that could be a capture.
+fn inside(probe: &Probe) -> Option<String> {
+    let files = probe.files(&["npy", "npz", "gz", "tif", "tiff", "h5", "png"]).ok()?;
+    let file = files.first().filter(|_| probe.is_folder)?;
+    let picture = file.extension().is_some_and(|e| e == "png");
+    let path = if picture { file.parent()? } else { file };
+    Some(path.display().to_string())
+}
+
+fn ambiguous(probe: &Probe, found: &[(&Format, Match)]) -> SimError {
+    let candidates: Vec<String> = found
+        .iter()
+        .map(|(format, fit)| {
+            let evidence = fit.evidence.join(", ");
+            let why = if evidence.is_empty() { evidence } else { format!(" ({evidence})") };
+            format!("{}{why}", format.name)
+        })
+        .collect();
+    SimError::data(
+        format!("the format is ambiguous: {}", candidates.join("; ")),
+        &probe.path,
+        format!("say which it is, as in --format {}", found[0].0.name),
+    )
+}
+
+/// The map `name` of a MATLAB file, or the only array of two dimensions in it.
+pub(crate) fn read_mat_map(path: &Path, name: &str) -> Result<qudi_core::Frame> {
+    let arrays = mat::file::arrays(path)?;
+    let mut maps = arrays.iter().filter(|a| a.dims.len() == 2 && a.dims.iter().all(|&d| d > 1));
+    let found =
+        arrays.iter().find(|a| a.name == name).or_else(|| match (maps.next(), maps.next()) {
+            (Some(one), None) => Some(one),
+            _ => None,
+        });
+    match found {
+        Some(array) => mat::file::read_map(array, path),
+        None => Err(SimError::data(
+            format!("no variable `{name}` in it"),
+            path,
+            "save the map as a matrix of height x width",
+        )),
+    }
+}

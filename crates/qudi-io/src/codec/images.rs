@@ -1,0 +1,191 @@
+//! A folder of gray images, one per frame, or a single one.
+
+use super::npy::described;
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty};
+use crate::capture::levels::infer_levels;
+use crate::capture::options::ReadOptions;
+use crate::capture::probe::Probe;
+use crate::frames::CountFrames;
+use crate::frames::samples::{Scale, no_count};
+use image::DynamicImage;
+use qudi_core::Size;
+use qudi_core::{Result, SimError};
+use qudi_sim::clip::decode_image;
+use std::path::{Path, PathBuf};
+
+pub(crate) const FORMAT: Format = Format {
+    name: "images",
+    title: "folder of images",
+    probe: |probe| {
+        if probe.path.join("burst.json").is_file() {
+            return Ok(Some(Match::new(Certainty::Certain, &["burst.json in the folder"])));
+        }
+        let found = !files(probe)?.is_empty() && (probe.is_folder || probe.has_extension(SINGLE));
+        Ok(found.then(|| Match::new(Certainty::Likely, &["image files"])))
+    },
+    open,
+};
+
+const EXTENSIONS: &[&str] = &["png", "tif", "tiff", "jpg", "jpeg"];
+/// A single TIFF is a stack.
+const SINGLE: &[&str] = &["png", "jpg", "jpeg"];
+
+/// The images themselves; not those in folders below, which are captures of their own.
+fn files(probe: &Probe) -> Result<Vec<PathBuf>> {
+    let mut files = probe.files(EXTENSIONS)?;
+    if probe.is_folder {
+        files.retain(|file| file.parent() == Some(&probe.path));
+    }
+    Ok(files)
+}
+
+pub(crate) struct Images {
+    files: Vec<PathBuf>,
+    size: Size,
+    scale: Scale,
+}
+
+fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+    let files = files(probe)?;
+    let recorded = described(&probe.path.join("burst.json"), about).is_some();
+    open_files(files, &probe.path, recorded, options, about)
+}
+
+/// Opens images as frames, in this order.
+pub(crate) fn open_files(
+    files: Vec<PathBuf>,
+    place: &Path,
+    recorded: bool,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<Box<dyn CountFrames>> {
+    let Some(first) = files.first() else {
+        return Err(SimError::data(
+            "the folder holds no images",
+            place,
+            "put frames into it as PNG or TIFF",
+        ));
+    };
+    let (size, samples, full) = gray(first)?;
+    if lossy(first) {
+        about.remarks.push("JPEG is lossy: its values are not photon counts".to_owned());
+    }
+    let mut images = Images { files, size, scale: Scale::Counts };
+    if let Some(scale) = Scale::asked(options.levels, f32::from(full), about) {
+        images.scale = scale;
+    } else if !recorded {
+        images.infer_scale(samples, full, place, about)?;
+    }
+    Ok(Box::new(images))
+}
+
+impl Images {
+    /// Whether values are multiples of a step, by a look at a few images.
+    fn infer_scale(
+        &mut self,
+        first: Vec<u16>,
+        full: u16,
+        place: &Path,
+        about: &mut About,
+    ) -> Result<()> {
+        let distinct = |mut values: Vec<u16>| {
+            values.sort_unstable();
+            values.dedup();
+            values
+        };
+        let mut values = distinct(first);
+        let mut ladders = vec![infer_levels(&values, full)];
+        for i in spread(self.files.len()) {
+            let more = distinct(gray(&self.files[i])?.1);
+            ladders.push(infer_levels(&more, full));
+            values.extend(more);
+            values = distinct(values);
+        }
+        self.scale = Scale::seen(values, full, about);
+        if self.scale == Scale::Counts
+            && let Some(levels) = ladders[0].filter(|&n| n > 1)
+            && ladders.iter().all(Option::is_some)
+        {
+            return Err(SimError::data(
+                format!(
+                    "images of different scale: {full}/{levels} in the first, another step in others"
+                ),
+                place,
+                "they were stretched one by one, and are no frames of one capture: name a single image",
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// A few frames spread over the capture.
+fn spread(frames: usize) -> impl Iterator<Item = usize> {
+    let looks = frames.min(8);
+    (0..looks).map(move |i| i * frames / looks)
+}
+
+fn lossy(path: &Path) -> bool {
+    path.extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
+}
+
+/// Gray samples of an image, its size, and full scale.
+fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
+    let image = decode_image(path)?;
+    let size =
+        Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
+    let channels = usize::from(image.color().channel_count());
+    let alpha = image.color().has_alpha();
+    let (samples, full): (Vec<u16>, u16) = match image {
+        DynamicImage::ImageLuma16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageLumaA16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageRgb16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageRgba16(i) => (i.into_raw(), 65535),
+        DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_) => {
+            return Err(SimError::data(
+                "a floating-point colour image",
+                path,
+                "save counts as 8- or 16-bit gray",
+            ));
+        }
+        other => (other.into_bytes().into_iter().map(u16::from).collect(), 255),
+    };
+    let colours = channels - usize::from(alpha);
+    let coloured = samples.chunks_exact(channels).any(|p| p[..colours].iter().any(|&v| v != p[0]));
+    if coloured {
+        return Err(SimError::data(
+            "a colour image",
+            path,
+            "colour is not supported yet; frames of counts are gray",
+        ));
+    }
+    Ok((size, samples.into_iter().step_by(channels).collect(), full))
+}
+
+impl CountFrames for Images {
+    fn frames(&self) -> u64 {
+        self.files.len() as u64
+    }
+
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        let path = &self.files[frame as usize];
+        let (size, samples, _) = gray(path)?;
+        if size != self.size {
+            return Err(SimError::data(
+                format!("an image of {size} among images of {}", self.size),
+                path,
+                "frames of one capture have one size",
+            ));
+        }
+        for (count, &value) in counts.iter_mut().zip(&samples) {
+            let value = f32::from(value);
+            *count = self.scale.count(value).ok_or_else(|| no_count(value, frame, path))?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,163 @@
+//! MATLAB captures: `part_1.mat`, `part_2.mat`, ... with `info.json`, or one file.
+
+pub(super) mod file;
+
+use super::array::{Array, Hints, Place, Stored};
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty};
+use crate::capture::options::{Axes, ReadOptions};
+use crate::capture::probe::{Probe, stem};
+use crate::codec::mat::file::{MatArray, arrays, is_level_5};
+use crate::frames::CountFrames;
+use crate::frames::chain::Chain;
+use qudi_core::{Result, SimError};
+use std::path::{Path, PathBuf};
+
+pub(crate) const FORMAT: Format = Format {
+    name: "mat",
+    title: "MATLAB arrays (level 5)",
+    probe: |probe| {
+        if probe.is_folder {
+            let parts = !parts(probe)?.is_empty();
+            let info = probe.path.join("info.json").is_file();
+            let evidence: &[&str] =
+                if info { &["part_<N>.mat", "info.json"] } else { &["part_<N>.mat"] };
+            return Ok(parts.then(|| Match::new(Certainty::Certain, evidence)));
+        }
+        let found = is_level_5(&probe.head);
+        Ok(found.then(|| Match::new(Certainty::Certain, &["MATLAB's header"])))
+    },
+    open,
+};
+
+/// The variable that converters of SwissSPAD2 write.
+const CUSTOMARY: &str = "OUTPUT";
+
+fn parts(probe: &Probe) -> Result<Vec<PathBuf>> {
+    let mut files = probe.files(&["mat"])?;
+    files.retain(|file| stem(file).starts_with("part_") && file.parent() == Some(&probe.path));
+    Ok(files)
+}
+
+fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+    if !probe.is_folder {
+        let array = choose(&probe.path, options)?;
+        about.evidence.push(format!("variable `{}`", array.name));
+        return frames(&probe.path, array, options, about);
+    }
+    let files = parts(probe)?;
+    let mut lengths = Vec::new();
+    let mut size = None;
+    for path in &files {
+        let part = frames(path, choose(path, options)?, options, about)?;
+        if *size.get_or_insert(part.size()) != part.size() {
+            return Err(SimError::data(
+                format!("a part of {} among parts of another size", part.size()),
+                path,
+                "parts of one capture have one size",
+            ));
+        }
+        lengths.push(part.frames());
+    }
+    let Some(size) = size else {
+        return Err(SimError::data("no part_<N>.mat in it", &probe.path, "name one .mat file"));
+    };
+    about.remarks.dedup();
+    check_info(&probe.path.join("info.json"), files.len(), lengths.iter().sum(), options, about)?;
+    let (options, template) = (options.clone(), about.clone());
+    let opener = move |part: usize| {
+        frames(&files[part], choose(&files[part], &options)?, &options, &mut template.clone())
+    };
+    Ok(Box::new(Chain::new(size, &lengths, Box::new(opener))))
+}
+
+/// Compares with what the converter noted.
+fn check_info(
+    path: &Path,
+    parts: usize,
+    frames: u64,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<()> {
+    let Ok(text) = std::fs::read(path) else { return Ok(()) };
+    let Ok(info) = serde_json::from_slice::<serde_json::Value>(&text) else {
+        about.remarks.push("info.json is not JSON: ignored".to_owned());
+        return Ok(());
+    };
+    let noted = info["no_parts"].as_u64();
+    let missing = noted.is_some_and(|noted| noted != parts as u64);
+    if missing && !options.lenient {
+        return Err(SimError::data(
+            format!("{parts} parts, where info.json notes {}", noted.unwrap_or(0)),
+            path,
+            "copy the missing parts, or read those that are there with --lenient",
+        ));
+    }
+    // Some converters note the frames of a part, some those of the capture.
+    let per_part = info["no_frames"].as_u64().unwrap_or(frames);
+    if per_part != frames && per_part != frames / parts as u64 {
+        about.remarks.push(format!("info.json notes {per_part} frames, the parts hold {frames}"));
+    }
+    Ok(())
+}
+
+fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
+    let found = arrays(path)?;
+    let listed = || {
+        let names: Vec<_> = found.iter().map(|a| format!("{} {:?}", a.name, a.dims)).collect();
+        if names.is_empty() { "it holds no numeric arrays".to_owned() } else { names.join(", ") }
+    };
+    if let Some(wanted) = &options.array {
+        return found.iter().find(|a| a.name == *wanted).cloned().ok_or_else(|| {
+            SimError::data(format!("no variable `{wanted}` in it"), path, listed())
+        });
+    }
+    if found.iter().any(|a| a.name == "imbs") {
+        return Err(SimError::data(
+            "a simulated colour-filter capture (`imbs`)",
+            path,
+            "colour is not supported yet; read the mosaic as if it were gray with --array imbs",
+        ));
+    }
+    let captures: Vec<_> = found.iter().filter(|a| a.dims.len() >= 3).collect();
+    let customary = found.iter().find(|a| a.name == CUSTOMARY);
+    match (customary, captures.as_slice()) {
+        (Some(array), _) => Ok(array.clone()),
+        (None, [one]) => Ok((*one).clone()),
+        (None, []) => Err(SimError::data(
+            format!("no array of frames in it; there are: {}", listed()),
+            path,
+            "a capture is an array of height x width x frames; dark maps go to --dcr",
+        )),
+        (None, _) => Err(SimError::data(
+            format!("several arrays could be the capture: {}", listed()),
+            path,
+            "name one with --array",
+        )),
+    }
+}
+
+fn frames(
+    path: &Path,
+    array: MatArray,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<Box<dyn CountFrames>> {
+    let place = if let Some((start, available)) = array.in_place() {
+        Place::File { start, available }
+    } else {
+        array.refuse_bomb(path)?;
+        Place::Stream(array.opener(path))
+    };
+    let array = Array {
+        path: path.to_owned(),
+        sample: array.sample,
+        shape: array.dims,
+        fortran: true,
+        axes: Axes::Hwt,
+        place,
+    };
+    // Samples of MATLAB arrays are never packed.
+    let hints = Hints { stored: Stored::Counts, size: None };
+    array.open(options, &hints, about)
+}

@@ -1,0 +1,151 @@
+//! NumPy `.npy`, also gzipped: packed bits as photoncube and visionsim write them, or plain counts.
+
+use super::array::{Array, Hints, Place};
+use super::{Format, Match};
+use crate::burst::BurstFormat;
+use crate::capture::about::{About, Certainty, Packing};
+use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
+use crate::capture::probe::Probe;
+use crate::frames::CountFrames;
+use crate::frames::frame_bytes::Opener;
+use crate::record::{self, BurstLayout, Described};
+use flate2::read::MultiGzDecoder;
+use qudi_core::npy::Header;
+use qudi_core::sensor::{Response, preset};
+use qudi_core::{Result, SimError};
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+pub(crate) const FORMAT: Format = Format {
+    name: "npy",
+    title: "NumPy array",
+    probe: |probe| {
+        let found = probe.head.starts_with(b"\x93NUMPY");
+        Ok(found.then(|| Match::new(Certainty::Certain, &["NumPy's magic number"])))
+    },
+    open: |probe, options, about| {
+        let array = open_array(&probe.path)?;
+        let hints = hints(&probe.path, about);
+        array.open(options, &hints, about)
+    },
+};
+
+pub(crate) const COMPRESSED: Format = Format {
+    name: "npy-gz",
+    title: "gzipped NumPy array",
+    probe: |probe| {
+        let found =
+            probe.head.starts_with(&[0x1f, 0x8b]) && probe.stem().to_lowercase().ends_with(".npy");
+        Ok(found.then(|| Match::new(Certainty::Certain, &["gzip's magic number", "the name"])))
+    },
+    open: |probe, options, about| open_gzip(probe, options, about),
+};
+
+/// Deflate never shrinks data by more than this.
+pub(crate) const MOST_COMPRESSION: u64 = 1032;
+
+/// A `.npy` file as an array; sizes are checked by [`Array::open`].
+pub(crate) fn open_array(path: &Path) -> Result<Array> {
+    let io = |e| SimError::io("open", path, e);
+    let file = File::open(path).map_err(io)?;
+    let length = file.metadata().map_err(io)?.len();
+    let header = Header::read(&mut BufReader::new(file), path)?;
+    let place = Place::File {
+        start: header.data_start,
+        available: length.saturating_sub(header.data_start),
+    };
+    Ok(array(path, header, place))
+}
+
+pub(crate) fn array(path: &Path, header: Header, place: Place) -> Array {
+    Array {
+        path: path.to_owned(),
+        sample: header.sample,
+        shape: header.shape,
+        fortran: header.fortran,
+        axes: Axes::Thw,
+        place,
+    }
+}
+
+fn open_gzip(
+    probe: &Probe,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<Box<dyn CountFrames>> {
+    let path = probe.path.clone();
+    let unpacked = move || -> Result<MultiGzDecoder<BufReader<File>>> {
+        let file = File::open(&path).map_err(|e| SimError::io("open", &path, e))?;
+        Ok(MultiGzDecoder::new(BufReader::with_capacity(1 << 16, file)))
+    };
+    let header = Header::read(&mut unpacked()?, &probe.path)?;
+    refuse_bomb(&header, probe.length, &probe.path)?;
+    let start = header.data_start;
+    let path = probe.path.clone();
+    let opener: Opener = Box::new(move || {
+        let mut stream = unpacked()?;
+        std::io::copy(&mut stream.by_ref().take(start), &mut std::io::sink())
+            .map_err(|e| SimError::io("decompress", &path, e))?;
+        Ok(Box::new(stream))
+    });
+    array(&probe.path, header, Place::Stream(opener)).open(options, &Hints::default(), about)
+}
+
+/// Refuses a header that promises more than its compressed bytes can hold.
+pub(crate) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Result<()> {
+    let most = compressed.saturating_mul(MOST_COMPRESSION);
+    match header.data_bytes() {
+        Some(bytes) if bytes <= most => Ok(()),
+        _ => Err(SimError::data(
+            format!(
+                "its header promises an array of shape {:?}, more than {compressed} compressed bytes can hold",
+                header.shape
+            ),
+            path,
+            "the file is truncated or damaged: copy or export it again",
+        )),
+    }
+}
+
+/// What lies beside an array and describes it: our own record.
+fn hints(path: &Path, about: &mut About) -> Hints {
+    let Some(layout) = described(&record::beside(path), about) else { return Hints::default() };
+    let packed = layout.format == BurstFormat::NpyPacked;
+    let packing = packed.then_some(Packing { axis: PackAxis::Width, order: BitOrder::Msb });
+    Hints { stored: packing.into(), size: Some(layout.size) }
+}
+
+/// What our record at `path` says of its burst, if it exists; what it says about the camera goes
+/// to `about`.
+pub(crate) fn described(path: &Path, about: &mut About) -> Option<BurstLayout> {
+    if !path.is_file() {
+        return None;
+    }
+    let record = match Described::load(path) {
+        Ok(record) => record,
+        Err(e) => {
+            about.remarks.push(format!("{} is ignored: {e}", path.display()));
+            return None;
+        }
+    };
+    about.evidence.push("the record beside it".to_owned());
+    let layout = match record {
+        Described::Simulated(record) => {
+            about.binary = record.simulation.sensor.response == Response::Binary;
+            about.gain = Some(record.gain);
+            about.ppp = Some(record.light.ppp);
+            about.sensor = Some(record.simulation.sensor);
+            record.burst
+        }
+        Described::Converted(conversion) => {
+            about.binary = conversion.binary;
+            let known = conversion.preset.as_deref().and_then(preset);
+            about.preset = known.map(|preset| preset.name);
+            conversion.burst
+        }
+    };
+    about.max_count = Some(layout.max_count);
+    about.fps = layout.fps;
+    Some(layout)
+}

@@ -1,0 +1,88 @@
+//! Captures through a pipe: NumPy arrays, which say what they are, and raw frames by name.
+
+use super::array::{Hints, Place};
+use super::npy::array;
+use super::raw::piped as piped_raw;
+use crate::capture::about::About;
+use crate::capture::options::ReadOptions;
+use crate::capture::pipe::{Pipe, STDIN, Tail};
+use crate::frames::CountFrames;
+use qudi_core::npy::Header;
+use qudi_core::{Result, SimError};
+use std::io::{Cursor, Read};
+use std::path::Path;
+
+/// Bytes that tell formats apart.
+const MAGIC: u64 = 16;
+
+/// What comes through pipes by mistake, and what to do about it.
+const OTHERS: &[(&[u8], &str, &str)] = &[
+    (
+        b"YUV4MPEG2",
+        "a Y4M stream: pictures, not photon counts",
+        "make counts of it with `qudi simulate - -o -`; a camera's 8-bit counts come through as `-f rawvideo`, read with --format raw-u8 --size HxW",
+    ),
+    (b"\x1f\x8b", "gzipped data", "unpack them on the way: `gunzip -c FILE | qudi restore - ...`"),
+    (b"II*\0", "a TIFF file", "name the file itself: its pages cannot be read in turn"),
+    (b"MM\0*", "a TIFF file", "name the file itself: its pages cannot be read in turn"),
+    (b"\x89HDF", "an HDF5 file", "name the file itself: its frames cannot be read in turn"),
+    (b"PK\x03\x04", "a zip archive, perhaps .npz", "name the file itself, or pipe a .npy"),
+    (b"\x89PNG", "a single picture", "put the frames into a folder and name that"),
+];
+
+/// Recognises what comes out of `reader`, unless `options` name it.
+pub(crate) fn open_pipe(
+    mut reader: Box<dyn Read + Send>,
+    options: &ReadOptions,
+) -> Result<(Box<dyn CountFrames>, About)> {
+    let place = Path::new(STDIN);
+    if options.frames_per_file.is_some() {
+        return Err(SimError::request(
+            "a pipe has no files to count frames in",
+            "--frames-per-file",
+            "leave it out, or end with --end",
+        ));
+    }
+    if let Some(name) = options.format.as_deref().filter(|&name| name != "npy") {
+        return piped_raw(name, reader, options).unwrap_or_else(|| {
+            Err(SimError::request(
+                format!("`{name}` cannot be read from a pipe"),
+                "--format",
+                "pipes carry npy, raw-bits, raw-u8 and raw-u16: name the file itself, or `qudi convert` it",
+            ))
+        });
+    }
+    let mut start = Vec::new();
+    (&mut reader)
+        .take(MAGIC)
+        .read_to_end(&mut start)
+        .map_err(|e| SimError::io("read", place, e))?;
+    if start.is_empty() {
+        return Err(SimError::data(
+            "nothing came through the pipe",
+            place,
+            "check the command before it",
+        ));
+    }
+    if options.format.is_none() && !start.starts_with(b"\x93NUMPY") {
+        let other = OTHERS.iter().find(|(magic, _, _)| start.starts_with(magic));
+        let (what, help) = other.map_or(
+            (
+                "no known format",
+                "a .npy is recognised; raw frames are read with --format raw-bits, raw-u8 or raw-u16 and --size HxW",
+            ),
+            |&(_, what, help)| (what, help),
+        );
+        return Err(SimError::data(what, place, help));
+    }
+    let mut reader: Box<dyn Read + Send> = Box::new(Cursor::new(start).chain(reader));
+    let header = Header::read(&mut reader, place)?;
+    let mut about = About::new("npy", "NumPy array");
+    about.evidence.push("NumPy's magic number".to_owned());
+    // How long a frame is follows from the order of the axes.
+    let tail = Tail { trailer: 0, known: &[], lenient: options.lenient };
+    let pipe = Pipe::new(reader, 0, None, tail);
+    let frames =
+        array(place, header, Place::Pipe(pipe)).open(options, &Hints::default(), &mut about)?;
+    Ok((frames, about))
+}

@@ -1,0 +1,144 @@
+//! Files without header of any camera, described by the user: `--size`, `--bitorder`, `--header`,
+//! `--trailer`. Never guessed.
+
+pub(super) mod files;
+
+use super::Format;
+use crate::capture::about::{About, Packing};
+use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
+use crate::capture::pipe::{Pipe, STDIN, Tail};
+use crate::capture::probe::Probe;
+use crate::codec::raw::files::{TRAILERS, frame_files};
+use crate::frames::CountFrames;
+use crate::frames::frame_bytes::FrameBytes;
+use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
+use crate::frames::samples::{MONO, SampleFrames, Scale};
+use qudi_core::Size;
+use qudi_core::npy::Sample;
+use qudi_core::{Result, SimError};
+use std::io::Read;
+use std::path::Path;
+
+pub(crate) const BITS: Format = Format {
+    name: "raw-bits",
+    title: "packed bits without header",
+    probe: |_| Ok(None),
+    open: |probe, options, about| bits(options, about, &mut from_files(probe, options)),
+};
+
+pub(crate) const BYTES: Format = Format {
+    name: "raw-u8",
+    title: "one byte per count without header",
+    probe: |_| Ok(None),
+    open: |probe, options, about| {
+        samples(Sample::U8, &probe.path, options, about, &mut from_files(probe, options))
+    },
+};
+
+pub(crate) const WORDS: Format = Format {
+    name: "raw-u16",
+    title: "two little-endian bytes per count without header",
+    probe: |_| Ok(None),
+    open: |probe, options, about| {
+        samples(WORD, &probe.path, options, about, &mut from_files(probe, options))
+    },
+};
+
+const WORD: Sample = Sample::U16 { big_endian: false };
+
+fn size(options: &ReadOptions) -> Result<Size> {
+    options.size.ok_or_else(|| {
+        SimError::request(
+            "files without header do not say how large a frame is",
+            "--size",
+            "give height and width, as in --size 256x512",
+        )
+    })
+}
+
+/// The file, or every file of the folder.
+fn files(probe: &Probe) -> Result<Vec<std::path::PathBuf>> {
+    let files = probe.files(&["bin", "raw", "dat", ""])?;
+    if files.is_empty() {
+        return Err(SimError::data(
+            "the folder holds no .bin, .raw or .dat files",
+            &probe.path,
+            "name the file itself",
+        ));
+    }
+    Ok(files)
+}
+
+/// Frames of so many bytes.
+type Source<'a> = dyn FnMut(usize, &mut About) -> Result<FrameBytes> + 'a;
+
+fn from_files<'a>(
+    probe: &'a Probe,
+    options: &'a ReadOptions,
+) -> impl FnMut(usize, &mut About) -> Result<FrameBytes> + 'a {
+    |frame_bytes, about| frame_files(&files(probe)?, frame_bytes, 0, options, about)
+}
+
+/// Frames of the raw format `name` out of a pipe; `None` if there is no such format.
+pub(crate) fn piped(
+    name: &str,
+    reader: Box<dyn Read + Send>,
+    options: &ReadOptions,
+) -> Option<Result<(Box<dyn CountFrames>, About)>> {
+    let format = [BITS, BYTES, WORDS].into_iter().find(|format| format.name == name)?;
+    let mut about = About::new(format.name, format.title);
+    about.evidence.push("--format".to_owned());
+    let mut reader = Some(reader);
+    let mut source = |frame_bytes: usize, _: &mut About| {
+        // Asked once: the reader goes with the frames.
+        let mut reader = reader.take().unwrap_or_else(|| Box::new(std::io::empty()));
+        let header = options.header.unwrap_or(0);
+        std::io::copy(&mut (&mut reader).take(header), &mut std::io::sink())
+            .map_err(|e| SimError::io("read", Path::new(STDIN), e))?;
+        let trailer = options.trailer.unwrap_or(0);
+        let tail = Tail { trailer, known: &TRAILERS, lenient: options.lenient };
+        Ok(FrameBytes::Pipe(Pipe::new(reader, frame_bytes, None, tail)))
+    };
+    let place = Path::new(STDIN);
+    let frames = match name {
+        "raw-bits" => bits(options, &mut about, &mut source),
+        "raw-u8" => samples(Sample::U8, place, options, &mut about, &mut source),
+        _ => samples(WORD, place, options, &mut about, &mut source),
+    };
+    Some(frames.map(|frames| (frames, about)))
+}
+
+fn bits(
+    options: &ReadOptions,
+    about: &mut About,
+    source: &mut Source<'_>,
+) -> Result<Box<dyn CountFrames>> {
+    let size = size(options)?;
+    let axis = match options.pack_axis {
+        Some(axis @ (PackAxis::Width | PackAxis::Height)) => axis,
+        Some(PackAxis::None) | None => PackAxis::Width,
+    };
+    let (rows, columns) = stored_bytes(size, axis);
+    let bytes = source(rows * columns, about)?;
+    let order = options.bit_order.unwrap_or(BitOrder::Msb);
+    about.max_count = Some(1);
+    about.packing = Some(Packing { axis, order });
+    let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
+    let placement = Placement::packed(size, axis, transposed);
+    Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
+}
+
+fn samples(
+    sample: Sample,
+    place: &Path,
+    options: &ReadOptions,
+    about: &mut About,
+    source: &mut Source<'_>,
+) -> Result<Box<dyn CountFrames>> {
+    let size = size(options)?;
+    let bytes = source(size.pixels() * sample.bytes(), about)?;
+    let full = sample.full_scale().unwrap_or(1.0);
+    let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
+    let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
+    Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, place)))
+}

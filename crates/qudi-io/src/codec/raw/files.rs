@@ -1,0 +1,136 @@
+//! Headerless files of equally long frames, one or many.
+
+use crate::capture::about::About;
+use crate::capture::options::ReadOptions;
+use crate::frames::frame_bytes::{FrameBytes, Segment};
+use qudi_core::{Result, SimError};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// What camera servers append to a stream of frames.
+pub(crate) const TRAILERS: [&[u8]; 2] = [b"DONE", b"ERROR"];
+
+/// The frames of `files`, `frame_bytes` each, after `header` bytes.
+pub(crate) fn frame_files(
+    files: &[PathBuf],
+    frame_bytes: usize,
+    header: u64,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<FrameBytes> {
+    let mut segments = Vec::with_capacity(files.len());
+    for (i, path) in files.iter().enumerate() {
+        let last = i + 1 == files.len();
+        let mut segment = segment(path, frame_bytes as u64, header, options, about)?;
+        if let Some(per_file) = options.frames_per_file {
+            if segment.frames > per_file {
+                segment.frames = per_file;
+            } else if segment.frames < per_file && !last {
+                return Err(SimError::data(
+                    format!("the file holds {} frames instead of {per_file}", segment.frames),
+                    path,
+                    "only the last file may be shorter; leave --frames-per-file out, or copy the file again",
+                ));
+            }
+        }
+        let shorter = segments.first().is_some_and(|f: &Segment| segment.frames < f.frames);
+        if shorter && !last {
+            about.remarks.push(format!(
+                "{} holds {} frames, fewer than the files before it: frames may be missing",
+                path.display(),
+                segment.frames
+            ));
+        }
+        if segment.frames > 0 {
+            segments.push(segment);
+        }
+    }
+    if segments.is_empty() {
+        let place = files.first().map_or(Path::new("the folder"), PathBuf::as_path);
+        return Err(SimError::data(
+            format!("no whole frame of {frame_bytes} bytes"),
+            place,
+            "check --format and --size",
+        ));
+    }
+    Ok(FrameBytes::files(segments, frame_bytes))
+}
+
+fn segment(
+    path: &Path,
+    frame_bytes: u64,
+    header: u64,
+    options: &ReadOptions,
+    about: &mut About,
+) -> Result<Segment> {
+    let io = |e| SimError::io("open", path, e);
+    let mut file = File::open(path).map_err(io)?;
+    let length = file.metadata().map_err(io)?.len();
+    let header = options.header.unwrap_or(header);
+    let too_short = || {
+        SimError::data(
+            format!("{length} bytes, shorter than its header and trailer"),
+            path,
+            "check --header and --trailer, or copy the file again",
+        )
+    };
+    let body = length.checked_sub(header).ok_or_else(too_short)?;
+    let trailer = match options.trailer {
+        Some(trailer) => trailer,
+        None => trailer(&mut file, body % frame_bytes, path, about)?,
+    };
+    let body = body.checked_sub(trailer).ok_or_else(too_short)?;
+    let rest = body % frame_bytes;
+    if rest != 0 {
+        if !options.lenient {
+            return Err(SimError::data(
+                format!(
+                    "{length} bytes are {} frames of {frame_bytes} bytes and {rest} bytes more",
+                    body / frame_bytes
+                ),
+                path,
+                format!(
+                    "drop an incomplete last frame with --lenient, or a trailer with --trailer {rest}; or check --format and --size"
+                ),
+            ));
+        }
+        about
+            .remarks
+            .push(format!("{}: incomplete last frame of {rest} bytes dropped", path.display()));
+    }
+    Ok(Segment { path: path.to_owned(), start: header, frames: body / frame_bytes })
+}
+
+/// Length of a known trailer, if `rest` bytes beyond whole frames are one.
+fn trailer(file: &mut File, rest: u64, path: &Path, about: &mut About) -> Result<u64> {
+    let Some(known) = TRAILERS.iter().find(|known| known.len() as u64 == rest) else {
+        return Ok(0);
+    };
+    let mut end = vec![0u8; known.len()];
+    let io = |e| SimError::io("read the end of", path, e);
+    file.seek(SeekFrom::End(-(known.len() as i64))).map_err(io)?;
+    file.read_exact(&mut end).map_err(io)?;
+    if end != *known {
+        return Ok(0);
+    }
+    if *known == b"ERROR" {
+        about.remarks.push(format!(
+            "{} ends in ERROR: the camera stopped before the capture was complete",
+            path.display()
+        ));
+    }
+    Ok(rest)
+}
+
+/// Length of the trailer that ends `bytes`, for recognising a format.
+pub(crate) fn ends_in_trailer(path: &Path) -> bool {
+    let read = || -> std::io::Result<[u8; 4]> {
+        let mut end = [0u8; 4];
+        let mut file = File::open(path)?;
+        file.seek(SeekFrom::End(-4))?;
+        file.read_exact(&mut end)?;
+        Ok(end)
+    };
+    read().is_ok_and(|end| &end == b"DONE" || &end == b"RROR")
+}

@@ -1,0 +1,96 @@
+//! SwissSPAD2 (EPFL) as its own software writes it: files of 8 MiB, lowest bit first.
+//!
+//! Half array: 512 frames of 256 x 512 per file, rows one after the other. Full array: 256 frames
+//! of 512 x 512; each of 256 stored rows holds 8 zones of 128 pixels, alternately of image row `r`
+//! and, upside down, of image row `511 - r`.
+
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty, Packing};
+use crate::capture::byte_kind::ByteKind;
+use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
+use crate::capture::probe::Probe;
+use crate::capture::raw_look::{Habit, RawLook, SWISSSPAD_FILE};
+use crate::codec::raw::files::frame_files;
+use crate::frames::CountFrames;
+use crate::frames::packed::{PackedFrames, Placement};
+use qudi_core::Result;
+use qudi_core::Size;
+
+pub(crate) const HALF: Format = Format {
+    name: "swissspad2",
+    title: "SwissSPAD2 raw files, half array",
+    probe: |probe| recognise(probe, false),
+    open: |probe, options, about| {
+        open(probe, options, about, Size { height: 256, width: 512 }, Placement::Straight)
+    },
+};
+
+pub(crate) const FULL: Format = Format {
+    name: "swissspad2-full",
+    title: "SwissSPAD2 raw files, full array",
+    probe: |probe| recognise(probe, true),
+    open: |probe, options, about| {
+        let size = Size { height: 512, width: 512 };
+        open(probe, options, about, size, Placement::Bytes(zones()))
+    },
+};
+
+/// Bytes of a half-array frame; a full one has twice as many.
+const HALF_FRAME: u64 = 16_384;
+
+fn recognise(probe: &Probe, full: bool) -> Result<Option<Match>> {
+    let Some(look) = RawLook::at(probe)? else { return Ok(None) };
+    let frame = if full { 2 * HALF_FRAME } else { HALF_FRAME };
+    if !look.length.is_multiple_of(frame) || look.kind == ByteKind::Counts {
+        return Ok(None);
+    }
+    let mut evidence = Vec::new();
+    if look.length == SWISSSPAD_FILE {
+        evidence.push("8 MiB per file");
+    }
+    if look.habit == Habit::SwissSpad2 {
+        evidence.push("the name");
+    }
+    let arrangement = look.full_array.unwrap_or(false);
+    let certainty = match (look.habit, look.order) {
+        (Habit::Spad512s, _) | (_, Some(BitOrder::Msb)) => return Ok(None),
+        _ if arrangement != full => return Ok(None),
+        (_, Some(BitOrder::Lsb)) => {
+            evidence.push(if full {
+                "the picture: lowest bit first, zones"
+            } else {
+                "the picture: lowest bit first"
+            });
+            Certainty::Likely
+        }
+        (Habit::SwissSpad2, None) => Certainty::Likely,
+        (Habit::Unknown, None) => Certainty::Possible,
+    };
+    Ok(Some(Match::new(certainty, &evidence)))
+}
+
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    about: &mut About,
+    size: Size,
+    placement: Placement,
+) -> Result<Box<dyn CountFrames>> {
+    let files = probe.files(&["bin"])?;
+    let bytes = frame_files(&files, size.pixels() / 8, 0, options, about)?;
+    let order = options.bit_order.unwrap_or(BitOrder::Lsb);
+    about.max_count = Some(1);
+    about.packing = Some(Packing { axis: PackAxis::Width, order });
+    about.preset = Some("swissspad2");
+    Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
+}
+
+/// Image byte of every stored byte of a full-array frame.
+fn zones() -> Vec<u32> {
+    let byte = |i: u32| {
+        let (row, zone, x) = (i / 128, i / 16 % 8, i % 16);
+        let y = if zone % 2 == 0 { row } else { 511 - row };
+        y * 64 + zone / 2 * 16 + x
+    };
+    (0..512 * 64).map(byte).collect()
+}

@@ -1,0 +1,104 @@
+//! TIFF stacks: one image file directory per frame, or ImageJ's single directory before one block
+//! of frames (which is how it goes beyond 4 GiB).
+
+mod pages;
+
+use super::npy::described;
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty};
+use crate::capture::options::ReadOptions;
+use crate::capture::probe::Probe;
+use crate::codec::tiff::pages::{TiffPages, decoder, fault};
+use crate::frames::CountFrames;
+use crate::frames::frame_bytes::{FrameBytes, Segment};
+use crate::frames::samples::{MONO, SampleFrames, Scale};
+use crate::record;
+use qudi_core::Size;
+use qudi_core::npy::Sample;
+use qudi_core::{Result, SimError};
+use tiff::ColorType;
+use tiff::tags::{ByteOrder, Tag};
+
+pub(crate) const FORMAT: Format = Format {
+    name: "tiff",
+    title: "TIFF stack",
+    probe: |probe| {
+        let magic = [&b"II*\0"[..], b"MM\0*", b"II+\0", b"MM\0+"];
+        let found = magic.iter().any(|magic| probe.head.starts_with(magic));
+        Ok(found.then(|| Match::new(Certainty::Certain, &["TIFF's magic number"])))
+    },
+    open,
+};
+
+/// A stack in one block, as ImageJ writes it.
+struct Block {
+    start: u64,
+    frames: u64,
+    size: Size,
+    sample: Sample,
+}
+
+fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+    let path = &probe.path;
+    if probe.is_folder {
+        return Err(SimError::data("a folder", path, "use --format images, or name one file"));
+    }
+    let recorded = described(&record::beside(path), about).is_some();
+    let Some(block) = block(probe)? else {
+        let pages = TiffPages::open(path, options, recorded, about)?;
+        return Ok(Box::new(pages));
+    };
+    about.evidence.push(format!("ImageJ's description: {} images", block.frames));
+    let frame_bytes = (block.size.pixels() * block.sample.bytes()) as u64;
+    let whole = (probe.length.saturating_sub(block.start) / frame_bytes).min(block.frames);
+    if whole < block.frames {
+        if !options.lenient || whole == 0 {
+            return Err(SimError::data(
+                format!(
+                    "the stack is truncated: {} frames promised, {whole} whole ones there",
+                    block.frames
+                ),
+                path,
+                "copy or export it again, or read the whole frames with --lenient",
+            ));
+        }
+        about.remarks.push(format!("truncated: {} frames dropped", block.frames - whole));
+    }
+    let segment = Segment { path: path.clone(), start: block.start, frames: whole };
+    let bytes = FrameBytes::files(vec![segment], frame_bytes as usize);
+    let full = block.sample.full_scale().unwrap_or(1.0);
+    let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
+    let frames = SampleFrames::new(bytes, block.sample, block.size, false, MONO, scale, path);
+    Ok(Box::new(frames))
+}
+
+/// ImageJ's block of frames, if this is one.
+fn block(probe: &Probe) -> Result<Option<Block>> {
+    let path = &probe.path;
+    let mut decoder = decoder(path)?;
+    if decoder.more_images() {
+        return Ok(None);
+    }
+    let tag = |decoder: &mut tiff::decoder::Decoder<_>, tag| decoder.find_tag(tag).ok().flatten();
+    let description = tag(&mut decoder, Tag::ImageDescription).and_then(|v| v.into_string().ok());
+    let images =
+        description.as_deref().filter(|text| text.starts_with("ImageJ=")).and_then(|text| {
+            text.lines().find_map(|line| line.strip_prefix("images=")?.trim().parse::<u64>().ok())
+        });
+    let Some(frames) = images.filter(|&n| n > 1) else { return Ok(None) };
+    let compression = tag(&mut decoder, Tag::Compression).and_then(|v| v.into_u16().ok());
+    if compression.unwrap_or(1) != 1 {
+        return Ok(None);
+    }
+    let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;
+    let big_endian = decoder.byte_order() == ByteOrder::BigEndian;
+    let sample = match decoder.colortype().map_err(|e| fault(path, e))? {
+        ColorType::Gray(8) => Sample::U8,
+        ColorType::Gray(16) => Sample::U16 { big_endian },
+        _ => return Ok(None),
+    };
+    let strips = tag(&mut decoder, Tag::StripOffsets).and_then(|v| v.into_u64_vec().ok());
+    let Some(start) = strips.and_then(|strips| strips.first().copied()) else { return Ok(None) };
+    let size = Size::new(height as usize, width as usize, &path.display().to_string())?;
+    Ok(Some(Block { start, frames, size, sample }))
+}

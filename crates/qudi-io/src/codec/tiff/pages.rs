@@ -1,0 +1,203 @@
+//! A TIFF whose frames are image file directories.
+
+use crate::capture::about::About;
+use crate::capture::options::ReadOptions;
+use crate::frames::CountFrames;
+use crate::frames::samples::{Scale, no_count};
+use qudi_core::Size;
+use qudi_core::{Result, SimError};
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+use tiff::ColorType;
+use tiff::decoder::{Decoder, DecodingResult};
+
+pub(crate) type TiffDecoder = Decoder<BufReader<File>>;
+
+pub(crate) struct TiffPages {
+    decoder: TiffDecoder,
+    path: PathBuf,
+    size: Size,
+    frames: u64,
+    scale: Scale,
+    /// Rows of single bits, padded to bytes.
+    bits: bool,
+}
+
+pub(crate) fn fault(path: &Path, e: tiff::TiffError) -> SimError {
+    match e {
+        tiff::TiffError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
+            SimError::io("read", path, e)
+        }
+        other => SimError::data(
+            format!("not a readable TIFF: {other}"),
+            path,
+            "open it in ImageJ to see whether it is damaged, and save it again as 8- or 16-bit gray",
+        ),
+    }
+}
+
+pub(crate) fn decoder(path: &Path) -> Result<TiffDecoder> {
+    let file = File::open(path).map_err(|e| SimError::io("open", path, e))?;
+    Decoder::new(BufReader::with_capacity(1 << 16, file)).map_err(|e| fault(path, e))
+}
+
+impl TiffPages {
+    pub(crate) fn open(
+        path: &Path,
+        options: &ReadOptions,
+        recorded: bool,
+        about: &mut About,
+    ) -> Result<Self> {
+        let mut decoder = decoder(path)?;
+        let color = decoder.colortype().map_err(|e| fault(path, e))?;
+        let ColorType::Gray(bits) = color else {
+            return Err(SimError::data(
+                format!("images of type {color:?}"),
+                path,
+                "colour is not supported yet; save the stack as 8- or 16-bit gray",
+            ));
+        };
+        let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;
+        let size = Size::new(height as usize, width as usize, &path.display().to_string())?;
+        let mut frames = 1u64;
+        while decoder.more_images() {
+            if let Err(e) = decoder.next_image() {
+                if options.lenient {
+                    about.remarks.push(format!("truncated after frame {}", frames - 1));
+                    break;
+                }
+                return Err(fault(path, e));
+            }
+            frames += 1;
+        }
+        let path = path.to_owned();
+        let scale = Scale::Counts;
+        let mut pages = Self { decoder, path, size, frames, scale, bits: bits == 1 };
+        pages.drop_unreadable(options, about)?;
+        pages.scale = pages.find_scale(bits, options, recorded, about)?;
+        Ok(pages)
+    }
+
+    /// A truncated file shows on its last frame.
+    fn drop_unreadable(&mut self, options: &ReadOptions, about: &mut About) -> Result<()> {
+        loop {
+            match self.page(self.frames - 1) {
+                Ok(_) => return Ok(()),
+                Err(e) if !options.lenient || self.frames == 1 => return Err(e),
+                Err(_) => {
+                    self.frames -= 1;
+                    about.remarks.push(format!("frame {} is incomplete: dropped", self.frames));
+                }
+            }
+        }
+    }
+
+    fn find_scale(
+        &mut self,
+        bits: u8,
+        options: &ReadOptions,
+        recorded: bool,
+        about: &mut About,
+    ) -> Result<Scale> {
+        let full = if bits <= 8 { 255u16 } else { 65535 };
+        if let Some(scale) = Scale::asked(options.levels, f32::from(full), about) {
+            return Ok(scale);
+        }
+        if bits == 1 {
+            about.max_count = Some(1);
+        }
+        if recorded || !matches!(bits, 8 | 16) {
+            return Ok(Scale::Counts);
+        }
+        let mut values = Vec::new();
+        for frame in [0, self.frames / 2, self.frames - 1] {
+            match self.page(frame)? {
+                DecodingResult::U8(v) => values.extend(v.into_iter().map(u16::from)),
+                DecodingResult::U16(v) => values.extend(v),
+                _ => return Ok(Scale::Counts),
+            }
+        }
+        Ok(Scale::seen(values, full, about))
+    }
+
+    fn page(&mut self, frame: u64) -> Result<DecodingResult> {
+        let fault = |e| fault(&self.path, e);
+        self.decoder.seek_to_image(frame as usize).map_err(fault)?;
+        let (width, height) = self.decoder.dimensions().map_err(fault)?;
+        if (height as usize, width as usize) != (self.size.height, self.size.width) {
+            return Err(SimError::data(
+                format!("frame {frame} is {height} x {width} among frames of {}", self.size),
+                &self.path,
+                "frames of one capture have one size",
+            ));
+        }
+        if !matches!(self.decoder.colortype().map_err(fault)?, ColorType::Gray(_)) {
+            return Err(SimError::data(
+                format!("frame {frame} is no gray image"),
+                &self.path,
+                "colour is not supported yet; save the stack as 8- or 16-bit gray",
+            ));
+        }
+        self.decoder.read_image().map_err(fault)
+    }
+
+    fn wrong_length(&self, frame: u64, length: usize) -> SimError {
+        SimError::data(
+            format!("frame {frame} holds {length} samples instead of {}", self.size.pixels()),
+            &self.path,
+            "save the stack again as 8- or 16-bit gray",
+        )
+    }
+}
+
+impl CountFrames for TiffPages {
+    fn frames(&self) -> u64 {
+        self.frames
+    }
+
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        let page = self.page(frame)?;
+        let width = self.size.width;
+        if self.bits {
+            let DecodingResult::U8(bytes) = page else {
+                return Err(self.wrong_length(frame, 0));
+            };
+            let row = width.div_ceil(8);
+            if bytes.len() != row * self.size.height {
+                return Err(self.wrong_length(frame, bytes.len() * 8));
+            }
+            for (counts, bytes) in counts.chunks_mut(width).zip(bytes.chunks(row)) {
+                crate::burst::unpack_row(bytes, counts);
+            }
+            return Ok(());
+        }
+        let values: Vec<f32> = match page {
+            DecodingResult::U8(v) => v.into_iter().map(f32::from).collect(),
+            DecodingResult::U16(v) => v.into_iter().map(f32::from).collect(),
+            DecodingResult::U32(v) => v.into_iter().map(|v| v as f32).collect(),
+            DecodingResult::I16(v) => v.into_iter().map(f32::from).collect(),
+            DecodingResult::I32(v) => v.into_iter().map(|v| v as f32).collect(),
+            DecodingResult::F32(v) => v,
+            DecodingResult::F64(v) => v.into_iter().map(|v| v as f32).collect(),
+            _ => {
+                return Err(SimError::data(
+                    format!("frame {frame} has samples of an unusual type"),
+                    &self.path,
+                    "save the stack again as 8- or 16-bit gray",
+                ));
+            }
+        };
+        if values.len() != counts.len() {
+            return Err(self.wrong_length(frame, values.len()));
+        }
+        for (count, value) in counts.iter_mut().zip(values) {
+            *count = self.scale.count(value).ok_or_else(|| no_count(value, frame, &self.path))?;
+        }
+        Ok(())
+    }
+}

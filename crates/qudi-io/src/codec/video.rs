@@ -1,0 +1,48 @@
+//! Videos through ffmpeg, for what was stored as one. Lossy compression leaves no photon counts.
+
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty};
+use crate::capture::options::ReadOptions;
+use crate::capture::probe::Probe;
+use crate::frames::CountFrames;
+use crate::frames::frame_bytes::{FrameBytes, Segment};
+use crate::frames::samples::{MONO, SampleFrames, Scale};
+use qudi_core::Transfer;
+use qudi_core::npy::Sample;
+use qudi_core::{Result, SimError};
+use qudi_sim::clip::{FrameReader, Video};
+use std::io::{BufWriter, Write};
+
+pub(crate) const FORMAT: Format = Format {
+    name: "video",
+    title: "video, decoded by ffmpeg",
+    probe: |probe| {
+        let found = probe.has_extension(&["mp4", "avi", "mkv", "mov", "webm", "m4v"]);
+        Ok(found.then(|| Match::new(Certainty::Likely, &["the name"])))
+    },
+    open,
+};
+
+/// Decodes the video once into an unnamed temporary file, 8 bits per pixel.
+fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+    let path = &probe.path;
+    let mut video = Video::open(path, Transfer::AsIs)?;
+    let size = video.size();
+    let spool = |e| SimError::io("store the decoded frames of", path, e);
+    let mut file = BufWriter::with_capacity(1 << 18, tempfile::tempfile().map_err(spool)?);
+    let mut frames = 0;
+    while let Some(frame) = video.next()? {
+        let bytes: Vec<u8> = frame.data.iter().map(|v| (v * 255.0).round() as u8).collect();
+        file.write_all(&bytes).map_err(spool)?;
+        frames += 1;
+    }
+    let file = file.into_inner().map_err(|e| spool(e.into_error()))?;
+    about.remarks.push(
+        "video is stored with loss: its values are not photon counts, and no figure made from them means much"
+            .to_owned(),
+    );
+    let scale = Scale::asked(options.levels, 255.0, about).unwrap_or(Scale::Counts);
+    let segment = Segment { path: path.clone(), start: 0, frames };
+    let bytes = FrameBytes::spool(segment, file, size.pixels());
+    Ok(Box::new(SampleFrames::new(bytes, Sample::U8, size, false, MONO, scale, path)))
+}

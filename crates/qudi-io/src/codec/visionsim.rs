@@ -1,0 +1,118 @@
+//! visionsim datasets: `transforms.json` beside `frames.npy` or a list of images.
+
+use super::array::{Hints, Stored};
+use super::images::open_files;
+use super::npy::open_array;
+use super::{Format, Match};
+use crate::capture::about::{About, Certainty, Packing};
+use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
+use crate::capture::probe::Probe;
+use crate::frames::CountFrames;
+use qudi_core::Size;
+use qudi_core::{Result, SimError};
+use serde::Deserialize;
+use std::path::{Component, Path, PathBuf};
+
+pub(crate) const FORMAT: Format = Format {
+    name: "visionsim",
+    title: "visionsim dataset",
+    probe: |probe| {
+        let found = document(probe).is_file();
+        Ok(found.then(|| Match::new(Certainty::Certain, &["transforms.json"])))
+    },
+    open,
+};
+
+/// Lists of camera poses are long; longer ones are something else.
+const MAX_FILE: u64 = 1 << 28;
+
+#[derive(Deserialize)]
+struct Transforms {
+    w: Option<usize>,
+    h: Option<usize>,
+    c: Option<usize>,
+    fps: Option<f64>,
+    file_path: Option<String>,
+    #[serde(default)]
+    bitpack: Option<bool>,
+    bitpack_dim: Option<u32>,
+    #[serde(default)]
+    frames: Vec<Pose>,
+}
+
+#[derive(Deserialize)]
+struct Pose {
+    file_path: Option<String>,
+}
+
+fn document(probe: &Probe) -> PathBuf {
+    let itself = probe.path.file_name().is_some_and(|name| name == "transforms.json");
+    if itself { probe.path.clone() } else { probe.path.join("transforms.json") }
+}
+
+fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+    let path = document(probe);
+    let io = |e| SimError::io("read", &path, e);
+    let fault = |what: String| {
+        SimError::data(
+            what,
+            &path,
+            "write the data set again with visionsim, or name the .npy itself",
+        )
+    };
+    if std::fs::metadata(&path).map_err(io)?.len() > MAX_FILE {
+        return Err(fault("a transforms.json of more than 256 MiB".to_owned()));
+    }
+    let bytes = std::fs::read(&path).map_err(io)?;
+    let transforms: Transforms = serde_json::from_slice(&bytes)
+        .map_err(|e| fault(format!("not visionsim's transforms.json: {e}")))?;
+    let folder = path.parent().unwrap_or(Path::new("."));
+    about.fps = transforms.fps;
+    if transforms.c.is_some_and(|c| c > 1) && options.channel.is_none() {
+        return Err(SimError::data(
+            format!("a colour capture of {} channels", transforms.c.unwrap_or(0)),
+            &path,
+            "colour is not supported yet; read one channel of unpacked frames with --channel",
+        ));
+    }
+    if let Some(name) = &transforms.file_path {
+        let data =
+            inside(folder, name).ok_or_else(|| fault(format!("its data lie at `{name}`")))?;
+        return open_array(&data)?.open(options, &transforms.hints(&path)?, about);
+    }
+    let files: Option<Vec<PathBuf>> =
+        transforms.frames.iter().map(|pose| inside(folder, pose.file_path.as_deref()?)).collect();
+    let files = files.ok_or_else(|| fault("frames without file_path".to_owned()))?;
+    open_files(files, &path, false, options, about)
+}
+
+/// A path inside the data set.
+fn inside(folder: &Path, name: &str) -> Option<PathBuf> {
+    let ordinary = |part| matches!(part, Component::Normal(_) | Component::CurDir);
+    Path::new(name).components().all(ordinary).then(|| folder.join(name))
+}
+
+impl Transforms {
+    fn hints(&self, path: &Path) -> Result<Hints> {
+        let axis = match (self.bitpack, self.bitpack_dim) {
+            (Some(false), _) => PackAxis::None,
+            (None, None) => return Ok(Hints::default()),
+            (_, None | Some(2)) => PackAxis::Width,
+            (_, Some(1)) => PackAxis::Height,
+            (_, Some(dim)) => {
+                return Err(SimError::data(
+                    format!("bits packed along axis {dim}"),
+                    path,
+                    "frames are packed along axis 1 (height) or 2 (width)",
+                ));
+            }
+        };
+        let size = match (self.h, self.w) {
+            (Some(h), Some(w)) => Some(Size::new(h, w, &path.display().to_string())?),
+            _ => None,
+        };
+        let packed = axis != PackAxis::None;
+        let packing = packed.then_some(Packing { axis, order: BitOrder::Msb });
+        Ok(Hints { stored: Stored::from(packing), size })
+    }
+}

@@ -1,0 +1,11 @@
+//! Native frames of a capture: packed bits or samples, over files, streams and pipes.
+
+pub(crate) mod bit_sums;
+pub(crate) mod chain;
+mod count_frames;
+pub(crate) mod frame_bytes;
+pub(crate) mod memory;
+pub(crate) mod packed;
+pub(crate) mod samples;
+
+pub use count_frames::CountFrames;

@@ -1,0 +1,284 @@
+//! The stored bytes of frames: in files, in a compressed stream, or strewn across an array whose
+//! frame axis is not the slowest. Memory is bounded by a few frames.
+
+use crate::capture::pipe::Pipe;
+use qudi_core::{Result, SimError};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+/// Frames that lie one after the other in a file.
+#[derive(Clone, Debug)]
+pub(crate) struct Segment {
+    pub(crate) path: PathBuf,
+    /// Bytes before the first frame.
+    pub(crate) start: u64,
+    pub(crate) frames: u64,
+}
+
+/// Opens a stream at its beginning.
+pub(crate) type Opener = Box<dyn Fn() -> Result<Box<dyn Read + Send>> + Send>;
+
+/// Where the bytes of frames come from.
+pub(crate) enum FrameBytes {
+    /// Files read in place, not mapped: resident memory stays flat, and a file that shrinks
+    /// meanwhile is an error instead of a signal.
+    Files(Files),
+    /// A stream that can only go forward.
+    Stream(Stream),
+    /// Whatever is cheaper by the batch: compressed chunks, an array whose frame axis is not the
+    /// slowest.
+    Batched(Batched),
+    /// Frames that come once.
+    Pipe(Pipe),
+}
+
+impl FrameBytes {
+    pub(crate) fn files(segments: Vec<Segment>, frame_bytes: usize) -> Self {
+        Self::Files(Files::new(segments, frame_bytes))
+    }
+
+    /// Frames in an unnamed file.
+    pub(crate) fn spool(segment: Segment, file: File, frame_bytes: usize) -> Self {
+        Self::Files(Files { open: Some((0, file)), ..Files::new(vec![segment], frame_bytes) })
+    }
+
+    pub(crate) fn stream(opener: Opener, frames: u64, frame_bytes: usize, path: &Path) -> Self {
+        Self::Stream(Stream {
+            opener,
+            reader: None,
+            at: 0,
+            frames,
+            frame_bytes,
+            path: path.to_owned(),
+        })
+    }
+
+    /// Frames that `fetch` gives, in multiples of `group` frames where memory allows.
+    pub(crate) fn batched(fetch: Fetch, frames: u64, frame_bytes: usize, group: u64) -> Self {
+        let fit = (BATCH_BYTES / frame_bytes).max(1) as u64;
+        let at_once = if group <= fit { fit / group * group } else { fit };
+        Self::Batched(Batched {
+            fetch,
+            frames,
+            frame_bytes,
+            at_once,
+            range: 0..0,
+            batch: Vec::new(),
+        })
+    }
+
+    pub(crate) fn frames(&self) -> u64 {
+        match self {
+            Self::Files(files) => files.total,
+            Self::Stream(stream) => stream.frames,
+            Self::Batched(batched) => batched.frames,
+            Self::Pipe(pipe) => pipe.arrived(),
+        }
+    }
+
+    pub(crate) fn frame_bytes(&self) -> usize {
+        match self {
+            Self::Files(files) => files.frame_bytes,
+            Self::Stream(stream) => stream.frame_bytes,
+            Self::Batched(batched) => batched.frame_bytes,
+            Self::Pipe(pipe) => pipe.frame_bytes(),
+        }
+    }
+
+    pub(crate) fn forward_only(&self) -> bool {
+        matches!(self, Self::Stream(_) | Self::Pipe(_))
+    }
+
+    /// Frames in all, if that is known.
+    pub(crate) fn length(&self) -> Option<u64> {
+        match self {
+            Self::Pipe(pipe) => pipe.length(),
+            _ => Some(self.frames()),
+        }
+    }
+
+    /// Waits for `frames` frames; gives how many there are.
+    pub(crate) fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
+        match self {
+            Self::Pipe(pipe) => pipe.reach(frames, remarks),
+            _ => Ok(self.frames()),
+        }
+    }
+
+    /// No frame before `frame` is asked for again.
+    pub(crate) fn release(&mut self, frame: u64) {
+        if let Self::Pipe(pipe) = self {
+            pipe.release(frame);
+        }
+    }
+
+    /// Fills `bytes`, a whole number of frames, from frame `first` on.
+    pub(crate) fn read(&mut self, first: u64, bytes: &mut [u8]) -> Result<()> {
+        debug_assert_eq!(bytes.len() % self.frame_bytes(), 0);
+        debug_assert!(first + (bytes.len() / self.frame_bytes()) as u64 <= self.frames());
+        match self {
+            Self::Files(files) => files.read(first, bytes),
+            Self::Stream(stream) => stream.read(first, bytes),
+            Self::Batched(batched) => batched.read(first, bytes),
+            Self::Pipe(pipe) => pipe.read(first, bytes),
+        }
+    }
+}
+
+pub(crate) struct Files {
+    segments: Vec<Segment>,
+    firsts: Vec<u64>,
+    total: u64,
+    frame_bytes: usize,
+    open: Option<(usize, File)>,
+}
+
+impl Files {
+    fn new(segments: Vec<Segment>, frame_bytes: usize) -> Self {
+        let mut total = 0;
+        let firsts = segments
+            .iter()
+            .map(|segment| {
+                total += segment.frames;
+                total - segment.frames
+            })
+            .collect();
+        Self { segments, firsts, total, frame_bytes, open: None }
+    }
+
+    fn read(&mut self, mut first: u64, mut bytes: &mut [u8]) -> Result<()> {
+        while !bytes.is_empty() {
+            let at = self.firsts.partition_point(|&start| start <= first) - 1;
+            let Segment { path, start, frames } = &self.segments[at];
+            let within = first - self.firsts[at];
+            let wanted = (bytes.len() / self.frame_bytes) as u64;
+            let here = wanted.min(frames - within);
+            let (piece, rest) = bytes.split_at_mut(here as usize * self.frame_bytes);
+            if self.open.as_ref().is_none_or(|(open, _)| *open != at) {
+                let file = File::open(path).map_err(|e| SimError::io("open", path, e))?;
+                self.open = Some((at, file));
+            }
+            let (_, file) = self.open.as_mut().expect("opened above");
+            file.seek(SeekFrom::Start(start + within * self.frame_bytes as u64))
+                .and_then(|_| file.read_exact(piece))
+                .map_err(|e| SimError::io(format!("read frame {first} of"), path, e))?;
+            bytes = rest;
+            first += here;
+        }
+        Ok(())
+    }
+}
+
+pub(crate) struct Stream {
+    opener: Opener,
+    reader: Option<Box<dyn Read + Send>>,
+    at: u64,
+    frames: u64,
+    frame_bytes: usize,
+    path: PathBuf,
+}
+
+impl Stream {
+    fn read(&mut self, first: u64, bytes: &mut [u8]) -> Result<()> {
+        if self.reader.is_none() || first < self.at {
+            self.reader = Some((self.opener)()?);
+            self.at = 0;
+        }
+        let reader = self.reader.as_mut().expect("opened above");
+        let fault = |frame: u64, path: &Path, e: std::io::Error| match e.kind() {
+            std::io::ErrorKind::UnexpectedEof => SimError::data(
+                format!("the compressed data end before frame {frame} is complete"),
+                path,
+                "the file is truncated or damaged: copy or export it again",
+            ),
+            std::io::ErrorKind::InvalidInput | std::io::ErrorKind::InvalidData => SimError::data(
+                format!("the compressed data are damaged before frame {frame}: {e}"),
+                path,
+                "copy or export the file again",
+            ),
+            _ => SimError::io(format!("read frame {frame} of"), path, e),
+        };
+        let skip = (first - self.at) * self.frame_bytes as u64;
+        let skipped = std::io::copy(&mut reader.by_ref().take(skip), &mut std::io::sink());
+        match skipped {
+            Ok(n) if n == skip => {}
+            Ok(_) => {
+                return Err(fault(first, &self.path, std::io::ErrorKind::UnexpectedEof.into()));
+            }
+            Err(e) => return Err(fault(first, &self.path, e)),
+        }
+        self.at = first;
+        reader.read_exact(bytes).map_err(|e| fault(first, &self.path, e))?;
+        self.at += (bytes.len() / self.frame_bytes) as u64;
+        Ok(())
+    }
+}
+
+/// Fetches frames `first..first + count` whole.
+pub(crate) type Fetch = Box<dyn FnMut(u64, u64) -> Result<Vec<u8>> + Send>;
+
+/// Frames fetched and kept in batches, where one alone would cost as much as many.
+pub(crate) struct Batched {
+    fetch: Fetch,
+    frames: u64,
+    frame_bytes: usize,
+    at_once: u64,
+    range: Range<u64>,
+    batch: Vec<u8>,
+}
+
+/// Memory for one batch.
+const BATCH_BYTES: usize = 1 << 25;
+
+impl Batched {
+    fn read(&mut self, first: u64, bytes: &mut [u8]) -> Result<()> {
+        for (frame, out) in (first..).zip(bytes.chunks_exact_mut(self.frame_bytes)) {
+            if !self.range.contains(&frame) {
+                let start = frame - frame % self.at_once;
+                let count = self.at_once.min(self.frames - start);
+                self.range = 0..0;
+                self.batch = (self.fetch)(start, count)?;
+                self.range = start..start + count;
+            }
+            let at = (frame - self.range.start) as usize * self.frame_bytes;
+            out.copy_from_slice(&self.batch[at..at + self.frame_bytes]);
+        }
+        Ok(())
+    }
+}
+
+/// Fetches frames of an array with axes `outer x frames x inner`, elements of `element` bytes, that
+/// starts at byte `start` of a file.
+pub(crate) fn strewn(
+    path: &Path,
+    start: u64,
+    element: usize,
+    [outer, frames, inner]: [usize; 3],
+) -> FrameBytes {
+    let size = outer * inner * element;
+    let run = inner * element;
+    let (path, mut open) = (path.to_owned(), None);
+    let fetch = move |first: u64, count: u64| {
+        let io = |e| SimError::io("read", &path, e);
+        if open.is_none() {
+            open = Some(File::open(&path).map_err(io)?);
+        }
+        let file = open.as_mut().expect("opened above");
+        let mut batch = vec![0; count as usize * size];
+        let mut scratch = vec![0; count as usize * run];
+        for o in 0..outer {
+            let at = (o as u64 * frames as u64 + first) * run as u64;
+            file.seek(SeekFrom::Start(start + at))
+                .and_then(|_| file.read_exact(&mut scratch))
+                .map_err(io)?;
+            for (t, piece) in scratch.chunks_exact(run).enumerate() {
+                let to = t * size + o * run;
+                batch[to..to + run].copy_from_slice(piece);
+            }
+        }
+        Ok(batch)
+    };
+    FrameBytes::batched(Box::new(fetch), frames as u64, size, 1)
+}

@@ -1,0 +1,156 @@
+//! Frames with one sample per pixel.
+
+use super::count_frames::CountFrames;
+use super::frame_bytes::FrameBytes;
+use crate::capture::about::About;
+use crate::capture::levels::infer_levels;
+use qudi_core::Size;
+use qudi_core::npy::Sample;
+use qudi_core::{Result, SimError};
+use std::path::{Path, PathBuf};
+
+/// How stored values become counts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Scale {
+    /// They are counts.
+    Counts,
+    /// They are means of `levels` binary frames, `full` standing for all ones.
+    Means { levels: u16, full: f32 },
+}
+
+impl Scale {
+    /// What `--levels` asks for; `full` is the value that stands for all ones.
+    pub(crate) fn asked(levels: Option<u16>, full: f32, about: &mut About) -> Option<Self> {
+        let levels = levels?;
+        about.max_count = Some(levels);
+        about.binary = true;
+        Some(Self::Means { levels, full })
+    }
+
+    /// What some values (in any order) show.
+    pub(crate) fn seen(mut values: Vec<u16>, full: u16, about: &mut About) -> Self {
+        values.sort_unstable();
+        values.dedup();
+        let Some(levels) = infer_levels(&values, full) else { return Self::Counts };
+        about.max_count = Some(levels);
+        about.remarks.push(format!(
+            "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
+        ));
+        Self::Means { levels, full: f32::from(full) }
+    }
+
+    /// The count that a stored value stands for; `None` if there is none.
+    pub(crate) fn count(self, value: f32) -> Option<u16> {
+        let count = match self {
+            Self::Counts => value,
+            Self::Means { levels, full } => {
+                let exact = value * f32::from(levels) / full;
+                let count = exact.round_ties_even();
+                // Integer files round the mean, or cut it off.
+                let slack = if full > 1.0 { f32::from(levels) / full } else { 0.0 };
+                if (exact - count).abs() > slack + 1e-3 {
+                    return None;
+                }
+                count
+            }
+        };
+        let whole = count as u16;
+        (f32::from(whole) == count).then_some(whole)
+    }
+}
+
+/// Colour channels stored with each pixel, and the one that is read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Channel {
+    pub(crate) of: usize,
+    pub(crate) index: usize,
+}
+
+pub(crate) const MONO: Channel = Channel { of: 1, index: 0 };
+
+pub(crate) struct SampleFrames {
+    bytes: FrameBytes,
+    sample: Sample,
+    size: Size,
+    transposed: bool,
+    channel: Channel,
+    scale: Scale,
+    path: PathBuf,
+    buffer: Vec<u8>,
+}
+
+impl SampleFrames {
+    /// Frames of `[height][width][channels]` samples, or `[width][height]` if `transposed`.
+    pub(crate) fn new(
+        bytes: FrameBytes,
+        sample: Sample,
+        size: Size,
+        transposed: bool,
+        channel: Channel,
+        scale: Scale,
+        path: &Path,
+    ) -> Self {
+        debug_assert_eq!(bytes.frame_bytes(), size.pixels() * channel.of * sample.bytes());
+        let path = path.to_owned();
+        Self { bytes, sample, size, transposed, channel, scale, path, buffer: Vec::new() }
+    }
+}
+
+impl CountFrames for SampleFrames {
+    fn frames(&self) -> u64 {
+        self.bytes.frames()
+    }
+
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        self.buffer.resize(self.bytes.frame_bytes(), 0);
+        self.bytes.read(frame, &mut self.buffer)?;
+        let bytes = self.sample.bytes();
+        let pixel = bytes * self.channel.of;
+        let stored =
+            self.buffer.chunks_exact(pixel).map(|p| &p[self.channel.index * bytes..][..bytes]);
+        let Size { height, width } = self.size;
+        let place = |i: usize| if self.transposed { i % height * width + i / height } else { i };
+        if self.scale == Scale::Counts && matches!(self.sample, Sample::U8 | Sample::Bool) {
+            for (i, value) in stored.enumerate() {
+                counts[place(i)] =
+                    u16::from(if self.sample == Sample::Bool { value[0].min(1) } else { value[0] });
+            }
+            return Ok(());
+        }
+        for (i, value) in stored.enumerate() {
+            let value = self.sample.decode(value);
+            counts[place(i)] =
+                self.scale.count(value).ok_or_else(|| no_count(value, frame, &self.path))?;
+        }
+        Ok(())
+    }
+
+    fn forward_only(&self) -> bool {
+        self.bytes.forward_only()
+    }
+
+    fn length(&self) -> Option<u64> {
+        self.bytes.length()
+    }
+
+    fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
+        self.bytes.reach(frames, remarks)
+    }
+
+    fn release(&mut self, frame: u64) {
+        self.bytes.release(frame);
+    }
+}
+
+/// A value that no photon counter gives.
+pub(crate) fn no_count(value: f32, frame: u64, path: &Path) -> SimError {
+    SimError::data(
+        format!("frame {frame} holds {value}, and photon counts are whole numbers from 0 to 65535"),
+        path,
+        "means of N binary frames are read with --levels N; an image without photon counts is not a capture",
+    )
+}

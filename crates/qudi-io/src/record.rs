@@ -1,0 +1,205 @@
+//! The record beside every burst: what is needed to read it, and to make it again.
+
+use crate::burst::BurstFormat;
+use crate::capture::ReadOptions;
+use qudi_core::Light;
+use qudi_core::Size;
+use qudi_core::sensor::Sensor;
+use qudi_core::{Result, SimError};
+use qudi_sim::Simulation;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Version of this layout.
+pub const VERSION: u32 = 1;
+
+/// Records are a few pages of JSON; anything much larger is something else.
+const MAX_FILE: u64 = 1 << 24;
+
+/// Where the record of the file at `path` lies: `NAME.npy.json` beside `NAME.npy`.
+pub fn beside(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".json");
+    name.into()
+}
+
+/// The record of a simulated burst, `NAME.npy.json`.
+#[derive(Debug, Serialize, Deserialize)]
+pub struct Record {
+    /// Layout of this document.
+    pub version: u32,
+    /// Program that wrote it.
+    pub program: String,
+    /// How the burst lies on disk.
+    pub burst: BurstLayout,
+    /// The light that was found for the request.
+    pub light: Light,
+    /// Gain in DN/e-.
+    pub gain: f64,
+    /// Statistics of the clip: another value means that the input has changed.
+    pub clip: ClipDigest,
+    /// Everything asked for.
+    pub simulation: Simulation,
+}
+
+/// How a burst lies on disk.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct BurstLayout {
+    /// File format.
+    pub format: BurstFormat,
+    /// Output frames.
+    pub frames: u64,
+    /// Frame size.
+    #[serde(flatten)]
+    pub size: Size,
+    /// Largest possible count.
+    pub max_count: u16,
+    /// Bits that a count needs.
+    pub bits: u8,
+    /// Output frames per second, if the sensor's rate is known.
+    pub fps: Option<f64>,
+    /// Whether 8 pixels share a byte.
+    pub bitpack: bool,
+    /// The packed axis of `[frames][height][width]`.
+    pub bitpack_dim: Option<u32>,
+    /// `msb`: the first pixel is the highest bit.
+    pub bitorder: Option<String>,
+}
+
+impl BurstLayout {
+    /// The layout of a burst of `sensor`.
+    pub fn new(format: BurstFormat, frames: u64, size: Size, sensor: &Sensor) -> Self {
+        let fps = sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed));
+        Self::of_counts(format, frames, size, sensor.max_count(), fps)
+    }
+
+    /// The layout of a burst of counts up to `max_count`.
+    pub fn of_counts(
+        format: BurstFormat,
+        frames: u64,
+        size: Size,
+        max_count: u16,
+        fps: Option<f64>,
+    ) -> Self {
+        let packed = format == BurstFormat::NpyPacked;
+        Self {
+            format,
+            frames,
+            size,
+            max_count,
+            bits: (16 - max_count.leading_zeros()) as u8,
+            fps,
+            bitpack: packed,
+            bitpack_dim: packed.then_some(2),
+            bitorder: packed.then(|| "msb".to_owned()),
+        }
+    }
+}
+
+/// Identifies the scene that was exposed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ClipDigest {
+    /// Mean image value.
+    pub mean: f64,
+    /// CRC-32 of all image values.
+    pub crc32: u32,
+}
+
+/// The record of a converted capture.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Conversion {
+    /// Layout of this document.
+    pub version: u32,
+    /// Program that wrote it.
+    pub program: String,
+    /// How the burst lies on disk.
+    pub burst: BurstLayout,
+    /// Whether counts are sums of `max_count` binary frames.
+    pub binary: bool,
+    /// The camera preset that the capture's format belongs to.
+    pub preset: Option<String>,
+    /// The capture.
+    pub capture: PathBuf,
+    /// Its format.
+    pub format: String,
+    /// How it was read.
+    pub read: ReadOptions,
+}
+
+/// A record of either kind.
+#[derive(Debug)]
+pub enum Described {
+    /// Written by `qudi simulate`.
+    Simulated(Box<Record>),
+    /// Written by `qudi convert`.
+    Converted(Box<Conversion>),
+}
+
+impl Described {
+    /// Reads a record of either kind.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read or is no record.
+    pub fn load(path: &Path) -> Result<Self> {
+        let document: serde_json::Value = parse(&read_file(path)?, path)?;
+        if document.get("capture").is_none() {
+            return Ok(Self::Simulated(Box::new(Record::load(path)?)));
+        }
+        let conversion: Conversion = serde_json::from_value(document).map_err(|e| {
+            SimError::data(
+                format!("not the record of a converted capture: {e}"),
+                path,
+                "convert the capture again",
+            )
+        })?;
+        check_version(conversion.version, path)?;
+        Ok(Self::Converted(Box::new(conversion)))
+    }
+}
+
+impl Record {
+    /// Reads a record.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read, is no record, or describes an impossible sensor.
+    pub fn load(path: &Path) -> Result<Self> {
+        let record: Self = parse(&read_file(path)?, path)?;
+        check_version(record.version, path)?;
+        record.simulation.sensor.validate()?;
+        Ok(record)
+    }
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>> {
+    let read = |e| SimError::io("read the record", path, e);
+    let length = std::fs::metadata(path).map_err(read)?.len();
+    if length > MAX_FILE {
+        return Err(SimError::data(
+            format!("a record of {length} bytes"),
+            path,
+            "name the .json beside a burst",
+        ));
+    }
+    std::fs::read(path).map_err(read)
+}
+
+fn parse<T: serde::de::DeserializeOwned>(bytes: &[u8], path: &Path) -> Result<T> {
+    serde_json::from_slice(bytes).map_err(|e| {
+        SimError::data(
+            format!("not the record of a burst: {e}"),
+            path,
+            "name the .json that `qudi simulate` wrote beside a burst",
+        )
+    })
+}
+
+fn check_version(version: u32, path: &Path) -> Result<()> {
+    if version == VERSION {
+        return Ok(());
+    }
+    Err(SimError::data(
+        format!("a record of version {version}, this program reads {VERSION}"),
+        path,
+        "use the version of qudi that wrote it",
+    ))
+}

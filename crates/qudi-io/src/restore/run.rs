@@ -1,0 +1,98 @@
+//! Runs a method over a capture of any length: windows, cross-fade, frames out in order.
+
+use crate::capture::Capture;
+use qudi_core::Frame;
+use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::windows::{CrossFade, Windows};
+use qudi_core::{Result, SimError};
+use std::collections::VecDeque;
+use std::ops::{ControlFlow, Range};
+
+/// What becomes of restored frames.
+pub trait RestoreSink {
+    /// Takes frame `number`, restored, with its counts. Frames come in order.
+    ///
+    /// # Errors
+    /// The sink's own; the run ends with it.
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()>;
+
+    /// Takes the deviation of frame `number` over a method's samples, right after the frame. Methods that draw none
+    /// have none.
+    ///
+    /// # Errors
+    /// The sink's own; the run ends with it.
+    fn deviation(&mut self, number: u64, deviation: &Frame) -> Result<()> {
+        let _ = (number, deviation);
+        Ok(())
+    }
+}
+
+/// Restores the frames `wanted` of `capture` and hands them to `sink`. A window is computed if it
+/// holds a wanted frame; what a frame looks like does not depend on which others are wanted, nor on
+/// whether it came from a file or a pipe. Memory holds two windows at most.
+///
+/// # Errors
+/// [`SimError`] if the capture cannot be read or the method or the sink fails;
+/// [`SimError::Interrupted`] if `on`, told how many wanted frames are done of how many (if that is
+/// known), says so.
+pub fn run(
+    restorer: &mut dyn Restorer,
+    capture: &mut Capture,
+    windows: &Windows,
+    wanted: Range<u64>,
+    context: &Context,
+    sink: &mut dyn RestoreSink,
+    on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
+) -> Result<()> {
+    let size = capture.size();
+    let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
+    let mut first_held = 0;
+    let mut fade = CrossFade::default();
+    let mut deviations = CrossFade::default();
+    for number in windows.first_with(wanted.start).. {
+        // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
+        // the next one is whole, or no more frames come.
+        let windows = windows.over(capture.reach(windows.nominal_end(number + 1))?);
+        if number >= windows.count() || windows.range(number).start >= wanted.end {
+            break;
+        }
+        let range = windows.range(number);
+        let total = capture.length().map(|length| wanted.end.min(length) - wanted.start);
+        if on(range.start.saturating_sub(wanted.start), total).is_break() {
+            return Err(SimError::Interrupted);
+        }
+        if counts.is_empty() {
+            first_held = range.start;
+        }
+        while first_held < range.start {
+            counts.pop_front();
+            first_held += 1;
+        }
+        while first_held + (counts.len() as u64) < range.end {
+            let mut frame = vec![0; size.pixels()];
+            capture.read(first_held + counts.len() as u64, &mut frame)?;
+            counts.push_back(frame);
+        }
+        capture.release(range.end);
+        let context = Context { first_frame: range.start, ..context.clone() };
+        let burst = BurstView { size, frames: counts.make_contiguous() };
+        let restored = restorer.restore(burst, &context)?;
+        fade.push(range.start, restored.frames);
+        if let Some(deviation) = restored.std {
+            deviations.push(range.start, deviation);
+        }
+        let last = number + 1 == windows.count();
+        let until = if last { range.end } else { windows.range(number + 1).start };
+        while let Some((frame, image)) = fade.pop(until) {
+            if wanted.contains(&frame) {
+                sink.frame(frame, &image, &counts[(frame - first_held) as usize])?;
+            }
+            if let Some((frame, deviation)) = deviations.pop(until)
+                && wanted.contains(&frame)
+            {
+                sink.deviation(frame, &deviation)?;
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,134 @@
+//! Frames in [0, 1] on disk: `.npy` of float32, 16-bit or float TIFF, GIF, MP4, or a folder of 16-bit PNG.
+
+use super::array::ArrayWriter;
+use super::gif_preview::GifPreview;
+use super::mp4::Mp4;
+use super::tiff_stack::{TiffSamples, TiffStack};
+use image::{ImageBuffer, Luma};
+use qudi_core::atomic_file::{Overwrite, PendingFolder};
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
+use std::path::Path;
+
+/// The first file of a folder; it also marks the folder as ours.
+const FIRST: &str = "frame_000000.png";
+
+/// A clip of images as a TIFF stack.
+pub struct TiffWriter {
+    stack: TiffStack,
+    samples: TiffSamples,
+}
+
+impl std::fmt::Debug for TiffWriter {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("TiffWriter").field("samples", &self.samples).finish_non_exhaustive()
+    }
+}
+
+/// A clip being written, frame by frame.
+#[derive(Debug)]
+pub enum FramesWriter {
+    /// `.npy`, `[frames][height][width]` float32.
+    Array(ArrayWriter),
+    /// Multi-page TIFF.
+    Tiff(TiffWriter),
+    /// Animated GIF, the first frames of a long clip.
+    Gif(GifPreview),
+    /// MP4, for looking at.
+    Mp4(Mp4),
+    /// Folder of 16-bit PNG; 65535 is 1.
+    Folder {
+        /// The folder.
+        folder: PendingFolder,
+        /// Frames so far.
+        frames: usize,
+    },
+}
+
+impl FramesWriter {
+    /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
+    /// extension. `tiff` says what the samples of a `.tif` are.
+    ///
+    /// # Errors
+    /// [`SimError`] for other extensions, or if the name is taken or the folder cannot be written.
+    pub fn create(
+        path: &Path,
+        size: Size,
+        tiff: TiffSamples,
+        overwrite: Overwrite,
+    ) -> Result<Self> {
+        match path.extension().map(|e| e.to_string_lossy().to_lowercase()).as_deref() {
+            Some("npy") => ArrayWriter::create(path, overwrite, "<f4", &[size.height, size.width])
+                .map(Self::Array),
+            Some("tif" | "tiff") => {
+                let stack = TiffStack::create(path, size, overwrite)?;
+                Ok(Self::Tiff(TiffWriter { stack, samples: tiff }))
+            }
+            Some("gif") => GifPreview::create(path, overwrite, size, u16::MAX).map(Self::Gif),
+            Some("mp4") => Mp4::create(path, size, overwrite).map(Self::Mp4),
+            None => {
+                let folder = PendingFolder::create(path, overwrite, FIRST)?;
+                Ok(Self::Folder { folder, frames: 0 })
+            }
+            Some(other) => Err(SimError::data(
+                format!("frames are not written as .{other}"),
+                path,
+                "use .npy, .tif, .gif, .mp4, or a name without extension for a folder of 16-bit PNG",
+            )),
+        }
+    }
+
+    /// Adds one frame.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full.
+    pub fn push(&mut self, frame: &Frame) -> Result<()> {
+        match self {
+            Self::Array(array) => array.push_f32(frame.data.iter().copied()),
+            Self::Tiff(TiffWriter { stack, samples: TiffSamples::U16 }) => {
+                stack.push_u16(&sixteen_bits(frame))
+            }
+            Self::Tiff(TiffWriter { stack, samples: TiffSamples::F32 }) => {
+                stack.push_f32(&frame.data)
+            }
+            Self::Gif(gif) => gif.push(&sixteen_bits(frame)),
+            Self::Mp4(film) => film.push(frame),
+            Self::Folder { folder, frames } => {
+                let file = folder.file(&format!("frame_{frames:06}.png"));
+                *frames += 1;
+                save_png16(frame, &file)
+                    .map_err(|e| SimError::io("write a frame into", folder.path(), e))
+            }
+        }
+    }
+
+    /// Gives the clip its name.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full.
+    pub fn finish(self) -> Result<()> {
+        match self {
+            Self::Array(array) => array.finish(),
+            Self::Tiff(writer) => writer.stack.finish(),
+            Self::Gif(gif) => gif.finish(),
+            Self::Mp4(film) => film.finish(),
+            Self::Folder { folder, .. } => folder.finish(),
+        }
+    }
+}
+
+/// Writes a frame as 16-bit gray PNG; 65535 is 1.
+pub(crate) fn save_png16(frame: &Frame, path: &Path) -> std::io::Result<()> {
+    let samples = sixteen_bits(frame);
+    let image = ImageBuffer::<Luma<u16>, _>::from_raw(
+        frame.size.width as u32,
+        frame.size.height as u32,
+        samples,
+    );
+    let image = image.expect("a frame holds all its pixels");
+    image.save_with_format(path, image::ImageFormat::Png).map_err(std::io::Error::other)
+}
+
+fn sixteen_bits(frame: &Frame) -> Vec<u16> {
+    frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 65535.0).round() as u16).collect()
+}

@@ -1,0 +1,88 @@
+//! A gray animated GIF of what was recorded, for a quick look.
+
+use qudi_core::Size;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::{Result, SimError};
+use std::path::Path;
+
+/// A growing GIF.
+pub struct GifPreview {
+    encoder: gif::Encoder<PendingFile>,
+    size: (u16, u16),
+    full_scale: f32,
+    frames: usize,
+}
+
+impl std::fmt::Debug for GifPreview {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("GifPreview").field("frames", &self.frames).finish_non_exhaustive()
+    }
+}
+
+/// Hundredths of a second per frame: 20 frames per second.
+const DELAY: u16 = 5;
+
+/// Longer previews would be larger than the data.
+const MAX_FRAMES: usize = 200;
+
+impl GifPreview {
+    /// Starts a preview of frames whose brightest value is `full_scale`.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken, the folder cannot be written, or frames are too large.
+    pub fn create(path: &Path, overwrite: Overwrite, size: Size, full_scale: u16) -> Result<Self> {
+        let (Ok(width), Ok(height)) = (u16::try_from(size.width), u16::try_from(size.height))
+        else {
+            return Err(SimError::data(
+                format!("frames of {size} do not fit into a GIF"),
+                path,
+                "GIF ends at 65535 pixels: leave out --preview",
+            ));
+        };
+        let file = PendingFile::create(path, overwrite)?;
+        let palette: Vec<u8> = (0..=255u8).flat_map(|v| [v, v, v]).collect();
+        let mut encoder =
+            gif::Encoder::new(file, width, height, &palette).map_err(|e| fault(path, e))?;
+        encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| fault(path, e))?;
+        Ok(Self { encoder, size: (width, height), full_scale: f32::from(full_scale), frames: 0 })
+    }
+
+    /// Adds a frame of counts; those after the 200th are left out.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full.
+    pub fn push(&mut self, counts: &[u16]) -> Result<()> {
+        if self.frames == MAX_FRAMES {
+            return Ok(());
+        }
+        self.frames += 1;
+        let gray = |&c: &u16| (f32::from(c) / self.full_scale * 255.0).round() as u8;
+        let mut frame = gif::Frame {
+            width: self.size.0,
+            height: self.size.1,
+            delay: DELAY,
+            buffer: counts.iter().map(gray).collect(),
+            ..gif::Frame::default()
+        };
+        frame.make_lzw_pre_encoded();
+        let path = self.encoder.get_ref().path().to_owned();
+        self.encoder.write_lzw_pre_encoded_frame(&frame).map_err(|e| fault(&path, e))
+    }
+
+    /// Gives the file its name.
+    ///
+    /// # Errors
+    /// [`SimError::Io`] if the disk is full.
+    pub fn finish(self) -> Result<()> {
+        let path = self.encoder.get_ref().path().to_owned();
+        let file = self.encoder.into_inner().map_err(|e| fault(&path, e))?;
+        file.finish()
+    }
+}
+
+fn fault(path: &Path, e: gif::EncodingError) -> SimError {
+    match e {
+        gif::EncodingError::Io(e) => SimError::io("write", path, e),
+        other => SimError::io("write", path, std::io::Error::other(other)),
+    }
+}

@@ -1,0 +1,119 @@
+//! MP4 through the `ffmpeg` program on PATH, for looking at: 8 bits, compressed.
+
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use tempfile::NamedTempFile;
+
+/// Frames per second of the film, whatever the camera's rate was.
+const FPS: &str = "25";
+
+/// A film being written.
+#[derive(Debug)]
+pub struct Mp4 {
+    child: Child,
+    /// What ffmpeg says; a file, since a full pipe would stop it.
+    words: File,
+    unfinished: NamedTempFile,
+    path: PathBuf,
+    overwrite: Overwrite,
+}
+
+impl Mp4 {
+    /// Starts a film of frames of `size`.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken or there is no ffmpeg.
+    pub fn create(path: &Path, size: Size, overwrite: Overwrite) -> Result<Self> {
+        refuse_taken(path, overwrite)?;
+        let io = |e| SimError::io("create the output", path, e);
+        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(".qudi-").suffix(".mp4");
+        #[cfg(unix)]
+        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        let unfinished = builder.tempfile_in(folder).map_err(io)?;
+        let words = tempfile::tempfile().map_err(io)?;
+        // `file:` keeps ffmpeg from taking the name for a URL or an option.
+        let mut url = std::ffi::OsString::from("file:");
+        url.push(unfinished.path());
+        let shape = format!("{}x{}", size.width, size.height);
+        let spawned = Command::new("ffmpeg")
+            .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "gray"])
+            .args(["-s", shape.as_str(), "-r", FPS, "-i", "-"])
+            // Players want even sides and half-resolution colour.
+            .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16"])
+            .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"])
+            .arg(url)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(words.try_clone().map_err(io)?)
+            .spawn();
+        let child = spawned.map_err(|e| match e.kind() {
+            std::io::ErrorKind::NotFound => SimError::data(
+                "films are made by ffmpeg, and there is no `ffmpeg` on PATH",
+                path,
+                "install ffmpeg (https://ffmpeg.org), or write .gif, .npy or a folder",
+            ),
+            _ => SimError::io("start ffmpeg for", path, e),
+        })?;
+        Ok(Self { child, words, unfinished, path: path.to_owned(), overwrite })
+    }
+
+    /// Adds a frame.
+    ///
+    /// # Errors
+    /// [`SimError`] with ffmpeg's words if it has given up.
+    pub fn push(&mut self, frame: &Frame) -> Result<()> {
+        let bytes: Vec<u8> =
+            frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        let Some(stdin) = &mut self.child.stdin else { return Err(self.failed()) };
+        match stdin.write_all(&bytes) {
+            Ok(()) => Ok(()),
+            Err(_) => Err(self.failed()),
+        }
+    }
+
+    /// Waits for ffmpeg and gives the film its name.
+    ///
+    /// # Errors
+    /// [`SimError`] if ffmpeg failed or the disk is full.
+    pub fn finish(mut self) -> Result<()> {
+        drop(self.child.stdin.take());
+        let status =
+            self.child.wait().map_err(|e| SimError::io("wait for ffmpeg at", &self.path, e))?;
+        if !status.success() {
+            return Err(self.failed());
+        }
+        // Whoever took the name since the start keeps it.
+        refuse_taken(&self.path, self.overwrite)?;
+        std::fs::rename(self.unfinished.path(), &self.path)
+            .map_err(|e| SimError::io("write", &self.path, e))
+    }
+
+    fn failed(&mut self) -> SimError {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        let mut text = Vec::new();
+        let _ = self.words.seek(SeekFrom::Start(0));
+        let _ = (&mut self.words).take(4096).read_to_end(&mut text);
+        let text = String::from_utf8_lossy(&text);
+        let reason = text.lines().next().unwrap_or("it gave no reason").trim().to_owned();
+        SimError::data(
+            format!("ffmpeg cannot write the film: {reason}"),
+            &self.path,
+            "an ffmpeg with libx264 is needed; or write .gif, .npy or a folder",
+        )
+    }
+}
+
+impl Drop for Mp4 {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

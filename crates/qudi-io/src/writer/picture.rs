@@ -1,0 +1,66 @@
+//! Frames side by side in one labelled picture.
+
+use image::{ExtendedColorType, ImageEncoder};
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
+use qudi_sim::scene::{GLYPH_HEIGHT, draw_text};
+use std::path::Path;
+
+const MARGIN: usize = 8;
+const LABEL_SCALE: usize = 2;
+const LABEL_HEIGHT: usize = GLYPH_HEIGHT * LABEL_SCALE + 6;
+
+/// A grid of equally large frames with one or two lines of text above each.
+#[derive(Debug)]
+pub struct Picture {
+    canvas: Frame,
+    cell: Size,
+    lines: usize,
+}
+
+impl Picture {
+    /// An empty grid.
+    pub fn new(cell: Size, rows: usize, columns: usize, lines: usize) -> Self {
+        let size = Size {
+            height: MARGIN + rows * (cell.height + lines * LABEL_HEIGHT + MARGIN),
+            width: MARGIN + columns * (cell.width + MARGIN),
+        };
+        Self { canvas: Frame::filled(size, 0.13), cell, lines }
+    }
+
+    /// One frame alone, without margin or labels.
+    pub fn single(frame: &Frame) -> Self {
+        Self { canvas: frame.clone(), cell: frame.size, lines: 0 }
+    }
+
+    /// Puts a frame with its labels into a cell.
+    pub fn place(&mut self, row: usize, column: usize, labels: &[&str], frame: &Frame) {
+        let x = MARGIN + column * (self.cell.width + MARGIN);
+        let y = MARGIN + row * (self.cell.height + self.lines * LABEL_HEIGHT + MARGIN);
+        for (n, label) in labels.iter().take(self.lines).enumerate() {
+            draw_text(&mut self.canvas, (x, y + n * LABEL_HEIGHT), LABEL_SCALE, 0.92, label);
+        }
+        let top = y + self.lines * LABEL_HEIGHT;
+        for row in 0..self.cell.height.min(frame.size.height) {
+            let width = self.cell.width.min(frame.size.width);
+            let start = (top + row) * self.canvas.size.width + x;
+            self.canvas.data[start..start + width].copy_from_slice(&frame.row(row)[..width]);
+        }
+    }
+
+    /// Writes it as an 8-bit gray PNG.
+    ///
+    /// # Errors
+    /// [`SimError`] if the name is taken or the folder cannot be written.
+    pub fn save(&self, path: &Path, overwrite: Overwrite) -> Result<()> {
+        let mut file = PendingFile::create(path, overwrite)?;
+        let bytes: Vec<u8> =
+            self.canvas.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        let Size { height, width } = self.canvas.size;
+        image::codecs::png::PngEncoder::new(&mut file)
+            .write_image(&bytes, width as u32, height as u32, ExtendedColorType::L8)
+            .map_err(|e| SimError::io("write", path, std::io::Error::other(e)))?;
+        file.finish()
+    }
+}

@@ -1,0 +1,104 @@
+//! A multi-page gray TIFF, as ImageJ opens it: counts of 8 or 16 bits, or images of 16 bits or
+//! float.
+
+use qudi_core::Size;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::{Result, SimError};
+use std::cell::RefCell;
+use std::io::{Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use tiff::encoder::colortype::{self, ColorType};
+use tiff::encoder::{TiffEncoder, TiffValue};
+
+/// Classic TIFF ends at 4 GiB; larger stacks need BigTIFF.
+const CLASSIC_LIMIT: u64 = 4_000_000_000;
+
+/// Bytes of a page beside its samples, at most.
+const DIRECTORY: usize = 512;
+
+/// The encoder keeps its file for good; sharing it gives it back.
+struct Shared(Rc<RefCell<PendingFile>>);
+
+impl Write for Shared {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.borrow_mut().write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.0.borrow_mut().flush()
+    }
+}
+
+impl Seek for Shared {
+    fn seek(&mut self, position: SeekFrom) -> std::io::Result<u64> {
+        self.0.borrow_mut().seek(position)
+    }
+}
+
+/// Samples of a stack of images.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TiffSamples {
+    /// 16 bit; 65535 is 1, and what lies outside 0 to 1 is clipped.
+    U16,
+    /// 32-bit float, values as they are.
+    F32,
+}
+
+/// A growing stack. Every page goes in with the samples that it is given in.
+pub(crate) struct TiffStack {
+    encoder: TiffEncoder<Shared>,
+    file: Rc<RefCell<PendingFile>>,
+    path: PathBuf,
+    size: Size,
+    bytes: u64,
+}
+
+impl TiffStack {
+    pub(crate) fn create(path: &Path, size: Size, overwrite: Overwrite) -> Result<Self> {
+        let file = Rc::new(RefCell::new(PendingFile::create(path, overwrite)?));
+        let encoder = TiffEncoder::new(Shared(Rc::clone(&file))).map_err(|e| fault(path, e))?;
+        Ok(Self { encoder, file, path: path.to_owned(), size, bytes: 0 })
+    }
+
+    pub(crate) fn push_u8(&mut self, samples: &[u8]) -> Result<()> {
+        self.push::<colortype::Gray8>(samples)
+    }
+
+    pub(crate) fn push_u16(&mut self, samples: &[u16]) -> Result<()> {
+        self.push::<colortype::Gray16>(samples)
+    }
+
+    pub(crate) fn push_f32(&mut self, samples: &[f32]) -> Result<()> {
+        self.push::<colortype::Gray32Float>(samples)
+    }
+
+    fn push<C: ColorType>(&mut self, samples: &[C::Inner]) -> Result<()>
+    where
+        [C::Inner]: TiffValue,
+    {
+        self.bytes += (size_of_val(samples) + DIRECTORY) as u64;
+        if self.bytes > CLASSIC_LIMIT {
+            return Err(SimError::data(
+                "the stack outgrows the 4 GiB of a TIFF file",
+                &self.path,
+                "write it as .npy, or fewer frames at a time",
+            ));
+        }
+        let (width, height) = (self.size.width as u32, self.size.height as u32);
+        self.encoder.write_image::<C>(width, height, samples).map_err(|e| fault(&self.path, e))
+    }
+
+    pub(crate) fn finish(self) -> Result<()> {
+        drop(self.encoder);
+        let file = Rc::into_inner(self.file).expect("the encoder held the only other share");
+        file.into_inner().finish()
+    }
+}
+
+fn fault(path: &Path, e: tiff::TiffError) -> SimError {
+    match e {
+        tiff::TiffError::IoError(e) => SimError::io("write", path, e),
+        other => SimError::io("write", path, std::io::Error::other(other)),
+    }
+}

@@ -1,0 +1,75 @@
+//! Where scenes come from: files of all kinds, pipes, stills in motion, procedural scenes.
+//!
+//! An [`Input`] says what to read and can be opened as often as needed; an [`ExposureSource`]
+//! yields, for each output frame, the instants that one exposure sees.
+
+mod gif;
+mod image_file;
+mod image_folder;
+mod input;
+mod npy;
+mod ppm;
+mod recorded;
+mod synthetic;
+mod video;
+mod y4m;
+
+pub use image_file::{decode_image, is_image, read_still};
+pub use input::{Input, Sampling};
+pub use video::Video;
+
+use qudi_core::Result;
+use qudi_core::flow::Flow;
+use qudi_core::{Frame, Size};
+
+/// What is known of a clip before it is read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ClipInfo {
+    /// Frame size.
+    pub size: Size,
+    /// Number of exposures, if known.
+    pub frames: Option<u64>,
+}
+
+/// What a pixel sees during one output frame.
+#[derive(Clone, Debug)]
+pub struct Exposure {
+    /// The scene at evenly spaced instants of the exposure.
+    pub instants: Vec<Frame>,
+    /// The scene in the middle of the exposure, where it is none of the instants.
+    middle: Option<Frame>,
+}
+
+impl Exposure {
+    /// The sharp scene in the middle of the exposure: what a restoration should show.
+    pub fn truth(&self) -> &Frame {
+        self.middle.as_ref().unwrap_or(&self.instants[self.instants.len() / 2])
+    }
+}
+
+/// A clip, exposure by exposure.
+pub trait ExposureSource {
+    /// What is known of it.
+    fn info(&self) -> ClipInfo;
+
+    /// The next exposure; none at the end.
+    fn next(&mut self) -> Result<Option<Exposure>>;
+
+    /// True flow from exposure `index` to the next, where the scene is synthetic.
+    fn flow(&self, index: u64) -> Option<Flow>;
+}
+
+/// Single frames of a recorded clip, one after another.
+pub trait FrameReader {
+    /// The size of every frame.
+    fn size(&self) -> Size;
+
+    /// Frames in all, if known.
+    fn len(&self) -> Option<u64>;
+
+    /// The next frame; none at the end.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_core::SimError) if it cannot be read.
+    fn next(&mut self) -> Result<Option<Frame>>;
+}

@@ -1,0 +1,94 @@
+//! PNG, JPEG and TIFF images as gray frames.
+
+use image::{DynamicImage, ImageError, ImageReader};
+use qudi_core::Transfer;
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
+use std::path::Path;
+
+/// Extensions of image files.
+pub(super) const EXTENSIONS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
+
+/// Whether a file's name is that of an image.
+pub fn is_image(path: &Path) -> bool {
+    let known = |e: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known));
+    path.extension().is_some_and(known) && path.is_file()
+}
+
+/// Reads one image as gray values in [0, 1]; an alpha channel is ignored.
+///
+/// # Errors
+/// [`SimError`] if it cannot be read, is damaged, or is too large.
+pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
+    to_gray(decode_image(path)?, path, transfer)
+}
+
+/// Decodes one image as it is stored.
+///
+/// # Errors
+/// [`SimError`] if it cannot be read, is damaged, or is too large.
+pub fn decode_image(path: &Path) -> Result<DynamicImage> {
+    let open = |e| SimError::io("open the image", path, e);
+    let decoded =
+        ImageReader::open(path).map_err(open)?.with_guessed_format().map_err(open)?.decode();
+    decoded.map_err(|e| match e {
+        ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
+            SimError::io("read the image", path, e)
+        }
+        other => SimError::data(
+            format!("not a readable image: {other}"),
+            path,
+            "open it in a viewer to see whether it is damaged, and save it again as PNG",
+        ),
+    })
+}
+
+fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame> {
+    let size =
+        Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
+    let gray = |samples: Vec<f32>, channels: usize, alpha: bool| -> Vec<f32> {
+        let colours = channels - usize::from(alpha);
+        samples
+            .chunks_exact(channels)
+            .map(|p| {
+                if colours == 1 { transfer.decode(p[0]) } else { transfer.gray([p[0], p[1], p[2]]) }
+            })
+            .collect()
+    };
+    let from_u8 = |raw: Vec<u8>| raw.into_iter().map(|v| f32::from(v) / 255.0).collect();
+    let from_u16 = |raw: Vec<u16>| raw.into_iter().map(|v| f32::from(v) / 65535.0).collect();
+    let channels = usize::from(image.color().channel_count());
+    let alpha = image.color().has_alpha();
+    let samples: Vec<f32> = match image {
+        DynamicImage::ImageLuma8(_)
+        | DynamicImage::ImageLumaA8(_)
+        | DynamicImage::ImageRgb8(_)
+        | DynamicImage::ImageRgba8(_) => from_u8(image.into_bytes()),
+        DynamicImage::ImageLuma16(i) => from_u16(i.into_raw()),
+        DynamicImage::ImageLumaA16(i) => from_u16(i.into_raw()),
+        DynamicImage::ImageRgb16(i) => from_u16(i.into_raw()),
+        DynamicImage::ImageRgba16(i) => from_u16(i.into_raw()),
+        DynamicImage::ImageRgb32F(i) => i.into_raw(),
+        DynamicImage::ImageRgba32F(i) => i.into_raw(),
+        other => {
+            return Err(SimError::data(
+                format!("an image of unsupported type {:?}", other.color()),
+                path,
+                "save it as 8- or 16-bit gray or RGB",
+            ));
+        }
+    };
+    let data = gray(samples, channels, alpha);
+    check_values(&data, path)?;
+    Ok(Frame { size, data })
+}
+
+/// Floating-point files may hold anything; scenes hold values in [0, 1].
+pub(super) fn check_values(data: &[f32], path: &Path) -> Result<()> {
+    let Some(bad) = data.iter().find(|v| !(0.0..=1.0).contains(*v)) else { return Ok(()) };
+    Err(SimError::data(
+        format!("a value of {bad}, where scenes lie between 0 (black) and 1 (white)"),
+        path,
+        "replace missing values; for other scales give the value of white, as in --white 255",
+    ))
+}

@@ -1,0 +1,74 @@
+//! A folder of image files, in the order of the numbers in their names.
+
+use super::FrameReader;
+use super::image_file::{EXTENSIONS, is_image, read_still};
+use qudi_core::Transfer;
+use qudi_core::natural_order::natural_order;
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
+use std::path::{Path, PathBuf};
+
+pub(super) struct ImageFolder {
+    files: std::vec::IntoIter<PathBuf>,
+    total: u64,
+    first: Option<Frame>,
+    size: Size,
+    transfer: Transfer,
+}
+
+impl ImageFolder {
+    pub(super) fn open(folder: &Path, transfer: Transfer) -> Result<Self> {
+        let read = |e| SimError::io("list the folder", folder, e);
+        let mut files = Vec::new();
+        for entry in std::fs::read_dir(folder).map_err(read)? {
+            let path = entry.map_err(read)?.path();
+            if is_image(&path) {
+                files.push(path);
+            }
+        }
+        files.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
+        let Some(name) = files.first() else {
+            return Err(SimError::data(
+                "the folder holds no images",
+                folder,
+                format!("put frames into it as {}", EXTENSIONS.join(", ")),
+            ));
+        };
+        let first = read_still(name, transfer)?;
+        let total = files.len() as u64;
+        let size = first.size;
+        let mut files = files.into_iter();
+        files.next();
+        Ok(Self { files, total, size, first: Some(first), transfer })
+    }
+}
+
+impl FrameReader for ImageFolder {
+    fn size(&self) -> Size {
+        self.size
+    }
+
+    fn len(&self) -> Option<u64> {
+        Some(self.total)
+    }
+
+    fn next(&mut self) -> Result<Option<Frame>> {
+        if let Some(first) = self.first.take() {
+            return Ok(Some(first));
+        }
+        let Some(path) = self.files.next() else { return Ok(None) };
+        let frame = read_still(&path, self.transfer)?;
+        if frame.size != self.size {
+            return Err(SimError::data(
+                format!("an image of {} among images of {}", frame.size, self.size),
+                &path,
+                "frames of one clip have one size: resize it, or move it to another folder",
+            ));
+        }
+        Ok(Some(frame))
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}

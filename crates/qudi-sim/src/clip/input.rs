@@ -1,0 +1,287 @@
+//! What to read, in a form that can be written down and opened again.
+
+use super::gif::Gif;
+use super::image_file::{EXTENSIONS, read_still};
+use super::image_folder::ImageFolder;
+use super::npy::NpyFrames;
+use super::recorded::Recorded;
+use super::synthetic::Synthetic;
+use super::video::Video;
+use super::y4m::Y4m;
+use super::{ExposureSource, FrameReader};
+use crate::scene::{PROCEDURAL, Procedural, ProceduralScene, StillMotion, still_scene};
+use qudi_core::Size;
+use qudi_core::Transfer;
+use qudi_core::{Result, SimError};
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom, Write};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+/// A place that scenes come from.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(tag = "type", rename_all = "kebab-case")]
+pub enum Input {
+    /// A folder of images.
+    Images {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// An animated GIF.
+    Gif {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A Y4M file.
+    Y4m {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A `.npy` array of frames.
+    Npy {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Any video that ffmpeg decodes.
+    Video {
+        /// The file.
+        path: PathBuf,
+    },
+    /// One image, set in motion.
+    Still {
+        /// The file.
+        path: PathBuf,
+        /// How it moves.
+        motion: StillMotion,
+        /// Frame size; the image's own if absent.
+        size: Option<Size>,
+        /// Seed of the cut-outs.
+        seed: u64,
+    },
+    /// A procedural scene.
+    Procedural(Procedural),
+    /// Y4M from standard input, kept in an unnamed temporary file so that it can be read twice.
+    Pipe {
+        /// The spool, absent once written down.
+        #[serde(skip)]
+        spool: Option<File>,
+    },
+}
+
+/// How a clip is taken from its input.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sampling {
+    /// Output frames at most; synthetic scenes need it.
+    pub frames: Option<u64>,
+    /// Instants per exposure; 1: nothing moves while a frame is exposed.
+    pub instants: usize,
+    /// What file values mean.
+    pub transfer: Transfer,
+    /// File value of white in `.npy` arrays, if not the type's full scale.
+    pub white: Option<f32>,
+}
+
+impl Default for Sampling {
+    fn default() -> Self {
+        Self { frames: None, instants: 1, transfer: Transfer::AsIs, white: None }
+    }
+}
+
+/// Length of synthetic clips unless said otherwise: one window of the paper's network.
+const SYNTHETIC_FRAMES: u64 = 11;
+
+/// More instants per exposure than any motion needs.
+const MAX_INSTANTS: usize = 4096;
+
+impl Input {
+    /// What `text` names: a file, a folder, `scene:NAME`, or `-` for Y4M on standard input.
+    /// `motion`, `size`, `seed` and `speed` are for the synthetic kinds.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is no such file or scene, or an option does not go with it.
+    pub fn parse(
+        text: &str,
+        motion: Option<StillMotion>,
+        size: Option<Size>,
+        seed: u64,
+        speed: f64,
+    ) -> Result<Self> {
+        if let Some(name) = text.strip_prefix("scene:") {
+            let Some(kind) = ProceduralScene::by_name(name) else {
+                let names: Vec<_> = PROCEDURAL.iter().map(|kind| kind.name()).collect();
+                return Err(SimError::request(
+                    format!("no procedural scene named `{name}`"),
+                    text,
+                    format!("there are {}", names.join(", ")),
+                ));
+            };
+            let size = size.unwrap_or(Size { height: 256, width: 256 });
+            return Ok(Self::Procedural(Procedural { kind, size, seed, speed }));
+        }
+        if text == "-" {
+            return Ok(Self::Pipe { spool: None });
+        }
+        // Absolute, so that a record works from any folder.
+        let path = std::path::absolute(text)
+            .map_err(|e| SimError::io("find the input", Path::new(text), e))?;
+        let about =
+            std::fs::metadata(&path).map_err(|e| SimError::io("find the input", &path, e))?;
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        let input = match extension.as_str() {
+            _ if about.is_dir() => Self::Images { path },
+            "gif" => Self::Gif { path },
+            "y4m" => Self::Y4m { path },
+            "npy" => Self::Npy { path },
+            e if EXTENSIONS.contains(&e) => {
+                let motion = motion.unwrap_or_default();
+                return Ok(Self::Still { path, motion, size, seed });
+            }
+            _ => Self::Video { path },
+        };
+        if motion.is_some() || size.is_some() {
+            return Err(SimError::request(
+                "--motion and --size shape synthetic scenes, and this is a recorded clip",
+                text,
+                "leave them out, or give a single image",
+            ));
+        }
+        Ok(input)
+    }
+
+    /// A recorded clip: a folder of frames or a file.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is none.
+    pub fn clip(path: &Path) -> Result<Self> {
+        Self::parse(&path.to_string_lossy(), None, None, 0, 0.0)
+    }
+
+    /// One image, at rest.
+    pub fn still(path: &Path) -> Self {
+        let motion = StillMotion::default();
+        Self::Still { path: path.to_owned(), motion, size: None, seed: 0 }
+    }
+
+    /// Copies standard input to a temporary file, so that the clip can be read twice.
+    /// Does nothing for other kinds. `on` is asked between pieces whether to go on.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read or stored; [`SimError::Interrupted`] if told to stop.
+    pub fn spool(
+        &mut self,
+        from: &mut impl Read,
+        on: &mut dyn FnMut() -> ControlFlow<()>,
+    ) -> Result<()> {
+        let Self::Pipe { spool } = self else { return Ok(()) };
+        let stdin = Path::new("standard input");
+        let mut file = tempfile::tempfile()
+            .map_err(|e| SimError::io("make a temporary file for the pipe", stdin, e))?;
+        let mut piece = vec![0u8; 1 << 18];
+        loop {
+            let n = from.read(&mut piece).map_err(|e| SimError::io("read the pipe", stdin, e))?;
+            if n == 0 {
+                break;
+            }
+            file.write_all(&piece[..n])
+                .map_err(|e| SimError::io("store the pipe's data", stdin, e))?;
+            if on().is_break() {
+                return Err(SimError::Interrupted);
+            }
+        }
+        *spool = Some(file);
+        Ok(())
+    }
+
+    /// Opens the clip at its beginning.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read or the sampling does not fit.
+    pub fn open(&self, sampling: &Sampling) -> Result<Box<dyn ExposureSource>> {
+        if !(1..=MAX_INSTANTS).contains(&sampling.instants) {
+            return Err(SimError::request(
+                format!("{} instants per exposure", sampling.instants),
+                "--instants",
+                format!("between 1 (no motion during an exposure) and {MAX_INSTANTS}"),
+            ));
+        }
+        if let Some(white) = sampling.white
+            && !(white.is_finite() && white > 0.0)
+        {
+            return Err(SimError::request(
+                format!("white at {white}"),
+                "--white",
+                "give a number above 0",
+            ));
+        }
+        let transfer = sampling.transfer;
+        let synthetic_frames = sampling.frames.unwrap_or(SYNTHETIC_FRAMES);
+        let reader: Box<dyn FrameReader> = match self {
+            Self::Images { path } => Box::new(ImageFolder::open(path, transfer)?),
+            Self::Gif { path } => Box::new(Gif::open(path, transfer)?),
+            Self::Npy { path } => Box::new(NpyFrames::open(path, transfer, sampling.white)?),
+            Self::Video { path } => Box::new(Video::open(path, transfer)?),
+            Self::Y4m { path } => {
+                let file =
+                    File::open(path).map_err(|e| SimError::io("open the Y4M file", path, e))?;
+                Box::new(Y4m::open(BufReader::with_capacity(1 << 18, file), path, transfer)?)
+            }
+            Self::Pipe { spool } => {
+                let stdin = Path::new("standard input");
+                let Some(spool) = spool else {
+                    return Err(SimError::request(
+                        "the pipe is gone",
+                        "standard input",
+                        "pipe the clip in again",
+                    ));
+                };
+                let again = |e| SimError::io("reread the pipe's data", stdin, e);
+                let mut file = spool.try_clone().map_err(again)?;
+                file.seek(SeekFrom::Start(0)).map_err(again)?;
+                Box::new(Y4m::open(BufReader::with_capacity(1 << 18, file), stdin, transfer)?)
+            }
+            Self::Still { path, motion, size, seed } => {
+                let image = read_still(path, transfer)?;
+                let size = size.unwrap_or(image.size);
+                let scene = still_scene(image, *motion, size, *seed);
+                return Ok(Box::new(Synthetic::new(scene, synthetic_frames, sampling.instants)));
+            }
+            Self::Procedural(procedural) => {
+                let size = procedural.size;
+                Size::new(size.height, size.width, "--size")?;
+                if !(procedural.speed.is_finite() && procedural.speed >= 0.0) {
+                    return Err(SimError::request(
+                        format!("a speed of {}", procedural.speed),
+                        "--speed",
+                        "give pixels per frame, 0 or more",
+                    ));
+                }
+                return Ok(Box::new(Synthetic::new(
+                    procedural.scene(),
+                    synthetic_frames,
+                    sampling.instants,
+                )));
+            }
+        };
+        Ok(Box::new(Recorded::new(reader, sampling.instants, sampling.frames)))
+    }
+
+    /// Whether it is a synthetic scene, whose flow is known.
+    pub fn is_synthetic(&self) -> bool {
+        matches!(self, Self::Still { .. } | Self::Procedural(_))
+    }
+
+    /// The file or folder behind it, for messages.
+    pub fn place(&self) -> String {
+        match self {
+            Self::Images { path }
+            | Self::Gif { path }
+            | Self::Y4m { path }
+            | Self::Npy { path }
+            | Self::Video { path }
+            | Self::Still { path, .. } => path.display().to_string(),
+            Self::Procedural(p) => format!("scene:{}", p.kind.name()),
+            Self::Pipe { .. } => "standard input".to_owned(),
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! Recorded clips as exposures: each output frame sees `instants` recorded frames in turn.
+
+use super::{ClipInfo, Exposure, ExposureSource, FrameReader};
+use qudi_core::Result;
+use qudi_core::flow::Flow;
+
+pub(super) struct Recorded {
+    reader: Box<dyn FrameReader>,
+    instants: usize,
+    left: Option<u64>,
+}
+
+impl Recorded {
+    /// At most `limit` exposures of `instants` recorded frames each; an incomplete last one is
+    /// left out.
+    pub(super) fn new(reader: Box<dyn FrameReader>, instants: usize, limit: Option<u64>) -> Self {
+        Self { reader, instants, left: limit }
+    }
+}
+
+impl ExposureSource for Recorded {
+    fn info(&self) -> ClipInfo {
+        let there = self.reader.len().map(|n| n / self.instants as u64);
+        let frames = match (there, self.left) {
+            (Some(there), Some(limit)) => Some(there.min(limit)),
+            (there, _) => there,
+        };
+        ClipInfo { size: self.reader.size(), frames }
+    }
+
+    fn next(&mut self) -> Result<Option<Exposure>> {
+        match &mut self.left {
+            Some(0) => return Ok(None),
+            Some(left) => *left -= 1,
+            None => {}
+        }
+        let mut instants = Vec::with_capacity(self.instants);
+        while instants.len() < self.instants {
+            let Some(frame) = self.reader.next()? else { return Ok(None) };
+            instants.push(frame);
+        }
+        Ok(Some(Exposure { instants, middle: None }))
+    }
+
+    fn flow(&self, _: u64) -> Option<Flow> {
+        None
+    }
+}

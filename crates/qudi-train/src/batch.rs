@@ -1,0 +1,103 @@
+//! Samples as planes, noise and times, ready to go to a device.
+
+use super::bursts::{Bursts, Guided};
+use super::recipe::Recipe;
+use crate::objective::{Example, training_time};
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_core::restorer::{BurstView, Context};
+use qudi_core::{Result, Size};
+use qudi_model::diffusion::noise::Noise;
+use qudi_model::measurement::{GuidePlanes, Planes, sensor_numbers};
+use qudi_model::network::{Measured, SENSOR_NUMBERS};
+use qudi_model::tensor::to_tensor;
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+
+/// Samples for one pass.
+#[derive(Clone, Debug)]
+pub struct Batch {
+    /// Number of the batch in its run.
+    pub number: u64,
+    size: Size,
+    frames: usize,
+    u: Vec<f32>,
+    guide: GuidePlanes,
+    truth: Vec<f32>,
+    noise: Vec<f32>,
+    numbers: Vec<f32>,
+    contexts: Vec<Context>,
+    times: Vec<usize>,
+}
+
+impl Batch {
+    /// Batch `number` of a recipe.
+    ///
+    /// # Errors
+    /// [`qudi_core::SimError`] if the data cannot be read.
+    pub fn draw(recipe: &Recipe, bursts: &mut Bursts, number: u64) -> Result<Self> {
+        let count = recipe.train.batch;
+        let (frames, side) = recipe.sample_size();
+        let size = Size { height: side, width: side };
+        let mut batch = Self {
+            number,
+            size,
+            frames,
+            u: Vec::new(),
+            guide: GuidePlanes::default(),
+            truth: Vec::new(),
+            noise: Vec::new(),
+            numbers: Vec::new(),
+            contexts: Vec::new(),
+            times: Vec::new(),
+        };
+        for sample in (number * count as u64..).take(count) {
+            let Guided { sample: drawn, guide, .. } = bursts.sample(sample)?;
+            let view = BurstView { size, frames: &drawn.counts };
+            batch.u.extend(Planes::of(view, &drawn.context).u);
+            batch.guide.extend(guide);
+            batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
+            let noise = Noise::new(drawn.context.seed, 0);
+            let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
+            batch.noise.extend(noise);
+            batch.numbers.extend(sensor_numbers(&drawn.context));
+            let mut random = ChaCha8Rng::seed_from_u64(drawn.context.seed);
+            let time = training_time(random.random(), random.random(), recipe.train.start);
+            batch.times.push(time);
+            batch.contexts.push(drawn.context);
+        }
+        Ok(batch)
+    }
+
+    /// Samples in it.
+    pub fn len(&self) -> usize {
+        self.contexts.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.contexts.is_empty()
+    }
+
+    /// What was measured, on `device`.
+    pub(super) fn measured(&self, device: &Device) -> Measured {
+        let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
+        Measured {
+            u: to_tensor(self.u.clone(), self.size, device),
+            guide: self.guide.clone().into_tensor(self.size, device),
+            sensor: Tensor::from_data(numbers, device),
+            frames: self.frames,
+        }
+    }
+
+    /// The batch as an example of the objective, on the device of `measured`.
+    pub(super) fn example<'a>(&'a self, measured: &'a Measured) -> Example<'a> {
+        let device = measured.u.device();
+        Example {
+            measured,
+            truth: to_tensor(self.truth.clone(), self.size, &device),
+            contexts: &self.contexts,
+            noise: to_tensor(self.noise.clone(), self.size, &device),
+            times: &self.times,
+        }
+    }
+}

@@ -1,0 +1,310 @@
+//! Bursts with their guides: drawn for every sample, or drawn once and cut into parts again and again.
+
+use super::kept::{KeptBurst, Shelf};
+use super::recipe::{PartsConfig, Recipe};
+use crate::dataset::{Dataset, Sample};
+use qudi_core::restorer::BurstView;
+use qudi_core::{Result, SimError, Size, USUAL_EXPOSURE};
+use qudi_model::config::Part;
+use qudi_model::draft::Draft;
+use qudi_model::measurement::{GuidePlanes, Laid, aligned};
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::sync_channel;
+use std::sync::{Arc, OnceLock};
+
+/// Frames of a burst and what classical methods make of all of them.
+#[derive(Clone, Debug)]
+pub(super) struct Guided {
+    pub(super) size: Size,
+    pub(super) sample: Sample,
+    pub(super) guide: GuidePlanes,
+}
+
+/// Where samples come from, for one thread.
+#[derive(Debug)]
+pub struct Bursts {
+    dataset: Dataset,
+    seed: u64,
+    crop: usize,
+    laid: Laid,
+    exposure: bool,
+    parts: Option<(PartsConfig, Kept)>,
+    drafts: Vec<Draft>,
+    shelf: Option<Arc<Shelf>>,
+}
+
+/// Bursts that all threads share, each computed by the first that needs it.
+type Kept = Arc<Vec<OnceLock<KeptBurst>>>;
+
+impl Bursts {
+    /// Those of a recipe, with the drafts of the network that learns.
+    pub fn new(recipe: &Recipe, dataset: Dataset, drafts: Vec<Draft>) -> Self {
+        let keep = |parts: PartsConfig| {
+            let kept = (0..parts.bursts).map(|_| OnceLock::new()).collect();
+            (parts, Arc::new(kept))
+        };
+        Self {
+            dataset,
+            seed: recipe.train.seed,
+            crop: recipe.data.crop,
+            laid: recipe.network.pre.laid(),
+            exposure: !recipe.network.lacks(Part::Exposure),
+            parts: recipe.train.parts.map(keep),
+            drafts,
+            shelf: None,
+        }
+    }
+
+    /// Writes drawn bursts into `folder`, which exists, and reads those that lie there.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_core::SimError) if the recipe keeps no bursts.
+    pub fn keep_in(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
+        let shelf = Some(Arc::new(Shelf::new(folder, recipe, &self.drafts)?));
+        Ok(Self { shelf, ..self })
+    }
+
+    /// The same for another thread.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_core::SimError) if the data cannot be opened again.
+    pub fn again(&self) -> Result<Self> {
+        let (dataset, shelf) = (self.dataset.again()?, self.shelf.clone());
+        let (drafts, parts) = (self.drafts.clone(), self.parts.clone());
+        Ok(Self { dataset, parts, drafts, shelf, ..*self })
+    }
+
+    /// Sample `number`.
+    pub(super) fn sample(&mut self, number: u64) -> Result<Guided> {
+        let Some((parts, kept)) = self.parts.clone() else { return self.draw(number, None) };
+        let mut random = ChaCha8Rng::seed_from_u64(self.seed);
+        random.set_stream(number);
+        let place = random.random_range(0..parts.bursts);
+        let cell = &kept[place as usize];
+        if cell.get().is_none() {
+            // Two threads may draw the same one: they draw the same.
+            let burst = self.kept(place, parts.kept)?;
+            cell.get_or_init(|| burst);
+        }
+        Ok(cell.get().expect("just filled").part(parts, &mut random))
+    }
+
+    /// Burst `number` from where bursts are kept, or drawn and kept there.
+    fn kept(&mut self, number: u64, frames: usize) -> Result<KeptBurst> {
+        let shelf = self.shelf.clone();
+        if let Some(burst) = shelf.as_ref().map(|shelf| shelf.take(number)).transpose()?.flatten() {
+            return Ok(burst);
+        }
+        let burst = KeptBurst::new(self.draw(number, Some(frames))?);
+        if let Some(shelf) = shelf {
+            shelf.put(number, &burst)?;
+        }
+        Ok(burst)
+    }
+
+    /// Every burst that is to be kept, on `workers` threads: none of a recipe that keeps none.
+    pub(super) fn draw_all(
+        &self,
+        workers: usize,
+        on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
+    ) -> Result<()> {
+        let Some((PartsConfig { bursts: all, kept, .. }, _)) = self.parts else { return Ok(()) };
+        let next = AtomicU64::new(0);
+        // Threads stop where nobody hears of their bursts any more.
+        let (sender, receiver) = sync_channel(1);
+        std::thread::scope(|scope| {
+            for _ in 0..workers.max(1) {
+                let (mut bursts, sender, next) = (self.again()?, sender.clone(), &next);
+                scope.spawn(move || {
+                    loop {
+                        let number = next.fetch_add(1, Ordering::Relaxed);
+                        let mut drawn = || bursts.kept(number, kept).map(drop);
+                        if number >= all || sender.send(drawn()).is_err() {
+                            break;
+                        }
+                    }
+                });
+            }
+            drop(sender);
+            for (done, drawn) in (1..).zip(receiver) {
+                drawn?;
+                if on([done, all]).is_break() {
+                    return Err(SimError::Interrupted);
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// Burst `number`, or some of its frames.
+    fn draw(&mut self, number: u64, frames: Option<usize>) -> Result<Guided> {
+        let size = Size { height: self.crop, width: self.crop };
+        let mut sample = self.dataset.sample(self.seed, number)?;
+        if !self.exposure {
+            sample.context.exposure = USUAL_EXPOSURE;
+        }
+        let all = sample.counts.len();
+        let frames = frames.unwrap_or(all).min(all);
+        let mut random = ChaCha8Rng::seed_from_u64(sample.context.seed);
+        let first = random.random_range(0..=all - frames);
+        let view = BurstView { size, frames: &sample.counts };
+        let range = first..first + frames;
+        let alignment = aligned(view, &sample.context, &self.drafts)?;
+        let guide = GuidePlanes::of(&alignment, self.laid, range.clone());
+        sample.truth = sample.truth[range.clone()].to_vec();
+        sample.counts = sample.counts[range].to_vec();
+        Ok(Guided { size, sample, guide })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_model::restorer::TILE;
+
+    fn recipe(parts: &str) -> Recipe {
+        let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.parts", parts)];
+        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
+        Recipe::load("tiny", &changes).unwrap_or_else(|e| panic!("{e}"))
+    }
+
+    fn of(recipe: &Recipe) -> Bursts {
+        let dataset = Dataset::new(&recipe.data, None).unwrap_or_else(|e| panic!("{e}"));
+        Bursts::new(recipe, dataset, Vec::new())
+    }
+
+    fn bursts(parts: &str) -> Bursts {
+        of(&recipe(parts))
+    }
+
+    fn sample(bursts: &mut Bursts, number: u64) -> Guided {
+        bursts.sample(number).unwrap_or_else(|e| panic!("{e}"))
+    }
+
+    /// Truth, count and restored value of every pixel, in the order of their values.
+    fn pixels(burst: &Guided) -> Vec<(u32, u16, u32)> {
+        let truth = burst.sample.truth.iter().flat_map(|frame| frame.data.clone());
+        let counts = burst.sample.counts.iter().flatten();
+        let pixels = truth.zip(counts).zip(&burst.guide.0[0]);
+        let mut list: Vec<_> = pixels.map(|((t, &y), c)| (t.to_bits(), y, c.to_bits())).collect();
+        list.sort_unstable();
+        list
+    }
+
+    #[test]
+    fn turned_bursts_keep_their_pixels_together() {
+        let mut bursts = bursts("{ bursts = 2, kept = 3, frames = 3, side = 32 }");
+        let whole = [0, 1].map(|place| bursts.draw(place, None).unwrap_or_else(|e| panic!("{e}")));
+        let whole = whole.map(|burst| pixels(&burst));
+        let mut corners = std::collections::HashSet::new();
+        for number in 0..16 {
+            let part = sample(&mut bursts, number);
+            assert!(whole.contains(&pixels(&part)), "sample {number}");
+            corners.insert(part.guide.0[0][0].to_bits());
+        }
+        assert!(corners.len() > 4, "two bursts in eight positions, and {} corners", corners.len());
+    }
+
+    #[test]
+    fn kept_frames_know_the_others() {
+        let mut bursts = bursts("{ bursts = 1, kept = 3, frames = 3, side = 32 }");
+        let whole = bursts.draw(0, None).unwrap_or_else(|e| panic!("{e}"));
+        let kept = bursts.draw(0, Some(2)).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!((kept.sample.truth.len(), kept.sample.counts.len()), (2, 2));
+        let pixels = whole.size.pixels();
+        let first = whole.sample.truth.iter().position(|frame| *frame == kept.sample.truth[0]);
+        let first = first.unwrap_or_else(|| panic!("no frame of the whole"));
+        for (all, some) in whole.guide.0.iter().zip(&kept.guide.0) {
+            assert!(all[first * pixels..][..2 * pixels] == some[..]);
+        }
+    }
+
+    #[test]
+    fn parts_are_parts_and_always_the_same() {
+        let mut one = bursts("{ bursts = 1, kept = 3, frames = 3, side = 16 }");
+        let whole = pixels(&one.draw(0, None).unwrap_or_else(|e| panic!("{e}")));
+        let mut other = one.again().unwrap_or_else(|e| panic!("{e}"));
+        let mut seen = Vec::new();
+        for number in [3, 1, 2] {
+            let part = sample(&mut one, number);
+            assert_eq!((part.size.pixels(), part.sample.truth.len()), (256, 3));
+            let list = pixels(&part);
+            assert!(list.iter().all(|pixel| whole.binary_search(pixel).is_ok()));
+            assert_eq!(list, pixels(&sample(&mut other, number)));
+            seen.push(list);
+        }
+        assert!(seen[0] != seen[1] && seen[1] != seen[2]);
+    }
+
+    #[test]
+    fn bursts_on_disk_are_those_drawn() {
+        let recipe = recipe("{ bursts = 2, kept = 3, frames = 3, side = 16 }");
+        let folder = tempfile::tempdir().unwrap_or_else(|e| panic!("{e}"));
+        let keep = |recipe: &Recipe| {
+            of(recipe).keep_in(folder.path(), recipe).unwrap_or_else(|e| panic!("{e}"))
+        };
+        let same = |a: &Guided, b: &Guided| {
+            let (one, other) = (&a.sample.context, &b.sample.context);
+            a.guide.0 == b.guide.0
+                && a.sample.truth == b.sample.truth
+                && a.sample.counts == b.sample.counts
+                && one.seed == other.seed
+                && (one.ppp.to_bits(), one.exposure.to_bits(), one.gain.to_bits())
+                    == (other.ppp.to_bits(), other.exposure.to_bits(), other.gain.to_bits())
+                && one.sensor == other.sensor
+        };
+        let (mut drawn, mut first, mut second) = (of(&recipe), keep(&recipe), keep(&recipe));
+        for number in 0..6 {
+            let expected = sample(&mut drawn, number);
+            assert!(same(&expected, &sample(&mut first, number)), "written, sample {number}");
+            assert!(same(&expected, &sample(&mut second, number)), "read, sample {number}");
+        }
+        let list = std::fs::read_dir(folder.path()).unwrap_or_else(|e| panic!("{e}"));
+        let mut files: Vec<_> = list.map(|entry| entry.unwrap_or_else(|e| panic!("{e}"))).collect();
+        files.sort_by_key(std::fs::DirEntry::file_name);
+        let names: Vec<_> = files.iter().map(std::fs::DirEntry::file_name).collect();
+        assert_eq!(names, ["1-000000.safetensors", "1-000001.safetensors"]);
+
+        let mut other = recipe.clone();
+        other.data.source[0].speed = 1.0;
+        let error = (0..6).find_map(|number| keep(&other).sample(number).err());
+        assert!(error.is_some_and(|e| e.to_string().contains("something else")));
+        for file in files {
+            let bytes = std::fs::read(file.path()).unwrap_or_else(|e| panic!("{e}"));
+            for broken in [
+                &bytes[..bytes.len() - 1],
+                &bytes[..40],
+                &[],
+                &[&bytes[..], &vec![0; 1 << 17]].concat(),
+            ] {
+                std::fs::write(file.path(), broken).unwrap_or_else(|e| panic!("{e}"));
+                let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
+                assert!(error.is_some_and(|e| e.place().is_some()), "{} bytes", broken.len());
+            }
+            let mut dark = bytes.clone();
+            let label = b"exposure = 0.";
+            let at = dark.windows(label.len()).position(|part| part == label);
+            let at = at.unwrap_or_else(|| panic!("no exposure in the label"));
+            dark[at..at + label.len()].copy_from_slice(b"exposure =-0.");
+            std::fs::write(file.path(), dark).unwrap_or_else(|e| panic!("{e}"));
+            let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
+            assert!(error.is_some_and(|e| e.to_string().contains("above 0")));
+            std::fs::write(file.path(), bytes).unwrap_or_else(|e| panic!("{e}"));
+        }
+        // What other weights restored is something else, too.
+        let device = burn::tensor::Device::flex();
+        let network = recipe.network.init(1, &device).with_round_more(0);
+        let drafts = Draft::all(&network, &recipe.network, TILE, &device);
+        let drafted = Bursts { drafts, ..of(&recipe) };
+        let mut drafted = drafted.keep_in(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
+        let error = (0..6).find_map(|number| drafted.sample(number).err());
+        assert!(error.is_some_and(|e| e.to_string().contains("something else")));
+
+        other.train.parts = None;
+        assert!(of(&other).keep_in(folder.path(), &other).is_err());
+    }
+}

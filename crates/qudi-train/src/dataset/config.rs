@@ -1,0 +1,233 @@
+//! What samples are drawn from, as recipes write it down.
+
+use qudi_core::random::uniform;
+use qudi_core::sensor::Sensor;
+use qudi_core::{Result, SimError};
+use qudi_sim::scene::{PROCEDURAL, ProceduralScene};
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+/// The `[data]` part of a recipe.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataConfig {
+    /// Frames of a sample.
+    pub frames: usize,
+    /// Side of a sample in pixels.
+    pub crop: usize,
+    /// Sensors with the light that falls on them.
+    pub sensor: Vec<SensorMix>,
+    /// Where scenes come from.
+    pub source: Vec<SourceConfig>,
+}
+
+/// A sensor that samples are taken with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SensorMix {
+    /// A preset's name or a sensor file.
+    pub name: String,
+    /// Incident photons per pixel and output frame.
+    pub ppp: LightRange,
+    /// Binary frames summed into an output frame, if not as the sensor says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frames_summed: Option<u32>,
+    /// Share of the samples, relative to the others'.
+    #[serde(default = "one")]
+    pub weight: f64,
+}
+
+/// Light of a sample.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum LightRange {
+    /// Log-uniform between two values.
+    Between {
+        /// The least.
+        from: f64,
+        /// The most.
+        to: f64,
+    },
+    /// One of these.
+    Of(Vec<f64>),
+}
+
+/// A place that scenes come from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SourceConfig {
+    /// Its name in packs, reports and model cards.
+    pub name: String,
+    /// What it holds.
+    pub kind: SourceKind,
+    /// Files and folders below the data folder, or names of procedural scenes.
+    pub from: Vec<String>,
+    /// Share of the samples, relative to the others'.
+    #[serde(default = "one")]
+    pub weight: f64,
+    /// Longest step through a clip, in its frames: 2 also makes motion twice as fast.
+    #[serde(default = "one_frame")]
+    pub stride: usize,
+    /// Most that clips and stills are made smaller: a factor drawn log-uniformly between 1 and this.
+    #[serde(default = "one")]
+    pub shrink: f64,
+    /// Fastest motion given to stills and procedural scenes, in pixels per frame.
+    #[serde(default = "usual_speed")]
+    pub speed: f64,
+    /// Share of stills' samples in which nothing moves.
+    #[serde(default)]
+    pub rest: f64,
+}
+
+/// What a source holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SourceKind {
+    /// Videos, and folders of frames.
+    Clips,
+    /// Images, set in motion.
+    Stills,
+    /// Procedural scenes; no files.
+    Scenes,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+fn one_frame() -> usize {
+    1
+}
+
+fn usual_speed() -> f64 {
+    4.0
+}
+
+impl SourceConfig {
+    /// How many times smaller a sample is made.
+    pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
+        if self.shrink > 1.0 { self.shrink.powf(uniform(random)) } else { 1.0 }
+    }
+}
+
+impl LightRange {
+    /// Least and most.
+    pub fn bounds(&self) -> [f64; 2] {
+        match self {
+            Self::Between { from, to } => [*from, *to],
+            Self::Of(values) => values
+                .iter()
+                .fold([f64::INFINITY, 0.0], |[low, high], &v| [low.min(v), high.max(v)]),
+        }
+    }
+
+    /// A value for a uniform number in [0, 1).
+    pub(super) fn at(&self, u: f64) -> f64 {
+        match self {
+            Self::Between { from, to } => from * (to / from).powf(u),
+            Self::Of(values) => values[(u * values.len() as f64) as usize],
+        }
+    }
+}
+
+impl SensorMix {
+    /// The sensor, as it is used.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is none of that name, or it cannot exist.
+    pub fn load(&self) -> Result<Sensor> {
+        let mut sensor = Sensor::load(&self.name)?;
+        if let Some(frames) = self.frames_summed {
+            sensor.frames_summed = frames;
+            sensor.validate()?;
+        }
+        Ok(sensor)
+    }
+}
+
+impl DataConfig {
+    /// The configuration, if samples can be drawn from it.
+    ///
+    /// # Errors
+    /// [`SimError::Request`] with the key that is wrong.
+    pub fn checked(self) -> Result<Self> {
+        let fault = |key: &str, what: String, help: &str| {
+            Err(SimError::request(format!("{key} {what}"), key, help))
+        };
+        if !(3..=1000).contains(&self.frames) {
+            return fault(
+                "data.frames",
+                format!("is {}", self.frames),
+                "use 3 to 1000; the paper has 11",
+            );
+        }
+        if !(16..=4096).contains(&self.crop) {
+            return fault("data.crop", format!("is {}", self.crop), "use 16 to 4096 pixels");
+        }
+        if self.sensor.is_empty() || self.source.is_empty() {
+            let key = if self.sensor.is_empty() { "data.sensor" } else { "data.source" };
+            return fault(key, "is missing".into(), "name at least one");
+        }
+        let weight = |w: f64| w.is_finite() && w > 0.0;
+        for mix in &self.sensor {
+            let [low, high] = mix.ppp.bounds();
+            if !(low > 0.0 && low <= high && high <= 1e6) {
+                let what = format!("of `{}` reaches from {low} to {high}", mix.name);
+                return fault("data.sensor.ppp", what, "give photons per pixel and frame above 0");
+            }
+            if !weight(mix.weight) {
+                return fault(
+                    "data.sensor.weight",
+                    format!("is {}", mix.weight),
+                    "use a number above 0",
+                );
+            }
+        }
+        for (i, source) in self.source.iter().enumerate() {
+            let key = format!("data.source `{}`", source.name);
+            if source.name.is_empty() || source.name.contains(['/', '\\', '"']) {
+                return fault(&key, "has no usable name".into(), "use letters and digits");
+            }
+            if self.source[..i].iter().any(|other| other.name == source.name) {
+                return fault(&key, "comes twice".into(), "give every source its own name");
+            }
+            if source.from.is_empty() || !weight(source.weight) || source.stride == 0 {
+                return fault(
+                    &key,
+                    "wants `from`, a weight above 0 and a stride of 1 or more".into(),
+                    "correct the recipe",
+                );
+            }
+            if !(0.0..=100.0).contains(&source.speed) {
+                return fault(
+                    &key,
+                    format!("has a speed of {}", source.speed),
+                    "use 0 to 100 pixels per frame",
+                );
+            }
+            if !(0.0..=1.0).contains(&source.rest) {
+                let what = format!("has a share of {} at rest", source.rest);
+                return fault(&key, what, "use a share from 0 to 1");
+            }
+            if !(1.0..=4.0).contains(&source.shrink) {
+                let what = format!("shrinks by {}", source.shrink);
+                return fault(&key, what, "use a factor from 1 to 4");
+            }
+            if source.kind == SourceKind::Scenes {
+                for name in &source.from {
+                    if ProceduralScene::by_name(name).is_none() {
+                        let names: Vec<_> = PROCEDURAL.iter().map(|kind| kind.name()).collect();
+                        let help = format!("there are {}", names.join(", "));
+                        return fault(&key, format!("names an unknown scene, `{name}`"), &help);
+                    }
+                }
+            }
+        }
+        Ok(self)
+    }
+
+    /// Whether any source reads files.
+    pub fn needs_files(&self) -> bool {
+        self.source.iter().any(|source| source.kind != SourceKind::Scenes)
+    }
+}

@@ -1,0 +1,83 @@
+//! Finding the clips and stills that a source names.
+
+use super::config::{SourceConfig, SourceKind};
+use qudi_core::natural_order::natural_order;
+use qudi_core::{Result, SimError};
+use qudi_sim::clip::is_image;
+use std::path::{Path, PathBuf};
+
+/// One clip or still to read: its name in the pack, and where it is.
+#[derive(Debug)]
+pub(super) struct Content {
+    pub(super) name: String,
+    pub(super) path: PathBuf,
+}
+
+/// Folders within folders that are looked into.
+const DEEPEST: usize = 4;
+
+/// Extensions of files that are passed over in folders of videos.
+const NO_VIDEO: &[&str] = &["txt", "md", "json", "csv", "zip", "npy", "toml", "html"];
+
+/// Everything a source names, in the order of names, below `data`.
+pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content>> {
+    let mut list = Vec::new();
+    for from in &source.from {
+        let path = data.join(from);
+        let about = std::fs::metadata(&path)
+            .map_err(|e| SimError::io(format!("find the source `{}`", source.name), &path, e))?;
+        if about.is_dir() {
+            gather(source.kind, &path, DEEPEST, &mut list)?;
+        } else {
+            list.push(path);
+        }
+    }
+    if list.is_empty() {
+        return Err(SimError::data(
+            format!("source `{}` holds nothing", source.name),
+            data,
+            "name videos, folders of frames, or images",
+        ));
+    }
+    let names = list.iter().map(|path| {
+        let relative = path.strip_prefix(data).unwrap_or(path).with_extension("");
+        let name = relative.to_string_lossy();
+        name.chars().map(|c| if c.is_alphanumeric() || c == '.' { c } else { '-' }).collect()
+    });
+    let names: Vec<String> = names.collect();
+    Ok(names.into_iter().zip(list).map(|(name, path)| Content { name, path }).collect())
+}
+
+/// What lies in a folder: for clips a folder of images is one clip and other files are videos.
+fn gather(kind: SourceKind, folder: &Path, depth: usize, list: &mut Vec<PathBuf>) -> Result<()> {
+    let read = |e| SimError::io("list the folder", folder, e);
+    let mut paths = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(read)? {
+        let path = entry.map_err(read)?.path();
+        if !path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.')) {
+            paths.push(path);
+        }
+    }
+    paths.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
+    if kind == SourceKind::Clips && paths.iter().any(|path| is_image(path)) {
+        list.push(folder.to_owned());
+        return Ok(());
+    }
+    for path in paths {
+        if path.is_dir() {
+            if depth > 0 {
+                gather(kind, &path, depth - 1, list)?;
+            }
+        } else if kind == SourceKind::Stills {
+            if is_image(&path) {
+                list.push(path);
+            }
+        } else {
+            let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+            if !extension.is_empty() && !NO_VIDEO.contains(&extension.as_str()) {
+                list.push(path);
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,99 @@
+//! A square cut from a frame, turned, mirrored, and made smaller.
+
+use qudi_core::{Frame, Size};
+
+/// Where a sample lies in its frames, and how it is turned.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Crop {
+    pub(super) left: usize,
+    pub(super) top: usize,
+    pub(super) side: usize,
+    /// One of eight: bit 0 mirrors, bit 1 flips, bit 2 exchanges rows and columns.
+    pub(super) turn: u8,
+}
+
+impl Crop {
+    /// The square of a frame that holds it.
+    pub(super) fn of(self, frame: &Frame) -> Frame {
+        let last = self.side - 1;
+        Frame::from_fn(Size { height: self.side, width: self.side }, |x, y| {
+            let (x, y) = if self.turn & 4 == 0 { (x, y) } else { (y, x) };
+            let x = if self.turn & 1 == 0 { x } else { last - x };
+            let y = if self.turn & 2 == 0 { y } else { last - y };
+            frame.data[(self.top + y) * frame.size.width + self.left + x]
+        })
+    }
+}
+
+/// A square picture at another side, not longer than its own: means over areas.
+pub(super) fn shrunk(square: Frame, side: usize) -> Frame {
+    let long = square.size.width;
+    if side == long {
+        return square;
+    }
+    // Along rows and transposed, twice.
+    let half = |rows: &[f32], count: usize| -> Vec<f32> {
+        let mut data = vec![0.0; side * count];
+        for (y, row) in rows.chunks_exact(long).enumerate() {
+            for x in 0..side {
+                data[x * count + y] = mean(row, x, side);
+            }
+        }
+        data
+    };
+    let data = half(&half(&square.data, long), side);
+    Frame { size: Size { height: side, width: side }, data }
+}
+
+/// The mean over place `x` of `side` equal parts of a row.
+fn mean(row: &[f32], x: usize, side: usize) -> f32 {
+    let length = row.len() as f32 / side as f32;
+    let (from, to) = (x as f32 * length, (x + 1) as f32 * length);
+    let first = from as usize;
+    let covered = |i: usize| (to.min((i + 1) as f32) - from.max(i as f32)).max(0.0);
+    let last = (to.ceil() as usize).min(row.len());
+    let sum: f32 = (first..last).map(|i| covered(i) * row[i]).sum();
+    sum / (first..last).map(covered).sum::<f32>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn smaller_pictures_keep_slopes_means_and_white() {
+        let ramp = |side: usize| {
+            let size = Size { height: side, width: side };
+            let place = |i: usize| (i as f32 + 0.5) / side as f32;
+            Frame::from_fn(size, |x, y| 0.25 * place(x) + 0.75 * place(y))
+        };
+        for (long, side) in [(9, 9), (9, 8), (12, 6), (31, 20), (17, 5)] {
+            let (small, wanted) = (shrunk(ramp(long), side), ramp(side));
+            assert_eq!(small.size, wanted.size);
+            // Parts of a step of the ramp count as that step: up to a quarter of it is lost.
+            let most = 0.26 / long as f32;
+            for (a, b) in small.data.iter().zip(&wanted.data) {
+                assert!((a - b).abs() < most, "{long} -> {side}: {a} for {b}");
+            }
+            assert!((small.mean() - wanted.mean()).abs() < 1e-4);
+        }
+        let white = Frame::from_fn(Size { height: 31, width: 31 }, |_, _| 1.0);
+        assert!(shrunk(white, 19).data.iter().all(|&value| (value - 1.0).abs() < 1e-6));
+    }
+
+    #[test]
+    fn eight_turns_differ_and_keep_every_pixel() {
+        let size = Size { height: 5, width: 6 };
+        let frame = Frame::from_fn(size, |x, y| (10 * y + x) as f32);
+        let mut seen = Vec::new();
+        for turn in 0..8 {
+            let part = Crop { left: 2, top: 1, side: 3, turn }.of(&frame);
+            let mut sorted = part.data.clone();
+            sorted.sort_by(f32::total_cmp);
+            assert_eq!(sorted, [12.0, 13.0, 14.0, 22.0, 23.0, 24.0, 32.0, 33.0, 34.0]);
+            assert!(!seen.contains(&part.data));
+            seen.push(part.data);
+        }
+        assert_eq!(seen[0][..3], [12.0, 13.0, 14.0]);
+    }
+}

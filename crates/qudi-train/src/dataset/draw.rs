@@ -1,0 +1,244 @@
+//! Drawing samples: a scene, a crop, a sensor, light, and fresh photons.
+
+use super::config::{DataConfig, SourceConfig, SourceKind};
+use super::crop::{Crop, shrunk};
+use super::pack::Pack;
+use qudi_core::Camera;
+use qudi_core::Light;
+use qudi_core::random::{Domain, Streams, uniform};
+use qudi_core::restorer::Context;
+use qudi_core::sensor::Sensor;
+use qudi_core::{Frame, Size};
+use qudi_core::{Result, SimError};
+use qudi_sim::scene::{Procedural, ProceduralScene, StillMotion, still_scene};
+use rand::Rng;
+use std::f64::consts::TAU;
+
+/// Exposures outside make no picture: all black, or burnt out.
+const EXPOSURES: [f64; 2] = [0.02, 0.95];
+
+/// Least and most that a scene is made darker or brighter, photons unchanged: users do not know the true exposure.
+const RESCALING: [f64; 2] = [0.6, 1.5];
+
+/// One burst to learn from.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// The clean frames.
+    pub truth: Vec<Frame>,
+    /// What the sensor counted, frame by frame.
+    pub counts: Vec<Vec<u16>>,
+    /// Sensor and light; its seed is the sample's own.
+    pub context: Context,
+}
+
+/// Draws samples. One for each thread that draws.
+#[derive(Debug)]
+pub struct Dataset {
+    config: DataConfig,
+    pack: Option<Pack>,
+    sensors: Vec<Sensor>,
+    /// Clips of the pack that belong to each source.
+    clips: Vec<Vec<usize>>,
+}
+
+impl Dataset {
+    /// Samples of `config` from `pack`, which sources with files need.
+    ///
+    /// # Errors
+    /// [`SimError`] if a sensor is unknown, or the pack lacks a source or holds clips that are too small.
+    pub fn new(config: &DataConfig, pack: Option<Pack>) -> Result<Self> {
+        let sensors = config.sensor.iter().map(super::SensorMix::load).collect::<Result<_>>()?;
+        let clips = config.source.iter().map(|source| clips_of(config, source, pack.as_ref()));
+        let clips = clips.collect::<Result<_>>()?;
+        Ok(Self { config: config.clone(), pack, sensors, clips })
+    }
+
+    /// The same for another thread.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn again(&self) -> Result<Self> {
+        let pack = self.pack.as_ref().map(Pack::again).transpose()?;
+        Self::new(&self.config, pack)
+    }
+
+    /// Sample `number` of `seed`.
+    ///
+    /// # Errors
+    /// [`SimError`] if the pack is damaged.
+    pub fn sample(&mut self, seed: u64, number: u64) -> Result<Sample> {
+        let mut rng = Streams::new(seed).row(Domain::Training, number, 0);
+        let weights: Vec<f64> = self.config.source.iter().map(|source| source.weight).collect();
+        let at = pick(&weights, uniform(&mut rng));
+        let (truth, exposure) = match self.config.source[at].kind {
+            SourceKind::Clips => self.clip(at, &mut rng)?,
+            SourceKind::Stills => self.still(at, &mut rng)?,
+            SourceKind::Scenes => self.scene(at, &mut rng),
+        };
+        let (truth, exposure) = rescaled(truth, exposure, uniform(&mut rng));
+        let weights: Vec<f64> = self.config.sensor.iter().map(|mix| mix.weight).collect();
+        let at = pick(&weights, uniform(&mut rng));
+        let sensor = self.sensors[at].clone();
+        let light = Light { ppp: self.config.sensor[at].ppp.at(uniform(&mut rng)), exposure };
+        let seed = rng.next_u64();
+        let mut camera = Camera::new(&sensor, truth[0].size, light, seed)?;
+        let counts = (0..).zip(&truth).map(|(t, frame)| camera.expose(t, &[frame]));
+        let counts = counts.collect::<Result<_>>()?;
+        let context = Context {
+            seed,
+            first_frame: 0,
+            ppp: light.ppp,
+            exposure,
+            gain: camera.gain(),
+            sensor,
+            dark: None,
+        };
+        Ok(Sample { truth, counts, context })
+    }
+
+    fn clip(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
+        let pack = self.pack.as_mut().expect("checked at the start");
+        let number = self.clips[source][below(self.clips[source].len(), rng)];
+        let clip = pack.clips()[number].clone();
+        let steps = self.config.frames - 1;
+        let longest = self.config.source[source].stride.min((clip.frames - 1) / steps.max(1));
+        let stride = 1 + below(longest.max(1), rng);
+        let first = below(clip.frames - steps * stride, rng);
+        let backward = rng.next_u64() & 1 == 1;
+        let factor = self.config.source[source].factor(rng);
+        let crop = cut(clip.size, enlarged(self.config.crop, factor), rng);
+        let mut frames = Vec::with_capacity(steps + 1);
+        for i in 0..=steps {
+            let frame = crop.of(&pack.frame(number, first + i * stride)?);
+            frames.push(shrunk(frame, self.config.crop));
+        }
+        if backward {
+            frames.reverse();
+        }
+        Ok((frames, clip.mean))
+    }
+
+    fn still(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
+        let pack = self.pack.as_mut().expect("checked at the start");
+        let number = self.clips[source][below(self.clips[source].len(), rng)];
+        let clip = pack.clips()[number].clone();
+        let (side, frames) = (self.config.crop, self.config.frames);
+        let (angle, speed) = (TAU * uniform(rng), self.config.source[source].speed * uniform(rng));
+        let mut motion = StillMotion {
+            pan: [speed * angle.cos(), speed * angle.sin()],
+            rotate: 1.5 * (uniform(rng) - 0.5),
+            zoom: 1.0 + 0.02 * (uniform(rng) - 0.5),
+            layers: below(4, rng) as u32,
+        };
+        let rest = self.config.source[source].rest;
+        if rest > 0.0 && uniform(rng) < rest {
+            motion = StillMotion::default();
+        }
+        // The scene shows the middle of the image: the part around the crop, with the way that it goes.
+        let way = (speed * frames as f64 / 2.0).ceil() as usize + 4;
+        let part = (side + 2 * way).min(clip.size.height).min(clip.size.width);
+        let factor = self.config.source[source].factor(rng);
+        let crop = cut(clip.size, enlarged(part, factor), rng);
+        let image = shrunk(crop.of(&pack.frame(number, 0)?), part);
+        let scene = still_scene(image, motion, Size { height: side, width: side }, rng.next_u64());
+        Ok((rendered(&scene, frames), clip.mean))
+    }
+
+    fn scene(&self, source: usize, rng: &mut impl Rng) -> (Vec<Frame>, f64) {
+        let SourceConfig { from, speed, .. } = &self.config.source[source];
+        let name = &from[below(from.len(), rng)];
+        let size = Size { height: self.config.crop, width: self.config.crop };
+        let kind = ProceduralScene::by_name(name).expect("checked with the recipe");
+        let speed = speed * uniform(rng);
+        let scene = Procedural { kind, size, seed: rng.next_u64(), speed }.scene();
+        let frames = rendered(&scene, self.config.frames);
+        let mean = frames.iter().map(Frame::mean).sum::<f64>() / frames.len() as f64;
+        (frames, mean)
+    }
+}
+
+/// The side that shrinks to `side` by `factor`.
+fn enlarged(side: usize, factor: f64) -> usize {
+    (side as f64 * factor).round() as usize
+}
+
+/// Some square of an image of `size`, of `side` or as much as there is of it, turned somehow.
+fn cut(size: Size, side: usize, rng: &mut impl Rng) -> Crop {
+    let side = side.min(size.height).min(size.width);
+    Crop {
+        left: below(size.width - side + 1, rng),
+        top: below(size.height - side + 1, rng),
+        side,
+        turn: (rng.next_u64() & 7) as u8,
+    }
+}
+
+/// Clips of the pack that belong to a source and are large enough.
+fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> Result<Vec<usize>> {
+    if source.kind == SourceKind::Scenes {
+        return Ok(Vec::new());
+    }
+    let Some(pack) = pack else {
+        let what = format!("source `{}` needs files", source.name);
+        return Err(SimError::request(what, "--data", "name the data folder, or a pack"));
+    };
+    let mine = pack.clips().iter().enumerate().filter(|(_, clip)| clip.source == source.name);
+    let list: Vec<usize> = mine.map(|(number, _)| number).collect();
+    if list.is_empty() {
+        let what = format!("the pack holds nothing of source `{}`", source.name);
+        let help = "make it again with `qudi train --cache-only`, from this recipe";
+        return Err(SimError::data(what, pack.path(), help));
+    }
+    let frames = if source.kind == SourceKind::Clips { config.frames } else { 1 };
+    for &number in &list {
+        let clip = &pack.clips()[number];
+        let small = clip.size.height.min(clip.size.width) < config.crop;
+        if small || clip.frames < frames {
+            return Err(SimError::data(
+                format!(
+                    "`{}` has {} frames of {}, samples have {frames} of {} x {}",
+                    clip.name, clip.frames, clip.size, config.crop, config.crop
+                ),
+                pack.path(),
+                "lower data.crop or data.frames, or leave the clip out",
+            ));
+        }
+    }
+    Ok(list)
+}
+
+/// The frames and their exposure times the same factor, drawn with `u`, which takes no value beyond white.
+fn rescaled(mut truth: Vec<Frame>, exposure: f64, u: f64) -> (Vec<Frame>, f64) {
+    let exposure = exposure.clamp(EXPOSURES[0], EXPOSURES[1]);
+    let values = truth.iter().flat_map(|frame| &frame.data);
+    let brightest = f64::from(values.fold(1e-3f32, |most, &value| most.max(value)));
+    let most = RESCALING[1].min(1.0 / brightest).min(EXPOSURES[1] / exposure);
+    let factor = RESCALING[0] * (most / RESCALING[0]).powf(u);
+    for value in truth.iter_mut().flat_map(|frame| &mut frame.data) {
+        *value *= factor as f32;
+    }
+    (truth, exposure * factor)
+}
+
+/// Frames around time 0.
+fn rendered(scene: &qudi_sim::scene::Scene, frames: usize) -> Vec<Frame> {
+    let middle = (frames / 2) as f64;
+    (0..frames).map(|t| scene.render(t as f64 - middle)).collect()
+}
+
+/// A number below `count`, which is positive.
+fn below(count: usize, rng: &mut impl Rng) -> usize {
+    ((uniform(rng) * count as f64) as usize).min(count - 1)
+}
+
+/// The place of `u` in [0, 1) among intervals of these lengths.
+fn pick(weights: &[f64], u: f64) -> usize {
+    let mut rest = u * weights.iter().sum::<f64>();
+    for (i, weight) in weights.iter().enumerate() {
+        rest -= weight;
+        if rest < 0.0 {
+            return i;
+        }
+    }
+    weights.len() - 1
+}

@@ -1,0 +1,35 @@
+//! Drawing all bursts of a recipe before anything learns from them.
+
+use super::bursts::Bursts;
+use super::recipe::Recipe;
+use super::run::Files;
+use crate::dataset::Dataset;
+use burn::tensor::Device;
+use qudi_core::{Result, SimError};
+use qudi_model::draft::Draft;
+use qudi_model::network::Qudi;
+use qudi_model::restorer::TILE;
+use std::ops::ControlFlow;
+
+/// Draws the bursts of a recipe with `train.parts` that its folder lacks, with the drafts of `network`, on `workers`
+/// threads. `on` hears how many there are and how many there will be, and says whether to go on.
+///
+/// # Errors
+/// [`SimError`] if `files` name no folder for bursts, the data or the disk fail, or bursts of something else lie in the
+/// folder; [`SimError::Interrupted`] if told to stop.
+pub fn draw_bursts(
+    recipe: &Recipe,
+    network: &Qudi,
+    files: Files,
+    device: &Device,
+    workers: usize,
+    on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
+) -> Result<()> {
+    let Some(folder) = &files.bursts else {
+        return Err(SimError::request("no folder for bursts", "--bursts", "name one"));
+    };
+    let dataset = Dataset::new(&recipe.data, files.pack)?;
+    let drafts = Draft::all(network, &recipe.network, TILE, device);
+    let bursts = Bursts::new(recipe, dataset, drafts).keep_in(folder, recipe)?;
+    bursts.draw_all(workers, on)
+}

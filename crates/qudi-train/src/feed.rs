@@ -1,0 +1,62 @@
+//! Batches drawn ahead on threads of their own, in order.
+
+use super::batch::Batch;
+use super::bursts::Bursts;
+use super::recipe::Recipe;
+use qudi_core::{Result, SimError};
+use std::sync::mpsc::{Receiver, sync_channel};
+
+/// Batches that a thread keeps ready.
+const AHEAD: usize = 2;
+
+/// Gives batch after batch; which thread drew them makes no difference.
+#[derive(Debug)]
+pub struct Feed {
+    workers: Vec<Receiver<Result<Batch>>>,
+    next: u64,
+}
+
+impl Feed {
+    /// Draws from batch `first` on, on `workers` threads.
+    ///
+    /// # Errors
+    /// [`SimError`] if the data cannot be opened.
+    pub fn new(recipe: &Recipe, bursts: &Bursts, first: u64, workers: usize) -> Result<Self> {
+        let count = workers.max(1) as u64;
+        let start = |worker: u64| {
+            let (sender, receiver) = sync_channel(AHEAD);
+            let (recipe, mut bursts) = (recipe.clone(), bursts.again()?);
+            let work = move || {
+                // Every thread draws each `count`-th batch, until nobody listens.
+                let mut number = first + worker;
+                while sender.send(Batch::draw(&recipe, &mut bursts, number)).is_ok() {
+                    number += count;
+                }
+            };
+            std::thread::Builder::new().name(format!("feed-{worker}")).spawn(work).map_err(
+                |e| {
+                    SimError::request(
+                        format!("no thread for the data: {e}"),
+                        "--workers",
+                        "use fewer",
+                    )
+                },
+            )?;
+            Ok(receiver)
+        };
+        let workers = (0..count).map(start).collect::<Result<_>>()?;
+        Ok(Self { workers, next: 0 })
+    }
+
+    /// The next batch.
+    ///
+    /// # Errors
+    /// [`SimError`] if it could not be drawn.
+    pub fn next_batch(&mut self) -> Result<Batch> {
+        let at = (self.next % self.workers.len() as u64) as usize;
+        self.next += 1;
+        self.workers[at].recv().unwrap_or_else(|_| {
+            Err(SimError::request("a data thread has stopped", "the data", "report this"))
+        })
+    }
+}

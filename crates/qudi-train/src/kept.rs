@@ -1,0 +1,300 @@
+//! Bursts with their guides, small in memory, and on disk: a guide takes longer to find than to learn from.
+
+use super::bursts::Guided;
+use super::recipe::{PartsConfig, Recipe};
+use super::values::values;
+use crate::dataset::Sample;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::restorer::Context;
+use qudi_core::sensor::Sensor;
+use qudi_core::{Frame, Result, SimError, Size};
+use qudi_model::config::Part;
+use qudi_model::draft::Draft;
+use qudi_model::measurement::{GuidePlanes, IMAGES, Laid};
+use qudi_model::tensor::read;
+use rand::{Rng, RngExt};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// A burst: planes of deviations in bytes, finer than any noise.
+#[derive(Debug)]
+pub(super) struct KeptBurst {
+    size: Size,
+    sample: Sample,
+    images: Vec<Vec<f32>>,
+    deviations: Vec<Vec<i8>>,
+}
+
+/// Steps of a byte: a 64th of a deviation near zero, wider far from it.
+const STEPS: f32 = 32.0;
+
+fn compressed(deviation: f32) -> i8 {
+    (STEPS * (2.0 * deviation).asinh()).round() as i8
+}
+
+fn expanded(byte: i8) -> f32 {
+    0.5 * (f32::from(byte) / STEPS).sinh()
+}
+
+impl KeptBurst {
+    pub(super) fn new(burst: Guided) -> Self {
+        let Guided { size, sample, guide: GuidePlanes(mut images) } = burst;
+        let deviations = images.split_off(IMAGES).into_iter();
+        let deviations = deviations.map(|plane| plane.into_iter().map(compressed).collect());
+        Self { size, sample, images, deviations: deviations.collect() }
+    }
+
+    /// Some frames, some square of them, turned and mirrored somehow.
+    pub(super) fn part(&self, parts: PartsConfig, random: &mut impl Rng) -> Guided {
+        let (frames, side) = (parts.frames, parts.side);
+        let first = random.random_range(0..=self.sample.truth.len() - frames);
+        let top = random.random_range(0..=self.size.height - side);
+        let left = random.random_range(0..=self.size.width - side);
+        let [mirrored, flipped, turned]: [bool; 3] = std::array::from_fn(|_| random.random());
+        let places: Vec<usize> = (0..side * side)
+            .map(|place| {
+                let (y, x) = (place / side, place % side);
+                let (y, x) = if turned { (x, y) } else { (y, x) };
+                let y = if flipped { side - 1 - y } else { y };
+                let x = if mirrored { side - 1 - x } else { x };
+                (top + y) * self.size.width + left + x
+            })
+            .collect();
+        let size = Size { height: side, width: side };
+        let range = first..first + frames;
+        let truth = self.sample.truth[range.clone()].iter();
+        let truth = truth.map(|frame| Frame { size, data: picked(&frame.data, &places) }).collect();
+        let counts = &self.sample.counts[range.clone()];
+        let counts = counts.iter().map(|frame| picked(frame, &places)).collect();
+        let mut context = self.sample.context.clone();
+        context.seed = random.next_u64();
+        let pixels = self.size.pixels();
+        let place = |frame: usize| frame * pixels..(frame + 1) * pixels;
+        let image = |plane: &Vec<f32>| -> Vec<f32> {
+            range.clone().flat_map(|frame| picked(&plane[place(frame)], &places)).collect()
+        };
+        let deviation = |plane: &Vec<i8>| -> Vec<f32> {
+            let bytes = range.clone().flat_map(|frame| picked(&plane[place(frame)], &places));
+            bytes.map(expanded).collect()
+        };
+        let planes = self.images.iter().map(image).chain(self.deviations.iter().map(deviation));
+        let guide = GuidePlanes(planes.collect());
+        Guided { size, sample: Sample { truth, counts, context }, guide }
+    }
+}
+
+fn picked<T: Copy>(values: &[T], places: &[usize]) -> Vec<T> {
+    places.iter().map(|&place| values[place]).collect()
+}
+
+/// A folder with a file for every burst that was drawn.
+#[derive(Debug)]
+pub(super) struct Shelf {
+    folder: PathBuf,
+    seed: u64,
+    /// All that decides what is drawn, as text: bursts of anything else are refused.
+    drawn: String,
+    /// Frames, height, width.
+    shape: [usize; 3],
+    laid: Laid,
+}
+
+/// What decides a burst, its number aside.
+#[derive(Serialize)]
+struct Drawn<'a> {
+    program: &'a str,
+    data: &'a crate::dataset::DataConfig,
+    seed: u64,
+    kept: usize,
+    neighbours: usize,
+    motions: usize,
+    exposure: bool,
+    /// Hashes of the drafts' weights.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    drafts: Vec<String>,
+}
+
+/// Hash of a draft's weights.
+fn sha256(draft: &Draft) -> Result<String> {
+    let mut hash = Sha256::new();
+    for list in values(draft.denoiser()) {
+        read(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
+    }
+    Ok(format!("{:x}", hash.finalize()))
+}
+
+/// What a file tells besides its planes.
+#[derive(Serialize, Deserialize)]
+struct Label {
+    drawn: String,
+    ppp: f64,
+    exposure: f64,
+    gain: f64,
+    sensor: Sensor,
+}
+
+/// The one entry of a file's metadata.
+const KEY: &str = "burst";
+
+/// Most bytes of a file that are not pixels.
+const HEADER: usize = 1 << 16;
+
+impl Shelf {
+    pub(super) fn new(folder: &Path, recipe: &Recipe, drafts: &[Draft]) -> Result<Self> {
+        let Some(parts) = recipe.train.parts else {
+            let what = "the recipe draws every sample anew";
+            return Err(SimError::request(what, "train.parts", "bursts are kept only for parts"));
+        };
+        let drawn = Drawn {
+            program: env!("CARGO_PKG_VERSION"),
+            data: &recipe.data,
+            seed: recipe.train.seed,
+            kept: parts.kept,
+            neighbours: recipe.network.pre.neighbours,
+            motions: recipe.network.pre.laid().along.motions(),
+            exposure: !recipe.network.lacks(Part::Exposure),
+            drafts: drafts.iter().map(sha256).collect::<Result<_>>()?,
+        };
+        Ok(Self {
+            folder: folder.to_owned(),
+            seed: recipe.train.seed,
+            drawn: serde_json::to_string(&drawn).expect("plain data"),
+            shape: [parts.kept.min(recipe.data.frames), recipe.data.crop, recipe.data.crop],
+            laid: recipe.network.pre.laid(),
+        })
+    }
+
+    fn path(&self, number: u64) -> PathBuf {
+        self.folder.join(format!("{}-{number:06}.safetensors", self.seed))
+    }
+
+    /// Names and types of a file's tensors, each of one value for every pixel of every frame.
+    fn tensors(&self) -> Vec<(String, Dtype)> {
+        let mut list = vec![("truth".to_owned(), Dtype::F32), ("counts".to_owned(), Dtype::U16)];
+        list.extend((0..IMAGES).map(|i| (format!("image.{i}"), Dtype::F32)));
+        let deviations = GuidePlanes::count(self.laid) - IMAGES;
+        list.extend((0..deviations).map(|i| (format!("deviation.{i}"), Dtype::I8)));
+        list
+    }
+
+    /// Writes burst `number`.
+    pub(super) fn put(&self, number: u64, burst: &KeptBurst) -> Result<()> {
+        let path = self.path(number);
+        let report = |e: &dyn std::fmt::Display| {
+            SimError::data(format!("no burst: {e}"), &path, "report this")
+        };
+        let Context { ppp, exposure, gain, ref sensor, .. } = burst.sample.context;
+        let label =
+            Label { drawn: self.drawn.clone(), ppp, exposure, gain, sensor: sensor.clone() };
+        // TOML: its numbers come back bit for bit.
+        let label = toml::to_string(&label).map_err(|e| report(&e))?;
+        let words =
+            |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>();
+        let truth = burst.sample.truth.iter().flat_map(|frame| words(&frame.data)).collect();
+        let counts = burst.sample.counts.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+        let images = burst.images.iter().map(|plane| words(plane));
+        let deviations = burst.deviations.iter();
+        let deviations =
+            deviations.map(|plane| plane.iter().flat_map(|v| v.to_le_bytes()).collect());
+        let bytes: Vec<Vec<u8>> =
+            [truth, counts].into_iter().chain(images).chain(deviations).collect();
+        let views = self.tensors().into_iter().zip(&bytes).map(|((name, kind), bytes)| {
+            Ok((name, TensorView::new(kind, self.shape.to_vec(), bytes).map_err(|e| report(&e))?))
+        });
+        let views = views.collect::<Result<Vec<_>>>()?;
+        let metadata = HashMap::from([(KEY.to_owned(), label)]);
+        let file = safetensors::serialize(views, Some(metadata)).map_err(|e| report(&e))?;
+        PendingFile::write_whole(&path, &file, Overwrite::Yes)
+    }
+
+    /// Burst `number`, if it is there.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be read, is damaged, or was drawn for something else.
+    pub(super) fn take(&self, number: u64) -> Result<Option<KeptBurst>> {
+        let path = self.path(number);
+        let io = |e| SimError::io("read the burst", &path, e);
+        let length = match std::fs::metadata(&path) {
+            Ok(about) => about.len(),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(e) => return Err(io(e)),
+        };
+        let damaged =
+            |what: String| SimError::data(what, &path, "remove the file: it will be drawn again");
+        let pixels: usize = self.shape.iter().product();
+        let bytes = |kind: Dtype| pixels * kind.bitsize() / 8;
+        let whole = self.tensors().iter().map(|(_, kind)| bytes(*kind)).sum::<usize>();
+        if length > (whole + HEADER) as u64 {
+            return Err(damaged(format!("{length} bytes are more than a burst of the recipe has")));
+        }
+        let file = std::fs::read(&path).map_err(io)?;
+        let (_, header) = SafeTensors::read_metadata(&file).map_err(|e| damaged(e.to_string()))?;
+        let label = header.metadata().as_ref().and_then(|entries| entries.get(KEY));
+        let label: Label = label
+            .and_then(|label| toml::from_str(label).ok())
+            .ok_or_else(|| damaged("it is no burst of ours".to_owned()))?;
+        if label.drawn != self.drawn {
+            let help =
+                "keep the bursts of another recipe, or of another version, in another folder";
+            return Err(SimError::data("it was drawn for something else", &path, help));
+        }
+        label.sensor.validate()?;
+        if ![label.ppp, label.exposure, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {
+            return Err(damaged("light and gain are no numbers above 0".to_owned()));
+        }
+        let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(e.to_string()))?;
+        let mut planes = Vec::new();
+        for (name, kind) in self.tensors() {
+            let tensor = tensors.tensor(&name).map_err(|e| damaged(e.to_string()))?;
+            if tensor.dtype() != kind || tensor.shape() != self.shape {
+                return Err(damaged(format!("`{name}` has another size than the recipe's")));
+            }
+            planes.push(tensor.data());
+        }
+        let [_, height, width] = self.shape;
+        let size = Size { height, width };
+        let words = |bytes: &[u8]| {
+            let words = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+            words.collect::<Vec<_>>()
+        };
+        let truth = planes[0].chunks_exact(4 * size.pixels());
+        let truth = truth.map(|bytes| Frame { size, data: words(bytes) }).collect();
+        let counts = planes[1]
+            .chunks_exact(2 * size.pixels())
+            .map(|bytes| bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect());
+        let context = Context {
+            seed: 0,
+            first_frame: 0,
+            ppp: label.ppp,
+            exposure: label.exposure,
+            gain: label.gain,
+            sensor: label.sensor,
+            dark: None,
+        };
+        let sample = Sample { truth, counts: counts.collect(), context };
+        let images = planes[2..2 + IMAGES].iter().map(|plane| words(plane)).collect();
+        let deviations = planes[2 + IMAGES..].iter();
+        let deviations =
+            deviations.map(|plane| plane.iter().map(|&b| b.cast_signed()).collect()).collect();
+        Ok(Some(KeptBurst { size, sample, images, deviations }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_finer_than_noise() {
+        for i in -800..=800 {
+            let deviation = i as f32 * 0.01;
+            let error = (expanded(compressed(deviation)) - deviation).abs();
+            assert!(error <= 0.008 + 0.016 * deviation.abs(), "{deviation}: {error}");
+        }
+        let far = [1e9, -1e9, f32::NAN].map(|value| expanded(compressed(value)));
+        assert!(far[0] > 13.0 && far[1] < -13.0 && far[2] == 0.0, "{far:?}");
+    }
+}

@@ -1,0 +1,320 @@
+//! Recipes: everything that decides what a training gives, in one TOML document.
+
+use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
+use crate::perceptual::PerceptualKind;
+use qudi_core::{Result, SimError};
+use qudi_kernels::ComputePrecision;
+use qudi_model::config::{NetworkConfig, PRESETS};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Recipes are a page long; anything much larger is something else.
+const LARGEST: u64 = 1 << 20;
+
+/// A recipe.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Sizes of the network.
+    pub network: NetworkConfig,
+    /// What it learns from.
+    pub data: DataConfig,
+    /// How it learns.
+    pub train: TrainConfig,
+    /// How its progress is measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub validation: Option<ValidationConfig>,
+}
+
+/// How the network learns.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Seed of weights and samples.
+    pub seed: u64,
+    /// Optimisation steps.
+    pub steps: u64,
+    /// Samples that go through the network at once.
+    pub batch: usize,
+    /// Parts of bursts to learn from; whole ones if there are none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parts: Option<PartsConfig>,
+    /// Batches whose gradients make one step.
+    pub accumulate: usize,
+    /// Highest learning rate.
+    pub rate: f64,
+    /// Last learning rate.
+    pub floor: f64,
+    /// Steps until the highest rate.
+    pub warmup: u64,
+    /// Largest norm of a step's gradient; longer ones are shortened.
+    pub clip: f64,
+    /// Numbers that convolutions multiply.
+    #[serde(default)]
+    pub precision: ComputePrecision,
+    /// Share of the average of weights that a step keeps.
+    pub ema: f64,
+    /// Share of the samples at the time where sampling begins: where nothing but the photons helps.
+    pub start: f64,
+    /// Steps between checkpoints.
+    pub checkpoint: u64,
+    /// The loss.
+    pub loss: LossConfig,
+    /// Licence of the weights, an SPDX expression.
+    pub licence: String,
+}
+
+/// What samples are cut from: guides of whole bursts, which take long to compute and see no borders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PartsConfig {
+    /// Bursts that are drawn in all and kept in memory; samples come back to them.
+    pub bursts: u64,
+    /// Consecutive frames of each that are kept; the others only help to restore these.
+    pub kept: usize,
+    /// Consecutive frames of a sample.
+    pub frames: usize,
+    /// Side of a sample in pixels.
+    pub side: usize,
+}
+
+/// Weights of the loss's terms.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossConfig {
+    /// Of the prediction.
+    pub prediction: f32,
+    /// Of the pre-denoised frames.
+    pub pre: f32,
+    /// Of the perceptual term.
+    pub perceptual: f32,
+    /// Which perceptual term.
+    pub term: PerceptualKind,
+    /// Of the misfit of true neighbours warped along the flows: flow learns from it long before fusion can teach it.
+    #[serde(default)]
+    pub flow: f32,
+}
+
+/// How progress is measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValidationConfig {
+    /// Videos and folders of frames below the data folder, or procedural scenes as `scene:NAME`.
+    pub from: Vec<String>,
+    /// Frames of every clip, around its middle.
+    pub frames: usize,
+    /// Side of the middle square.
+    pub crop: usize,
+    /// Sensor.
+    pub sensor: String,
+    /// Photons per pixel and frame.
+    pub ppp: Vec<f64>,
+    /// Reverse steps; 0 judges the pre-denoiser.
+    pub steps: usize,
+    /// Training steps between validations.
+    pub every: u64,
+}
+
+/// Source of validation clips in packs.
+pub(super) const VALIDATION: &str = "validation";
+
+impl Recipe {
+    /// A preset's recipe, or that of a file, with keys changed: `("train.steps", "100")`.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is none, or a key is unknown or wrong.
+    pub fn load(name: &str, changes: &[(String, String)]) -> Result<Self> {
+        let preset = PRESETS.iter().find(|preset| preset.0 == name);
+        let text = match preset {
+            Some((_, text)) => (*text).to_owned(),
+            None => read(name)?,
+        };
+        Self::parse(&text, name, changes)
+    }
+
+    /// A recipe from its text; `place` names it in errors.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn parse(text: &str, place: &str, changes: &[(String, String)]) -> Result<Self> {
+        let help = "compare with configs/small.toml and docs/training.md";
+        let fault = |what: String| SimError::request(what, place, help);
+        let mut document: toml::Table =
+            text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
+        for (key, value) in changes {
+            set(&mut document, key, value)?;
+        }
+        let recipe: Self =
+            document.try_into().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
+        recipe.checked()
+    }
+
+    /// The recipe as a TOML document.
+    pub fn text(&self) -> String {
+        toml::to_string(self).expect("plain data")
+    }
+
+    /// Frames of a sample, and the side of one.
+    pub fn sample_size(&self) -> (usize, usize) {
+        let whole = (self.data.frames, self.data.crop);
+        self.train.parts.map_or(whole, |parts| (parts.frames, parts.side))
+    }
+
+    /// Whether only the pre-denoiser learns: frame by frame.
+    pub(super) fn learns_frames(&self) -> bool {
+        let loss = &self.train.loss;
+        loss.prediction == 0.0 && loss.flow == 0.0 && loss.term == PerceptualKind::None
+    }
+
+    fn checked(self) -> Result<Self> {
+        let network = self.network.clone().checked()?;
+        let data = self.data.clone().checked()?;
+        let multiple = network.multiple();
+        let train = &self.train;
+        let share = |v: f64| (0.0..1.0).contains(&v);
+        let weight = |v: f32| v.is_finite() && v >= 0.0;
+        let (frames, side) = self.sample_size();
+        let fewest = if self.learns_frames() { 1 } else { 3 };
+        let rules = [
+            (
+                if train.parts.is_some() { "train.parts.side" } else { "data.crop" },
+                side.is_multiple_of(multiple) && side > 0,
+                "must be a multiple of the network's coarsest cell",
+            ),
+            (
+                "train.parts",
+                (fewest..=data.frames).contains(&frames)
+                    && train.parts.is_none_or(|parts| (frames..=data.frames).contains(&parts.kept))
+                    && side <= data.crop
+                    && train.parts.is_none_or(|parts| (1..=1 << 20).contains(&parts.bursts)),
+                "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
+            ),
+            ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
+            ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),
+            ("train.accumulate", (1..=4096).contains(&train.accumulate), "must be from 1 to 4096"),
+            ("train.rate", train.rate > 0.0 && train.rate <= 1.0, "must be above 0, at most 1"),
+            (
+                "train.floor",
+                train.floor >= 0.0 && train.floor <= train.rate,
+                "must be from 0 to the rate",
+            ),
+            ("train.clip", train.clip > 0.0, "must be above 0"),
+            ("train.ema", share(train.ema), "must be from 0 to below 1"),
+            ("train.start", (0.0..=1.0).contains(&train.start), "must be from 0 to 1"),
+            ("train.checkpoint", train.checkpoint > 0, "must be at least 1"),
+            (
+                "train.loss",
+                weight(train.loss.prediction)
+                    && weight(train.loss.flow)
+                    && weight(train.loss.pre)
+                    && weight(train.loss.perceptual),
+                "must have weights of 0 or more",
+            ),
+            (
+                "train.loss.term",
+                (train.loss.term == PerceptualKind::None) == (train.loss.perceptual == 0.0),
+                "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
+            ),
+        ];
+        for (key, good, problem) in rules {
+            if !good {
+                let what = format!("{key} {problem}");
+                return Err(SimError::request(what, key, "correct the recipe, or --set it"));
+            }
+        }
+        if let Some(validation) = &self.validation {
+            let good = (3..=1000).contains(&validation.frames)
+                && (16..=4096).contains(&validation.crop)
+                && !validation.ppp.is_empty()
+                && validation.ppp.iter().all(|&ppp| ppp > 0.0 && ppp < 1e6)
+                && validation.every > 0
+                && !validation.from.is_empty();
+            if !good {
+                return Err(SimError::request(
+                    "the validation cannot be done: it wants clips, 3 frames, 16 pixels, light",
+                    "validation",
+                    "correct the recipe",
+                ));
+            }
+        }
+        Ok(Self { network, data, ..self })
+    }
+
+    /// The validation clips as a source of a pack; none if there are none with files.
+    pub fn validation_data(&self) -> Option<DataConfig> {
+        let validation = self.validation.as_ref()?;
+        let files = validation.from.iter().filter(|from| !from.starts_with("scene:"));
+        let from: Vec<String> = files.cloned().collect();
+        (!from.is_empty()).then(|| DataConfig {
+            frames: validation.frames,
+            crop: validation.crop,
+            sensor: vec![SensorMix {
+                name: validation.sensor.clone(),
+                ppp: LightRange::Of(validation.ppp.clone()),
+                frames_summed: None,
+                weight: 1.0,
+            }],
+            source: vec![SourceConfig {
+                name: VALIDATION.to_owned(),
+                kind: SourceKind::Clips,
+                from,
+                weight: 1.0,
+                stride: 1,
+                shrink: 1.0,
+                speed: 0.0,
+                rest: 0.0,
+            }],
+        })
+    }
+}
+
+fn read(name: &str) -> Result<String> {
+    let path = Path::new(name);
+    let failed = |e: std::io::Error| match e.kind() {
+        std::io::ErrorKind::NotFound => {
+            let names: Vec<_> = PRESETS.iter().map(|preset| preset.0).collect();
+            let what = format!("`{name}` is no recipe");
+            SimError::request(
+                what,
+                "RECIPE",
+                format!("name a .toml file, or one of {}", names.join(", ")),
+            )
+        }
+        _ => SimError::io("read the recipe", path, e),
+    };
+    let length = std::fs::metadata(path).map_err(failed)?.len();
+    if length > LARGEST {
+        return Err(SimError::data(
+            format!("a recipe of {length} bytes"),
+            path,
+            "name a .toml file",
+        ));
+    }
+    std::fs::read_to_string(path).map_err(failed)
+}
+
+/// Sets a key below tables; numbers name the parts of a list, as in `data.source.0.weight`.
+fn set(document: &mut toml::Table, key: &str, text: &str) -> Result<()> {
+    let unknown = || {
+        let help = "name keys of the recipe, as in train.steps or data.source.0.weight";
+        SimError::request(format!("`{key}` is no key of the recipe"), "--set", help)
+    };
+    let value = format!("v = {text}").parse::<toml::Table>().ok();
+    let value = value.and_then(|mut table| table.remove("v"));
+    let value = value.unwrap_or_else(|| toml::Value::String(text.to_owned()));
+    let (path, last) = key.rsplit_once('.').ok_or_else(unknown)?;
+    let mut parts = path.split('.');
+    let first = parts.next().ok_or_else(unknown)?;
+    let mut at = document.get_mut(first).ok_or_else(unknown)?;
+    for part in parts {
+        at = match at {
+            toml::Value::Table(table) => table.get_mut(part),
+            toml::Value::Array(list) => part.parse().ok().and_then(|i: usize| list.get_mut(i)),
+            _ => None,
+        }
+        .ok_or_else(unknown)?;
+    }
+    // Unknown names are found when the recipe is read.
+    at.as_table_mut().ok_or_else(unknown)?.insert(last.to_owned(), value);
+    Ok(())
+}

@@ -1,0 +1,241 @@
+//! A training run in a folder: recipe, metrics, weights, state, pictures.
+
+use super::bursts::Bursts;
+use super::feed::Feed;
+use super::recipe::Recipe;
+use super::state;
+use super::trainer::{StepReport, Trainer};
+use super::validate::{Validation, Validator};
+use crate::dataset::{Dataset, Pack};
+use burn::tensor::Device;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::{Result, SimError};
+use qudi_model::checkpoint::{Description, Precision, save};
+use qudi_model::config::{NetworkConfig, PRESETS};
+use qudi_model::draft::Draft;
+use qudi_model::network::Qudi;
+use qudi_model::restorer::TILE;
+use serde::Serialize;
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+/// Name of the recipe in a run's folder.
+pub const RECIPE: &str = "recipe.toml";
+/// Name of the metrics.
+pub const METRICS: &str = "metrics.jsonl";
+/// Name of the weights for use.
+pub const WEIGHTS: &str = "weights.safetensors";
+
+/// What a run tells while it goes on.
+#[derive(Debug)]
+pub enum Event<'a> {
+    /// A step is done.
+    Step(&'a StepReport),
+    /// The network was measured.
+    Validation(&'a Validation),
+    /// The state has been written after this step.
+    Saved(u64),
+}
+
+/// A run.
+#[derive(Debug)]
+pub struct Run {
+    folder: PathBuf,
+    recipe: Recipe,
+    trainer: Trainer,
+    bursts: Bursts,
+    validator: Option<Validator>,
+    device: Device,
+    commit: Option<String>,
+}
+
+/// Files that a run learns from.
+#[derive(Debug, Default)]
+pub struct Files {
+    /// Decoded clips and stills, for recipes that name any.
+    pub pack: Option<Pack>,
+    /// A folder, which exists, for bursts with their guides: those there are not drawn again. Only for recipes with
+    /// `train.parts`.
+    pub bursts: Option<PathBuf>,
+}
+
+/// Where a run starts.
+#[derive(Debug)]
+pub enum From {
+    /// From initial weights, or those given.
+    Start(Option<Box<Qudi>>),
+    /// From the state in its folder.
+    State,
+}
+
+/// One line of the metrics.
+#[derive(Serialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+enum Line<'a> {
+    Step(&'a StepReport),
+    Validation(&'a Validation),
+}
+
+impl Run {
+    /// Opens a run in `folder`, which exists.
+    ///
+    /// # Errors
+    /// [`SimError`] if the data, the state or the folder cannot be used.
+    pub fn open(
+        folder: &Path,
+        recipe: &Recipe,
+        from: From,
+        files: Files,
+        devices: &[Device],
+        backbones: Option<&Path>,
+        commit: Option<String>,
+    ) -> Result<Self> {
+        let validator = Validator::new(recipe, files.pack.as_ref())?;
+        let trainer = match from {
+            From::Start(network) => {
+                Trainer::new(recipe, network.map(|network| *network), devices, backbones)?
+            }
+            From::State => Trainer::resume(folder, recipe, devices, backbones)?,
+        };
+        let dataset = Dataset::new(&recipe.data, files.pack)?;
+        let drafts = Draft::all(&trainer.averaged(), &recipe.network, TILE, &devices[0]);
+        let mut bursts = Bursts::new(recipe, dataset, drafts);
+        if let Some(folder) = &files.bursts {
+            bursts = bursts.keep_in(folder, recipe)?;
+        }
+        let run = Self {
+            folder: folder.to_owned(),
+            recipe: recipe.clone(),
+            device: devices[0].clone(),
+            trainer,
+            bursts,
+            validator,
+            commit,
+        };
+        run.write(RECIPE, run.recipe.text().as_bytes())?;
+        run.trim_metrics()?;
+        Ok(run)
+    }
+
+    /// Whether a folder holds a state to go on from.
+    pub fn exists(folder: &Path) -> bool {
+        state::exists(folder)
+    }
+
+    /// Steps taken, and in all.
+    pub fn progress(&self) -> [u64; 2] {
+        [self.trainer.step_number(), self.recipe.train.steps]
+    }
+
+    /// Learns to the end of the recipe, with data drawn on `workers` threads. `on` hears of every step and says whether
+    /// to go on; if not, the state is written and the run stops.
+    ///
+    /// # Errors
+    /// [`SimError`] if data, device or disk fail, or the loss is no number any more; [`SimError::Interrupted`] if told
+    /// to stop.
+    pub fn learn(
+        &mut self,
+        workers: usize,
+        on: &mut dyn FnMut(Event<'_>) -> ControlFlow<()>,
+    ) -> Result<()> {
+        let train = self.recipe.train.clone();
+        let mut feed = Feed::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
+        let mut metrics = self.metrics()?;
+        while self.trainer.step_number() < train.steps {
+            let report = self.trainer.step(&mut feed)?;
+            self.log(&mut metrics, &Line::Step(&report))?;
+            let step = report.step;
+            let mut go_on = on(Event::Step(&report));
+            let last = step == train.steps;
+            if let Some(validator) = &self.validator
+                && (step.is_multiple_of(validator.every()) || last)
+            {
+                let network = self.trainer.averaged();
+                let sizes = &self.recipe.network;
+                let validation = validator.measure(&network, sizes, &self.device, step)?;
+                self.log(&mut metrics, &Line::Validation(&validation))?;
+                if on(Event::Validation(&validation)).is_break() {
+                    go_on = ControlFlow::Break(());
+                }
+            }
+            if step.is_multiple_of(train.checkpoint) || last || go_on.is_break() {
+                metrics.sync_data().map_err(|e| self.failed(METRICS, e))?;
+                self.trainer.save_state(&self.folder)?;
+                self.save_weights()?;
+                if on(Event::Saved(step)).is_break() {
+                    go_on = ControlFlow::Break(());
+                }
+            }
+            if go_on.is_break() && !last {
+                return Err(SimError::Interrupted);
+            }
+        }
+        Ok(())
+    }
+
+    fn save_weights(&self) -> Result<()> {
+        let recipe = &self.recipe;
+        let bounds = recipe.data.sensor.iter().map(|mix| mix.ppp.bounds());
+        let ppp = bounds.fold([f64::INFINITY, 0.0], |[low, high]: [f64; 2], [from, to]| {
+            [low.min(from), high.max(to)]
+        });
+        let is_preset = |name: &str| NetworkConfig::preset(name).is_ok_and(|n| n == recipe.network);
+        let preset = PRESETS.iter().find(|(name, _)| is_preset(name));
+        let sensor = |mix: &crate::dataset::SensorMix| match mix.frames_summed {
+            None => mix.name.clone(),
+            Some(frames) => format!("{} x {frames}", mix.name),
+        };
+        let description = Description {
+            program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
+            preset: preset.map(|(name, _)| (*name).to_owned()),
+            network: recipe.network.clone(),
+            window: recipe.data.frames.max(11),
+            sensors: recipe.data.sensor.iter().map(sensor).collect(),
+            ppp,
+            data: recipe.data.source.iter().map(|source| source.name.clone()).collect(),
+            steps: self.trainer.step_number(),
+            commit: self.commit.clone(),
+            licence: recipe.train.licence.clone(),
+        };
+        let path = self.folder.join(WEIGHTS);
+        save(&self.trainer.averaged(), &description, Precision::Single, &path, Overwrite::Yes)
+    }
+
+    fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
+        PendingFile::write_whole(&self.folder.join(name), bytes, Overwrite::Yes)
+    }
+
+    fn metrics(&self) -> Result<std::fs::File> {
+        let path = self.folder.join(METRICS);
+        let file = OpenOptions::new().create(true).append(true).open(path);
+        file.map_err(|e| self.failed(METRICS, e))
+    }
+
+    fn log(&self, file: &mut std::fs::File, line: &Line<'_>) -> Result<()> {
+        let mut text = serde_json::to_vec(line).expect("plain data");
+        text.push(b'\n');
+        file.write_all(&text).map_err(|e| self.failed(METRICS, e))
+    }
+
+    /// Drops lines of steps that a killed run took after its last state: they come again.
+    fn trim_metrics(&self) -> Result<()> {
+        let text = match std::fs::read_to_string(self.folder.join(METRICS)) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+            Err(e) => return Err(self.failed(METRICS, e)),
+        };
+        let taken = self.trainer.step_number();
+        let kept = text.lines().filter(|line| {
+            let line: Option<serde_json::Value> = serde_json::from_str(line).ok();
+            line.and_then(|line| line["step"].as_u64()).is_some_and(|step| step <= taken)
+        });
+        let kept: String = kept.flat_map(|line| [line, "\n"]).collect();
+        self.write(METRICS, kept.as_bytes())
+    }
+
+    fn failed(&self, name: &str, e: std::io::Error) -> SimError {
+        SimError::io("write the run", &self.folder.join(name), e)
+    }
+}

@@ -1,0 +1,260 @@
+//! What a device must get right: every operation of the network with its gradients, and a small network whole.
+
+use crate::objective::reconstruction;
+use burn::tensor::activation::softmax;
+use burn::tensor::ops::PadMode;
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_core::Result;
+use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
+use qudi_kernels::group_norm::{self, Norm, group_norm};
+use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
+use qudi_model::config::NetworkConfig;
+use qudi_model::measurement::GuidePlanes;
+use qudi_model::network::{Measured, SENSOR_NUMBERS, Simulated, State};
+use qudi_model::tensor::read;
+
+/// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
+pub const TOLERANCE: f32 = 2e-3;
+
+/// Largest error that is rounding where the numbers that are multiplied have eight bits.
+pub const BF16_TOLERANCE: f32 = 2e-2;
+
+/// How much larger errors are where sums have no more bits than what is multiplied.
+const SUMS: f32 = 10.0;
+
+/// What an error says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Rounding.
+    Right,
+    /// Rounding, also of sums: kernels of Burn 0.22 that multiply numbers of 16 bits may sum in 16 bits, too.
+    Rough,
+    /// More than rounding.
+    Wrong,
+}
+
+/// One check.
+#[derive(Clone, Copy, Debug)]
+pub struct Check {
+    /// What is checked.
+    pub name: &'static str,
+    /// Numbers that convolutions multiply on the device; the reference's have 32 bits.
+    precision: ComputePrecision,
+    run: fn(&Device) -> Result<Vec<Vec<f32>>>,
+}
+
+impl Check {
+    const fn exact(name: &'static str, run: fn(&Device) -> Result<Vec<Vec<f32>>>) -> Self {
+        Self { name, precision: ComputePrecision::F32, run }
+    }
+
+    const fn reduced(
+        name: &'static str,
+        precision: ComputePrecision,
+        run: fn(&Device) -> Result<Vec<Vec<f32>>>,
+    ) -> Self {
+        Self { name, precision, run }
+    }
+
+    /// Whether the device has such numbers at all.
+    pub fn is_possible(&self, device: &Device) -> bool {
+        self.precision.is_supported(device)
+    }
+
+    /// What an error says.
+    pub fn verdict(&self, error: f32) -> Verdict {
+        let (right, rough) = match self.precision {
+            ComputePrecision::F32 => (TOLERANCE, TOLERANCE),
+            ComputePrecision::Bf16 => (BF16_TOLERANCE, SUMS * BF16_TOLERANCE),
+        };
+        if error < right {
+            Verdict::Right
+        } else if error < rough {
+            Verdict::Rough
+        } else {
+            Verdict::Wrong
+        }
+    }
+
+    /// Largest difference between the device's results and those of Burn's stock operations on `reference`, in
+    /// terms of the largest value.
+    ///
+    /// # Errors
+    /// [`SimError`](qudi_core::SimError) if a device fails.
+    pub fn error(&self, device: &Device, reference: &Device) -> Result<f32> {
+        let got = with_precision(self.precision, || (self.run)(device))?;
+        let expected = with_stock_operations(|| (self.run)(reference))?;
+        let mut worst = 0f32;
+        for (got, expected) in got.iter().zip(&expected) {
+            let scale = expected.iter().fold(1e-6f32, |scale, value| scale.max(value.abs()));
+            for (got, expected) in got.iter().zip(expected) {
+                let error = (got - expected).abs() / scale;
+                // NaN is an error, too.
+                worst = if error <= worst { worst } else { error };
+                if error.is_nan() {
+                    return Ok(f32::INFINITY);
+                }
+            }
+        }
+        Ok(worst)
+    }
+}
+
+/// All checks, cheap ones first.
+pub const CHECKS: &[Check] = &[
+    Check::exact("arithmetic", arithmetic),
+    Check::exact("joining and slicing", joining),
+    Check::exact("warp", warping),
+    Check::exact("group norm", normalising),
+    Check::exact("matrix product", products),
+    Check::exact("softmax", attention),
+    Check::exact("convolution 3x3", |device| convolution(device, 3, 1)),
+    Check::exact("convolution 1x1", |device| convolution(device, 1, 1)),
+    Check::exact("convolution 7x7", |device| convolution(device, 7, 1)),
+    Check::exact("convolution, stride 2", |device| convolution(device, 3, 2)),
+    Check::exact("convolution 5x5x5", |device| convolution_3d(device, 1)),
+    Check::exact("convolution 5x5x5 / 2", |device| convolution_3d(device, 2)),
+    Check::reduced("convolution 3x3, bf16", ComputePrecision::Bf16, linear),
+    Check::reduced("convolution 5x5x5, bf16", ComputePrecision::Bf16, |device| {
+        convolution_3d(device, 1)
+    }),
+    Check::exact("network", network),
+];
+
+/// Repeatable values in [-1, 1).
+fn values<const D: usize>(seed: u32, shape: [usize; D], device: &Device) -> Tensor<D> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9) | 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        state as f32 / 2f32.powi(31) - 1.0
+    };
+    let values: Vec<f32> = (0..shape.iter().product()).map(|_| next()).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
+}
+
+/// The result, and the gradients of a weighted sum of it.
+fn with_gradients<const D: usize>(
+    output: Tensor<D>,
+    inputs: &[Tensor<D>],
+) -> Result<Vec<Vec<f32>>> {
+    let weights = values(99, output.dims(), &output.device());
+    let grads = (output.clone() * weights).sum().backward();
+    let mut results = vec![read(output.inner())?];
+    for input in inputs {
+        results.push(input.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?);
+    }
+    Ok(results)
+}
+
+fn arithmetic(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let a = values(1, [2, 3, 5, 7], &device).require_grad();
+    let b = values(2, [2, 3, 5, 7], &device).require_grad();
+    let positive = b.clone() * b.clone() + 0.1;
+    let output = (a.clone() * 2.0 - b.clone()) / positive.clone().sqrt()
+        + a.clone().abs() * burn::tensor::activation::silu(b.clone())
+        + burn::tensor::activation::relu(a.clone())
+        + (b.clone().clamp_min(0.0) * -0.5).exp() * positive.recip() * a.clone().clamp(-0.5, 0.5);
+    with_gradients(output, &[a, b])
+}
+
+fn joining(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let a = values(3, [2, 3, 4, 6], &device).require_grad();
+    let b = values(4, [2, 2, 4, 6], &device).require_grad();
+    let joined = Tensor::cat(vec![a.clone(), b.clone()], 1).narrow(1, 1, 3);
+    let joined = joined.pad([(0, 0), (0, 0), (1, 1), (2, 4)], PadMode::Edge);
+    let folded = joined.reshape([2, 3, 3, 2, 6, 2]).permute([0, 1, 3, 5, 2, 4]);
+    with_gradients(folded.reshape([2, 12, 3, 6]), &[a, b])
+}
+
+fn warping(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(5, [2, 3, 12, 20], &device).require_grad();
+    let flow = (values(6, [2, 2, 12, 20], &device) * 3.3).require_grad();
+    with_gradients(warp(x.clone(), flow.clone()), &[x, flow])
+}
+
+fn normalising(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(7, [4, 12, 6, 10], &device).require_grad();
+    let weight = values(8, [2, 12], &device) + 1.5;
+    let bias = values(9, [2, 12], &device);
+    let norm = Norm { groups: 6, activation: group_norm::Activation::Silu };
+    with_gradients(group_norm(x.clone(), weight, bias, norm), &[x])
+}
+
+fn products(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let a = values(10, [3, 17, 33], &device).require_grad();
+    let b = values(11, [3, 33, 9], &device).require_grad();
+    with_gradients(a.clone().matmul(b.clone()), &[a, b])
+}
+
+fn attention(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = (values(12, [3, 40, 40], &device) * 4.0).require_grad();
+    with_gradients(softmax(x.clone(), 2), &[x])
+}
+
+fn convolution(device: &Device, kernel: usize, stride: usize) -> Result<Vec<Vec<f32>>> {
+    let options = Options { stride, activation: Activation::Relu, ..Options::default() };
+    convolution_with(device, kernel, options)
+}
+
+/// Without a ReLU: what is rounded may be on its other side.
+fn linear(device: &Device) -> Result<Vec<Vec<f32>>> {
+    convolution_with(device, 3, Options::default())
+}
+
+fn convolution_with(device: &Device, kernel: usize, options: Options) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(13, [2, 6, 24, 36], &device).require_grad();
+    let weight = values(14, [8, 6, kernel, kernel], &device).require_grad();
+    let bias = values(15, [8], &device);
+    let output = conv_2d(std::slice::from_ref(&x), weight.clone(), bias, options);
+    with_gradients(output, &[x, weight])
+}
+
+fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(16, [5, 4, 16, 24], &device).require_grad();
+    let weight = values(17, [6, 4, 5, 5, 5], &device);
+    let options = Options { stride, ..Options::default() };
+    let output = conv_3d(std::slice::from_ref(&x), weight, values(18, [6], &device), 5, options);
+    with_gradients(output, &[x])
+}
+
+/// `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the loss's gradient for the
+/// noisy image.
+fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let config = NetworkConfig::preset("tiny")?;
+    let network = config.init(1, &device);
+    let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
+    let planes = GuidePlanes::count(config.pre.laid());
+    let mut guide = vec![image(29), image(30), image(31) * 0.5 + 0.2];
+    guide.extend((guide.len()..planes).map(|plane| image(29 + plane as u32)));
+    let measured = Measured {
+        u: image(22),
+        guide: Tensor::cat(guide, 1),
+        sensor: values(23, [1, SENSOR_NUMBERS], &device),
+        frames: 4,
+    };
+    let simulated = Simulated { y: image(24), u: image(25), exists: vec![true] };
+    let x_t = values(26, [4, 1, 32, 48], &device).require_grad();
+    let x0_prev = values(27, [4, 1, 32, 48], &device);
+    let state = State { x_t: x_t.clone(), x0_prev, known: vec![true], times: vec![500] };
+    let prepared = network.prepare(&measured);
+    let prediction = network.forward(&prepared, Some(&simulated), &state, None);
+    let loss = reconstruction((prediction.x0.clone() + 1.0) * 0.5, image(28));
+    let grads = loss.backward();
+    Ok(vec![
+        read(prediction.x0.inner())?,
+        read(prediction.d.inner())?,
+        read(prediction.flows.to_next.inner())?,
+        x_t.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?,
+    ])
+}

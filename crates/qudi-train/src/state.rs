@@ -1,0 +1,156 @@
+//! The state that a run goes on from: a folder of weights, their average, the optimizer's moments and counters, which
+//! is replaced whole or not at all.
+
+use super::adam::Adam;
+use super::recipe::Recipe;
+use super::trainer::Trainer;
+use super::values::with_values;
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_core::{Result, SimError};
+use qudi_model::network::parameters;
+use qudi_model::tensor::read;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// Counters of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Counters {
+    step: u64,
+}
+
+/// The lists that a state holds, by the prefix of their names.
+const LISTS: [&str; 4] = ["weights", "average", "mean", "square"];
+
+const COUNTERS: &str = "counters.json";
+const TENSORS: &str = "tensors.safetensors";
+
+/// Names of the folder, of its successor while it is written, and of its predecessor while it is removed.
+fn names(run: &Path) -> [PathBuf; 3] {
+    ["state", "state.new", "state.old"].map(|name| run.join(name))
+}
+
+impl Trainer {
+    /// Writes the state into the run's folder. At any moment one whole state lies there.
+    ///
+    /// # Errors
+    /// [`SimError`] if it cannot be written; the state before is intact then.
+    pub fn save_state(&self, run: &Path) -> Result<()> {
+        let [state, new, old] = names(run);
+        let failed = |path: &Path| {
+            let path = path.to_owned();
+            move |e| SimError::io("write the training state", &path, e)
+        };
+        // What an interrupted call left.
+        if new.exists() {
+            std::fs::remove_dir_all(&new).map_err(failed(&new))?;
+        }
+        std::fs::create_dir(&new).map_err(failed(&new))?;
+        let weights = super::values::values(&self.network);
+        let lists = [&weights, &self.average, &self.adam.mean, &self.adam.square];
+        let names = parameters(&self.network);
+        let mut tensors = Vec::new();
+        for (prefix, list) in LISTS.iter().zip(lists) {
+            for ((name, _), values) in names.iter().zip(list) {
+                let values = read(values.clone())?;
+                let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+                tensors.push((format!("{prefix}/{name}"), values.len(), bytes));
+            }
+        }
+        let views = tensors.iter().map(|(name, count, bytes)| {
+            let view = TensorView::new(Dtype::F32, vec![*count], bytes);
+            (name, view.expect("as many bytes as the shape says"))
+        });
+        let bytes = safetensors::serialize(views, None).map_err(|e| {
+            SimError::data(format!("cannot lay out the state: {e}"), &new, "report this")
+        })?;
+        let counters =
+            serde_json::to_vec(&Counters { step: self.step_number() }).expect("plain data");
+        let write = |name: &str, bytes: &[u8]| {
+            let path = new.join(name);
+            let write = || {
+                let mut file = File::create(&path)?;
+                file.write_all(bytes)?;
+                file.sync_all()
+            };
+            write().map_err(failed(&path))
+        };
+        if let Err(error) = write(TENSORS, &bytes).and_then(|()| write(COUNTERS, &counters)) {
+            let _ = std::fs::remove_dir_all(&new);
+            return Err(error);
+        }
+        if old.exists() {
+            std::fs::remove_dir_all(&old).map_err(failed(&old))?;
+        }
+        if state.exists() {
+            std::fs::rename(&state, &old).map_err(failed(&state))?;
+        }
+        std::fs::rename(&new, &state).map_err(failed(&new))?;
+        let _ = std::fs::remove_dir_all(&old);
+        // The renames reach the disk with their folder.
+        if let Ok(folder) = File::open(run) {
+            let _ = folder.sync_all();
+        }
+        Ok(())
+    }
+
+    /// Goes on from the state in a run's folder.
+    ///
+    /// # Errors
+    /// [`SimError`] if there is none, or it is damaged or of another recipe.
+    pub fn resume(
+        run: &Path,
+        recipe: &Recipe,
+        devices: &[Device],
+        backbones: Option<&Path>,
+    ) -> Result<Self> {
+        let [state, _, old] = names(run);
+        // Killed between two renames: the old state is the whole one.
+        let folder = if state.exists() { state } else { old };
+        let damaged = |what: String| {
+            SimError::data(
+                format!("the training state cannot be used: {what}"),
+                &folder,
+                "start anew in another folder, with --init and this run's weights.safetensors",
+            )
+        };
+        let open = |name: &str| {
+            let path = folder.join(name);
+            std::fs::read(&path).map_err(|e| SimError::io("read the training state", &path, e))
+        };
+        let counters: Counters =
+            serde_json::from_slice(&open(COUNTERS)?).map_err(|e| damaged(e.to_string()))?;
+        let bytes = open(TENSORS)?;
+        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
+        let mut trainer = Self::new(recipe, None, devices, backbones)?;
+        let names = parameters(&trainer.network);
+        let device = trainer.average[0].device();
+        let list = |prefix: &str| {
+            let values = names.iter().map(|(name, shape)| {
+                let name = format!("{prefix}/{name}");
+                let tensor = tensors.tensor(&name).map_err(|e| damaged(e.to_string()))?;
+                let count = shape.iter().product::<usize>();
+                if tensor.dtype() != Dtype::F32 || tensor.shape() != [count] {
+                    return Err(damaged(format!("`{name}` has another size than the recipe's")));
+                }
+                let words = tensor.data().chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
+                let values: Vec<f32> = words.map(f32::from_le_bytes).collect();
+                Ok(Tensor::<1>::from_data(TensorData::new(values, [count]), &device))
+            });
+            values.collect::<Result<Vec<_>>>()
+        };
+        let [weights, average, mean, square] = LISTS.map(list);
+        trainer.network = with_values(trainer.network, weights?);
+        trainer.average = average?;
+        trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
+        Ok(trainer)
+    }
+}
+
+/// Whether a folder holds a state to go on from.
+pub(super) fn exists(run: &Path) -> bool {
+    let [state, _, old] = names(run);
+    state.exists() || old.exists()
+}

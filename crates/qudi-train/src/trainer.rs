@@ -1,0 +1,325 @@
+//! The network while it learns: weights, their average, the optimizer's state.
+
+use super::adam::Adam;
+use super::batch::Batch;
+use super::feed::Feed;
+use super::learning_rate::learning_rate;
+use super::recipe::{LossConfig, Recipe};
+use super::values::{gradients, values, with_values};
+use crate::objective::{FirstPass, LossWeights, Switches, terms};
+use crate::perceptual::{Perceptual, PerceptualKind};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_core::{Result, SimError, Size};
+use qudi_kernels::{ComputePrecision, with_precision};
+use qudi_model::config::Part;
+use qudi_model::network::Qudi;
+use qudi_model::tensor::read;
+use rand::rngs::ChaCha8Rng;
+use rand::{Rng, SeedableRng};
+use serde::Serialize;
+use std::path::Path;
+use std::time::Instant;
+
+/// Means of the loss's terms over a step.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Losses {
+    /// The weighted sum.
+    pub total: f64,
+    /// Of the prediction.
+    pub prediction: f64,
+    /// Of the pre-denoised frames.
+    pub pre: f64,
+    /// Of the perceptual term.
+    pub perceptual: f64,
+    /// Of the flows.
+    pub flow: f64,
+    /// Of the errors that the pre-denoiser tells.
+    pub error: f64,
+}
+
+/// What a step did.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct StepReport {
+    /// Steps taken, this one included.
+    pub step: u64,
+    /// Learning rate.
+    pub rate: f64,
+    /// The loss.
+    #[serde(flatten)]
+    pub loss: Losses,
+    /// Norm of the gradient before it was shortened.
+    pub norm: f64,
+    /// Seconds that the step waited for data.
+    pub data_s: f64,
+    /// Seconds of the forward passes.
+    pub forward_s: f64,
+    /// Seconds of the backward passes.
+    pub backward_s: f64,
+    /// Seconds of the optimizer.
+    pub optimizer_s: f64,
+}
+
+/// See the module.
+#[derive(Debug)]
+pub struct Trainer {
+    recipe: Recipe,
+    /// With autodiff; the first one holds weights and optimizer.
+    devices: Vec<Device>,
+    pub(super) network: Qudi,
+    pub(super) average: Vec<Tensor<1>>,
+    pub(super) adam: Adam,
+    perceptual: Vec<Perceptual>,
+}
+
+/// One batch's gradients and losses, and the seconds that they took.
+struct Pass {
+    gradients: Vec<Tensor<1>>,
+    loss: Losses,
+    forward_s: f64,
+    backward_s: f64,
+}
+
+impl Trainer {
+    /// Starts from `network`, or from the recipe's initial weights. `devices` are without autodiff; batches go to
+    /// them in turn. `backbones` is the folder of the perceptual term's weights.
+    ///
+    /// # Errors
+    /// [`SimError`] if the perceptual term cannot be loaded, or a device lacks the numbers of `train.precision`.
+    pub fn new(
+        recipe: &Recipe,
+        network: Option<Qudi>,
+        devices: &[Device],
+        backbones: Option<&Path>,
+    ) -> Result<Self> {
+        let devices: Vec<Device> = devices.iter().map(|device| device.clone().autodiff()).collect();
+        let Some(main) = devices.first() else {
+            return Err(SimError::request("no device", "--device", "name at least one"));
+        };
+        let precision = recipe.train.precision;
+        if let Some(device) = devices.iter().find(|device| !precision.is_supported(device)) {
+            return Err(unsupported(precision, device));
+        }
+        let mut learner = recipe.network.init(recipe.train.seed, main);
+        if let Some(network) = network {
+            learner = with_values(learner, values(&network));
+        }
+        let start = values(&learner);
+        let term = recipe.train.loss.term;
+        let (_, side) = recipe.sample_size();
+        let size = Size { height: side, width: side };
+        let load = |device: &Device| {
+            let loaded = Perceptual::load(term, backbones, device)?;
+            loaded.check(size)?;
+            Ok(loaded)
+        };
+        let perceptual = if term == PerceptualKind::None {
+            Vec::new()
+        } else {
+            devices.iter().map(load).collect::<Result<_>>()?
+        };
+        Ok(Self {
+            recipe: recipe.clone(),
+            adam: Adam::new(&start),
+            average: start,
+            network: learner,
+            devices,
+            perceptual,
+        })
+    }
+
+    /// Steps taken.
+    pub fn step_number(&self) -> u64 {
+        self.adam.steps
+    }
+
+    /// Batches used.
+    pub fn batches(&self) -> u64 {
+        self.step_number() * self.recipe.train.accumulate as u64
+    }
+
+    /// The network with averaged weights, for use.
+    pub fn averaged(&self) -> Qudi {
+        let network = self.network.valid();
+        // Drafts do not learn, and an average of equal numbers is not always that number.
+        let drafts = network.drafts().to_vec();
+        with_values(network, self.average.clone()).with_drafts(drafts)
+    }
+
+    /// Takes one step.
+    ///
+    /// # Errors
+    /// [`SimError`] if the data or the device fails, or the loss is no number any more.
+    pub fn step(&mut self, feed: &mut Feed) -> Result<StepReport> {
+        let start = Instant::now();
+        let count = self.recipe.train.accumulate;
+        let batches = (0..count).map(|_| feed.next_batch()).collect::<Result<Vec<_>>>()?;
+        let data_s = start.elapsed().as_secs_f64();
+        let passes = self.passes(&batches)?;
+        let start = Instant::now();
+        let mut sum: Option<Vec<Tensor<1>>> = None;
+        let mut loss = Losses::default();
+        let (mut forward_s, mut backward_s) = (0.0, 0.0);
+        // Summed in the order of the batches: which device had them makes no difference.
+        for pass in passes {
+            loss.add(pass.loss, 1.0 / count as f64);
+            forward_s += pass.forward_s;
+            backward_s += pass.backward_s;
+            sum = Some(match sum {
+                None => pass.gradients,
+                Some(sum) => sum.into_iter().zip(pass.gradients).map(|(a, b)| a + b).collect(),
+            });
+        }
+        let gradients = sum.expect("at least one batch");
+        let norm = norm(&gradients)? / count as f64;
+        self.check("the gradient", norm)?;
+        let train = &self.recipe.train;
+        let taken = self.step_number();
+        let rate = learning_rate(train, taken);
+        let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
+        let moved = self.adam.step(values(&self.network), gradients, scale, rate);
+        // An average over few steps at first, or the initial weights would stay in it for long.
+        let keep = train.ema.min((1 + taken) as f64 / (10 + taken) as f64);
+        let average = std::mem::take(&mut self.average).into_iter().zip(&moved);
+        self.average = average.map(|(a, b)| a * keep + b.clone() * (1.0 - keep)).collect();
+        self.network = with_values(self.network.clone(), moved);
+        let optimizer_s = start.elapsed().as_secs_f64();
+        Ok(StepReport {
+            step: self.step_number(),
+            rate,
+            loss,
+            norm,
+            data_s,
+            forward_s,
+            backward_s,
+            optimizer_s,
+        })
+    }
+
+    /// Gradients of all batches, in their order, each on the first device.
+    fn passes(&self, batches: &[Batch]) -> Result<Vec<Pass>> {
+        let main = self.devices[0].clone().inner();
+        if self.devices.len() == 1 {
+            return batches.iter().map(|batch| self.pass(&self.network, batch, 0)).collect();
+        }
+        let weights = values(&self.network);
+        let lists = std::thread::scope(|scope| {
+            let work = |number: usize| {
+                let (weights, device) = (weights.clone(), &self.devices[number]);
+                let mine = batches.iter().enumerate().skip(number).step_by(self.devices.len());
+                move || -> Result<Vec<(usize, Pass)>> {
+                    let inner = device.clone().inner();
+                    let weights = weights.into_iter().map(|w| w.to_device(&inner)).collect();
+                    let network = with_values(self.recipe.network.shell(device), weights);
+                    mine.map(|(at, batch)| Ok((at, self.pass(&network, batch, number)?))).collect()
+                }
+            };
+            let handles: Vec<_> =
+                (0..self.devices.len()).map(|number| scope.spawn(work(number))).collect();
+            let failed =
+                || Err(SimError::request("a device's thread failed", "--device", "report this"));
+            let lists =
+                handles.into_iter().map(|handle| handle.join().unwrap_or_else(|_| failed()));
+            lists.collect::<Result<Vec<_>>>()
+        })?;
+        let mut lists: Vec<(usize, Pass)> = lists.into_iter().flatten().collect();
+        lists.sort_by_key(|(at, _)| *at);
+        let home = |(_, mut pass): (usize, Pass)| {
+            pass.gradients = pass.gradients.into_iter().map(|g| g.to_device(&main)).collect();
+            pass
+        };
+        Ok(lists.into_iter().map(home).collect())
+    }
+
+    /// One batch through `network`, on device `number`.
+    fn pass(&self, network: &Qudi, batch: &Batch, number: usize) -> Result<Pass> {
+        let start = Instant::now();
+        let device = &self.devices[number];
+        let measured = batch.measured(device);
+        let mut random = ChaCha8Rng::seed_from_u64(self.recipe.train.seed);
+        random.set_stream(batch.number);
+        let (weights, switches) = self.options();
+        // Half of all batches start from nothing, as sampling does.
+        let from_nothing = random.next_u64() & 1 == 0;
+        let first_pass = if from_nothing || switches == Switches::NONE {
+            FirstPass::No
+        } else {
+            FirstPass::Yes(random.next_u64())
+        };
+        let example = batch.example(&measured);
+        let perceptual = self.perceptual.get(number);
+        let terms = with_precision(self.recipe.train.precision, || {
+            terms(network, &example, first_pass, weights, switches, perceptual)
+        })?;
+        let number_of = |term: &Tensor<1>| Ok(f64::from(read(term.clone())?[0]));
+        let optional = |term: &Option<Tensor<1>>| term.as_ref().map_or(Ok(0.0), number_of);
+        let loss = Losses {
+            total: number_of(&terms.total)?,
+            prediction: number_of(&terms.prediction)?,
+            pre: number_of(&terms.pre)?,
+            perceptual: optional(&terms.perceptual)?,
+            flow: optional(&terms.flow)?,
+            error: optional(&terms.error)?,
+        };
+        self.check("the loss of the prediction", loss.prediction)?;
+        self.check("the loss of the pre-denoised frames", loss.pre)?;
+        self.check("the perceptual loss", loss.perceptual)?;
+        self.check("the misfit of the flows", loss.flow)?;
+        self.check("the errors told", loss.error)?;
+        let forward_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let gradients = gradients(network, &terms.total.backward());
+        let backward_s = start.elapsed().as_secs_f64();
+        Ok(Pass { gradients, loss, forward_s, backward_s })
+    }
+
+    fn options(&self) -> (LossWeights, Switches) {
+        let LossConfig { prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
+        let network = &self.recipe.network;
+        let switches = Switches {
+            physics: !network.lacks(Part::Physics),
+            self_conditioning: !network.lacks(Part::SelfConditioning),
+        };
+        (LossWeights { prediction, pre, perceptual, flow }, switches)
+    }
+
+    fn check(&self, what: &str, value: f64) -> Result<()> {
+        if value.is_finite() {
+            return Ok(());
+        }
+        Err(SimError::request(
+            format!(
+                "{what} is {value} in step {}: training stopped, the last checkpoint is good",
+                self.step_number() + 1
+            ),
+            what,
+            "lower train.rate or train.clip and go on from the checkpoint with --resume",
+        ))
+    }
+}
+
+impl Losses {
+    fn add(&mut self, other: Self, share: f64) {
+        self.total += share * other.total;
+        self.prediction += share * other.prediction;
+        self.pre += share * other.pre;
+        self.perceptual += share * other.perceptual;
+        self.flow += share * other.flow;
+        self.error += share * other.error;
+    }
+}
+
+fn unsupported(precision: ComputePrecision, device: &Device) -> SimError {
+    SimError::request(
+        format!("{device:?} cannot compute with {precision} numbers"),
+        "train.precision",
+        "set it to \"f32\", which all devices have",
+    )
+}
+
+/// Euclidean norm over all lists.
+fn norm(gradients: &[Tensor<1>]) -> Result<f64> {
+    let squares = gradients.iter().map(|g| g.clone().powi_scalar(2).sum()).collect();
+    let squares = read(Tensor::cat(squares, 0))?;
+    Ok(squares.into_iter().map(f64::from).sum::<f64>().sqrt())
+}

@@ -1,0 +1,201 @@
+//! Measuring a network on fixed bursts.
+
+use super::recipe::{Recipe, VALIDATION, ValidationConfig};
+use crate::dataset::Pack;
+use burn::tensor::Device;
+use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
+use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Camera, Frame, Light, Result, SimError, Size, USUAL_EXPOSURE};
+use qudi_model::config::NetworkConfig;
+use qudi_model::network::Qudi;
+use qudi_model::restorer::{QudiRestorer, SampleOptions};
+use qudi_sim::scene::{Procedural, ProceduralScene};
+use serde::Serialize;
+
+/// Seed of the photons.
+const SEED: u64 = 2026;
+
+/// Speed of procedural scenes, in pixels per frame.
+const SPEED: f64 = 2.0;
+
+/// Fixed bursts.
+#[derive(Debug)]
+pub struct Validator {
+    config: ValidationConfig,
+    clips: Vec<(String, Vec<Frame>)>,
+    sensor: Sensor,
+}
+
+/// Quality on one clip.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ValidationClip {
+    /// Its name.
+    pub name: String,
+    /// Photons per pixel and frame.
+    pub ppp: f64,
+    /// Gain-aligned PSNR in dB, mean over frames.
+    pub psnr_a: f64,
+    /// Raw PSNR in dB.
+    pub psnr: f64,
+    /// SSIM.
+    pub ssim: f64,
+    /// Counts, restored and true image of the middle frame.
+    #[serde(skip)]
+    pub strip: [Frame; 3],
+}
+
+/// Quality on all clips.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Validation {
+    /// Training steps taken.
+    pub step: u64,
+    /// Every clip at every light.
+    pub clips: Vec<ValidationClip>,
+}
+
+impl Validator {
+    /// Reads the clips of a recipe from its pack; none if the recipe measures nothing.
+    ///
+    /// # Errors
+    /// [`SimError`] if the pack lacks them or they are too small.
+    pub fn new(recipe: &Recipe, pack: Option<&Pack>) -> Result<Option<Self>> {
+        let Some(config) = recipe.validation.clone() else { return Ok(None) };
+        let side = Size { height: config.crop, width: config.crop };
+        let mut clips = Vec::new();
+        for name in config.from.iter().filter_map(|from| from.strip_prefix("scene:")) {
+            let Some(kind) = ProceduralScene::by_name(name) else {
+                let what = format!("no procedural scene named `{name}`");
+                return Err(SimError::request(what, "validation.from", "correct the recipe"));
+            };
+            let scene = Procedural { kind, size: side, seed: SEED, speed: SPEED }.scene();
+            let frames = (0..config.frames).map(|t| scene.render(t as f64)).collect();
+            clips.push((name.to_owned(), frames));
+        }
+        if recipe.validation_data().is_some() {
+            let Some(pack) = pack else {
+                let help = "name the data folder, or a pack";
+                return Err(SimError::request("the validation clips need files", "--data", help));
+            };
+            let mut pack = pack.again()?;
+            for number in 0..pack.clips().len() {
+                let clip = pack.clips()[number].clone();
+                if clip.source != VALIDATION {
+                    continue;
+                }
+                let Size { height, width } = clip.size;
+                if height.min(width) < config.crop || clip.frames < config.frames {
+                    let what =
+                        format!("`{}` is smaller than the validation's crop or frames", clip.name);
+                    return Err(SimError::data(
+                        what,
+                        pack.path(),
+                        "lower validation.crop or validation.frames",
+                    ));
+                }
+                let first = (clip.frames - config.frames) / 2;
+                let (left, top) = ((width - config.crop) / 2, (height - config.crop) / 2);
+                let frames = (first..first + config.frames).map(|t| {
+                    let frame = pack.frame(number, t)?;
+                    Ok(Frame::from_fn(side, |x, y| frame.data[(top + y) * width + left + x]))
+                });
+                clips.push((clip.name, frames.collect::<Result<_>>()?));
+            }
+        }
+        if clips.is_empty() {
+            let what = "the pack holds no validation clips";
+            return Err(SimError::request(
+                what,
+                "validation.from",
+                "make the pack again from this recipe",
+            ));
+        }
+        let sensor = Sensor::load(&config.sensor)?;
+        Ok(Some(Self { config, clips, sensor }))
+    }
+
+    /// Steps between validations.
+    pub fn every(&self) -> u64 {
+        self.config.every
+    }
+
+    /// Restores every clip at every light with `network`, which is on `device`.
+    ///
+    /// # Errors
+    /// [`SimError`] if the device fails.
+    pub fn measure(
+        &self,
+        network: &Qudi,
+        sizes: &NetworkConfig,
+        device: &Device,
+        step: u64,
+    ) -> Result<Validation> {
+        let options = SampleOptions { steps: self.config.steps, ..SampleOptions::default() };
+        let mut restorer =
+            QudiRestorer::new(network.clone(), sizes, self.config.frames, options, device)?;
+        let mut clips = Vec::new();
+        for &ppp in &self.config.ppp {
+            for (number, (name, truth)) in self.clips.iter().enumerate() {
+                let size = truth[0].size;
+                let mean = truth.iter().map(Frame::mean).sum::<f64>() / truth.len() as f64;
+                let light = Light { ppp, exposure: mean.max(1e-3) };
+                let mut camera = Camera::new(&self.sensor, size, light, SEED + number as u64)?;
+                let counts = (0..).zip(truth).map(|(t, frame)| camera.expose(t, &[frame]));
+                let counts: Vec<Vec<u16>> = counts.collect::<Result<_>>()?;
+                let mut context = Context {
+                    seed: SEED,
+                    first_frame: 0,
+                    ppp,
+                    exposure: USUAL_EXPOSURE,
+                    sensor: self.sensor.clone(),
+                    gain: camera.gain(),
+                    dark: None,
+                };
+                let read = |frame: u64| Ok(counts[frame as usize].clone());
+                context.exposure = fitting_exposure(size, counts.len() as u64, &context, read)?;
+                let restored =
+                    restorer.restore(BurstView { size, frames: &counts }, &context)?.frames;
+                let mean = |of: fn(&Frame, &Frame) -> f64| {
+                    let all = restored.iter().zip(truth).map(|(frame, truth)| of(frame, truth));
+                    all.sum::<f64>() / truth.len() as f64
+                };
+                let middle = truth.len() / 2;
+                let full = f32::from(self.sensor.max_count());
+                let seen = counts[middle].iter().map(|&count| f32::from(count) / full).collect();
+                clips.push(ValidationClip {
+                    name: name.clone(),
+                    ppp,
+                    psnr_a: mean(gain_aligned_psnr),
+                    psnr: mean(psnr),
+                    ssim: mean(|a, b| ssim(a, b).unwrap_or(f64::NAN)),
+                    strip: [
+                        Frame { size, data: seen },
+                        restored[middle].clone(),
+                        truth[middle].clone(),
+                    ],
+                });
+            }
+        }
+        Ok(Validation { step, clips })
+    }
+}
+
+impl Validation {
+    /// Means of gain-aligned PSNR, raw PSNR and SSIM at every light, in the recipe's order.
+    pub fn means(&self) -> Vec<(f64, [f64; 3])> {
+        let mut means: Vec<(f64, [f64; 3], usize)> = Vec::new();
+        for clip in &self.clips {
+            let values = [clip.psnr_a, clip.psnr, clip.ssim];
+            if let Some((_, sums, count)) = means.iter_mut().find(|mean| mean.0 == clip.ppp) {
+                for (sum, value) in sums.iter_mut().zip(values) {
+                    *sum += value;
+                }
+                *count += 1;
+            } else {
+                means.push((clip.ppp, values, 1));
+            }
+        }
+        means.into_iter().map(|(ppp, sums, n)| (ppp, sums.map(|sum| sum / n as f64))).collect()
+    }
+}

@@ -1,0 +1,338 @@
+//! Training is exact: it goes on from a state as if never stopped, whatever draws the data and wherever batches go.
+#![allow(clippy::unwrap_used)]
+
+use burn::tensor::{Device, Tensor};
+use qudi_core::SimError;
+use qudi_model::checkpoint::load;
+use qudi_model::network::{Qudi, fill, parameters};
+use qudi_train::dataset::Dataset;
+use qudi_train::{
+    Adam, Batch, Bursts, Event, Feed, Files, From, METRICS, Recipe, Run, StepReport, Trainer,
+    WEIGHTS, values,
+};
+use std::ops::ControlFlow;
+use std::path::Path;
+
+/// The recipe `tiny`, smaller and shorter.
+fn recipe(changes: &[(&str, &str)]) -> Recipe {
+    let small = [
+        ("data.crop", "32"),
+        ("data.frames", "3"),
+        ("train.steps", "6"),
+        ("train.checkpoint", "2"),
+        ("train.warmup", "2"),
+        ("validation.frames", "3"),
+        ("validation.crop", "32"),
+        ("validation.every", "3"),
+    ];
+    let changes: Vec<_> =
+        small.iter().chain(changes).map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+    Recipe::load("tiny", &changes).unwrap()
+}
+
+fn weights(network: &Qudi) -> Vec<f32> {
+    let list = values(network).into_iter();
+    list.flat_map(|v| v.into_data().try_into_vec::<f32>().unwrap()).collect()
+}
+
+fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Vec<StepReport>) {
+    let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let mut feed = Feed::new(recipe, &bursts, 0, workers).unwrap();
+    let mut trainer = Trainer::new(recipe, None, devices, None).unwrap();
+    let steps = (0..3).map(|_| trainer.step(&mut feed).unwrap()).collect();
+    (weights(&trainer.averaged()), steps)
+}
+
+fn open(folder: &Path, recipe: &Recipe, from: From) -> Result<Run, SimError> {
+    Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
+}
+
+fn learn(run: &mut Run, stop_after: u64) -> Result<(), SimError> {
+    run.learn(1, &mut |event| match event {
+        Event::Step(report) if report.step == stop_after => ControlFlow::Break(()),
+        _ => ControlFlow::Continue(()),
+    })
+}
+
+/// Adam of Burn's own, on the same gradients.
+#[test]
+fn adam_is_that_of_the_framework() {
+    use burn::module::{Module, Param};
+    use burn::optim::{AdamConfig, GradientsParams};
+    #[derive(Module, Debug)]
+    struct Values {
+        values: Param<Tensor<1>>,
+    }
+    let device = Device::flex().autodiff();
+    let start: Vec<f32> = (0..50).map(|i| (i as f32 * 0.7).sin()).collect();
+    let target = Tensor::<1>::from_floats([0.3; 50], &device);
+    let mut module =
+        Values { values: Param::from_tensor(Tensor::<1>::from_floats(start.as_slice(), &device)) };
+    let mut theirs = AdamConfig::new().with_epsilon(1e-8).init();
+    let mut list = vec![Tensor::<1>::from_floats(start.as_slice(), &Device::flex())];
+    let mut ours = Adam::new(&list);
+    for step in 0..20 {
+        let rate = 0.05 / f64::from(step + 1);
+        let loss = (module.values.val() - target.clone()).powi_scalar(2).sum();
+        let gradients = GradientsParams::from_grads(loss.backward(), &module);
+        let gradient = (list[0].clone() - target.clone().inner()) * 2.0;
+        list = ours.step(list, vec![gradient * 4.0], 0.25, rate);
+        module = theirs.step(rate, module, gradients);
+    }
+    let theirs = module.values.val().into_data().try_into_vec::<f32>().unwrap();
+    let ours = list.remove(0).into_data().try_into_vec::<f32>().unwrap();
+    for (a, b) in ours.iter().zip(&theirs) {
+        assert!((a - b).abs() < 2e-6, "{a} {b}");
+    }
+}
+
+#[test]
+fn threads_that_draw_make_no_difference() {
+    let recipe = recipe(&[]);
+    let (one, steps) = trained(&recipe, &[Device::flex()], 1);
+    let (three, _) = trained(&recipe, &[Device::flex()], 3);
+    assert!(one == three, "weights differ");
+    assert_eq!(steps.iter().map(|s| s.step).collect::<Vec<_>>(), [1, 2, 3]);
+    assert!(steps.iter().all(|s| s.loss.total > 0.0 && s.norm > 0.0));
+    let loss = steps[0].loss;
+    let expected = loss.prediction + 0.2 * loss.pre + 30.0 * loss.flow;
+    assert!((loss.total - expected).abs() < 1e-6 * loss.total);
+}
+
+/// Two devices with a batch each, one device with both in turn, and one device with both at once.
+#[test]
+fn devices_share_batches_without_changing_the_result() {
+    let accumulated = recipe(&[("train.batch", "1"), ("train.accumulate", "2")]);
+    let (turns, _) = trained(&accumulated, &[Device::flex()], 1);
+    let (pair, _) = trained(&accumulated, &[Device::flex(), Device::flex()], 1);
+    assert!(turns == pair, "weights differ");
+    // A doubled batch has one coin for the first pass: compare a step where both sides agree.
+    let doubled = recipe(&[
+        ("train.batch", "2"),
+        ("network.without", "[\"physics\", \"self-conditioning\"]"),
+    ]);
+    let mut halves = doubled.clone();
+    (halves.train.batch, halves.train.accumulate) = (1, 2);
+    let (whole, a) = trained(&doubled, &[Device::flex()], 1);
+    let (pair, b) = trained(&halves, &[Device::flex(), Device::flex()], 1);
+    assert!((a[0].loss.total - b[0].loss.total).abs() < 1e-6 * a[0].loss.total);
+    assert!((a[0].norm - b[0].norm).abs() < 1e-4 * a[0].norm, "{} {}", a[0].norm, b[0].norm);
+    let far = whole.iter().zip(&pair).map(|(a, b)| (a - b).abs()).fold(0f32, f32::max);
+    // Adam's first steps have the gradient's sign: where it is about zero, rounding decides.
+    assert!(far < 2.5 * 3.0 * 2e-3, "{far}");
+    let mean = whole.iter().zip(&pair).map(|(a, b)| (a - b).abs()).sum::<f32>();
+    assert!(mean / (whole.len() as f32) < 2e-5, "{}", mean / whole.len() as f32);
+}
+
+/// The second half after a stop, in another process as it were, gives the bits of an undisturbed run.
+#[test]
+fn a_run_goes_on_exactly() {
+    let recipe = recipe(&[]);
+    let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let mut run = open(folders[0].path(), &recipe, From::Start(None)).unwrap();
+    learn(&mut run, u64::MAX).unwrap();
+    for stop in [1, 4] {
+        let from = if stop == 1 { From::Start(None) } else { From::State };
+        let mut run = open(folders[1].path(), &recipe, from).unwrap();
+        assert!(matches!(learn(&mut run, stop), Err(SimError::Interrupted)));
+        assert_eq!(run.progress(), [stop, 6]);
+    }
+    let mut run = open(folders[1].path(), &recipe, From::State).unwrap();
+    learn(&mut run, u64::MAX).unwrap();
+    let read =
+        |folder: &tempfile::TempDir, name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    for name in ["state/tensors.safetensors", WEIGHTS] {
+        assert!(read(&folders[0], name) == read(&folders[1], name), "{name} differs");
+    }
+    // The same metrics but for the seconds, each step once.
+    let lines = |folder| {
+        let text = String::from_utf8(read(folder, METRICS)).unwrap();
+        let line = |line: &str| {
+            let mut line: serde_json::Map<String, serde_json::Value> =
+                serde_json::from_str(line).unwrap();
+            line.retain(|key, _| !key.ends_with("_s"));
+            serde_json::to_string(&line).unwrap()
+        };
+        text.lines().map(line).collect::<Vec<_>>()
+    };
+    assert_eq!(lines(&folders[0]), lines(&folders[1]));
+    assert_eq!(lines(&folders[0]).len(), 8); // six steps, two validations
+}
+
+/// Killed between the renames of a new state, a run has the old one; half a new one is ignored.
+#[test]
+fn one_whole_state_is_always_there() {
+    let recipe = recipe(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let mut run = open(folder.path(), &recipe, From::Start(None)).unwrap();
+    let _ = learn(&mut run, 2);
+    let steps = || open(folder.path(), &recipe, From::State).map(|run| run.progress()[0]);
+    std::fs::create_dir(at("state.new")).unwrap();
+    std::fs::write(at("state.new/tensors.safetensors"), b"half").unwrap();
+    assert_eq!(steps().unwrap(), 2);
+    std::fs::rename(at("state"), at("state.old")).unwrap();
+    assert_eq!(steps().unwrap(), 2);
+    let mut run = open(folder.path(), &recipe, From::State).unwrap();
+    let _ = learn(&mut run, 4);
+    assert_eq!(steps().unwrap(), 4);
+    assert!(!at("state.new").exists() && !at("state.old").exists());
+}
+
+#[test]
+fn damaged_states_are_refused() {
+    let recipe = recipe(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let mut run = open(folder.path(), &recipe, From::Start(None)).unwrap();
+    let _ = learn(&mut run, 1);
+    let path = folder.path().join("state/tensors.safetensors");
+    let whole = std::fs::read(&path).unwrap();
+    for length in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
+        std::fs::write(&path, &whole[..length]).unwrap();
+        let error = open(folder.path(), &recipe, From::State).unwrap_err();
+        assert!(error.to_string().contains("state"), "{error}");
+    }
+    std::fs::write(&path, &whole).unwrap();
+    let mut wider = recipe.clone();
+    wider.network.unet.width = 16;
+    assert!(open(folder.path(), &wider, From::State).unwrap_err().to_string().contains("size"));
+    open(folder.path(), &recipe, From::State).unwrap();
+}
+
+/// The first stage: the pre-denoiser alone, from single frames of bursts that are kept. Nothing else moves.
+#[test]
+fn the_pre_denoiser_learns_from_parts() {
+    let recipe = recipe(&[
+        ("train.parts", "{ bursts = 3, kept = 2, frames = 1, side = 24 }"),
+        (
+            "train.loss",
+            "{ prediction = 0.0, pre = 1.0, perceptual = 0.0, term = \"none\", flow = 0.0 }",
+        ),
+        ("train.steps", "4"),
+    ]);
+    let before = weights(&recipe.network.init(recipe.train.seed, &Device::flex()));
+    let (after, reports) = trained(&recipe, &[Device::flex()], 2);
+    assert_eq!(after, trained(&recipe, &[Device::flex()], 1).0, "whoever draws the bursts");
+    assert!(reports.iter().all(|report| report.loss.pre > 0.0 && report.loss.flow == 0.0));
+    let count = |part: &str| {
+        let list = parameters(&recipe.network.init(1, &Device::flex()));
+        let sizes = list.iter().filter(|(name, _)| name.starts_with(part));
+        sizes.map(|(_, shape)| shape.iter().product::<usize>()).sum::<usize>()
+    };
+    // Averages of equal weights are equal but for rounding.
+    let moved = after.iter().zip(&before).filter(|(a, b)| (**a - **b).abs() > 1e-6).count();
+    let pre = count("pre.");
+    assert!(moved > pre / 2 && moved <= pre, "{moved} of {pre} weights moved");
+    for (key, value, word) in [
+        ("train.parts", "{ bursts = 3, kept = 2, frames = 1, side = 24 }", "3 frames"),
+        ("train.parts", "{ bursts = 0, kept = 3, frames = 3, side = 24 }", "one burst"),
+        ("train.parts", "{ bursts = 3, kept = 3, frames = 3, side = 30 }", "train.parts.side"),
+        ("train.parts", "{ bursts = 3, kept = 3, frames = 3, side = 40 }", "fit"),
+        ("train.parts", "{ bursts = 3, kept = 2, frames = 3, side = 24 }", "fit"),
+    ] {
+        let changes = [("data.crop", "32"), ("data.frames", "3"), (key, value)];
+        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
+        let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
+        assert!(error.contains(word), "{value}: {error}");
+    }
+}
+
+/// What an earlier round has learnt stays as it was, bit for bit, in the average of weights, too; a run that stopped goes on
+/// with the same bursts.
+#[test]
+fn drafts_do_not_learn() {
+    let recipe = recipe(&[("network.pre.rounds", "2")]);
+    let start = recipe.network.init(1, &Device::flex());
+    let start = fill(start, |_, shape| {
+        let count = shape.iter().product::<usize>();
+        (0..count).map(|i| 0.03 * ((i * 37 % 101) as f32 / 50.0 - 1.0)).collect()
+    });
+    let split = |network: &Qudi| -> [Vec<f32>; 2] {
+        let names = parameters(network).into_iter().map(|(name, _)| name);
+        let lists = names.zip(values(network)).map(|(name, values)| {
+            (name.starts_with("drafts."), values.into_data().try_into_vec::<f32>().unwrap())
+        });
+        let (drafts, others): (Vec<_>, Vec<_>) = lists.partition(|(draft, _)| *draft);
+        [drafts, others].map(|lists| lists.into_iter().flat_map(|(_, values)| values).collect())
+    };
+    let [drafts, others] = split(&start);
+    assert!(!drafts.is_empty() && drafts.len() < others.len());
+    let folders = [0, 1].map(|_| tempfile::tempdir().unwrap());
+    let [whole, parts] = [0, 1].map(|i| folders[i].path());
+    let from = || From::Start(Some(Box::new(start.clone())));
+    learn(&mut open(whole, &recipe, from()).unwrap(), u64::MAX).unwrap();
+    assert!(learn(&mut open(parts, &recipe, from()).unwrap(), 2).is_err());
+    learn(&mut open(parts, &recipe, From::State).unwrap(), u64::MAX).unwrap();
+    let [whole, parts] =
+        [whole, parts].map(|folder| load(&folder.join(WEIGHTS), &Device::flex()).unwrap().0);
+    let [kept, learnt] = split(&whole);
+    assert!(kept == drafts && learnt != others);
+    assert_eq!(weights(&whole), weights(&parts));
+}
+
+/// A network that has gone wrong stops the run before it spoils the state, and the term is named.
+#[test]
+fn no_number_stops_the_run() {
+    let recipe = recipe(&[]);
+    let bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let broken = recipe.network.init(1, &Device::flex());
+    let broken = fill(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
+    let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
+    let mut feed = Feed::new(&recipe, &bursts, 0, 1).unwrap();
+    let error = trainer.step(&mut feed).unwrap_err().to_string();
+    assert!(error.contains("estimate") || error.contains("prediction is NaN"), "{error}");
+    assert_eq!(trainer.step_number(), 0);
+}
+
+/// Numbers of 16 bits change a step by their rounding.
+#[test]
+fn products_may_have_16_bits() {
+    let few =
+        |precision: &str| trained(&recipe(&[("train.precision", precision)]), &[Device::flex()], 1);
+    let (exact_weights, exact) = few("f32");
+    let (weights, got) = few("bf16");
+    assert!(weights != exact_weights, "nothing was rounded");
+    let off = |got: f64, exact: f64| (got / exact - 1.0).abs();
+    let norm = off(got[0].norm, exact[0].norm);
+    assert!(norm > 0.0 && norm < 0.05, "{norm}");
+    let total = off(got[2].loss.total, exact[2].loss.total);
+    assert!(total < 0.05, "{total}");
+}
+
+#[test]
+fn a_device_without_such_numbers_is_refused() {
+    #[allow(deprecated)] // asked for by name
+    let device = Device::ndarray();
+    let recipe = recipe(&[("train.precision", "bf16")]);
+    let text = Trainer::new(&recipe, None, &[device], None).unwrap_err().to_string();
+    assert!(text.contains("bf16"), "{text}");
+}
+
+#[test]
+fn recipes_say_what_is_wrong_with_them() {
+    let load = |key: &str, value: &str| Recipe::load("tiny", &[(key.to_owned(), value.to_owned())]);
+    for (key, value, word) in [
+        ("train.steps", "0", "train.steps"),
+        ("train.rate", "-1", "train.rate"),
+        ("train.ema", "1.0", "train.ema"),
+        ("train.learning", "3", "learning"),
+        ("trains.steps", "3", "trains.steps"),
+        ("data.crop", "50", "data.crop"),
+        ("data.source.0.kind", "films", "films"),
+        ("data.source.0.from", "[\"deadleaves\"]", "deadleaves"),
+        ("data.sensor.0.ppp", "[]", "ppp"),
+        ("data.source.7.weight", "1", "data.source.7"),
+        ("train.loss.perceptual", "0.3", "train.loss.term"),
+        ("network.unet.width", "0", "unet.width"),
+    ] {
+        let error = load(key, value).unwrap_err().to_string();
+        assert!(error.contains(word), "{key}={value}: {error}");
+    }
+    assert!(Recipe::load("huge", &[]).unwrap_err().to_string().contains("huge"));
+    assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);
+    let recipe = load("data.sensor.0.ppp", "[3.25, 9.75]").unwrap();
+    assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
+    let mut bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
+    assert_eq!(again.len(), 2);
+}

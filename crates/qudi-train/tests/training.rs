@@ -1,0 +1,325 @@
+//! Learning works: gradients reach every parameter, one burst can be learnt by heart, and a step runs on ndarray.
+#![allow(clippy::unwrap_used)]
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::{AdamConfig, GradientsParams};
+use burn::tensor::{Device, Gradients, Tensor, TensorData};
+use qudi_core::restorer::{BurstView, Context};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Camera, Frame, Light, Size};
+use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::noise::Noise;
+use qudi_model::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
+use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, fill, parameters};
+use qudi_model::tensor::to_tensor;
+use qudi_model::{ComputePrecision, with_precision};
+use qudi_train::objective::{
+    Example, FirstPass, LossWeights, Switches, Terms, surprise, terms, training_time,
+};
+use qudi_train::{Adam, gradients, values, with_values};
+use std::collections::HashMap;
+
+/// A burst of a moving disk, its truth and its light.
+struct Burst {
+    measured: Measured,
+    truth: Tensor<4>,
+    context: Context,
+    size: Size,
+}
+
+fn tiny() -> NetworkConfig {
+    NetworkConfig::preset("tiny").unwrap()
+}
+
+fn burst(size: Size, frames: usize, device: &Device) -> Burst {
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let light = Light { ppp: 3.25, exposure: 0.45 };
+    let mut camera = Camera::new(&sensor, size, light, 4).unwrap();
+    let scene = |t: usize| {
+        Frame::from_fn(size, |x, y| {
+            let (dx, dy) = (x as f32 - 10.0 - t as f32, y as f32 - 14.0);
+            if dx * dx + dy * dy < 40.0 { 0.9 } else { 0.2 + 0.01 * y as f32 }
+        })
+    };
+    let truth: Vec<Frame> = (0..frames).map(scene).collect();
+    let counts: Vec<Vec<u16>> =
+        truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
+    let context = Context {
+        seed: 0,
+        first_frame: 0,
+        ppp: light.ppp,
+        exposure: light.exposure,
+        gain: camera.gain(),
+        sensor,
+        dark: None,
+    };
+    let view = BurstView { size, frames: &counts };
+    let planes = Planes::of(view, &context);
+    let guide = GuidePlanes::of(
+        &aligned(view, &context, &[]).unwrap(),
+        tiny().pre.laid(),
+        0..view.frames.len(),
+    );
+    let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
+    let measured = Measured {
+        u: to_tensor(planes.u, size, device),
+        guide: guide.into_tensor(size, device),
+        sensor: Tensor::from_data(numbers, device),
+        frames,
+    };
+    let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
+    Burst { measured, truth: to_tensor(truth, size, device), context, size }
+}
+
+/// The loss of step `number`, at a time and with noise of its own.
+fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
+    let frames = burst.measured.frames;
+    let noise = Noise::new(number, 1);
+    let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
+    let place = (number as f64 * 0.618_034).fract();
+    let time = training_time((number as f64 * 0.414_214).fract(), place, 0.2);
+    let example = Example {
+        measured: &burst.measured,
+        truth: burst.truth.clone(),
+        contexts: std::slice::from_ref(&burst.context),
+        noise: to_tensor(values, burst.size, &burst.truth.device()),
+        times: &[time],
+    };
+    let first_pass = if number.is_multiple_of(2) { FirstPass::No } else { FirstPass::Yes(number) };
+    terms(network, &example, first_pass, LossWeights::default(), Switches::ALL, None).unwrap()
+}
+
+/// The first stage computes what the whole network would of pre-denoiser and flow, and nothing else learns.
+#[test]
+fn the_first_stage_is_a_part_of_the_whole() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let network = tiny().init(3, &device);
+    let with = |prediction: f32| {
+        let weights = LossWeights { prediction, pre: 1.0, flow: 0.5, ..LossWeights::default() };
+        let example = Example {
+            measured: &burst.measured,
+            truth: burst.truth.clone(),
+            contexts: std::slice::from_ref(&burst.context),
+            noise: burst.truth.zeros_like(),
+            times: &[500],
+        };
+        terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap()
+    };
+    let (part, whole) = (with(0.0), with(1.0));
+    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
+    assert_eq!(value(&part.pre), value(&whole.pre));
+    let flows = [&part, &whole].map(|terms| value(terms.flow.as_ref().unwrap()));
+    assert_eq!(flows[0], flows[1]);
+    assert!((value(&part.total) - value(&part.pre) - 0.5 * flows[0]).abs() < 1e-7);
+    let grads = part.total.backward();
+    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut without);
+    let idle = |part: &str| without.names.iter().any(|name| name.starts_with(part));
+    // Other layers of the two lie behind last layers that start at zero.
+    assert!(!idle("pre.out") && !idle("flow.levels.0.layers.4"));
+    assert!(idle("unet.") && idle("fusion.") && idle("low.") && idle("high."));
+}
+
+/// The layers that tell errors learn from the frames' errors, and nothing else learns from that.
+#[test]
+fn errors_are_told_without_changing_frames() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let mut config = tiny();
+    config.pre.error = true;
+    let network = config.init(3, &device);
+    let terms_of = |prediction: f32| {
+        let weights = LossWeights { prediction, pre: 0.0, ..LossWeights::default() };
+        let example = Example {
+            measured: &burst.measured,
+            truth: burst.truth.clone(),
+            contexts: std::slice::from_ref(&burst.context),
+            noise: burst.truth.zeros_like(),
+            times: &[500],
+        };
+        terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap()
+    };
+    let (part, whole) = (terms_of(0.0), terms_of(1.0));
+    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
+    let [told, again] = [&part, &whole].map(|terms| value(terms.error.as_ref().unwrap()));
+    assert_eq!(told, again);
+    assert_eq!(told, value(&part.total));
+    let grads = part.total.backward();
+    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut without);
+    let idle = |part: &str| without.names.iter().any(|name| name.starts_with(part));
+    // What enters lies behind a last layer that starts at zero.
+    assert!(!idle("error.out") && idle("error.enter") && idle("pre.out"));
+}
+
+/// The U-Net's corrections are as large as errors are told to be; at first as without telling.
+#[test]
+fn told_errors_scale_the_diffusion() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let prediction = |error: bool, bias: f32| {
+        let mut config = tiny();
+        config.pre.error = error;
+        let mut network = config.init(3, &device);
+        if error {
+            let told = |name: &str, shape: &[usize]| {
+                let initial = vec![bias; shape.iter().product()];
+                (name == "error.out.bias").then_some(initial)
+            };
+            let kept = values_by_name(&network);
+            network = fill(network, |name, shape| {
+                told(name, shape).unwrap_or_else(|| kept[name].clone())
+            });
+        }
+        let example = Example {
+            measured: &burst.measured,
+            truth: burst.truth.clone(),
+            contexts: std::slice::from_ref(&burst.context),
+            noise: burst.truth.ones_like(),
+            times: &[100],
+        };
+        let weights = LossWeights::default();
+        let terms = terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap();
+        terms.prediction.into_scalar::<f32>()
+    };
+    let without = prediction(false, 0.0);
+    assert!((prediction(true, 0.0) - without).abs() < 1e-5 * without);
+    assert!((prediction(true, 1.0) - without).abs() > 1e-3 * without);
+}
+
+fn values_by_name(network: &Qudi) -> HashMap<String, Vec<f32>> {
+    let names = parameters(network).into_iter().map(|(name, _)| name);
+    let lists =
+        values(network).into_iter().map(|list| list.into_data().try_to_vec::<f32>().unwrap());
+    names.zip(lists).collect()
+}
+
+/// Least where the deviations are those of the errors: 0.5 and their logarithm.
+#[test]
+fn surprise_is_least_where_deviations_are_right() {
+    let device = Device::flex();
+    let noise: Vec<f32> = Noise::new(5, 1).frame(0, 0, 64 * 64).collect();
+    let scale = (noise.iter().map(|n| n * n).sum::<f32>() / noise.len() as f32).sqrt();
+    let of = |deviation: f32| {
+        let errors = noise.iter().map(|n| 0.2 * n / scale).collect();
+        let errors = to_tensor(errors, Size { height: 64, width: 64 }, &device);
+        surprise(errors.clone(), errors.ones_like() * deviation).into_scalar::<f32>()
+    };
+    assert!((of(0.2) - (0.5 + 0.2f32.ln())).abs() < 1e-5, "{}", of(0.2));
+    assert!(of(0.2) < of(0.19) && of(0.2) < of(0.21));
+}
+
+/// Names of parameters whose gradient is missing or zero.
+struct Without<'a> {
+    grads: &'a Gradients,
+    path: Vec<String>,
+    names: Vec<String>,
+}
+
+impl ModuleVisitor for Without<'_> {
+    fn enter_module(&mut self, name: &str, _container: &str) {
+        self.path.push(name.into());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let size = param.val().grad(self.grads).map(|g| g.abs().sum().into_scalar::<f32>());
+        if !size.is_some_and(|size| size > 0.0 && size.is_finite()) {
+            self.names.push(self.path.join("."));
+        }
+    }
+}
+
+#[test]
+fn gradients_reach_every_parameter() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let mut config = tiny();
+    config.unet.temporal = true;
+    config.unet.attention = vec![1];
+    let mut network = config.init(3, &device);
+    let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
+    for number in 0..10 {
+        let grads = loss(&network, &burst, number).total.backward();
+        let grads = GradientsParams::from_grads(grads, &network);
+        network = optimizer.step(1e-3, network, grads);
+    }
+    // A step with a first pass: only then the simulated measurement matters. Its time is not the last one.
+    let number = (1..).step_by(2).find(|&n| (f64::from(n) * 0.414_214).fract() > 0.2).unwrap();
+    let grads = loss(&network, &burst, number as u64).total.backward();
+    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut without);
+    assert!(without.names.is_empty(), "no gradient: {}", without.names.join(", "));
+}
+
+#[test]
+fn gradients_in_16_bits_are_those_in_32() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 64, width: 64 }, 5, &device);
+    let mut network = tiny().init(3, &device);
+    let mut optimizer = Adam::new(&values(&network));
+    let of = |network: &Qudi, precision| {
+        with_precision(precision, || {
+            gradients(network, &loss(network, &burst, 10).total.backward())
+        })
+    };
+    for _ in 0..10 {
+        let gradients = of(&network, ComputePrecision::F32);
+        let moved = optimizer.step(values(&network), gradients, 1.0, 1e-3);
+        network = with_values(network, moved);
+    }
+    let norm = |lists: &[Tensor<1>]| {
+        let squares = lists.iter().map(|list| list.clone().powi_scalar(2).sum());
+        squares.map(|square| square.into_scalar::<f32>()).sum::<f32>().sqrt()
+    };
+    let exact = of(&network, ComputePrecision::F32);
+    let apart = of(&network, ComputePrecision::Bf16).into_iter().zip(&exact);
+    let apart: Vec<_> = apart.map(|(a, b)| a - b.clone()).collect();
+    let off = norm(&apart) / norm(&exact);
+    assert!(off > 1e-3 && off < 0.05, "{off}");
+}
+
+#[test]
+fn one_burst_is_learnt_by_heart() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 16, width: 16 }, 5, &device);
+    let mut network = tiny().init(3, &device);
+    let mut optimizer = Adam::new(&values(&network));
+    let (mut totals, mut predictions) = (Vec::new(), Vec::new());
+    for number in 0..200u32 {
+        let terms = loss(&network, &burst, u64::from(number));
+        totals.push(terms.total.clone().into_scalar::<f32>());
+        predictions.push(terms.prediction.into_scalar::<f32>());
+        let gradients = gradients(&network, &terms.total.backward());
+        let norm = gradients.iter().map(|g| g.clone().powi_scalar(2).sum().into_scalar::<f32>());
+        let norm = f64::from(norm.sum::<f32>().sqrt());
+        let rate = 4e-3 * (1.0 - f64::from(number) / 200.0);
+        let moved = optimizer.step(values(&network), gradients, (0.05 / norm).min(1.0), rate);
+        network = with_values(network, moved);
+    }
+    let drop = |losses: &[f32]| losses[190..].iter().sum::<f32>() / 10.0 / losses[0];
+    let (total, prediction) = (drop(&totals), drop(&predictions));
+    assert!(prediction < 0.05, "the prediction's loss is still {prediction} of the first");
+    assert!(total < 0.1, "the loss is still {total} of the first");
+}
+
+#[test]
+fn a_step_on_ndarray_is_that_on_flex() {
+    #[allow(deprecated)] // asked for by name
+    let devices = [Device::flex(), Device::ndarray()];
+    let losses = devices.map(|device| {
+        let device = device.autodiff();
+        let burst = burst(Size { height: 16, width: 16 }, 3, &device);
+        let mut network = tiny().init(3, &device);
+        let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
+        let grads = loss(&network, &burst, 2).total.backward();
+        let grads = GradientsParams::from_grads(grads, &network);
+        network = optimizer.step(1e-3, network, grads);
+        loss(&network, &burst, 4).total.into_scalar::<f32>()
+    });
+    assert!((losses[0] / losses[1] - 1.0).abs() < 1e-3, "{losses:?}");
+}
