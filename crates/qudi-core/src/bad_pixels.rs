@@ -138,7 +138,7 @@ impl Repair {
     }
 
     /// The number of repaired pixels.
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.pixels.len()
     }
 
@@ -210,6 +210,6 @@ mod tests {
     #[test]
     fn a_fully_bad_array_is_left_alone() {
         let size = Size { height: 2, width: 2 };
-        assert_eq!(Repair::new(&[true; 4], size).len(), 0);
+        assert_eq!(Repair::new(&[true; 4], size).count(), 0);
     }
 }

@@ -398,7 +398,7 @@ impl Capture {
     /// # Errors
     /// [`SimError`] if the file cannot be read.
     pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
-        let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.len() == 0;
+        let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.count() == 0;
         if !untouched || self.about.packing.is_none() {
             return Ok(false);
         }

@@ -65,7 +65,7 @@ pub trait FrameReader {
     fn size(&self) -> Size;
 
     /// Frames in all, if known.
-    fn len(&self) -> Option<u64>;
+    fn frames(&self) -> Option<u64>;
 
     /// The next frame; none at the end.
     ///

@@ -59,7 +59,7 @@ pub(crate) fn plan(
     };
     let size = capture.size();
     capture.repair = Repair::new(&capture.bad.mask(size), size);
-    if capture.repair.len() < capture.bad.len() {
+    if capture.repair.count() < capture.bad.len() {
         return Err(SimError::request(
             "every pixel is bad",
             "--mask",

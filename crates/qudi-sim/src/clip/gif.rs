@@ -40,7 +40,7 @@ impl FrameReader for Gif {
         self.size
     }
 
-    fn len(&self) -> Option<u64> {
+    fn frames(&self) -> Option<u64> {
         None
     }
 

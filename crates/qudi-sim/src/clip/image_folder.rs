@@ -48,7 +48,7 @@ impl FrameReader for ImageFolder {
         self.size
     }
 
-    fn len(&self) -> Option<u64> {
+    fn frames(&self) -> Option<u64> {
         Some(self.total)
     }
 

@@ -71,7 +71,7 @@ impl FrameReader for NpyFrames {
         self.size
     }
 
-    fn len(&self) -> Option<u64> {
+    fn frames(&self) -> Option<u64> {
         Some(self.total)
     }
 

@@ -64,7 +64,7 @@ impl<R: BufRead> FrameReader for PpmStream<R> {
         self.size
     }
 
-    fn len(&self) -> Option<u64> {
+    fn frames(&self) -> Option<u64> {
         None
     }
 

@@ -20,7 +20,7 @@ impl Recorded {
 
 impl ExposureSource for Recorded {
     fn info(&self) -> ClipInfo {
-        let there = self.reader.len().map(|n| n / self.instants as u64);
+        let there = self.reader.frames().map(|n| n / self.instants as u64);
         let frames = match (there, self.left) {
             (Some(there), Some(limit)) => Some(there.min(limit)),
             (there, _) => there,

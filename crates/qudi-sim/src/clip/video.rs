@@ -97,7 +97,7 @@ impl FrameReader for Video {
         self.frames.size()
     }
 
-    fn len(&self) -> Option<u64> {
+    fn frames(&self) -> Option<u64> {
         None
     }
 

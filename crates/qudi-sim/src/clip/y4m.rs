@@ -76,7 +76,7 @@ impl<R: Read> FrameReader for Y4m<R> {
         self.size
     }
 
-    fn len(&self) -> Option<u64> {
+    fn frames(&self) -> Option<u64> {
         None
     }
 
