@@ -3,7 +3,7 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use qudi_burst::bm3d;
 use qudi_burst::{Finish, Qbp, Transform, TransformDenoise};
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
 use qudi_sim::scene::{Procedural, ProceduralScene};
@@ -21,7 +21,7 @@ fn methods(c: &mut Criterion) {
         .map(|t| camera.expose(t, &[&scene.render(t as f64)]).expect("an exposure"))
         .collect();
     let gain = camera.gain();
-    let context = Context {
+    let acquisition = Acquisition {
         seed: 1,
         first_frame: 0,
         ppp: light.ppp,
@@ -44,7 +44,7 @@ fn methods(c: &mut Criterion) {
     ];
     for mut method in methods {
         group.bench_function(format!("{}, 11 frames", method.name()), |b| {
-            b.iter(|| method.restore(black_box(burst), &context).expect("a result"));
+            b.iter(|| method.restore(black_box(burst), &acquisition).expect("a result"));
         });
     }
     group.finish();

@@ -9,7 +9,7 @@
 use qudi_burst::half_of_least_risk;
 use qudi_burst::{Finish, Qbp, QbpSettings, Transform, TransformDenoise};
 use qudi_core::metrics::gain_aligned_psnr;
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Result, SimError, Size};
 use qudi_sim::clip::{Input, Sampling};
@@ -19,7 +19,7 @@ use std::path::Path;
 struct Exposed {
     truth: Vec<Frame>,
     counts: Vec<Vec<u16>>,
-    context: Context,
+    acquisition: Acquisition,
 }
 
 fn main() -> Result<()> {
@@ -69,7 +69,7 @@ fn sweep(clips: &[Exposed], ppp: f64) -> Result<()> {
         for noise_left in [1.0, 0.3, 0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01] {
             let chosen = mean(&|i| {
                 let samples = [clips[i].burst()];
-                figures[i][half_of_least_risk(&samples, &clips[i].context, noise_left)]
+                figures[i][half_of_least_risk(&samples, &clips[i].acquisition, noise_left)]
             });
             println!("  {transform:?}, chosen with {noise_left}: {chosen:.2} dB");
         }
@@ -104,7 +104,7 @@ impl Exposed {
 
 /// Mean over all frames.
 fn psnr(clip: &Exposed, method: &mut dyn Restorer) -> Result<f64> {
-    let restored = method.restore(clip.burst(), &clip.context)?.frames;
+    let restored = method.restore(clip.burst(), &clip.acquisition)?.frames;
     let total: f64 = restored
         .iter()
         .zip(&clip.truth)
@@ -139,6 +139,7 @@ fn expose(truth: &[Frame], ppp: f64, seed: u64) -> Result<Exposed> {
     }
     let gain = camera.gain();
     let exposure = 0.45;
-    let context = Context { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None };
-    Ok(Exposed { truth: truth.to_vec(), counts, context })
+    let acquisition =
+        Acquisition { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None };
+    Ok(Exposed { truth: truth.to_vec(), counts, acquisition })
 }

@@ -13,7 +13,7 @@
 use qudi_burst::{Average, Mle};
 use qudi_burst::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, SimError, Size};
 use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
@@ -83,7 +83,7 @@ fn main() -> qudi_core::Result<()> {
     document["quantum_efficiency"] = 1.0.into();
     document["frames_summed"] = SUM.into();
     let sensor = Sensor::from_document(document, "swissspad2")?;
-    let context = Context {
+    let acquisition = Acquisition {
         seed: 0,
         first_frame: 0,
         ppp: mean * f64::from(SUM),
@@ -94,11 +94,11 @@ fn main() -> qudi_core::Result<()> {
     };
     println!(
         "{size}, {:.4} detections per frame of {SUM}, reference of {rest} frames",
-        context.ppp
+        acquisition.ppp
     );
     let burst = BurstView { size, frames: &frames };
     match other {
-        Some(("write", path)) => return write(path, burst, &context.sensor),
+        Some(("write", path)) => return write(path, burst, &acquisition.sensor),
         Some((_, path)) => {
             let image = middle(path, size)?;
             println!("{path}: psnr-a {:.2} dB", corrected(&image, &truth, own_noise));
@@ -106,8 +106,8 @@ fn main() -> qudi_core::Result<()> {
         }
         None => {}
     }
-    let mut mle = Mle::choose(&[burst], &context);
-    let choose = |transform| TransformDenoise::choose(transform, &[burst], &context);
+    let mut mle = Mle::choose(&[burst], &acquisition);
+    let choose = |transform| TransformDenoise::choose(transform, &[burst], &acquisition);
     let mut stabilized = choose(Transform::Integral);
     let mut plain = choose(Transform::Identity);
     let (mut qbp, mut qbp_bm3d) = (Qbp::new(Finish::Plain), Qbp::new(Finish::Bm3d));
@@ -121,7 +121,7 @@ fn main() -> qudi_core::Result<()> {
         &mut TwoRounds,
     ];
     for method in methods {
-        let restored = method.restore(burst, &context)?.frames;
+        let restored = method.restore(burst, &acquisition)?.frames;
         let decibels = corrected(&restored[FRAMES / 2], &truth, own_noise);
         println!("{:<17} psnr-a {decibels:6.2} dB", method.name());
     }

@@ -8,7 +8,7 @@ use crate::merge::blocks::Blocks;
 use crate::merge::dft::SIDE;
 use crate::methods::qbp::{Merged, Merger, Patchwise, Pilots, at_least, nearest};
 use crate::methods::transform_denoise::{image, units};
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 use std::sync::OnceLock;
@@ -24,7 +24,7 @@ const LEAST_VARIANCE: f64 = 1e-4;
 pub struct Alignment<'a> {
     merger: Merger,
     stabilizer: Stabilizer,
-    context: &'a Context,
+    acquisition: &'a Acquisition,
     /// Dark detections of an ordinary pixel.
     ordinary: f64,
     clean: Vec<Frame>,
@@ -80,10 +80,10 @@ pub struct Aligned {
 
 impl<'a> Alignment<'a> {
     /// Of the window that `guide` was found for.
-    pub fn new(guide: Guide, context: &'a Context) -> Self {
+    pub fn new(guide: Guide, acquisition: &'a Acquisition) -> Self {
         let Guide { clean, means, merger, stabilizer, ordinary } = guide;
         let (none, flows) = (Vec::new(), Vec::new());
-        Self { merger, stabilizer, context, ordinary, clean: none, flows }.led_by(clean, means)
+        Self { merger, stabilizer, acquisition, ordinary, clean: none, flows }.led_by(clean, means)
     }
 
     /// Goes by restored frames, in image units and in mean counts.
@@ -96,11 +96,12 @@ impl<'a> Alignment<'a> {
     /// Once more, on better frames of the window in image units.
     #[must_use]
     pub fn on(self, clean: Vec<Frame>) -> Self {
-        let units = units(self.context);
+        let units = units(self.acquisition);
         let size = self.merger.frames[0].size;
         let means = clean.iter().map(|frame| {
             let mean = |(i, &image): (usize, &f32)| {
-                let detections = f64::from(image) / units + self.context.dark_of(i, self.ordinary);
+                let detections =
+                    f64::from(image) / units + self.acquisition.dark_of(i, self.ordinary);
                 self.merger.moments.at(detections).0 as f32
             };
             let means: Vec<f32> = frame.data.iter().enumerate().map(mean).collect();
@@ -122,13 +123,13 @@ impl<'a> Alignment<'a> {
 
     /// What is known of frame `reference`, with so many neighbours laid upon it.
     pub fn of(&self, reference: usize, neighbours: usize, along: Along) -> Aligned {
-        let Self { merger, stabilizer, context, ordinary, clean, .. } = self;
+        let Self { merger, stabilizer, acquisition, ordinary, clean, .. } = self;
         let motion = self.motion(reference);
         let flow = &motion.likeliest;
         let blocks = Blocks::around(reference, merger.frames.len(), merger.block);
         let Merged { counts, noises, .. } = merger.merge_along(&blocks, flow);
         let noises = merger.blended(|i| [[noises[i]; SIDE]; SIDE]);
-        let merged = image(&stabilizer.stabilized(&counts), stabilizer, context, *ordinary);
+        let merged = image(&stabilizer.stabilized(&counts), stabilizer, acquisition, *ordinary);
 
         let nearest = nearest(merger.frames.len(), reference, neighbours + 1);
         let guide = &merger.pilots.as_ref().expect("set at first").frames;
@@ -193,7 +194,7 @@ impl<'a> Alignment<'a> {
     /// above and below, through the inverse of the transform; black is no bound.
     fn noise(&self, means: &Frame, noises: &Frame) -> Frame {
         let n = self.merger.frames.len() as f64;
-        let units = units(self.context);
+        let units = units(self.acquisition);
         let deviation = |(&mean, &noise): (&f32, &f32)| {
             let z = self.stabilizer.transform(n * f64::from(mean));
             let z = self.stabilizer.possible(z);

@@ -8,7 +8,7 @@ use crate::methods::qbp::{Finish, Merged, Merger, Pilots, Qbp, QbpSettings, at_l
 use crate::methods::transform_denoise::{denoise, image};
 use crate::motion::camera::Camera;
 use crate::motion::paths::Even;
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
 use rayon::prelude::*;
@@ -46,15 +46,19 @@ impl Guide {
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown.
-    pub fn find(burst: BurstView<'_>, context: &Context) -> Result<Self> {
-        let ordinary = context.sensor.dark_per_frame()?;
+    pub fn find(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Self> {
+        let ordinary = acquisition.sensor.dark_per_frame()?;
         let count = burst.frames.len();
         let n = count as f64;
-        let stabilizer =
-            Stabilizer::new(Transform::Integral, &context.sensor, context.gain, count as u32);
+        let stabilizer = Stabilizer::new(
+            Transform::Integral,
+            &acquisition.sensor,
+            acquisition.gain,
+            count as u32,
+        );
         let qbp = Qbp::new(Finish::Bm3d);
         let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
-        let mut merger = Merger::new(burst, context, qbp.block(context)?, trust);
+        let mut merger = Merger::new(burst, acquisition, qbp.block(acquisition)?, trust);
         merger.even = Even::find(&merger);
         merger.camera = Camera::find(&merger.frames, &merger.moments, 1.0);
         let round = |merger: &Merger, profile, assumed| {
@@ -74,7 +78,7 @@ impl Guide {
         let frames = means(&round(&merger, QUICK, first_noise), size);
         merger.follow(Pilots { frames, error: ERROR });
         let restored = round(&merger, THOROUGH, NOISE);
-        let clean = restored.iter().map(|z| image(z, &stabilizer, context, ordinary)).collect();
+        let clean = restored.iter().map(|z| image(z, &stabilizer, acquisition, ordinary)).collect();
         let means = means(&restored, size);
         Ok(Self { clean, means, merger, stabilizer, ordinary })
     }
@@ -93,8 +97,8 @@ impl Restorer for TwoRounds {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
-        Ok(Restored { frames: Guide::find(burst, context)?.clean, std: None })
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        Ok(Restored { frames: Guide::find(burst, acquisition)?.clean, std: None })
     }
 }
 

@@ -4,14 +4,14 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_burst::PatchFlow;
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
 use qudi_sim::scene::{Motion, Procedural, ProceduralScene, Scene};
 
 const SIZE: Size = Size { height: 192, width: 192 };
 
-fn exposed(scene: &Scene, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Context) {
+fn exposed(scene: &Scene, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Acquisition) {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let light = Light { ppp, exposure: scene.render(0.0).mean() };
     let mut camera = Camera::new(&sensor, scene.size, light, 3).unwrap();
@@ -19,14 +19,14 @@ fn exposed(scene: &Scene, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Context) {
     let counts = (0..frames).map(expose).collect();
     let gain = camera.gain();
     let exposure = light.exposure;
-    (counts, Context { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None })
+    (counts, Acquisition { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None })
 }
 
 /// End-point errors of all patches that stay inside, from `reference` to `other`.
 fn errors(scene: &Scene, ppp: f64, reference: usize, others: &[usize]) -> Vec<f64> {
-    let (counts, context) = exposed(scene, ppp, 11);
+    let (counts, acquisition) = exposed(scene, ppp, 11);
     let burst = BurstView { size: scene.size, frames: &counts };
-    let PatchFlow { corners, flow } = PatchFlow::find(burst, &context, reference).unwrap();
+    let PatchFlow { corners, flow } = PatchFlow::find(burst, &acquisition, reference).unwrap();
     let mut errors = Vec::new();
     for &other in others {
         let truth = scene.flow(reference as f64, other as f64);

@@ -6,7 +6,7 @@ use qudi_burst::{
     Aligned, Alignment, Along, Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds,
 };
 use qudi_core::metrics::gain_aligned_psnr;
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_sim::scene::{Procedural, ProceduralScene};
@@ -22,9 +22,9 @@ fn methods() -> Vec<Box<dyn Restorer>> {
     ]
 }
 
-fn context(sensor: Sensor, ppp: f64) -> Context {
+fn acquisition(sensor: Sensor, ppp: f64) -> Acquisition {
     let gain = sensor.gain_at(ppp).unwrap();
-    Context { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+    Acquisition { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
 }
 
 /// A window of a scene in motion, and its truth.
@@ -49,14 +49,14 @@ fn every_method_beats_the_average_of_a_moving_scene() {
     spad.frames_summed = 7;
     for sensor in [Sensor::load("qudi-paper").unwrap(), spad] {
         let (counts, truth) = exposed(size, &sensor, 6.0, 11);
-        let context = context(sensor, 6.0);
+        let acquisition = acquisition(sensor, 6.0);
         let burst = BurstView { size, frames: &counts };
-        let naive = mean_psnr(&Average.restore(burst, &context).unwrap().frames, &truth);
+        let naive = mean_psnr(&Average.restore(burst, &acquisition).unwrap().frames, &truth);
         for mut method in methods() {
-            let restored = method.restore(burst, &context).unwrap().frames;
+            let restored = method.restore(burst, &acquisition).unwrap().frames;
             let found = mean_psnr(&restored, &truth);
             let name = method.name();
-            println!("{} {name}: {found:.2} dB, average {naive:.2} dB", context.sensor.name);
+            println!("{} {name}: {found:.2} dB, average {naive:.2} dB", acquisition.sensor.name);
             // A sum of 11 is no better than the average where everything moves.
             let margin = if name == "transform-denoise" { 0.0 } else { 0.5 };
             assert!(found > naive + margin, "{name}: {found} dB, average {naive} dB");
@@ -72,11 +72,11 @@ fn the_second_round_beats_the_first() {
     for (name, ppp, margin) in cases {
         let sensor = Sensor::load(name).unwrap();
         let (counts, truth) = exposed(size, &sensor, ppp, 11);
-        let context = context(sensor, ppp);
+        let acquisition = acquisition(sensor, ppp);
         let burst = BurstView { size, frames: &counts };
-        let first = Qbp::new(Finish::Bm3d).restore(burst, &context).unwrap().frames;
-        let guide = Guide::find(burst, &context).unwrap();
-        let alignment = Alignment::new(guide, &context);
+        let first = Qbp::new(Finish::Bm3d).restore(burst, &acquisition).unwrap().frames;
+        let guide = Guide::find(burst, &acquisition).unwrap();
+        let alignment = Alignment::new(guide, &acquisition);
         let aligned: Vec<Aligned> =
             (0..truth.len()).map(|frame| alignment.of(frame, 10, Along::Likeliest)).collect();
         let merged: Vec<Frame> = aligned.iter().map(|aligned| aligned.merged.clone()).collect();
@@ -111,10 +111,10 @@ fn neighbours_are_seen_in_deviations() {
     let light = Light { ppp: 3.25, exposure: still.mean() };
     let mut camera = Camera::new(&sensor, size, light, 9).unwrap();
     let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
-    let context = Context { exposure: still.mean(), ..context(sensor, 3.25) };
+    let acquisition = Acquisition { exposure: still.mean(), ..acquisition(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
-    let guide = Guide::find(burst, &context).unwrap();
-    let aligned = Alignment::new(guide, &context).of(2, 8, Along::Likeliest);
+    let guide = Guide::find(burst, &acquisition).unwrap();
+    let aligned = Alignment::new(guide, &acquisition).of(2, 8, Along::Likeliest);
     assert_eq!((aligned.seen.len(), aligned.expected.len()), (9, 8));
     let deviation = |frame: &Frame| {
         let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
@@ -130,11 +130,11 @@ fn neighbours_are_seen_in_deviations() {
     assert!(aligned.seen[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
 
     // The truth in the guide's place shows it as well: what it expects is what the camera counts.
-    let guide = Guide::find(burst, &context).unwrap();
+    let guide = Guide::find(burst, &acquisition).unwrap();
     let aligned =
-        Alignment::new(guide, &context).on(vec![still.clone(); 7]).of(2, 8, Along::Likeliest);
+        Alignment::new(guide, &acquisition).on(vec![still.clone(); 7]).of(2, 8, Along::Likeliest);
     assert_eq!(aligned.clean, still);
-    let thrice = Alignment::new(Guide::find(burst, &context).unwrap(), &context)
+    let thrice = Alignment::new(Guide::find(burst, &acquisition).unwrap(), &acquisition)
         .on(vec![still.clone(); 7])
         .of(2, 8, Along::Pixels);
     assert_eq!((thrice.seen.len(), thrice.expected.len()), (25, 24));
@@ -161,12 +161,12 @@ fn threads_do_not_change_a_bit() {
     let size = Size { height: 48, width: 64 };
     let sensor = Sensor::load("qudi-paper").unwrap();
     let (counts, _) = exposed(size, &sensor, 9.75, 5);
-    let context = context(sensor, 9.75);
+    let acquisition = acquisition(sensor, 9.75);
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let burst = BurstView { size, frames: &counts };
         pool.install(|| -> Vec<Vec<Frame>> {
-            methods().iter_mut().map(|m| m.restore(burst, &context).unwrap().frames).collect()
+            methods().iter_mut().map(|m| m.restore(burst, &acquisition).unwrap().frames).collect()
         })
     };
     assert_eq!(on(1), on(2));
@@ -178,14 +178,14 @@ fn odd_input_gives_pictures() {
     for name in ["qudi-paper", "swissspad2", "qis4-gj"] {
         let sensor = Sensor::load(name).unwrap();
         let most = sensor.max_count();
-        let context = context(sensor, 3.25);
+        let acquisition = acquisition(sensor, 3.25);
         for (height, width) in [(1, 1), (5, 9), (16, 16), (17, 40)] {
             let size = Size { height, width };
             for (count, frames) in [(0, 1), (most, 1), (0, 3), (most, 3), (most / 2, 12)] {
                 let counts = vec![vec![count; size.pixels()]; frames];
                 for mut method in methods() {
                     let burst = BurstView { size, frames: &counts };
-                    let restored = method.restore(burst, &context).unwrap().frames;
+                    let restored = method.restore(burst, &acquisition).unwrap().frames;
                     assert_eq!(restored.len(), frames);
                     for frame in restored {
                         assert_eq!(frame.size, size);

@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::frame::Size;
 use crate::light::USUAL_EXPOSURE;
-use crate::restorer::{BurstView, Context};
+use crate::restorer::{Acquisition, BurstView};
 use crate::sensor::{CountLaw, Response};
 use crate::windows::LONGEST_HALF;
 
@@ -19,7 +19,7 @@ const BRIGHTER: usize = 1000;
 /// What the brightest square of the others becomes: what moves, or is smaller than a square, is brighter still.
 const BRIGHT: f64 = 0.75;
 
-/// The image value that should receive `context.ppp` photons, whatever `context.exposure` says: [`USUAL_EXPOSURE`], or less
+/// The image value that should receive `acquisition.ppp` photons, whatever `acquisition.exposure` says: [`USUAL_EXPOSURE`], or less
 /// where parts of the scene would be brighter than white. Looks at the first, the middle and the last 11 of the
 /// `frames` frames that `read` knows, in this order.
 ///
@@ -28,7 +28,7 @@ const BRIGHT: f64 = 0.75;
 pub fn fitting_exposure(
     size: Size,
     frames: u64,
-    context: &Context,
+    acquisition: &Acquisition,
     mut read: impl FnMut(u64) -> Result<Vec<u16>>,
 ) -> Result<f64> {
     let length = frames.min(2 * LONGEST_HALF as u64 + 1);
@@ -37,15 +37,15 @@ pub fn fitting_exposure(
     let mut exposure = USUAL_EXPOSURE;
     for start in starts {
         let frames = (start..start + length).map(&mut read).collect::<Result<Vec<_>>>()?;
-        let bright = brightest(BurstView { size, frames: &frames }, context)?;
-        exposure = exposure.min(BRIGHT * context.ppp / bright.max(f64::MIN_POSITIVE));
+        let bright = brightest(BurstView { size, frames: &frames }, acquisition)?;
+        exposure = exposure.min(BRIGHT * acquisition.ppp / bright.max(f64::MIN_POSITIVE));
     }
     Ok(exposure)
 }
 
 /// Photons per pixel and frame that a thousandth of the squares exceed.
-fn brightest(burst: BurstView<'_>, context: &Context) -> Result<f64> {
-    let ordinary = context.sensor.dark_per_frame()?;
+fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
+    let ordinary = acquisition.sensor.dark_per_frame()?;
     let size = burst.size;
     let mut sums = vec![0u32; size.pixels()];
     for frame in burst.frames {
@@ -58,26 +58,26 @@ fn brightest(burst: BurstView<'_>, context: &Context) -> Result<f64> {
             let columns = left..(left + SIDE).min(size.width);
             let places = rows.flat_map(|y| columns.clone().map(move |x| y * size.width + x));
             let mut pixels: Vec<(u32, f64)> =
-                places.map(|i| (sums[i], context.dark_of(i, ordinary))).collect();
+                places.map(|i| (sums[i], acquisition.dark_of(i, ordinary))).collect();
             pixels.sort_unstable_by_key(|&(sum, _)| sum);
             let trimmed = pixels.len() / TRIMMED;
             let pixels = &pixels[trimmed..pixels.len() - trimmed];
             let dark = pixels.iter().map(|(_, dark)| dark).sum::<f64>() / pixels.len() as f64;
             let total: f64 = pixels.iter().map(|&(sum, _)| f64::from(sum)).sum();
             let samples = (pixels.len() * burst.frames.len()) as u32;
-            let flux = context.sensor.estimate_flux(total, samples, context.gain, dark);
+            let flux = acquisition.sensor.estimate_flux(total, samples, acquisition.gain, dark);
             squares.push((flux, total / f64::from(samples), dark));
         }
     }
     let place = squares.len() - 1 - squares.len() / BRIGHTER;
     let (_, &mut (flux, mean, dark), _) =
         squares.select_nth_unstable_by(place, |a, b| f64::total_cmp(&a.0, &b.0));
-    if context.sensor.response == Response::Binary {
+    if acquisition.sensor.response == Response::Binary {
         return Ok(flux);
     }
     // What full scale cuts off, the law knows; asking it of every square takes seconds where counts are deep.
-    let law = CountLaw::new(&context.sensor, context.gain);
-    Ok((law.detections_for_mean(mean) - dark) / context.sensor.quantum_efficiency)
+    let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
+    Ok((law.detections_for_mean(mean) - dark) / acquisition.sensor.quantum_efficiency)
 }
 
 #[cfg(test)]
@@ -96,7 +96,7 @@ mod tests {
         let sensor = Sensor::load(sensor).unwrap();
         let light = Light { ppp, exposure: scene.mean() };
         let mut camera = Camera::new(&sensor, SIZE, light, 5).unwrap();
-        let context = Context {
+        let acquisition = Acquisition {
             seed: 0,
             first_frame: 0,
             ppp,
@@ -105,9 +105,12 @@ mod tests {
             dark: None,
             sensor,
         };
-        fitting_exposure(SIZE, 30, &context, |t| {
+        fitting_exposure(SIZE, 30, &acquisition, |t| {
             let mut counts = camera.expose(t, &[scene])?;
-            counts.iter_mut().step_by(hot).for_each(|count| *count = context.sensor.max_count());
+            counts
+                .iter_mut()
+                .step_by(hot)
+                .for_each(|count| *count = acquisition.sensor.max_count());
             Ok(counts)
         })
         .unwrap()

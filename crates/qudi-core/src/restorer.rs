@@ -15,7 +15,7 @@ pub struct BurstView<'a> {
 
 /// What a method knows besides the counts.
 #[derive(Clone, Debug)]
-pub struct Context {
+pub struct Acquisition {
     /// Seed of any random draws.
     pub seed: u64,
     /// Number of the window's first frame in the capture.
@@ -53,10 +53,10 @@ pub trait Restorer {
     ///
     /// # Errors
     /// [`SimError`](crate::SimError) if the method cannot work with this burst.
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored>;
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored>;
 }
 
-impl Context {
+impl Acquisition {
     /// Incident photons per unit of image value.
     pub fn photons_per_unit(&self) -> f64 {
         self.ppp / self.exposure

@@ -7,7 +7,7 @@
 
 use burn::tensor::Device;
 use qudi_core::metrics::psnr;
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_model::checkpoint::load;
@@ -16,7 +16,7 @@ use qudi_sim::scene::{Procedural, ProceduralScene};
 use std::path::PathBuf;
 
 /// A simulated burst of moving leaves: counts, truth, light.
-fn burst(size: Size, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>, Context) {
+fn burst(size: Size, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>, Acquisition) {
     let (kind, seed) = (ProceduralScene::DeadLeaves, 1_000_000);
     let scene = Procedural { kind, size, seed, speed: 1.5 }.scene();
     let truth: Vec<Frame> = (0..frames).map(|t| scene.render(t as f64)).collect();
@@ -26,7 +26,7 @@ fn burst(size: Size, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>, Context) {
     let mut camera = Camera::new(&sensor, size, light, seed).unwrap();
     let counts = (0..).zip(&truth).map(|(t, f)| camera.expose(t, &[f]).unwrap()).collect();
     let (ppp, gain, dark) = (light.ppp, camera.gain(), None);
-    (counts, truth, Context { seed: 1, first_frame: 0, ppp, exposure, sensor, gain, dark })
+    (counts, truth, Acquisition { seed: 1, first_frame: 0, ppp, exposure, sensor, gain, dark })
 }
 
 fn main() {
@@ -36,13 +36,13 @@ fn main() {
     let (side, reverse) = (number(512), number(10));
     let device = Device::flex();
     let size = Size { height: side, width: side };
-    let (counts, truth, context) = burst(size, 11);
+    let (counts, truth, acquisition) = burst(size, 11);
     let restore = |tile: usize| {
         let (network, description) = load(&weights, &device).unwrap();
         let options = SampleOptions { tile, steps: reverse, ..SampleOptions::default() };
         let mut restorer =
             QudiRestorer::new(network, &description.network, 11, options, &device).unwrap();
-        restorer.restore(BurstView { size, frames: &counts }, &context).unwrap().frames
+        restorer.restore(BurstView { size, frames: &counts }, &acquisition).unwrap().frames
     };
     let mean = |a: &[Frame], b: &[Frame]| {
         a.iter().zip(b).map(|(a, b)| psnr(a, b)).sum::<f64>() / a.len() as f64

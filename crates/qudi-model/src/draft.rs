@@ -112,16 +112,16 @@ mod tests {
     use crate::network::fill;
     use qudi_burst::Guide;
     use qudi_core::Size;
-    use qudi_core::restorer::{BurstView, Context};
+    use qudi_core::restorer::{Acquisition, BurstView};
     use qudi_core::sensor::Sensor;
 
     const SIZE: Size = Size { height: 48, width: 80 };
 
-    fn context() -> Context {
+    fn acquisition() -> Acquisition {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let gain = sensor.gain_at(3.25).unwrap_or_else(|e| panic!("{e}"));
         let (seed, first_frame, dark) = (1, 0, None);
-        Context { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark }
+        Acquisition { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark }
     }
 
     /// Three frames.
@@ -144,13 +144,13 @@ mod tests {
     /// What lies far from the borders of a tile does not know of them.
     #[test]
     fn drafts_see_tiles_of_the_size_asked_for() {
-        let (context, frames, device) = (context(), counts(), Device::flex());
+        let (acquisition, frames, device) = (acquisition(), counts(), Device::flex());
         let burst = BurstView { size: SIZE, frames: &frames };
         let (config, network) = network(1, 1);
         let network = network.with_round_more(0);
         let [whole, tiled] = [512, 32].map(|tile| {
-            let guide = Guide::find(burst, &context).unwrap_or_else(|e| panic!("{e}"));
-            let alignment = Alignment::new(guide, &context);
+            let guide = Guide::find(burst, &acquisition).unwrap_or_else(|e| panic!("{e}"));
+            let alignment = Alignment::new(guide, &acquisition);
             let draft = Draft::all(&network, &config, tile, &device).remove(0);
             draft.restore(&alignment).unwrap_or_else(|e| panic!("{e}"))
         });
@@ -191,12 +191,12 @@ mod tests {
 
     #[test]
     fn only_the_last_round_sees_pixels_go_their_own_ways() {
-        let (context, frames, device) = (context(), counts(), Device::flex());
+        let (acquisition, frames, device) = (acquisition(), counts(), Device::flex());
         let burst = BurstView { size: SIZE, frames: &frames };
         let (config, network) = network(3, 2);
         let drafts = Draft::all(&network, &config, 512, &device);
         let laid = config.pre.laid();
-        let alignment = aligned(burst, &context, &drafts).unwrap_or_else(|e| panic!("{e}"));
+        let alignment = aligned(burst, &acquisition, &drafts).unwrap_or_else(|e| panic!("{e}"));
         let guide = GuidePlanes::of(&alignment, laid, 1..2).into_tensor(SIZE, &device);
         let inputs = IMAGES + 1 + 6 * config.pre.neighbours;
         assert_eq!(guide.dims(), [1, inputs, SIZE.height, SIZE.width]);

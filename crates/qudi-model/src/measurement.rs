@@ -5,7 +5,7 @@ use crate::network::SENSOR_NUMBERS;
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
 use qudi_burst::{Aligned, Alignment, Along, Guide};
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, Response, Sensor};
 use qudi_core::{Result, Size};
 use std::ops::Range;
@@ -24,17 +24,17 @@ pub struct Planes {
 
 impl Planes {
     /// The planes of a captured burst.
-    pub fn of(burst: BurstView<'_>, context: &Context) -> Self {
+    pub fn of(burst: BurstView<'_>, acquisition: &Acquisition) -> Self {
         let response = CountResponse::new(
-            &context.sensor,
-            context.photons_per_unit(),
-            context.gain,
-            dark(&context.sensor),
+            &acquisition.sensor,
+            acquisition.photons_per_unit(),
+            acquisition.gain,
+            dark(&acquisition.sensor),
         );
         let mut planes = Self { y: Vec::new(), u: Vec::new() };
         for frame in burst.frames {
             response.add(frame, &mut planes);
-            if let Some(map) = &context.dark {
+            if let Some(map) = &acquisition.dark {
                 let start = planes.u.len() - frame.len();
                 for ((u, &count), &dark) in planes.u[start..].iter_mut().zip(frame).zip(map) {
                     *u = response.estimate(count, f64::from(dark));
@@ -73,10 +73,10 @@ impl Laid {
 /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown, or the drafts' device fails.
 pub fn aligned<'a>(
     burst: BurstView<'_>,
-    context: &'a Context,
+    acquisition: &'a Acquisition,
     drafts: &[Draft],
 ) -> Result<Alignment<'a>> {
-    let mut alignment = Alignment::new(Guide::find(burst, context)?, context);
+    let mut alignment = Alignment::new(Guide::find(burst, acquisition)?, acquisition);
     for draft in drafts {
         let better = draft.restore(&alignment)?;
         alignment = alignment.on(better);
@@ -191,27 +191,27 @@ pub(crate) fn dark(sensor: &Sensor) -> f64 {
 }
 
 /// The sensor and its light as the network is told them (docs/network.md).
-pub fn sensor_numbers(context: &Context) -> [f32; SENSOR_NUMBERS] {
-    let sensor = &context.sensor;
+pub fn sensor_numbers(acquisition: &Acquisition) -> [f32; SENSOR_NUMBERS] {
+    let sensor = &acquisition.sensor;
     let binary = sensor.response == Response::Binary;
-    let light = context.photons_per_unit();
-    let response = CountResponse::new(sensor, light, context.gain, dark(sensor));
+    let light = acquisition.photons_per_unit();
+    let response = CountResponse::new(sensor, light, acquisition.gain, dark(sensor));
     let deviation = |image| {
         let detections = sensor.quantum_efficiency * image * light + dark(sensor);
         response.linear_deviation(detections).max(1e-4).log10()
     };
     [
-        context.ppp.max(1e-6).log10(),
-        context.exposure,
+        acquisition.ppp.max(1e-6).log10(),
+        acquisition.exposure,
         sensor.quantum_efficiency,
         dark(sensor),
         sensor.read_noise,
-        context.gain.max(1e-6).log10(),
+        acquisition.gain.max(1e-6).log10(),
         (f64::from(sensor.max_count()) + 1.0).log2() / 8.0,
         f64::from(u8::from(binary)),
         f64::from(sensor.frames_summed).log2() / 8.0,
         deviation(0.0),
-        deviation(context.exposure),
+        deviation(acquisition.exposure),
     ]
     .map(|number| number as f32)
 }

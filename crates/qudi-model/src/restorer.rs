@@ -14,7 +14,7 @@ use crate::network::{Flows, Measured, Prepared, Qudi, SENSOR_NUMBERS, Simulated,
 use crate::restorer::layout::Layout;
 use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Result, SimError};
 
 /// Fewest frames that the fusion makes sense of.
@@ -127,18 +127,18 @@ impl QudiRestorer {
     }
 
     /// A window whose planes are padded to what the network wants.
-    fn job<'a>(&self, burst: BurstView<'_>, context: &'a Context) -> Result<Job<'a>> {
+    fn job<'a>(&self, burst: BurstView<'_>, acquisition: &'a Acquisition) -> Result<Job<'a>> {
         let frames = burst.frames.len();
         let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
-        let planes = Planes::of(burst, context);
+        let planes = Planes::of(burst, acquisition);
         let planes = Planes { y: layout.padded(&planes.y), u: layout.padded(&planes.u) };
         let laid = self.config.pre.laid();
-        let alignment = aligned(burst, context, &self.drafts)?;
+        let alignment = aligned(burst, acquisition, &self.drafts)?;
         let guide = GuidePlanes::of(&alignment, laid, 0..frames);
         let guide = guide.map(|plane| layout.padded(plane));
-        let sensor = sensor_numbers(context);
+        let sensor = sensor_numbers(acquisition);
         let prepared = None;
-        let mut job = Job { context, sensor, planes, guide, frames, layout, prepared };
+        let mut job = Job { acquisition, sensor, planes, guide, frames, layout, prepared };
         if self.generates && job.layout.tiles.count() == 1 {
             // The one tile is all there is: nobody asks for its guide again.
             let guide = std::mem::take(&mut job.guide);
@@ -149,8 +149,8 @@ impl QudiRestorer {
 
     /// One sample of a window whose planes are padded to `size`.
     fn sample(&self, job: &Job<'_>, sample: u64) -> Result<Vec<f32>> {
-        let noise = Noise::new(job.context.seed, sample);
-        let frames = || (job.context.first_frame..).take(job.frames);
+        let noise = Noise::new(job.acquisition.seed, sample);
+        let frames = || (job.acquisition.first_frame..).take(job.frames);
         let (size, tiles) = (job.layout.size, &job.layout.tiles);
         let pixels = size.pixels();
         let mut x: Vec<f32> = frames().flat_map(|frame| noise.frame(frame, 0, pixels)).collect();
@@ -161,10 +161,10 @@ impl QudiRestorer {
             let simulated = if step.number == 1 || self.config.lacks(Part::Physics) {
                 None
             } else {
-                let sensor = LoopSensor::at(job.context, step.time, TIMES);
+                let sensor = LoopSensor::at(job.acquisition, step.time, TIMES);
                 let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
                 let seed = noise.photon_seed(step.number);
-                Some(sensor.measure(&images, size, job.context.first_frame, seed)?)
+                Some(sensor.measure(&images, size, job.acquisition.first_frame, seed)?)
             };
             if self.config.flow.steps.contains(&step.number) {
                 flows.fill(None);
@@ -185,9 +185,9 @@ impl QudiRestorer {
     /// What the pre-denoiser makes of the frames, without what the U-Net would take: most of the time and memory. Before any
     /// simulated measurement: where the U-Net has not learnt, none was seen in training. Fusion has no part in it: the frames,
     /// each denoised for itself, are steadied afterwards.
-    fn denoised(&self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
+    fn denoised(&self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
         let laid = self.config.pre.laid();
-        let alignment = aligned(burst, context, &self.drafts)?;
+        let alignment = aligned(burst, acquisition, &self.drafts)?;
         let layout = Layout::new(burst.size, self.config.multiple(), self.options.tile);
         let denoise = |guide: &Tensor<4>| {
             let (d, error) = self.network.denoise(guide);
@@ -268,7 +268,7 @@ fn possible(mut images: Vec<f32>) -> Vec<f32> {
 
 /// A window, padded.
 struct Job<'a> {
-    context: &'a Context,
+    acquisition: &'a Acquisition,
     /// The sensor in numbers: the same for all tiles and steps.
     sensor: [f32; SENSOR_NUMBERS],
     planes: Planes,
@@ -289,7 +289,7 @@ impl Restorer for QudiRestorer {
         self.window
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
         let frames = burst.frames.len();
         if frames < FEWEST_FRAMES {
             return Err(SimError::request(
@@ -299,9 +299,9 @@ impl Restorer for QudiRestorer {
             ));
         }
         if !self.generates {
-            return self.denoised(burst, context);
+            return self.denoised(burst, acquisition);
         }
-        let job = self.job(burst, context)?;
+        let job = self.job(burst, acquisition)?;
         let mut sum = Moments::default();
         for sample in 0..self.options.samples as u64 {
             sum.add(&self.sample(&job, sample)?);
@@ -361,19 +361,26 @@ mod tests {
             .collect();
         let sensor = Sensor::load("qudi-paper").unwrap();
         let gain = sensor.gain_at(3.25).unwrap();
-        let context =
-            Context { seed: 1, first_frame: 0, ppp: 3.25, exposure: 0.3, sensor, gain, dark: None };
+        let acquisition = Acquisition {
+            seed: 1,
+            first_frame: 0,
+            ppp: 3.25,
+            exposure: 0.3,
+            sensor,
+            gain,
+            dark: None,
+        };
         let (config, device) = (NetworkConfig::preset("tiny").unwrap(), Device::flex());
         let options = SampleOptions { steps: 1, tile: 32, ..SampleOptions::default() };
         let network = config.init(2, &device);
         let mut restorer = QudiRestorer::new(network, &config, 11, options, &device).unwrap();
         assert!(!restorer.generates);
         let burst = BurstView { size, frames: &counts };
-        let short = restorer.restore(burst, &context).unwrap().frames;
+        let short = restorer.restore(burst, &acquisition).unwrap().frames;
         restorer.generates = true;
-        let whole = restorer.restore(burst, &context).unwrap().frames;
+        let whole = restorer.restore(burst, &acquisition).unwrap().frames;
         let laid = config.pre.laid();
-        let alignment = aligned(burst, &context, &[]).unwrap();
+        let alignment = aligned(burst, &acquisition, &[]).unwrap();
         let noises = (0..counts.len()).map(|frame| laid.of(&alignment, frame).noise).collect();
         let whole = settled(&alignment, whole, noises, 1.0);
         for (short, whole) in short.iter().zip(&whole) {

@@ -2,23 +2,23 @@
 #![allow(clippy::unwrap_used)]
 
 use qudi_core::Size;
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, FullWell, Gain, Sensor};
 use qudi_model::diffusion::physics::LoopSensor;
 use qudi_model::measurement::Planes;
 
 const SIZE: Size = Size { height: 128, width: 256 };
 
-fn context(sensor: &str, ppp: f64, frames_summed: u32) -> Context {
+fn acquisition(sensor: &str, ppp: f64, frames_summed: u32) -> Acquisition {
     let mut sensor = Sensor::load(sensor).unwrap();
     sensor.frames_summed = frames_summed;
     let gain = sensor.gain_at(ppp).unwrap();
-    Context { seed: 1, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+    Acquisition { seed: 1, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
 }
 
 /// Counts of a flat image of value 0.5 by level, measured at a diffusion time.
-fn histogram(context: &Context, time: usize, levels: usize) -> Vec<f64> {
-    let sensor = LoopSensor::at(context, time, 1000);
+fn histogram(acquisition: &Acquisition, time: usize, levels: usize) -> Vec<f64> {
+    let sensor = LoopSensor::at(acquisition, time, 1000);
     let image = vec![0.5; SIZE.pixels()];
     let planes = sensor.measure(&image, SIZE, 3, 77).unwrap();
     let mut histogram = vec![0.0; levels];
@@ -47,34 +47,34 @@ fn check(observed: &[f64], probabilities: &[f64]) {
 
 #[test]
 fn counts_follow_the_sensors_law_under_growing_light() {
-    let context = context("qudi-paper", 3.25, 1);
+    let acquisition = acquisition("qudi-paper", 3.25, 1);
     for (time, factor) in [(900, 10f64.powf(0.1)), (500, 10f64.powf(0.5)), (0, 10.0)] {
-        let mut sensor = context.sensor.clone();
-        let gain = context.gain / factor;
+        let mut sensor = acquisition.sensor.clone();
+        let gain = acquisition.gain / factor;
         sensor.gain = Gain::Fixed(gain);
         sensor.full_well = FullWell::new(sensor.full_well.electrons() * factor);
         let detections = 0.8 * 3.25 * factor * 0.5 / 0.45 + 1.6;
         let law = CountLaw::new(&sensor, gain);
-        check(&histogram(&context, time, 8), &law.probabilities(detections));
+        check(&histogram(&acquisition, time, 8), &law.probabilities(detections));
     }
 }
 
 #[test]
 fn sums_of_binary_frames_keep_their_light_and_get_longer() {
-    let context = context("swissspad2", 2.0, 7);
-    let sensor = Sensor { frames_summed: 22, ..context.sensor.clone() }; // round(7 * sqrt(10))
+    let acquisition = acquisition("swissspad2", 2.0, 7);
+    let sensor = Sensor { frames_summed: 22, ..acquisition.sensor.clone() }; // round(7 * sqrt(10))
     let dark = sensor.dark_per_frame().unwrap();
     let photons = 2.0 * 22.0 / 7.0 * 0.5 / 0.45;
     let detections = sensor.quantum_efficiency * photons + dark;
     let law = CountLaw::new(&sensor, 1.0);
-    check(&histogram(&context, 500, 23), &law.probabilities(detections));
+    check(&histogram(&acquisition, 500, 23), &law.probabilities(detections));
 }
 
 #[test]
 fn the_same_estimate_gives_the_same_counts() {
-    let context = context("qudi-paper", 9.75, 1);
+    let acquisition = acquisition("qudi-paper", 9.75, 1);
     let image: Vec<f32> = (0..2 * SIZE.pixels()).map(|i| (i % 97) as f32 / 97.0).collect();
-    let sensor = LoopSensor::at(&context, 300, 1000);
+    let sensor = LoopSensor::at(&acquisition, 300, 1000);
     let measure = |first, seed| sensor.measure(&image, SIZE, first, seed).unwrap();
     let all = measure(5, 9);
     assert_eq!(all, measure(5, 9));
@@ -89,27 +89,27 @@ fn the_same_estimate_gives_the_same_counts() {
 #[test]
 fn the_linear_estimate_is_unbiased_in_image_units() {
     // Without read noise and with light far from saturation the mean estimate is the image.
-    let mut context = context("qudi-paper", 3.25, 1);
-    context.sensor.dark = qudi_core::sensor::DarkRate::PerFrame(0.0);
-    context.sensor.bits = 8;
-    context.gain = 10.0;
-    context.sensor.gain = Gain::Fixed(10.0);
+    let mut acquisition = acquisition("qudi-paper", 3.25, 1);
+    acquisition.sensor.dark = qudi_core::sensor::DarkRate::PerFrame(0.0);
+    acquisition.sensor.bits = 8;
+    acquisition.gain = 10.0;
+    acquisition.sensor.gain = Gain::Fixed(10.0);
     let image = vec![0.45; SIZE.pixels()];
-    let planes = LoopSensor::at(&context, 1000, 1000).measure(&image, SIZE, 0, 3).unwrap();
+    let planes = LoopSensor::at(&acquisition, 1000, 1000).measure(&image, SIZE, 0, 3).unwrap();
     let mean = planes.u.iter().map(|&u| f64::from(u)).sum::<f64>() / planes.u.len() as f64;
     assert!((mean - 0.45).abs() < 0.01, "mean estimate {mean}");
 }
 
 #[test]
 fn planes_hold_counts_over_full_scale_and_follow_a_dark_map() {
-    let mut context = context("qudi-paper", 3.25, 1);
+    let mut acquisition = acquisition("qudi-paper", 3.25, 1);
     let size = Size { height: 1, width: 4 };
     let frames = [vec![0, 3, 7, 9]];
-    let planes = Planes::of(BurstView { size, frames: &frames }, &context);
+    let planes = Planes::of(BurstView { size, frames: &frames }, &acquisition);
     assert_eq!(planes.y, [0.0, 3.0 / 7.0, 1.0, 1.0]);
     assert_eq!(planes.u[0], 0.0);
-    context.dark = Some(vec![0.0, 3.0, 1.6, 1.6]);
-    let mapped = Planes::of(BurstView { size, frames: &frames }, &context);
+    acquisition.dark = Some(vec![0.0, 3.0, 1.6, 1.6]);
+    let mapped = Planes::of(BurstView { size, frames: &frames }, &acquisition);
     assert!(mapped.u[1] < planes.u[1]);
     assert_eq!(mapped.u[2], planes.u[2]);
 }

@@ -3,17 +3,17 @@
 
 use burn::tensor::Device;
 use qudi_core::Size;
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::network::fill;
 use qudi_model::restorer::{QudiRestorer, SampleOptions};
 
-fn context(seed: u64, first_frame: u64) -> Context {
+fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let gain = sensor.gain_at(3.25).unwrap();
-    Context { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark: None }
+    Acquisition { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark: None }
 }
 
 /// A tiny network whose last layers are not zero, so that everything matters.
@@ -44,10 +44,15 @@ fn counts(size: Size, frames: usize) -> Vec<Vec<u16>> {
         .collect()
 }
 
-fn restore(options: SampleOptions, context: &Context, size: Size, frames: usize) -> Restored {
+fn restore(
+    options: SampleOptions,
+    acquisition: &Acquisition,
+    size: Size,
+    frames: usize,
+) -> Restored {
     let counts = counts(size, frames);
     let burst = BurstView { size, frames: &counts };
-    restorer(options, &Device::flex()).restore(burst, context).unwrap()
+    restorer(options, &Device::flex()).restore(burst, acquisition).unwrap()
 }
 
 const SIZE: Size = Size { height: 21, width: 38 };
@@ -60,7 +65,7 @@ fn quick() -> SampleOptions {
 fn any_size_and_length_comes_back_as_it_was() {
     for (height, width, frames) in [(21, 38, 4), (8, 8, 3), (1, 50, 5), (40, 33, 12)] {
         let size = Size { height, width };
-        let restored = restore(quick(), &context(1, 0), size, frames);
+        let restored = restore(quick(), &acquisition(1, 0), size, frames);
         assert_eq!(restored.frames.len(), frames);
         assert!(restored.std.is_none());
         for frame in restored.frames {
@@ -74,7 +79,7 @@ fn any_size_and_length_comes_back_as_it_was() {
 fn the_result_depends_on_the_seed_and_on_nothing_else() {
     for sampler in [Sampler::Ddim, Sampler::Ancestral] {
         let options = SampleOptions { sampler, ..quick() };
-        let frames = |seed| restore(options, &context(seed, 40), SIZE, 3).frames;
+        let frames = |seed| restore(options, &acquisition(seed, 40), SIZE, 3).frames;
         assert_eq!(frames(1), frames(1));
         assert_ne!(frames(1), frames(2));
     }
@@ -83,12 +88,12 @@ fn the_result_depends_on_the_seed_and_on_nothing_else() {
 #[test]
 fn samples_have_a_mean_and_a_deviation() {
     let options = SampleOptions { samples: 3, ..quick() };
-    let three = restore(options, &context(1, 0), SIZE, 3);
+    let three = restore(options, &acquisition(1, 0), SIZE, 3);
     let std = three.std.unwrap();
     assert!(std.iter().all(|frame| frame.data.iter().all(|v| v.is_finite() && *v >= 0.0)));
     assert!(std.iter().any(|frame| frame.data.iter().any(|&v| v > 0.0)));
     // The first of the samples is what one sample gives.
-    let one = restore(quick(), &context(1, 0), SIZE, 3);
+    let one = restore(quick(), &acquisition(1, 0), SIZE, 3);
     assert_ne!(one.frames, three.frames);
 }
 
@@ -101,22 +106,23 @@ fn ndarray_restores_what_flex_does() {
     let burst = BurstView { size, frames: &counts };
     // One step: later ones draw counts from estimates, and a count may flip on rounding.
     let options = SampleOptions { steps: 1, ..quick() };
-    let [a, b] = [Device::flex(), ndarray.clone()]
-        .map(|device| restorer(options, &device).restore(burst, &context(1, 0)).unwrap().frames);
+    let [a, b] = [Device::flex(), ndarray.clone()].map(|device| {
+        restorer(options, &device).restore(burst, &acquisition(1, 0)).unwrap().frames
+    });
     for (a, b) in a.iter().zip(&b) {
         for (a, b) in a.data.iter().zip(&b.data) {
             assert!((a - b).abs() < 1e-4, "{a} and {b}");
         }
     }
-    restorer(quick(), &ndarray).restore(burst, &context(1, 0)).unwrap();
+    restorer(quick(), &ndarray).restore(burst, &acquisition(1, 0)).unwrap();
 }
 
 #[test]
 fn tiles_agree_on_their_noise_and_cover_the_frame() {
     let size = Size { height: 48, width: 80 };
     let options = SampleOptions { steps: 2, tile: 32, ..SampleOptions::default() };
-    let tiled = restore(options, &context(1, 0), size, 3);
-    let whole = restore(quick(), &context(1, 0), size, 3);
+    let tiled = restore(options, &acquisition(1, 0), size, 3);
+    let whole = restore(quick(), &acquisition(1, 0), size, 3);
     // Random weights let every pixel see far: the two are alike, not equal.
     for (tiled, whole) in tiled.frames.iter().zip(&whole.frames) {
         assert_eq!(tiled.size, whole.size);
@@ -135,7 +141,7 @@ fn what_makes_no_sense_is_refused() {
     let size = Size { height: 16, width: 16 };
     let two = counts(size, 2);
     let error = restorer(quick(), &device)
-        .restore(BurstView { size, frames: &two }, &context(1, 0))
+        .restore(BurstView { size, frames: &two }, &acquisition(1, 0))
         .unwrap_err();
     assert!(error.to_string().contains("2 frames") && error.help().is_some(), "{error}");
     let config = NetworkConfig::preset("tiny").unwrap();

@@ -4,7 +4,7 @@ use super::bursts::{Bursts, Guided};
 use super::recipe::Recipe;
 use crate::objective::{Example, training_time};
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::measurement::{GuidePlanes, Planes, sensor_numbers};
@@ -25,7 +25,7 @@ pub struct Batch {
     truth: Vec<f32>,
     noise: Vec<f32>,
     numbers: Vec<f32>,
-    contexts: Vec<Context>,
+    acquisitions: Vec<Acquisition>,
     times: Vec<usize>,
 }
 
@@ -47,35 +47,35 @@ impl Batch {
             truth: Vec::new(),
             noise: Vec::new(),
             numbers: Vec::new(),
-            contexts: Vec::new(),
+            acquisitions: Vec::new(),
             times: Vec::new(),
         };
         for sample in (number * count as u64..).take(count) {
             let Guided { sample: drawn, guide, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
-            batch.u.extend(Planes::of(view, &drawn.context).u);
+            batch.u.extend(Planes::of(view, &drawn.acquisition).u);
             batch.guide.extend(guide);
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
-            let noise = Noise::new(drawn.context.seed, 0);
+            let noise = Noise::new(drawn.acquisition.seed, 0);
             let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
             batch.noise.extend(noise);
-            batch.numbers.extend(sensor_numbers(&drawn.context));
-            let mut random = ChaCha8Rng::seed_from_u64(drawn.context.seed);
+            batch.numbers.extend(sensor_numbers(&drawn.acquisition));
+            let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
             let time = training_time(random.random(), random.random(), recipe.train.start);
             batch.times.push(time);
-            batch.contexts.push(drawn.context);
+            batch.acquisitions.push(drawn.acquisition);
         }
         Ok(batch)
     }
 
     /// Samples in it.
     pub fn len(&self) -> usize {
-        self.contexts.len()
+        self.acquisitions.len()
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.contexts.is_empty()
+        self.acquisitions.is_empty()
     }
 
     /// What was measured, on `device`.
@@ -95,7 +95,7 @@ impl Batch {
         Example {
             measured,
             truth: to_tensor(self.truth.clone(), self.size, &device),
-            contexts: &self.contexts,
+            acquisitions: &self.acquisitions,
             noise: to_tensor(self.noise.clone(), self.size, &device),
             times: &self.times,
         }

@@ -145,15 +145,15 @@ impl Bursts {
         let size = Size { height: self.crop, width: self.crop };
         let mut sample = self.dataset.sample(self.seed, number)?;
         if !self.exposure {
-            sample.context.exposure = USUAL_EXPOSURE;
+            sample.acquisition.exposure = USUAL_EXPOSURE;
         }
         let all = sample.counts.len();
         let frames = frames.unwrap_or(all).min(all);
-        let mut random = ChaCha8Rng::seed_from_u64(sample.context.seed);
+        let mut random = ChaCha8Rng::seed_from_u64(sample.acquisition.seed);
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let alignment = aligned(view, &sample.context, &self.drafts)?;
+        let alignment = aligned(view, &sample.acquisition, &self.drafts)?;
         let guide = GuidePlanes::of(&alignment, self.laid, range.clone());
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
@@ -248,7 +248,7 @@ mod tests {
             of(recipe).keep_in(folder.path(), recipe).unwrap_or_else(|e| panic!("{e}"))
         };
         let same = |a: &Guided, b: &Guided| {
-            let (one, other) = (&a.sample.context, &b.sample.context);
+            let (one, other) = (&a.sample.acquisition, &b.sample.acquisition);
             a.guide.0 == b.guide.0
                 && a.sample.truth == b.sample.truth
                 && a.sample.counts == b.sample.counts

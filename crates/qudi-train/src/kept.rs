@@ -5,7 +5,7 @@ use super::recipe::{PartsConfig, Recipe};
 use super::values::values;
 use crate::dataset::Sample;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, Result, SimError, Size};
 use qudi_model::config::Part;
@@ -69,8 +69,8 @@ impl KeptBurst {
         let truth = truth.map(|frame| Frame { size, data: picked(&frame.data, &places) }).collect();
         let counts = &self.sample.counts[range.clone()];
         let counts = counts.iter().map(|frame| picked(frame, &places)).collect();
-        let mut context = self.sample.context.clone();
-        context.seed = random.next_u64();
+        let mut acquisition = self.sample.acquisition.clone();
+        acquisition.seed = random.next_u64();
         let pixels = self.size.pixels();
         let place = |frame: usize| frame * pixels..(frame + 1) * pixels;
         let image = |plane: &Vec<f32>| -> Vec<f32> {
@@ -82,7 +82,7 @@ impl KeptBurst {
         };
         let planes = self.images.iter().map(image).chain(self.deviations.iter().map(deviation));
         let guide = GuidePlanes(planes.collect());
-        Guided { size, sample: Sample { truth, counts, context }, guide }
+        Guided { size, sample: Sample { truth, counts, acquisition }, guide }
     }
 }
 
@@ -186,7 +186,7 @@ impl Shelf {
         let report = |e: &dyn std::fmt::Display| {
             SimError::data(format!("no burst: {e}"), &path, "report this")
         };
-        let Context { ppp, exposure, gain, ref sensor, .. } = burst.sample.context;
+        let Acquisition { ppp, exposure, gain, ref sensor, .. } = burst.sample.acquisition;
         let label =
             Label { drawn: self.drawn.clone(), ppp, exposure, gain, sensor: sensor.clone() };
         // TOML: its numbers come back bit for bit.
@@ -265,7 +265,7 @@ impl Shelf {
         let counts = planes[1]
             .chunks_exact(2 * size.pixels())
             .map(|bytes| bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect());
-        let context = Context {
+        let acquisition = Acquisition {
             seed: 0,
             first_frame: 0,
             ppp: label.ppp,
@@ -274,7 +274,7 @@ impl Shelf {
             sensor: label.sensor,
             dark: None,
         };
-        let sample = Sample { truth, counts: counts.collect(), context };
+        let sample = Sample { truth, counts: counts.collect(), acquisition };
         let images = planes[2..2 + IMAGES].iter().map(|plane| words(plane)).collect();
         let deviations = planes[2 + IMAGES..].iter();
         let deviations =

@@ -5,7 +5,7 @@
 use crate::perceptual::Perceptual;
 use burn::module::Module;
 use burn::tensor::Tensor;
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::{Result, SimError, Size};
 use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::diffusion::physics::LoopSensor;
@@ -94,7 +94,7 @@ pub struct Example<'a> {
     /// The clean frames, `[bursts * frames, 1, height, width]` in [0, 1].
     pub truth: Tensor<4>,
     /// Sensor and light of every burst.
-    pub contexts: &'a [Context],
+    pub acquisitions: &'a [Acquisition],
     /// Standard normal noise of the truth's shape.
     pub noise: Tensor<4>,
     /// Diffusion time of every burst.
@@ -285,7 +285,9 @@ fn estimate(
     let burst = measured.frames * size.pixels();
     let mut planes = Planes { y: Vec::new(), u: Vec::new() };
     let exists: Vec<bool> = example.times.iter().map(|&t| t < TIMES - 1).collect();
-    for (number, (x0, context)) in x0.chunks_exact_mut(burst).zip(example.contexts).enumerate() {
+    for (number, (x0, acquisition)) in
+        x0.chunks_exact_mut(burst).zip(example.acquisitions).enumerate()
+    {
         if !exists[number] {
             x0.fill(0.0);
             planes.y.resize(planes.y.len() + burst, 0.0);
@@ -293,7 +295,7 @@ fn estimate(
             continue;
         }
         let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
-        let sensor = LoopSensor::at(context, example.times[number], TIMES);
+        let sensor = LoopSensor::at(acquisition, example.times[number], TIMES);
         let first = (number * measured.frames) as u64;
         let more = sensor.measure(&images, size, first, seed)?;
         planes.y.extend(more.y);

@@ -5,7 +5,7 @@ use crate::dataset::Pack;
 use burn::tensor::Device;
 use qudi_core::auto_exposure::fitting_exposure;
 use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Result, SimError, Size, USUAL_EXPOSURE};
 use qudi_model::config::NetworkConfig;
@@ -143,7 +143,7 @@ impl Validator {
                 let mut camera = Camera::new(&self.sensor, size, light, SEED + number as u64)?;
                 let counts = (0..).zip(truth).map(|(t, frame)| camera.expose(t, &[frame]));
                 let counts: Vec<Vec<u16>> = counts.collect::<Result<_>>()?;
-                let mut context = Context {
+                let mut acquisition = Acquisition {
                     seed: SEED,
                     first_frame: 0,
                     ppp,
@@ -153,9 +153,10 @@ impl Validator {
                     dark: None,
                 };
                 let read = |frame: u64| Ok(counts[frame as usize].clone());
-                context.exposure = fitting_exposure(size, counts.len() as u64, &context, read)?;
+                acquisition.exposure =
+                    fitting_exposure(size, counts.len() as u64, &acquisition, read)?;
                 let restored =
-                    restorer.restore(BurstView { size, frames: &counts }, &context)?.frames;
+                    restorer.restore(BurstView { size, frames: &counts }, &acquisition)?.frames;
                 let mean = |of: fn(&Frame, &Frame) -> f64| {
                     let all = restored.iter().zip(truth).map(|(frame, truth)| of(frame, truth));
                     all.sum::<f64>() / truth.len() as f64

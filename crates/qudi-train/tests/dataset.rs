@@ -73,7 +73,7 @@ fn pack(config: &DataConfig, folder: &Path) -> Result<PathBuf, SimError> {
 }
 
 fn same(a: &Sample, b: &Sample) -> bool {
-    a.truth == b.truth && a.counts == b.counts && a.context.ppp == b.context.ppp
+    a.truth == b.truth && a.counts == b.counts && a.acquisition.ppp == b.acquisition.ppp
 }
 
 #[test]
@@ -138,11 +138,11 @@ fn exposure_is_that_of_the_whole_clip() {
             for &v in &frame.data {
                 assert!((0.0..=1.0).contains(&v));
                 // Every pixel is a whole number of the file's steps.
-                let level = f64::from(v) / sample.context.exposure * mean;
+                let level = f64::from(v) / sample.acquisition.exposure * mean;
                 assert!((level - level.round()).abs() < 1e-3 && level >= 20.0, "{level}");
             }
         }
-        factors.push(sample.context.exposure * 255.0 / mean);
+        factors.push(sample.acquisition.exposure * 255.0 / mean);
     }
     let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
     let least = factors.iter().fold(9.0f64, |a, &b| a.min(b));
@@ -167,7 +167,7 @@ fn samples_shrink_as_the_recipe_says() {
         let at = |x: usize, y: usize| f64::from(frame.data[16 * y + x]);
         let (across, down) = (at(15, 0) - at(0, 0), at(0, 15) - at(0, 0));
         let level = 255.0 * (across.abs() + down.abs()) / 15.0;
-        let brightness = sample.context.exposure / clip_mean(1);
+        let brightness = sample.acquisition.exposure / clip_mean(1);
         factors.push(level / 3.0 / brightness);
     }
     let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
@@ -204,17 +204,17 @@ fn light_covers_its_range_and_counts_follow_it() {
     let (mut logs, mut seen, mut expected) = (Vec::new(), 0.0, 0.0);
     for k in 0..400 {
         let sample = dataset.sample(9, k).unwrap();
-        logs.push((sample.context.ppp / 1.0).ln() / 30f64.ln());
-        let sensor = &sample.context.sensor;
-        let photons = sample.context.photons_per_unit();
+        logs.push((sample.acquisition.ppp / 1.0).ln() / 30f64.ln());
+        let sensor = &sample.acquisition.sensor;
+        let photons = sample.acquisition.photons_per_unit();
         for (counts, truth) in sample.counts.iter().zip(&sample.truth) {
             // Mean response without noise; saturation bends it, so only dim pixels are summed.
             for (&count, &value) in counts.iter().zip(&truth.data) {
                 let electrons = sensor.quantum_efficiency * photons * f64::from(value)
                     + sensor.dark_per_frame().unwrap();
-                if electrons * sample.context.gain < 2.0 {
+                if electrons * sample.acquisition.gain < 2.0 {
                     seen += f64::from(count);
-                    expected += electrons * sample.context.gain;
+                    expected += electrons * sample.acquisition.gain;
                 }
             }
         }

@@ -4,7 +4,7 @@
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_model::config::NetworkConfig;
@@ -23,7 +23,7 @@ use std::collections::HashMap;
 struct Burst {
     measured: Measured,
     truth: Tensor<4>,
-    context: Context,
+    acquisition: Acquisition,
     size: Size,
 }
 
@@ -44,7 +44,7 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let truth: Vec<Frame> = (0..frames).map(scene).collect();
     let counts: Vec<Vec<u16>> =
         truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
-    let context = Context {
+    let acquisition = Acquisition {
         seed: 0,
         first_frame: 0,
         ppp: light.ppp,
@@ -54,13 +54,13 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
         dark: None,
     };
     let view = BurstView { size, frames: &counts };
-    let planes = Planes::of(view, &context);
+    let planes = Planes::of(view, &acquisition);
     let guide = GuidePlanes::of(
-        &aligned(view, &context, &[]).unwrap(),
+        &aligned(view, &acquisition, &[]).unwrap(),
         tiny().pre.laid(),
         0..view.frames.len(),
     );
-    let numbers = TensorData::new(sensor_numbers(&context).to_vec(), [1, SENSOR_NUMBERS]);
+    let numbers = TensorData::new(sensor_numbers(&acquisition).to_vec(), [1, SENSOR_NUMBERS]);
     let measured = Measured {
         u: to_tensor(planes.u, size, device),
         guide: guide.into_tensor(size, device),
@@ -68,7 +68,7 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
         frames,
     };
     let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
-    Burst { measured, truth: to_tensor(truth, size, device), context, size }
+    Burst { measured, truth: to_tensor(truth, size, device), acquisition, size }
 }
 
 /// The loss of step `number`, at a time and with noise of its own.
@@ -81,7 +81,7 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
     let example = Example {
         measured: &burst.measured,
         truth: burst.truth.clone(),
-        contexts: std::slice::from_ref(&burst.context),
+        acquisitions: std::slice::from_ref(&burst.acquisition),
         noise: to_tensor(values, burst.size, &burst.truth.device()),
         times: &[time],
     };
@@ -100,7 +100,7 @@ fn the_first_stage_is_a_part_of_the_whole() {
         let example = Example {
             measured: &burst.measured,
             truth: burst.truth.clone(),
-            contexts: std::slice::from_ref(&burst.context),
+            acquisitions: std::slice::from_ref(&burst.acquisition),
             noise: burst.truth.zeros_like(),
             times: &[500],
         };
@@ -134,7 +134,7 @@ fn errors_are_told_without_changing_frames() {
         let example = Example {
             measured: &burst.measured,
             truth: burst.truth.clone(),
-            contexts: std::slice::from_ref(&burst.context),
+            acquisitions: std::slice::from_ref(&burst.acquisition),
             noise: burst.truth.zeros_like(),
             times: &[500],
         };
@@ -175,7 +175,7 @@ fn told_errors_scale_the_diffusion() {
         let example = Example {
             measured: &burst.measured,
             truth: burst.truth.clone(),
-            contexts: std::slice::from_ref(&burst.context),
+            acquisitions: std::slice::from_ref(&burst.acquisition),
             noise: burst.truth.ones_like(),
             times: &[100],
         };

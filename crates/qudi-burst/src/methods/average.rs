@@ -4,7 +4,7 @@
 use crate::moving_sums;
 use qudi_core::Frame;
 use qudi_core::Result;
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::CountLaw;
 
 /// Mean of 11 frames.
@@ -23,12 +23,12 @@ impl Restorer for Average {
         WINDOW
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
-        let law = CountLaw::new(&context.sensor, context.gain);
-        let detections =
-            context.sensor.quantum_efficiency * context.ppp + context.sensor.dark_per_frame()?;
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
+        let detections = acquisition.sensor.quantum_efficiency * acquisition.ppp
+            + acquisition.sensor.dark_per_frame()?;
         // The count that an image value of `exposure` gives on average.
-        let per_unit = law.mean(detections) / context.exposure;
+        let per_unit = law.mean(detections) / acquisition.exposure;
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, WINDOW / 2, |sums, n| {
             let scale = 1.0 / (per_unit * f64::from(n));

@@ -4,7 +4,7 @@
 use crate::{half_of_least_risk, moving_sums};
 use qudi_core::Frame;
 use qudi_core::Result;
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 
 /// Maximum-likelihood estimate over a window of 1 to 11 frames.
@@ -20,8 +20,8 @@ impl Mle {
     }
 
     /// Chooses the length on windows of the clip, by [`half_of_least_risk`].
-    pub fn choose(samples: &[BurstView<'_>], context: &Context) -> Self {
-        Self { half: half_of_least_risk(samples, context, 1.0) }
+    pub fn choose(samples: &[BurstView<'_>], acquisition: &Acquisition) -> Self {
+        Self { half: half_of_least_risk(samples, acquisition, 1.0) }
     }
 
     /// Frames that it sums.
@@ -39,14 +39,15 @@ impl Restorer for Mle {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
-        let ordinary = context.sensor.dark_per_frame()?;
-        let units = 1.0 / context.photons_per_unit();
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let ordinary = acquisition.sensor.dark_per_frame()?;
+        let units = 1.0 / acquisition.photons_per_unit();
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, self.half, |sums, n| {
             let pixel = |(i, &sum): (usize, &u32)| {
-                let dark = context.dark_of(i, ordinary);
-                let flux = context.sensor.estimate_flux(f64::from(sum), n, context.gain, dark);
+                let dark = acquisition.dark_of(i, ordinary);
+                let flux =
+                    acquisition.sensor.estimate_flux(f64::from(sum), n, acquisition.gain, dark);
                 (flux * units) as f32
             };
             let data = sums.iter().enumerate().map(pixel).collect();

@@ -1,6 +1,6 @@
 //! Moving sums of frames, and how many frames they should span.
 
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, CountMoments};
 use qudi_core::windows::LONGEST_HALF;
 
@@ -34,8 +34,12 @@ pub fn moving_sums(burst: BurstView<'_>, half: usize, mut f: impl FnMut(&[u32], 
 /// With `y` a frame's counts and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y`
 /// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise; the
 /// sensor says what `Var y` is.
-pub fn half_of_least_risk(samples: &[BurstView<'_>], context: &Context, noise_left: f64) -> usize {
-    let moments = CountMoments::new(&CountLaw::new(&context.sensor, context.gain));
+pub fn half_of_least_risk(
+    samples: &[BurstView<'_>],
+    acquisition: &Acquisition,
+    noise_left: f64,
+) -> usize {
+    let moments = CountMoments::new(&CountLaw::new(&acquisition.sensor, acquisition.gain));
     let risk = |burst: BurstView<'_>, variances: &[f64], half: usize| -> f64 {
         let (mut total, mut frame) = (0.0, 0);
         moving_sums(burst, half, |sums, n| {
@@ -48,7 +52,7 @@ pub fn half_of_least_risk(samples: &[BurstView<'_>], context: &Context, noise_le
         });
         total
     };
-    let full = f64::from(context.sensor.max_count());
+    let full = f64::from(acquisition.sensor.max_count());
     let mut risks = [0.0; LONGEST_HALF + 1];
     for burst in samples {
         // From the longest mean: short ones of few bits lie at the ends, where nothing varies.
@@ -94,7 +98,7 @@ mod tests {
             let frames: Vec<Vec<u16>> =
                 (0..11).map(|t| camera.expose(t, &[&scene]).unwrap()).collect();
             let gain = camera.gain();
-            let context = Context {
+            let acquisition = Acquisition {
                 seed: 0,
                 first_frame: 0,
                 ppp: light.ppp,
@@ -106,7 +110,7 @@ mod tests {
             for noise_left in [1.0, 0.1] {
                 let half = half_of_least_risk(
                     &[BurstView { size, frames: &frames }],
-                    &context,
+                    &acquisition,
                     noise_left,
                 );
                 // 7 frames or more: from there on hardly anything is to be won.

@@ -16,7 +16,7 @@ use crate::motion::camera::Camera;
 use crate::motion::grid::Grid;
 use crate::motion::paths::Even;
 use crate::motion::pyramid::Pyramid;
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::{CountLaw, CountMoments};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result, Size};
@@ -73,9 +73,9 @@ impl Qbp {
     }
 
     /// Frames in a block.
-    pub(crate) fn block(self, context: &Context) -> Result<usize> {
-        let sensor = &context.sensor;
-        let detections = sensor.quantum_efficiency * context.ppp + sensor.dark_per_frame()?;
+    pub(crate) fn block(self, acquisition: &Acquisition) -> Result<usize> {
+        let sensor = &acquisition.sensor;
+        let detections = sensor.quantum_efficiency * acquisition.ppp + sensor.dark_per_frame()?;
         let frames = (self.settings.detections / detections).ceil().clamp(1.0, 5.0) as usize;
         // Odd, so that a block has a middle.
         Ok(frames | 1)
@@ -94,16 +94,20 @@ impl Restorer for Qbp {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
-        let ordinary = context.sensor.dark_per_frame()?;
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let ordinary = acquisition.sensor.dark_per_frame()?;
         let transform = match self.finish {
             Finish::Plain => Transform::Identity,
             Finish::Bm3d => Transform::Integral,
         };
         let n = burst.frames.len() as f64;
-        let stabilizer =
-            Stabilizer::new(transform, &context.sensor, context.gain, burst.frames.len() as u32);
-        let merger = Merger::new(burst, context, self.block(context)?, self.settings.trust);
+        let stabilizer = Stabilizer::new(
+            transform,
+            &acquisition.sensor,
+            acquisition.gain,
+            burst.frames.len() as u32,
+        );
+        let merger = Merger::new(burst, acquisition, self.block(acquisition)?, self.settings.trust);
         let finish = |frame: usize| {
             let Merged { counts, noise, .. } = merger.merge(frame);
             let mut z = stabilizer.stabilized(&counts);
@@ -111,7 +115,7 @@ impl Restorer for Qbp {
                 let scale = self.settings.noise * (n * noise).sqrt();
                 z = denoise(Profile::NORMAL, z, &stabilizer, scale);
             }
-            image(&z, &stabilizer, context, ordinary)
+            image(&z, &stabilizer, acquisition, ordinary)
         };
         Ok(Restored { frames: (0..burst.frames.len()).map(finish).collect(), std: None })
     }
@@ -134,9 +138,9 @@ impl PatchFlow {
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown.
-    pub fn find(burst: BurstView<'_>, context: &Context, reference: usize) -> Result<Self> {
+    pub fn find(burst: BurstView<'_>, acquisition: &Acquisition, reference: usize) -> Result<Self> {
         let qbp = Qbp::new(Finish::Plain);
-        let merger = Merger::new(burst, context, qbp.block(context)?, qbp.settings.trust);
+        let merger = Merger::new(burst, acquisition, qbp.block(acquisition)?, qbp.settings.trust);
         let (_, flow) = merger.flow(reference);
         let corners = (0..merger.grid.len()).map(|i| merger.grid.corner(i)).collect();
         Ok(Self { corners, flow })
@@ -184,10 +188,15 @@ pub(crate) struct Pilots {
 }
 
 impl Merger {
-    pub(crate) fn new(burst: BurstView<'_>, context: &Context, block: usize, trust: f32) -> Self {
-        let moments = CountMoments::new(&CountLaw::new(&context.sensor, context.gain));
+    pub(crate) fn new(
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        block: usize,
+        trust: f32,
+    ) -> Self {
+        let moments = CountMoments::new(&CountLaw::new(&acquisition.sensor, acquisition.gain));
         let size = Size { height: burst.size.height.max(SIDE), width: burst.size.width.max(SIDE) };
-        let hot = crate::merge::hot::HotPixels::find(burst, context.sensor.max_count());
+        let hot = crate::merge::hot::HotPixels::find(burst, acquisition.sensor.max_count());
         let repaired = |counts: &Vec<u16>| at_least(&hot.repaired(counts), burst.size, size);
         let frames: Vec<Frame> = burst.frames.par_iter().map(repaired).collect();
         let pyramids =

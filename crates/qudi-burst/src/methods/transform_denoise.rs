@@ -6,7 +6,7 @@ use crate::denoise::bm3d::{Profile, bm3d_as};
 use crate::denoise::plane::{Spread, spread};
 use crate::denoise::stabilizer::{Stabilizer, Transform};
 use crate::{half_of_least_risk, moving_sums};
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
 
@@ -28,8 +28,12 @@ impl TransformDenoise {
 
     /// Chooses the length of the sums on windows of the clip, so that what moves is not blurred more
     /// than the noise allows.
-    pub fn choose(transform: Transform, samples: &[BurstView<'_>], context: &Context) -> Self {
-        Self::new(transform, half_of_least_risk(samples, context, NOISE_LEFT))
+    pub fn choose(
+        transform: Transform,
+        samples: &[BurstView<'_>],
+        acquisition: &Acquisition,
+    ) -> Self {
+        Self::new(transform, half_of_least_risk(samples, acquisition, NOISE_LEFT))
     }
 
     /// Frames that it sums.
@@ -47,18 +51,18 @@ impl Restorer for TransformDenoise {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, context: &Context) -> Result<Restored> {
-        let ordinary = context.sensor.dark_per_frame()?;
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let ordinary = acquisition.sensor.dark_per_frame()?;
         let mut stabilizers: Vec<Option<Stabilizer>> = vec![None; self.length() + 1];
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, self.half, |sums, n| {
             let stabilizer = stabilizers[n as usize].get_or_insert_with(|| {
-                Stabilizer::new(self.transform, &context.sensor, context.gain, n)
+                Stabilizer::new(self.transform, &acquisition.sensor, acquisition.gain, n)
             });
             let z = sums.iter().map(|&sum| stabilizer.transform(f64::from(sum)) as f32).collect();
             let z = Frame { size: burst.size, data: z };
             let z = denoise(Profile::NORMAL, z, stabilizer, 1.0);
-            frames.push(image(&z, stabilizer, context, ordinary));
+            frames.push(image(&z, stabilizer, acquisition, ordinary));
         });
         Ok(Restored { frames, std: None })
     }
@@ -83,15 +87,20 @@ pub(crate) fn denoise(
 }
 
 /// Image units of a detection.
-pub(crate) fn units(context: &Context) -> f64 {
-    1.0 / (context.photons_per_unit() * context.sensor.quantum_efficiency)
+pub(crate) fn units(acquisition: &Acquisition) -> f64 {
+    1.0 / (acquisition.photons_per_unit() * acquisition.sensor.quantum_efficiency)
 }
 
 /// The image behind a denoised transform: inverse, dark counts subtracted.
-pub(crate) fn image(z: &Frame, stabilizer: &Stabilizer, context: &Context, ordinary: f64) -> Frame {
-    let units = units(context);
+pub(crate) fn image(
+    z: &Frame,
+    stabilizer: &Stabilizer,
+    acquisition: &Acquisition,
+    ordinary: f64,
+) -> Frame {
+    let units = units(acquisition);
     let pixel = |(i, &z): (usize, &f32)| {
-        let detections = stabilizer.invert(f64::from(z)) - context.dark_of(i, ordinary);
+        let detections = stabilizer.invert(f64::from(z)) - acquisition.dark_of(i, ordinary);
         (detections.max(0.0) * units) as f32
     };
     Frame { size: z.size, data: z.data.iter().enumerate().map(pixel).collect() }

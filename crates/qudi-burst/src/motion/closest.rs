@@ -124,7 +124,7 @@ fn misfit(a: &Patch, b: &Patch) -> Patch {
 mod tests {
     use super::*;
     use crate::methods::qbp::Pilots;
-    use qudi_core::restorer::{BurstView, Context};
+    use qudi_core::restorer::{Acquisition, BurstView};
     use qudi_core::sensor::Sensor;
     use qudi_core::{Camera, Light, Size};
 
@@ -147,7 +147,7 @@ mod tests {
         let light = Light { ppp: 3.25, exposure: 0.45 };
         let camera = Camera::new(&sensor, SIZE, light, 5).unwrap_or_else(|e| panic!("{e}"));
         let gain = camera.gain();
-        let context = Context {
+        let acquisition = Acquisition {
             seed: 0,
             first_frame: 0,
             ppp: 3.25,
@@ -157,7 +157,8 @@ mod tests {
             dark: None,
         };
         let counts = vec![vec![3; SIZE.pixels()]; 6];
-        let mut merger = Merger::new(BurstView { size: SIZE, frames: &counts }, &context, 1, 16.0);
+        let mut merger =
+            Merger::new(BurstView { size: SIZE, frames: &counts }, &acquisition, 1, 16.0);
         let frames: Vec<Frame> = (0..6).map(scene).collect();
         merger.follow(Pilots { frames: frames.clone(), error: 0.1 });
         let motion =

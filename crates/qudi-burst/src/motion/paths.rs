@@ -313,7 +313,7 @@ impl Sums {
 mod tests {
     use super::*;
     use crate::methods::qbp::Pilots;
-    use qudi_core::restorer::{BurstView, Context};
+    use qudi_core::restorer::{Acquisition, BurstView};
     use qudi_core::sensor::{CountLaw, Sensor};
     use qudi_core::{Camera, Light, Size};
 
@@ -337,14 +337,14 @@ mod tests {
             frames.push(scene);
         }
         let gain = camera.gain();
-        let context =
-            Context { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None };
+        let acquisition =
+            Acquisition { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None };
         let burst = BurstView { size: SIZE, frames: &counts };
-        let mut merger = Merger::new(burst, &context, 1, 16.0);
+        let mut merger = Merger::new(burst, &acquisition, 1, 16.0);
         merger.even = Even::find(&merger);
-        let law = CountLaw::new(&context.sensor, gain);
-        let dark = context.sensor.dark_per_frame().unwrap_or_else(|e| panic!("{e}"));
-        let light = context.sensor.quantum_efficiency * ppp / 0.45;
+        let law = CountLaw::new(&acquisition.sensor, gain);
+        let dark = acquisition.sensor.dark_per_frame().unwrap_or_else(|e| panic!("{e}"));
+        let light = acquisition.sensor.quantum_efficiency * ppp / 0.45;
         for value in frames.iter_mut().flat_map(|frame| &mut frame.data) {
             *value = law.mean(light * f64::from(*value) + dark) as f32;
         }

@@ -7,7 +7,7 @@ use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::memory::Peak;
 use crate::report::Report;
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, SimError};
 use qudi_io::capture::Capture;
@@ -56,17 +56,17 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
     if args.rounds == 0 || args.frames == 0 {
         return Err(Fault::new("nothing to measure", "--rounds, --frames", "ask for at least 1"));
     }
-    let (counts, context) = burst(args)?;
-    let sensor = context.sensor.clone();
+    let (counts, acquisition) = burst(args)?;
+    let sensor = acquisition.sensor.clone();
     let mut measured = Vec::new();
     let mut bar = report.bar();
     for name in &args.method {
         let mut capture = Capture::in_memory("bench", args.size, counts.clone(), &sensor)?;
-        let (mut restorer, _) = method(name, &mut capture, &context, &args.network)?;
+        let (mut restorer, _) = method(name, &mut capture, &acquisition, &args.network)?;
         let burst = BurstView { size: args.size, frames: &counts };
         let peak = Peak::start();
         // The first round warms caches up, and compiles kernels where there are any.
-        restorer.restore(burst, &context)?;
+        restorer.restore(burst, &acquisition)?;
         let mut times = Vec::with_capacity(args.rounds);
         for round in 0..args.rounds {
             bar.update("measuring", round as u64, Some(args.rounds as u64));
@@ -74,7 +74,7 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
                 return Err(Fault::Interrupted);
             }
             let start = Instant::now();
-            restorer.restore(burst, &context)?;
+            restorer.restore(burst, &acquisition)?;
             times.push(start.elapsed().as_secs_f64());
         }
         measured.push(Measured {
@@ -103,7 +103,7 @@ pub(crate) fn median(mut times: Vec<f64>) -> f64 {
 }
 
 /// A simulated burst to restore.
-pub(crate) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Context)> {
+pub(crate) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Acquisition)> {
     let sensor = Sensor::load("qudi-paper")?;
     let light = Light { ppp: 3.25, exposure: EXPOSURE };
     let scene =
@@ -116,8 +116,9 @@ pub(crate) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Context)> {
         counts.push(camera.expose(t as u64, &[&scene.render(t as f64)])?);
     }
     let (ppp, exposure) = (light.ppp, light.exposure);
-    let context = Context { seed: 1, first_frame: 0, ppp, exposure, sensor, gain, dark: None };
-    Ok((counts, context))
+    let acquisition =
+        Acquisition { seed: 1, first_frame: 0, ppp, exposure, sensor, gain, dark: None };
+    Ok((counts, acquisition))
 }
 
 fn load(path: &Path) -> Result<Results> {

@@ -126,12 +126,12 @@ fn measure(
         }
     }
     drop((differentiable, of_step));
-    let (counts, context) = burst(args)?;
+    let (counts, acquisition) = burst(args)?;
     let options = sample_options(&args.network);
     let mut restorer = QudiRestorer::new(network, &config, args.frames, options, &device.device)?;
     let peak = Peak::start();
     let start = Instant::now();
-    restorer.restore(BurstView { size: args.size, frames: &counts }, &context)?;
+    restorer.restore(BurstView { size: args.size, frames: &counts }, &acquisition)?;
     let restore = start.elapsed().as_secs_f64();
     let fastest = steps.iter().copied().fold(f64::MAX, f64::min);
     Ok(Figures {

@@ -3,7 +3,7 @@
 use crate::error::{Fault, Result};
 use qudi_core::USUAL_EXPOSURE;
 use qudi_core::auto_exposure::fitting_exposure;
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::LONGEST_HALF;
 use qudi_io::capture::{Capture, Summary};
@@ -20,11 +20,11 @@ pub(crate) struct Stated {
 }
 
 /// What is known of light and sensor, and where the light comes from.
-pub(crate) fn context(
+pub(crate) fn acquisition(
     stated: &Stated,
     capture: &mut Capture,
     sensor: &Sensor,
-) -> Result<(Context, &'static str)> {
+) -> Result<(Acquisition, &'static str)> {
     checked_exposure(stated.exposure)?;
     let of_frames = capture.output_sensor(sensor)?;
     let recorded = capture.about().ppp.map(|ppp| ppp * f64::from(capture.summed()));
@@ -60,7 +60,7 @@ pub(crate) fn context(
     };
     let summed = of_frames.frames_summed as f32;
     let dark = capture.dark().map(|map| map.iter().map(|dark| dark * summed).collect());
-    let mut context = Context {
+    let mut acquisition = Acquisition {
         seed: stated.seed,
         first_frame: 0,
         ppp,
@@ -69,11 +69,11 @@ pub(crate) fn context(
         gain,
         dark,
     };
-    context.exposure = match stated.exposure {
+    acquisition.exposure = match stated.exposure {
         Some(exposure) => exposure,
-        None => exposure_of(capture, &context)?,
+        None => exposure_of(capture, &acquisition)?,
     };
-    Ok((context, source))
+    Ok((acquisition, source))
 }
 
 /// What the user says of the exposure, if it can be.
@@ -89,7 +89,7 @@ pub(crate) fn checked_exposure(stated: Option<f64>) -> Result<()> {
 }
 
 /// What the capture says of it.
-fn exposure_of(capture: &mut Capture, context: &Context) -> Result<f64> {
+fn exposure_of(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
     let size = capture.size();
     // Pipes have shown their first frames only.
     let first = 2 * LONGEST_HALF as u64 + 1;
@@ -100,5 +100,5 @@ fn exposure_of(capture: &mut Capture, context: &Context) -> Result<f64> {
         capture.read(frame, &mut counts)?;
         Ok(counts)
     };
-    Ok(fitting_exposure(size, frames, context, read)?)
+    Ok(fitting_exposure(size, frames, acquisition, read)?)
 }

@@ -11,7 +11,7 @@ use qudi_burst::Average;
 use qudi_burst::{Finish, Qbp, TwoRounds};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
-use qudi_core::restorer::{BurstView, Context, Restored, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{
     Camera, ClipStatistics, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE,
@@ -68,7 +68,7 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
     for (t, frame) in (0..).zip(&truths) {
         burst.push(camera.expose(t, &[frame])?);
     }
-    let context = Context {
+    let acquisition = Acquisition {
         seed: demo.seed,
         first_frame: 0,
         ppp: light.ppp,
@@ -83,8 +83,8 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
         ("QBP + BM3D", Box::new(Qbp::new(Finish::Bm3d))),
         ("GUIDE", Box::new(TwoRounds)),
     ];
-    if demo.network.weights.is_some() || network::built_in_knows(&context)? {
-        methods.push(("QUDI", network::restorer(&demo.network, &context, SIZE)?.0));
+    if demo.network.weights.is_some() || network::built_in_knows(&acquisition)? {
+        methods.push(("QUDI", network::restorer(&demo.network, &acquisition, SIZE)?.0));
     } else {
         report.remark(
             "note: the built-in weights do not know this sensor or light; the other methods do",
@@ -96,7 +96,7 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
     for (done, (label, method)) in (1..).zip(&mut methods) {
         let start = Instant::now();
         let view = BurstView { size: SIZE, frames: &burst };
-        last = method.restore(view, &context)?;
+        last = method.restore(view, &acquisition)?;
         let frame = last.frames[CENTRE].clone();
         shown.push(Shown {
             label,
@@ -114,7 +114,7 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
         (deviations.swap_remove(CENTRE), TOLD)
     } else {
         let (_, method) = methods.last_mut().expect("there are three at least");
-        (redrawn(method.as_mut(), &last.frames, &context, &mut bar)?, REDRAWN_TELLS)
+        (redrawn(method.as_mut(), &last.frames, &acquisition, &mut bar)?, REDRAWN_TELLS)
     };
     drop(bar);
 
@@ -167,19 +167,19 @@ fn light(demo: &Demo, sensor: &Sensor, truths: &[Frame]) -> Result<Light> {
 fn redrawn(
     method: &mut dyn Restorer,
     result: &[Frame],
-    context: &Context,
+    acquisition: &Acquisition,
     bar: &mut Bar,
 ) -> Result<Frame> {
-    let light = Light { ppp: context.ppp, exposure: context.exposure };
+    let light = Light { ppp: acquisition.ppp, exposure: acquisition.exposure };
     let mut sums = vec![[0.0f32; 2]; SIZE.pixels()];
     for draw in 1..=REDRAWN {
-        let mut camera = Camera::new(&context.sensor, SIZE, light, context.seed)?;
+        let mut camera = Camera::new(&acquisition.sensor, SIZE, light, acquisition.seed)?;
         let mut burst = Vec::with_capacity(FRAMES);
         for (t, frame) in (draw * FRAMES as u64..).zip(result) {
             burst.push(camera.expose(t, &[frame])?);
         }
         let view = BurstView { size: SIZE, frames: &burst };
-        let again = method.restore(view, context)?.frames;
+        let again = method.restore(view, acquisition)?.frames;
         for (sum, value) in sums.iter_mut().zip(&again[CENTRE].data) {
             *sum = [sum[0] + value, sum[1] + value * value];
         }

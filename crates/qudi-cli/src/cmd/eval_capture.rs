@@ -2,7 +2,7 @@
 
 use crate::args::{Eval, Protocol};
 use crate::cmd::capture_info::{remarks, required_sensor};
-use crate::cmd::capture_light::{Stated, context};
+use crate::cmd::capture_light::{Stated, acquisition};
 use crate::cmd::eval_clip::stem;
 use crate::cmd::eval_html::Pictures;
 use crate::cmd::eval_score::{FrameScore, Row, Score};
@@ -13,7 +13,7 @@ use crate::memory::Peak;
 use crate::report::Report;
 use qudi_core::Frame;
 use qudi_core::metrics::Consistency;
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_io::capture::{Capture, MaskChoice};
@@ -47,16 +47,16 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
         exposure: args.exposure,
         seed: args.seed,
     };
-    let (context, source) = context(&stated, &mut capture, &sensor)?;
+    let (acquisition, source) = acquisition(&stated, &mut capture, &sensor)?;
     let frames = capture.frames().min(args.frames);
     let mut counts = vec![0; capture.size().pixels()];
     capture.read(frames / 2, &mut counts)?;
-    let full = f32::from(context.sensor.max_count());
+    let full = f32::from(acquisition.sensor.max_count());
     let data = counts.iter().map(|&count| f32::from(count) / full).collect();
     let clip = stem(path);
     let pictures = vec![Pictures {
         clip: clip.clone(),
-        ppp: context.ppp,
+        ppp: acquisition.ppp,
         counts: Frame { size: capture.size(), data },
         truth: None,
     }];
@@ -64,8 +64,8 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
     let mut bar = report.bar();
     for (n, name) in args.method.iter().enumerate() {
         bar.update("evaluating", n as u64, Some(args.method.len() as u64));
-        let score = score(name, &clip, &mut capture, frames, &context, args)?;
-        rows.push(Row { method: name.clone(), ppp: context.ppp, scores: vec![score] });
+        let score = score(name, &clip, &mut capture, frames, &acquisition, args)?;
+        rows.push(Row { method: name.clone(), ppp: acquisition.ppp, scores: vec![score] });
     }
     drop(bar);
     remarks(&capture, report);
@@ -73,18 +73,18 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
         "{frames} frames of {} of {}, sensor {}, {:.4} incident photons/pixel/frame ({source}); no truth: chi-square of the counts given the result, 1 where it explains them, below where it follows their noise, above where it blurs or invents",
         capture.size(),
         args.data,
-        context.sensor.name,
-        context.ppp
+        acquisition.sensor.name,
+        acquisition.ppp
     );
     let settings = json!({
         "capture": args.data,
         "format": capture.about().format,
         "frames": frames,
         "ppp_from": source,
-        "gain": context.gain,
-        "sensor": context.sensor,
+        "gain": acquisition.gain,
+        "sensor": acquisition.sensor,
         "seed": args.seed,
-        "exposure": context.exposure,
+        "exposure": acquisition.exposure,
         "overlap": args.overlap,
     });
     Ok(Judged { rows, pictures, about, settings })
@@ -122,22 +122,30 @@ fn score(
     clip: &str,
     capture: &mut Capture,
     frames: u64,
-    context: &Context,
+    acquisition: &Acquisition,
     args: &Eval,
 ) -> Result<Score> {
     let mut sink = Watch {
-        consistency: Consistency::new(capture.size(), context),
-        context,
+        consistency: Consistency::new(capture.size(), acquisition),
+        acquisition,
         shown: frames / 2,
         frames: Vec::new(),
         picture: None,
     };
     let peak = Peak::start();
     let start = Instant::now();
-    let (mut restorer, _) = method(name, capture, context, &args.network)?;
+    let (mut restorer, _) = method(name, capture, acquisition, &args.network)?;
     let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
-    run_method(restorer.as_mut(), capture, &windows, 0..frames, context, &mut sink, &mut go_on)?;
+    run_method(
+        restorer.as_mut(),
+        capture,
+        &windows,
+        0..frames,
+        acquisition,
+        &mut sink,
+        &mut go_on,
+    )?;
     let seconds = start.elapsed().as_secs_f64();
     Ok(Score {
         clip: clip.to_owned(),
@@ -154,7 +162,7 @@ fn score(
 /// Judges frames as they come, and keeps the one that is shown.
 struct Watch<'a> {
     consistency: Consistency,
-    context: &'a Context,
+    acquisition: &'a Acquisition,
     shown: u64,
     frames: Vec<FrameScore>,
     picture: Option<Frame>,
@@ -162,7 +170,7 @@ struct Watch<'a> {
 
 impl RestoreSink for Watch<'_> {
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
-        let chi_square = Some(self.consistency.add(restored, counts, self.context)?);
+        let chi_square = Some(self.consistency.add(restored, counts, self.acquisition)?);
         self.frames.push(FrameScore { chi_square, ..FrameScore::default() });
         if number == self.shown {
             self.picture = Some(restored.clone());

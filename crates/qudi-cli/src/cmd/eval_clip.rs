@@ -14,7 +14,7 @@ use qudi_core::flow::Flow;
 use qudi_core::metrics::Consistency;
 use qudi_core::metrics::{best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim};
 use qudi_core::npy::read_clip;
-use qudi_core::restorer::{BurstView, Context};
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_core::{Camera, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE};
@@ -117,7 +117,7 @@ impl Clip {
                 .map_err(|e| Fault::new(e, path.display(), "report this as a bug"))?;
             writer.finish(&bytes, overwrite)?;
         }
-        let mut context = Context {
+        let mut acquisition = Acquisition {
             seed: args.seed,
             first_frame: 0,
             ppp: summary.light.ppp,
@@ -126,11 +126,11 @@ impl Clip {
             gain: summary.gain,
             dark: None,
         };
-        context.exposure = if let Some(exposure) = args.exposure {
+        acquisition.exposure = if let Some(exposure) = args.exposure {
             exposure
         } else {
             let read = |frame: u64| Ok(kept.counts[frame as usize].clone());
-            fitting_exposure(size, kept.counts.len() as u64, &context, read)?
+            fitting_exposure(size, kept.counts.len() as u64, &acquisition, read)?
         };
         let motion = if kept.flow.is_empty() {
             let estimate = || {
@@ -141,7 +141,7 @@ impl Clip {
         } else {
             Motion::True(std::mem::take(&mut kept.flow))
         };
-        Ok(ExposedClip { name: self.name.clone(), size, ppp, seed, kept, motion, context })
+        Ok(ExposedClip { name: self.name.clone(), size, ppp, seed, kept, motion, acquisition })
     }
 }
 
@@ -201,17 +201,17 @@ pub(crate) struct ExposedClip {
     seed: u64,
     kept: Kept,
     motion: Motion,
-    context: Context,
+    acquisition: Acquisition,
 }
 
 impl ExposedClip {
     pub(crate) fn score_method(&self, name: &str, args: &Eval) -> Result<Score> {
-        let sensor = &self.context.sensor;
+        let sensor = &self.acquisition.sensor;
         let mut capture =
             Capture::in_memory(&self.name, self.size, self.kept.counts.clone(), sensor)?;
         let peak = Peak::start();
         let start = Instant::now();
-        let (mut restorer, _) = method(name, &mut capture, &self.context, &args.network)?;
+        let (mut restorer, _) = method(name, &mut capture, &self.acquisition, &args.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
@@ -220,7 +220,7 @@ impl ExposedClip {
             &mut capture,
             &windows,
             all,
-            &self.context,
+            &self.acquisition,
             &mut sink,
             &mut |_, _| interrupt::check(),
         )?;
@@ -243,7 +243,7 @@ impl ExposedClip {
                 "use longer clips, or --protocol strict",
             ));
         }
-        let sensor = &self.context.sensor;
+        let sensor = &self.acquisition.sensor;
         let (mut frames, mut middles) = (Vec::new(), Vec::new());
         let (mut seconds, mut highest) = (0.0, None::<f64>);
         let windows = truth.len() - WINDOW + 1;
@@ -260,13 +260,14 @@ impl ExposedClip {
             for (t, frame) in scene.iter().enumerate() {
                 counts.push(camera.expose(t as u64, &[frame])?);
             }
-            let context = Context { gain: camera.gain(), ppp: self.ppp, ..self.context.clone() };
+            let acquisition =
+                Acquisition { gain: camera.gain(), ppp: self.ppp, ..self.acquisition.clone() };
             let peak = Peak::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
-            let (mut restorer, _) = method(name, &mut capture, &context, &args.network)?;
+            let (mut restorer, _) = method(name, &mut capture, &acquisition, &args.network)?;
             let burst = BurstView { size: self.size, frames: &counts };
-            let restored = restorer.restore(burst, &context)?.frames.swap_remove(WINDOW / 2);
+            let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();
             highest = [highest, peak.grown_mib()].into_iter().flatten().reduce(f64::max);
             frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
@@ -336,11 +337,11 @@ impl ExposedClip {
     }
 
     fn score(&self, restored: &[Frame], cost: Option<Cost>) -> Result<Score> {
-        let mut consistency = Consistency::new(self.size, &self.context);
+        let mut consistency = Consistency::new(self.size, &self.acquisition);
         let mut frames = Vec::with_capacity(restored.len());
         for ((image, truth), counts) in restored.iter().zip(&self.kept.truth).zip(&self.kept.counts)
         {
-            let chi_square = Some(consistency.add(image, counts, &self.context)?);
+            let chi_square = Some(consistency.add(image, counts, &self.acquisition)?);
             frames.push(FrameScore { chi_square, ..self.score_frame(image, truth)? });
         }
         Ok(Score {
@@ -364,7 +365,7 @@ impl ExposedClip {
     /// What the middle frame looks like, and what was seen of it.
     pub(crate) fn pictures(&self) -> Pictures {
         let middle = self.kept.truth.len() / 2;
-        let full = f32::from(self.context.sensor.max_count());
+        let full = f32::from(self.acquisition.sensor.max_count());
         let counts = self.kept.counts[middle].iter().map(|&count| f32::from(count) / full);
         Pictures {
             clip: self.name.clone(),

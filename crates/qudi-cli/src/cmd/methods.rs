@@ -5,7 +5,7 @@ use crate::cmd::network;
 use crate::error::{Fault, Result};
 use qudi_burst::{Average, Mle};
 use qudi_burst::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_io::capture::Capture;
 use qudi_model::restorer::FEWEST_FRAMES;
 
@@ -20,20 +20,20 @@ const SAMPLES: u64 = 4;
 pub(crate) fn method(
     name: &str,
     capture: &mut Capture,
-    context: &Context,
+    acquisition: &Acquisition,
     options: &Network,
 ) -> Result<(Box<dyn Restorer>, String)> {
     match name {
         "average" => Ok((Box::new(Average), String::new())),
         "mle" => {
-            let mle = sampled(capture, |views| Mle::choose(views, context))?;
+            let mle = sampled(capture, |views| Mle::choose(views, acquisition))?;
             Ok((Box::new(mle), over(mle.length())))
         }
-        "qudi" => network::restorer(options, context, capture.size()),
+        "qudi" => network::restorer(options, acquisition, capture.size()),
         "transform-denoise" | "bm3d" => {
             let transform = if name == "bm3d" { Transform::Identity } else { Transform::Integral };
             let chosen =
-                sampled(capture, |views| TransformDenoise::choose(transform, views, context))?;
+                sampled(capture, |views| TransformDenoise::choose(transform, views, acquisition))?;
             Ok((Box::new(chosen), over(chosen.length())))
         }
         "qbp" => Ok((Box::new(Qbp::new(Finish::Plain)), String::new())),
@@ -51,14 +51,14 @@ pub(crate) fn method(
 pub(crate) fn usual_method(
     options: &Network,
     capture: &Capture,
-    context: &Context,
+    acquisition: &Acquisition,
 ) -> Result<&'static str> {
     let long_enough = capture.length().is_none_or(|frames| frames >= FEWEST_FRAMES as u64);
     Ok(if options.weights.is_some() {
         "qudi"
-    } else if context.sensor.dark_per_frame().is_err() {
+    } else if acquisition.sensor.dark_per_frame().is_err() {
         "mle"
-    } else if long_enough && network::built_in_knows(context)? {
+    } else if long_enough && network::built_in_knows(acquisition)? {
         "qudi"
     } else {
         "guide"

@@ -6,7 +6,7 @@ use crate::error::{Fault, Result};
 use crate::memory::available_bytes;
 use crate::weights::Weights;
 use qudi_core::Size;
-use qudi_core::restorer::{Context, Restorer};
+use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_model::checkpoint::Description;
 use qudi_model::diffusion::sampler::Sampler;
@@ -19,12 +19,12 @@ const TOLERATED: f64 = 10.0;
 /// The restorer, and what it runs on.
 pub(crate) fn restorer(
     options: &Network,
-    context: &Context,
+    acquisition: &Acquisition,
     size: Size,
 ) -> Result<(Box<dyn Restorer>, String)> {
     let device = device::open(&options.device)?;
     let (network, description) = options.weights().load(&device.device)?;
-    check(&description, context)?;
+    check(&description, acquisition)?;
     if matches!(device.name.as_str(), "cpu" | "ndarray") {
         check_memory(&description, options.tile, size, available_bytes())?;
     }
@@ -113,24 +113,24 @@ fn is_like(sensor: &Sensor, trained: &str) -> bool {
 }
 
 /// Whether the weights that come along were trained for such a capture.
-pub(crate) fn built_in_knows(context: &Context) -> Result<bool> {
-    Ok(check(&Weights::BuiltIn.describe()?, context).is_ok())
+pub(crate) fn built_in_knows(acquisition: &Acquisition) -> Result<bool> {
+    Ok(check(&Weights::BuiltIn.describe()?, acquisition).is_ok())
 }
 
 /// Refuses a capture far outside what the weights were trained for.
-fn check(description: &Description, context: &Context) -> Result<()> {
+fn check(description: &Description, acquisition: &Acquisition) -> Result<()> {
     let [least, most] = description.ppp;
-    if context.ppp < least / TOLERATED || context.ppp > most * TOLERATED {
+    if acquisition.ppp < least / TOLERATED || acquisition.ppp > most * TOLERATED {
         return Err(Fault::new(
             format!(
                 "{:.4} photons per pixel and frame; the weights know {least} to {most}",
-                context.ppp
+                acquisition.ppp
             ),
             "--weights",
             "sum frames (--sum N) or average fewer, give --ppp if it was estimated wrongly, or train for this light",
         ));
     }
-    let sensor = &context.sensor;
+    let sensor = &acquisition.sensor;
     if !description.sensors.iter().any(|trained| is_like(sensor, trained)) {
         let response = format!("{:?}", sensor.response).to_lowercase();
         return Err(Fault::new(

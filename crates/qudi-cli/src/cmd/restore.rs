@@ -2,7 +2,7 @@
 
 use crate::args::{Global, Network, Restore};
 use crate::cmd::capture_info::{remarks, required_sensor};
-use crate::cmd::capture_light::{Stated, context};
+use crate::cmd::capture_light::{Stated, acquisition};
 use crate::cmd::methods::{method, usual_method};
 use crate::cmd::network::device_failed;
 use crate::cmd::restore_deviation::Deviation;
@@ -14,7 +14,7 @@ use crate::interrupt;
 use crate::report::Report;
 use qudi_core::SimError;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
-use qudi_core::restorer::{Context, Restorer};
+use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_io::capture::{Capture, MaskChoice};
@@ -57,7 +57,7 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     // A pipe may not have told how many frames come.
     let frames = job.capture.length().unwrap_or(u64::MAX);
     let part = args.shard.map_or(0..frames, |shard| shard.range(frames));
-    let mut misfit = Misfit::new(&job.capture, &job.context);
+    let mut misfit = Misfit::new(&job.capture, &job.acquisition);
     let done = output.finished(part.clone());
     let mut deviation =
         Deviation::create(args, job.restorer.name(), &job.capture, done, overwrite)?;
@@ -133,7 +133,7 @@ fn refuse_for_pipes(args: &Restore, overwrite: Overwrite) -> Result<()> {
 /// Everything that a run needs.
 struct Job {
     capture: Capture,
-    context: Context,
+    acquisition: Acquisition,
     /// Where the light comes from.
     source: &'static str,
     restorer: Box<dyn Restorer>,
@@ -158,12 +158,12 @@ impl Job {
         };
         let stated =
             Stated { ppp: args.ppp, gain: args.gain, exposure: args.exposure, seed: args.seed };
-        let (context, source) = context(&stated, &mut capture, &sensor)?;
+        let (acquisition, source) = acquisition(&stated, &mut capture, &sensor)?;
         let name = match &args.method {
             Some(name) => name,
-            None => usual_method(&args.network, &capture, &context)?,
+            None => usual_method(&args.network, &capture, &acquisition)?,
         };
-        let (restorer, choice) = method(name, &mut capture, &context, &args.network)?;
+        let (restorer, choice) = method(name, &mut capture, &acquisition, &args.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
         let place = if is_pipe(args) {
             capture.path().to_owned()
@@ -183,13 +183,13 @@ impl Job {
             "overlap": args.overlap,
             "seed": args.seed,
             "network": network_settings(restorer.name(), &args.network)?,
-            "ppp": context.ppp,
-            "exposure": context.exposure,
-            "gain": context.gain,
-            "sensor": context.sensor,
+            "ppp": acquisition.ppp,
+            "exposure": acquisition.exposure,
+            "gain": acquisition.gain,
+            "sensor": acquisition.sensor,
             "repaired_pixels": capture.bad_pixels().len(),
         });
-        Ok(Self { capture, context, source, restorer, choice, windows, settings })
+        Ok(Self { capture, acquisition, source, restorer, choice, windows, settings })
     }
 
     fn run(
@@ -210,12 +210,13 @@ impl Job {
             interrupt::check()
         };
         let mut sink = output.sink(misfit, deviation);
-        let (capture, context) = (&mut self.capture, &self.context);
+        let (capture, acquisition) = (&mut self.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
         let restorer_is_network = restorer.name() == "qudi";
         let windows = &self.windows;
-        let run =
-            || run_method(restorer, capture, windows, wanted, context, &mut sink, &mut progress);
+        let run = || {
+            run_method(restorer, capture, windows, wanted, acquisition, &mut sink, &mut progress)
+        };
         if restorer_is_network {
             // Devices report too little memory and broken drivers by panicking.
             let run = device::guarded(&network.device, run);
@@ -250,19 +251,19 @@ fn describe(
     chi_square: Option<f64>,
     seconds: Option<f64>,
 ) -> String {
-    let (context, size) = (&job.context, job.capture.size());
+    let (acquisition, size) = (&job.acquisition, job.capture.size());
     let (name, choice) = (job.restorer.name(), &job.choice);
     let mut text = format!("{}   {frames} frames of {size} by {name}{choice}\n", args.output);
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
-    let (ppp, exposure) = (context.ppp, context.exposure);
+    let (ppp, exposure) = (acquisition.ppp, acquisition.exposure);
     let source = job.source;
     line(
         "light",
         format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {exposure:.4}"),
     );
-    line("sensor", format!("{}, gain {:.4} DN/e-", context.sensor.name, context.gain));
+    line("sensor", format!("{}, gain {:.4} DN/e-", acquisition.sensor.name, acquisition.gain));
     if resumed > 0 {
         line("resumed", format!("{resumed} frames were there already"));
     }

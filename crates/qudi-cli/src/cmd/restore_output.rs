@@ -4,7 +4,7 @@ use crate::cmd::restore_deviation::Deviation;
 use crate::error::{Fault, Result};
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::metrics::Consistency;
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::{Frame, SimError, Size};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{FrameFolder, RestoreSink};
@@ -120,7 +120,7 @@ impl RestoreSink for Sink<'_> {
 /// What is seen of the result: chi-square of all frames, and three of them beside their counts.
 pub(crate) struct Misfit {
     consistency: Consistency,
-    context: Context,
+    acquisition: Acquisition,
     /// Frames to show; of a pipe that has not told its length, the first.
     shown: Vec<u64>,
     /// Frames that are shown: number, counts, restored.
@@ -131,14 +131,14 @@ pub(crate) struct Misfit {
 }
 
 impl Misfit {
-    pub(crate) fn new(capture: &Capture, context: &Context) -> Self {
+    pub(crate) fn new(capture: &Capture, acquisition: &Acquisition) -> Self {
         let length = capture.length();
         let mut shown = vec![0];
         shown.extend(length.into_iter().flat_map(|n| [(n - 1) / 2, n - 1]));
         shown.dedup();
         Self {
-            consistency: Consistency::new(capture.size(), context),
-            context: context.clone(),
+            consistency: Consistency::new(capture.size(), acquisition),
+            acquisition: acquisition.clone(),
             shown,
             pictures: Vec::new(),
             keep_latest: length.is_none(),
@@ -151,13 +151,13 @@ impl Misfit {
             if self.keep_latest {
                 self.pictures.truncate(self.shown.len());
             }
-            let full = f32::from(self.context.sensor.max_count());
+            let full = f32::from(self.acquisition.sensor.max_count());
             let data = counts.iter().map(|&count| f32::from(count) / full).collect();
             let counts = Frame { size: restored.size, data };
             self.pictures.push((self.judged, [counts, restored.clone()]));
         }
         self.judged += 1;
-        self.consistency.add(restored, counts, &self.context).map(drop)
+        self.consistency.add(restored, counts, &self.acquisition).map(drop)
     }
 
     /// Takes in frames that an earlier run finished.

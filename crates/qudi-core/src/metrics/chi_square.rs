@@ -4,7 +4,7 @@
 
 use crate::error::Result;
 use crate::frame::{Frame, Size};
-use crate::restorer::Context;
+use crate::restorer::Acquisition;
 use crate::sensor::{CountLaw, CountMoments};
 
 /// Variances below this (in DN^2) tell nothing: a black pixel of a noiseless sensor.
@@ -20,9 +20,9 @@ pub struct Consistency {
 }
 
 impl Consistency {
-    /// For frames of `size` of the context's sensor.
-    pub fn new(size: Size, context: &Context) -> Self {
-        let law = CountLaw::new(&context.sensor, context.gain);
+    /// For frames of `size` of the acquisition's sensor.
+    pub fn new(size: Size, acquisition: &Acquisition) -> Self {
+        let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
         let moments = CountMoments::new(&law);
         Self { moments, size, map: vec![0.0; size.pixels()], frames: 0 }
     }
@@ -31,12 +31,17 @@ impl Consistency {
     ///
     /// # Errors
     /// [`SimError`](crate::SimError) if the sensor's dark rate is unknown.
-    pub fn add(&mut self, restored: &Frame, counts: &[u16], context: &Context) -> Result<f64> {
-        let ordinary = context.sensor.dark_per_frame()?;
-        let photons = context.photons_per_unit() * context.sensor.quantum_efficiency;
+    pub fn add(
+        &mut self,
+        restored: &Frame,
+        counts: &[u16],
+        acquisition: &Acquisition,
+    ) -> Result<f64> {
+        let ordinary = acquisition.sensor.dark_per_frame()?;
+        let photons = acquisition.photons_per_unit() * acquisition.sensor.quantum_efficiency;
         let mut total = 0.0;
         for (i, (&image, &count)) in restored.data.iter().zip(counts).enumerate() {
-            let detections = f64::from(image).max(0.0) * photons + context.dark_of(i, ordinary);
+            let detections = f64::from(image).max(0.0) * photons + acquisition.dark_of(i, ordinary);
             let (mean, variance) = self.moments.at(detections);
             if variance > LEAST_VARIANCE {
                 let misfit = (f64::from(count) - mean).powi(2) / variance;

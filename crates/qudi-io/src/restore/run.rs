@@ -2,7 +2,7 @@
 
 use crate::capture::Capture;
 use qudi_core::Frame;
-use qudi_core::restorer::{BurstView, Context, Restorer};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::windows::{CrossFade, Windows};
 use qudi_core::{Result, SimError};
 use std::collections::VecDeque;
@@ -40,7 +40,7 @@ pub fn run(
     capture: &mut Capture,
     windows: &Windows,
     wanted: Range<u64>,
-    context: &Context,
+    acquisition: &Acquisition,
     sink: &mut dyn RestoreSink,
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
@@ -74,9 +74,9 @@ pub fn run(
             counts.push_back(frame);
         }
         capture.release(range.end);
-        let context = Context { first_frame: range.start, ..context.clone() };
+        let acquisition = Acquisition { first_frame: range.start, ..acquisition.clone() };
         let burst = BurstView { size, frames: counts.make_contiguous() };
-        let restored = restorer.restore(burst, &context)?;
+        let restored = restorer.restore(burst, &acquisition)?;
         fade.push(range.start, restored.frames);
         if let Some(deviation) = restored.std {
             deviations.push(range.start, deviation);

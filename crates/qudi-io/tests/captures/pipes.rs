@@ -3,7 +3,7 @@
 use crate::{counts, npy, open, pack, plain, refusal, scene, scratch, write};
 use proptest::prelude::*;
 use qudi_burst::Average;
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_core::{Frame, SimError};
@@ -73,7 +73,7 @@ impl RestoreSink for Collected {
 }
 
 fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, SimError> {
-    let context = Context {
+    let acquisition = Acquisition {
         seed: 1,
         first_frame: 0,
         ppp: 1.0,
@@ -85,7 +85,7 @@ fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, SimError> {
     let windows = Windows::new(capture.frames(), 11, 3)?;
     let mut sink = Collected::default();
     let mut on = |_: u64, _: Option<u64>| ControlFlow::Continue(());
-    run(&mut Average, capture, &windows, 0..u64::MAX, &context, &mut sink, &mut on)?;
+    run(&mut Average, capture, &windows, 0..u64::MAX, &acquisition, &mut sink, &mut on)?;
     Ok(sink.0)
 }
 

@@ -2,7 +2,7 @@
 //! certain (DESIGN 4.5).
 
 use crate::measurement::{CountResponse, Planes, dark};
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::{FullWell, Gain, Response, Sensor};
 use qudi_core::{Camera, Frame, Light, Result, Size};
 
@@ -20,16 +20,16 @@ impl LoopSensor {
     /// The sensor at diffusion time `time` of `times`: light, and with it gain and full well, follow
     /// `GROWTH^(1 - time / times)`, so that nothing saturates that did not. Sums of binary frames keep their light
     /// and get more frames instead.
-    pub fn at(context: &Context, time: usize, times: usize) -> Self {
+    pub fn at(acquisition: &Acquisition, time: usize, times: usize) -> Self {
         let factor = GROWTH.powf(1.0 - time as f64 / times as f64);
-        let mut sensor = context.sensor.clone();
+        let mut sensor = acquisition.sensor.clone();
         // Damaged pixels are repaired in what the network sees; only the law of an ordinary one counts.
         sensor.defects = qudi_core::sensor::Defects::default();
-        let mut ppp = context.ppp;
+        let mut ppp = acquisition.ppp;
         match sensor.response {
             Response::Linear => {
                 ppp *= factor;
-                sensor.gain = Gain::Fixed(context.gain / factor);
+                sensor.gain = Gain::Fixed(acquisition.gain / factor);
                 sensor.full_well = FullWell::new(sensor.full_well.electrons() * factor);
             }
             Response::Binary => {
@@ -39,7 +39,7 @@ impl LoopSensor {
                 ppp *= after / before;
             }
         }
-        Self { sensor, light: Light { ppp, exposure: context.exposure } }
+        Self { sensor, light: Light { ppp, exposure: acquisition.exposure } }
     }
 
     /// Measures `frames`, row-major images in [0, 1] of `size`; frame `i` is number `first + i` of the capture. The

@@ -18,7 +18,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_core::Size;
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 
 fn devices() -> [Device; 2] {
     #[allow(deprecated)] // asked for by name
@@ -462,5 +462,5 @@ fn paper_numbers() -> [f32; SENSOR_NUMBERS] {
     let gain = sensor.gain_at(3.25).unwrap();
     let (ppp, exposure) = (3.25, 0.45);
     let dark = None;
-    sensor_numbers(&Context { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark })
+    sensor_numbers(&Acquisition { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark })
 }

@@ -6,7 +6,7 @@ use super::pack::Pack;
 use qudi_core::Camera;
 use qudi_core::Light;
 use qudi_core::random::{Domain, Streams, uniform};
-use qudi_core::restorer::Context;
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
@@ -28,7 +28,7 @@ pub struct Sample {
     /// What the sensor counted, frame by frame.
     pub counts: Vec<Vec<u16>>,
     /// Sensor and light; its seed is the sample's own.
-    pub context: Context,
+    pub acquisition: Acquisition,
 }
 
 /// Draws samples. One for each thread that draws.
@@ -84,7 +84,7 @@ impl Dataset {
         let mut camera = Camera::new(&sensor, truth[0].size, light, seed)?;
         let counts = (0..).zip(&truth).map(|(t, frame)| camera.expose(t, &[frame]));
         let counts = counts.collect::<Result<_>>()?;
-        let context = Context {
+        let acquisition = Acquisition {
             seed,
             first_frame: 0,
             ppp: light.ppp,
@@ -93,7 +93,7 @@ impl Dataset {
             sensor,
             dark: None,
         };
-        Ok(Sample { truth, counts, context })
+        Ok(Sample { truth, counts, acquisition })
     }
 
     fn clip(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
