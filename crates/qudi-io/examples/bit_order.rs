@@ -3,7 +3,7 @@
 
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
-use qudi_io::capture::bit_order_evidence;
+use qudi_io::capture::bit_order_z_score;
 use qudi_sim::clip::{Input, Sampling};
 
 fn main() -> qudi_core::Result<()> {
@@ -24,7 +24,7 @@ fn main() -> qudi_core::Result<()> {
                     *sum += u32::from(count);
                 }
                 if frame >= 15 && (frame + 1).is_power_of_two() {
-                    line += &format!(" {:.1}", bit_order_evidence(&sums, size));
+                    line += &format!(" {:.1}", bit_order_z_score(&sums, size));
                 }
             }
             println!("{line}");

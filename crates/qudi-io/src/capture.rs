@@ -4,22 +4,22 @@
 //! ([`CountFrames`]); a [`Capture`] turns and crops them, sums them, and repairs bad pixels, so that
 //! nothing downstream sees a raw file. Memory holds a few frames, however long the capture is.
 
-pub(crate) mod about;
 pub(crate) mod bit_order;
 pub(crate) mod byte_kind;
 mod calibrate;
+pub(crate) mod info;
 pub(crate) mod levels;
 pub(crate) mod options;
 pub(crate) mod pipe;
 mod pixel_map;
 pub(crate) mod probe;
-pub(crate) mod raw_look;
+pub(crate) mod raw_sample;
 mod summary;
 mod view;
 
-pub use about::{About, Certainty, Packing};
-pub use bit_order::{SURE, bit_order_evidence};
+pub use bit_order::{SURE, bit_order_z_score};
 pub use calibrate::{Calibration, calibrate};
+pub use info::{CaptureInfo, Certainty, Packing};
 pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 pub use summary::{BitOrderCheck, Summary};
 
@@ -36,12 +36,12 @@ use std::path::{Path, PathBuf};
 use view::View;
 
 /// Frames looked at for statistics at most.
-pub const MOST_LOOKS: u64 = 1000;
+pub const MAX_SAMPLE_FRAMES: u64 = 1000;
 
 /// A capture, read as output frames: turned, cropped, summed, repaired.
 pub struct Capture {
     path: PathBuf,
-    about: About,
+    info: CaptureInfo,
     native: Box<dyn CountFrames>,
     view: View,
     /// Native frames in use; of a pipe, those that have arrived.
@@ -63,13 +63,13 @@ impl std::fmt::Debug for Capture {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Capture")
             .field("path", &self.path)
-            .field("about", &self.about)
+            .field("info", &self.info)
             .finish_non_exhaustive()
     }
 }
 
 /// What the user says of the depth, unless the file knows better.
-fn state_depth(about: &mut About, bits: u8) -> Result<()> {
+fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     if !(1..=16).contains(&bits) {
         return Err(SimError::request(
             format!("{bits} bits"),
@@ -78,14 +78,14 @@ fn state_depth(about: &mut About, bits: u8) -> Result<()> {
         ));
     }
     let max = ((1u32 << bits) - 1) as u16;
-    match about.max_count {
+    match info.max_count {
         Some(known) if known != max => Err(SimError::request(
             format!("{bits} bits, where the file has counts up to {known}"),
             "--bits",
             "leave it out: the file knows its depth",
         )),
         _ => {
-            about.max_count = Some(max);
+            info.max_count = Some(max);
             Ok(())
         }
     }
@@ -98,12 +98,12 @@ impl Capture {
     /// # Errors
     /// [`SimError`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
-        let (native, about) = codec::open(path, options)?;
-        Self::assemble(path, native, about, options, sensor)
+        let (native, info) = codec::open(path, options)?;
+        Self::assemble(path, native, info, options, sensor)
     }
 
     /// The capture that comes out of `reader`: a `.npy`, or raw frames that `options` name. Each frame
-    /// comes once: [`Capture::reach`] waits for more, and statistics see the first window.
+    /// comes once: [`Capture::wait_for`] waits for more, and statistics see the first window.
     ///
     /// # Errors
     /// As [`Capture::open`].
@@ -112,31 +112,31 @@ impl Capture {
         options: &ReadOptions,
         sensor: Option<&Sensor>,
     ) -> Result<Self> {
-        let (native, about) = codec::open_pipe(Box::new(reader), options)?;
-        Self::assemble(Path::new(STDIN), native, about, options, sensor)
+        let (native, info) = codec::open_pipe(Box::new(reader), options)?;
+        Self::assemble(Path::new(STDIN), native, info, options, sensor)
     }
 
     fn assemble(
         path: &Path,
         mut native: Box<dyn CountFrames>,
-        mut about: About,
+        mut info: CaptureInfo,
         options: &ReadOptions,
         sensor: Option<&Sensor>,
     ) -> Result<Self> {
         if let Some(bits) = options.bits {
-            state_depth(&mut about, bits)?;
+            state_depth(&mut info, bits)?;
         }
-        about.binary |= about.max_count == Some(1);
+        info.binary |= info.max_count == Some(1);
         if let Some(orient) = options.orient {
-            about.orient = orient;
+            info.orient = orient;
         }
         let stored = native.size();
-        let view = View::new(stored, about.orient, about.vendor, options.crop)?;
+        let view = View::new(stored, info.orient, info.vendor, options.crop)?;
         let sum = options.sum.unwrap_or(1);
         let start = options.start.unwrap_or(0);
-        native.release(start);
+        native.discard_before(start);
         let window = start.saturating_add(FIRST_WINDOW.saturating_mul(sum.max(1).into()));
-        let there = native.reach(window.min(options.end.unwrap_or(window)), &mut about.remarks)?;
+        let there = native.wait_for(window.min(options.end.unwrap_or(window)), &mut info.notes)?;
         let frames = native.length().unwrap_or(u64::MAX);
         let range = start..options.end.unwrap_or(frames).min(there);
         if range.start >= range.end || options.end.is_some_and(|end| end > frames) {
@@ -154,8 +154,7 @@ impl Capture {
                 "sum between 1 and all frames",
             ));
         }
-        if about.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX))
-        {
+        if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
             return Err(SimError::request(
                 format!("sums of {sum} frames do not fit into 16 bits"),
                 "--sum",
@@ -164,7 +163,7 @@ impl Capture {
         }
         let mut capture = Self {
             path: path.to_owned(),
-            about,
+            info,
             view,
             range,
             end: options.end,
@@ -200,13 +199,13 @@ impl Capture {
                 "give at least one frame, all of one size",
             ));
         }
-        let mut about = About::new("memory", "counts in memory");
-        about.max_count = Some(sensor.max_count());
-        about.binary = sensor.response == Response::Binary;
-        about.sensor = Some(sensor.clone());
+        let mut info = CaptureInfo::new("memory", "counts in memory");
+        info.max_count = Some(sensor.max_count());
+        info.binary = sensor.response == Response::Binary;
+        info.sensor = Some(sensor.clone());
         Ok(Self {
             path: place.to_owned(),
-            about,
+            info,
             view: View { size, from: None },
             range: 0..frames.len() as u64,
             end: None,
@@ -222,8 +221,8 @@ impl Capture {
     }
 
     /// What is known about it.
-    pub fn about(&self) -> &About {
-        &self.about
+    pub fn info(&self) -> &CaptureInfo {
+        &self.info
     }
 
     /// Where it lies.
@@ -250,24 +249,25 @@ impl Capture {
         Some((end - self.range.start) / u64::from(self.sum))
     }
 
-    /// Waits until there are `frames` output frames, or no more come; gives how many there are.
+    /// Waits until `frames` output frames have arrived or the input ends, and returns how many have arrived.
+    /// A file has all its frames from the start; a pipe blocks until they come.
     ///
     /// # Errors
     /// [`SimError`] if a pipe fails, or ends inside a frame.
-    pub fn reach(&mut self, frames: u64) -> Result<u64> {
+    pub fn wait_for(&mut self, frames: u64) -> Result<u64> {
         if !self.complete {
             let native = frames.saturating_mul(self.sum.into()).saturating_add(self.range.start);
             let native = native.min(self.end.unwrap_or(native));
-            let there = self.native.reach(native, &mut self.about.remarks)?;
+            let there = self.native.wait_for(native, &mut self.info.notes)?;
             self.range.end = there.min(self.end.unwrap_or(there));
             self.note_end();
         }
         Ok(self.frames())
     }
 
-    /// Says that no output frame before `frame` is read again, so that a pipe need not keep it.
-    pub fn release(&mut self, frame: u64) {
-        self.native.release(self.range.start + frame * u64::from(self.sum));
+    /// Drops the output frames of a pipe before `frame`: they cannot be read again. Files are not changed.
+    pub fn discard_before(&mut self, frame: u64) {
+        self.native.discard_before(self.range.start + frame * u64::from(self.sum));
     }
 
     /// Notes whether the end has come, and what is to be said of it.
@@ -280,12 +280,12 @@ impl Capture {
         if let Some(end) = self.end.filter(|&end| end > self.range.end) {
             let text =
                 format!("the pipe ended after {} frames, before --end {end}", self.range.end);
-            self.about.remarks.push(text);
+            self.info.notes.push(text);
         }
         let left_over = self.native_frames() % u64::from(self.sum);
         if left_over > 0 {
             let text = format!("the last {left_over} frames fill no sum of {}", self.sum);
-            self.about.remarks.push(text);
+            self.info.notes.push(text);
         }
     }
 
@@ -301,7 +301,7 @@ impl Capture {
 
     /// Largest possible count of an output frame, if known.
     pub fn max_count(&self) -> Option<u16> {
-        self.about.max_count.map(|max| (u32::from(max) * self.sum) as u16)
+        self.info.max_count.map(|max| (u32::from(max) * self.sum) as u16)
     }
 
     /// The sensor whose output frames these are: `sensor`, summing as many binary frames as one
@@ -321,7 +321,7 @@ impl Capture {
             ));
         }
         match self.max_count() {
-            _ if linear && self.about.binary => Err(SimError::request(
+            _ if linear && self.info.binary => Err(SimError::request(
                 format!("binary frames, and `{}` is a linear sensor", sensor.name),
                 place,
                 "name the sensor that took them, as in --sensor swissspad2",
@@ -347,7 +347,7 @@ impl Capture {
 
     /// Output frames per second, if known.
     pub fn fps(&self) -> Option<f64> {
-        self.about.fps.map(|fps| fps / f64::from(self.sum))
+        self.info.fps.map(|fps| fps / f64::from(self.sum))
     }
 
     /// Dark electrons per native frame of every pixel, if a map is known.
@@ -399,7 +399,7 @@ impl Capture {
     /// [`SimError`] if the file cannot be read.
     pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
         let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.count() == 0;
-        if !untouched || self.about.packing.is_none() {
+        if !untouched || self.info.packing.is_none() {
             return Ok(false);
         }
         let frame_bytes = self.size().height * self.size().width.div_ceil(8);
@@ -443,12 +443,15 @@ impl Capture {
     /// Output frames to look at for statistics: one from each of equally long stretches, not all at
     /// the same place in theirs, since lamps flicker; or the first frames, where going through the
     /// whole file would take long.
-    pub fn looks(&self) -> Vec<u64> {
-        let looks = self.frames().min(MOST_LOOKS);
+    pub fn sample_frames(&self) -> Vec<u64> {
+        let sampled = self.frames().min(MAX_SAMPLE_FRAMES);
         if self.forward_only() {
-            return (0..looks).collect();
+            return (0..sampled).collect();
         }
-        let start = |i: u64| (u128::from(i) * u128::from(self.frames()) / u128::from(looks)) as u64;
-        (0..looks).map(|i| start(i) + bad_pixels::scramble(i) % (start(i + 1) - start(i))).collect()
+        let start =
+            |i: u64| (u128::from(i) * u128::from(self.frames()) / u128::from(sampled)) as u64;
+        (0..sampled)
+            .map(|i| start(i) + bad_pixels::scramble(i) % (start(i + 1) - start(i)))
+            .collect()
     }
 }

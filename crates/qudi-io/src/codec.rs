@@ -20,7 +20,7 @@ mod visionsim;
 
 pub(crate) use piped::open_pipe;
 
-use crate::capture::about::{About, Certainty};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
@@ -35,20 +35,20 @@ pub struct Format {
     /// In words.
     pub title: &'static str,
     /// Whether a path is of this format, and why.
-    probe: fn(&Probe) -> Result<Option<Match>>,
+    probe: fn(&Probe) -> Result<Option<Recognition>>,
     /// Opens it.
-    open: fn(&Probe, &ReadOptions, &mut About) -> Result<Box<dyn CountFrames>>,
+    open: fn(&Probe, &ReadOptions, &mut CaptureInfo) -> Result<Box<dyn CountFrames>>,
 }
 
-/// How well a path fits a format.
-pub(crate) struct Match {
+/// How sure it is that a path is of a format, and why.
+pub(crate) struct Recognition {
     certainty: Certainty,
-    evidence: Vec<String>,
+    reasons: Vec<String>,
 }
 
-impl Match {
-    fn new(certainty: Certainty, evidence: &[&str]) -> Self {
-        Self { certainty, evidence: evidence.iter().map(|&e| e.to_owned()).collect() }
+impl Recognition {
+    fn new(certainty: Certainty, reasons: &[&str]) -> Self {
+        Self { certainty, reasons: reasons.iter().map(|&e| e.to_owned()).collect() }
     }
 }
 
@@ -77,13 +77,16 @@ pub const FORMATS: &[Format] = &[
 ];
 
 /// Opens `path` in the format that `options` name, or in the one it fits best.
-pub(crate) fn open(path: &Path, options: &ReadOptions) -> Result<(Box<dyn CountFrames>, About)> {
+pub(crate) fn open(
+    path: &Path,
+    options: &ReadOptions,
+) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
     let probe = Probe::new(path)?;
     if let Some(name) = &options.format {
         let format = by_name(name)?;
-        let mut about = About::new(format.name, format.title);
-        about.evidence.push("--format".to_owned());
-        return Ok(((format.open)(&probe, options, &mut about)?, about));
+        let mut info = CaptureInfo::new(format.name, format.title);
+        info.reasons.push("--format".to_owned());
+        return Ok(((format.open)(&probe, options, &mut info)?, info));
     }
     let mut found = Vec::new();
     for format in FORMATS {
@@ -99,10 +102,10 @@ pub(crate) fn open(path: &Path, options: &ReadOptions) -> Result<(Box<dyn CountF
         return Err(ambiguous(&probe, &found));
     }
     let (format, fit) = found.remove(0);
-    let mut about = About::new(format.name, format.title);
-    about.certainty = fit.certainty;
-    about.evidence = fit.evidence;
-    Ok(((format.open)(&probe, options, &mut about)?, about))
+    let mut info = CaptureInfo::new(format.name, format.title);
+    info.certainty = fit.certainty;
+    info.reasons = fit.reasons;
+    Ok(((format.open)(&probe, options, &mut info)?, info))
 }
 
 fn by_name(name: &str) -> Result<&'static Format> {
@@ -152,12 +155,12 @@ fn inside(probe: &Probe) -> Option<String> {
     Some(path.display().to_string())
 }
 
-fn ambiguous(probe: &Probe, found: &[(&Format, Match)]) -> SimError {
+fn ambiguous(probe: &Probe, found: &[(&Format, Recognition)]) -> SimError {
     let candidates: Vec<String> = found
         .iter()
         .map(|(format, fit)| {
-            let evidence = fit.evidence.join(", ");
-            let why = if evidence.is_empty() { evidence } else { format!(" ({evidence})") };
+            let reasons = fit.reasons.join(", ");
+            let why = if reasons.is_empty() { reasons } else { format!(" ({reasons})") };
             format!("{}{why}", format.name)
         })
         .collect();

@@ -30,7 +30,7 @@ pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<
     let mut capture = Capture::open(&args.capture, &args.reading.options(MaskChoice::None), None)?;
     let (base, sensor) = base_sensor(args, &capture)?;
     let gain = args.gain.or(sensor.fixed_gain());
-    let fps = capture.about().fps.or(sensor.fps);
+    let fps = capture.info().fps.or(sensor.fps);
     let hot = args.hot.as_deref().map(|text| threshold(text, fps)).transpose()?;
     let mut bar = report.bar();
     let calibration = calibrate(&mut capture, &sensor, gain, hot, &mut |done, total| {

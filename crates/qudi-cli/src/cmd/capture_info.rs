@@ -8,7 +8,7 @@ use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
-use qudi_io::record::Described;
+use qudi_io::sidecar::Sidecar;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
 use std::fmt::Write;
@@ -23,7 +23,7 @@ const BINS: usize = 8;
 /// `record` is the record beside it, and where that lies.
 pub(crate) fn run(
     path: &Path,
-    record: Option<&(Described, PathBuf)>,
+    record: Option<&(Sidecar, PathBuf)>,
     info: &Info,
     global: &Global,
     report: &Report,
@@ -39,7 +39,7 @@ pub(crate) fn run(
         Some(sensor) => Some(sensor),
         None => known_sensor(&capture)?,
     };
-    let gain = capture.about().gain;
+    let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.look.preview {
         let mut picture = summary.picture(&capture, sensor.as_ref(), gain);
@@ -61,7 +61,7 @@ pub(crate) fn run(
 
 /// The sensor that a record names, or the camera that the format belongs to.
 pub(crate) fn known_sensor(capture: &Capture) -> Result<Option<Sensor>> {
-    let about = capture.about();
+    let about = capture.info();
     match (&about.sensor, about.preset) {
         (Some(sensor), _) => Ok(Some(sensor.clone())),
         (None, Some(preset)) => {
@@ -87,7 +87,7 @@ pub(crate) fn required_sensor(capture: &Capture) -> Result<Sensor> {
 
 /// Says on standard error what the user should know about a capture.
 pub(crate) fn remarks(capture: &Capture, report: &Report) {
-    for remark in &capture.about().remarks {
+    for remark in &capture.info().notes {
         report.remark(&format!("note: {remark}"));
     }
 }
@@ -100,12 +100,12 @@ fn save(picture: &Frame, path: &Path, overwrite: Overwrite) -> Result<()> {
 }
 
 fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> String {
-    let about = capture.about();
+    let about = capture.info();
     let mut text = String::new();
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "{key:<11}{value}");
     };
-    let evidence = about.evidence.join(", ");
+    let evidence = about.reasons.join(", ");
     line(
         "format",
         format!("{}: {} ({}: {evidence})", about.format, about.title, about.certainty.name()),
@@ -135,7 +135,7 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
             format!("not in the file; `{}` takes up to {fps} frames per second", sensor.name),
         );
     }
-    line("looked at", format!("{} frames", summary.looks));
+    line("looked at", format!("{} frames", summary.sampled));
     let ppp = &summary.ppp;
     let photons = |value: Option<f64>| value.map_or("unknown".to_owned(), |v| format!("{v:.4}"));
     let by = sensor
@@ -162,7 +162,7 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
     }
     line("pixels", capture.bad_pixels().describe(capture.size()));
     histogram(&mut text, &summary.histogram);
-    for remark in &about.remarks {
+    for remark in &about.notes {
         let _ = writeln!(text, "note       {remark}");
     }
     text
@@ -175,14 +175,14 @@ fn describe_packing(packing: Packing, check: Option<BitOrderCheck>) -> String {
     };
     let order = packing.order;
     let judged = match check {
-        Some(BitOrderCheck { seen: Some(seen), evidence }) if seen == order => {
-            format!("the picture agrees, {evidence:.0} standard errors")
+        Some(BitOrderCheck { seen: Some(seen), z_score }) if seen == order => {
+            format!("the picture agrees, {z_score:.0} standard errors")
         }
-        Some(BitOrderCheck { seen: Some(seen), evidence }) => {
-            format!("but the picture says {seen}, {:.0} standard errors: see --bitorder", -evidence)
+        Some(BitOrderCheck { seen: Some(seen), z_score }) => {
+            format!("but the picture says {seen}, {:.0} standard errors: see --bitorder", -z_score)
         }
-        Some(BitOrderCheck { seen: None, evidence }) => {
-            format!("unsure from the picture, {evidence:.1} standard errors")
+        Some(BitOrderCheck { seen: None, z_score }) => {
+            format!("unsure from the picture, {z_score:.1} standard errors")
         }
         None => return format!("8 pixels per byte along the {axis}, {order}"),
     };
@@ -208,14 +208,14 @@ fn document(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> Va
     let bad = capture.bad_pixels();
     json!({
         "path": capture.path(),
-        "about": capture.about(),
+        "about": capture.info(),
         "frames": capture.frames(),
         "height": capture.size().height,
         "width": capture.size().width,
         "max_count": capture.max_count(),
         "summed": capture.summed(),
         "fps": capture.fps(),
-        "looked_at": summary.looks,
+        "looked_at": summary.sampled,
         "ppp": summary.ppp,
         "sensor": sensor.map(|sensor| &sensor.name),
         "mean": summary.mean,

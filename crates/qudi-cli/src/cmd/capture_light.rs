@@ -27,8 +27,8 @@ pub(crate) fn acquisition(
 ) -> Result<(Acquisition, &'static str)> {
     checked_exposure(stated.exposure)?;
     let of_frames = capture.output_sensor(sensor)?;
-    let recorded = capture.about().ppp.map(|ppp| ppp * f64::from(capture.summed()));
-    let known_gain = stated.gain.or(capture.about().gain);
+    let recorded = capture.info().ppp.map(|ppp| ppp * f64::from(capture.summed()));
+    let known_gain = stated.gain.or(capture.info().gain);
     let (ppp, source) = match (stated.ppp, recorded) {
         (Some(ppp), _) => (ppp, "given"),
         (None, Some(ppp)) => (ppp, "from the record"),

@@ -7,9 +7,9 @@ use crate::interrupt;
 use crate::report::{Bar, Report};
 use qudi_core::SimError;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
-use qudi_io::burst::{BurstFormat, BurstWriter};
 use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
-use qudi_io::record::{BurstLayout, Conversion, VERSION};
+use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
+use qudi_io::writer::{BurstFormat, BurstWriter};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -58,7 +58,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
         "{}   {frames} frames of {size}, {} bit, from {}",
         args.output.display(),
         record.burst.bits,
-        capture.about().title
+        capture.info().title
     );
     report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
 }
@@ -101,7 +101,7 @@ fn conversion(
     capture: &Capture,
     burst: BurstLayout,
 ) -> Result<Conversion> {
-    let about = capture.about();
+    let about = capture.info();
     let absolute = |path: &Path| {
         std::path::absolute(path).map_err(|e| SimError::io("find the capture", path, e))
     };

@@ -78,7 +78,7 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
     );
     let settings = json!({
         "capture": args.data,
-        "format": capture.about().format,
+        "format": capture.info().format,
         "frames": frames,
         "ppp_from": source,
         "gain": acquisition.gain,

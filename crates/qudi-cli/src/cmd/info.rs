@@ -7,7 +7,7 @@ use crate::report::Report;
 use crate::weights::Weights;
 use burn::tensor::Device;
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
-use qudi_io::record::Described;
+use qudi_io::sidecar::Sidecar;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -34,7 +34,7 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
             let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
             // A record that cannot be read is remarked upon when the capture is opened.
             let record = beside.into_iter().find(|record| record.is_file());
-            let record = record.and_then(|path| Some((Described::load(&path).ok()?, path)));
+            let record = record.and_then(|path| Some((Sidecar::load(&path).ok()?, path)));
             capture_info::run(path, record.as_ref(), info, global, report)
         }
         _ if preset(subject).is_some() => sensor(subject, report),
@@ -111,10 +111,10 @@ fn sensor(name: &str, report: &Report) -> Result<()> {
 
 /// A record, without its burst.
 fn burst(path: &Path, report: &Report) -> Result<()> {
-    let record = Described::load(path)?;
+    let record = Sidecar::load(path)?;
     let burst = match &record {
-        Described::Simulated(record) => &record.burst,
-        Described::Converted(conversion) => &conversion.burst,
+        Sidecar::Simulated(record) => &record.burst,
+        Sidecar::Converted(conversion) => &conversion.burst,
     };
     let mut text = format!(
         "{:<11}{} of {}, {} bit, counts up to {}\n",
@@ -126,21 +126,21 @@ fn burst(path: &Path, report: &Report) -> Result<()> {
     report.result(&(text + &origin(&record, path)), || record_document(&record))
 }
 
-pub(crate) fn record_document(record: &Described) -> Value {
+pub(crate) fn record_document(record: &Sidecar) -> Value {
     match record {
-        Described::Simulated(record) => json!(record),
-        Described::Converted(conversion) => json!(conversion),
+        Sidecar::Simulated(record) => json!(record),
+        Sidecar::Converted(conversion) => json!(conversion),
     }
 }
 
 /// Where a burst comes from, and how to make it again.
-pub(crate) fn origin(record: &Described, path: &Path) -> String {
+pub(crate) fn origin(record: &Sidecar, path: &Path) -> String {
     let mut text = String::new();
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "{key:<11}{value}");
     };
     match record {
-        Described::Simulated(record) => {
+        Sidecar::Simulated(record) => {
             let (simulation, light) = (&record.simulation, record.light);
             let sensor = &simulation.sensor.name;
             line("simulated", format!("sensor {sensor}, gain {:.4} DN/e-", record.gain));
@@ -151,7 +151,7 @@ pub(crate) fn origin(record: &Described, path: &Path) -> String {
             line("made by", record.program.clone());
             line("again", format!("qudi simulate --from {} -o OUT", path.display()));
         }
-        Described::Converted(conversion) => {
+        Sidecar::Converted(conversion) => {
             line("converted", format!("from {}", conversion.capture.display()));
             line("made by", conversion.program.clone());
         }

@@ -172,7 +172,7 @@ impl Job {
         };
         let settings = json!({
             "capture": place,
-            "format": capture.about().format,
+            "format": capture.info().format,
             "read": options,
             "frames": capture.length(),
             "height": capture.size().height,

@@ -8,7 +8,7 @@ use qudi_core::restorer::Acquisition;
 use qudi_core::{Frame, SimError, Size};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{FrameFolder, RestoreSink};
-use qudi_io::writer::{FramesWriter, Picture, TiffSamples};
+use qudi_io::writer::{ClipWriter, Picture, TiffSamples};
 use serde_json::Value;
 use std::io::Write;
 use std::ops::Range;
@@ -19,7 +19,7 @@ pub(crate) enum Output {
     /// Frames appear one by one; an interrupted run goes on.
     Folder(FrameFolder),
     /// One file, whole or not at all.
-    File(Option<FramesWriter>),
+    File(Option<ClipWriter>),
     /// Y4M on standard output.
     Pipe,
 }
@@ -56,7 +56,7 @@ impl Output {
         if path.extension().is_none() {
             return Ok(Self::Folder(FrameFolder::open(path, size, settings.clone(), overwrite)?));
         }
-        Ok(Self::File(Some(FramesWriter::create(path, size, tiff, overwrite)?)))
+        Ok(Self::File(Some(ClipWriter::create(path, size, tiff, overwrite)?)))
     }
 
     /// Frames from the start of `range` on that an earlier run finished.
@@ -80,7 +80,7 @@ impl Output {
         match self {
             Self::Folder(folder) if complete => Ok(folder.finish(results)?),
             Self::Folder(_) | Self::Pipe => Ok(()),
-            Self::File(writer) => Ok(writer.take().map_or(Ok(()), FramesWriter::finish)?),
+            Self::File(writer) => Ok(writer.take().map_or(Ok(()), ClipWriter::finish)?),
         }
     }
 }
@@ -92,7 +92,7 @@ pub(crate) struct Sink<'a> {
 }
 
 impl RestoreSink for Sink<'_> {
-    fn deviation(&mut self, _: u64, deviation: &Frame) -> qudi_core::Result<()> {
+    fn uncertainty(&mut self, _: u64, deviation: &Frame) -> qudi_core::Result<()> {
         self.deviation.push(deviation)
     }
 

@@ -10,9 +10,9 @@ use qudi_core::SimError;
 use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
 use qudi_core::flow::Flow;
 use qudi_core::sensor::Sensor;
-use qudi_io::burst::{BurstFormat, BurstWriter, write_npy_stream};
-use qudi_io::record::{BurstLayout, ClipDigest, Record, VERSION};
-use qudi_io::writer::{ArrayWriter, FramesWriter, GifPreview, TiffSamples};
+use qudi_io::sidecar::{BurstLayout, ClipDigest, Record, VERSION};
+use qudi_io::writer::{ArrayWriter, ClipWriter, GifWriter, TiffSamples};
+use qudi_io::writer::{BurstFormat, BurstWriter, write_npy_stream};
 use qudi_sim::clip::{Input, Sampling};
 use qudi_sim::{Exposed, Simulation, Sink, Stage, Start, Summary, simulate};
 use serde_json::{Value, json};
@@ -173,10 +173,10 @@ struct Outputs<'a> {
     format: BurstFormat,
     burst: Option<BurstWriter>,
     stream: Option<FrameEncoder>,
-    truth: Option<FramesWriter>,
+    truth: Option<ClipWriter>,
     tiff: TiffSamples,
     flow: Option<ArrayWriter>,
-    preview: Option<GifPreview>,
+    preview: Option<GifWriter>,
 }
 
 impl<'a> Outputs<'a> {
@@ -279,14 +279,14 @@ impl Sink for Outputs<'_> {
                 overwrite,
             )?);
         }
-        let create = |path: &PathBuf| FramesWriter::create(path, start.size, self.tiff, overwrite);
+        let create = |path: &PathBuf| ClipWriter::create(path, start.size, self.tiff, overwrite);
         self.truth = args.truth.as_ref().map(create).transpose()?;
         let create = |path: &PathBuf| {
             ArrayWriter::create(path, overwrite, "<f4", &[3, start.size.height, start.size.width])
         };
         self.flow = args.flow.as_ref().map(create).transpose()?;
         let create =
-            |path: &PathBuf| GifPreview::create(path, overwrite, start.size, self.max_count);
+            |path: &PathBuf| GifWriter::create(path, overwrite, start.size, self.max_count);
         self.preview = args.preview.as_ref().map(create).transpose()?;
         Ok(())
     }

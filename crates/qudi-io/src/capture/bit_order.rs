@@ -9,28 +9,28 @@ use qudi_core::Size;
 /// Beyond this many standard errors the answer is taken as sure.
 pub const SURE: f64 = 5.0;
 
-/// Rows that share one unit of evidence: neighbouring rows see the same edges.
+/// Rows of one unit: neighbouring rows see the same edges, and do not count twice.
 const BLOCK_ROWS: usize = 16;
 
 /// Pixels averaged on both sides of a boundary: fine ones for many photons, coarse ones for few.
 const SCALES: [usize; 3] = [1, 2, 4];
 
-/// Fewer units of evidence decide nothing.
+/// Fewer units than this decide nothing.
 const FEWEST_UNITS: usize = 8;
 
-/// Evidence in standard errors that `sums` (the sum of packed frames, row-major) were unpacked in
-/// the right order; negative if the other order fits better. Packed along the width.
-pub fn bit_order_evidence(sums: &[u32], size: Size) -> f64 {
+/// Gives how well `sums` fit the order they were unpacked in, in standard errors; negative if the other
+/// order fits better. `sums` is the sum of frames packed along the width, row-major.
+pub fn bit_order_z_score(sums: &[u32], size: Size) -> f64 {
     // The square root makes the noise of all counts alike.
     let roots: Vec<f32> = sums.iter().map(|&sum| (sum as f32).sqrt()).collect();
     SCALES
         .iter()
-        .filter_map(|&scale| evidence_at(&roots, size, scale))
+        .filter_map(|&scale| z_score_at(&roots, size, scale))
         .max_by(|a, b| a.abs().total_cmp(&b.abs()))
         .unwrap_or(0.0)
 }
 
-fn evidence_at(roots: &[f32], size: Size, scale: usize) -> Option<f64> {
+fn z_score_at(roots: &[f32], size: Size, scale: usize) -> Option<f64> {
     let Size { height, width } = size;
     let boundaries = (width / 8).saturating_sub(1);
     let bands = height / scale;

@@ -52,7 +52,7 @@ pub fn calibrate(
     let binary = sensor.response == Response::Binary;
     let size = capture.size();
     let native = u64::from(capture.summed())
-        * u64::from(if binary { capture.about.max_count.unwrap_or(1) } else { 1 });
+        * u64::from(if binary { capture.info.max_count.unwrap_or(1) } else { 1 });
     if !binary && capture.summed() > 1 {
         return Err(SimError::request(
             "a sum of frames cannot tell read noise from dark counts",
@@ -161,7 +161,7 @@ fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f6
     let chosen: Vec<usize> = (0..n).filter(|&i| (low..=high).contains(&means[i])).collect();
     let mut histogram = vec![0u64; usize::from(sensor.max_count()) + 1];
     let mut counts = vec![0u16; n];
-    for frame in capture.looks() {
+    for frame in capture.sample_frames() {
         capture.read(frame, &mut counts)?;
         for &i in &chosen {
             let Some(bin) = histogram.get_mut(usize::from(counts[i])) else {

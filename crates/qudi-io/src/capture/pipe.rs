@@ -70,7 +70,7 @@ impl Pipe {
     }
 
     /// Waits until `frames` frames have arrived, or the pipe ends; gives how many have.
-    pub(crate) fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
+    pub(crate) fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
         while self.arrived < frames && !self.ended {
             if self.promised == Some(self.arrived) {
                 self.ended = true;
@@ -83,7 +83,7 @@ impl Pipe {
                 .read_to_end(&mut frame)
                 .map_err(|e| SimError::io("read", Path::new(STDIN), e))?;
             if frame.len() < self.frame_bytes {
-                self.end(&frame, remarks)?;
+                self.end(&frame, notes)?;
                 break;
             }
             self.arrived += 1;
@@ -95,7 +95,7 @@ impl Pipe {
     }
 
     /// The pipe ended after `rest` bytes of a frame.
-    fn end(&mut self, rest: &[u8], remarks: &mut Vec<String>) -> Result<()> {
+    fn end(&mut self, rest: &[u8], notes: &mut Vec<String>) -> Result<()> {
         self.ended = true;
         let (whole, bytes) = (self.arrived, self.frame_bytes);
         let missing = self.promised.filter(|&promised| promised > whole);
@@ -104,7 +104,7 @@ impl Pipe {
             None if trailer => {
                 if rest == b"ERROR" {
                     let text = "the pipe ends in ERROR: the camera stopped early";
-                    remarks.push(text.to_owned());
+                    notes.push(text.to_owned());
                 }
                 return Ok(());
             }
@@ -117,7 +117,7 @@ impl Pipe {
             ),
         };
         if self.tail.lenient && whole > 0 {
-            remarks.push(what);
+            notes.push(what);
             return Ok(());
         }
         Err(SimError::data(
@@ -128,7 +128,7 @@ impl Pipe {
     }
 
     /// Lets go of the frames before `frame`.
-    pub(crate) fn release(&mut self, frame: u64) {
+    pub(crate) fn discard_before(&mut self, frame: u64) {
         self.wanted_from = self.wanted_from.max(frame);
         while !self.kept.is_empty() && self.arrived - (self.kept.len() as u64) < frame {
             self.kept.pop_front();
@@ -171,29 +171,29 @@ mod tests {
     #[test]
     fn frames_are_kept_until_released_and_no_longer() {
         let mut pipe = pipe(b"aaabbbcccdddeee", None, TAIL);
-        let mut remarks = Vec::new();
-        assert_eq!((pipe.reach(2, &mut remarks).unwrap(), pipe.length()), (2, None));
+        let mut notes = Vec::new();
+        assert_eq!((pipe.wait_for(2, &mut notes).unwrap(), pipe.length()), (2, None));
         let mut two = [0; 6];
         for _ in 0..2 {
             pipe.read(0, &mut two).unwrap();
             assert_eq!(&two, b"aaabbb");
         }
-        pipe.release(3);
-        assert_eq!(pipe.reach(5, &mut remarks).unwrap(), 5);
+        pipe.discard_before(3);
+        assert_eq!(pipe.wait_for(5, &mut notes).unwrap(), 5);
         pipe.read(3, &mut two).unwrap();
         assert_eq!(&two, b"dddeee");
         assert!(pipe.read(2, &mut two).is_err(), "released before it came");
         assert!(pipe.read(4, &mut two).is_err(), "never came");
         assert_eq!(pipe.kept.len(), 2);
-        assert_eq!((pipe.reach(9, &mut remarks).unwrap(), pipe.length()), (5, Some(5)));
-        assert!(remarks.is_empty());
+        assert_eq!((pipe.wait_for(9, &mut notes).unwrap(), pipe.length()), (5, Some(5)));
+        assert!(notes.is_empty());
     }
 
     #[test]
     fn ends_inside_frames_are_refused_or_said() {
         let all = |mut pipe: Pipe| {
-            let mut remarks = Vec::new();
-            pipe.reach(9, &mut remarks).map(|n| (n, remarks.len()))
+            let mut notes = Vec::new();
+            pipe.wait_for(9, &mut notes).map(|n| (n, notes.len()))
         };
         let lenient = Tail { lenient: true, ..TAIL };
         assert!(all(pipe(b"aaabb", None, TAIL)).is_err());
@@ -208,8 +208,8 @@ mod tests {
     #[test]
     fn camera_trailers_are_no_frames() {
         let mut four = Pipe::new(Box::new(&b"aaaaabbbbbDONE"[..]), 5, None, TAIL);
-        let mut remarks = Vec::new();
-        assert_eq!(four.reach(9, &mut remarks).unwrap(), 2);
-        assert!(remarks.is_empty());
+        let mut notes = Vec::new();
+        assert_eq!(four.wait_for(9, &mut notes).unwrap(), 2);
+        assert!(notes.is_empty());
     }
 }

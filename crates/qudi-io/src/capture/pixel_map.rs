@@ -1,7 +1,7 @@
 //! Which pixels of a capture are bad, and how dark each one is: from files, or from the capture.
 
 use super::options::{MaskChoice, ReadOptions};
-use super::{Capture, MOST_LOOKS};
+use super::{Capture, MAX_SAMPLE_FRAMES};
 use crate::codec::read_mat_map;
 use qudi_core::Frame;
 use qudi_core::Transfer;
@@ -41,11 +41,11 @@ pub(crate) fn plan(
         let rates = load(capture, path)?;
         let hot = (0..rates.data.len()).filter(|&i| rates.data[i] > HOT_PER_SECOND).collect();
         named = Some(BadPixels { hot, dead: Vec::new() });
-        match capture.about.fps.or(sensor.and_then(|sensor| sensor.fps)) {
+        match capture.info.fps.or(sensor.and_then(|sensor| sensor.fps)) {
             Some(fps) => {
                 capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
             }
-            None => capture.about.remarks.push(
+            None => capture.info.notes.push(
                 "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a --sensor knows its rate)"
                     .to_owned(),
             ),
@@ -74,16 +74,16 @@ fn find(capture: &mut Capture) -> Result<BadPixels> {
     let size = capture.size();
     let mut sums = vec![0u32; size.pixels()];
     let mut one = vec![0u32; size.pixels()];
-    let looks = capture.looks();
-    debug_assert!(looks.len() as u64 <= MOST_LOOKS);
-    for &frame in &looks {
+    let sampled = capture.sample_frames();
+    debug_assert!(sampled.len() as u64 <= MAX_SAMPLE_FRAMES);
+    for &frame in &sampled {
         capture.stored_total(frame..frame + 1, &mut one)?;
         for (sum, one) in sums.iter_mut().zip(&one) {
             *sum += one;
         }
     }
-    let native = looks.len() as u64 * u64::from(capture.sum);
-    Ok(BadPixels::find(&sums, size, native, capture.about.max_count))
+    let native = sampled.len() as u64 * u64::from(capture.sum);
+    Ok(BadPixels::find(&sums, size, native, capture.info.max_count))
 }
 
 fn nonzero(map: &Frame) -> BadPixels {

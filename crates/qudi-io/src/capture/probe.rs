@@ -1,6 +1,6 @@
 //! A first look at a path, shared by all formats that try to recognise it.
 
-use super::raw_look::RawLook;
+use super::raw_sample::RawSample;
 use qudi_core::natural_order::natural_order;
 use qudi_core::{Result, SimError};
 use std::cell::OnceCell;
@@ -32,8 +32,8 @@ pub(crate) struct Probe {
     /// The first bytes of a file.
     pub(crate) head: Vec<u8>,
     files: OnceCell<Vec<PathBuf>>,
-    /// Filled by [`RawLook::at`], which several formats ask.
-    pub(crate) raw_look: OnceCell<Option<RawLook>>,
+    /// Filled by [`RawSample::at`], which several formats ask.
+    pub(crate) raw_sample: OnceCell<Option<RawSample>>,
 }
 
 impl Probe {
@@ -43,14 +43,14 @@ impl Probe {
     /// [`SimError::Io`] if it cannot be read.
     pub(crate) fn new(path: &Path) -> Result<Self> {
         let io = |e| SimError::io("open the capture", path, e);
-        let about = std::fs::metadata(path).map_err(io)?;
+        let found = std::fs::metadata(path).map_err(io)?;
         let mut head = Vec::new();
-        if about.is_file() {
+        if found.is_file() {
             File::open(path).map_err(io)?.take(HEAD).read_to_end(&mut head).map_err(io)?;
             if head.is_empty() {
                 return Err(SimError::data("the file is empty", path, "copy or export it again"));
             }
-        } else if !about.is_dir() {
+        } else if !found.is_dir() {
             return Err(SimError::data(
                 "neither a file nor a folder",
                 path,
@@ -59,12 +59,12 @@ impl Probe {
         }
         Ok(Self {
             path: path.to_owned(),
-            is_folder: about.is_dir(),
-            length: about.len(),
+            is_folder: found.is_dir(),
+            length: found.len(),
             extension: path.extension().unwrap_or_default().to_string_lossy().to_lowercase(),
             head,
             files: OnceCell::new(),
-            raw_look: OnceCell::new(),
+            raw_sample: OnceCell::new(),
         })
     }
 

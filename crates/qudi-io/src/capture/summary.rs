@@ -1,7 +1,7 @@
 //! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
 
 use super::Capture;
-use super::bit_order::{SURE, bit_order_evidence};
+use super::bit_order::{SURE, bit_order_z_score};
 use super::options::{BitOrder, PackAxis};
 use qudi_core::PppDefinition;
 use qudi_core::Result;
@@ -9,11 +9,11 @@ use qudi_core::sensor::{CountLaw, DarkRate, Response, Sensor};
 use qudi_core::{Frame, Size};
 use serde::Serialize;
 
-/// Statistics of at most [`MOST_LOOKS`](super::MOST_LOOKS) output frames.
+/// Statistics of at most [`MAX_SAMPLE_FRAMES`](super::MAX_SAMPLE_FRAMES) output frames.
 #[derive(Clone, Debug)]
 pub struct Summary {
     /// Frames looked at.
-    pub looks: u64,
+    pub sampled: u64,
     /// Mean count per pixel and output frame, bad pixels repaired.
     pub mean: f64,
     /// Samples of each count; the last entry counts the largest seen.
@@ -53,8 +53,9 @@ impl Ppp {
 /// What the picture says about the order of bits.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct BitOrderCheck {
-    /// Evidence for the order in use, in standard errors; negative: against it.
-    pub evidence: f64,
+    /// How well the picture fits the order in use, in standard errors; negative: it fits the other better.
+    #[serde(rename = "evidence")]
+    pub z_score: f64,
     /// The order that the picture shows, if it shows one.
     pub seen: Option<BitOrder>,
 }
@@ -71,11 +72,11 @@ impl Summary {
         gain: Option<f64>,
     ) -> Result<Self> {
         let size = capture.size();
-        let looks = capture.looks();
+        let sampled = capture.sample_frames();
         let mut sums = vec![0u32; size.pixels()];
         let mut counts = vec![0u16; size.pixels()];
         let mut histogram = vec![0u64; 1 << 16];
-        for &frame in &looks {
+        for &frame in &sampled {
             capture.read(frame, &mut counts)?;
             for (sum, &count) in sums.iter_mut().zip(&counts) {
                 *sum += u32::from(count);
@@ -84,16 +85,16 @@ impl Summary {
         }
         let largest = histogram.iter().rposition(|&n| n > 0).unwrap_or(0);
         histogram.truncate(largest + 1);
-        let samples = looks.len() as f64 * size.pixels() as f64;
+        let samples = sampled.len() as f64 * size.pixels() as f64;
         let total: f64 = sums.iter().map(|&sum| f64::from(sum)).sum();
         let saturated = capture
             .max_count()
             .map(|max| histogram.get(usize::from(max)).map_or(0.0, |&n| n as f64 / samples));
-        let looked = looks.len() as u64;
-        let bit_order = check_bit_order(capture, &looks)?;
+        let looked = sampled.len() as u64;
+        let bit_order = check_bit_order(capture, &sampled)?;
         let ppp = ppp(capture, &sums, looked, sensor, gain)?;
         Ok(Self {
-            looks: looked,
+            sampled: looked,
             mean: total / samples,
             histogram,
             saturated,
@@ -107,7 +108,7 @@ impl Summary {
     /// `sensor` is known; white is the 99.5th percentile.
     pub fn picture(&self, capture: &Capture, sensor: Option<&Sensor>, gain: Option<f64>) -> Frame {
         let size = capture.size();
-        let frames = self.looks as u32 * capture.sum;
+        let frames = self.sampled as u32 * capture.sum;
         let mut data = match native_sensor(capture, sensor) {
             Some(sensor) => {
                 let gain = gain.or(sensor.fixed_gain()).unwrap_or(1.0);
@@ -134,68 +135,68 @@ impl Summary {
 /// The sensor of native frames: `sensor`, or an ideal binary one if no more is known; summing as
 /// many binary frames as the capture's counts do.
 fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
-    let about = &capture.about;
+    let info = &capture.info;
     let known = match sensor {
         Some(sensor) => sensor.clone(),
-        None if about.binary => {
+        None if info.binary => {
             let mut ideal = Sensor::load("swissspad2").ok()?;
             (ideal.dark, ideal.quantum_efficiency) = (DarkRate::PerFrame(0.0), 1.0);
             ideal
         }
         None => return None,
     };
-    match (known.response, about.max_count) {
+    match (known.response, info.max_count) {
         (Response::Binary, Some(max)) => Some(Sensor { frames_summed: u32::from(max), ..known }),
         _ => Some(known),
     }
 }
 
 /// Compares pixels across byte boundaries, in the frames as they are stored.
-fn check_bit_order(capture: &mut Capture, looks: &[u64]) -> Result<Option<BitOrderCheck>> {
-    let Some(packing) = capture.about.packing else { return Ok(None) };
+fn check_bit_order(capture: &mut Capture, sampled: &[u64]) -> Result<Option<BitOrderCheck>> {
+    let Some(packing) = capture.info.packing else { return Ok(None) };
     let stored = capture.native.size();
     let mut sums = vec![0u32; stored.pixels()];
-    for &look in looks {
+    for &look in sampled {
         let first = capture.range.start + look * u64::from(capture.sum);
         capture.native.add(first..first + u64::from(capture.sum), &mut sums)?;
     }
-    let evidence = match packing.axis {
+    let z_score = match packing.axis {
         PackAxis::Height => {
             let turned = Size { height: stored.width, width: stored.height };
             let columns: Vec<u32> = (0..stored.pixels())
                 .map(|i| sums[i % stored.height * stored.width + i / stored.height])
                 .collect();
-            bit_order_evidence(&columns, turned)
+            bit_order_z_score(&columns, turned)
         }
-        _ => bit_order_evidence(&sums, stored),
+        _ => bit_order_z_score(&sums, stored),
     };
-    let seen = match evidence {
+    let seen = match z_score {
         e if e > SURE => Some(packing.order),
         e if e < -SURE => Some(packing.order.reversed()),
         _ => None,
     };
-    Ok(Some(BitOrderCheck { evidence, seen }))
+    Ok(Some(BitOrderCheck { z_score, seen }))
 }
 
 /// Photons per pixel and output frame.
 fn ppp(
     capture: &Capture,
     sums: &[u32],
-    looks: u64,
+    sampled: u64,
     sensor: Option<&Sensor>,
     gain: Option<f64>,
 ) -> Result<Ppp> {
-    let looks = looks as f64;
-    let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / sums.len() as f64 / looks;
+    let sampled = sampled as f64;
+    let dn = sums.iter().map(|&sum| f64::from(sum)).sum::<f64>() / sums.len() as f64 / sampled;
     let Some(native) = native_sensor(capture, sensor) else {
         return Ok(Ppp { incident: None, detected: None, dn });
     };
     let per_frame = f64::from(capture.sum);
     let detected = if native.response == Response::Binary {
         let n = f64::from(native.frames_summed) * per_frame;
-        let trials = n * looks;
-        let light = |mean: f64| -n * (-(mean * looks).min(trials - 0.5) / trials).ln_1p();
-        Some(light_of_blocks(sums, capture.size(), looks, light))
+        let trials = n * sampled;
+        let light = |mean: f64| -n * (-(mean * sampled).min(trials - 0.5) / trials).ln_1p();
+        Some(light_of_blocks(sums, capture.size(), sampled, light))
     } else {
         gain.or(native.fixed_gain()).map(|gain| {
             CountLaw::new(&native, gain).detections_for_mean(dn / per_frame) * per_frame
@@ -216,7 +217,7 @@ fn ppp(
 
 /// Mean light over the picture: the response of binary pixels bends, so that bright and dark parts
 /// are unbent apart; block by block, since single pixels have counted too little.
-fn light_of_blocks(sums: &[u32], size: Size, looks: f64, light: impl Fn(f64) -> f64) -> f64 {
+fn light_of_blocks(sums: &[u32], size: Size, sampled: f64, light: impl Fn(f64) -> f64) -> f64 {
     const BLOCK: usize = 8;
     let (down, across) = (size.height.div_ceil(BLOCK), size.width.div_ceil(BLOCK));
     let mut blocks = vec![(0u64, 0u32); down * across];
@@ -224,6 +225,6 @@ fn light_of_blocks(sums: &[u32], size: Size, looks: f64, light: impl Fn(f64) -> 
         let block = &mut blocks[i / size.width / BLOCK * across + i % size.width / BLOCK];
         *block = (block.0 + u64::from(sum), block.1 + 1);
     }
-    let total = |&(sum, n): &(u64, u32)| light(sum as f64 / f64::from(n) / looks) * f64::from(n);
+    let total = |&(sum, n): &(u64, u32)| light(sum as f64 / f64::from(n) / sampled) * f64::from(n);
     blocks.iter().map(total).sum::<f64>() / size.pixels() as f64
 }

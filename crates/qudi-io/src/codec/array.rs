@@ -1,7 +1,7 @@
 //! Arrays of counts, whatever file they lie in: axes, packing, colour.
 
-use crate::capture::about::{About, Packing};
 use crate::capture::byte_kind::ByteKind;
+use crate::capture::info::{CaptureInfo, Packing};
 use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::pipe::{FIRST_WINDOW, Pipe};
 use crate::frames::CountFrames;
@@ -76,7 +76,7 @@ impl Array {
         mut self,
         options: &ReadOptions,
         hints: &Hints,
-        about: &mut About,
+        info: &mut CaptureInfo,
     ) -> Result<Box<dyn CountFrames>> {
         let (dims, channels) = self.dims()?;
         let axes = options.axes.unwrap_or(self.axes);
@@ -105,20 +105,20 @@ impl Array {
         let scale = if hints.stored != Stored::Unsaid && options.levels.is_none() {
             Scale::Counts
         } else {
-            self.scale(options, about, &sample_bytes)?
+            self.scale(options, info, &sample_bytes)?
         };
         let (path, sample) = (self.path.clone(), self.sample);
-        let bytes = self.bytes(axes, dims, frame_bytes, options, about)?;
-        about.packing = packing;
+        let bytes = self.bytes(axes, dims, frame_bytes, options, info)?;
+        info.packing = packing;
         if let Some(packing) = packing {
-            about.max_count = Some(1);
+            info.max_count = Some(1);
             let placement = Placement::packed(size, packing.axis, axes.transposed());
             return Ok(Box::new(PackedFrames::new(bytes, packing.order, size, placement)));
         }
         if sample == Sample::Bool {
-            about.max_count = Some(1);
+            info.max_count = Some(1);
             if frames == 1 {
-                about.remarks.push(
+                info.notes.push(
                     "a single boolean image: if it is a map of bad pixels, it belongs to --mask"
                         .to_owned(),
                 );
@@ -247,11 +247,11 @@ impl Array {
         Size::new(size.height, size.width, &self.path.display().to_string())
     }
 
-    fn scale(&self, options: &ReadOptions, about: &mut About, looked: &[u8]) -> Result<Scale> {
+    fn scale(&self, options: &ReadOptions, info: &mut CaptureInfo, looked: &[u8]) -> Result<Scale> {
         let full = self.sample.full_scale();
         match (self.sample, full) {
             (_, Some(full)) if options.levels.is_some() => {
-                Ok(Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts))
+                Ok(Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts))
             }
             (_, None) if options.levels.is_some() => Err(self.fault(
                 "--levels on wide integers, which have no full scale",
@@ -260,7 +260,7 @@ impl Array {
             (Sample::U8 | Sample::U16 { .. }, Some(full)) => {
                 let samples = looked.chunks_exact(self.sample.bytes());
                 let values = samples.map(|bytes| self.sample.decode(bytes) as u16).collect();
-                Ok(Scale::seen(values, full as u16, about))
+                Ok(Scale::seen(values, full as u16, info))
             }
             _ => Ok(Scale::Counts),
         }
@@ -295,7 +295,7 @@ impl Array {
                 bytes = fetch((frames - count) / 2, count)?;
             }
             Place::Pipe(pipe) => {
-                pipe.reach(frames.min(FIRST_WINDOW), &mut Vec::new())?;
+                pipe.wait_for(frames.min(FIRST_WINDOW), &mut Vec::new())?;
                 bytes = pipe.look();
             }
         }
@@ -308,7 +308,7 @@ impl Array {
         dims: [usize; 3],
         frame_bytes: usize,
         options: &ReadOptions,
-        about: &mut About,
+        info: &mut CaptureInfo,
     ) -> Result<FrameBytes> {
         let at = axes.frame_position();
         let frames = dims[at] as u64;
@@ -334,7 +334,7 @@ impl Array {
                     "copy or export it again, or read the whole frames with --lenient",
                 ));
             }
-            about.remarks.push(format!("truncated: {} of {frames} frames dropped", frames - whole));
+            info.notes.push(format!("truncated: {} of {frames} frames dropped", frames - whole));
         }
         Ok(match self.place {
             Place::File { start, .. } if at == 0 => {

@@ -4,8 +4,8 @@
 mod guard;
 
 use super::array::{Array, Hints, Place};
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::{Axes, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::codec::hdf5::guard::{Checked, Hdf5};
@@ -23,7 +23,7 @@ pub(crate) const FORMAT: Format = Format {
         let found = [0, 512, 1024, 2048]
             .iter()
             .any(|&at: &usize| probe.head.get(at..at + 8).is_some_and(|bytes| bytes == magic));
-        Ok(found.then(|| Match::new(Certainty::Certain, &["HDF5's signature"])))
+        Ok(found.then(|| Recognition::new(Certainty::Certain, &["HDF5's signature"])))
     },
     open,
 };
@@ -35,7 +35,11 @@ struct Candidate {
     shape: Vec<usize>,
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     let damaged = |e: String| damaged(&e, path);
     let file = Hdf5::open(path).map_err(damaged)?;
@@ -59,8 +63,8 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     };
     let frames: Vec<usize> = (0..found.len()).filter(|&i| numbered(&found[i].0)).collect();
     if options.array.is_none() && frames.len() > 1 {
-        metadata(&file, &found[frames[0]].0.path, options, about, path)?;
-        about.evidence.push(format!("{} datasets named by numbers", frames.len()));
+        metadata(&file, &found[frames[0]].0.path, options, info, path)?;
+        info.reasons.push(format!("{} datasets named by numbers", frames.len()));
         let sample = found[frames[0]].0.sample;
         let shape = found[frames[0]].0.shape.clone();
         let mut keep = frames.iter().peekable();
@@ -82,13 +86,13 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
         return numbered_frames(file, checked, sample, shape, path).open(
             options,
             &Hints::default(),
-            about,
+            info,
         );
     }
     let at = choose(&found.iter().map(|(c, _)| c).collect::<Vec<_>>(), options, path)?;
     let (candidate, dataset) = found.swap_remove(at);
-    about.evidence.push(format!("dataset {}", candidate.path));
-    metadata(&file, &candidate.path, options, about, path)?;
+    info.reasons.push(format!("dataset {}", candidate.path));
+    metadata(&file, &candidate.path, options, info, path)?;
     let matlab = file.attribute(&candidate.path, "MATLAB_class").is_some();
     let checked = file.check(dataset).map_err(damaged)?;
     let owned = path.clone();
@@ -105,7 +109,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
         axes: if matlab { Axes::Twh } else { Axes::Thw },
         place: Place::Fetch { fetch: Box::new(fetch), group },
     };
-    array.open(options, &Hints::default(), about)
+    array.open(options, &Hints::default(), info)
 }
 
 fn damaged(e: &str, path: &Path) -> SimError {
@@ -148,7 +152,7 @@ fn metadata(
     file: &Hdf5,
     dataset: &str,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
     path: &Path,
 ) -> Result<()> {
     let Some(text) = file.attribute(dataset, "metadata") else { return Ok(()) };
@@ -165,10 +169,10 @@ fn metadata(
     }
     let summed = metadata["polycam_metadata"]["num_integrated_binary_frames"].as_u64();
     if let Some(summed) = summed.and_then(|n| u16::try_from(n).ok()).filter(|&n| n > 0) {
-        about.max_count = Some(summed);
+        info.max_count = Some(summed);
     }
     let rate = &metadata["node_history"][0]["schedule"]["base_schedule"]["binary_frame_rate_fps"];
-    about.fps = rate.as_f64().map(|fps| fps / f64::from(about.max_count.unwrap_or(1)));
+    info.fps = rate.as_f64().map(|fps| fps / f64::from(info.max_count.unwrap_or(1)));
     Ok(())
 }
 

@@ -1,8 +1,8 @@
 //! A folder of gray images, one per frame, or a single one.
 
 use super::npy::described;
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::levels::infer_levels;
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
@@ -19,10 +19,10 @@ pub(crate) const FORMAT: Format = Format {
     title: "folder of images",
     probe: |probe| {
         if probe.path.join("burst.json").is_file() {
-            return Ok(Some(Match::new(Certainty::Certain, &["burst.json in the folder"])));
+            return Ok(Some(Recognition::new(Certainty::Certain, &["burst.json in the folder"])));
         }
         let found = !files(probe)?.is_empty() && (probe.is_folder || probe.has_extension(SINGLE));
-        Ok(found.then(|| Match::new(Certainty::Likely, &["image files"])))
+        Ok(found.then(|| Recognition::new(Certainty::Likely, &["image files"])))
     },
     open,
 };
@@ -46,10 +46,14 @@ pub(crate) struct Images {
     scale: Scale,
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let files = files(probe)?;
-    let recorded = described(&probe.path.join("burst.json"), about).is_some();
-    open_files(files, &probe.path, recorded, options, about)
+    let recorded = described(&probe.path.join("burst.json"), info).is_some();
+    open_files(files, &probe.path, recorded, options, info)
 }
 
 /// Opens images as frames, in this order.
@@ -58,7 +62,7 @@ pub(crate) fn open_files(
     place: &Path,
     recorded: bool,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let Some(first) = files.first() else {
         return Err(SimError::data(
@@ -69,13 +73,13 @@ pub(crate) fn open_files(
     };
     let (size, samples, full) = gray(first)?;
     if lossy(first) {
-        about.remarks.push("JPEG is lossy: its values are not photon counts".to_owned());
+        info.notes.push("JPEG is lossy: its values are not photon counts".to_owned());
     }
     let mut images = Images { files, size, scale: Scale::Counts };
-    if let Some(scale) = Scale::asked(options.levels, f32::from(full), about) {
+    if let Some(scale) = Scale::asked(options.levels, f32::from(full), info) {
         images.scale = scale;
     } else if !recorded {
-        images.infer_scale(samples, full, place, about)?;
+        images.infer_scale(samples, full, place, info)?;
     }
     Ok(Box::new(images))
 }
@@ -87,7 +91,7 @@ impl Images {
         first: Vec<u16>,
         full: u16,
         place: &Path,
-        about: &mut About,
+        info: &mut CaptureInfo,
     ) -> Result<()> {
         let distinct = |mut values: Vec<u16>| {
             values.sort_unstable();
@@ -102,7 +106,7 @@ impl Images {
             values.extend(more);
             values = distinct(values);
         }
-        self.scale = Scale::seen(values, full, about);
+        self.scale = Scale::seen(values, full, info);
         if self.scale == Scale::Counts
             && let Some(levels) = ladders[0].filter(|&n| n > 1)
             && ladders.iter().all(Option::is_some)
@@ -121,8 +125,8 @@ impl Images {
 
 /// A few frames spread over the capture.
 fn spread(frames: usize) -> impl Iterator<Item = usize> {
-    let looks = frames.min(8);
-    (0..looks).map(move |i| i * frames / looks)
+    let sampled = frames.min(8);
+    (0..sampled).map(move |i| i * frames / sampled)
 }
 
 fn lossy(path: &Path) -> bool {

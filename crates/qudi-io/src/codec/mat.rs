@@ -3,8 +3,8 @@
 pub(super) mod file;
 
 use super::array::{Array, Hints, Place, Stored};
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::{Axes, ReadOptions};
 use crate::capture::probe::{Probe, stem};
 use crate::codec::mat::file::{MatArray, arrays, is_level_5};
@@ -20,12 +20,12 @@ pub(crate) const FORMAT: Format = Format {
         if probe.is_folder {
             let parts = !parts(probe)?.is_empty();
             let info = probe.path.join("info.json").is_file();
-            let evidence: &[&str] =
+            let reasons: &[&str] =
                 if info { &["part_<N>.mat", "info.json"] } else { &["part_<N>.mat"] };
-            return Ok(parts.then(|| Match::new(Certainty::Certain, evidence)));
+            return Ok(parts.then(|| Recognition::new(Certainty::Certain, reasons)));
         }
         let found = is_level_5(&probe.head);
-        Ok(found.then(|| Match::new(Certainty::Certain, &["MATLAB's header"])))
+        Ok(found.then(|| Recognition::new(Certainty::Certain, &["MATLAB's header"])))
     },
     open,
 };
@@ -39,17 +39,21 @@ fn parts(probe: &Probe) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     if !probe.is_folder {
         let array = choose(&probe.path, options)?;
-        about.evidence.push(format!("variable `{}`", array.name));
-        return frames(&probe.path, array, options, about);
+        info.reasons.push(format!("variable `{}`", array.name));
+        return frames(&probe.path, array, options, info);
     }
     let files = parts(probe)?;
     let mut lengths = Vec::new();
     let mut size = None;
     for path in &files {
-        let part = frames(path, choose(path, options)?, options, about)?;
+        let part = frames(path, choose(path, options)?, options, info)?;
         if *size.get_or_insert(part.size()) != part.size() {
             return Err(SimError::data(
                 format!("a part of {} among parts of another size", part.size()),
@@ -62,9 +66,9 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     let Some(size) = size else {
         return Err(SimError::data("no part_<N>.mat in it", &probe.path, "name one .mat file"));
     };
-    about.remarks.dedup();
-    check_info(&probe.path.join("info.json"), files.len(), lengths.iter().sum(), options, about)?;
-    let (options, template) = (options.clone(), about.clone());
+    info.notes.dedup();
+    check_info(&probe.path.join("info.json"), files.len(), lengths.iter().sum(), options, info)?;
+    let (options, template) = (options.clone(), info.clone());
     let opener = move |part: usize| {
         frames(&files[part], choose(&files[part], &options)?, &options, &mut template.clone())
     };
@@ -77,26 +81,26 @@ fn check_info(
     parts: usize,
     frames: u64,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<()> {
     let Ok(text) = std::fs::read(path) else { return Ok(()) };
-    let Ok(info) = serde_json::from_slice::<serde_json::Value>(&text) else {
-        about.remarks.push("info.json is not JSON: ignored".to_owned());
+    let Ok(noted) = serde_json::from_slice::<serde_json::Value>(&text) else {
+        info.notes.push("info.json is not JSON: ignored".to_owned());
         return Ok(());
     };
-    let noted = info["no_parts"].as_u64();
-    let missing = noted.is_some_and(|noted| noted != parts as u64);
+    let promised = noted["no_parts"].as_u64();
+    let missing = promised.is_some_and(|promised| promised != parts as u64);
     if missing && !options.lenient {
         return Err(SimError::data(
-            format!("{parts} parts, where info.json notes {}", noted.unwrap_or(0)),
+            format!("{parts} parts, where info.json notes {}", promised.unwrap_or(0)),
             path,
             "copy the missing parts, or read those that are there with --lenient",
         ));
     }
     // Some converters note the frames of a part, some those of the capture.
-    let per_part = info["no_frames"].as_u64().unwrap_or(frames);
+    let per_part = noted["no_frames"].as_u64().unwrap_or(frames);
     if per_part != frames && per_part != frames / parts as u64 {
-        about.remarks.push(format!("info.json notes {per_part} frames, the parts hold {frames}"));
+        info.notes.push(format!("info.json notes {per_part} frames, the parts hold {frames}"));
     }
     Ok(())
 }
@@ -141,7 +145,7 @@ fn frames(
     path: &Path,
     array: MatArray,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let place = if let Some((start, available)) = array.in_place() {
         Place::File { start, available }
@@ -159,5 +163,5 @@ fn frames(
     };
     // Samples of MATLAB arrays are never packed.
     let hints = Hints { stored: Stored::Counts, size: None };
-    array.open(options, &hints, about)
+    array.open(options, &hints, info)
 }

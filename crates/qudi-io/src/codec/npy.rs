@@ -1,14 +1,14 @@
 //! NumPy `.npy`, also gzipped: packed bits as photoncube and visionsim write them, or plain counts.
 
 use super::array::{Array, Hints, Place};
-use super::{Format, Match};
-use crate::burst::BurstFormat;
-use crate::capture::about::{About, Certainty, Packing};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::Opener;
-use crate::record::{self, BurstLayout, Described};
+use crate::sidecar::{self, BurstLayout, Sidecar};
+use crate::writer::BurstFormat;
 use flate2::read::MultiGzDecoder;
 use qudi_core::npy::Header;
 use qudi_core::sensor::{Response, preset};
@@ -22,12 +22,12 @@ pub(crate) const FORMAT: Format = Format {
     title: "NumPy array",
     probe: |probe| {
         let found = probe.head.starts_with(b"\x93NUMPY");
-        Ok(found.then(|| Match::new(Certainty::Certain, &["NumPy's magic number"])))
+        Ok(found.then(|| Recognition::new(Certainty::Certain, &["NumPy's magic number"])))
     },
-    open: |probe, options, about| {
+    open: |probe, options, info| {
         let array = open_array(&probe.path)?;
-        let hints = hints(&probe.path, about);
-        array.open(options, &hints, about)
+        let hints = hints(&probe.path, info);
+        array.open(options, &hints, info)
     },
 };
 
@@ -37,9 +37,10 @@ pub(crate) const COMPRESSED: Format = Format {
     probe: |probe| {
         let found =
             probe.head.starts_with(&[0x1f, 0x8b]) && probe.stem().to_lowercase().ends_with(".npy");
-        Ok(found.then(|| Match::new(Certainty::Certain, &["gzip's magic number", "the name"])))
+        Ok(found
+            .then(|| Recognition::new(Certainty::Certain, &["gzip's magic number", "the name"])))
     },
-    open: |probe, options, about| open_gzip(probe, options, about),
+    open: |probe, options, info| open_gzip(probe, options, info),
 };
 
 /// Deflate never shrinks data by more than this.
@@ -72,7 +73,7 @@ pub(crate) fn array(path: &Path, header: Header, place: Place) -> Array {
 fn open_gzip(
     probe: &Probe,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let path = probe.path.clone();
     let unpacked = move || -> Result<MultiGzDecoder<BufReader<File>>> {
@@ -89,7 +90,7 @@ fn open_gzip(
             .map_err(|e| SimError::io("decompress", &path, e))?;
         Ok(Box::new(stream))
     });
-    array(&probe.path, header, Place::Stream(opener)).open(options, &Hints::default(), about)
+    array(&probe.path, header, Place::Stream(opener)).open(options, &Hints::default(), info)
 }
 
 /// Refuses a header that promises more than its compressed bytes can hold.
@@ -109,8 +110,8 @@ pub(crate) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Resu
 }
 
 /// What lies beside an array and describes it: our own record.
-fn hints(path: &Path, about: &mut About) -> Hints {
-    let Some(layout) = described(&record::beside(path), about) else { return Hints::default() };
+fn hints(path: &Path, info: &mut CaptureInfo) -> Hints {
+    let Some(layout) = described(&sidecar::beside(path), info) else { return Hints::default() };
     let packed = layout.format == BurstFormat::NpyPacked;
     let packing = packed.then_some(Packing { axis: PackAxis::Width, order: BitOrder::Msb });
     Hints { stored: packing.into(), size: Some(layout.size) }
@@ -118,34 +119,34 @@ fn hints(path: &Path, about: &mut About) -> Hints {
 
 /// What our record at `path` says of its burst, if it exists; what it says about the camera goes
 /// to `about`.
-pub(crate) fn described(path: &Path, about: &mut About) -> Option<BurstLayout> {
+pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayout> {
     if !path.is_file() {
         return None;
     }
-    let record = match Described::load(path) {
+    let record = match Sidecar::load(path) {
         Ok(record) => record,
         Err(e) => {
-            about.remarks.push(format!("{} is ignored: {e}", path.display()));
+            info.notes.push(format!("{} is ignored: {e}", path.display()));
             return None;
         }
     };
-    about.evidence.push("the record beside it".to_owned());
+    info.reasons.push("the record beside it".to_owned());
     let layout = match record {
-        Described::Simulated(record) => {
-            about.binary = record.simulation.sensor.response == Response::Binary;
-            about.gain = Some(record.gain);
-            about.ppp = Some(record.light.ppp);
-            about.sensor = Some(record.simulation.sensor);
+        Sidecar::Simulated(record) => {
+            info.binary = record.simulation.sensor.response == Response::Binary;
+            info.gain = Some(record.gain);
+            info.ppp = Some(record.light.ppp);
+            info.sensor = Some(record.simulation.sensor);
             record.burst
         }
-        Described::Converted(conversion) => {
-            about.binary = conversion.binary;
+        Sidecar::Converted(conversion) => {
+            info.binary = conversion.binary;
             let known = conversion.preset.as_deref().and_then(preset);
-            about.preset = known.map(|preset| preset.name);
+            info.preset = known.map(|preset| preset.name);
             conversion.burst
         }
     };
-    about.max_count = Some(layout.max_count);
-    about.fps = layout.fps;
+    info.max_count = Some(layout.max_count);
+    info.fps = layout.fps;
     Some(layout)
 }

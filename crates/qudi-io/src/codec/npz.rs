@@ -2,8 +2,8 @@
 
 use super::array::{Hints, Place};
 use super::npy::{array, refuse_bomb};
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
@@ -21,7 +21,7 @@ pub(crate) const FORMAT: Format = Format {
     title: "NumPy archive",
     probe: |probe| {
         let found = probe.head.starts_with(b"PK\x03\x04") && probe.extension == "npz";
-        Ok(found.then(|| Match::new(Certainty::Certain, &["zip's magic number", "the name"])))
+        Ok(found.then(|| Recognition::new(Certainty::Certain, &["zip's magic number", "the name"])))
     },
     open,
 };
@@ -36,12 +36,16 @@ struct Entry {
     header: Header,
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     let entries = entries(path)?;
     let entry = choose(&entries, options, path)?.clone();
     refuse_bomb(&entry.header, entry.compressed, path)?;
-    about.evidence.push(format!("array `{}`", entry.name));
+    info.reasons.push(format!("array `{}`", entry.name));
     let data_start = entry.header.data_start;
     let place = if entry.deflated {
         let (path, entry) = (path.clone(), entry.clone());
@@ -58,7 +62,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
             available: entry.compressed.saturating_sub(data_start),
         }
     };
-    array(path, entry.header, place).open(options, &Hints::default(), about)
+    array(path, entry.header, place).open(options, &Hints::default(), info)
 }
 
 impl Entry {

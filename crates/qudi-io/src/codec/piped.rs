@@ -3,7 +3,7 @@
 use super::array::{Hints, Place};
 use super::npy::array;
 use super::raw::piped as piped_raw;
-use crate::capture::about::About;
+use crate::capture::info::CaptureInfo;
 use crate::capture::options::ReadOptions;
 use crate::capture::pipe::{Pipe, STDIN, Tail};
 use crate::frames::CountFrames;
@@ -34,7 +34,7 @@ const OTHERS: &[(&[u8], &str, &str)] = &[
 pub(crate) fn open_pipe(
     mut reader: Box<dyn Read + Send>,
     options: &ReadOptions,
-) -> Result<(Box<dyn CountFrames>, About)> {
+) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
     let place = Path::new(STDIN);
     if options.frames_per_file.is_some() {
         return Err(SimError::request(
@@ -77,12 +77,12 @@ pub(crate) fn open_pipe(
     }
     let mut reader: Box<dyn Read + Send> = Box::new(Cursor::new(start).chain(reader));
     let header = Header::read(&mut reader, place)?;
-    let mut about = About::new("npy", "NumPy array");
-    about.evidence.push("NumPy's magic number".to_owned());
+    let mut info = CaptureInfo::new("npy", "NumPy array");
+    info.reasons.push("NumPy's magic number".to_owned());
     // How long a frame is follows from the order of the axes.
     let tail = Tail { trailer: 0, known: &[], lenient: options.lenient };
     let pipe = Pipe::new(reader, 0, None, tail);
     let frames =
-        array(place, header, Place::Pipe(pipe)).open(options, &Hints::default(), &mut about)?;
-    Ok((frames, about))
+        array(place, header, Place::Pipe(pipe)).open(options, &Hints::default(), &mut info)?;
+    Ok((frames, info))
 }

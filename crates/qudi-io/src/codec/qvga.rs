@@ -3,9 +3,9 @@
 //! Without header, or with the 3 bytes of the MATLAB interface: exposure index, `yrange`, global
 //! shutter; a rolling-shutter file of exposure 1 starts with `yrange * 80` bytes to skip.
 
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty, Packing};
+use super::{Format, Recognition};
 use crate::capture::byte_kind::ByteKind;
+use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::codec::raw::files::frame_files;
@@ -50,7 +50,7 @@ impl Header {
     }
 }
 
-fn recognise(probe: &Probe) -> Result<Option<Match>> {
+fn recognise(probe: &Probe) -> Result<Option<Recognition>> {
     if !probe.has_extension(&["bin", "raw"]) {
         return Ok(None);
     }
@@ -63,17 +63,21 @@ fn recognise(probe: &Probe) -> Result<Option<Match>> {
     if ByteKind::of(&probe.middle(1)?) == ByteKind::Counts {
         return Ok(None);
     }
-    let evidence: &[&str] = match (named, header) {
+    let reasons: &[&str] = match (named, header) {
         (true, true) => &["the name", "the header of its MATLAB interface"],
         (true, false) => &["the name", "whole frames of 9600 bytes"],
         (false, true) => &["the header of its MATLAB interface"],
         (false, false) => &["whole frames of 9600 bytes"],
     };
     let certainty = if named { Certainty::Likely } else { Certainty::Possible };
-    Ok(Some(Match::new(certainty, evidence)))
+    Ok(Some(Recognition::new(certainty, reasons)))
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     if probe.is_folder {
         return Err(SimError::data("a folder", &probe.path, "name one spc_data<N>.bin"));
     }
@@ -91,15 +95,15 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
         ));
     }
     if header.as_ref().is_some_and(|header| header.rolling) {
-        about.remarks.push("rolling shutter: rows are exposed one after the other".to_owned());
+        info.notes.push("rolling shutter: rows are exposed one after the other".to_owned());
     }
     let start = header.map_or(0, |header| header.start);
     let files = [probe.path.clone()];
-    let bytes = frame_files(&files, size.pixels() / 8, start, options, about)?;
+    let bytes = frame_files(&files, size.pixels() / 8, start, options, info)?;
     let order = options.bit_order.unwrap_or(BitOrder::Lsb);
-    about.max_count = Some(1);
-    about.fps = Some(FPS);
-    about.preset = Some("spad-qvga");
-    about.packing = Some(Packing { axis: PackAxis::Width, order });
+    info.max_count = Some(1);
+    info.fps = Some(FPS);
+    info.preset = Some("spad-qvga");
+    info.packing = Some(Packing { axis: PackAxis::Width, order });
     Ok(Box::new(PackedFrames::new(bytes, order, size, Placement::Straight)))
 }

@@ -4,7 +4,7 @@
 pub(super) mod files;
 
 use super::Format;
-use crate::capture::about::{About, Packing};
+use crate::capture::info::{CaptureInfo, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::pipe::{Pipe, STDIN, Tail};
 use crate::capture::probe::Probe;
@@ -23,15 +23,15 @@ pub(crate) const BITS: Format = Format {
     name: "raw-bits",
     title: "packed bits without header",
     probe: |_| Ok(None),
-    open: |probe, options, about| bits(options, about, &mut from_files(probe, options)),
+    open: |probe, options, info| bits(options, info, &mut from_files(probe, options)),
 };
 
 pub(crate) const BYTES: Format = Format {
     name: "raw-u8",
     title: "one byte per count without header",
     probe: |_| Ok(None),
-    open: |probe, options, about| {
-        samples(Sample::U8, &probe.path, options, about, &mut from_files(probe, options))
+    open: |probe, options, info| {
+        samples(Sample::U8, &probe.path, options, info, &mut from_files(probe, options))
     },
 };
 
@@ -39,8 +39,8 @@ pub(crate) const WORDS: Format = Format {
     name: "raw-u16",
     title: "two little-endian bytes per count without header",
     probe: |_| Ok(None),
-    open: |probe, options, about| {
-        samples(WORD, &probe.path, options, about, &mut from_files(probe, options))
+    open: |probe, options, info| {
+        samples(WORD, &probe.path, options, info, &mut from_files(probe, options))
     },
 };
 
@@ -70,13 +70,13 @@ fn files(probe: &Probe) -> Result<Vec<std::path::PathBuf>> {
 }
 
 /// Frames of so many bytes.
-type Source<'a> = dyn FnMut(usize, &mut About) -> Result<FrameBytes> + 'a;
+type Source<'a> = dyn FnMut(usize, &mut CaptureInfo) -> Result<FrameBytes> + 'a;
 
 fn from_files<'a>(
     probe: &'a Probe,
     options: &'a ReadOptions,
-) -> impl FnMut(usize, &mut About) -> Result<FrameBytes> + 'a {
-    |frame_bytes, about| frame_files(&files(probe)?, frame_bytes, 0, options, about)
+) -> impl FnMut(usize, &mut CaptureInfo) -> Result<FrameBytes> + 'a {
+    |frame_bytes, info| frame_files(&files(probe)?, frame_bytes, 0, options, info)
 }
 
 /// Frames of the raw format `name` out of a pipe; `None` if there is no such format.
@@ -84,12 +84,12 @@ pub(crate) fn piped(
     name: &str,
     reader: Box<dyn Read + Send>,
     options: &ReadOptions,
-) -> Option<Result<(Box<dyn CountFrames>, About)>> {
+) -> Option<Result<(Box<dyn CountFrames>, CaptureInfo)>> {
     let format = [BITS, BYTES, WORDS].into_iter().find(|format| format.name == name)?;
-    let mut about = About::new(format.name, format.title);
-    about.evidence.push("--format".to_owned());
+    let mut info = CaptureInfo::new(format.name, format.title);
+    info.reasons.push("--format".to_owned());
     let mut reader = Some(reader);
-    let mut source = |frame_bytes: usize, _: &mut About| {
+    let mut source = |frame_bytes: usize, _: &mut CaptureInfo| {
         // Asked once: the reader goes with the frames.
         let mut reader = reader.take().unwrap_or_else(|| Box::new(std::io::empty()));
         let header = options.header.unwrap_or(0);
@@ -101,16 +101,16 @@ pub(crate) fn piped(
     };
     let place = Path::new(STDIN);
     let frames = match name {
-        "raw-bits" => bits(options, &mut about, &mut source),
-        "raw-u8" => samples(Sample::U8, place, options, &mut about, &mut source),
-        _ => samples(WORD, place, options, &mut about, &mut source),
+        "raw-bits" => bits(options, &mut info, &mut source),
+        "raw-u8" => samples(Sample::U8, place, options, &mut info, &mut source),
+        _ => samples(WORD, place, options, &mut info, &mut source),
     };
-    Some(frames.map(|frames| (frames, about)))
+    Some(frames.map(|frames| (frames, info)))
 }
 
 fn bits(
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
     source: &mut Source<'_>,
 ) -> Result<Box<dyn CountFrames>> {
     let size = size(options)?;
@@ -119,10 +119,10 @@ fn bits(
         Some(PackAxis::None) | None => PackAxis::Width,
     };
     let (rows, columns) = stored_bytes(size, axis);
-    let bytes = source(rows * columns, about)?;
+    let bytes = source(rows * columns, info)?;
     let order = options.bit_order.unwrap_or(BitOrder::Msb);
-    about.max_count = Some(1);
-    about.packing = Some(Packing { axis, order });
+    info.max_count = Some(1);
+    info.packing = Some(Packing { axis, order });
     let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
     let placement = Placement::packed(size, axis, transposed);
     Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
@@ -132,13 +132,13 @@ fn samples(
     sample: Sample,
     place: &Path,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
     source: &mut Source<'_>,
 ) -> Result<Box<dyn CountFrames>> {
     let size = size(options)?;
-    let bytes = source(size.pixels() * sample.bytes(), about)?;
+    let bytes = source(size.pixels() * sample.bytes(), info)?;
     let full = sample.full_scale().unwrap_or(1.0);
-    let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
+    let scale = Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts);
     let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
     Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, place)))
 }

@@ -1,7 +1,7 @@
 //! SPAD512S sparse mode: 32-bit little-endian indices of fired pixels, a delimiter ends each frame.
 
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::{Orientation, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
@@ -25,8 +25,8 @@ pub(crate) const FORMAT: Format = Format {
         let delimiters = words.iter().filter(|&&w| w == ARRAY.pixels() as u32).count();
         // Indices that jump about, with delimiters between: no picture looks like this.
         let several = words.len() > 4 && delimiters > 0 && words.iter().any(|&w| w > 0xffff);
-        let evidence = ["every word is a pixel index or the delimiter"];
-        Ok((stream && several).then(|| Match::new(Certainty::Certain, &evidence)))
+        let reasons = ["every word is a pixel index or the delimiter"];
+        Ok((stream && several).then(|| Recognition::new(Certainty::Certain, &reasons)))
     },
     open,
 };
@@ -46,7 +46,11 @@ struct SparseFrames {
     words: Vec<u8>,
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     if probe.is_folder {
         return Err(SimError::data("a folder", path, "name one file of the sparse stream"));
@@ -54,11 +58,11 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     let size = options.size.unwrap_or(ARRAY);
     let io = |e| SimError::io("read", path, e);
     let mut file = File::open(path).map_err(io)?;
-    let starts = index(&mut file, size, path, options, about)?;
-    about.preset = Some("spad512s");
-    about.max_count = Some(1);
-    about.vendor = Orientation::Rot90;
-    about.orient = Orientation::Vendor;
+    let starts = index(&mut file, size, path, options, info)?;
+    info.preset = Some("spad512s");
+    info.max_count = Some(1);
+    info.vendor = Orientation::Rot90;
+    info.orient = Orientation::Vendor;
     Ok(Box::new(SparseFrames { file, path: path.clone(), size, starts, words: Vec::new() }))
 }
 
@@ -68,7 +72,7 @@ fn index(
     size: Size,
     path: &Path,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<Vec<u64>> {
     let delimiter = size.pixels() as u32;
     let mut reader = BufReader::with_capacity(1 << 20, file);
@@ -107,7 +111,7 @@ fn index(
                 "the stream was cut off: copy it again, or drop the last frame with --lenient",
             ));
         }
-        about.remarks.push(format!("{what}: dropped"));
+        info.notes.push(format!("{what}: dropped"));
     }
     if starts.len() < 2 {
         return Err(SimError::data("no whole frame", path, "check --format and --size"));

@@ -4,12 +4,12 @@
 //! of 512 x 512; each of 256 stored rows holds 8 zones of 128 pixels, alternately of image row `r`
 //! and, upside down, of image row `511 - r`.
 
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty, Packing};
+use super::{Format, Recognition};
 use crate::capture::byte_kind::ByteKind;
+use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
-use crate::capture::raw_look::{Habit, RawLook, SWISSSPAD_FILE};
+use crate::capture::raw_sample::{Convention, RawSample, SWISSSPAD_FILE};
 use crate::codec::raw::files::frame_files;
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement};
@@ -20,8 +20,8 @@ pub(crate) const HALF: Format = Format {
     name: "swissspad2",
     title: "SwissSPAD2 raw files, half array",
     probe: |probe| recognise(probe, false),
-    open: |probe, options, about| {
-        open(probe, options, about, Size { height: 256, width: 512 }, Placement::Straight)
+    open: |probe, options, info| {
+        open(probe, options, info, Size { height: 256, width: 512 }, Placement::Straight)
     },
 };
 
@@ -29,59 +29,59 @@ pub(crate) const FULL: Format = Format {
     name: "swissspad2-full",
     title: "SwissSPAD2 raw files, full array",
     probe: |probe| recognise(probe, true),
-    open: |probe, options, about| {
+    open: |probe, options, info| {
         let size = Size { height: 512, width: 512 };
-        open(probe, options, about, size, Placement::Bytes(zones()))
+        open(probe, options, info, size, Placement::Bytes(zones()))
     },
 };
 
 /// Bytes of a half-array frame; a full one has twice as many.
 const HALF_FRAME: u64 = 16_384;
 
-fn recognise(probe: &Probe, full: bool) -> Result<Option<Match>> {
-    let Some(look) = RawLook::at(probe)? else { return Ok(None) };
+fn recognise(probe: &Probe, full: bool) -> Result<Option<Recognition>> {
+    let Some(sample) = RawSample::at(probe)? else { return Ok(None) };
     let frame = if full { 2 * HALF_FRAME } else { HALF_FRAME };
-    if !look.length.is_multiple_of(frame) || look.kind == ByteKind::Counts {
+    if !sample.length.is_multiple_of(frame) || sample.kind == ByteKind::Counts {
         return Ok(None);
     }
-    let mut evidence = Vec::new();
-    if look.length == SWISSSPAD_FILE {
-        evidence.push("8 MiB per file");
+    let mut reasons = Vec::new();
+    if sample.length == SWISSSPAD_FILE {
+        reasons.push("8 MiB per file");
     }
-    if look.habit == Habit::SwissSpad2 {
-        evidence.push("the name");
+    if sample.convention == Convention::SwissSpad2 {
+        reasons.push("the name");
     }
-    let arrangement = look.full_array.unwrap_or(false);
-    let certainty = match (look.habit, look.order) {
-        (Habit::Spad512s, _) | (_, Some(BitOrder::Msb)) => return Ok(None),
+    let arrangement = sample.full_array.unwrap_or(false);
+    let certainty = match (sample.convention, sample.order) {
+        (Convention::Spad512s, _) | (_, Some(BitOrder::Msb)) => return Ok(None),
         _ if arrangement != full => return Ok(None),
         (_, Some(BitOrder::Lsb)) => {
-            evidence.push(if full {
+            reasons.push(if full {
                 "the picture: lowest bit first, zones"
             } else {
                 "the picture: lowest bit first"
             });
             Certainty::Likely
         }
-        (Habit::SwissSpad2, None) => Certainty::Likely,
-        (Habit::Unknown, None) => Certainty::Possible,
+        (Convention::SwissSpad2, None) => Certainty::Likely,
+        (Convention::Unknown, None) => Certainty::Possible,
     };
-    Ok(Some(Match::new(certainty, &evidence)))
+    Ok(Some(Recognition::new(certainty, &reasons)))
 }
 
 fn open(
     probe: &Probe,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
     size: Size,
     placement: Placement,
 ) -> Result<Box<dyn CountFrames>> {
     let files = probe.files(&["bin"])?;
-    let bytes = frame_files(&files, size.pixels() / 8, 0, options, about)?;
+    let bytes = frame_files(&files, size.pixels() / 8, 0, options, info)?;
     let order = options.bit_order.unwrap_or(BitOrder::Lsb);
-    about.max_count = Some(1);
-    about.packing = Some(Packing { axis: PackAxis::Width, order });
-    about.preset = Some("swissspad2");
+    info.max_count = Some(1);
+    info.packing = Some(Packing { axis: PackAxis::Width, order });
+    info.preset = Some("swissspad2");
     Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
 }
 

@@ -4,15 +4,15 @@
 mod pages;
 
 use super::npy::described;
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::codec::tiff::pages::{TiffPages, decoder, fault};
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
-use crate::record;
+use crate::sidecar;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Result, SimError};
@@ -25,7 +25,7 @@ pub(crate) const FORMAT: Format = Format {
     probe: |probe| {
         let magic = [&b"II*\0"[..], b"MM\0*", b"II+\0", b"MM\0+"];
         let found = magic.iter().any(|magic| probe.head.starts_with(magic));
-        Ok(found.then(|| Match::new(Certainty::Certain, &["TIFF's magic number"])))
+        Ok(found.then(|| Recognition::new(Certainty::Certain, &["TIFF's magic number"])))
     },
     open,
 };
@@ -38,17 +38,21 @@ struct Block {
     sample: Sample,
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     if probe.is_folder {
         return Err(SimError::data("a folder", path, "use --format images, or name one file"));
     }
-    let recorded = described(&record::beside(path), about).is_some();
+    let recorded = described(&sidecar::beside(path), info).is_some();
     let Some(block) = block(probe)? else {
-        let pages = TiffPages::open(path, options, recorded, about)?;
+        let pages = TiffPages::open(path, options, recorded, info)?;
         return Ok(Box::new(pages));
     };
-    about.evidence.push(format!("ImageJ's description: {} images", block.frames));
+    info.reasons.push(format!("ImageJ's description: {} images", block.frames));
     let frame_bytes = (block.size.pixels() * block.sample.bytes()) as u64;
     let whole = (probe.length.saturating_sub(block.start) / frame_bytes).min(block.frames);
     if whole < block.frames {
@@ -62,12 +66,12 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
                 "copy or export it again, or read the whole frames with --lenient",
             ));
         }
-        about.remarks.push(format!("truncated: {} frames dropped", block.frames - whole));
+        info.notes.push(format!("truncated: {} frames dropped", block.frames - whole));
     }
     let segment = Segment { path: path.clone(), start: block.start, frames: whole };
     let bytes = FrameBytes::files(vec![segment], frame_bytes as usize);
     let full = block.sample.full_scale().unwrap_or(1.0);
-    let scale = Scale::asked(options.levels, full, about).unwrap_or(Scale::Counts);
+    let scale = Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts);
     let frames = SampleFrames::new(bytes, block.sample, block.size, false, MONO, scale, path);
     Ok(Box::new(frames))
 }

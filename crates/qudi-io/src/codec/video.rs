@@ -1,7 +1,7 @@
 //! Videos through ffmpeg, for what was stored as one. Lossy compression leaves no photon counts.
 
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
@@ -18,13 +18,17 @@ pub(crate) const FORMAT: Format = Format {
     title: "video, decoded by ffmpeg",
     probe: |probe| {
         let found = probe.has_extension(&["mp4", "avi", "mkv", "mov", "webm", "m4v"]);
-        Ok(found.then(|| Match::new(Certainty::Likely, &["the name"])))
+        Ok(found.then(|| Recognition::new(Certainty::Likely, &["the name"])))
     },
     open,
 };
 
 /// Decodes the video once into an unnamed temporary file, 8 bits per pixel.
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     let mut video = Video::open(path, Transfer::AsIs)?;
     let size = video.size();
@@ -37,11 +41,11 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
         frames += 1;
     }
     let file = file.into_inner().map_err(|e| spool(e.into_error()))?;
-    about.remarks.push(
+    info.notes.push(
         "video is stored with loss: its values are not photon counts, and no figure made from them means much"
             .to_owned(),
     );
-    let scale = Scale::asked(options.levels, 255.0, about).unwrap_or(Scale::Counts);
+    let scale = Scale::asked(options.levels, 255.0, info).unwrap_or(Scale::Counts);
     let segment = Segment { path: path.clone(), start: 0, frames };
     let bytes = FrameBytes::spool(segment, file, size.pixels());
     Ok(Box::new(SampleFrames::new(bytes, Sample::U8, size, false, MONO, scale, path)))

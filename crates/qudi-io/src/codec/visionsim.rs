@@ -3,8 +3,8 @@
 use super::array::{Hints, Stored};
 use super::images::open_files;
 use super::npy::open_array;
-use super::{Format, Match};
-use crate::capture::about::{About, Certainty, Packing};
+use super::{Format, Recognition};
+use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
@@ -18,7 +18,7 @@ pub(crate) const FORMAT: Format = Format {
     title: "visionsim dataset",
     probe: |probe| {
         let found = document(probe).is_file();
-        Ok(found.then(|| Match::new(Certainty::Certain, &["transforms.json"])))
+        Ok(found.then(|| Recognition::new(Certainty::Certain, &["transforms.json"])))
     },
     open,
 };
@@ -50,7 +50,11 @@ fn document(probe: &Probe) -> PathBuf {
     if itself { probe.path.clone() } else { probe.path.join("transforms.json") }
 }
 
-fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<dyn CountFrames>> {
+fn open(
+    probe: &Probe,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
     let path = document(probe);
     let io = |e| SimError::io("read", &path, e);
     let fault = |what: String| {
@@ -67,7 +71,7 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     let transforms: Transforms = serde_json::from_slice(&bytes)
         .map_err(|e| fault(format!("not visionsim's transforms.json: {e}")))?;
     let folder = path.parent().unwrap_or(Path::new("."));
-    about.fps = transforms.fps;
+    info.fps = transforms.fps;
     if transforms.c.is_some_and(|c| c > 1) && options.channel.is_none() {
         return Err(SimError::data(
             format!("a colour capture of {} channels", transforms.c.unwrap_or(0)),
@@ -78,12 +82,12 @@ fn open(probe: &Probe, options: &ReadOptions, about: &mut About) -> Result<Box<d
     if let Some(name) = &transforms.file_path {
         let data =
             inside(folder, name).ok_or_else(|| fault(format!("its data lie at `{name}`")))?;
-        return open_array(&data)?.open(options, &transforms.hints(&path)?, about);
+        return open_array(&data)?.open(options, &transforms.hints(&path)?, info);
     }
     let files: Option<Vec<PathBuf>> =
         transforms.frames.iter().map(|pose| inside(folder, pose.file_path.as_deref()?)).collect();
     let files = files.ok_or_else(|| fault("frames without file_path".to_owned()))?;
-    open_files(files, &path, false, options, about)
+    open_files(files, &path, false, options, info)
 }
 
 /// A path inside the data set.

@@ -15,16 +15,16 @@ pub trait CountFrames: Send {
     }
 
     /// Waits until there are `frames` frames, or no more come; gives how many there are. What the
-    /// user should know of the end goes to `remarks`.
+    /// user should know of the end goes to `notes`.
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the pipe ends inside a frame.
-    fn reach(&mut self, _frames: u64, _remarks: &mut Vec<String>) -> Result<u64> {
+    fn wait_for(&mut self, _frames: u64, _remarks: &mut Vec<String>) -> Result<u64> {
         Ok(self.frames())
     }
 
     /// Says that no frame before `frame` is asked for again.
-    fn release(&mut self, _frame: u64) {}
+    fn discard_before(&mut self, _frame: u64) {}
 
     /// Size of every frame.
     fn size(&self) -> Size;

@@ -100,17 +100,17 @@ impl FrameBytes {
     }
 
     /// Waits for `frames` frames; gives how many there are.
-    pub(crate) fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
+    pub(crate) fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
         match self {
-            Self::Pipe(pipe) => pipe.reach(frames, remarks),
+            Self::Pipe(pipe) => pipe.wait_for(frames, notes),
             _ => Ok(self.frames()),
         }
     }
 
     /// No frame before `frame` is asked for again.
-    pub(crate) fn release(&mut self, frame: u64) {
+    pub(crate) fn discard_before(&mut self, frame: u64) {
         if let Self::Pipe(pipe) = self {
-            pipe.release(frame);
+            pipe.discard_before(frame);
         }
     }
 

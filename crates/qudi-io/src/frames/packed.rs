@@ -186,11 +186,11 @@ impl CountFrames for PackedFrames {
         self.bytes.length()
     }
 
-    fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
-        self.bytes.reach(frames, remarks)
+    fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
+        self.bytes.wait_for(frames, notes)
     }
 
-    fn release(&mut self, frame: u64) {
-        self.bytes.release(frame);
+    fn discard_before(&mut self, frame: u64) {
+        self.bytes.discard_before(frame);
     }
 }

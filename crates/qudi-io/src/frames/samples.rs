@@ -2,7 +2,7 @@
 
 use super::count_frames::CountFrames;
 use super::frame_bytes::FrameBytes;
-use crate::capture::about::About;
+use crate::capture::info::CaptureInfo;
 use crate::capture::levels::infer_levels;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
@@ -20,20 +20,20 @@ pub(crate) enum Scale {
 
 impl Scale {
     /// What `--levels` asks for; `full` is the value that stands for all ones.
-    pub(crate) fn asked(levels: Option<u16>, full: f32, about: &mut About) -> Option<Self> {
+    pub(crate) fn asked(levels: Option<u16>, full: f32, info: &mut CaptureInfo) -> Option<Self> {
         let levels = levels?;
-        about.max_count = Some(levels);
-        about.binary = true;
+        info.max_count = Some(levels);
+        info.binary = true;
         Some(Self::Means { levels, full })
     }
 
     /// What some values (in any order) show.
-    pub(crate) fn seen(mut values: Vec<u16>, full: u16, about: &mut About) -> Self {
+    pub(crate) fn seen(mut values: Vec<u16>, full: u16, info: &mut CaptureInfo) -> Self {
         values.sort_unstable();
         values.dedup();
         let Some(levels) = infer_levels(&values, full) else { return Self::Counts };
-        about.max_count = Some(levels);
-        about.remarks.push(format!(
+        info.max_count = Some(levels);
+        info.notes.push(format!(
             "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
         ));
         Self::Means { levels, full: f32::from(full) }
@@ -137,12 +137,12 @@ impl CountFrames for SampleFrames {
         self.bytes.length()
     }
 
-    fn reach(&mut self, frames: u64, remarks: &mut Vec<String>) -> Result<u64> {
-        self.bytes.reach(frames, remarks)
+    fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
+        self.bytes.wait_for(frames, notes)
     }
 
-    fn release(&mut self, frame: u64) {
-        self.bytes.release(frame);
+    fn discard_before(&mut self, frame: u64) {
+        self.bytes.discard_before(frame);
     }
 }
 

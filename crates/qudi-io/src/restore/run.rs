@@ -16,13 +16,13 @@ pub trait RestoreSink {
     /// The sink's own; the run ends with it.
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()>;
 
-    /// Takes the deviation of frame `number` over a method's samples, right after the frame. Methods that draw none
-    /// have none.
+    /// Takes the uncertainty of frame `number`, right after the frame: the standard deviation over the samples of
+    /// a method that draws several. Other methods have none.
     ///
     /// # Errors
     /// The sink's own; the run ends with it.
-    fn deviation(&mut self, number: u64, deviation: &Frame) -> Result<()> {
-        let _ = (number, deviation);
+    fn uncertainty(&mut self, number: u64, uncertainty: &Frame) -> Result<()> {
+        let _ = (number, uncertainty);
         Ok(())
     }
 }
@@ -48,11 +48,11 @@ pub fn run(
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
     let mut first_held = 0;
     let mut fade = CrossFade::default();
-    let mut deviations = CrossFade::default();
+    let mut uncertainties = CrossFade::default();
     for number in windows.first_with(wanted.start).. {
         // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
         // the next one is whole, or no more frames come.
-        let windows = windows.over(capture.reach(windows.nominal_end(number + 1))?);
+        let windows = windows.over(capture.wait_for(windows.nominal_end(number + 1))?);
         if number >= windows.count() || windows.range(number).start >= wanted.end {
             break;
         }
@@ -73,13 +73,13 @@ pub fn run(
             capture.read(first_held + counts.len() as u64, &mut frame)?;
             counts.push_back(frame);
         }
-        capture.release(range.end);
+        capture.discard_before(range.end);
         let acquisition = Acquisition { first_frame: range.start, ..acquisition.clone() };
         let burst = BurstView { size, frames: counts.make_contiguous() };
         let restored = restorer.restore(burst, &acquisition)?;
         fade.push(range.start, restored.frames);
-        if let Some(deviation) = restored.std {
-            deviations.push(range.start, deviation);
+        if let Some(uncertainty) = restored.std {
+            uncertainties.push(range.start, uncertainty);
         }
         let last = number + 1 == windows.count();
         let until = if last { range.end } else { windows.range(number + 1).start };
@@ -87,10 +87,10 @@ pub fn run(
             if wanted.contains(&frame) {
                 sink.frame(frame, &image, &counts[(frame - first_held) as usize])?;
             }
-            if let Some((frame, deviation)) = deviations.pop(until)
+            if let Some((frame, uncertainty)) = uncertainties.pop(until)
                 && wanted.contains(&frame)
             {
-                sink.deviation(frame, &deviation)?;
+                sink.uncertainty(frame, &uncertainty)?;
             }
         }
     }

@@ -14,7 +14,7 @@ const FPS: &str = "25";
 
 /// A film being written.
 #[derive(Debug)]
-pub struct Mp4 {
+pub struct Mp4Writer {
     child: Child,
     /// What ffmpeg says; a file, since a full pipe would stop it.
     words: File,
@@ -23,7 +23,7 @@ pub struct Mp4 {
     overwrite: Overwrite,
 }
 
-impl Mp4 {
+impl Mp4Writer {
     /// Starts a film of frames of `size`.
     ///
     /// # Errors
@@ -111,7 +111,7 @@ impl Mp4 {
     }
 }
 
-impl Drop for Mp4 {
+impl Drop for Mp4Writer {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();

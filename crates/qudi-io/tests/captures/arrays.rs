@@ -214,7 +214,7 @@ fn truncated_arrays_are_refused_or_trimmed() {
     let lenient = ReadOptions { lenient: true, ..plain() };
     let mut capture = open(&path, &lenient).unwrap();
     assert_eq!(counts(&mut capture), [[5, 6, 7, 8]]);
-    assert!(capture.about().remarks[0].contains("2 of 3 frames dropped"));
+    assert!(capture.info().notes[0].contains("2 of 3 frames dropped"));
 }
 
 #[test]
@@ -261,7 +261,7 @@ fn frames_are_chosen_cropped_turned_and_summed() {
     };
     let mut capture = open(&path, &options).unwrap();
     assert_eq!((capture.frames(), capture.max_count()), (2, Some(7)));
-    assert!(capture.about().remarks.iter().any(|r| r.contains("last 1 frames")));
+    assert!(capture.info().notes.iter().any(|r| r.contains("last 1 frames")));
     let read = counts(&mut capture);
     for (n, frame) in read.iter().enumerate() {
         for (i, &count) in frame.iter().enumerate() {

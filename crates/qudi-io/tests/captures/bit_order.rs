@@ -2,7 +2,7 @@
 
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
-use qudi_io::capture::{SURE, bit_order_evidence};
+use qudi_io::capture::{SURE, bit_order_z_score};
 use qudi_sim::clip::{Input, Sampling};
 
 /// Sums of simulated binary frames of a procedural scene, seen in either order.
@@ -47,8 +47,8 @@ fn bursts_of_16_to_1024_frames_are_right_or_unsure() {
     {
         for ppp in [0.06, 0.5] {
             for (frames, sums) in sums(scene, seed, ppp, &lengths) {
-                let right = bit_order_evidence(&sums, size);
-                let wrong = bit_order_evidence(&reversed(&sums), size);
+                let right = bit_order_z_score(&sums, size);
+                let wrong = bit_order_z_score(&reversed(&sums), size);
                 assert!(right > -SURE, "{scene} {ppp} {frames}: {right}");
                 assert!(wrong < SURE, "{scene} {ppp} {frames}: {wrong}");
                 all += 2;
@@ -68,14 +68,14 @@ fn bursts_of_16_to_1024_frames_are_right_or_unsure() {
 #[test]
 fn noise_and_nothing_leave_it_open() {
     let size = Size { height: 64, width: 64 };
-    assert_eq!(bit_order_evidence(&vec![0; 64 * 64], size), 0.0);
+    assert_eq!(bit_order_z_score(&vec![0; 64 * 64], size), 0.0);
     for seed in 0..20 {
         let noise = crate::scene(1, 64, 64, seed);
         // The light of the test scene, without its structure.
         let sums: Vec<u32> =
             noise[0].iter().enumerate().map(|(i, &c)| u32::from(c) * (i as u32 * 7 % 5)).collect();
         let shuffled: Vec<u32> = (0..64 * 64).map(|i| sums[i * 1531 % 4096]).collect();
-        assert!(bit_order_evidence(&shuffled, size).abs() < SURE);
+        assert!(bit_order_z_score(&shuffled, size).abs() < SURE);
     }
-    assert_eq!(bit_order_evidence(&[1, 2, 3], Size { height: 1, width: 3 }), 0.0);
+    assert_eq!(bit_order_z_score(&[1, 2, 3], Size { height: 1, width: 3 }), 0.0);
 }

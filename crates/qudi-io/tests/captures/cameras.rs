@@ -18,7 +18,7 @@ fn swissspad2_half_arrays_are_lowest_bit_first() {
     write(folder.path(), "0/0/filename63.bin", &bytes);
     write(folder.path(), "0/1/filename64.bin", &bytes[..16_384 * 10]);
     let mut capture = open(folder.path(), &plain()).unwrap();
-    assert_eq!(capture.about().format, "swissspad2");
+    assert_eq!(capture.info().format, "swissspad2");
     assert_eq!((capture.frames(), capture.size().height, capture.size().width), (522, 256, 512));
     let mut one = vec![0; 256 * 512];
     for frame in [0usize, 1, 511, 512, 521, 3] {
@@ -49,7 +49,7 @@ fn swissspad2_full_arrays_are_zones_with_the_bottom_upside_down() {
     }
     let path = write(folder.path(), "filename0.bin", &bytes);
     let mut capture = open(&path, &plain()).unwrap();
-    assert_eq!(capture.about().format, "swissspad2-full");
+    assert_eq!(capture.info().format, "swissspad2-full");
     let mut one = vec![0; 512 * 512];
     for frame in [0, 100, 255] {
         capture.read(frame, &mut one).unwrap();
@@ -80,7 +80,7 @@ fn spad512s_frames_come_with_and_without_trailer_and_turned() {
         let dumped = write(folder.path(), "RAW_1700000000.123.bin", &bytes);
         for path in [plain_file, dumped] {
             let mut capture = open(&path, &plain()).unwrap();
-            assert_eq!(capture.about().format, "spad512s", "{n}");
+            assert_eq!(capture.info().format, "spad512s", "{n}");
             assert_eq!(capture.frames(), n as u64);
             let mut one = vec![0; 512 * 512];
             capture.read(n as u64 - 1, &mut one).unwrap();
@@ -102,7 +102,7 @@ fn the_server_s_error_is_reported_and_a_torn_frame_refused() {
     let named = ReadOptions { format: Some("spad512s".into()), ..plain() };
     let capture = open(&path, &named).unwrap();
     assert_eq!(capture.frames(), 20);
-    assert!(capture.about().remarks[0].contains("ERROR"));
+    assert!(capture.info().notes[0].contains("ERROR"));
     let torn = write(folder.path(), "RAW00001.bin", &bytes[..bytes.len() - 100]);
     let words = refusal(open(&torn, &named));
     assert!(words.contains("19 frames") && words.contains("--lenient"), "{words}");
@@ -147,11 +147,11 @@ fn spad512s_deeper_modes_are_bytes_and_words() {
     let raw = ReadOptions { orient: Some(Orientation::Raw), ..plain() };
     let path = write(folder.path(), "RAW00000.bin", &bytes);
     let mut capture = open(&path, &raw).unwrap();
-    assert_eq!(capture.about().format, "spad512s-8");
+    assert_eq!(capture.info().format, "spad512s-8");
     assert_eq!(counts(&mut capture), frames);
     let path = write(folder.path(), "RAW00001.bin", &words);
     let mut capture = open(&path, &raw).unwrap();
-    assert_eq!(capture.about().format, "spad512s-16");
+    assert_eq!(capture.info().format, "spad512s-16");
     assert_eq!(counts(&mut capture)[2][77], frames[2][77] * 40);
 }
 
@@ -164,7 +164,7 @@ fn sparse_streams_end_frames_with_the_delimiter() {
     let path = write(folder.path(), "RAW00000.bin", &stream);
     let raw = ReadOptions { orient: Some(Orientation::Raw), ..plain() };
     let mut capture = open(&path, &raw).unwrap();
-    assert_eq!((capture.about().format, capture.frames()), ("spad512s-sparse", 3));
+    assert_eq!((capture.info().format, capture.frames()), ("spad512s-sparse", 3));
     let frames = counts(&mut capture);
     let fired = |t: usize| {
         frames[t].iter().enumerate().filter(|(_, c)| **c == 1).map(|(i, _)| i).collect::<Vec<_>>()
@@ -193,9 +193,9 @@ fn qvga_files_have_a_header_or_none() {
     for (bytes, note) in [(bytes, None), (global, None), (rolling, Some("rolling"))] {
         let path = write(folder.path(), "spc_data1.bin", &bytes);
         let mut capture = open(&path, &plain()).unwrap();
-        assert_eq!((capture.about().format, capture.fps()), ("qvga", Some(9938.4)));
+        assert_eq!((capture.info().format, capture.fps()), ("qvga", Some(9938.4)));
         assert_eq!(counts(&mut capture), frames);
-        let noted = capture.about().remarks.iter().any(|r| r.contains("rolling"));
+        let noted = capture.info().notes.iter().any(|r| r.contains("rolling"));
         assert_eq!(noted, note.is_some());
     }
 }
@@ -207,10 +207,10 @@ fn a_length_alone_decides_nothing() {
     let frames = scene(256, 512, 512, 10);
     let msb: Vec<u8> = frames.iter().flat_map(|f| pack(f, 512, false)).collect();
     let path = write(folder.path(), "capture.bin", &msb);
-    assert_eq!(open(&path, &plain()).unwrap().about().format, "spad512s");
+    assert_eq!(open(&path, &plain()).unwrap().info().format, "spad512s");
     let lsb: Vec<u8> = frames.iter().flat_map(|f| pack(f, 512, true)).collect();
     let path = write(folder.path(), "capture.bin", &lsb);
-    assert_eq!(open(&path, &plain()).unwrap().about().format, "swissspad2");
+    assert_eq!(open(&path, &plain()).unwrap().info().format, "swissspad2");
     let mut state = 1u64;
     let noise: Vec<u8> = (0..8 << 20)
         .map(|_| {
@@ -225,7 +225,7 @@ fn a_length_alone_decides_nothing() {
     assert!(words.contains("ambiguous") && words.contains("--format"), "{words}");
     // A name decides where the picture does not.
     let path = write(folder.path(), "filename7.bin", &noise);
-    assert_eq!(open(&path, &plain()).unwrap().about().format, "swissspad2");
+    assert_eq!(open(&path, &plain()).unwrap().info().format, "swissspad2");
 }
 
 #[test]

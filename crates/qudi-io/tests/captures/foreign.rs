@@ -80,15 +80,15 @@ fn without_the_feature_hdf5_says_so() {
 
 #[test]
 fn what_is_known_is_said() {
-    let about = |name: &str| open(&golden(name), &plain()).unwrap().about().clone();
+    let info = |name: &str| open(&golden(name), &plain()).unwrap().info().clone();
     for name in ["counts.npy", "stored.npz", "plain.mat", "pages.tif", "visionsim1", "parts"] {
-        assert_eq!(about(name).certainty, Certainty::Certain, "{name}");
+        assert_eq!(info(name).certainty, Certainty::Certain, "{name}");
     }
-    assert_eq!(about("images").certainty, Certainty::Likely);
-    assert_eq!(about("images").max_count, Some(1));
-    assert_eq!(about("means.tif").max_count, Some(7));
-    assert_eq!(about("visionsim1").packing.unwrap().axis, PackAxis::Height);
-    assert!(about("stored.npz").evidence.contains(&"array `spk`".to_owned()));
+    assert_eq!(info("images").certainty, Certainty::Likely);
+    assert_eq!(info("images").max_count, Some(1));
+    assert_eq!(info("means.tif").max_count, Some(7));
+    assert_eq!(info("visionsim1").packing.unwrap().axis, PackAxis::Height);
+    assert!(info("stored.npz").reasons.contains(&"array `spk`".to_owned()));
 }
 
 #[test]
@@ -120,7 +120,7 @@ fn matlab_s_dark_map_names_hot_pixels() {
     let hot = &capture.bad_pixels().hot;
     assert_eq!(hot.last(), Some(&239));
     assert!(!hot.is_empty() && hot.len() < 10, "{hot:?}");
-    assert!(capture.about().remarks.iter().any(|r| r.contains("frame rate is unknown")));
+    assert!(capture.info().notes.iter().any(|r| r.contains("frame rate is unknown")));
 }
 
 /// Cut anywhere, a file is an error or fewer frames, never a panic.

@@ -52,7 +52,7 @@ proptest! {
         if let Ok(mut capture) = piped(&bytes, &options) {
             prop_assert!(capture.frames() > 0);
             let mut counts = vec![0; capture.size().pixels()];
-            if let Ok(frames) = capture.reach(u64::MAX) {
+            if let Ok(frames) = capture.wait_for(u64::MAX) {
                 for frame in 0..frames {
                     let _ = capture.read(frame, &mut counts);
                 }
@@ -124,9 +124,9 @@ fn packed_frames_parts_and_sums_are_those_of_a_file() {
         let mut file = open(&path, &options).unwrap();
         let mut pipe = piped(&array, &options).unwrap();
         assert_eq!(pipe.frames().min(11), file.frames().min(11), "a first window is there");
-        assert_eq!(pipe.reach(u64::MAX).unwrap(), file.frames());
+        assert_eq!(pipe.wait_for(u64::MAX).unwrap(), file.frames());
         assert_eq!(counts(&mut pipe), counts(&mut file));
-        assert_eq!(pipe.about().remarks, file.about().remarks);
+        assert_eq!(pipe.info().notes, file.info().notes);
     }
 }
 
@@ -135,15 +135,15 @@ fn released_frames_are_gone_and_the_end_is_said() {
     let data: Vec<u8> = scene(30, 4, 5, 1).iter().flatten().map(|&c| c as u8).collect();
     let mut pipe = piped(&data, &ReadOptions { end: Some(50), ..raw("4x5") }).unwrap();
     assert_eq!(pipe.length(), None);
-    pipe.reach(20).unwrap();
-    pipe.release(15);
+    pipe.wait_for(20).unwrap();
+    pipe.discard_before(15);
     let mut frame = vec![0; 20];
     pipe.read(15, &mut frame).unwrap();
     let gone = pipe.read(14, &mut frame).unwrap_err();
     assert!(gone.to_string().contains("frame 14 of a pipe"), "{gone}");
-    assert_eq!(pipe.reach(50).unwrap(), 30);
+    assert_eq!(pipe.wait_for(50).unwrap(), 30);
     assert_eq!(pipe.length(), Some(30));
-    assert_eq!(pipe.about().remarks, ["the pipe ended after 30 frames, before --end 50"]);
+    assert_eq!(pipe.info().notes, ["the pipe ended after 30 frames, before --end 50"]);
 }
 
 #[test]

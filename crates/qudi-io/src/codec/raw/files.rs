@@ -1,6 +1,6 @@
 //! Headerless files of equally long frames, one or many.
 
-use crate::capture::about::About;
+use crate::capture::info::CaptureInfo;
 use crate::capture::options::ReadOptions;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use qudi_core::{Result, SimError};
@@ -17,12 +17,12 @@ pub(crate) fn frame_files(
     frame_bytes: usize,
     header: u64,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<FrameBytes> {
     let mut segments = Vec::with_capacity(files.len());
     for (i, path) in files.iter().enumerate() {
         let last = i + 1 == files.len();
-        let mut segment = segment(path, frame_bytes as u64, header, options, about)?;
+        let mut segment = segment(path, frame_bytes as u64, header, options, info)?;
         if let Some(per_file) = options.frames_per_file {
             if segment.frames > per_file {
                 segment.frames = per_file;
@@ -36,7 +36,7 @@ pub(crate) fn frame_files(
         }
         let shorter = segments.first().is_some_and(|f: &Segment| segment.frames < f.frames);
         if shorter && !last {
-            about.remarks.push(format!(
+            info.notes.push(format!(
                 "{} holds {} frames, fewer than the files before it: frames may be missing",
                 path.display(),
                 segment.frames
@@ -62,7 +62,7 @@ fn segment(
     frame_bytes: u64,
     header: u64,
     options: &ReadOptions,
-    about: &mut About,
+    info: &mut CaptureInfo,
 ) -> Result<Segment> {
     let io = |e| SimError::io("open", path, e);
     let mut file = File::open(path).map_err(io)?;
@@ -78,7 +78,7 @@ fn segment(
     let body = length.checked_sub(header).ok_or_else(too_short)?;
     let trailer = match options.trailer {
         Some(trailer) => trailer,
-        None => trailer(&mut file, body % frame_bytes, path, about)?,
+        None => trailer(&mut file, body % frame_bytes, path, info)?,
     };
     let body = body.checked_sub(trailer).ok_or_else(too_short)?;
     let rest = body % frame_bytes;
@@ -95,15 +95,14 @@ fn segment(
                 ),
             ));
         }
-        about
-            .remarks
+        info.notes
             .push(format!("{}: incomplete last frame of {rest} bytes dropped", path.display()));
     }
     Ok(Segment { path: path.to_owned(), start: header, frames: body / frame_bytes })
 }
 
 /// Length of a known trailer, if `rest` bytes beyond whole frames are one.
-fn trailer(file: &mut File, rest: u64, path: &Path, about: &mut About) -> Result<u64> {
+fn trailer(file: &mut File, rest: u64, path: &Path, info: &mut CaptureInfo) -> Result<u64> {
     let Some(known) = TRAILERS.iter().find(|known| known.len() as u64 == rest) else {
         return Ok(0);
     };
@@ -115,7 +114,7 @@ fn trailer(file: &mut File, rest: u64, path: &Path, about: &mut About) -> Result
         return Ok(0);
     }
     if *known == b"ERROR" {
-        about.remarks.push(format!(
+        info.notes.push(format!(
             "{} ends in ERROR: the camera stopped before the capture was complete",
             path.display()
         ));

@@ -1,6 +1,6 @@
 //! A TIFF whose frames are image file directories.
 
-use crate::capture::about::About;
+use crate::capture::info::CaptureInfo;
 use crate::capture::options::ReadOptions;
 use crate::frames::CountFrames;
 use crate::frames::samples::{Scale, no_count};
@@ -47,7 +47,7 @@ impl TiffPages {
         path: &Path,
         options: &ReadOptions,
         recorded: bool,
-        about: &mut About,
+        info: &mut CaptureInfo,
     ) -> Result<Self> {
         let mut decoder = decoder(path)?;
         let color = decoder.colortype().map_err(|e| fault(path, e))?;
@@ -64,7 +64,7 @@ impl TiffPages {
         while decoder.more_images() {
             if let Err(e) = decoder.next_image() {
                 if options.lenient {
-                    about.remarks.push(format!("truncated after frame {}", frames - 1));
+                    info.notes.push(format!("truncated after frame {}", frames - 1));
                     break;
                 }
                 return Err(fault(path, e));
@@ -74,20 +74,20 @@ impl TiffPages {
         let path = path.to_owned();
         let scale = Scale::Counts;
         let mut pages = Self { decoder, path, size, frames, scale, bits: bits == 1 };
-        pages.drop_unreadable(options, about)?;
-        pages.scale = pages.find_scale(bits, options, recorded, about)?;
+        pages.drop_unreadable(options, info)?;
+        pages.scale = pages.find_scale(bits, options, recorded, info)?;
         Ok(pages)
     }
 
     /// A truncated file shows on its last frame.
-    fn drop_unreadable(&mut self, options: &ReadOptions, about: &mut About) -> Result<()> {
+    fn drop_unreadable(&mut self, options: &ReadOptions, info: &mut CaptureInfo) -> Result<()> {
         loop {
             match self.page(self.frames - 1) {
                 Ok(_) => return Ok(()),
                 Err(e) if !options.lenient || self.frames == 1 => return Err(e),
                 Err(_) => {
                     self.frames -= 1;
-                    about.remarks.push(format!("frame {} is incomplete: dropped", self.frames));
+                    info.notes.push(format!("frame {} is incomplete: dropped", self.frames));
                 }
             }
         }
@@ -98,14 +98,14 @@ impl TiffPages {
         bits: u8,
         options: &ReadOptions,
         recorded: bool,
-        about: &mut About,
+        info: &mut CaptureInfo,
     ) -> Result<Scale> {
         let full = if bits <= 8 { 255u16 } else { 65535 };
-        if let Some(scale) = Scale::asked(options.levels, f32::from(full), about) {
+        if let Some(scale) = Scale::asked(options.levels, f32::from(full), info) {
             return Ok(scale);
         }
         if bits == 1 {
-            about.max_count = Some(1);
+            info.max_count = Some(1);
         }
         if recorded || !matches!(bits, 8 | 16) {
             return Ok(Scale::Counts);
@@ -118,7 +118,7 @@ impl TiffPages {
                 _ => return Ok(Scale::Counts),
             }
         }
-        Ok(Scale::seen(values, full, about))
+        Ok(Scale::seen(values, full, info))
     }
 
     fn page(&mut self, frame: u64) -> Result<DecodingResult> {
@@ -172,7 +172,7 @@ impl CountFrames for TiffPages {
                 return Err(self.wrong_length(frame, bytes.len() * 8));
             }
             for (counts, bytes) in counts.chunks_mut(width).zip(bytes.chunks(row)) {
-                crate::burst::unpack_row(bytes, counts);
+                crate::writer::unpack_row(bytes, counts);
             }
             return Ok(());
         }

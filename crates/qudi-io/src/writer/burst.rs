@@ -1,8 +1,12 @@
 //! One writer for all burst formats, chosen by the name of the output.
 
-use super::bits::pack_row;
-use super::png_folder::PngFolder;
-use crate::writer::{ArrayWriter, TiffStack};
+mod bits;
+mod png_folder;
+
+pub use bits::{pack_row, unpack_row};
+
+use super::{ArrayWriter, TiffStack};
+use png_folder::PngFolder;
 use qudi_core::Size;
 use qudi_core::atomic_file::Overwrite;
 use qudi_core::npy::write_header;
@@ -61,7 +65,7 @@ impl BurstFormat {
         if self == Self::Png {
             return path.join(PngFolder::RECORD);
         }
-        crate::record::beside(path)
+        crate::sidecar::beside(path)
     }
 
     /// NumPy type and shape of one frame.

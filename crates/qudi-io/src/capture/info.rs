@@ -1,4 +1,4 @@
-//! What is known about a capture, and how.
+//! What is known about a capture, and how it is known.
 
 use super::options::{BitOrder, Orientation, PackAxis};
 use qudi_core::sensor::Sensor;
@@ -27,17 +27,18 @@ impl Certainty {
     }
 }
 
-/// Description of an opened capture.
+/// Describes an opened capture: its format, depth, packing, rate and sensor.
 #[derive(Clone, Debug, Serialize)]
-pub struct About {
+pub struct CaptureInfo {
     /// Name of the format.
     pub format: &'static str,
     /// The format in words.
     pub title: &'static str,
     /// How sure that is.
     pub certainty: Certainty,
-    /// What speaks for it.
-    pub evidence: Vec<String>,
+    /// Why the format was chosen.
+    #[serde(rename = "evidence")]
+    pub reasons: Vec<String>,
     /// Largest possible count of a native frame, if the file says.
     pub max_count: Option<u16>,
     /// Whether counts are sums of `max_count` binary frames (or one of them).
@@ -60,7 +61,8 @@ pub struct About {
     /// The camera preset that this format belongs to.
     pub preset: Option<&'static str>,
     /// What the user should know.
-    pub remarks: Vec<String>,
+    #[serde(rename = "remarks")]
+    pub notes: Vec<String>,
 }
 
 /// Eight pixels to the byte.
@@ -72,14 +74,14 @@ pub struct Packing {
     pub order: BitOrder,
 }
 
-impl About {
+impl CaptureInfo {
     /// A description with nothing but names; the rest is filled in by the format.
     pub(crate) fn new(format: &'static str, title: &'static str) -> Self {
         Self {
             format,
             title,
             certainty: Certainty::Certain,
-            evidence: Vec::new(),
+            reasons: Vec::new(),
             max_count: None,
             binary: false,
             packing: None,
@@ -90,7 +92,7 @@ impl About {
             gain: None,
             ppp: None,
             preset: None,
-            remarks: Vec::new(),
+            notes: Vec::new(),
         }
     }
 }

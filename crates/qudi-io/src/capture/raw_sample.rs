@@ -1,6 +1,6 @@
 //! What headerless `.bin` files of 512-pixel cameras look like: name, length, bits.
 
-use super::bit_order::{SURE, bit_order_evidence, standard_errors};
+use super::bit_order::{SURE, bit_order_z_score, standard_errors};
 use super::byte_kind::ByteKind;
 use super::options::BitOrder;
 use super::probe::{Probe, stem};
@@ -17,9 +17,9 @@ pub(crate) const FRAME: usize = 32_768;
 /// Length of every SwissSPAD2 file.
 pub(crate) const SWISSSPAD_FILE: u64 = 8 << 20;
 
-/// Whose habit a file name follows.
+/// Whose convention a file name follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Habit {
+pub(crate) enum Convention {
     /// `RAW00000.bin`, or anything in `acq00000/`.
     Spad512s,
     /// `filename12.bin`, or files of 8 MiB in numbered folders.
@@ -30,8 +30,8 @@ pub(crate) enum Habit {
 
 /// What a `.bin` file, or the first one of a folder, looks like.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct RawLook {
-    pub(crate) habit: Habit,
+pub(crate) struct RawSample {
+    pub(crate) convention: Convention,
     pub(crate) length: u64,
     pub(crate) kind: ByteKind,
     /// `Some` if the picture tells which bit comes first.
@@ -40,14 +40,14 @@ pub(crate) struct RawLook {
     pub(crate) full_array: Option<bool>,
 }
 
-impl RawLook {
+impl RawSample {
     /// Looks at the first `.bin` file of `probe`, if there is one.
     pub(crate) fn at(probe: &Probe) -> Result<Option<Self>> {
-        if let Some(look) = probe.raw_look.get() {
-            return Ok(*look);
+        if let Some(sample) = probe.raw_sample.get() {
+            return Ok(*sample);
         }
-        let look = Self::new(probe)?;
-        Ok(*probe.raw_look.get_or_init(|| look))
+        let sample = Self::new(probe)?;
+        Ok(*probe.raw_sample.get_or_init(|| sample))
     }
 
     fn new(probe: &Probe) -> Result<Option<Self>> {
@@ -63,11 +63,11 @@ impl RawLook {
         bytes.truncate(bytes.len() / FRAME * FRAME);
         let (order, full_array) = pictures(&bytes);
         let kind = ByteKind::of(&bytes[..bytes.len().min(1 << 20)]);
-        Ok(Some(Self { habit: habit(&path), length, kind, order, full_array }))
+        Ok(Some(Self { convention: convention(&path), length, kind, order, full_array }))
     }
 }
 
-fn habit(path: &Path) -> Habit {
+fn convention(path: &Path) -> Convention {
     let name = stem(path);
     let numbered = |text: &str, prefix: &str| {
         text.strip_prefix(prefix).is_some_and(|rest| {
@@ -77,11 +77,11 @@ fn habit(path: &Path) -> Habit {
     };
     let folder = path.parent().map(stem).unwrap_or_default();
     if numbered(&name, "RAW") || name.starts_with("RAW_") || numbered(&folder, "acq") {
-        Habit::Spad512s
+        Convention::Spad512s
     } else if numbered(&name, "filename") || numbered(&folder, "") {
-        Habit::SwissSpad2
+        Convention::SwissSpad2
     } else {
-        Habit::Unknown
+        Convention::Unknown
     }
 }
 
@@ -92,7 +92,7 @@ fn pictures(bytes: &[u8]) -> (Option<BitOrder>, Option<bool>) {
     for frames in bytes.chunks(MOST_FRAMES * FRAME) {
         add_packed(frames, FRAME, BitOrder::Msb, &mut sums);
     }
-    let msb = bit_order_evidence(&sums, size);
+    let msb = bit_order_z_score(&sums, size);
     let order = (msb.abs() > SURE).then_some(if msb > 0.0 { BitOrder::Msb } else { BitOrder::Lsb });
     // Next rows against rows after next, in units of 16 rows by 16 columns.
     let roots: Vec<f32> = sums.iter().map(|&sum| (sum as f32).sqrt()).collect();

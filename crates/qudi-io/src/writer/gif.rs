@@ -6,16 +6,16 @@ use qudi_core::{Result, SimError};
 use std::path::Path;
 
 /// A growing GIF.
-pub struct GifPreview {
+pub struct GifWriter {
     encoder: gif::Encoder<PendingFile>,
     size: (u16, u16),
     full_scale: f32,
     frames: usize,
 }
 
-impl std::fmt::Debug for GifPreview {
+impl std::fmt::Debug for GifWriter {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("GifPreview").field("frames", &self.frames).finish_non_exhaustive()
+        f.debug_struct("GifWriter").field("frames", &self.frames).finish_non_exhaustive()
     }
 }
 
@@ -25,7 +25,7 @@ const DELAY: u16 = 5;
 /// Longer previews would be larger than the data.
 const MAX_FRAMES: usize = 200;
 
-impl GifPreview {
+impl GifWriter {
     /// Starts a preview of frames whose brightest value is `full_scale`.
     ///
     /// # Errors

@@ -1,7 +1,7 @@
 //! The record beside every burst: what is needed to read it, and to make it again.
 
-use crate::burst::BurstFormat;
 use crate::capture::ReadOptions;
+use crate::writer::BurstFormat;
 use qudi_core::Light;
 use qudi_core::Size;
 use qudi_core::sensor::Sensor;
@@ -128,14 +128,14 @@ pub struct Conversion {
 
 /// A record of either kind.
 #[derive(Debug)]
-pub enum Described {
+pub enum Sidecar {
     /// Written by `qudi simulate`.
     Simulated(Box<Record>),
     /// Written by `qudi convert`.
     Converted(Box<Conversion>),
 }
 
-impl Described {
+impl Sidecar {
     /// Reads a record of either kind.
     ///
     /// # Errors

@@ -1,8 +1,8 @@
 //! Frames in [0, 1] on disk: `.npy` of float32, 16-bit or float TIFF, GIF, MP4, or a folder of 16-bit PNG.
 
 use super::array::ArrayWriter;
-use super::gif_preview::GifPreview;
-use super::mp4::Mp4;
+use super::gif::GifWriter;
+use super::mp4::Mp4Writer;
 use super::tiff_stack::{TiffSamples, TiffStack};
 use image::{ImageBuffer, Luma};
 use qudi_core::atomic_file::{Overwrite, PendingFolder};
@@ -27,15 +27,15 @@ impl std::fmt::Debug for TiffWriter {
 
 /// A clip being written, frame by frame.
 #[derive(Debug)]
-pub enum FramesWriter {
+pub enum ClipWriter {
     /// `.npy`, `[frames][height][width]` float32.
     Array(ArrayWriter),
     /// Multi-page TIFF.
     Tiff(TiffWriter),
     /// Animated GIF, the first frames of a long clip.
-    Gif(GifPreview),
+    Gif(GifWriter),
     /// MP4, for looking at.
-    Mp4(Mp4),
+    Mp4Writer(Mp4Writer),
     /// Folder of 16-bit PNG; 65535 is 1.
     Folder {
         /// The folder.
@@ -45,7 +45,7 @@ pub enum FramesWriter {
     },
 }
 
-impl FramesWriter {
+impl ClipWriter {
     /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
     /// extension. `tiff` says what the samples of a `.tif` are.
     ///
@@ -64,8 +64,8 @@ impl FramesWriter {
                 let stack = TiffStack::create(path, size, overwrite)?;
                 Ok(Self::Tiff(TiffWriter { stack, samples: tiff }))
             }
-            Some("gif") => GifPreview::create(path, overwrite, size, u16::MAX).map(Self::Gif),
-            Some("mp4") => Mp4::create(path, size, overwrite).map(Self::Mp4),
+            Some("gif") => GifWriter::create(path, overwrite, size, u16::MAX).map(Self::Gif),
+            Some("mp4") => Mp4Writer::create(path, size, overwrite).map(Self::Mp4Writer),
             None => {
                 let folder = PendingFolder::create(path, overwrite, FIRST)?;
                 Ok(Self::Folder { folder, frames: 0 })
@@ -92,7 +92,7 @@ impl FramesWriter {
                 stack.push_f32(&frame.data)
             }
             Self::Gif(gif) => gif.push(&sixteen_bits(frame)),
-            Self::Mp4(film) => film.push(frame),
+            Self::Mp4Writer(film) => film.push(frame),
             Self::Folder { folder, frames } => {
                 let file = folder.file(&format!("frame_{frames:06}.png"));
                 *frames += 1;
@@ -111,7 +111,7 @@ impl FramesWriter {
             Self::Array(array) => array.finish(),
             Self::Tiff(writer) => writer.stack.finish(),
             Self::Gif(gif) => gif.finish(),
-            Self::Mp4(film) => film.finish(),
+            Self::Mp4Writer(film) => film.finish(),
             Self::Folder { folder, .. } => folder.finish(),
         }
     }
