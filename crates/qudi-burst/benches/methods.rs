@@ -20,16 +20,8 @@ fn methods(c: &mut Criterion) {
     let counts: Vec<Vec<u16>> = (0..11)
         .map(|t| camera.expose(t, &[&scene.render(t as f64)]).expect("an exposure"))
         .collect();
-    let gain = camera.gain();
-    let acquisition = Acquisition {
-        seed: 1,
-        first_frame: 0,
-        ppp: light.ppp,
-        exposure: light.exposure,
-        sensor,
-        gain,
-        dark: None,
-    };
+    let acquisition =
+        Acquisition::new(sensor, light.ppp, light.exposure).expect("a gain").with_seed(1);
     let burst = BurstView { size: SIZE, frames: &counts };
     let image = scene.render(0.0);
 

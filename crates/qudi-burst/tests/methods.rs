@@ -23,8 +23,7 @@ fn methods() -> Vec<Box<dyn Restorer>> {
 }
 
 fn acquisition(sensor: Sensor, ppp: f64) -> Acquisition {
-    let gain = sensor.gain_at(ppp).unwrap();
-    Acquisition { seed: 0, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+    Acquisition::new(sensor, ppp, 0.45).unwrap()
 }
 
 /// A window of a scene in motion, and its truth.

@@ -92,19 +92,11 @@ mod tests {
     const SIZE: Size = Size { height: 64, width: 80 };
 
     /// What is told for 11 frames of a scene whose mean gets `ppp` photons, and every `hot`-th pixel of which counts the most.
-    fn told(scene: &Frame, sensor: &str, ppp: f64, hot: usize) -> f64 {
+    fn estimated(scene: &Frame, sensor: &str, ppp: f64, hot: usize) -> f64 {
         let sensor = Sensor::load(sensor).unwrap();
         let light = Light { ppp, exposure: scene.mean() };
         let mut camera = Camera::new(&sensor, SIZE, light, 5).unwrap();
-        let acquisition = Acquisition {
-            seed: 0,
-            first_frame: 0,
-            ppp,
-            exposure: f64::NAN,
-            gain: camera.gain(),
-            dark: None,
-            sensor,
-        };
+        let acquisition = Acquisition::new(sensor, ppp, f64::NAN).unwrap();
         fitting_exposure(SIZE, 30, &acquisition, |t| {
             let mut counts = camera.expose(t, &[scene])?;
             counts
@@ -124,10 +116,10 @@ mod tests {
     #[test]
     fn scenes_that_fit_are_exposed_as_usual() {
         let even = Frame::from_fn(SIZE, |x, _| 0.5 + 0.004 * x as f32);
-        assert_eq!(told(&even, "qudi-paper", 3.25, usize::MAX), USUAL_EXPOSURE);
-        assert_eq!(told(&even, "spad512s", 0.3, usize::MAX), USUAL_EXPOSURE);
+        assert_eq!(estimated(&even, "qudi-paper", 3.25, usize::MAX), USUAL_EXPOSURE);
+        assert_eq!(estimated(&even, "spad512s", 0.3, usize::MAX), USUAL_EXPOSURE);
         // Hot pixels are not the scene's.
-        assert_eq!(told(&even, "spad512s", 0.05, 131), USUAL_EXPOSURE);
+        assert_eq!(estimated(&even, "spad512s", 0.05, 131), USUAL_EXPOSURE);
     }
 
     #[test]
@@ -136,7 +128,7 @@ mod tests {
             // The scene's mean is 0.467 where its brightest is 1; what is told does not depend on the scale, and
             // is 0.35 but for the noise of the brightest square.
             for brightest in [1.0, 0.2] {
-                let exposure = told(&lamp(brightest), sensor, ppp, usize::MAX);
+                let exposure = estimated(&lamp(brightest), sensor, ppp, usize::MAX);
                 assert!((0.29..0.37).contains(&exposure), "{sensor} {ppp} {brightest}: {exposure}");
             }
         }

@@ -57,6 +57,28 @@ pub trait Restorer {
 }
 
 impl Acquisition {
+    /// The acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons per pixel
+    /// and frame, where the image has the mean level `exposure`; seed 0, from the first frame on, no dark map.
+    ///
+    /// # Errors
+    /// [`SimError`](crate::SimError) if the sensor has no gain at this light.
+    pub fn new(sensor: Sensor, ppp: f64, exposure: f64) -> Result<Self> {
+        let gain = sensor.gain_at(ppp)?;
+        Ok(Self { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None })
+    }
+
+    /// The same acquisition with another seed of random draws.
+    #[must_use]
+    pub fn with_seed(self, seed: u64) -> Self {
+        Self { seed, ..self }
+    }
+
+    /// The same acquisition for a window that begins with frame `first_frame` of the capture.
+    #[must_use]
+    pub fn with_first_frame(self, first_frame: u64) -> Self {
+        Self { first_frame, ..self }
+    }
+
     /// Incident photons per unit of image value.
     pub fn photons_per_unit(&self) -> f64 {
         self.ppp / self.exposure

@@ -12,8 +12,7 @@ const SIZE: Size = Size { height: 128, width: 256 };
 fn acquisition(sensor: &str, ppp: f64, frames_summed: u32) -> Acquisition {
     let mut sensor = Sensor::load(sensor).unwrap();
     sensor.frames_summed = frames_summed;
-    let gain = sensor.gain_at(ppp).unwrap();
-    Acquisition { seed: 1, first_frame: 0, ppp, exposure: 0.45, sensor, gain, dark: None }
+    Acquisition::new(sensor, ppp, 0.45).unwrap().with_seed(1)
 }
 
 /// Counts of a flat image of value 0.5 by level, measured at a diffusion time.

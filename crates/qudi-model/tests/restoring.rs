@@ -12,8 +12,8 @@ use qudi_model::restorer::{QudiRestorer, SampleOptions};
 
 fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
     let sensor = Sensor::load("qudi-paper").unwrap();
-    let gain = sensor.gain_at(3.25).unwrap();
-    Acquisition { seed, first_frame, ppp: 3.25, exposure: 0.45, sensor, gain, dark: None }
+    let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap();
+    acquisition.with_seed(seed).with_first_frame(first_frame)
 }
 
 /// A tiny network whose last layers are not zero, so that everything matters.

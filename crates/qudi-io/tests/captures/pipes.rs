@@ -73,15 +73,8 @@ impl RestoreSink for Collected {
 }
 
 fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, SimError> {
-    let acquisition = Acquisition {
-        seed: 1,
-        first_frame: 0,
-        ppp: 1.0,
-        exposure: 0.45,
-        sensor: Sensor::load("ideal").unwrap(),
-        gain: 1.0,
-        dark: None,
-    };
+    let acquisition =
+        Acquisition::new(Sensor::load("ideal").unwrap(), 1.0, 0.45).unwrap().with_seed(1);
     let windows = Windows::new(capture.frames(), 11, 3)?;
     let mut sink = Collected::default();
     let mut on = |_: u64, _: Option<u64>| ControlFlow::Continue(());
