@@ -14,11 +14,11 @@ mkdir -p "$out"
 { sed -n '/^\[network\]/,/^$/p' "$configs/tiny.toml"; sed -n '/^\[data\]/,$p' "$configs/small.toml"; } >"$out/recipe.toml"
 
 for part in "$@"; do
-    without="[]"
-    [ "$part" = whole ] || without="[\"$part\"]"
+    ablate="[]"
+    [ "$part" = whole ] || ablate="[\"$part\"]"
     "$qudi" train "$out/recipe.toml" -o "$out/$part" --pack "$pack" --device cpu --json \
-        --set "network.without=$without" --set train.steps="$steps" --set train.rate=4e-3 \
-        --set train.parts='{ bursts = 300, kept = 5, frames = 5, side = 96 }' --set train.batch=2 --set train.loss="$loss" \
+        --set "network.ablate=$ablate" --set train.steps="$steps" --set train.lr=4e-3 \
+        --set train.crops='{ bursts = 300, cached_frames = 5, frames = 5, side = 96 }' --set train.batch=2 --set train.loss="$loss" \
         --set validation.every="$steps" --set validation.steps=10 >"$out/$part.json"
     printf '%s' "without $part:"
     sed -n 's/.*"ppp": \([0-9.]*\).*/ \1 PPP/p; s/.*"psnr_a": \([0-9.]*\).*/ \1 dB/p' "$out/$part.json" | tr '\n' ' '

@@ -21,9 +21,9 @@ pub struct NetworkConfig {
     pub fusion: FusionConfig,
     /// U-Net.
     pub unet: UNetConfig,
-    /// What is left out, to measure what it is worth.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub without: Vec<Part>,
+    /// Parts of the method that are left out, to measure what they are worth.
+    #[serde(default, alias = "without", skip_serializing_if = "Vec::is_empty")]
+    pub ablate: Vec<Part>,
 }
 
 /// A part of the method that can be left out.
@@ -193,7 +193,7 @@ impl NetworkConfig {
 
     /// Whether a part is left out.
     pub fn lacks(&self, part: Part) -> bool {
-        self.without.contains(&part)
+        self.ablate.contains(&part)
     }
 
     /// Height and width of the frames are multiples of this.

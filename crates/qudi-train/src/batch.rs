@@ -1,8 +1,8 @@
 //! Samples as planes, noise and times, ready to go to a device.
 
-use super::bursts::{Bursts, Guided};
+use super::burst_sampler::{BurstSampler, ConditionedBurst};
 use super::recipe::Recipe;
-use crate::objective::{Example, training_time};
+use crate::loss::{Example, training_timestep};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
@@ -26,7 +26,7 @@ pub struct Batch {
     noise: Vec<f32>,
     numbers: Vec<f32>,
     acquisitions: Vec<Acquisition>,
-    times: Vec<usize>,
+    timesteps: Vec<usize>,
 }
 
 impl Batch {
@@ -34,7 +34,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`qudi_core::SimError`] if the data cannot be read.
-    pub fn draw(recipe: &Recipe, bursts: &mut Bursts, number: u64) -> Result<Self> {
+    pub fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Self> {
         let count = recipe.train.batch;
         let (frames, side) = recipe.sample_size();
         let size = Size { height: side, width: side };
@@ -48,10 +48,10 @@ impl Batch {
             noise: Vec::new(),
             numbers: Vec::new(),
             acquisitions: Vec::new(),
-            times: Vec::new(),
+            timesteps: Vec::new(),
         };
         for sample in (number * count as u64..).take(count) {
-            let Guided { sample: drawn, guide, .. } = bursts.sample(sample)?;
+            let ConditionedBurst { sample: drawn, guide, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
             batch.u.extend(Planes::of(view, &drawn.acquisition).u);
             batch.guide.extend(guide);
@@ -61,8 +61,8 @@ impl Batch {
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
-            let time = training_time(random.random(), random.random(), recipe.train.start);
-            batch.times.push(time);
+            let time = training_timestep(random.random(), random.random(), recipe.train.noise_start_fraction);
+            batch.timesteps.push(time);
             batch.acquisitions.push(drawn.acquisition);
         }
         Ok(batch)
@@ -97,7 +97,7 @@ impl Batch {
             truth: to_tensor(self.truth.clone(), self.size, &device),
             acquisitions: &self.acquisitions,
             noise: to_tensor(self.noise.clone(), self.size, &device),
-            times: &self.times,
+            timesteps: &self.timesteps,
         }
     }
 }

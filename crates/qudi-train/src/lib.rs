@@ -1,6 +1,6 @@
 //! Learning the network from photons: data, loop, state, validation.
 //!
-//! A [`Recipe`] says everything that decides the result. A [`Feed`] draws batches on threads of its own; the
+//! A [`Recipe`] says everything that decides the result. A [`Prefetcher`] draws batches on threads of its own; the
 //! [`Trainer`] learns from them, step by step; a [`Run`] does so in a folder that a killed run goes on from.
 
 #![warn(missing_docs)]
@@ -9,15 +9,15 @@
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 
-mod adam;
+mod optimizer;
 mod batch;
-mod bursts;
+mod burst_sampler;
 pub mod dataset;
-mod draw;
-mod feed;
-mod kept;
+mod draw_bursts;
+mod prefetch;
+mod burst_cache;
 mod learning_rate;
-pub mod objective;
+pub mod loss;
 pub mod perceptual;
 mod recipe;
 mod run;
@@ -25,16 +25,16 @@ pub mod selftest;
 mod state;
 mod trainer;
 mod validate;
-mod values;
+mod parameters;
 
-pub use adam::Adam;
+pub use optimizer::Adam;
 pub use batch::Batch;
-pub use bursts::Bursts;
-pub use draw::draw_bursts;
-pub use feed::Feed;
+pub use burst_sampler::BurstSampler;
+pub use draw_bursts::draw_bursts;
+pub use prefetch::Prefetcher;
 pub use learning_rate::learning_rate;
-pub use recipe::{LossConfig, PartsConfig, Recipe, TrainConfig, ValidationConfig};
+pub use recipe::{LossConfig, CropsConfig, Recipe, TrainConfig, ValidationConfig};
 pub use run::{Event, Files, From, METRICS, RECIPE, Run, WEIGHTS};
-pub use trainer::{Losses, StepReport, Trainer};
+pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};
-pub use values::{gradients, values, with_values};
+pub use parameters::{gradients, parameters, with_parameters};

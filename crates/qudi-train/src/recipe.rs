@@ -36,16 +36,18 @@ pub struct TrainConfig {
     pub steps: u64,
     /// Samples that go through the network at once.
     pub batch: usize,
-    /// Parts of bursts to learn from; whole ones if there are none.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub parts: Option<PartsConfig>,
+    /// The crops of cached bursts that are the samples; without it, every sample is a new burst.
+    #[serde(default, alias = "parts", skip_serializing_if = "Option::is_none")]
+    pub crops: Option<CropsConfig>,
     /// Batches whose gradients make one step.
     pub accumulate: usize,
-    /// Highest learning rate.
-    pub rate: f64,
-    /// Last learning rate.
-    pub floor: f64,
-    /// Steps until the highest rate.
+    /// The learning rate after the warm-up.
+    #[serde(alias = "rate")]
+    pub lr: f64,
+    /// The learning rate of the last step.
+    #[serde(alias = "floor")]
+    pub min_lr: f64,
+    /// Number of steps of linear warm-up.
     pub warmup: u64,
     /// Largest norm of a step's gradient; longer ones are shortened.
     pub clip: f64,
@@ -54,8 +56,9 @@ pub struct TrainConfig {
     pub precision: ComputePrecision,
     /// Share of the average of weights that a step keeps.
     pub ema: f64,
-    /// Share of the samples at the time where sampling begins: where nothing but the photons helps.
-    pub start: f64,
+    /// Fraction of the samples at the noisiest timestep, where sampling begins.
+    #[serde(alias = "start")]
+    pub noise_start_fraction: f64,
     /// Steps between checkpoints.
     pub checkpoint: u64,
     /// The loss.
@@ -67,11 +70,12 @@ pub struct TrainConfig {
 /// What samples are cut from: guides of whole bursts, which take long to compute and see no borders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct PartsConfig {
+pub struct CropsConfig {
     /// Bursts that are drawn in all and kept in memory; samples come back to them.
     pub bursts: u64,
-    /// Consecutive frames of each that are kept; the others only help to restore these.
-    pub kept: usize,
+    /// Consecutive frames of each burst that are kept; the others only help to restore these.
+    #[serde(alias = "kept")]
+    pub cached_frames: usize,
     /// Consecutive frames of a sample.
     pub frames: usize,
     /// Side of a sample in pixels.
@@ -141,8 +145,9 @@ impl Recipe {
         let fault = |what: String| SimError::request(what, place, help);
         let mut document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
+        modernize(&mut document, "");
         for (key, value) in changes {
-            set(&mut document, key, value)?;
+            set(&mut document, &modern_key(key), value)?;
         }
         let recipe: Self =
             document.try_into().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
@@ -157,7 +162,7 @@ impl Recipe {
     /// Frames of a sample, and the side of one.
     pub fn sample_size(&self) -> (usize, usize) {
         let whole = (self.data.frames, self.data.crop);
-        self.train.parts.map_or(whole, |parts| (parts.frames, parts.side))
+        self.train.crops.map_or(whole, |crops| (crops.frames, crops.side))
     }
 
     /// Whether only the pre-denoiser learns: frame by frame.
@@ -177,30 +182,30 @@ impl Recipe {
         let fewest = if self.learns_frames() { 1 } else { 3 };
         let rules = [
             (
-                if train.parts.is_some() { "train.parts.side" } else { "data.crop" },
+                if train.crops.is_some() { "train.crops.side" } else { "data.crop" },
                 side.is_multiple_of(multiple) && side > 0,
                 "must be a multiple of the network's coarsest cell",
             ),
             (
-                "train.parts",
+                "train.crops",
                 (fewest..=data.frames).contains(&frames)
-                    && train.parts.is_none_or(|parts| (frames..=data.frames).contains(&parts.kept))
+                    && train.crops.is_none_or(|crops| (frames..=data.frames).contains(&crops.cached_frames))
                     && side <= data.crop
-                    && train.parts.is_none_or(|parts| (1..=1 << 20).contains(&parts.bursts)),
+                    && train.crops.is_none_or(|crops| (1..=1 << 20).contains(&crops.bursts)),
                 "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
             ),
             ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
             ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),
             ("train.accumulate", (1..=4096).contains(&train.accumulate), "must be from 1 to 4096"),
-            ("train.rate", train.rate > 0.0 && train.rate <= 1.0, "must be above 0, at most 1"),
+            ("train.lr", train.lr > 0.0 && train.lr <= 1.0, "must be above 0, at most 1"),
             (
-                "train.floor",
-                train.floor >= 0.0 && train.floor <= train.rate,
-                "must be from 0 to the rate",
+                "train.min_lr",
+                train.min_lr >= 0.0 && train.min_lr <= train.lr,
+                "must be from 0 to train.lr",
             ),
             ("train.clip", train.clip > 0.0, "must be above 0"),
             ("train.ema", share(train.ema), "must be from 0 to below 1"),
-            ("train.start", (0.0..=1.0).contains(&train.start), "must be from 0 to 1"),
+            ("train.noise_start_fraction", (0.0..=1.0).contains(&train.noise_start_fraction), "must be from 0 to 1"),
             ("train.checkpoint", train.checkpoint > 0, "must be at least 1"),
             (
                 "train.loss",
@@ -260,9 +265,9 @@ impl Recipe {
                 from,
                 weight: 1.0,
                 stride: 1,
-                shrink: 1.0,
+                max_downscale: 1.0,
                 speed: 0.0,
-                rest: 0.0,
+                static_fraction: 0.0,
             }],
         })
     }
@@ -293,7 +298,57 @@ fn read(name: &str) -> Result<String> {
     std::fs::read_to_string(path).map_err(failed)
 }
 
-/// Sets a key below tables; numbers name the parts of a list, as in `data.source.0.weight`.
+/// Former names of keys and their names now; both are read (`#[serde(alias)]` on the fields).
+const RENAMED: &[(&str, &str)] = &[
+    ("network.without", "network.ablate"),
+    ("data.source.rest", "data.source.static_fraction"),
+    ("data.source.shrink", "data.source.max_downscale"),
+    ("train.rate", "train.lr"),
+    ("train.floor", "train.min_lr"),
+    ("train.start", "train.noise_start_fraction"),
+    ("train.parts", "train.crops"),
+    ("train.crops.kept", "train.crops.cached_frames"),
+];
+
+/// Gives the keys of a table, and of the tables in it, their names of now. `path` is the table's place in the
+/// recipe, without the numbers of list elements.
+fn modernize(table: &mut toml::Table, path: &str) {
+    for (old, new) in RENAMED {
+        let names = old.rsplit_once('.').zip(new.rsplit_once('.'));
+        if let Some(((place, old), (_, new))) = names
+            && place == path
+            && !table.contains_key(new)
+            && let Some(value) = table.remove(old)
+        {
+            table.insert(new.to_owned(), value);
+        }
+    }
+    for (key, value) in table.iter_mut() {
+        let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+        let tables = match value {
+            toml::Value::Array(list) => list.as_mut_slice(),
+            value => std::slice::from_mut(value),
+        };
+        tables.iter_mut().filter_map(toml::Value::as_table_mut).for_each(|t| modernize(t, &path));
+    }
+}
+
+/// A dotted key by its name of now: `train.rate` is `train.lr`.
+fn modern_key(key: &str) -> String {
+    let mut modern: Vec<&str> = key.split('.').collect();
+    for end in 1..=modern.len() {
+        let is_name = |part: &&str| part.parse::<usize>().is_err();
+        let path: Vec<_> = modern[..end].iter().copied().filter(is_name).collect();
+        let path = path.join(".");
+        let renamed = RENAMED.iter().find(|(old, _)| *old == path);
+        if let Some((_, name)) = renamed.and_then(|(_, new)| new.rsplit_once('.')) {
+            modern[end - 1] = name;
+        }
+    }
+    modern.join(".")
+}
+
+/// Sets a key below tables; numbers name the elements of a list, as in `data.source.0.weight`.
 fn set(document: &mut toml::Table, key: &str, text: &str) -> Result<()> {
     let unknown = || {
         let help = "name keys of the recipe, as in train.steps or data.source.0.weight";

@@ -1,7 +1,7 @@
 //! A training run in a folder: recipe, metrics, weights, state, pictures.
 
-use super::bursts::Bursts;
-use super::feed::Feed;
+use super::burst_sampler::BurstSampler;
+use super::prefetch::Prefetcher;
 use super::recipe::Recipe;
 use super::state;
 use super::trainer::{StepReport, Trainer};
@@ -45,7 +45,7 @@ pub struct Run {
     folder: PathBuf,
     recipe: Recipe,
     trainer: Trainer,
-    bursts: Bursts,
+    bursts: BurstSampler,
     validator: Option<Validator>,
     device: Device,
     commit: Option<String>,
@@ -57,7 +57,7 @@ pub struct Files {
     /// Decoded clips and stills, for recipes that name any.
     pub pack: Option<Pack>,
     /// A folder, which exists, for bursts with their guides: those there are not drawn again. Only for recipes with
-    /// `train.parts`.
+    /// `train.crops`.
     pub bursts: Option<PathBuf>,
 }
 
@@ -101,9 +101,9 @@ impl Run {
         };
         let dataset = Dataset::new(&recipe.data, files.pack)?;
         let drafts = Draft::all(&trainer.averaged(), &recipe.network, TILE, &devices[0]);
-        let mut bursts = Bursts::new(recipe, dataset, drafts);
+        let mut bursts = BurstSampler::new(recipe, dataset, drafts);
         if let Some(folder) = &files.bursts {
-            bursts = bursts.keep_in(folder, recipe)?;
+            bursts = bursts.with_cache(folder, recipe)?;
         }
         let run = Self {
             folder: folder.to_owned(),
@@ -133,7 +133,7 @@ impl Run {
     /// to go on; if not, the state is written and the run stops.
     ///
     /// # Errors
-    /// [`SimError`] if data, device or disk fail, or the loss is no number any more; [`SimError::Interrupted`] if told
+    /// [`SimError`] if data, device or disk fail, or the loss is not finite; [`SimError::Interrupted`] if told
     /// to stop.
     pub fn learn(
         &mut self,
@@ -141,10 +141,10 @@ impl Run {
         on: &mut dyn FnMut(Event<'_>) -> ControlFlow<()>,
     ) -> Result<()> {
         let train = self.recipe.train.clone();
-        let mut feed = Feed::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
+        let mut prefetcher = Prefetcher::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
         let mut metrics = self.metrics()?;
         while self.trainer.step_number() < train.steps {
-            let report = self.trainer.step(&mut feed)?;
+            let report = self.trainer.step(&mut prefetcher)?;
             self.log(&mut metrics, &Line::Step(&report))?;
             let step = report.step;
             let mut go_on = on(Event::Step(&report));

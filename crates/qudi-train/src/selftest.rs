@@ -1,6 +1,6 @@
 //! What a device must get right: every operation of the network with its gradients, and a small network whole.
 
-use crate::objective::reconstruction;
+use crate::loss::reconstruction;
 use burn::tensor::activation::softmax;
 use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor, TensorData};

@@ -1,13 +1,13 @@
 //! The state that a run goes on from: a folder of weights, their average, the optimizer's moments and counters, which
 //! is replaced whole or not at all.
 
-use super::adam::Adam;
+use super::optimizer::Adam;
 use super::recipe::Recipe;
 use super::trainer::Trainer;
-use super::values::with_values;
+use super::parameters::with_parameters;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::{Result, SimError};
-use qudi_model::network::parameters;
+use qudi_model::network::parameters as parameter_shapes;
 use qudi_model::tensor::read;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -48,9 +48,9 @@ impl Trainer {
             std::fs::remove_dir_all(&new).map_err(failed(&new))?;
         }
         std::fs::create_dir(&new).map_err(failed(&new))?;
-        let weights = super::values::values(&self.network);
+        let weights = super::parameters::parameters(&self.network);
         let lists = [&weights, &self.average, &self.adam.mean, &self.adam.square];
-        let names = parameters(&self.network);
+        let names = parameter_shapes(&self.network);
         let mut tensors = Vec::new();
         for (prefix, list) in LISTS.iter().zip(lists) {
             for ((name, _), values) in names.iter().zip(list) {
@@ -125,7 +125,7 @@ impl Trainer {
         let bytes = open(TENSORS)?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
         let mut trainer = Self::new(recipe, None, devices, backbones)?;
-        let names = parameters(&trainer.network);
+        let names = parameter_shapes(&trainer.network);
         let device = trainer.average[0].device();
         let list = |prefix: &str| {
             let values = names.iter().map(|(name, shape)| {
@@ -142,7 +142,7 @@ impl Trainer {
             values.collect::<Result<Vec<_>>>()
         };
         let [weights, average, mean, square] = LISTS.map(list);
-        trainer.network = with_values(trainer.network, weights?);
+        trainer.network = with_parameters(trainer.network, weights?);
         trainer.average = average?;
         trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
         Ok(trainer)

@@ -1,12 +1,12 @@
 //! The network while it learns: weights, their average, the optimizer's state.
 
-use super::adam::Adam;
+use super::optimizer::Adam;
 use super::batch::Batch;
-use super::feed::Feed;
+use super::prefetch::Prefetcher;
 use super::learning_rate::learning_rate;
 use super::recipe::{LossConfig, Recipe};
-use super::values::{gradients, values, with_values};
-use crate::objective::{FirstPass, LossWeights, Switches, terms};
+use super::parameters::{gradients, parameters, with_parameters};
+use crate::loss::{SelfConditioning, LossWeights, LoopOptions, loss_terms};
 use crate::perceptual::{Perceptual, PerceptualKind};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -23,7 +23,7 @@ use std::time::Instant;
 
 /// Means of the loss's terms over a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Losses {
+pub struct LossValues {
     /// The weighted sum.
     pub total: f64,
     /// Of the prediction.
@@ -35,7 +35,8 @@ pub struct Losses {
     /// Of the flows.
     pub flow: f64,
     /// Of the errors that the pre-denoiser tells.
-    pub error: f64,
+    #[serde(rename = "error")]
+    pub uncertainty: f64,
 }
 
 /// What a step did.
@@ -44,10 +45,11 @@ pub struct StepReport {
     /// Steps taken, this one included.
     pub step: u64,
     /// Learning rate.
-    pub rate: f64,
+    #[serde(rename = "rate")]
+    pub lr: f64,
     /// The loss.
     #[serde(flatten)]
-    pub loss: Losses,
+    pub loss: LossValues,
     /// Norm of the gradient before it was shortened.
     pub norm: f64,
     /// Seconds that the step waited for data.
@@ -75,7 +77,7 @@ pub struct Trainer {
 /// One batch's gradients and losses, and the seconds that they took.
 struct Pass {
     gradients: Vec<Tensor<1>>,
-    loss: Losses,
+    loss: LossValues,
     forward_s: f64,
     backward_s: f64,
 }
@@ -102,9 +104,9 @@ impl Trainer {
         }
         let mut learner = recipe.network.init(recipe.train.seed, main);
         if let Some(network) = network {
-            learner = with_values(learner, values(&network));
+            learner = with_parameters(learner, parameters(&network));
         }
-        let start = values(&learner);
+        let start = parameters(&learner);
         let term = recipe.train.loss.term;
         let (_, side) = recipe.sample_size();
         let size = Size { height: side, width: side };
@@ -143,22 +145,22 @@ impl Trainer {
         let network = self.network.valid();
         // Drafts do not learn, and an average of equal numbers is not always that number.
         let drafts = network.drafts().to_vec();
-        with_values(network, self.average.clone()).with_drafts(drafts)
+        with_parameters(network, self.average.clone()).with_drafts(drafts)
     }
 
     /// Takes one step.
     ///
     /// # Errors
-    /// [`SimError`] if the data or the device fails, or the loss is no number any more.
-    pub fn step(&mut self, feed: &mut Feed) -> Result<StepReport> {
+    /// [`SimError`] if the data or the device fails, or the loss is not finite.
+    pub fn step(&mut self, prefetcher: &mut Prefetcher) -> Result<StepReport> {
         let start = Instant::now();
         let count = self.recipe.train.accumulate;
-        let batches = (0..count).map(|_| feed.next_batch()).collect::<Result<Vec<_>>>()?;
+        let batches = (0..count).map(|_| prefetcher.next_batch()).collect::<Result<Vec<_>>>()?;
         let data_s = start.elapsed().as_secs_f64();
         let passes = self.passes(&batches)?;
         let start = Instant::now();
         let mut sum: Option<Vec<Tensor<1>>> = None;
-        let mut loss = Losses::default();
+        let mut loss = LossValues::default();
         let (mut forward_s, mut backward_s) = (0.0, 0.0);
         // Summed in the order of the batches: which device had them makes no difference.
         for pass in passes {
@@ -172,21 +174,21 @@ impl Trainer {
         }
         let gradients = sum.expect("at least one batch");
         let norm = norm(&gradients)? / count as f64;
-        self.check("the gradient", norm)?;
+        self.check("gradient norm", norm)?;
         let train = &self.recipe.train;
         let taken = self.step_number();
-        let rate = learning_rate(train, taken);
+        let lr = learning_rate(train, taken);
         let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
-        let moved = self.adam.step(values(&self.network), gradients, scale, rate);
+        let moved = self.adam.step(parameters(&self.network), gradients, scale, lr);
         // An average over few steps at first, or the initial weights would stay in it for long.
         let keep = train.ema.min((1 + taken) as f64 / (10 + taken) as f64);
         let average = std::mem::take(&mut self.average).into_iter().zip(&moved);
         self.average = average.map(|(a, b)| a * keep + b.clone() * (1.0 - keep)).collect();
-        self.network = with_values(self.network.clone(), moved);
+        self.network = with_parameters(self.network.clone(), moved);
         let optimizer_s = start.elapsed().as_secs_f64();
         Ok(StepReport {
             step: self.step_number(),
-            rate,
+            lr,
             loss,
             norm,
             data_s,
@@ -202,7 +204,7 @@ impl Trainer {
         if self.devices.len() == 1 {
             return batches.iter().map(|batch| self.pass(&self.network, batch, 0)).collect();
         }
-        let weights = values(&self.network);
+        let weights = parameters(&self.network);
         let lists = std::thread::scope(|scope| {
             let work = |number: usize| {
                 let (weights, device) = (weights.clone(), &self.devices[number]);
@@ -210,7 +212,7 @@ impl Trainer {
                 move || -> Result<Vec<(usize, Pass)>> {
                     let inner = device.clone().inner();
                     let weights = weights.into_iter().map(|w| w.to_device(&inner)).collect();
-                    let network = with_values(self.recipe.network.shell(device), weights);
+                    let network = with_parameters(self.recipe.network.shell(device), weights);
                     mine.map(|(at, batch)| Ok((at, self.pass(&network, batch, number)?))).collect()
                 }
             };
@@ -238,34 +240,34 @@ impl Trainer {
         let measured = batch.measured(device);
         let mut random = ChaCha8Rng::seed_from_u64(self.recipe.train.seed);
         random.set_stream(batch.number);
-        let (weights, switches) = self.options();
+        let (weights, loop_options) = self.options();
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
-        let first_pass = if from_nothing || switches == Switches::NONE {
-            FirstPass::No
+        let self_conditioning = if from_nothing || loop_options == LoopOptions::NONE {
+            SelfConditioning::Off
         } else {
-            FirstPass::Yes(random.next_u64())
+            SelfConditioning::On(random.next_u64())
         };
         let example = batch.example(&measured);
         let perceptual = self.perceptual.get(number);
         let terms = with_precision(self.recipe.train.precision, || {
-            terms(network, &example, first_pass, weights, switches, perceptual)
+            loss_terms(network, &example, self_conditioning, weights, loop_options, perceptual)
         })?;
         let number_of = |term: &Tensor<1>| Ok(f64::from(read(term.clone())?[0]));
         let optional = |term: &Option<Tensor<1>>| term.as_ref().map_or(Ok(0.0), number_of);
-        let loss = Losses {
+        let loss = LossValues {
             total: number_of(&terms.total)?,
             prediction: number_of(&terms.prediction)?,
             pre: number_of(&terms.pre)?,
             perceptual: optional(&terms.perceptual)?,
             flow: optional(&terms.flow)?,
-            error: optional(&terms.error)?,
+            uncertainty: optional(&terms.uncertainty)?,
         };
-        self.check("the loss of the prediction", loss.prediction)?;
-        self.check("the loss of the pre-denoised frames", loss.pre)?;
-        self.check("the perceptual loss", loss.perceptual)?;
-        self.check("the misfit of the flows", loss.flow)?;
-        self.check("the errors told", loss.error)?;
+        self.check("prediction loss", loss.prediction)?;
+        self.check("pre-denoiser loss", loss.pre)?;
+        self.check("perceptual loss", loss.perceptual)?;
+        self.check("flow loss", loss.flow)?;
+        self.check("uncertainty loss", loss.uncertainty)?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let gradients = gradients(network, &terms.total.backward());
@@ -273,14 +275,14 @@ impl Trainer {
         Ok(Pass { gradients, loss, forward_s, backward_s })
     }
 
-    fn options(&self) -> (LossWeights, Switches) {
+    fn options(&self) -> (LossWeights, LoopOptions) {
         let LossConfig { prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
         let network = &self.recipe.network;
-        let switches = Switches {
-            physics: !network.lacks(Part::Physics),
+        let loop_options = LoopOptions {
+            forward_model: !network.lacks(Part::Physics),
             self_conditioning: !network.lacks(Part::SelfConditioning),
         };
-        (LossWeights { prediction, pre, perceptual, flow }, switches)
+        (LossWeights { prediction, pre, perceptual, flow }, loop_options)
     }
 
     fn check(&self, what: &str, value: f64) -> Result<()> {
@@ -289,23 +291,23 @@ impl Trainer {
         }
         Err(SimError::request(
             format!(
-                "{what} is {value} in step {}: training stopped, the last checkpoint is good",
+                "{what} is {value} at step {}: training stopped, the last checkpoint is good",
                 self.step_number() + 1
             ),
             what,
-            "lower train.rate or train.clip and go on from the checkpoint with --resume",
+            "lower train.lr or train.clip and go on from the checkpoint with --resume",
         ))
     }
 }
 
-impl Losses {
+impl LossValues {
     fn add(&mut self, other: Self, share: f64) {
         self.total += share * other.total;
         self.prediction += share * other.prediction;
         self.pre += share * other.pre;
         self.perceptual += share * other.perceptual;
         self.flow += share * other.flow;
-        self.error += share * other.error;
+        self.uncertainty += share * other.uncertainty;
     }
 }
 

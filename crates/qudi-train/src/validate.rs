@@ -78,7 +78,7 @@ impl Validator {
                 let help = "name the data folder, or a pack";
                 return Err(SimError::request("the validation clips need files", "--data", help));
             };
-            let mut pack = pack.again()?;
+            let mut pack = pack.try_clone()?;
             for number in 0..pack.clips().len() {
                 let clip = pack.clips()[number].clone();
                 if clip.source != VALIDATION {

@@ -18,9 +18,9 @@ fn source(name: &str, kind: SourceKind, from: &[&str]) -> SourceConfig {
         from,
         weight: 1.0,
         stride: 2,
-        shrink: 1.0,
+        max_downscale: 1.0,
         speed: 2.0,
-        rest: 0.0,
+        static_fraction: 0.0,
     }
 }
 
@@ -110,7 +110,7 @@ fn samples_depend_on_seed_and_number_alone() {
     let config = all_sources();
     let path = pack(&config, folder.path()).unwrap();
     let mut one = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
-    let mut other = one.again().unwrap();
+    let mut other = one.try_clone().unwrap();
     let forth: Vec<_> = (0..12).map(|k| one.sample(5, k).unwrap()).collect();
     let mut back: Vec<_> = (0..12).rev().map(|k| other.sample(5, k).unwrap()).collect();
     back.reverse();
@@ -155,7 +155,7 @@ fn samples_shrink_as_the_recipe_says() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let mut config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
-    config.source[0].shrink = 1.25;
+    config.source[0].max_downscale = 1.25;
     let path = pack(&config, folder.path()).unwrap();
     let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
     let mut factors = Vec::new();
@@ -173,8 +173,8 @@ fn samples_shrink_as_the_recipe_says() {
     let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
     let least = factors.iter().fold(9.0f64, |a, &b| a.min(b));
     assert!((0.99..1.01).contains(&least) && (1.23..1.26).contains(&most), "{least} {most}");
-    config.source[0].shrink = 0.5;
-    assert!(config.checked().unwrap_err().to_string().contains("shrinks"));
+    config.source[0].max_downscale = 0.5;
+    assert!(config.checked().unwrap_err().to_string().contains("max_downscale"));
 }
 
 /// As many stills rest as the recipe says, all frames alike; the others move.
@@ -183,7 +183,7 @@ fn stills_rest_as_often_as_the_recipe_says() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let mut config = config(vec![source("stills", SourceKind::Stills, &["stills"])]);
-    config.source[0].rest = 0.3;
+    config.source[0].static_fraction = 0.3;
     let path = pack(&config, folder.path()).unwrap();
     let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
     let mut resting = 0;
@@ -192,8 +192,8 @@ fn stills_rest_as_often_as_the_recipe_says() {
         resting += usize::from(truth.iter().all(|frame| frame.data == truth[0].data));
     }
     assert!((45..75).contains(&resting), "{resting} of 200");
-    config.source[0].rest = 1.1;
-    assert!(config.checked().unwrap_err().to_string().contains("at rest"));
+    config.source[0].static_fraction = 1.1;
+    assert!(config.checked().unwrap_err().to_string().contains("static_fraction"));
 }
 
 /// Light is log-uniform, and the photons are those that it gives.

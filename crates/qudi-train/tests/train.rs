@@ -4,11 +4,11 @@
 use burn::tensor::{Device, Tensor};
 use qudi_core::SimError;
 use qudi_model::checkpoint::load;
-use qudi_model::network::{Qudi, fill, parameters};
+use qudi_model::network::{Qudi, fill, parameters as parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::{
-    Adam, Batch, Bursts, Event, Feed, Files, From, METRICS, Recipe, Run, StepReport, Trainer,
-    WEIGHTS, values,
+    Adam, Batch, BurstSampler, Event, Prefetcher, Files, From, METRICS, Recipe, Run, StepReport, Trainer,
+    WEIGHTS, parameters,
 };
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -31,15 +31,15 @@ fn recipe(changes: &[(&str, &str)]) -> Recipe {
 }
 
 fn weights(network: &Qudi) -> Vec<f32> {
-    let list = values(network).into_iter();
+    let list = parameters(network).into_iter();
     list.flat_map(|v| v.into_data().try_into_vec::<f32>().unwrap()).collect()
 }
 
 fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Vec<StepReport>) {
-    let bursts = Bursts::new(recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
-    let mut feed = Feed::new(recipe, &bursts, 0, workers).unwrap();
+    let bursts = BurstSampler::new(recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let mut prefetcher = Prefetcher::new(recipe, &bursts, 0, workers).unwrap();
     let mut trainer = Trainer::new(recipe, None, devices, None).unwrap();
-    let steps = (0..3).map(|_| trainer.step(&mut feed).unwrap()).collect();
+    let steps = (0..3).map(|_| trainer.step(&mut prefetcher).unwrap()).collect();
     (weights(&trainer.averaged()), steps)
 }
 
@@ -109,7 +109,7 @@ fn devices_share_batches_without_changing_the_result() {
     // A doubled batch has one coin for the first pass: compare a step where both sides agree.
     let doubled = recipe(&[
         ("train.batch", "2"),
-        ("network.without", "[\"physics\", \"self-conditioning\"]"),
+        ("network.ablate", "[\"physics\", \"self-conditioning\"]"),
     ]);
     let mut halves = doubled.clone();
     (halves.train.batch, halves.train.accumulate) = (1, 2);
@@ -203,7 +203,7 @@ fn damaged_states_are_refused() {
 #[test]
 fn the_pre_denoiser_learns_from_parts() {
     let recipe = recipe(&[
-        ("train.parts", "{ bursts = 3, kept = 2, frames = 1, side = 24 }"),
+        ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }"),
         (
             "train.loss",
             "{ prediction = 0.0, pre = 1.0, perceptual = 0.0, term = \"none\", flow = 0.0 }",
@@ -215,7 +215,7 @@ fn the_pre_denoiser_learns_from_parts() {
     assert_eq!(after, trained(&recipe, &[Device::flex()], 1).0, "whoever draws the bursts");
     assert!(reports.iter().all(|report| report.loss.pre > 0.0 && report.loss.flow == 0.0));
     let count = |part: &str| {
-        let list = parameters(&recipe.network.init(1, &Device::flex()));
+        let list = parameter_shapes(&recipe.network.init(1, &Device::flex()));
         let sizes = list.iter().filter(|(name, _)| name.starts_with(part));
         sizes.map(|(_, shape)| shape.iter().product::<usize>()).sum::<usize>()
     };
@@ -224,11 +224,11 @@ fn the_pre_denoiser_learns_from_parts() {
     let pre = count("pre.");
     assert!(moved > pre / 2 && moved <= pre, "{moved} of {pre} weights moved");
     for (key, value, word) in [
-        ("train.parts", "{ bursts = 3, kept = 2, frames = 1, side = 24 }", "3 frames"),
-        ("train.parts", "{ bursts = 0, kept = 3, frames = 3, side = 24 }", "one burst"),
-        ("train.parts", "{ bursts = 3, kept = 3, frames = 3, side = 30 }", "train.parts.side"),
-        ("train.parts", "{ bursts = 3, kept = 3, frames = 3, side = 40 }", "fit"),
-        ("train.parts", "{ bursts = 3, kept = 2, frames = 3, side = 24 }", "fit"),
+        ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }", "3 frames"),
+        ("train.crops", "{ bursts = 0, cached_frames = 3, frames = 3, side = 24 }", "one burst"),
+        ("train.crops", "{ bursts = 3, cached_frames = 3, frames = 3, side = 30 }", "train.crops.side"),
+        ("train.crops", "{ bursts = 3, cached_frames = 3, frames = 3, side = 40 }", "fit"),
+        ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 3, side = 24 }", "fit"),
     ] {
         let changes = [("data.crop", "32"), ("data.frames", "3"), (key, value)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
@@ -248,8 +248,8 @@ fn drafts_do_not_learn() {
         (0..count).map(|i| 0.03 * ((i * 37 % 101) as f32 / 50.0 - 1.0)).collect()
     });
     let split = |network: &Qudi| -> [Vec<f32>; 2] {
-        let names = parameters(network).into_iter().map(|(name, _)| name);
-        let lists = names.zip(values(network)).map(|(name, values)| {
+        let names = parameter_shapes(network).into_iter().map(|(name, _)| name);
+        let lists = names.zip(parameters(network)).map(|(name, values)| {
             (name.starts_with("drafts."), values.into_data().try_into_vec::<f32>().unwrap())
         });
         let (drafts, others): (Vec<_>, Vec<_>) = lists.partition(|(draft, _)| *draft);
@@ -272,15 +272,15 @@ fn drafts_do_not_learn() {
 
 /// A network that has gone wrong stops the run before it spoils the state, and the term is named.
 #[test]
-fn no_number_stops_the_run() {
+fn refuses_to_step_on_nan_loss() {
     let recipe = recipe(&[]);
-    let bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let broken = recipe.network.init(1, &Device::flex());
     let broken = fill(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
-    let mut feed = Feed::new(&recipe, &bursts, 0, 1).unwrap();
-    let error = trainer.step(&mut feed).unwrap_err().to_string();
-    assert!(error.contains("estimate") || error.contains("prediction is NaN"), "{error}");
+    let mut prefetcher = Prefetcher::new(&recipe, &bursts, 0, 1).unwrap();
+    let error = trainer.step(&mut prefetcher).unwrap_err().to_string();
+    assert!(error.contains("first estimate") || error.contains("prediction loss is NaN at step 1"), "{error}");
     assert_eq!(trainer.step_number(), 0);
 }
 
@@ -313,7 +313,7 @@ fn recipes_say_what_is_wrong_with_them() {
     let load = |key: &str, value: &str| Recipe::load("tiny", &[(key.to_owned(), value.to_owned())]);
     for (key, value, word) in [
         ("train.steps", "0", "train.steps"),
-        ("train.rate", "-1", "train.rate"),
+        ("train.lr", "-1", "train.lr"),
         ("train.ema", "1.0", "train.ema"),
         ("train.learning", "3", "learning"),
         ("trains.steps", "3", "trains.steps"),
@@ -332,7 +332,29 @@ fn recipes_say_what_is_wrong_with_them() {
     assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);
     let recipe = load("data.sensor.0.ppp", "[3.25, 9.75]").unwrap();
     assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
-    let mut bursts = Bursts::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let mut bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
     assert_eq!(again.len(), 2);
+}
+
+/// Recipes of the first version, with the keys' former names, are those of today.
+#[test]
+fn reads_recipes_with_former_key_names() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/old");
+    for name in ["tiny", "small"] {
+        let old = Recipe::load(&format!("{folder}/{name}.toml"), &[]).unwrap();
+        assert_eq!(old, Recipe::load(name, &[]).unwrap());
+    }
+    let change = |key: &str, value: &str| {
+        Recipe::load("small", &[(key.to_owned(), value.to_owned())]).unwrap()
+    };
+    for (old, new, value) in [
+        ("train.rate", "train.lr", "2e-3"),
+        ("train.parts.kept", "train.crops.cached_frames", "7"),
+        ("data.source.1.rest", "data.source.1.static_fraction", "0.5"),
+        ("network.without", "network.ablate", "[\"flow\"]"),
+    ] {
+        assert_eq!(change(old, value), change(new, value), "{old}");
+    }
+    assert!(!change("train.rate", "2e-3").text().contains("rate ="));
 }

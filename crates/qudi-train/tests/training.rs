@@ -10,13 +10,13 @@ use qudi_core::{Camera, Frame, Light, Size};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
-use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, fill, parameters};
+use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, fill, parameters as parameter_shapes};
 use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
-use qudi_train::objective::{
-    Example, FirstPass, LossWeights, Switches, Terms, surprise, terms, training_time,
+use qudi_train::loss::{
+    Example, SelfConditioning, LossWeights, LoopOptions, LossTerms, gaussian_nll, loss_terms, training_timestep,
 };
-use qudi_train::{Adam, gradients, values, with_values};
+use qudi_train::{Adam, gradients, parameters, with_parameters};
 use std::collections::HashMap;
 
 /// A burst of a moving disk, its truth and its light.
@@ -72,21 +72,21 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
 }
 
 /// The loss of step `number`, at a time and with noise of its own.
-fn loss(network: &Qudi, burst: &Burst, number: u64) -> Terms {
+fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
     let frames = burst.measured.frames;
     let noise = Noise::new(number, 1);
     let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
     let place = (number as f64 * 0.618_034).fract();
-    let time = training_time((number as f64 * 0.414_214).fract(), place, 0.2);
+    let time = training_timestep((number as f64 * 0.414_214).fract(), place, 0.2);
     let example = Example {
         measured: &burst.measured,
         truth: burst.truth.clone(),
         acquisitions: std::slice::from_ref(&burst.acquisition),
         noise: to_tensor(values, burst.size, &burst.truth.device()),
-        times: &[time],
+        timesteps: &[time],
     };
-    let first_pass = if number.is_multiple_of(2) { FirstPass::No } else { FirstPass::Yes(number) };
-    terms(network, &example, first_pass, LossWeights::default(), Switches::ALL, None).unwrap()
+    let self_conditioning = if number.is_multiple_of(2) { SelfConditioning::Off } else { SelfConditioning::On(number) };
+    loss_terms(network, &example, self_conditioning, LossWeights::default(), LoopOptions::ALL, None).unwrap()
 }
 
 /// The first stage computes what the whole network would of pre-denoiser and flow, and nothing else learns.
@@ -102,9 +102,9 @@ fn the_first_stage_is_a_part_of_the_whole() {
             truth: burst.truth.clone(),
             acquisitions: std::slice::from_ref(&burst.acquisition),
             noise: burst.truth.zeros_like(),
-            times: &[500],
+            timesteps: &[500],
         };
-        terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap()
+        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None).unwrap()
     };
     let (part, whole) = (with(0.0), with(1.0));
     let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
@@ -136,13 +136,13 @@ fn errors_are_told_without_changing_frames() {
             truth: burst.truth.clone(),
             acquisitions: std::slice::from_ref(&burst.acquisition),
             noise: burst.truth.zeros_like(),
-            times: &[500],
+            timesteps: &[500],
         };
-        terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap()
+        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None).unwrap()
     };
     let (part, whole) = (terms_of(0.0), terms_of(1.0));
     let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
-    let [told, again] = [&part, &whole].map(|terms| value(terms.error.as_ref().unwrap()));
+    let [told, again] = [&part, &whole].map(|terms| value(terms.uncertainty.as_ref().unwrap()));
     assert_eq!(told, again);
     assert_eq!(told, value(&part.total));
     let grads = part.total.backward();
@@ -177,10 +177,10 @@ fn told_errors_scale_the_diffusion() {
             truth: burst.truth.clone(),
             acquisitions: std::slice::from_ref(&burst.acquisition),
             noise: burst.truth.ones_like(),
-            times: &[100],
+            timesteps: &[100],
         };
         let weights = LossWeights::default();
-        let terms = terms(&network, &example, FirstPass::No, weights, Switches::ALL, None).unwrap();
+        let terms = loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None).unwrap();
         terms.prediction.into_scalar::<f32>()
     };
     let without = prediction(false, 0.0);
@@ -189,9 +189,9 @@ fn told_errors_scale_the_diffusion() {
 }
 
 fn values_by_name(network: &Qudi) -> HashMap<String, Vec<f32>> {
-    let names = parameters(network).into_iter().map(|(name, _)| name);
+    let names = parameter_shapes(network).into_iter().map(|(name, _)| name);
     let lists =
-        values(network).into_iter().map(|list| list.into_data().try_to_vec::<f32>().unwrap());
+        parameters(network).into_iter().map(|list| list.into_data().try_to_vec::<f32>().unwrap());
     names.zip(lists).collect()
 }
 
@@ -204,7 +204,7 @@ fn surprise_is_least_where_deviations_are_right() {
     let of = |deviation: f32| {
         let errors = noise.iter().map(|n| 0.2 * n / scale).collect();
         let errors = to_tensor(errors, Size { height: 64, width: 64 }, &device);
-        surprise(errors.clone(), errors.ones_like() * deviation).into_scalar::<f32>()
+        gaussian_nll(errors.clone(), errors.ones_like() * deviation).into_scalar::<f32>()
     };
     assert!((of(0.2) - (0.5 + 0.2f32.ln())).abs() < 1e-5, "{}", of(0.2));
     assert!(of(0.2) < of(0.19) && of(0.2) < of(0.21));
@@ -261,7 +261,7 @@ fn gradients_in_16_bits_are_those_in_32() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 64, width: 64 }, 5, &device);
     let mut network = tiny().init(3, &device);
-    let mut optimizer = Adam::new(&values(&network));
+    let mut optimizer = Adam::new(&parameters(&network));
     let of = |network: &Qudi, precision| {
         with_precision(precision, || {
             gradients(network, &loss(network, &burst, 10).total.backward())
@@ -269,8 +269,8 @@ fn gradients_in_16_bits_are_those_in_32() {
     };
     for _ in 0..10 {
         let gradients = of(&network, ComputePrecision::F32);
-        let moved = optimizer.step(values(&network), gradients, 1.0, 1e-3);
-        network = with_values(network, moved);
+        let moved = optimizer.step(parameters(&network), gradients, 1.0, 1e-3);
+        network = with_parameters(network, moved);
     }
     let norm = |lists: &[Tensor<1>]| {
         let squares = lists.iter().map(|list| list.clone().powi_scalar(2).sum());
@@ -288,7 +288,7 @@ fn one_burst_is_learnt_by_heart() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 16, width: 16 }, 5, &device);
     let mut network = tiny().init(3, &device);
-    let mut optimizer = Adam::new(&values(&network));
+    let mut optimizer = Adam::new(&parameters(&network));
     let (mut totals, mut predictions) = (Vec::new(), Vec::new());
     for number in 0..200u32 {
         let terms = loss(&network, &burst, u64::from(number));
@@ -298,8 +298,8 @@ fn one_burst_is_learnt_by_heart() {
         let norm = gradients.iter().map(|g| g.clone().powi_scalar(2).sum().into_scalar::<f32>());
         let norm = f64::from(norm.sum::<f32>().sqrt());
         let rate = 4e-3 * (1.0 - f64::from(number) / 200.0);
-        let moved = optimizer.step(values(&network), gradients, (0.05 / norm).min(1.0), rate);
-        network = with_values(network, moved);
+        let moved = optimizer.step(parameters(&network), gradients, (0.05 / norm).min(1.0), rate);
+        network = with_parameters(network, moved);
     }
     let drop = |losses: &[f32]| losses[190..].iter().sum::<f32>() / 10.0 / losses[0];
     let (total, prediction) = (drop(&totals), drop(&predictions));

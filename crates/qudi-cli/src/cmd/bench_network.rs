@@ -16,7 +16,7 @@ use qudi_model::measurement::GuidePlanes;
 use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State};
 use qudi_model::restorer::QudiRestorer;
 use qudi_model::with_precision;
-use qudi_train::objective::reconstruction;
+use qudi_train::loss::reconstruction;
 use serde::Serialize;
 use serde_json::json;
 use std::collections::BTreeMap;

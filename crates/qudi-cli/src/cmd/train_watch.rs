@@ -75,7 +75,7 @@ impl<'a> Watch<'a> {
         let loss = self.loss.map_or(step.loss.total, |loss| 0.98 * loss + 0.02 * step.loss.total);
         self.loss = Some(loss);
         let rate = self.samples * self.taken as f64 / self.start.elapsed().as_secs_f64();
-        let text = format!("loss {loss:.5} rate {:.1e} {rate:.2} samples/s", step.rate);
+        let text = format!("loss {loss:.5} rate {:.1e} {rate:.2} samples/s", step.lr);
         self.bar.learning(text, step.step, self.steps);
         let scalars = [
             ("loss/total", step.loss.total),
@@ -83,8 +83,8 @@ impl<'a> Watch<'a> {
             ("loss/pre", step.loss.pre),
             ("loss/perceptual", step.loss.perceptual),
             ("loss/flow", step.loss.flow),
-            ("loss/error", step.loss.error),
-            ("train/rate", step.rate),
+            ("loss/error", step.loss.uncertainty),
+            ("train/rate", step.lr),
             ("train/norm", step.norm),
         ];
         self.events.scalars(step.step, &scalars.map(|(tag, value)| (tag.to_owned(), value)))

@@ -68,15 +68,15 @@ pub struct SourceConfig {
     /// Longest step through a clip, in its frames: 2 also makes motion twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
-    /// Most that clips and stills are made smaller: a factor drawn log-uniformly between 1 and this.
-    #[serde(default = "one")]
-    pub shrink: f64,
+    /// The largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from 1 to it.
+    #[serde(default = "one", alias = "shrink")]
+    pub max_downscale: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
     #[serde(default = "usual_speed")]
     pub speed: f64,
-    /// Share of stills' samples in which nothing moves.
-    #[serde(default)]
-    pub rest: f64,
+    /// The fraction of the samples from stills in which nothing moves.
+    #[serde(default, alias = "rest")]
+    pub static_fraction: f64,
 }
 
 /// What a source holds.
@@ -106,7 +106,7 @@ fn usual_speed() -> f64 {
 impl SourceConfig {
     /// How many times smaller a sample is made.
     pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
-        if self.shrink > 1.0 { self.shrink.powf(uniform(random)) } else { 1.0 }
+        if self.max_downscale > 1.0 { self.max_downscale.powf(uniform(random)) } else { 1.0 }
     }
 }
 
@@ -205,12 +205,12 @@ impl DataConfig {
                     "use 0 to 100 pixels per frame",
                 );
             }
-            if !(0.0..=1.0).contains(&source.rest) {
-                let what = format!("has a share of {} at rest", source.rest);
-                return fault(&key, what, "use a share from 0 to 1");
+            if !(0.0..=1.0).contains(&source.static_fraction) {
+                let what = format!("has a static_fraction of {}", source.static_fraction);
+                return fault(&key, what, "use a fraction from 0 to 1");
             }
-            if !(1.0..=4.0).contains(&source.shrink) {
-                let what = format!("shrinks by {}", source.shrink);
+            if !(1.0..=4.0).contains(&source.max_downscale) {
+                let what = format!("has a max_downscale of {}", source.max_downscale);
                 return fault(&key, what, "use a factor from 1 to 4");
             }
             if source.kind == SourceKind::Scenes {

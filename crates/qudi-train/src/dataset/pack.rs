@@ -82,7 +82,7 @@ impl Pack {
     ///
     /// # Errors
     /// As [`Self::open`].
-    pub fn again(&self) -> Result<Self> {
+    pub fn try_clone(&self) -> Result<Self> {
         Self::open(&self.path)
     }
 

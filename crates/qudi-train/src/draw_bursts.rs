@@ -1,6 +1,6 @@
 //! Drawing all bursts of a recipe before anything learns from them.
 
-use super::bursts::Bursts;
+use super::burst_sampler::BurstSampler;
 use super::recipe::Recipe;
 use super::run::Files;
 use crate::dataset::Dataset;
@@ -11,7 +11,7 @@ use qudi_model::network::Qudi;
 use qudi_model::restorer::TILE;
 use std::ops::ControlFlow;
 
-/// Draws the bursts of a recipe with `train.parts` that its folder lacks, with the drafts of `network`, on `workers`
+/// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the drafts of `network`, on `workers`
 /// threads. `on` hears how many there are and how many there will be, and says whether to go on.
 ///
 /// # Errors
@@ -30,6 +30,6 @@ pub fn draw_bursts(
     };
     let dataset = Dataset::new(&recipe.data, files.pack)?;
     let drafts = Draft::all(network, &recipe.network, TILE, device);
-    let bursts = Bursts::new(recipe, dataset, drafts).keep_in(folder, recipe)?;
+    let bursts = BurstSampler::new(recipe, dataset, drafts).with_cache(folder, recipe)?;
     bursts.draw_all(workers, on)
 }

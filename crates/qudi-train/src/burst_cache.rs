@@ -1,9 +1,9 @@
 //! Bursts with their guides, small in memory, and on disk: a guide takes longer to find than to learn from.
 
-use super::bursts::Guided;
-use super::recipe::{PartsConfig, Recipe};
-use super::values::values;
-use crate::dataset::Sample;
+use super::burst_sampler::ConditionedBurst;
+use super::recipe::{CropsConfig, Recipe};
+use super::parameters::parameters;
+use crate::dataset::{DataConfig, Sample};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
@@ -11,7 +11,7 @@ use qudi_core::{Frame, Result, SimError, Size};
 use qudi_model::config::Part;
 use qudi_model::draft::Draft;
 use qudi_model::measurement::{GuidePlanes, IMAGES, Laid};
-use qudi_model::tensor::read;
+use qudi_model::tensor::read as read_tensor;
 use rand::{Rng, RngExt};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 
 /// A burst: planes of deviations in bytes, finer than any noise.
 #[derive(Debug)]
-pub(super) struct KeptBurst {
+pub(super) struct CachedBurst {
     size: Size,
     sample: Sample,
     images: Vec<Vec<f32>>,
@@ -39,17 +39,17 @@ fn expanded(byte: i8) -> f32 {
     0.5 * (f32::from(byte) / STEPS).sinh()
 }
 
-impl KeptBurst {
-    pub(super) fn new(burst: Guided) -> Self {
-        let Guided { size, sample, guide: GuidePlanes(mut images) } = burst;
+impl CachedBurst {
+    pub(super) fn new(burst: ConditionedBurst) -> Self {
+        let ConditionedBurst { size, sample, guide: GuidePlanes(mut images) } = burst;
         let deviations = images.split_off(IMAGES).into_iter();
         let deviations = deviations.map(|plane| plane.into_iter().map(compressed).collect());
         Self { size, sample, images, deviations: deviations.collect() }
     }
 
     /// Some frames, some square of them, turned and mirrored somehow.
-    pub(super) fn part(&self, parts: PartsConfig, random: &mut impl Rng) -> Guided {
-        let (frames, side) = (parts.frames, parts.side);
+    pub(super) fn crop(&self, crops: CropsConfig, random: &mut impl Rng) -> ConditionedBurst {
+        let (frames, side) = (crops.frames, crops.side);
         let first = random.random_range(0..=self.sample.truth.len() - frames);
         let top = random.random_range(0..=self.size.height - side);
         let left = random.random_range(0..=self.size.width - side);
@@ -82,7 +82,7 @@ impl KeptBurst {
         };
         let planes = self.images.iter().map(image).chain(self.deviations.iter().map(deviation));
         let guide = GuidePlanes(planes.collect());
-        Guided { size, sample: Sample { truth, counts, acquisition }, guide }
+        ConditionedBurst { size, sample: Sample { truth, counts, acquisition }, guide }
     }
 }
 
@@ -92,36 +92,48 @@ fn picked<T: Copy>(values: &[T], places: &[usize]) -> Vec<T> {
 
 /// A folder with a file for every burst that was drawn.
 #[derive(Debug)]
-pub(super) struct Shelf {
+pub(super) struct BurstCache {
     folder: PathBuf,
     seed: u64,
-    /// All that decides what is drawn, as text: bursts of anything else are refused.
-    drawn: String,
+    /// All that decides what is drawn: bursts of anything else are refused.
+    key: CacheKey,
     /// Frames, height, width.
     shape: [usize; 3],
     laid: Laid,
 }
 
-/// What decides a burst, its number aside.
-#[derive(Serialize)]
-struct Drawn<'a> {
-    program: &'a str,
-    data: &'a crate::dataset::DataConfig,
+/// Everything that decides a burst, its number aside. Files hold it as JSON.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct CacheKey {
+    program: String,
+    data: DataConfig,
     seed: u64,
-    kept: usize,
+    #[serde(alias = "kept")]
+    cached_frames: usize,
     neighbours: usize,
     motions: usize,
     exposure: bool,
     /// Hashes of the drafts' weights.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     drafts: Vec<String>,
+}
+
+impl CacheKey {
+    fn text(&self) -> String {
+        serde_json::to_string(self).expect("plain data")
+    }
+
+    /// The key as it is read back from a file: numbers of JSON may differ in the last bit.
+    fn from_text(text: &str) -> Option<Self> {
+        serde_json::from_str(text).ok()
+    }
 }
 
 /// Hash of a draft's weights.
 fn sha256(draft: &Draft) -> Result<String> {
     let mut hash = Sha256::new();
-    for list in values(draft.denoiser()) {
-        read(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
+    for list in parameters(draft.denoiser()) {
+        read_tensor(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
     }
     Ok(format!("{:x}", hash.finalize()))
 }
@@ -142,17 +154,17 @@ const KEY: &str = "burst";
 /// Most bytes of a file that are not pixels.
 const HEADER: usize = 1 << 16;
 
-impl Shelf {
+impl BurstCache {
     pub(super) fn new(folder: &Path, recipe: &Recipe, drafts: &[Draft]) -> Result<Self> {
-        let Some(parts) = recipe.train.parts else {
+        let Some(crops) = recipe.train.crops else {
             let what = "the recipe draws every sample anew";
-            return Err(SimError::request(what, "train.parts", "bursts are kept only for parts"));
+            return Err(SimError::request(what, "train.crops", "add train.crops, or leave the folder of bursts out"));
         };
-        let drawn = Drawn {
-            program: env!("CARGO_PKG_VERSION"),
-            data: &recipe.data,
+        let key = CacheKey {
+            program: env!("CARGO_PKG_VERSION").to_owned(),
+            data: recipe.data.clone(),
             seed: recipe.train.seed,
-            kept: parts.kept,
+            cached_frames: crops.cached_frames,
             neighbours: recipe.network.pre.neighbours,
             motions: recipe.network.pre.laid().along.motions(),
             exposure: !recipe.network.lacks(Part::Exposure),
@@ -161,8 +173,8 @@ impl Shelf {
         Ok(Self {
             folder: folder.to_owned(),
             seed: recipe.train.seed,
-            drawn: serde_json::to_string(&drawn).expect("plain data"),
-            shape: [parts.kept.min(recipe.data.frames), recipe.data.crop, recipe.data.crop],
+            key,
+            shape: [crops.cached_frames.min(recipe.data.frames), recipe.data.crop, recipe.data.crop],
             laid: recipe.network.pre.laid(),
         })
     }
@@ -181,14 +193,14 @@ impl Shelf {
     }
 
     /// Writes burst `number`.
-    pub(super) fn put(&self, number: u64, burst: &KeptBurst) -> Result<()> {
+    pub(super) fn write(&self, number: u64, burst: &CachedBurst) -> Result<()> {
         let path = self.path(number);
         let report = |e: &dyn std::fmt::Display| {
             SimError::data(format!("no burst: {e}"), &path, "report this")
         };
         let Acquisition { ppp, exposure, gain, ref sensor, .. } = burst.sample.acquisition;
         let label =
-            Label { drawn: self.drawn.clone(), ppp, exposure, gain, sensor: sensor.clone() };
+            Label { drawn: self.key.text(), ppp, exposure, gain, sensor: sensor.clone() };
         // TOML: its numbers come back bit for bit.
         let label = toml::to_string(&label).map_err(|e| report(&e))?;
         let words =
@@ -214,7 +226,7 @@ impl Shelf {
     ///
     /// # Errors
     /// [`SimError`] if it cannot be read, is damaged, or was drawn for something else.
-    pub(super) fn take(&self, number: u64) -> Result<Option<KeptBurst>> {
+    pub(super) fn read(&self, number: u64) -> Result<Option<CachedBurst>> {
         let path = self.path(number);
         let io = |e| SimError::io("read the burst", &path, e);
         let length = match std::fs::metadata(&path) {
@@ -235,11 +247,12 @@ impl Shelf {
         let label = header.metadata().as_ref().and_then(|entries| entries.get(KEY));
         let label: Label = label
             .and_then(|label| toml::from_str(label).ok())
-            .ok_or_else(|| damaged("it is no burst of ours".to_owned()))?;
-        if label.drawn != self.drawn {
+            .ok_or_else(|| damaged("not a burst cache file".to_owned()))?;
+        let key = CacheKey::from_text(&label.drawn);
+        if key.is_none() || key != CacheKey::from_text(&self.key.text()) {
             let help =
                 "keep the bursts of another recipe, or of another version, in another folder";
-            return Err(SimError::data("it was drawn for something else", &path, help));
+            return Err(SimError::data("the burst was drawn with other data, sensors or weights", &path, help));
         }
         label.sensor.validate()?;
         if ![label.ppp, label.exposure, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {
@@ -279,7 +292,7 @@ impl Shelf {
         let deviations = planes[2 + IMAGES..].iter();
         let deviations =
             deviations.map(|plane| plane.iter().map(|&b| b.cast_signed()).collect()).collect();
-        Ok(Some(KeptBurst { size, sample, images, deviations }))
+        Ok(Some(CachedBurst { size, sample, images, deviations }))
     }
 }
 

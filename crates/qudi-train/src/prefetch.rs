@@ -1,7 +1,7 @@
 //! Batches drawn ahead on threads of their own, in order.
 
 use super::batch::Batch;
-use super::bursts::Bursts;
+use super::burst_sampler::BurstSampler;
 use super::recipe::Recipe;
 use qudi_core::{Result, SimError};
 use std::sync::mpsc::{Receiver, sync_channel};
@@ -11,21 +11,21 @@ const AHEAD: usize = 2;
 
 /// Gives batch after batch; which thread drew them makes no difference.
 #[derive(Debug)]
-pub struct Feed {
+pub struct Prefetcher {
     workers: Vec<Receiver<Result<Batch>>>,
     next: u64,
 }
 
-impl Feed {
+impl Prefetcher {
     /// Draws from batch `first` on, on `workers` threads.
     ///
     /// # Errors
     /// [`SimError`] if the data cannot be opened.
-    pub fn new(recipe: &Recipe, bursts: &Bursts, first: u64, workers: usize) -> Result<Self> {
+    pub fn new(recipe: &Recipe, bursts: &BurstSampler, first: u64, workers: usize) -> Result<Self> {
         let count = workers.max(1) as u64;
         let start = |worker: u64| {
             let (sender, receiver) = sync_channel(AHEAD);
-            let (recipe, mut bursts) = (recipe.clone(), bursts.again()?);
+            let (recipe, mut bursts) = (recipe.clone(), bursts.try_clone()?);
             let work = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.
                 let mut number = first + worker;
@@ -33,7 +33,7 @@ impl Feed {
                     number += count;
                 }
             };
-            std::thread::Builder::new().name(format!("feed-{worker}")).spawn(work).map_err(
+            std::thread::Builder::new().name(format!("prefetch-{worker}")).spawn(work).map_err(
                 |e| {
                     SimError::request(
                         format!("no thread for the data: {e}"),

@@ -57,8 +57,8 @@ impl Dataset {
     ///
     /// # Errors
     /// As [`Self::new`].
-    pub fn again(&self) -> Result<Self> {
-        let pack = self.pack.as_ref().map(Pack::again).transpose()?;
+    pub fn try_clone(&self) -> Result<Self> {
+        let pack = self.pack.as_ref().map(Pack::try_clone).transpose()?;
         Self::new(&self.config, pack)
     }
 
@@ -130,8 +130,8 @@ impl Dataset {
             zoom: 1.0 + 0.02 * (uniform(rng) - 0.5),
             layers: below(4, rng) as u32,
         };
-        let rest = self.config.source[source].rest;
-        if rest > 0.0 && uniform(rng) < rest {
+        let static_fraction = self.config.source[source].static_fraction;
+        if static_fraction > 0.0 && uniform(rng) < static_fraction {
             motion = StillMotion::default();
         }
         // The scene shows the middle of the image: the part around the crop, with the way that it goes.

@@ -59,18 +59,18 @@ impl Default for LossWeights {
 
 /// What a pass makes use of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Switches {
+pub struct LoopOptions {
     /// The sensor inside the loop.
-    pub physics: bool,
+    pub forward_model: bool,
     /// The previous estimate as an input.
     pub self_conditioning: bool,
 }
 
-impl Switches {
+impl LoopOptions {
     /// Everything.
-    pub const ALL: Self = Self { physics: true, self_conditioning: true };
+    pub const ALL: Self = Self { forward_model: true, self_conditioning: true };
     /// Nothing: a first pass would be in vain.
-    pub const NONE: Self = Self { physics: false, self_conditioning: false };
+    pub const NONE: Self = Self { forward_model: false, self_conditioning: false };
 }
 
 /// `mean (p - q)^2 + 0.01 (mean |across| + mean |down|)`, where across and down are differences of neighbours of
@@ -98,22 +98,22 @@ pub struct Example<'a> {
     /// Standard normal noise of the truth's shape.
     pub noise: Tensor<4>,
     /// Diffusion time of every burst.
-    pub times: &'a [usize],
+    pub timesteps: &'a [usize],
 }
 
 /// Whether a first pass makes the estimate that the network is given, as at sampling after the first step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FirstPass {
+pub enum SelfConditioning {
     /// The network starts from nothing.
-    No,
+    Off,
     /// The network gets its own estimate from a noisier image, and that estimate measured again with photons
     /// of this seed.
-    Yes(u64),
+    On(u64),
 }
 
 /// The terms of the loss, `[1]` each, unweighted but the total.
 #[derive(Clone, Debug)]
-pub struct Terms {
+pub struct LossTerms {
     /// The weighted sum.
     pub total: Tensor<1>,
     /// Of the prediction; about 1 where it knows no more than the deviations told of every pixel's error.
@@ -125,12 +125,12 @@ pub struct Terms {
     /// How far neighbours warped along the flows are from the truth; computed only where it has a weight.
     pub flow: Option<Tensor<1>>,
     /// How well the pre-denoiser knows its errors, if it tells them; its weight is 1, for nothing else learns from it.
-    pub error: Option<Tensor<1>>,
+    pub uncertainty: Option<Tensor<1>>,
 }
 
 /// A diffusion time to train at, from two uniform numbers in [0, 1): the share `start` of all where sampling begins, the
 /// others by [`NoiseSchedule::time_at`].
-pub fn training_time(kind: f64, place: f64, start: f64) -> usize {
+pub fn training_timestep(kind: f64, place: f64, start: f64) -> usize {
     if kind < start {
         return TIMES - 1;
     }
@@ -138,7 +138,7 @@ pub fn training_time(kind: f64, place: f64, start: f64) -> usize {
 }
 
 /// The time of the estimate before `time`: a tenth of all further, by their roots.
-fn earlier(time: usize) -> usize {
+fn previous_timestep(time: usize) -> usize {
     let times = TIMES as f64;
     let share = ((time + 1) as f64 / times).sqrt() + 0.1;
     ((times * share * share).round() as usize - 1).min(TIMES - 1)
@@ -148,16 +148,16 @@ fn earlier(time: usize) -> usize {
 ///
 /// # Errors
 /// [`SimError`] if the device fails or a sensor is impossible.
-pub fn terms(
+pub fn loss_terms(
     network: &Qudi,
     example: &Example<'_>,
-    first_pass: FirstPass,
+    self_conditioning: SelfConditioning,
     weights: LossWeights,
-    switches: Switches,
+    loop_options: LoopOptions,
     perceptual: Option<&Perceptual>,
-) -> Result<Terms> {
+) -> Result<LossTerms> {
     if weights.prediction == 0.0 && perceptual.is_none() {
-        return Ok(front_terms(network, example, weights));
+        return Ok(first_stage_terms(network, example, weights));
     }
     let schedule = NoiseSchedule::cosine(TIMES);
     let clean = example.truth.clone() * 2.0 - 1.0;
@@ -174,18 +174,18 @@ pub fn terms(
         let noise = level(|a| (1.0 - a).sqrt()).expand([images, 1, height, width]);
         clean.clone() * signal + example.noise.clone() * noise
     };
-    let (x0_prev, known, simulated) = match first_pass {
+    let (x0_prev, known, simulated) = match self_conditioning {
         // Where sampling begins, nothing comes before.
-        FirstPass::Yes(seed) if example.times.iter().any(|&t| t < TIMES - 1) => {
-            let earlier: Vec<usize> = example.times.iter().map(|&t| earlier(t)).collect();
-            let x_t = noisy(&earlier);
-            let (x0_prev, simulated) = estimate(network, example, x_t, earlier, seed)?;
-            let known = simulated.exists.iter().map(|&exists| exists && switches.self_conditioning);
-            (x0_prev, known.collect(), Some(simulated).filter(|_| switches.physics))
+        SelfConditioning::On(seed) if example.timesteps.iter().any(|&t| t < TIMES - 1) => {
+            let previous: Vec<usize> = example.timesteps.iter().map(|&t| previous_timestep(t)).collect();
+            let x_t = noisy(&previous);
+            let (x0_prev, simulated) = estimate(network, example, x_t, previous, seed)?;
+            let known = simulated.exists.iter().map(|&exists| exists && loop_options.self_conditioning);
+            (x0_prev, known.collect(), Some(simulated).filter(|_| loop_options.forward_model))
         }
-        _ => (clean.zeros_like(), vec![false; example.times.len()], None),
+        _ => (clean.zeros_like(), vec![false; example.timesteps.len()], None),
     };
-    let state = State { x_t: noisy(example.times), x0_prev, known, times: example.times.to_vec() };
+    let state = State { x_t: noisy(example.timesteps), x0_prev, known, times: example.timesteps.to_vec() };
     let prepared = network.prepare(example.measured);
     let result = network.forward(&prepared, simulated.as_ref(), &state, None);
     let unknown = (result.x0.clone() - clean.clone()) / result.unit.clamp_min(LEAST_UNIT);
@@ -206,17 +206,17 @@ pub fn terms(
         total = total + term.clone() * weights.flow;
     }
     // Told, too, of frames before any simulated measurement.
-    let error = network.tells_errors().then(|| network.denoise(&example.measured.guide));
-    let error = error.and_then(|(d, deviation)| told(example, &d, deviation));
-    if let Some(term) = &error {
+    let uncertainty = network.tells_errors().then(|| network.denoise(&example.measured.guide));
+    let uncertainty = uncertainty.and_then(|(d, deviation)| uncertainty_loss(example, &d, deviation));
+    if let Some(term) = &uncertainty {
         total = total + term.clone();
     }
-    Ok(Terms { total, prediction, pre, perceptual, flow, error })
+    Ok(LossTerms { total, prediction, pre, perceptual, flow, uncertainty })
 }
 
 /// The terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no weight: a first stage, at
 /// a fifth of the cost or less, for what must work before the rest can learn from it.
-fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> Terms {
+fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> LossTerms {
     let measured = example.measured;
     let (d, deviation, flows) = if weights.flow > 0.0 {
         let (d, flows) = network.denoise_and_align(&network.prepare(measured));
@@ -226,27 +226,27 @@ fn front_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> T
         let (d, deviation) = network.denoise(&measured.guide);
         (d, deviation, None)
     };
-    let error = told(example, &d, deviation);
+    let uncertainty = uncertainty_loss(example, &d, deviation);
     let pre = relative_reconstruction(example)(d);
     let flow = flows.map(|flows| flows.misfit(example.truth.clone(), measured.frames));
     let mut total = pre.clone() * weights.pre;
     if let Some(term) = &flow {
         total = total + term.clone() * weights.flow;
     }
-    if let Some(term) = &error {
+    if let Some(term) = &uncertainty {
         total = total + term.clone();
     }
-    Terms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow, error }
+    LossTerms { total, prediction: pre.zeros_like(), pre, perceptual: None, flow, uncertainty }
 }
 
-/// [`surprise`] at the errors of pre-denoised frames, from which no gradient goes into the frames.
-fn told(example: &Example<'_>, d: &Tensor<4>, deviation: Option<Tensor<4>>) -> Option<Tensor<1>> {
-    deviation.map(|deviation| surprise(d.clone().detach() - example.truth.clone(), deviation))
+/// [`gaussian_nll`] at the errors of pre-denoised frames, from which no gradient goes into the frames.
+fn uncertainty_loss(example: &Example<'_>, d: &Tensor<4>, deviation: Option<Tensor<4>>) -> Option<Tensor<1>> {
+    deviation.map(|deviation| gaussian_nll(d.clone().detach() - example.truth.clone(), deviation))
 }
 
 /// Mean negative logarithm of the density of errors under a normal law of these deviations, but for a constant: least where
 /// the deviations are those of the errors (Kendall and Gal 2017, eq. 5). Same shapes, result `[1]`.
-pub fn surprise(error: Tensor<4>, deviation: Tensor<4>) -> Tensor<1> {
+pub fn gaussian_nll(error: Tensor<4>, deviation: Tensor<4>) -> Tensor<1> {
     let square = (error / deviation.clone()).powi_scalar(2);
     (square * 0.5 + deviation.log()).mean()
 }
@@ -257,7 +257,7 @@ fn estimate(
     network: &Qudi,
     example: &Example<'_>,
     x_t: Tensor<4>,
-    earlier: Vec<usize>,
+    previous: Vec<usize>,
     seed: u64,
 ) -> Result<(Tensor<4>, Simulated)> {
     let device = example.truth.device();
@@ -269,22 +269,22 @@ fn estimate(
     };
     let network = network.valid();
     let x_t = x_t.inner();
-    let known = vec![false; earlier.len()];
-    let state = State { x0_prev: x_t.zeros_like(), x_t, known, times: earlier };
+    let known = vec![false; previous.len()];
+    let state = State { x0_prev: x_t.zeros_like(), x_t, known, times: previous };
     let prediction = network.forward(&network.prepare(&measured), None, &state, None);
     let [_, _, height, width] = example.truth.dims();
     let size = Size { height, width };
     let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;
     if !x0.iter().all(|value| value.is_finite()) {
         return Err(SimError::request(
-            "the network's estimate in the first pass is no number any more: the last checkpoint is good",
-            "the first pass",
-            "lower train.rate or train.clip and go on from the checkpoint with --resume",
+            "the network's first estimate is not finite: the last checkpoint is good",
+            "self-conditioning",
+            "lower train.lr or train.clip and go on from the checkpoint with --resume",
         ));
     }
     let burst = measured.frames * size.pixels();
     let mut planes = Planes { y: Vec::new(), u: Vec::new() };
-    let exists: Vec<bool> = example.times.iter().map(|&t| t < TIMES - 1).collect();
+    let exists: Vec<bool> = example.timesteps.iter().map(|&t| t < TIMES - 1).collect();
     for (number, (x0, acquisition)) in
         x0.chunks_exact_mut(burst).zip(example.acquisitions).enumerate()
     {
@@ -295,7 +295,7 @@ fn estimate(
             continue;
         }
         let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
-        let sensor = LoopSensor::at(acquisition, example.times[number], TIMES);
+        let sensor = LoopSensor::at(acquisition, example.timesteps[number], TIMES);
         let first = (number * measured.frames) as u64;
         let more = sensor.measure(&images, size, first, seed)?;
         planes.y.extend(more.y);

@@ -5,7 +5,7 @@ use burn::tensor::{Gradients, Tensor};
 use qudi_model::network::Qudi;
 
 /// The values of all parameters, `[values]` each, outside autodiff.
-pub fn values<M: Module>(network: &M) -> Vec<Tensor<1>> {
+pub fn parameters<M: Module>(network: &M) -> Vec<Tensor<1>> {
     let mut collect = Collect { gradients: None, list: Vec::new() };
     network.visit(&mut collect);
     collect.list
@@ -18,9 +18,9 @@ pub fn gradients(network: &Qudi, gradients: &Gradients) -> Vec<Tensor<1>> {
     collect.list
 }
 
-/// The network with other values, in the order and with the sizes of [`values`].
+/// The network with other values, in the order and with the sizes of [`parameters`].
 #[must_use]
-pub fn with_values(network: Qudi, values: Vec<Tensor<1>>) -> Qudi {
+pub fn with_parameters(network: Qudi, values: Vec<Tensor<1>>) -> Qudi {
     network.map(&mut Replace { values: values.into_iter() })
 }
 

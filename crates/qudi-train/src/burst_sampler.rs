@@ -1,7 +1,7 @@
-//! Bursts with their guides: drawn for every sample, or drawn once and cut into parts again and again.
+//! Samples with their reference estimates: drawn one by one, or cut from cached bursts.
 
-use super::kept::{KeptBurst, Shelf};
-use super::recipe::{PartsConfig, Recipe};
+use super::burst_cache::{BurstCache, CachedBurst};
+use super::recipe::{CropsConfig, Recipe};
 use crate::dataset::{Dataset, Sample};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Result, SimError, Size, USUAL_EXPOSURE};
@@ -18,7 +18,7 @@ use std::sync::{Arc, OnceLock};
 
 /// Frames of a burst and what classical methods make of all of them.
 #[derive(Clone, Debug)]
-pub(super) struct Guided {
+pub(super) struct ConditionedBurst {
     pub(super) size: Size,
     pub(super) sample: Sample,
     pub(super) guide: GuidePlanes,
@@ -26,26 +26,26 @@ pub(super) struct Guided {
 
 /// Where samples come from, for one thread.
 #[derive(Debug)]
-pub struct Bursts {
+pub struct BurstSampler {
     dataset: Dataset,
     seed: u64,
     crop: usize,
     laid: Laid,
     exposure: bool,
-    parts: Option<(PartsConfig, Kept)>,
+    crops: Option<(CropsConfig, Cached)>,
     drafts: Vec<Draft>,
-    shelf: Option<Arc<Shelf>>,
+    cache: Option<Arc<BurstCache>>,
 }
 
 /// Bursts that all threads share, each computed by the first that needs it.
-type Kept = Arc<Vec<OnceLock<KeptBurst>>>;
+type Cached = Arc<Vec<OnceLock<CachedBurst>>>;
 
-impl Bursts {
+impl BurstSampler {
     /// Those of a recipe, with the drafts of the network that learns.
     pub fn new(recipe: &Recipe, dataset: Dataset, drafts: Vec<Draft>) -> Self {
-        let keep = |parts: PartsConfig| {
-            let kept = (0..parts.bursts).map(|_| OnceLock::new()).collect();
-            (parts, Arc::new(kept))
+        let cells = |crops: CropsConfig| {
+            let cached = (0..crops.bursts).map(|_| OnceLock::new()).collect();
+            (crops, Arc::new(cached))
         };
         Self {
             dataset,
@@ -53,76 +53,76 @@ impl Bursts {
             crop: recipe.data.crop,
             laid: recipe.network.pre.laid(),
             exposure: !recipe.network.lacks(Part::Exposure),
-            parts: recipe.train.parts.map(keep),
+            crops: recipe.train.crops.map(cells),
             drafts,
-            shelf: None,
+            cache: None,
         }
     }
 
     /// Writes drawn bursts into `folder`, which exists, and reads those that lie there.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the recipe keeps no bursts.
-    pub fn keep_in(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
-        let shelf = Some(Arc::new(Shelf::new(folder, recipe, &self.drafts)?));
-        Ok(Self { shelf, ..self })
+    /// [`SimError`](qudi_core::SimError) if the recipe has no `train.crops`.
+    pub fn with_cache(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
+        let cache = Some(Arc::new(BurstCache::new(folder, recipe, &self.drafts)?));
+        Ok(Self { cache, ..self })
     }
 
     /// The same for another thread.
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the data cannot be opened again.
-    pub fn again(&self) -> Result<Self> {
-        let (dataset, shelf) = (self.dataset.again()?, self.shelf.clone());
-        let (drafts, parts) = (self.drafts.clone(), self.parts.clone());
-        Ok(Self { dataset, parts, drafts, shelf, ..*self })
+    pub fn try_clone(&self) -> Result<Self> {
+        let (dataset, cache) = (self.dataset.try_clone()?, self.cache.clone());
+        let (drafts, crops) = (self.drafts.clone(), self.crops.clone());
+        Ok(Self { dataset, crops, drafts, cache, ..*self })
     }
 
     /// Sample `number`.
-    pub(super) fn sample(&mut self, number: u64) -> Result<Guided> {
-        let Some((parts, kept)) = self.parts.clone() else { return self.draw(number, None) };
+    pub(super) fn sample(&mut self, number: u64) -> Result<ConditionedBurst> {
+        let Some((crops, cached)) = self.crops.clone() else { return self.draw(number, None) };
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(number);
-        let place = random.random_range(0..parts.bursts);
-        let cell = &kept[place as usize];
+        let place = random.random_range(0..crops.bursts);
+        let cell = &cached[place as usize];
         if cell.get().is_none() {
             // Two threads may draw the same one: they draw the same.
-            let burst = self.kept(place, parts.kept)?;
+            let burst = self.cached(place, crops.cached_frames)?;
             cell.get_or_init(|| burst);
         }
-        Ok(cell.get().expect("just filled").part(parts, &mut random))
+        Ok(cell.get().expect("just filled").crop(crops, &mut random))
     }
 
-    /// Burst `number` from where bursts are kept, or drawn and kept there.
-    fn kept(&mut self, number: u64, frames: usize) -> Result<KeptBurst> {
-        let shelf = self.shelf.clone();
-        if let Some(burst) = shelf.as_ref().map(|shelf| shelf.take(number)).transpose()?.flatten() {
+    /// Burst `number` from the cache, or drawn and cached.
+    fn cached(&mut self, number: u64, frames: usize) -> Result<CachedBurst> {
+        let cache = self.cache.clone();
+        if let Some(burst) = cache.as_ref().map(|cache| cache.read(number)).transpose()?.flatten() {
             return Ok(burst);
         }
-        let burst = KeptBurst::new(self.draw(number, Some(frames))?);
-        if let Some(shelf) = shelf {
-            shelf.put(number, &burst)?;
+        let burst = CachedBurst::new(self.draw(number, Some(frames))?);
+        if let Some(cache) = cache {
+            cache.write(number, &burst)?;
         }
         Ok(burst)
     }
 
-    /// Every burst that is to be kept, on `workers` threads: none of a recipe that keeps none.
+    /// Draws every burst of the cache on `workers` threads; does nothing for a recipe without `train.crops`.
     pub(super) fn draw_all(
         &self,
         workers: usize,
         on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
     ) -> Result<()> {
-        let Some((PartsConfig { bursts: all, kept, .. }, _)) = self.parts else { return Ok(()) };
+        let Some((CropsConfig { bursts: all, cached_frames, .. }, _)) = self.crops else { return Ok(()) };
         let next = AtomicU64::new(0);
         // Threads stop where nobody hears of their bursts any more.
         let (sender, receiver) = sync_channel(1);
         std::thread::scope(|scope| {
             for _ in 0..workers.max(1) {
-                let (mut bursts, sender, next) = (self.again()?, sender.clone(), &next);
+                let (mut bursts, sender, next) = (self.try_clone()?, sender.clone(), &next);
                 scope.spawn(move || {
                     loop {
                         let number = next.fetch_add(1, Ordering::Relaxed);
-                        let mut drawn = || bursts.kept(number, kept).map(drop);
+                        let mut drawn = || bursts.cached(number, cached_frames).map(drop);
                         if number >= all || sender.send(drawn()).is_err() {
                             break;
                         }
@@ -141,7 +141,7 @@ impl Bursts {
     }
 
     /// Burst `number`, or some of its frames.
-    fn draw(&mut self, number: u64, frames: Option<usize>) -> Result<Guided> {
+    fn draw(&mut self, number: u64, frames: Option<usize>) -> Result<ConditionedBurst> {
         let size = Size { height: self.crop, width: self.crop };
         let mut sample = self.dataset.sample(self.seed, number)?;
         if !self.exposure {
@@ -157,7 +157,7 @@ impl Bursts {
         let guide = GuidePlanes::of(&alignment, self.laid, range.clone());
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
-        Ok(Guided { size, sample, guide })
+        Ok(ConditionedBurst { size, sample, guide })
     }
 }
 
@@ -166,27 +166,27 @@ mod tests {
     use super::*;
     use qudi_model::restorer::TILE;
 
-    fn recipe(parts: &str) -> Recipe {
-        let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.parts", parts)];
+    fn recipe(crops: &str) -> Recipe {
+        let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.crops", crops)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
         Recipe::load("tiny", &changes).unwrap_or_else(|e| panic!("{e}"))
     }
 
-    fn of(recipe: &Recipe) -> Bursts {
+    fn of(recipe: &Recipe) -> BurstSampler {
         let dataset = Dataset::new(&recipe.data, None).unwrap_or_else(|e| panic!("{e}"));
-        Bursts::new(recipe, dataset, Vec::new())
+        BurstSampler::new(recipe, dataset, Vec::new())
     }
 
-    fn bursts(parts: &str) -> Bursts {
-        of(&recipe(parts))
+    fn bursts(crops: &str) -> BurstSampler {
+        of(&recipe(crops))
     }
 
-    fn sample(bursts: &mut Bursts, number: u64) -> Guided {
+    fn sample(bursts: &mut BurstSampler, number: u64) -> ConditionedBurst {
         bursts.sample(number).unwrap_or_else(|e| panic!("{e}"))
     }
 
     /// Truth, count and restored value of every pixel, in the order of their values.
-    fn pixels(burst: &Guided) -> Vec<(u32, u16, u32)> {
+    fn pixels(burst: &ConditionedBurst) -> Vec<(u32, u16, u32)> {
         let truth = burst.sample.truth.iter().flat_map(|frame| frame.data.clone());
         let counts = burst.sample.counts.iter().flatten();
         let pixels = truth.zip(counts).zip(&burst.guide.0[0]);
@@ -196,43 +196,43 @@ mod tests {
     }
 
     #[test]
-    fn turned_bursts_keep_their_pixels_together() {
-        let mut bursts = bursts("{ bursts = 2, kept = 3, frames = 3, side = 32 }");
+    fn rotated_crops_move_all_planes_alike() {
+        let mut bursts = bursts("{ bursts = 2, cached_frames = 3, frames = 3, side = 32 }");
         let whole = [0, 1].map(|place| bursts.draw(place, None).unwrap_or_else(|e| panic!("{e}")));
         let whole = whole.map(|burst| pixels(&burst));
         let mut corners = std::collections::HashSet::new();
         for number in 0..16 {
-            let part = sample(&mut bursts, number);
-            assert!(whole.contains(&pixels(&part)), "sample {number}");
-            corners.insert(part.guide.0[0][0].to_bits());
+            let crop = sample(&mut bursts, number);
+            assert!(whole.contains(&pixels(&crop)), "sample {number}");
+            corners.insert(crop.guide.0[0][0].to_bits());
         }
         assert!(corners.len() > 4, "two bursts in eight positions, and {} corners", corners.len());
     }
 
     #[test]
-    fn kept_frames_know_the_others() {
-        let mut bursts = bursts("{ bursts = 1, kept = 3, frames = 3, side = 32 }");
+    fn cached_frames_are_aligned_with_all_frames() {
+        let mut bursts = bursts("{ bursts = 1, cached_frames = 3, frames = 3, side = 32 }");
         let whole = bursts.draw(0, None).unwrap_or_else(|e| panic!("{e}"));
-        let kept = bursts.draw(0, Some(2)).unwrap_or_else(|e| panic!("{e}"));
-        assert_eq!((kept.sample.truth.len(), kept.sample.counts.len()), (2, 2));
+        let cached = bursts.draw(0, Some(2)).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!((cached.sample.truth.len(), cached.sample.counts.len()), (2, 2));
         let pixels = whole.size.pixels();
-        let first = whole.sample.truth.iter().position(|frame| *frame == kept.sample.truth[0]);
+        let first = whole.sample.truth.iter().position(|frame| *frame == cached.sample.truth[0]);
         let first = first.unwrap_or_else(|| panic!("no frame of the whole"));
-        for (all, some) in whole.guide.0.iter().zip(&kept.guide.0) {
+        for (all, some) in whole.guide.0.iter().zip(&cached.guide.0) {
             assert!(all[first * pixels..][..2 * pixels] == some[..]);
         }
     }
 
     #[test]
-    fn parts_are_parts_and_always_the_same() {
-        let mut one = bursts("{ bursts = 1, kept = 3, frames = 3, side = 16 }");
+    fn crops_are_crops_of_the_burst_and_reproducible() {
+        let mut one = bursts("{ bursts = 1, cached_frames = 3, frames = 3, side = 16 }");
         let whole = pixels(&one.draw(0, None).unwrap_or_else(|e| panic!("{e}")));
-        let mut other = one.again().unwrap_or_else(|e| panic!("{e}"));
+        let mut other = one.try_clone().unwrap_or_else(|e| panic!("{e}"));
         let mut seen = Vec::new();
         for number in [3, 1, 2] {
-            let part = sample(&mut one, number);
-            assert_eq!((part.size.pixels(), part.sample.truth.len()), (256, 3));
-            let list = pixels(&part);
+            let crop = sample(&mut one, number);
+            assert_eq!((crop.size.pixels(), crop.sample.truth.len()), (256, 3));
+            let list = pixels(&crop);
             assert!(list.iter().all(|pixel| whole.binary_search(pixel).is_ok()));
             assert_eq!(list, pixels(&sample(&mut other, number)));
             seen.push(list);
@@ -241,13 +241,13 @@ mod tests {
     }
 
     #[test]
-    fn bursts_on_disk_are_those_drawn() {
-        let recipe = recipe("{ bursts = 2, kept = 3, frames = 3, side = 16 }");
+    fn cached_bursts_equal_drawn_ones_and_damage_is_refused() {
+        let recipe = recipe("{ bursts = 2, cached_frames = 3, frames = 3, side = 16 }");
         let folder = tempfile::tempdir().unwrap_or_else(|e| panic!("{e}"));
-        let keep = |recipe: &Recipe| {
-            of(recipe).keep_in(folder.path(), recipe).unwrap_or_else(|e| panic!("{e}"))
+        let cached = |recipe: &Recipe| {
+            of(recipe).with_cache(folder.path(), recipe).unwrap_or_else(|e| panic!("{e}"))
         };
-        let same = |a: &Guided, b: &Guided| {
+        let same = |a: &ConditionedBurst, b: &ConditionedBurst| {
             let (one, other) = (&a.sample.acquisition, &b.sample.acquisition);
             a.guide.0 == b.guide.0
                 && a.sample.truth == b.sample.truth
@@ -257,7 +257,7 @@ mod tests {
                     == (other.ppp.to_bits(), other.exposure.to_bits(), other.gain.to_bits())
                 && one.sensor == other.sensor
         };
-        let (mut drawn, mut first, mut second) = (of(&recipe), keep(&recipe), keep(&recipe));
+        let (mut drawn, mut first, mut second) = (of(&recipe), cached(&recipe), cached(&recipe));
         for number in 0..6 {
             let expected = sample(&mut drawn, number);
             assert!(same(&expected, &sample(&mut first, number)), "written, sample {number}");
@@ -271,8 +271,8 @@ mod tests {
 
         let mut other = recipe.clone();
         other.data.source[0].speed = 1.0;
-        let error = (0..6).find_map(|number| keep(&other).sample(number).err());
-        assert!(error.is_some_and(|e| e.to_string().contains("something else")));
+        let error = (0..6).find_map(|number| cached(&other).sample(number).err());
+        assert!(error.is_some_and(|e| e.to_string().contains("was drawn with other")));
         for file in files {
             let bytes = std::fs::read(file.path()).unwrap_or_else(|e| panic!("{e}"));
             for broken in [
@@ -282,7 +282,7 @@ mod tests {
                 &[&bytes[..], &vec![0; 1 << 17]].concat(),
             ] {
                 std::fs::write(file.path(), broken).unwrap_or_else(|e| panic!("{e}"));
-                let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
+                let error = (0..6).find_map(|number| cached(&recipe).sample(number).err());
                 assert!(error.is_some_and(|e| e.place().is_some()), "{} bytes", broken.len());
             }
             let mut dark = bytes.clone();
@@ -291,7 +291,7 @@ mod tests {
             let at = at.unwrap_or_else(|| panic!("no exposure in the label"));
             dark[at..at + label.len()].copy_from_slice(b"exposure =-0.");
             std::fs::write(file.path(), dark).unwrap_or_else(|e| panic!("{e}"));
-            let error = (0..6).find_map(|number| keep(&recipe).sample(number).err());
+            let error = (0..6).find_map(|number| cached(&recipe).sample(number).err());
             assert!(error.is_some_and(|e| e.to_string().contains("above 0")));
             std::fs::write(file.path(), bytes).unwrap_or_else(|e| panic!("{e}"));
         }
@@ -299,12 +299,12 @@ mod tests {
         let device = burn::tensor::Device::flex();
         let network = recipe.network.init(1, &device).with_round_more(0);
         let drafts = Draft::all(&network, &recipe.network, TILE, &device);
-        let drafted = Bursts { drafts, ..of(&recipe) };
-        let mut drafted = drafted.keep_in(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
+        let drafted = BurstSampler { drafts, ..of(&recipe) };
+        let mut drafted = drafted.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
         let error = (0..6).find_map(|number| drafted.sample(number).err());
-        assert!(error.is_some_and(|e| e.to_string().contains("something else")));
+        assert!(error.is_some_and(|e| e.to_string().contains("was drawn with other")));
 
-        other.train.parts = None;
-        assert!(of(&other).keep_in(folder.path(), &other).is_err());
+        other.train.crops = None;
+        assert!(of(&other).with_cache(folder.path(), &other).is_err());
     }
 }
