@@ -61,7 +61,11 @@ impl Batch {
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
-            let time = training_timestep(random.random(), random.random(), recipe.train.noise_start_fraction);
+            let time = training_timestep(
+                random.random(),
+                random.random(),
+                recipe.train.noise_start_fraction,
+            );
             batch.timesteps.push(time);
             batch.acquisitions.push(drawn.acquisition);
         }

@@ -1,8 +1,8 @@
 //! Bursts with their guides, small in memory, and on disk: a guide takes longer to find than to learn from.
 
 use super::burst_sampler::ConditionedBurst;
-use super::recipe::{CropsConfig, Recipe};
 use super::parameters::parameters;
+use super::recipe::{CropsConfig, Recipe};
 use crate::dataset::{DataConfig, Sample};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
@@ -158,7 +158,11 @@ impl BurstCache {
     pub(super) fn new(folder: &Path, recipe: &Recipe, drafts: &[Draft]) -> Result<Self> {
         let Some(crops) = recipe.train.crops else {
             let what = "the recipe draws every sample anew";
-            return Err(SimError::request(what, "train.crops", "add train.crops, or leave the folder of bursts out"));
+            return Err(SimError::request(
+                what,
+                "train.crops",
+                "add train.crops, or leave the folder of bursts out",
+            ));
         };
         let key = CacheKey {
             program: env!("CARGO_PKG_VERSION").to_owned(),
@@ -174,7 +178,11 @@ impl BurstCache {
             folder: folder.to_owned(),
             seed: recipe.train.seed,
             key,
-            shape: [crops.cached_frames.min(recipe.data.frames), recipe.data.crop, recipe.data.crop],
+            shape: [
+                crops.cached_frames.min(recipe.data.frames),
+                recipe.data.crop,
+                recipe.data.crop,
+            ],
             laid: recipe.network.pre.laid(),
         })
     }
@@ -199,8 +207,7 @@ impl BurstCache {
             SimError::data(format!("no burst: {e}"), &path, "report this")
         };
         let Acquisition { ppp, exposure, gain, ref sensor, .. } = burst.sample.acquisition;
-        let label =
-            Label { drawn: self.key.text(), ppp, exposure, gain, sensor: sensor.clone() };
+        let label = Label { drawn: self.key.text(), ppp, exposure, gain, sensor: sensor.clone() };
         // TOML: its numbers come back bit for bit.
         let label = toml::to_string(&label).map_err(|e| report(&e))?;
         let words =
@@ -252,7 +259,11 @@ impl BurstCache {
         if key.is_none() || key != CacheKey::from_text(&self.key.text()) {
             let help =
                 "keep the bursts of another recipe, or of another version, in another folder";
-            return Err(SimError::data("the burst was drawn with other data, sensors or weights", &path, help));
+            return Err(SimError::data(
+                "the burst was drawn with other data, sensors or weights",
+                &path,
+                help,
+            ));
         }
         label.sensor.validate()?;
         if ![label.ppp, label.exposure, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {

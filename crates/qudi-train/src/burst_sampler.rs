@@ -112,7 +112,9 @@ impl BurstSampler {
         workers: usize,
         on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
     ) -> Result<()> {
-        let Some((CropsConfig { bursts: all, cached_frames, .. }, _)) = self.crops else { return Ok(()) };
+        let Some((CropsConfig { bursts: all, cached_frames, .. }, _)) = self.crops else {
+            return Ok(());
+        };
         let next = AtomicU64::new(0);
         // Threads stop where nobody hears of their bursts any more.
         let (sender, receiver) = sync_channel(1);
@@ -300,7 +302,8 @@ mod tests {
         let network = recipe.network.init(1, &device).with_round_more(0);
         let drafts = Draft::all(&network, &recipe.network, TILE, &device);
         let drafted = BurstSampler { drafts, ..of(&recipe) };
-        let mut drafted = drafted.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
+        let mut drafted =
+            drafted.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
         let error = (0..6).find_map(|number| drafted.sample(number).err());
         assert!(error.is_some_and(|e| e.to_string().contains("was drawn with other")));
 

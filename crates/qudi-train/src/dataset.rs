@@ -6,11 +6,11 @@
 mod config;
 mod content;
 mod crop;
-mod sample;
 mod pack;
 mod pack_writer;
+mod sample;
 
 pub use config::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
-pub use sample::{Dataset, Sample};
 pub use pack::{Clip, Pack};
 pub use pack_writer::{PackProgress, write_pack};
+pub use sample::{Dataset, Sample};

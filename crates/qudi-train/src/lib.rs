@@ -9,32 +9,32 @@
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 
-mod optimizer;
 mod batch;
+mod burst_cache;
 mod burst_sampler;
 pub mod dataset;
 mod draw_bursts;
-mod prefetch;
-mod burst_cache;
 mod learning_rate;
 pub mod loss;
+mod optimizer;
+mod parameters;
 pub mod perceptual;
+mod prefetch;
 mod recipe;
 mod run;
 pub mod selftest;
 mod state;
 mod trainer;
 mod validate;
-mod parameters;
 
-pub use optimizer::Adam;
 pub use batch::Batch;
 pub use burst_sampler::BurstSampler;
 pub use draw_bursts::draw_bursts;
-pub use prefetch::Prefetcher;
 pub use learning_rate::learning_rate;
-pub use recipe::{LossConfig, CropsConfig, Recipe, TrainConfig, ValidationConfig};
+pub use optimizer::Adam;
+pub use parameters::{gradients, parameters, with_parameters};
+pub use prefetch::Prefetcher;
+pub use recipe::{CropsConfig, LossConfig, Recipe, TrainConfig, ValidationConfig};
 pub use run::{Event, Files, From, METRICS, RECIPE, Run, WEIGHTS};
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};
-pub use parameters::{gradients, parameters, with_parameters};

@@ -177,15 +177,18 @@ pub fn loss_terms(
     let (x0_prev, known, simulated) = match self_conditioning {
         // Where sampling begins, nothing comes before.
         SelfConditioning::On(seed) if example.timesteps.iter().any(|&t| t < TIMES - 1) => {
-            let previous: Vec<usize> = example.timesteps.iter().map(|&t| previous_timestep(t)).collect();
+            let previous: Vec<usize> =
+                example.timesteps.iter().map(|&t| previous_timestep(t)).collect();
             let x_t = noisy(&previous);
             let (x0_prev, simulated) = estimate(network, example, x_t, previous, seed)?;
-            let known = simulated.exists.iter().map(|&exists| exists && loop_options.self_conditioning);
+            let known =
+                simulated.exists.iter().map(|&exists| exists && loop_options.self_conditioning);
             (x0_prev, known.collect(), Some(simulated).filter(|_| loop_options.forward_model))
         }
         _ => (clean.zeros_like(), vec![false; example.timesteps.len()], None),
     };
-    let state = State { x_t: noisy(example.timesteps), x0_prev, known, times: example.timesteps.to_vec() };
+    let state =
+        State { x_t: noisy(example.timesteps), x0_prev, known, times: example.timesteps.to_vec() };
     let prepared = network.prepare(example.measured);
     let result = network.forward(&prepared, simulated.as_ref(), &state, None);
     let unknown = (result.x0.clone() - clean.clone()) / result.unit.clamp_min(LEAST_UNIT);
@@ -207,7 +210,8 @@ pub fn loss_terms(
     }
     // Told, too, of frames before any simulated measurement.
     let uncertainty = network.tells_errors().then(|| network.denoise(&example.measured.guide));
-    let uncertainty = uncertainty.and_then(|(d, deviation)| uncertainty_loss(example, &d, deviation));
+    let uncertainty =
+        uncertainty.and_then(|(d, deviation)| uncertainty_loss(example, &d, deviation));
     if let Some(term) = &uncertainty {
         total = total + term.clone();
     }
@@ -240,7 +244,11 @@ fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights
 }
 
 /// [`gaussian_nll`] at the errors of pre-denoised frames, from which no gradient goes into the frames.
-fn uncertainty_loss(example: &Example<'_>, d: &Tensor<4>, deviation: Option<Tensor<4>>) -> Option<Tensor<1>> {
+fn uncertainty_loss(
+    example: &Example<'_>,
+    d: &Tensor<4>,
+    deviation: Option<Tensor<4>>,
+) -> Option<Tensor<1>> {
     deviation.map(|deviation| gaussian_nll(d.clone().detach() - example.truth.clone(), deviation))
 }
 

@@ -189,7 +189,9 @@ impl Recipe {
             (
                 "train.crops",
                 (fewest..=data.frames).contains(&frames)
-                    && train.crops.is_none_or(|crops| (frames..=data.frames).contains(&crops.cached_frames))
+                    && train
+                        .crops
+                        .is_none_or(|crops| (frames..=data.frames).contains(&crops.cached_frames))
                     && side <= data.crop
                     && train.crops.is_none_or(|crops| (1..=1 << 20).contains(&crops.bursts)),
                 "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
@@ -205,7 +207,11 @@ impl Recipe {
             ),
             ("train.clip", train.clip > 0.0, "must be above 0"),
             ("train.ema", share(train.ema), "must be from 0 to below 1"),
-            ("train.noise_start_fraction", (0.0..=1.0).contains(&train.noise_start_fraction), "must be from 0 to 1"),
+            (
+                "train.noise_start_fraction",
+                (0.0..=1.0).contains(&train.noise_start_fraction),
+                "must be from 0 to 1",
+            ),
             ("train.checkpoint", train.checkpoint > 0, "must be at least 1"),
             (
                 "train.loss",

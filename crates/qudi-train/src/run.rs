@@ -141,7 +141,8 @@ impl Run {
         on: &mut dyn FnMut(Event<'_>) -> ControlFlow<()>,
     ) -> Result<()> {
         let train = self.recipe.train.clone();
-        let mut prefetcher = Prefetcher::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
+        let mut prefetcher =
+            Prefetcher::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
         let mut metrics = self.metrics()?;
         while self.trainer.step_number() < train.steps {
             let report = self.trainer.step(&mut prefetcher)?;

@@ -2,9 +2,9 @@
 //! is replaced whole or not at all.
 
 use super::optimizer::Adam;
+use super::parameters::with_parameters;
 use super::recipe::Recipe;
 use super::trainer::Trainer;
-use super::parameters::with_parameters;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::{Result, SimError};
 use qudi_model::network::parameters as parameter_shapes;

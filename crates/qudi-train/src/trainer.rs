@@ -1,12 +1,12 @@
 //! The network while it learns: weights, their average, the optimizer's state.
 
-use super::optimizer::Adam;
 use super::batch::Batch;
-use super::prefetch::Prefetcher;
 use super::learning_rate::learning_rate;
-use super::recipe::{LossConfig, Recipe};
+use super::optimizer::Adam;
 use super::parameters::{gradients, parameters, with_parameters};
-use crate::loss::{SelfConditioning, LossWeights, LoopOptions, loss_terms};
+use super::prefetch::Prefetcher;
+use super::recipe::{LossConfig, Recipe};
+use crate::loss::{LoopOptions, LossWeights, SelfConditioning, loss_terms};
 use crate::perceptual::{Perceptual, PerceptualKind};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};

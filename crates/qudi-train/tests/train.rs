@@ -7,8 +7,8 @@ use qudi_model::checkpoint::load;
 use qudi_model::network::{Qudi, fill, parameters as parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::{
-    Adam, Batch, BurstSampler, Event, Prefetcher, Files, From, METRICS, Recipe, Run, StepReport, Trainer,
-    WEIGHTS, parameters,
+    Adam, Batch, BurstSampler, Event, Files, From, METRICS, Prefetcher, Recipe, Run, StepReport,
+    Trainer, WEIGHTS, parameters,
 };
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -107,10 +107,8 @@ fn devices_share_batches_without_changing_the_result() {
     let (pair, _) = trained(&accumulated, &[Device::flex(), Device::flex()], 1);
     assert!(turns == pair, "weights differ");
     // A doubled batch has one coin for the first pass: compare a step where both sides agree.
-    let doubled = recipe(&[
-        ("train.batch", "2"),
-        ("network.ablate", "[\"physics\", \"self-conditioning\"]"),
-    ]);
+    let doubled =
+        recipe(&[("train.batch", "2"), ("network.ablate", "[\"physics\", \"self-conditioning\"]")]);
     let mut halves = doubled.clone();
     (halves.train.batch, halves.train.accumulate) = (1, 2);
     let (whole, a) = trained(&doubled, &[Device::flex()], 1);
@@ -226,7 +224,11 @@ fn the_pre_denoiser_learns_from_parts() {
     for (key, value, word) in [
         ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }", "3 frames"),
         ("train.crops", "{ bursts = 0, cached_frames = 3, frames = 3, side = 24 }", "one burst"),
-        ("train.crops", "{ bursts = 3, cached_frames = 3, frames = 3, side = 30 }", "train.crops.side"),
+        (
+            "train.crops",
+            "{ bursts = 3, cached_frames = 3, frames = 3, side = 30 }",
+            "train.crops.side",
+        ),
         ("train.crops", "{ bursts = 3, cached_frames = 3, frames = 3, side = 40 }", "fit"),
         ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 3, side = 24 }", "fit"),
     ] {
@@ -280,7 +282,10 @@ fn refuses_to_step_on_nan_loss() {
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
     let mut prefetcher = Prefetcher::new(&recipe, &bursts, 0, 1).unwrap();
     let error = trainer.step(&mut prefetcher).unwrap_err().to_string();
-    assert!(error.contains("first estimate") || error.contains("prediction loss is NaN at step 1"), "{error}");
+    assert!(
+        error.contains("first estimate") || error.contains("prediction loss is NaN at step 1"),
+        "{error}"
+    );
     assert_eq!(trainer.step_number(), 0);
 }
 
@@ -332,7 +337,8 @@ fn recipes_say_what_is_wrong_with_them() {
     assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);
     let recipe = load("data.sensor.0.ppp", "[3.25, 9.75]").unwrap();
     assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
-    let mut bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let mut bursts =
+        BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
     assert_eq!(again.len(), 2);
 }

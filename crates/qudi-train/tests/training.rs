@@ -14,7 +14,8 @@ use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, fill, parameters as pa
 use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::{
-    Example, SelfConditioning, LossWeights, LoopOptions, LossTerms, gaussian_nll, loss_terms, training_timestep,
+    Example, LoopOptions, LossTerms, LossWeights, SelfConditioning, gaussian_nll, loss_terms,
+    training_timestep,
 };
 use qudi_train::{Adam, gradients, parameters, with_parameters};
 use std::collections::HashMap;
@@ -85,8 +86,10 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
         noise: to_tensor(values, burst.size, &burst.truth.device()),
         timesteps: &[time],
     };
-    let self_conditioning = if number.is_multiple_of(2) { SelfConditioning::Off } else { SelfConditioning::On(number) };
-    loss_terms(network, &example, self_conditioning, LossWeights::default(), LoopOptions::ALL, None).unwrap()
+    let self_conditioning =
+        if number.is_multiple_of(2) { SelfConditioning::Off } else { SelfConditioning::On(number) };
+    loss_terms(network, &example, self_conditioning, LossWeights::default(), LoopOptions::ALL, None)
+        .unwrap()
 }
 
 /// The first stage computes what the whole network would of pre-denoiser and flow, and nothing else learns.
@@ -104,7 +107,8 @@ fn the_first_stage_is_a_part_of_the_whole() {
             noise: burst.truth.zeros_like(),
             timesteps: &[500],
         };
-        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None).unwrap()
+        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
+            .unwrap()
     };
     let (part, whole) = (with(0.0), with(1.0));
     let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
@@ -138,7 +142,8 @@ fn errors_are_told_without_changing_frames() {
             noise: burst.truth.zeros_like(),
             timesteps: &[500],
         };
-        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None).unwrap()
+        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
+            .unwrap()
     };
     let (part, whole) = (terms_of(0.0), terms_of(1.0));
     let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
@@ -180,7 +185,9 @@ fn told_errors_scale_the_diffusion() {
             timesteps: &[100],
         };
         let weights = LossWeights::default();
-        let terms = loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None).unwrap();
+        let terms =
+            loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
+                .unwrap();
         terms.prediction.into_scalar::<f32>()
     };
     let without = prediction(false, 0.0);
