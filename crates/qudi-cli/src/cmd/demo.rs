@@ -6,7 +6,7 @@ use crate::cmd::demo_html::html;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
 use crate::interrupt;
-use crate::report::{Bar, Report};
+use crate::report::{Bar, Cell, Column, Report, Table, json};
 use qudi_burst::Average;
 use qudi_burst::{Finish, Qbp, TwoRounds};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
@@ -120,19 +120,17 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
 
     let picture = picture(&shown, &burst, &deviation, truth, &sensor, demo.ppp);
     picture.save(&path, overwrite)?;
-    let text = text(&shown, &deviation, source, truth);
+    let table = table(&shown);
+    let text = table.to_text() + &text(&shown, &deviation, source, truth);
     let foot = format!(
         "{} at {} photons/pixel/frame, seed {}; psnr in dB, -a after the best gain",
         sensor.name, demo.ppp, demo.seed
     );
     let png = std::fs::read(&path).map_err(|e| SimError::io("read", &path, e))?;
     PendingFile::write_whole(&page, html(&png, &shown, &foot).as_bytes(), overwrite)?;
-    let figures = shown.iter().map(|s| {
-        json!({"method": s.name, "psnr_a": s.psnr_a, "psnr": s.psnr, "ssim": s.ssim, "seconds": s.seconds})
-    });
     let text = format!("{text}\n{}   {foot}\n{}\n", path.display(), page.display());
     report.result(&text, || {
-        json!({"picture": path, "page": page, "seed": demo.seed, "figures": figures.collect::<Vec<_>>()})
+        json!({"picture": path, "page": page, "seed": demo.seed, "figures": json::rows(&table)})
     })
 }
 
@@ -233,14 +231,29 @@ fn picture(
     picture
 }
 
+/// What every method reaches on the frame in the centre.
+fn table(shown: &[Shown]) -> Table {
+    let mut table = Table::new(vec![
+        Column::new("method", "centre frame"),
+        Column::new("psnr_a", "psnr-a").with_unit("dB"),
+        Column::new("psnr", "psnr").with_unit("dB"),
+        Column::new("ssim", "ssim"),
+        Column::new("seconds", "seconds"),
+    ]);
+    table.rows.extend(shown.iter().map(|method| {
+        vec![
+            Cell::text(method.name),
+            Cell::number(method.psnr_a, 2),
+            Cell::number(method.psnr, 2),
+            Cell::number(method.ssim, 3),
+            Cell::number(method.seconds, 2),
+        ]
+    }));
+    table
+}
+
 fn text(shown: &[Shown], deviation: &Frame, source: &str, truth: &Frame) -> String {
-    let mut text = format!(
-        "{:<14}{:>9}{:>9}{:>8}{:>10}\n",
-        "centre frame", "psnr-a", "psnr", "ssim", "seconds"
-    );
-    for Shown { name, psnr_a, psnr, ssim, seconds, .. } in shown {
-        let _ = writeln!(text, "{name:<14}{psnr_a:>9.2}{psnr:>9.2}{ssim:>8.3}{seconds:>10.2}");
-    }
+    let mut text = String::new();
     if let Some(method) = shown.last() {
         let error = rms(&error_map(&method.frame, truth)) / f64::from(ERROR_GAIN);
         let _ =

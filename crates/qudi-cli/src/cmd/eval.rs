@@ -6,16 +6,16 @@ use crate::cmd::eval_capture::{Judged, judge};
 use crate::cmd::eval_clip::Clip;
 use crate::cmd::eval_html::html;
 use crate::cmd::eval_score::{Figure, FlowKind, Row};
-use crate::cmd::eval_table::{csv, markdown, table};
+use crate::cmd::eval_table::{frames, summary};
 use crate::cmd::methods::METHODS;
 use crate::error::{Fault, Result};
 use crate::interrupt;
-use crate::report::Report;
-use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
+use crate::report::{Output, Report, csv, markdown};
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::sensor::Sensor;
 use qudi_io::capture::{MaskChoice, ReadOptions};
 use serde_json::{Value, json};
-use std::path::Path;
+use std::path::PathBuf;
 
 /// Light levels of clips unless said otherwise: those of the paper's table.
 const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
@@ -25,9 +25,11 @@ const SENSOR: &str = "qudi-paper";
 
 pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
-    for path in [&args.csv, &args.markdown, &args.html, &args.export_photons].into_iter().flatten()
-    {
-        refuse_taken(path, overwrite)?;
+    let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
+    let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
+    let html_file = output(&args.html)?;
+    if let Some(folder) = &args.export_photons {
+        refuse_taken(folder, overwrite)?;
     }
     checked_exposure(args.exposure)?;
     if let Some(unknown) = args.method.iter().find(|name| !METHODS.contains(&name.as_str())) {
@@ -39,13 +41,12 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
     }
     let Judged { rows, pictures, about, settings } =
         if args.capture { judge(args, report)? } else { judge_clips(args, report, overwrite)? };
-    write(args.csv.as_deref(), &csv(&rows), overwrite)?;
-    if args.html.is_some() {
-        let page = html(&rows, &pictures, &about);
-        write(args.html.as_deref(), &page, overwrite)?;
-    }
-    write(args.markdown.as_deref(), &markdown(&rows), overwrite)?;
-    report.result(&table(&rows, &about), || document(settings, &rows))?;
+    csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
+    html_file.write(|| Ok(html(&rows, &pictures, &about)))?;
+    let table = summary(&rows);
+    markdown_file.write(|| Ok(markdown::table(&table)))?;
+    let text = format!("{}\n{about}\n", table.to_text());
+    report.result(&text, || document(settings, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
     match args.min_psnr {
         Some(bar) => match rows.iter().find(|row| psnr_a(row) < bar) {
@@ -155,11 +156,6 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
         "overlap": args.overlap,
     });
     Ok(Judged { rows, pictures, about, settings })
-}
-
-fn write(path: Option<&Path>, text: &str, overwrite: Overwrite) -> Result<()> {
-    let Some(path) = path else { return Ok(()) };
-    Ok(PendingFile::write_whole(path, text.as_bytes(), overwrite)?)
 }
 
 /// What is not known is left out.

@@ -1,7 +1,7 @@
 //! The report of `qudi eval` as one HTML file: table, plot, pictures side by side. Nothing is fetched.
 
 use crate::cmd::eval_score::Row;
-use crate::cmd::eval_table::columns;
+use crate::cmd::eval_table::summary;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::{ExtendedColorType, ImageEncoder};
@@ -49,8 +49,8 @@ pub(crate) fn escape(text: &str) -> String {
 
 fn table(rows: &[Row]) -> String {
     let mut text = "<table><thead><tr>".to_owned();
-    let mut lines = columns(rows).into_iter();
-    for title in lines.next().unwrap_or_default() {
+    let (headings, lines) = summary(rows).shown();
+    for title in headings {
         let _ = write!(text, "<th>{}</th>", escape(&title));
     }
     text += "</tr></thead><tbody>\n";

@@ -1,0 +1,188 @@
+//! The console: results go to standard output, everything else to standard error. No other file prints.
+#![allow(clippy::print_stdout, clippy::print_stderr)]
+
+use crate::args::{Color, Global};
+use crate::error::{Fault, Result, stdout_fault};
+use crate::interrupt;
+use crate::report::json::document;
+use crate::report::printable;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::{IsTerminal, Write};
+use std::process::ExitCode;
+use tracing_subscriber::EnvFilter;
+
+/// Prints what a run has to say, as its options ask.
+#[derive(Debug)]
+pub(crate) struct Report {
+    json: bool,
+    volume: Volume,
+    color: bool,
+}
+
+/// The amount of text that a run prints.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Volume {
+    Quiet,
+    Normal,
+    Verbose,
+}
+
+impl Report {
+    pub(crate) fn new(global: &Global) -> Self {
+        let color = match global.color {
+            Color::Always => true,
+            Color::Never => false,
+            Color::Auto => {
+                std::io::stderr().is_terminal()
+                    && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+            }
+        };
+        let (volume, level) = match (global.quiet, global.verbose) {
+            (true, _) => (Volume::Quiet, "error"),
+            (false, 0) => (Volume::Normal, "warn"),
+            (false, 1) => (Volume::Verbose, "info"),
+            (false, _) => (Volume::Verbose, "debug"),
+        };
+        let filter = EnvFilter::try_from_env("QUDI_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+        // Setting it twice can only happen in tests, and then the first one serves.
+        let _ = tracing_subscriber::fmt()
+            .with_env_filter(filter)
+            .with_writer(std::io::stderr)
+            .with_ansi(color)
+            .without_time()
+            .with_target(false)
+            .try_init();
+        Self { json: global.json, volume, color }
+    }
+
+    /// Makes a report for errors that occur before the options are known.
+    pub(crate) fn plain() -> Self {
+        Self { json: false, volume: Volume::Normal, color: false }
+    }
+
+    pub(crate) fn json(&self) -> bool {
+        self.json
+    }
+
+    /// Prints a result: the JSON document if asked for, else the text unless quiet.
+    pub(crate) fn result(
+        &self,
+        text: &str,
+        json: impl FnOnce() -> serde_json::Value,
+    ) -> Result<()> {
+        if self.json {
+            return print(&document(&json()));
+        }
+        if self.volume == Volume::Quiet { Ok(()) } else { print(&printable(text)) }
+    }
+
+    /// Prints a remark beside the result.
+    pub(crate) fn remark(&self, text: &str) {
+        if self.volume != Volume::Quiet {
+            eprintln!("{}", printable(text));
+        }
+    }
+
+    /// Makes a progress bar, which is hidden off a terminal, under --json and under --quiet; with --verbose, log
+    /// lines take its place.
+    pub(crate) fn bar(&self) -> Bar {
+        let shown = !self.json && self.volume == Volume::Normal && std::io::stderr().is_terminal();
+        let target =
+            if shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+        let bar = ProgressBar::with_draw_target(None, target);
+        let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {per_sec} {eta}");
+        bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        Bar { bar, tenth: 0 }
+    }
+
+    /// Prints an error and returns the exit code of the program.
+    pub(crate) fn fault(&self, fault: &Fault) -> ExitCode {
+        match fault {
+            Fault::BrokenPipe => ExitCode::SUCCESS,
+            Fault::Interrupted => {
+                self.remark("interrupted: nothing was written");
+                ExitCode::from(interrupt::EXIT_CODE)
+            }
+            Fault::Stopped(what) => {
+                self.remark(what);
+                ExitCode::from(interrupt::EXIT_CODE)
+            }
+            Fault::Missed(what) => {
+                self.remark(what);
+                ExitCode::from(1)
+            }
+            Fault::Error { what, place, help } => {
+                let (red, bold, plain) =
+                    if self.color { ("\x1b[1;31m", "\x1b[1m", "\x1b[0m") } else { ("", "", "") };
+                let mut text = format!("{red}error:{plain} {}\n", printable(what));
+                if let Some(place) = place {
+                    text += &format!("  {bold}where:{plain} {}\n", printable(place));
+                }
+                if let Some(help) = help {
+                    text += &format!("  {bold}help:{plain} {}\n", printable(help));
+                }
+                // Nothing can be done if standard error is gone as well.
+                let _ = std::io::stderr().write_all(text.as_bytes());
+                ExitCode::from(2)
+            }
+        }
+    }
+}
+
+/// Prints text that was asked for by name, also when quiet.
+pub(crate) fn print(text: &str) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    let end = if text.ends_with('\n') { "" } else { "\n" };
+    write!(out, "{text}{end}").and_then(|()| out.flush()).map_err(stdout_fault)
+}
+
+/// Shows the progress of one command.
+#[derive(Debug)]
+pub(crate) struct Bar {
+    bar: ProgressBar,
+    tenth: u64,
+}
+
+impl Bar {
+    /// Shows how far the work `what` has come; another `what` starts at zero.
+    pub(crate) fn update(&mut self, what: &'static str, done: u64, total: Option<u64>) {
+        if self.bar.message() != what {
+            self.bar.set_message(what);
+            self.bar.reset();
+            self.tenth = 0;
+        }
+        if let Some(total) = total {
+            self.bar.set_length(total);
+        }
+        self.bar.set_position(done);
+        let tenth = total.map_or(done / 100, |total| 10 * done / total.max(1));
+        if tenth > self.tenth {
+            self.tenth = tenth;
+            let total = total.map_or("?".to_owned(), |total| total.to_string());
+            tracing::info!("{what}: {done}/{total} frames");
+        }
+    }
+
+    /// Shows the progress of training, with figures in `words`.
+    pub(crate) fn learning(&mut self, words: String, done: u64, total: u64) {
+        self.bar.set_length(total);
+        self.bar.set_position(done);
+        let percent = 100 * done / total.max(1);
+        if percent > self.tenth {
+            self.tenth = percent;
+            tracing::info!("step {done}/{total}: {words}");
+        }
+        self.bar.set_message(words);
+    }
+
+    /// Prints a remark above the bar.
+    pub(crate) fn above(&self, text: &str, report: &Report) {
+        self.bar.suspend(|| report.remark(text));
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
