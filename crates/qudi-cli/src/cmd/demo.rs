@@ -129,9 +129,10 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
     let png = std::fs::read(&path).map_err(|e| SimError::io("read", &path, e))?;
     PendingFile::write_whole(&page, html(&png, &shown, &foot).as_bytes(), overwrite)?;
     let text = format!("{text}\n{}   {foot}\n{}\n", path.display(), page.display());
-    report.result(&text, || {
-        json!({"picture": path, "page": page, "seed": demo.seed, "figures": json::rows(&table)})
-    })
+    report.result(
+        &text,
+        || json!({"picture": path, "page": page, "seed": demo.seed, "figures": json::rows(&table)}),
+    )
 }
 
 fn render(bar: &mut Bar) -> Vec<Frame> {

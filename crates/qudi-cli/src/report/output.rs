@@ -32,7 +32,8 @@ mod tests {
     use super::*;
 
     fn scratch(name: &str) -> std::path::PathBuf {
-        let folder = std::env::temp_dir().join(format!("qudi-output-{name}-{}", std::process::id()));
+        let folder =
+            std::env::temp_dir().join(format!("qudi-output-{name}-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap_or_else(|e| panic!("{e}"));
         folder
     }
@@ -55,7 +56,8 @@ mod tests {
     fn writes_file_when_work_is_done() {
         let folder = scratch("written");
         let path = folder.join("table.csv");
-        let written = Output::open(Some(&path), Overwrite::Yes).and_then(|file| file.write(|| Ok("a,b")));
+        let written =
+            Output::open(Some(&path), Overwrite::Yes).and_then(|file| file.write(|| Ok("a,b")));
         assert!(written.is_ok());
         assert_eq!(std::fs::read_to_string(&path).ok().as_deref(), Some("a,b"));
     }
@@ -63,7 +65,8 @@ mod tests {
     #[test]
     fn makes_no_content_without_a_path() {
         let unused = Output::open(None, Overwrite::No);
-        let written = unused.and_then(|none| none.write(|| -> Result<&str> { panic!("not asked for") }));
+        let written =
+            unused.and_then(|none| none.write(|| -> Result<&str> { panic!("not asked for") }));
         assert!(written.is_ok());
     }
 }

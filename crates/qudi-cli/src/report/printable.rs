@@ -24,7 +24,8 @@ pub(crate) fn printable(text: &str) -> Cow<'_, str> {
 
 /// Whether a terminal would act on a character instead of showing it.
 pub(super) fn is_unprintable(c: char) -> bool {
-    let is_bidi = matches!(c, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    let is_bidi =
+        matches!(c, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     is_bidi || c.is_control() && !matches!(c, '\n' | '\t')
 }
 

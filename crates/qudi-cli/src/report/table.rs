@@ -154,12 +154,7 @@ pub(super) fn example() -> Table {
             Cell::Unknown,
             Cell::text("a \"b\""),
         ],
-        vec![
-            Cell::text("mle"),
-            Cell::number(-3.0, 2),
-            Cell::Unknown,
-            Cell::text("<b>\u{1b}</b>"),
-        ],
+        vec![Cell::text("mle"), Cell::number(-3.0, 2), Cell::Unknown, Cell::text("<b>\u{1b}</b>")],
     ];
     table
 }
