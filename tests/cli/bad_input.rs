@@ -47,7 +47,7 @@ fn damaged_files_are_refused() {
         ("complex.npy", npy_bytes("<c8", "(1, 2, 2)", &[0; 32]), "`<c8`"),
         ("nan.npy", npy_bytes("<f4", "(1, 8, 8)", &nan), "NaN"),
         ("negative.npy", npy_bytes("<f4", "(1, 8, 8)", &ones(64, -0.5)), "-0.5"),
-        ("bright.npy", npy_bytes("<f4", "(1, 8, 8)", &ones(64, 200.0)), "--white"),
+        ("bright.npy", npy_bytes("<f4", "(1, 8, 8)", &ones(64, 200.0)), "white"),
         ("black.npy", npy_bytes("<f4", "(1, 8, 8)", &ones(64, 0.0)), "exposure"),
         ("empty.png", vec![], "not a readable image"),
         ("truncated.png", png[..40].to_vec(), "not a readable image"),

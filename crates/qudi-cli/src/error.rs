@@ -1,5 +1,6 @@
 //! Errors of the command line: what happened, where, what to do.
 
+use crate::fields::flags;
 use qudi_core::SimError;
 use std::fmt::Display;
 use std::io;
@@ -38,7 +39,11 @@ impl From<SimError> for Fault {
             SimError::Io { source, .. } if source.kind() == io::ErrorKind::BrokenPipe => {
                 Self::BrokenPipe
             }
-            _ => Self::Error { what: e.to_string(), place: e.place(), help: e.help() },
+            _ => Self::Error {
+                what: e.to_string(),
+                place: e.place().map(|place| flags(&place)),
+                help: e.help(),
+            },
         }
     }
 }

@@ -4,6 +4,7 @@ mod args;
 mod cmd;
 mod device;
 mod error;
+mod fields;
 mod interrupt;
 mod keys;
 mod memory;

@@ -65,7 +65,7 @@ impl Camera {
         if !electrons_per_value.is_finite() || electrons_per_value > MAX_DETECTIONS {
             return Err(SimError::request(
                 format!("{electrons_per_value:e} electrons in a white pixel"),
-                "--ppp and --exposure",
+                "ppp, exposure",
                 "lower the light or raise the exposure value",
             ));
         }
@@ -73,7 +73,7 @@ impl Camera {
         if law.dead_time() > 0.0 && electrons_per_value > MAX_ARRIVALS {
             return Err(SimError::request(
                 format!("{electrons_per_value:e} arrivals in a white pixel with a dead time"),
-                "--ppp and `defects.dead_time_ns`",
+                "ppp, defects.dead_time_ns",
                 format!(
                     "such counters are followed arrival by arrival: stay below {MAX_ARRIVALS:e}"
                 ),

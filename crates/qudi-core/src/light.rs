@@ -110,7 +110,7 @@ pub fn resolve_light(
     if !(value.is_finite() && (0.0..=1e6).contains(&value)) {
         return Err(SimError::request(
             format!("{value} photons per pixel"),
-            "--ppp",
+            "ppp",
             "give a number between 0 (darkness) and 1000000",
         ));
     }
@@ -118,8 +118,8 @@ pub fn resolve_light(
     if !(exposure.is_finite() && exposure > 0.0 && exposure <= 1e6) {
         return Err(SimError::request(
             format!("an exposure of {exposure}: the clip has no light to distribute photons over"),
-            "--exposure",
-            "give the image value that receives PPP photons, as in --exposure 0.45",
+            "exposure",
+            "give the image value that receives PPP photons, such as 0.45",
         ));
     }
     let qe = sensor.quantum_efficiency;
@@ -129,8 +129,8 @@ pub fn resolve_light(
         PppDefinition::Detected => {
             return Err(SimError::request(
                 format!("{value} detections per pixel, but dark counts alone are {dark:.4}"),
-                "--ppp",
-                "raise --ppp, or lower the sensor's `dark`",
+                "ppp",
+                "raise `ppp`, or lower the sensor's `dark`",
             ));
         }
         PppDefinition::Dn => {
@@ -141,8 +141,8 @@ pub fn resolve_light(
                         "the gain rule `{}` follows the light, so a mean output value does not fix it",
                         sensor.gain
                     ),
-                    "--ppp-def dn",
-                    "give a gain that does not: --gain unit, --gain fwc, or a number of DN per electron",
+                    "ppp_def",
+                    "give a gain that does not: `unit`, `fwc`, or a number of DN per electron",
                 ));
             }
             let law = CountLaw::new(sensor, sensor.gain_at(1.0)?);
@@ -160,7 +160,7 @@ fn light_for_mean_value(mean_dn: impl Fn(f64) -> f64, value: f64) -> Result<f64>
             format!(
                 "a mean output value of {value} is out of reach: this sensor gives {low:.4} to {high:.4} here"
             ),
-            "--ppp",
+            "ppp",
             "choose a value in that range, or more bits or summed frames",
         )
     };

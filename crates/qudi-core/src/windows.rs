@@ -25,7 +25,7 @@ impl Windows {
         if length == 0 || overlap >= length {
             return Err(SimError::request(
                 format!("windows of {length} frames that share {overlap}"),
-                "--window, --overlap",
+                "window, overlap",
                 "windows are longer than their overlap",
             ));
         }

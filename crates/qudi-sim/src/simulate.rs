@@ -135,7 +135,7 @@ pub fn simulate(
         return Err(SimError::request(
             format!("the clip is too short for one exposure of {} frames", sampling.instants),
             input.place(),
-            "lower --instants, or check --frames",
+            "lower `instants`, or check `frames`",
         ));
     }
 

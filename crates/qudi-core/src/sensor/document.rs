@@ -48,7 +48,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         let hint = nearest.map_or(String::new(), |n| format!("did you mean `{n}`?  "));
         return Err(SimError::request(
             format!("no sensor named `{name_or_path}`"),
-            "--sensor",
+            "sensor",
             format!("{hint}list them with `qudi info --sensors`, or pass a .toml file"),
         ));
     }

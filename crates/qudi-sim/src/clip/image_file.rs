@@ -89,6 +89,6 @@ pub(super) fn check_values(data: &[f32], path: &Path) -> Result<()> {
     Err(SimError::data(
         format!("a value of {bad}, where scenes lie between 0 (black) and 1 (white)"),
         path,
-        "replace missing values; for other scales give the value of white, as in --white 255",
+        "replace missing values; for other scales give the value of white, such as 255",
     ))
 }

@@ -141,7 +141,7 @@ impl Input {
         };
         if motion.is_some() || size.is_some() {
             return Err(SimError::request(
-                "--motion and --size shape synthetic scenes, and this is a recorded clip",
+                "`motion` and `size` shape synthetic scenes, and this is a recorded clip",
                 text,
                 "leave them out, or give a single image",
             ));
@@ -201,7 +201,7 @@ impl Input {
         if !(1..=MAX_INSTANTS).contains(&sampling.instants) {
             return Err(SimError::request(
                 format!("{} instants per exposure", sampling.instants),
-                "--instants",
+                "instants",
                 format!("between 1 (no motion during an exposure) and {MAX_INSTANTS}"),
             ));
         }
@@ -210,7 +210,7 @@ impl Input {
         {
             return Err(SimError::request(
                 format!("white at {white}"),
-                "--white",
+                "white",
                 "give a number above 0",
             ));
         }
@@ -248,11 +248,11 @@ impl Input {
             }
             Self::Procedural(procedural) => {
                 let size = procedural.size;
-                Size::new(size.height, size.width, "--size")?;
+                Size::new(size.height, size.width, "size")?;
                 if !(procedural.speed.is_finite() && procedural.speed >= 0.0) {
                     return Err(SimError::request(
                         format!("a speed of {}", procedural.speed),
-                        "--speed",
+                        "speed",
                         "give pixels per frame, 0 or more",
                     ));
                 }

@@ -30,7 +30,7 @@ impl NpyFrames {
             return Err(SimError::data(
                 "an array of wide integers, whose value of white is unknown",
                 path,
-                "give the value of white, as in --white 255",
+                "give the value of white, such as 255",
             ));
         };
         let (frames, height, width, channels) = match *header.shape.as_slice() {

@@ -1,26 +1,28 @@
-//! A stream of binary PPM images (P6, 8 bits), as ffmpeg writes them into a pipe.
+//! A stream of binary PPM images, one after another, as ffmpeg writes them into a pipe.
 
 use super::FrameReader;
-use qudi_core::Transfer;
-use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
-use std::io::{BufRead, ErrorKind, Read};
+use image::codecs::pnm::PnmDecoder;
+use image::{ColorType, ImageDecoder};
+use qudi_core::{Frame, Result, SimError, Size, Transfer};
+use std::io::BufRead;
 use std::path::{Path, PathBuf};
 
+/// Frames of a PPM stream, converted to gray.
 pub(super) struct PpmStream<R: BufRead> {
     reader: R,
+    /// The next frame, which has been decoded already.
+    next: Option<Frame>,
     size: Size,
-    /// The first header has been read already.
-    pending: bool,
     path: PathBuf,
     transfer: Transfer,
 }
 
 impl<R: BufRead> PpmStream<R> {
-    /// None for an empty stream.
+    /// Reads the first frame; none for an empty stream.
     pub(super) fn open(mut reader: R, path: &Path, transfer: Transfer) -> Result<Option<Self>> {
-        let Some(size) = read_header(&mut reader, path)? else { return Ok(None) };
-        Ok(Some(Self { reader, size, pending: true, path: path.to_owned(), transfer }))
+        let Some(first) = read_frame(&mut reader, path, transfer)? else { return Ok(None) };
+        let size = first.size;
+        Ok(Some(Self { reader, next: Some(first), size, path: path.to_owned(), transfer }))
     }
 }
 
@@ -32,31 +34,24 @@ fn damaged(path: &Path, what: &str) -> SimError {
     )
 }
 
-/// The size in the next header; none at the end of the stream.
-fn read_header(reader: &mut impl BufRead, path: &Path) -> Result<Option<Size>> {
-    let mut words: Vec<String> = Vec::new();
-    let mut word = String::new();
-    while words.len() < 4 {
-        let mut byte = [0u8];
-        match reader.read_exact(&mut byte) {
-            Err(e)
-                if e.kind() == ErrorKind::UnexpectedEof && words.is_empty() && word.is_empty() =>
-            {
-                return Ok(None);
-            }
-            Err(e) => return Err(SimError::io("read the decoded video", path, e)),
-            Ok(()) if !byte[0].is_ascii_whitespace() => word.push(byte[0] as char),
-            Ok(()) => words.push(std::mem::take(&mut word)),
-        }
-        if word.len() > 16 {
-            return Err(damaged(path, "no PPM header"));
-        }
+/// Decodes one image; none at the end of the stream.
+fn read_frame(reader: &mut impl BufRead, path: &Path, transfer: Transfer) -> Result<Option<Frame>> {
+    let rest = reader.fill_buf().map_err(|e| SimError::io("read the decoded video", path, e))?;
+    if rest.is_empty() {
+        return Ok(None);
     }
-    let number = |i: usize| words[i].parse::<usize>().map_err(|_| damaged(path, "no PPM header"));
-    if words[0] != "P6" || words[3] != "255" {
-        return Err(damaged(path, "no 8-bit PPM header"));
+    let broken = |e: image::ImageError| damaged(path, &e.to_string());
+    let decoder = PnmDecoder::new(reader).map_err(broken)?;
+    if decoder.color_type() != ColorType::Rgb8 {
+        return Err(damaged(path, "it is not 8-bit RGB"));
     }
-    Size::new(number(2)?, number(1)?, &path.display().to_string()).map(Some)
+    let (width, height) = decoder.dimensions();
+    // Refuses sizes beyond the limit on pixels before anything is allocated.
+    let size = Size::new(height as usize, width as usize, &path.display().to_string())?;
+    let mut bytes = vec![0; 3 * size.pixels()];
+    decoder.read_image(&mut bytes).map_err(broken)?;
+    let gray = |p: &[u8]| transfer.gray([p[0], p[1], p[2]].map(|v| f32::from(v) / 255.0)).min(1.0);
+    Ok(Some(Frame { size, data: bytes.chunks_exact(3).map(gray).collect() }))
 }
 
 impl<R: BufRead> FrameReader for PpmStream<R> {
@@ -69,27 +64,15 @@ impl<R: BufRead> FrameReader for PpmStream<R> {
     }
 
     fn next(&mut self) -> Result<Option<Frame>> {
-        if !std::mem::take(&mut self.pending) {
-            match read_header(&mut self.reader, &self.path)? {
-                None => return Ok(None),
-                Some(size) if size != self.size => {
-                    return Err(damaged(&self.path, "its frames change size"));
-                }
-                Some(_) => {}
+        if let Some(frame) = self.next.take() {
+            return Ok(Some(frame));
+        }
+        match read_frame(&mut self.reader, &self.path, self.transfer)? {
+            Some(frame) if frame.size != self.size => {
+                Err(damaged(&self.path, "its frames change size"))
             }
+            frame => Ok(frame),
         }
-        // Read through `take`, so that a lying header allocates no more than what arrives.
-        let bytes = 3 * self.size.pixels();
-        let mut raw = Vec::new();
-        let read = (&mut self.reader).take(bytes as u64).read_to_end(&mut raw);
-        read.map_err(|e| SimError::io("read the decoded video", &self.path, e))?;
-        if raw.len() < bytes {
-            return Err(damaged(&self.path, "it ends inside a frame"));
-        }
-        let data = raw
-            .chunks_exact(3)
-            .map(|p| self.transfer.gray([p[0], p[1], p[2]].map(|v| f32::from(v) / 255.0)).min(1.0));
-        Ok(Some(Frame { size: self.size, data: data.collect() }))
     }
 }
 
@@ -100,7 +83,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_stream_panics(bytes in prop::collection::vec(any::<u8>(), 0..200), magic: bool) {
+        fn random_streams_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..200), magic: bool) {
             let start: &[u8] = if magic { b"P6\n2 2\n255\n" } else { b"" };
             let bytes = [start, &bytes].concat();
             if let Ok(Some(mut stream)) = open(&bytes) {
@@ -114,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn two_frames_are_two_frames() {
+    fn reads_frames_one_after_another() {
         let mut bytes = b"P6\n2 1\n255\n".to_vec();
         bytes.extend([255, 255, 255, 0, 0, 0]);
         bytes.extend(b"P6\n2 1\n255\n\x80\x80\x80\xff\x00\x00");
@@ -126,12 +109,11 @@ mod tests {
     }
 
     #[test]
-    fn broken_streams_are_errors() {
+    fn rejects_broken_streams() {
         assert!(open(b"").unwrap().is_none());
-        assert!(open(b"P5\n2 1\n255\n").is_err());
+        assert!(open(b"P5\n2 1\n255\n12").is_err());
         assert!(open(b"P6 99999999999999999999").is_err());
         assert!(open(b"P6\n100000 100000\n255\n").is_err());
-        let mut short = open(b"P6\n1000 1000\n255\nabc").unwrap().unwrap();
-        assert!(short.next().is_err());
+        assert!(open(b"P6\n1000 1000\n255\nabc").is_err());
     }
 }
