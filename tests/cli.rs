@@ -16,6 +16,8 @@ mod outputs;
 mod remote;
 #[path = "cli/restore.rs"]
 mod restore;
+#[path = "cli/settings.rs"]
+mod settings;
 #[path = "cli/train.rs"]
 mod train;
 

@@ -28,7 +28,8 @@ const EXIT_CODES: &str = "Exit codes:
   130  interrupted
 
 Settings come from built-in defaults, then --config FILE, then QUDI_* variables, then --set
-KEY=VALUE, then flags; the later one wins. `qudi config show` tells which one did.";
+KEY=VALUE, then flags; the later one wins. `qudi config show` tells which one did. Unknown keys are
+errors. A file and the environment may hold keys of other commands; --set may not.";
 
 /// Simulate, restore and measure video from single-photon cameras.
 ///
@@ -103,6 +104,31 @@ pub(crate) enum Command {
     Completions(Completions),
     #[command(hide = true)]
     Man(Man),
+}
+
+impl Command {
+    /// The name on the command line.
+    pub(crate) fn name(&self) -> &'static str {
+        match self {
+            Self::Simulate(_) => "simulate",
+            Self::Restore(_) => "restore",
+            Self::Train(_) => "train",
+            Self::Publish(_) => "publish",
+            Self::Eval(_) => "eval",
+            Self::Bench(_) => "bench",
+            Self::Selftest(_) => "selftest",
+            #[cfg(feature = "remote")]
+            Self::Serve(_) => "serve",
+            Self::Convert(_) => "convert",
+            Self::Calibrate(_) => "calibrate",
+            Self::Demo(_) => "demo",
+            Self::Light(_) => "light",
+            Self::Info(_) => "info",
+            Self::Config(_) => "config",
+            Self::Completions(_) => "completions",
+            Self::Man(_) => "man",
+        }
+    }
 }
 
 /// Check that a device computes what Burn's stock operations do on the processor: every operation of the network, and a

@@ -13,6 +13,7 @@ mod demo_html;
 pub(crate) mod eval;
 mod eval_capture;
 mod eval_clip;
+mod eval_exposing;
 mod eval_html;
 mod eval_score;
 mod eval_table;

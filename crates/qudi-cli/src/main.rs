@@ -5,8 +5,8 @@ mod cmd;
 mod device;
 mod error;
 mod fields;
+mod files;
 mod interrupt;
-mod keys;
 mod memory;
 #[cfg(feature = "remote")]
 mod remote;
@@ -52,22 +52,26 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
     if let Some(threads) = args.global.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build_global()?;
     }
+    // Loaded for every command, so that none ignores what it was told.
+    let settings = settings::Settings::load(&args.global, args.command.name())?;
     match &args.command {
-        Command::Simulate(simulate) => cmd::simulate::run(simulate, &args.global, report),
-        Command::Restore(restore) => cmd::restore::run(restore, &args.global, report),
-        Command::Train(train) => cmd::train::run(train, &args.global, report),
+        Command::Simulate(simulate) => cmd::simulate::run(simulate, settings, &args.global, report),
+        Command::Restore(restore) => cmd::restore::run(restore, &settings, &args.global, report),
+        Command::Train(train) => cmd::train::run(train, &settings, &args.global, report),
         Command::Publish(publish) => cmd::publish::run(publish, &args.global, report),
-        Command::Eval(eval) => cmd::eval::run(eval, &args.global, report),
+        Command::Eval(eval) => cmd::eval::run(eval, &settings, &args.global, report),
         Command::Bench(bench) => cmd::bench::run(bench, &args.global, report),
         Command::Selftest(selftest) => cmd::selftest::run(selftest, report),
         #[cfg(feature = "remote")]
         Command::Serve(serve) => cmd::serve::run(serve, report),
         Command::Convert(convert) => cmd::convert::run(convert, &args.global, report),
-        Command::Calibrate(calibrate) => cmd::calibrate::run(calibrate, &args.global, report),
-        Command::Demo(demo) => cmd::demo::run(demo, &args.global, report),
-        Command::Light(light) => cmd::light::run(light, report),
-        Command::Info(info) => cmd::info::run(info, &args.global, report),
-        Command::Config(config) => cmd::config::run(config, &args.global, report),
+        Command::Calibrate(calibrate) => {
+            cmd::calibrate::run(calibrate, &settings, &args.global, report)
+        }
+        Command::Demo(demo) => cmd::demo::run(demo, &settings, &args.global, report),
+        Command::Light(light) => cmd::light::run(light, &settings, report),
+        Command::Info(info) => cmd::info::run(info, &settings, &args.global, report),
+        Command::Config(config) => cmd::config::run(config, &settings, report),
         Command::Completions(completions) => cmd::completions::run(completions),
         Command::Man(man) => cmd::completions::man(man),
     }

@@ -1,8 +1,20 @@
 //! Settings in layers: defaults, file, environment, `--set`, flags; each value knows its origin.
+//!
+//! Every command loads them, and says by name which keys of `--set` it does not take. Files and the environment
+//! are shared between commands: known keys of other commands are no error there.
+
+mod commands;
+mod flags;
+mod keys;
+mod recipe_keys;
+
+pub(crate) use flags::KeyFlags;
+pub(crate) use keys::KEYS;
 
 use crate::args::Global;
 use crate::error::{Fault, Result};
-use crate::keys::KEYS;
+use crate::files::read_small;
+use keys::Kind;
 use qudi_core::nearest::nearest;
 use qudi_core::sensor::{Sensor, load_document, merge_documents};
 use serde::de::DeserializeOwned;
@@ -12,109 +24,174 @@ use std::path::Path;
 /// Settings files are a page long; anything much larger is something else.
 const MAX_FILE: u64 = 1 << 20;
 
-/// A flag that sets a key: the key, the flag's name, and its value if given.
-pub(crate) type Flag = (&'static str, &'static str, Option<Value>);
+/// The origin of values that nobody set.
+const DEFAULT: &str = "default";
 
-/// The value of every key, in the order of [`KEYS`], with its origin.
+/// The settings of one command.
 #[derive(Debug)]
 pub(crate) struct Settings {
+    command: &'static str,
+    /// The value of every key, in the order of [`KEYS`], with its origin.
     values: Vec<(Value, String)>,
+    /// Keys of a recipe that were set, with value and origin.
+    recipe: Vec<(String, Value, String)>,
+}
+
+/// Who sets a key.
+enum Origin<'a> {
+    /// A file or the environment, which other commands read as well.
+    Shared(&'a str),
+    /// A flag of this command.
+    Own(&'a str),
+}
+
+impl Origin<'_> {
+    fn name(&self) -> &str {
+        match self {
+            Self::Shared(name) | Self::Own(name) => name,
+        }
+    }
 }
 
 impl Settings {
-    /// Lays all layers over each other.
-    pub(crate) fn load(global: &Global, flags: Vec<Flag>) -> Result<Self> {
+    /// Lays all layers of `command` over each other.
+    pub(crate) fn load(global: &Global, command: &'static str) -> Result<Self> {
         let default = |text: &str| if text.is_empty() { Value::Null } else { parse_value(text) };
-        let values = KEYS.iter().map(|key| (default(key.default), "default".to_owned())).collect();
-        let mut settings = Self { values };
+        let values = KEYS.iter().map(|key| (default(key.default), DEFAULT.to_owned())).collect();
+        let mut settings = Self { command, values, recipe: Vec::new() };
         if let Some(path) = &global.config {
             settings.add_file(path)?;
         }
         settings.add_environment()?;
         for assignment in &global.set {
-            let Some((name, value)) = assignment.split_once('=') else {
+            let Some((name, text)) = assignment.split_once('=') else {
                 return Err(Fault::new(
                     format!("`{assignment}` sets nothing"),
                     "--set",
                     "write KEY=VALUE, as in --set simulate.ppp=9.75",
                 ));
             };
-            settings.set(name.trim(), parse_value(value.trim()), "--set")?;
-        }
-        for (name, flag, value) in flags {
-            if let Some(value) = value {
-                settings.set(name, value, flag)?;
-            }
+            settings.set(name.trim(), parse_value(text.trim()), text, &Origin::Own("--set"))?;
         }
         Ok(settings)
     }
 
+    /// Lays flags over the other layers.
+    pub(crate) fn with_flags(mut self, flags: &KeyFlags) -> Result<Self> {
+        for (key, text) in &flags.0 {
+            let flag = key.flag.map_or(String::new(), |flag| format!("--{}", flag.long));
+            self.set(key.name, parse_value(text), text, &Origin::Own(&flag))?;
+        }
+        Ok(self)
+    }
+
     fn add_file(&mut self, path: &Path) -> Result<()> {
         let place = path.display().to_string();
-        let fault = |what: String| {
-            Fault::new(
-                what,
-                &place,
-                "see `qudi config docs` for the keys and configs/ for examples",
-            )
-        };
-        let read = |e: std::io::Error| fault(format!("cannot read the settings: {e}"));
-        let length = std::fs::metadata(path).map_err(read)?.len();
-        if length > MAX_FILE {
-            return Err(fault(format!(
-                "a settings file of {length} bytes is over the limit of {MAX_FILE}"
-            )));
-        }
-        let text = std::fs::read_to_string(path).map_err(read)?;
-        let document: Value = toml::from_str(&text)
-            .map_err(|e| fault(format!("not a TOML document: {}", e.message())))?;
+        let help = "see `qudi config docs` for the keys and configs/ for examples";
+        let text = read_small(path, "the settings", MAX_FILE, help)?;
+        let document: Value = toml::from_str(&text).map_err(|e| {
+            Fault::new(format!("not a TOML document: {}", e.message()), &place, help)
+        })?;
         let mut leaves = Vec::new();
         flatten("", document, &mut leaves);
-        leaves.into_iter().try_for_each(|(name, value)| self.set(&name, value, &place))
+        for (name, value) in leaves {
+            let text = value.to_string();
+            self.set(&name, value, &text, &Origin::Shared(&place))?;
+        }
+        Ok(())
     }
 
     /// `QUDI_SIMULATE_PPP=9.75` sets `simulate.ppp`.
     fn add_environment(&mut self) -> Result<()> {
-        let variable = |name: &str| format!("QUDI_{}", name.replace('.', "_").to_uppercase());
-        for (name, value) in std::env::vars_os() {
-            let (Some(name), Some(value)) = (name.to_str(), value.to_str()) else { continue };
-            let concerns_settings =
-                name.starts_with("QUDI_SIMULATE_") || name.starts_with("QUDI_SENSOR_");
-            if !concerns_settings {
+        let parts = commands::SETTINGS.iter().chain(commands::RECIPE);
+        let prefixes: Vec<String> = parts.map(|part| format!("{}_", variable(part))).collect();
+        for (name, text) in std::env::vars_os() {
+            let (Some(name), Some(text)) = (name.to_str(), text.to_str()) else { continue };
+            if !prefixes.iter().any(|prefix| name.starts_with(prefix)) {
                 continue;
             }
-            let Some(key) = KEYS.iter().find(|key| variable(key.name) == name) else {
-                let names: Vec<String> = KEYS.iter().map(|key| variable(key.name)).collect();
+            let keys = KEYS.iter().map(|key| key.name);
+            let keys = keys.chain(recipe_keys::names().iter().map(String::as_str));
+            let Some(key) = keys.clone().find(|key| variable(key) == name) else {
+                let names: Vec<String> = keys.map(variable).collect();
                 let names: Vec<&str> = names.iter().map(String::as_str).collect();
                 return Err(unknown_key(name, &names, "the environment"));
             };
-            self.set(key.name, parse_value(value), name)?;
+            self.set(key, parse_value(text), text, &Origin::Shared(name))?;
         }
         Ok(())
     }
 
-    fn set(&mut self, name: &str, value: Value, origin: &str) -> Result<()> {
-        let Some(at) = KEYS.iter().position(|key| key.name == name) else {
-            let names: Vec<_> = KEYS.iter().map(|key| key.name).collect();
-            return Err(unknown_key(name, &names, origin));
-        };
+    /// Sets a key to `value`, which was written as `text`.
+    fn set(&mut self, name: &str, value: Value, text: &str, origin: &Origin<'_>) -> Result<()> {
+        let at = KEYS.iter().position(|key| key.name == name);
+        let of_recipe = commands::RECIPE.contains(&name.split('.').next().unwrap_or_default());
+        if at.is_none() && !(of_recipe && recipe_keys::is_known(name, &value)) {
+            let names = KEYS.iter().map(|key| key.name);
+            let recipe = recipe_keys::names().iter().map(String::as_str);
+            let names: Vec<_> = if of_recipe { recipe.collect() } else { names.collect() };
+            return Err(unknown_key(name, &names, origin.name()));
+        }
+        if !commands::takes(self.command, name) {
+            return match origin {
+                Origin::Shared(_) => Ok(()),
+                Origin::Own(place) => Err(self.not_taken(name, place)),
+            };
+        }
         // JSON has no NaN and no infinity: both arrive as null.
         if value.is_null() {
             return Err(Fault::new(
                 format!("`{name}` is not a finite number"),
-                origin,
+                origin.name(),
                 "leave it out to keep the default",
             ));
         }
-        self.values[at] = (value, origin.to_owned());
+        let origin = origin.name().to_owned();
+        let Some(at) = at else {
+            self.recipe.push((name.to_owned(), value, origin));
+            return Ok(());
+        };
+        let value = match KEYS[at].kind {
+            Kind::Text if !value.is_string() => Value::String(text.trim().to_owned()),
+            _ => value,
+        };
+        self.values[at] = (value, origin);
         Ok(())
     }
 
+    fn not_taken(&self, key: &str, place: &str) -> Fault {
+        let command = self.command;
+        let part = key.split('.').next().unwrap_or_default();
+        let takers: Vec<_> = commands::takers(part);
+        let takers = takers.iter().filter(|taker| **taker != "config");
+        let takers: Vec<_> = takers.map(|taker| format!("`qudi {taker}`")).collect();
+        let own = match commands::taken(command) {
+            none if none.is_empty() => "it takes no settings".to_owned(),
+            parts => format!("it takes {parts}"),
+        };
+        let what = format!("`{key}` is not a setting of `qudi {command}`");
+        Fault::new(what, place, format!("{own}; {part}.* is for {}", takers.join(", ")))
+    }
+
+    /// Refuses keys of `--set` that begin so, since this run has no use for them.
+    pub(crate) fn refuse(&self, prefixes: &[&str], why: &str) -> Result<()> {
+        let meant = |name: &str| prefixes.iter().any(|prefix| name.starts_with(prefix));
+        let given = self.iter().find(|(name, _, origin)| *origin == "--set" && meant(name));
+        given.map_or(Ok(()), |(name, _, origin)| {
+            Err(Fault::new(format!("`{name}` is not used {why}"), origin, "leave it out"))
+        })
+    }
+
     /// All keys with value and origin.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (&'static str, &Value, &str)> {
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&str, &Value, &str)> {
         KEYS.iter()
             .zip(&self.values)
             .map(|(key, (value, origin))| (key.name, value, origin.as_str()))
+    }
+
+    /// Keys of a recipe that were set, with value and origin.
+    pub(crate) fn recipe_changes(&self) -> &[(String, Value, String)] {
+        &self.recipe
     }
 
     /// The value of a key; ask for an `Option` where it may be unset.
@@ -127,6 +204,11 @@ impl Settings {
                 "see `qudi config docs` for its meaning",
             )
         })
+    }
+
+    /// The value of a key if somebody set it.
+    pub(crate) fn given<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>> {
+        if self.find(name).1 == DEFAULT { Ok(None) } else { self.get(name).map(Some) }
     }
 
     /// The value of a key that has a text form of its own.
@@ -150,10 +232,26 @@ impl Settings {
         (value, origin)
     }
 
-    /// The chosen sensor with all overrides of `[sensor]`.
-    pub(crate) fn sensor(&self) -> Result<Sensor> {
-        let name: String = self.get("simulate.sensor")?;
-        let mut document = load_document(&name)?;
+    /// A sensor by name or file, with all overrides of `[sensor]`.
+    pub(crate) fn sensor(&self, name: &str) -> Result<Sensor> {
+        self.overridden(load_document(name)?, name)
+    }
+
+    /// A sensor that is known already, with all overrides of `[sensor]`.
+    pub(crate) fn adjusted(&self, sensor: Sensor) -> Result<Sensor> {
+        if !self.overrides_sensor() {
+            return Ok(sensor);
+        }
+        let name = sensor.name.clone();
+        self.overridden(serde_json::to_value(sensor).unwrap_or(Value::Null), &name)
+    }
+
+    /// Whether a key of `[sensor]` is set.
+    pub(crate) fn overrides_sensor(&self) -> bool {
+        self.iter().any(|(key, value, _)| key.starts_with("sensor.") && !value.is_null())
+    }
+
+    fn overridden(&self, mut document: Value, place: &str) -> Result<Sensor> {
         let mut overrides = Value::Object(Map::new());
         for (key, value, _) in
             self.iter().filter(|(key, value, _)| key.starts_with("sensor.") && !value.is_null())
@@ -165,8 +263,18 @@ impl Settings {
             merge_documents(&mut overrides, nested);
         }
         merge_documents(&mut document, overrides);
-        Ok(Sensor::from_document(document, &name)?)
+        Ok(Sensor::from_document(document, place)?)
     }
+}
+
+/// Keys of recipes with their values in the recipe that is shown, and that recipe's name.
+pub(crate) fn shown_recipe() -> (&'static str, Vec<(String, Value)>) {
+    (recipe_keys::SHOWN, recipe_keys::of_preset(recipe_keys::SHOWN))
+}
+
+/// The environment variable that sets a key.
+fn variable(key: &str) -> String {
+    format!("QUDI_{}", key.replace('.', "_").to_uppercase())
 }
 
 fn unknown_key(name: &str, names: &[&str], origin: &str) -> Fault {
@@ -187,6 +295,11 @@ fn parse_value(text: &str) -> Value {
     }
 }
 
+/// A value in TOML notation.
+pub(crate) fn toml_text(value: &Value) -> String {
+    toml::Value::try_from(value).map_or_else(|_| value.to_string(), |value| value.to_string())
+}
+
 /// Leaves of a document by dotted name.
 fn flatten(prefix: &str, value: Value, leaves: &mut Vec<(String, Value)>) {
     match value {
@@ -197,41 +310,5 @@ fn flatten(prefix: &str, value: Value, leaves: &mut Vec<(String, Value)>) {
             }
         }
         leaf => leaves.push((prefix.to_owned(), leaf)),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn values_are_toml_or_text() {
-        assert_eq!(parse_value("3.25"), json!(3.25));
-        assert_eq!(parse_value("7"), json!(7));
-        assert_eq!(parse_value("\"unit\""), json!("unit"));
-        assert_eq!(parse_value("7.5/s"), json!("7.5/s"));
-        assert_eq!(parse_value("1\nx = 2"), json!("1\nx = 2"));
-    }
-
-    #[test]
-    fn every_default_is_toml_and_every_sensor_key_exists() {
-        let paper = serde_json::to_value(Sensor::load("qudi-paper").unwrap()).unwrap();
-        for key in KEYS {
-            if !key.default.is_empty() {
-                assert!(
-                    toml::from_str::<Value>(&format!("v = {}", key.default)).is_ok(),
-                    "{}",
-                    key.name
-                );
-            }
-            if let Some(path) = key.name.strip_prefix("sensor.") {
-                let known = paper.pointer(&format!("/{}", path.replace('.', "/"))).is_some();
-                assert!(
-                    known || key.name.ends_with("dark_map") || key.name.ends_with("bad_pixels"),
-                    "{}",
-                    key.name
-                );
-            }
-        }
     }
 }

@@ -11,6 +11,7 @@ use std::path::PathBuf;
 /// DATA is a clip, or a folder of clips: folders of images, videos, GIF, Y4M, .npy, or scene:NAME.
 /// Each clip is exposed once per light level, with a seed of its own. Figures lead with PSNR after the
 /// best gain (psnr-a): counts do not fix the brightness of a picture, and no method is told.
+/// Settings of `qudi simulate` apply to clips.
 ///
 /// With --capture, DATA is a capture in any format. It has no truth, so that there are pictures (--html) and
 /// the chi-square of its counts given the result; a method that fits the noise gets below 1, one that blurs
@@ -35,16 +36,16 @@ pub(crate) struct Eval {
     /// Gain of a capture in DN per electron, for sensors whose gain follows the light
     #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, requires = "capture")]
     pub(crate) gain: Option<f64>,
-    /// Frames of each clip, or of the capture, at most
-    #[arg(long, value_name = "N", default_value_t = 33)]
-    pub(crate) frames: u64,
+    /// Frames of each clip, or of the capture, at most [default: 33]
+    #[arg(long, value_name = "N")]
+    pub(crate) frames: Option<u64>,
     /// How photons are drawn: strict (once per clip) or quiver (anew for every window of 11, light
     /// normalised by the window, middle frames judged)
     #[arg(long, value_name = "NAME", default_value = "strict")]
     pub(crate) protocol: Protocol,
-    /// Seed; each clip gets one made from it and its name
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    pub(crate) seed: u64,
+    /// Seed; each clip gets one made from it and its name [default: 1]
+    #[arg(long, value_name = "N")]
+    pub(crate) seed: Option<u64>,
     /// Mean image value that methods are told [default: as `qudi restore` finds it in each capture]
     #[arg(long, value_name = "VALUE")]
     pub(crate) exposure: Option<f64>,

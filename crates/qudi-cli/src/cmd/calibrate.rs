@@ -5,6 +5,7 @@ use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
+use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
 use qudi_core::npy::write_header;
 use qudi_core::sensor::{DarkRate, Gain, Response, Sensor, preset};
@@ -14,7 +15,12 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(
+    args: &Calibrate,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
     if args.output.extension().is_none_or(|e| e != "toml") {
         return Err(Fault::new(
@@ -28,7 +34,7 @@ pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<
         refuse_taken(path, overwrite)?;
     }
     let mut capture = Capture::open(&args.capture, &args.reading.options(MaskChoice::None), None)?;
-    let (base, sensor) = base_sensor(args, &capture)?;
+    let (base, sensor) = base_sensor(args, settings, &capture)?;
     let gain = args.gain.or(sensor.fixed_gain());
     let fps = capture.info().fps.or(sensor.fps);
     let hot = args.hot.as_deref().map(|text| threshold(text, fps)).transpose()?;
@@ -38,7 +44,7 @@ pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<
         interrupt::check()
     })?;
     drop(bar);
-    let document = document(args, &base, &sensor, &calibration, gain, &maps);
+    let document = document(args, base.as_deref(), &sensor, &calibration, gain, &maps);
     write_map(&maps[0], "<f4", &calibration, overwrite, |i, bytes| {
         bytes.extend(calibration.dark[i].to_le_bytes());
     })?;
@@ -91,13 +97,22 @@ pub(crate) fn run(args: &Calibrate, global: &Global, report: &Report) -> Result<
     })
 }
 
-/// The sensor to start from, and its name for `base`.
-fn base_sensor(args: &Calibrate, capture: &Capture) -> Result<(String, Sensor)> {
-    if let Some(name) = &args.sensor {
-        return Ok((name.clone(), Sensor::load(name)?));
-    }
-    let sensor = required_sensor(capture)?;
-    Ok((sensor.name.clone(), sensor))
+/// The sensor to start from, and its name for `base` if it is a preset.
+fn base_sensor(
+    args: &Calibrate,
+    settings: &Settings,
+    capture: &Capture,
+) -> Result<(Option<String>, Sensor)> {
+    let (name, sensor) = match &args.sensor {
+        Some(name) => (name.clone(), settings.sensor(name)?),
+        None => {
+            let sensor = required_sensor(capture)?;
+            (sensor.name.clone(), settings.adjusted(sensor)?)
+        }
+    };
+    // A preset with changes has no name to build on.
+    let preset = preset(&name).is_some() && !settings.overrides_sensor();
+    Ok((preset.then_some(name), sensor))
 }
 
 fn threshold(text: &str, fps: Option<f64>) -> Result<f64> {
@@ -115,7 +130,7 @@ fn threshold(text: &str, fps: Option<f64>) -> Result<f64> {
 
 fn document(
     args: &Calibrate,
-    base: &str,
+    base: Option<&str>,
     sensor: &Sensor,
     calibration: &Calibration,
     gain: Option<f64>,
@@ -146,7 +161,7 @@ fn document(
         let _ = writeln!(text, "dark_map = {}   # e- per native frame", name(&maps[0]));
         let _ = writeln!(text, "bad_pixels = {}   # nonzero: repaired", name(&maps[1]));
     };
-    if preset(base).is_some() {
+    if let Some(base) = base {
         let _ = writeln!(text, "base = {}", quoted(base));
         changes(&mut text);
         return text;

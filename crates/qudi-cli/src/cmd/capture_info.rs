@@ -4,10 +4,11 @@ use crate::args::{Global, Info};
 use crate::cmd::info::{origin, record_document};
 use crate::error::{Fault, Result};
 use crate::report::Report;
+use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
-use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
+use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, ReadOptions, Summary};
 use qudi_io::sidecar::Sidecar;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
@@ -25,6 +26,7 @@ pub(crate) fn run(
     path: &Path,
     record: Option<&(Sidecar, PathBuf)>,
     info: &Info,
+    settings: &Settings,
     global: &Global,
     report: &Report,
 ) -> Result<()> {
@@ -32,13 +34,9 @@ pub(crate) fn run(
     if let Some(preview) = &info.look.preview {
         refuse_taken(preview, overwrite)?;
     }
-    let named = info.look.sensor.as_deref().map(Sensor::load).transpose()?;
     let options = info.reading.options(MaskChoice::Auto);
-    let mut capture = Capture::open(path, &options, named.as_ref())?;
-    let sensor = match named {
-        Some(sensor) => Some(sensor),
-        None => known_sensor(&capture)?,
-    };
+    let (mut capture, sensor) =
+        open_capture(path, &options, info.look.sensor.as_deref(), settings)?;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.look.preview {
@@ -76,13 +74,38 @@ pub(crate) fn known_sensor(capture: &Capture) -> Result<Option<Sensor>> {
 
 /// The sensor that is known, where there has to be one.
 pub(crate) fn required_sensor(capture: &Capture) -> Result<Sensor> {
-    known_sensor(capture)?.ok_or_else(|| {
-        Fault::new(
-            "the file does not say which camera took it",
-            capture.path().display(),
-            "name its sensor, as in --sensor swissspad2 (`qudi info --sensors`)",
-        )
-    })
+    known_sensor(capture)?.ok_or_else(|| unknown_sensor(capture))
+}
+
+/// What is said where the sensor has to be known.
+pub(crate) fn unknown_sensor(capture: &Capture) -> Fault {
+    Fault::new(
+        "the file does not say which camera took it",
+        capture.path().display(),
+        "name its sensor, as in --sensor swissspad2 (`qudi info --sensors`)",
+    )
+}
+
+/// Opens a capture with the sensor that is named, or else known, all overrides of `[sensor]` applied.
+pub(crate) fn open_capture(
+    path: &Path,
+    options: &ReadOptions,
+    sensor: Option<&str>,
+    settings: &Settings,
+) -> Result<(Capture, Option<Sensor>)> {
+    if let Some(name) = sensor {
+        let sensor = settings.sensor(name)?;
+        return Ok((Capture::open(path, options, Some(&sensor))?, Some(sensor)));
+    }
+    let capture = Capture::open(path, options, None)?;
+    match known_sensor(&capture)? {
+        Some(sensor) if settings.overrides_sensor() => {
+            let sensor = settings.adjusted(sensor)?;
+            // Opened again: a dark map that is set decides which pixels are repaired.
+            Ok((Capture::open(path, options, Some(&sensor))?, Some(sensor)))
+        }
+        known => Ok((capture, known)),
+    }
 }
 
 /// Says on standard error what the user should know about a capture.

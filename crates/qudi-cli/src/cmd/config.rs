@@ -1,16 +1,15 @@
 //! `qudi config`: the settings, where they come from, what they mean.
 
-use crate::args::{Config, ConfigAction, Global};
+use crate::args::{Config, ConfigAction};
 use crate::error::Result;
-use crate::keys::KEYS;
 use crate::report::{Report, print};
-use crate::settings::Settings;
+use crate::settings::{KEYS, Settings, shown_recipe, toml_text};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
-pub(crate) fn run(config: &Config, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(config: &Config, settings: &Settings, report: &Report) -> Result<()> {
     match config.action {
-        ConfigAction::Show => show(&Settings::load(global, Vec::new())?, report),
+        ConfigAction::Show => show(settings, report),
         ConfigAction::Docs => print(&docs()),
     }
 }
@@ -21,8 +20,11 @@ fn show(settings: &Settings, report: &Report) -> Result<()> {
         Value::String(text) => text.clone(),
         other => other.to_string(),
     };
+    let recipe = settings.recipe_changes().iter();
+    let recipe = recipe.map(|(name, value, origin)| (name.as_str(), value, origin.as_str()));
+    let all: Vec<_> = settings.iter().chain(recipe).collect();
     let rows: Vec<_> =
-        settings.iter().map(|(name, value, origin)| (name, text_of(value), origin)).collect();
+        all.iter().map(|&(name, value, origin)| (name, text_of(value), origin)).collect();
     let names = rows.iter().map(|r| r.0.len()).max().unwrap_or(0);
     let values = rows.iter().map(|r| r.1.len()).max().unwrap_or(0);
     let mut text = String::new();
@@ -30,8 +32,7 @@ fn show(settings: &Settings, report: &Report) -> Result<()> {
         let _ = writeln!(text, "{name:names$}  {value:values$}  {origin}");
     }
     report.result(&text, || {
-        settings
-            .iter()
+        all.iter()
             .map(|(name, value, origin)| json!({"key": name, "value": value, "origin": origin}))
             .collect()
     })
@@ -42,12 +43,27 @@ fn docs() -> String {
     let mut text = String::from(
         "# Settings
 
-Keys of `--config FILE` (TOML) and `--set KEY=VALUE`. `QUDI_SIMULATE_PPP` in the environment sets
-`simulate.ppp`, and so on for every key. Later layers win: defaults, file, environment, `--set`,
-flags. Unknown keys are errors. Keys of `[sensor]` override the chosen sensor; sensor files in
-`sensors/` hold the same keys without the prefix, and `base = \"PRESET\"` starts one from a preset.
+Every command reads settings in layers; the later one wins:
 
-This page is the output of `qudi config docs`.
+1. built-in defaults,
+2. `--config FILE`, a TOML file of the keys below,
+3. the environment: `QUDI_SIMULATE_PPP` sets `simulate.ppp`, and so on for every key,
+4. `--set KEY=VALUE`,
+5. flags.
+
+| keys | commands that take them |
+|---|---|
+| `simulate.*` | `simulate`; `eval` on clips, where its own flags win |
+| `sensor.*` | `simulate`, `eval`, `restore`, `info`, `calibrate`, `light`, `demo`: on top of the chosen sensor |
+| `network.*`, `data.*`, `train.*`, `validation.*` | `train`: on top of the chosen recipe |
+
+Unknown keys are errors everywhere. `--set` with a key that the command does not take is an error. A file and the
+environment are shared between commands: there, known keys of other commands are left alone.
+
+Sensor files in `sensors/` hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one from a
+preset. This page is the output of `qudi config docs`.
+
+## Keys of the simulation and the sensor
 
 | key | default | meaning |
 |---|---|---|
@@ -57,6 +73,22 @@ This page is the output of `qudi config docs`.
         let default =
             if key.default.is_empty() { String::new() } else { format!("`{}`", key.default) };
         let _ = writeln!(text, "| `{}` | {default} | {} |", key.name, key.doc);
+    }
+    let (preset, keys) = shown_recipe();
+    let _ = write!(
+        text,
+        "
+## Keys of recipes
+
+Keys of `qudi train`, with their values in `{preset}.toml`; numbers in them count the entries of lists. What they mean
+stands in [training](../docs/training.md).
+
+| key | `{preset}` |
+|---|---|
+"
+    );
+    for (key, value) in keys {
+        let _ = writeln!(text, "| `{key}` | `{}` |", toml_text(&value));
     }
     text
 }

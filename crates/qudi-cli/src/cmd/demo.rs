@@ -7,6 +7,7 @@ use crate::cmd::network;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::{Bar, Cell, Column, Report, Table, json};
+use crate::settings::Settings;
 use qudi_burst::Average;
 use qudi_burst::{Finish, Qbp, TwoRounds};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
@@ -50,7 +51,12 @@ pub(crate) struct Shown {
     pub(crate) seconds: f64,
 }
 
-pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(
+    demo: &Demo,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
     let path = demo.output.clone().unwrap_or_else(|| PathBuf::from("qudi-demo.png"));
     let page = path.with_extension("html");
     if page == path {
@@ -59,7 +65,7 @@ pub(crate) fn run(demo: &Demo, global: &Global, report: &Report) -> Result<()> {
     }
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
-    let sensor = Sensor::load(&demo.sensor)?;
+    let sensor = settings.sensor(&demo.sensor)?;
     let mut bar = report.bar();
     let truths = render(&mut bar);
     let light = light(demo, &sensor, &truths)?;

@@ -4,6 +4,7 @@ use crate::args::{Eval, Global, Protocol};
 use crate::cmd::capture_light::checked_exposure;
 use crate::cmd::eval_capture::{Judged, judge};
 use crate::cmd::eval_clip::Clip;
+use crate::cmd::eval_exposing::Exposing;
 use crate::cmd::eval_html::html;
 use crate::cmd::eval_score::{Figure, FlowKind, Row};
 use crate::cmd::eval_table::{frames, summary};
@@ -11,8 +12,8 @@ use crate::cmd::methods::METHODS;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::{Output, Report, csv, markdown};
+use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
-use qudi_core::sensor::Sensor;
 use qudi_io::capture::{MaskChoice, ReadOptions};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -20,10 +21,12 @@ use std::path::PathBuf;
 /// Light levels of clips unless said otherwise: those of the paper's table.
 const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
 
-/// Sensor of clips unless said otherwise.
-const SENSOR: &str = "qudi-paper";
-
-pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(
+    args: &Eval,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
     let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
@@ -39,8 +42,11 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
             format!("there are {}", METHODS.join(", ")),
         ));
     }
-    let Judged { rows, pictures, about, settings } =
-        if args.capture { judge(args, report)? } else { judge_clips(args, report, overwrite)? };
+    let Judged { rows, pictures, about, settings } = if args.capture {
+        judge(args, settings, report)?
+    } else {
+        judge_clips(args, settings, report, overwrite)?
+    };
     csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
     html_file.write(|| Ok(html(&rows, &pictures, &about)))?;
     let table = summary(&rows);
@@ -63,7 +69,12 @@ pub(crate) fn run(args: &Eval, global: &Global, report: &Report) -> Result<()> {
 }
 
 /// Every method on every clip at every light level.
-fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Judged> {
+fn judge_clips(
+    args: &Eval,
+    settings: &Settings,
+    report: &Report,
+    overwrite: Overwrite,
+) -> Result<Judged> {
     if args.protocol == Protocol::Quiver
         && (args.export_photons.is_some() || !args.external.is_empty())
     {
@@ -80,8 +91,12 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
             "add --capture if it is a capture, or leave them out",
         ));
     }
-    let sensor = Sensor::load(args.sensor.as_deref().unwrap_or(SENSOR))?;
-    let levels = if args.ppp.is_empty() { &LEVELS[..] } else { &args.ppp };
+    let exposing = Exposing::new(args, settings)?;
+    let set = settings.given("simulate.ppp")?.map(|ppp: f64| vec![ppp]);
+    let levels = match &args.ppp[..] {
+        [] => &set.unwrap_or(LEVELS.to_vec())[..],
+        given => given,
+    };
     let mut clips = Clip::find(&args.data)?;
     if let Some(shard) = args.shard {
         let part = shard.range(clips.len() as u64);
@@ -116,7 +131,7 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
             if interrupt::check().is_break() {
                 return Err(Fault::Interrupted);
             }
-            let exposed = clip.expose(args, &sensor, ppp, overwrite)?;
+            let exposed = clip.expose(args, &exposing, ppp, overwrite)?;
             if args.html.is_some() {
                 pictures.push(exposed.pictures());
             }
@@ -145,13 +160,13 @@ fn judge_clips(args: &Eval, report: &Report, overwrite: Overwrite) -> Result<Jud
     };
     let about = format!(
         "{number} clips, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
-        sensor.name, args.seed
+        exposing.sensor.name, exposing.seed
     );
     let settings = json!({
         "protocol": args.protocol,
         "data": args.data,
-        "sensor": sensor,
-        "seed": args.seed,
+        "sensor": exposing.sensor,
+        "seed": exposing.seed,
         "exposure": args.exposure,
         "overlap": args.overlap,
     });

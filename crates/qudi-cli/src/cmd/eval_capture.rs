@@ -1,9 +1,10 @@
 //! One real capture, judged for every method without a truth: chi-square, cost, pictures.
 
 use crate::args::{Eval, Protocol};
-use crate::cmd::capture_info::{remarks, required_sensor};
+use crate::cmd::capture_info::{open_capture, remarks, unknown_sensor};
 use crate::cmd::capture_light::{Stated, acquisition};
 use crate::cmd::eval_clip::stem;
+use crate::cmd::eval_exposing::{FRAMES, SEED};
 use crate::cmd::eval_html::Pictures;
 use crate::cmd::eval_score::{FrameScore, Row, Score};
 use crate::cmd::methods::method;
@@ -11,10 +12,10 @@ use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::memory::Peak;
 use crate::report::Report;
+use crate::settings::Settings;
 use qudi_core::Frame;
 use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
-use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_io::capture::{Capture, MaskChoice};
 use qudi_io::restore::{RestoreSink, run as run_method};
@@ -32,23 +33,18 @@ pub(crate) struct Judged {
 }
 
 /// Restores the first frames of the capture by every method.
-pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
+pub(crate) fn judge(args: &Eval, overrides: &Settings, report: &Report) -> Result<Judged> {
     refuse_what_needs_truth(args)?;
+    overrides.refuse(&["simulate."], "with --capture, whose photons are drawn already")?;
+    let seed = args.seed.unwrap_or(SEED);
     let path = Path::new(&args.data);
-    let named = args.sensor.as_deref().map(Sensor::load).transpose()?;
-    let mut capture = Capture::open(path, &args.reading.options(MaskChoice::Auto), named.as_ref())?;
-    let sensor = match named {
-        Some(sensor) => sensor,
-        None => required_sensor(&capture)?,
-    };
-    let stated = Stated {
-        ppp: args.ppp.first().copied(),
-        gain: args.gain,
-        exposure: args.exposure,
-        seed: args.seed,
-    };
+    let options = args.reading.options(MaskChoice::Auto);
+    let (mut capture, sensor) = open_capture(path, &options, args.sensor.as_deref(), overrides)?;
+    let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
+    let stated =
+        Stated { ppp: args.ppp.first().copied(), gain: args.gain, exposure: args.exposure, seed };
     let (acquisition, source) = acquisition(&stated, &mut capture, &sensor)?;
-    let frames = capture.frames().min(args.frames);
+    let frames = capture.frames().min(args.frames.unwrap_or(FRAMES));
     let mut counts = vec![0; capture.size().pixels()];
     capture.read(frames / 2, &mut counts)?;
     let full = f32::from(acquisition.sensor.max_count());
@@ -83,7 +79,7 @@ pub(crate) fn judge(args: &Eval, report: &Report) -> Result<Judged> {
         "ppp_from": source,
         "gain": acquisition.gain,
         "sensor": acquisition.sensor,
-        "seed": args.seed,
+        "seed": seed,
         "exposure": acquisition.exposure,
         "overlap": args.overlap,
     });
@@ -111,7 +107,7 @@ fn refuse_what_needs_truth(args: &Eval) -> Result<()> {
             "give the light of this capture, or leave it out",
         ));
     }
-    if args.frames == 0 {
+    if args.frames == Some(0) {
         return Err(Fault::new("no frames", "--frames", "ask for at least 1"));
     }
     Ok(())

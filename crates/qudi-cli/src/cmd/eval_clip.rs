@@ -1,6 +1,7 @@
 //! One clip, exposed once, scored for every method.
 
 use crate::args::{Eval, External};
+use crate::cmd::eval_exposing::Exposing;
 use crate::cmd::eval_html::Pictures;
 use crate::cmd::eval_score::{Cost, FlowKind, FrameScore, Score};
 use crate::cmd::methods::method;
@@ -15,15 +16,14 @@ use qudi_core::metrics::Consistency;
 use qudi_core::metrics::{best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim};
 use qudi_core::npy::read_clip;
 use qudi_core::restorer::{Acquisition, BurstView};
-use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
-use qudi_core::{Camera, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE};
+use qudi_core::{Camera, Frame, Light, SimError, Size, USUAL_EXPOSURE};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{RestoreSink, run as run_method};
 use qudi_io::sidecar::{BurstLayout, ClipDigest, Record, VERSION, beside};
 use qudi_io::writer::{BurstFormat, BurstWriter};
 use qudi_sim::clip::{Input, Sampling};
-use qudi_sim::{Exposed, Simulation, Sink, Start, simulate};
+use qudi_sim::{Exposed, Sink, Start, simulate};
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
@@ -81,20 +81,13 @@ impl Clip {
     pub(crate) fn expose(
         &self,
         args: &Eval,
-        sensor: &Sensor,
+        exposing: &Exposing,
         ppp: f64,
         overwrite: Overwrite,
     ) -> Result<ExposedClip> {
-        let seed = args.seed.wrapping_add(u64::from(name_digest(&self.name)) << 20);
-        let simulation = Simulation {
-            input: Input::parse(&self.place, None, None, 1, 2.0)?,
-            sampling: Sampling { frames: Some(args.frames), ..Sampling::default() },
-            sensor: sensor.clone(),
-            ppp,
-            ppp_def: PppDefinition::Incident,
-            exposure: None,
-            seed,
-        };
+        let sensor = &exposing.sensor;
+        let seed = exposing.seed.wrapping_add(u64::from(name_digest(&self.name)) << 20);
+        let simulation = exposing.simulation(&self.place, ppp, seed)?;
         let mut kept = Kept::default();
         let summary = simulate(&simulation, &mut kept, &mut |_| interrupt::check())?;
         let size = summary.size;
@@ -118,7 +111,7 @@ impl Clip {
             writer.finish(&bytes, overwrite)?;
         }
         let mut acquisition = Acquisition {
-            seed: args.seed,
+            seed: exposing.seed,
             first_frame: 0,
             ppp: summary.light.ppp,
             exposure: USUAL_EXPOSURE,
@@ -253,15 +246,14 @@ impl ExposedClip {
             }
             let scene = &truth[first..first + WINDOW];
             let mean = scene.iter().map(Frame::mean).sum::<f64>() / WINDOW as f64;
-            let light = Light { ppp: self.ppp, exposure: mean.max(1e-4) };
+            let light = Light { ppp: self.acquisition.ppp, exposure: mean.max(1e-4) };
             let seed = self.seed.wrapping_add(first as u64);
             let mut camera = Camera::new(sensor, self.size, light, seed)?;
             let mut counts = Vec::with_capacity(WINDOW);
             for (t, frame) in scene.iter().enumerate() {
                 counts.push(camera.expose(t as u64, &[frame])?);
             }
-            let acquisition =
-                Acquisition { gain: camera.gain(), ppp: self.ppp, ..self.acquisition.clone() };
+            let acquisition = Acquisition { gain: camera.gain(), ..self.acquisition.clone() };
             let peak = Peak::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;

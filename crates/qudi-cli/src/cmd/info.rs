@@ -4,6 +4,7 @@ use crate::args::{Global, Info};
 use crate::cmd::{capture_info, convert};
 use crate::error::{Fault, Result};
 use crate::report::Report;
+use crate::settings::Settings;
 use crate::weights::Weights;
 use burn::tensor::Device;
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
@@ -12,7 +13,15 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(
+    info: &Info,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    if info.sensors || info.formats || info.devices {
+        settings.refuse(&["sensor."], "by lists")?;
+    }
     if info.sensors {
         return sensors(report);
     }
@@ -27,18 +36,27 @@ pub(crate) fn run(info: &Info, global: &Global, report: &Report) -> Result<()> {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let transforms = path.file_name().is_some_and(|name| name == "transforms.json");
     match extension.as_deref() {
-        Some("toml") => sensor(subject, report),
-        Some("safetensors") if path.is_file() => weights(&Weights::File(path.to_owned()), report),
-        Some("json") if path.is_file() && !transforms => burst(path, report),
+        Some("toml") => sensor(subject, settings, report),
+        Some("safetensors") if path.is_file() => {
+            settings.refuse(&["sensor."], "for weights")?;
+            weights(&Weights::File(path.to_owned()), report)
+        }
+        Some("json") if path.is_file() && !transforms => {
+            settings.refuse(&["sensor."], "for records: name the burst")?;
+            burst(path, report)
+        }
         _ if path.exists() => {
             let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
             // A record that cannot be read is remarked upon when the capture is opened.
             let record = beside.into_iter().find(|record| record.is_file());
             let record = record.and_then(|path| Some((Sidecar::load(&path).ok()?, path)));
-            capture_info::run(path, record.as_ref(), info, global, report)
+            capture_info::run(path, record.as_ref(), info, settings, global, report)
         }
-        _ if preset(subject).is_some() => sensor(subject, report),
-        _ if subject == "weights" => weights(&Weights::BuiltIn, report),
+        _ if preset(subject).is_some() => sensor(subject, settings, report),
+        _ if subject == "weights" => {
+            settings.refuse(&["sensor."], "for weights")?;
+            weights(&Weights::BuiltIn, report)
+        }
         _ => Err(Fault::new(
             format!("there is no file and no sensor named `{subject}`"),
             subject,
@@ -97,14 +115,12 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
     report.result(&text, || json!(weights.describe().ok()))
 }
 
-fn sensor(name: &str, report: &Report) -> Result<()> {
-    let sensor = Sensor::load(name)?;
+fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {
+    let sensor = settings.sensor(name)?;
     // A preset as it was written, with the remarks on its numbers.
     let text = match preset(name) {
-        Some(preset) => preset.toml.to_owned(),
-        None => {
-            toml::to_string(&sensor).map_err(|e| Fault::new(e, name, "report this as a bug"))?
-        }
+        Some(preset) if !settings.overrides_sensor() => preset.toml.to_owned(),
+        _ => toml::to_string(&sensor).map_err(|e| Fault::new(e, name, "report this as a bug"))?,
     };
     report.result(&text, || json!(sensor))
 }

@@ -3,13 +3,13 @@
 use crate::args::Light;
 use crate::error::{Fault, Result};
 use crate::report::Report;
-use qudi_core::sensor::Sensor;
+use crate::settings::Settings;
 use qudi_core::{Spectrum, ppp_from_lux, sensor_lux};
 use serde_json::json;
 use std::fmt::Write;
 
-pub(crate) fn run(light: &Light, report: &Report) -> Result<()> {
-    let sensor = Sensor::load(&light.sensor)?;
+pub(crate) fn run(light: &Light, settings: &Settings, report: &Report) -> Result<()> {
+    let sensor = settings.sensor(&light.sensor)?;
     let missing = |what: &str, flag: &str| {
         Fault::new(
             format!("the sensor has no {what}"),

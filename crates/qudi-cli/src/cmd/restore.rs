@@ -1,7 +1,7 @@
 //! `qudi restore`: a capture through a method into frames.
 
 use crate::args::{Global, Network, Restore};
-use crate::cmd::capture_info::{remarks, required_sensor};
+use crate::cmd::capture_info::{open_capture, remarks, required_sensor, unknown_sensor};
 use crate::cmd::capture_light::{Stated, acquisition};
 use crate::cmd::methods::{method, usual_method};
 use crate::cmd::network::device_failed;
@@ -12,10 +12,10 @@ use crate::device;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
+use crate::settings::Settings;
 use qudi_core::SimError;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_io::capture::{Capture, MaskChoice};
 use qudi_io::restore::run as run_method;
@@ -27,7 +27,12 @@ use std::ops::Range;
 use std::path::Path;
 use std::time::Instant;
 
-pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(
+    args: &Restore,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
     if args.output == "-" && report.json() {
         return Err(Fault::new(
             "--json and -o - both write to standard output",
@@ -51,7 +56,7 @@ pub(crate) fn run(args: &Restore, global: &Global, report: &Report) -> Result<()
     if is_pipe(args) {
         refuse_for_pipes(args, overwrite)?;
     }
-    let mut job = Job::prepare(args)?;
+    let mut job = Job::prepare(args, settings)?;
     let mut output = Output::open(&args.output, &job.capture, &job.settings, tiff, overwrite)?;
     let start = Instant::now();
     // A pipe may not have told how many frames come.
@@ -144,17 +149,21 @@ struct Job {
 }
 
 impl Job {
-    fn prepare(args: &Restore) -> Result<Self> {
-        let named = args.sensor.as_deref().map(Sensor::load).transpose()?;
+    fn prepare(args: &Restore, overrides: &Settings) -> Result<Self> {
         let options = args.reading.options(MaskChoice::Auto);
-        let mut capture = if is_pipe(args) {
-            Capture::from_pipe(std::io::stdin(), &options, named.as_ref())?
+        let name = args.sensor.as_deref();
+        let (mut capture, sensor) = if is_pipe(args) {
+            let named = name.map(|name| overrides.sensor(name)).transpose()?;
+            let capture = Capture::from_pipe(std::io::stdin(), &options, named.as_ref())?;
+            let sensor = match named {
+                Some(sensor) => sensor,
+                None => overrides.adjusted(required_sensor(&capture)?)?,
+            };
+            (capture, sensor)
         } else {
-            Capture::open(&args.capture, &options, named.as_ref())?
-        };
-        let sensor = match named {
-            Some(sensor) => sensor,
-            None => required_sensor(&capture)?,
+            let (capture, sensor) = open_capture(&args.capture, &options, name, overrides)?;
+            let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
+            (capture, sensor)
         };
         let stated =
             Stated { ppp: args.ppp, gain: args.gain, exposure: args.exposure, seed: args.seed };

@@ -5,7 +5,7 @@ use crate::cmd::tiff_samples::tiff_samples;
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
-use crate::settings::{Flag, Settings};
+use crate::settings::Settings;
 use qudi_core::SimError;
 use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
 use qudi_core::flow::Flow;
@@ -21,7 +21,12 @@ use std::hash::{BuildHasher, RandomState};
 use std::io::{IsTerminal, Write, stdout};
 use std::path::{Path, PathBuf};
 
-pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(
+    args: &Simulate,
+    settings: Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
     let to_stdout = args.output == "-";
     if to_stdout && report.json() {
         return Err(Fault::new(
@@ -36,7 +41,7 @@ pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<(
             let record = Record::load(path)?;
             (record.simulation, Some((record.clip.crc32, path)))
         }
-        None => (simulation(args, global)?, None),
+        None => (simulation(args, &settings.with_flags(&args.keys)?)?, None),
     };
     if matches!(simulation.input, Input::Pipe { .. }) && std::io::stdin().is_terminal() {
         return Err(Fault::new(
@@ -91,52 +96,18 @@ pub(crate) fn run(args: &Simulate, global: &Global, report: &Report) -> Result<(
 }
 
 fn reject_settings_beside_record(args: &Simulate, global: &Global) -> Result<()> {
-    let given = flags(args).into_iter().find(|flag| flag.2.is_some()).map(|flag| flag.1);
-    let given = given.or((!global.set.is_empty()).then_some("--set"));
-    let given = given.or(global.config.is_some().then_some("--config"));
+    let given = args.keys.first();
+    let given = given.or((!global.set.is_empty()).then(|| "--set".to_owned()));
+    let given = given.or(global.config.is_some().then(|| "--config".to_owned()));
     let Some(given) = given else { return Ok(()) };
     Err(Fault::new(
         format!("{given} beside --from: a record says everything about its burst"),
-        given,
+        &given,
         "leave it out, or give the input instead of the record",
     ))
 }
 
-/// The flags that set keys.
-fn flags(args: &Simulate) -> Vec<Flag> {
-    fn value<T: serde::Serialize>(option: Option<&T>) -> Option<Value> {
-        option.and_then(|v| serde_json::to_value(v).ok())
-    }
-    // Text that may be a number: `--dark 1.6`, `--dark 7.5/s`.
-    let number_or_text = |text: &Option<String>| {
-        text.as_ref().map(|t| t.parse::<f64>().map_or_else(|_| json!(t), |number| json!(number)))
-    };
-    vec![
-        ("simulate.sensor", "--sensor", value(args.sensor.as_ref())),
-        ("simulate.ppp", "--ppp", value(args.ppp.as_ref())),
-        ("simulate.ppp_def", "--ppp-def", value(args.ppp_def.as_ref())),
-        ("simulate.exposure", "--exposure", value(args.exposure.as_ref())),
-        ("simulate.seed", "--seed", value(args.seed.as_ref())),
-        ("simulate.transfer", "--transfer", value(args.transfer.as_ref())),
-        ("simulate.white", "--white", value(args.white.as_ref())),
-        ("simulate.frames", "--frames", value(args.frames.as_ref())),
-        ("simulate.instants", "--instants", value(args.instants.as_ref())),
-        ("simulate.motion", "--motion", value(args.motion.as_ref())),
-        ("simulate.size", "--size", args.size.map(|s| json!(format!("{}x{}", s.height, s.width)))),
-        ("simulate.speed", "--speed", value(args.speed.as_ref())),
-        ("simulate.scene_seed", "--scene-seed", value(args.scene_seed.as_ref())),
-        ("sensor.frames_summed", "--sum", value(args.sum.as_ref())),
-        ("sensor.bits", "--bits", value(args.bits.as_ref())),
-        ("sensor.quantum_efficiency", "--qe", value(args.qe.as_ref())),
-        ("sensor.dark", "--dark", number_or_text(&args.dark)),
-        ("sensor.read_noise", "--read-noise", value(args.read_noise.as_ref())),
-        ("sensor.full_well", "--full-well", number_or_text(&args.full_well)),
-        ("sensor.gain", "--gain", number_or_text(&args.gain)),
-    ]
-}
-
-fn simulation(args: &Simulate, global: &Global) -> Result<Simulation> {
-    let settings = Settings::load(global, flags(args))?;
+fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
     let input = Input::parse(
         args.input.as_deref().unwrap_or_default(),
         settings.parse("simulate.motion")?,
@@ -154,7 +125,7 @@ fn simulation(args: &Simulate, global: &Global) -> Result<Simulation> {
             transfer: settings.get("simulate.transfer")?,
             white: settings.get("simulate.white")?,
         },
-        sensor: settings.sensor()?,
+        sensor: settings.sensor(&settings.get::<String>("simulate.sensor")?)?,
         ppp: settings.get("simulate.ppp")?,
         ppp_def: settings.get("simulate.ppp_def")?,
         exposure: settings.get("simulate.exposure")?,

@@ -7,6 +7,7 @@ use crate::device::{self, Opened};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::Report;
+use crate::settings::{Settings, toml_text};
 use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, load};
 use qudi_train::dataset::{Pack, write_pack};
@@ -15,8 +16,13 @@ use qudi_train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bur
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-pub(crate) fn run(args: &Train, global: &Global, report: &Report) -> Result<()> {
-    let recipe = recipe(args, global)?;
+pub(crate) fn run(
+    args: &Train,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    let recipe = recipe(args, settings)?;
     if args.cache_only {
         let path = args.pack.as_deref().unwrap_or(Path::new("pack.zip"));
         make_pack(args, &recipe, path, overwrite(global), report)?;
@@ -138,15 +144,9 @@ fn overwrite(global: &Global) -> Overwrite {
     if global.force { Overwrite::Yes } else { Overwrite::No }
 }
 
-fn recipe(args: &Train, global: &Global) -> Result<Recipe> {
-    let mut changes = Vec::new();
-    for assignment in &global.set {
-        let Some((key, value)) = assignment.split_once('=') else {
-            let what = format!("`{assignment}` sets nothing");
-            return Err(Fault::new(what, "--set", "write KEY=VALUE, as in --set train.steps=1000"));
-        };
-        changes.push((key.trim().to_owned(), value.trim().to_owned()));
-    }
+fn recipe(args: &Train, settings: &Settings) -> Result<Recipe> {
+    let changes = settings.recipe_changes().iter();
+    let changes: Vec<_> = changes.map(|(key, value, _)| (key.clone(), toml_text(value))).collect();
     let own = args.output.as_ref().map(|folder| folder.join(RECIPE));
     let name = match (&args.recipe, own) {
         (Some(name), _) => name.clone(),

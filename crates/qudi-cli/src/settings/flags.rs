@@ -1,0 +1,61 @@
+//! The flags of `qudi simulate` that set keys, made from the table of keys.
+
+use super::keys::{KEYS, Key};
+use clap::{Arg, ArgMatches, Command, ValueHint};
+
+/// The keys that flags set, with their text.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct KeyFlags(pub(super) Vec<(&'static Key, String)>);
+
+impl KeyFlags {
+    /// The first flag that was given, with its dashes.
+    pub(crate) fn first(&self) -> Option<String> {
+        self.0.first().and_then(|(key, _)| key.flag).map(|flag| format!("--{}", flag.long))
+    }
+}
+
+impl clap::FromArgMatches for KeyFlags {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let given = KEYS.iter().filter_map(|key| {
+            let text = matches.get_one::<String>(key.flag?.long)?;
+            Some((key, text.clone()))
+        });
+        Ok(Self(given.collect()))
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+impl clap::Args for KeyFlags {
+    fn augment_args(command: Command) -> Command {
+        command.args(KEYS.iter().filter_map(argument))
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+/// The argument of a key that has a flag.
+fn argument(key: &'static Key) -> Option<Arg> {
+    let flag = key.flag?;
+    let default = match key.default.trim_matches('"') {
+        "" => String::new(),
+        default => format!(" [default: {default}]"),
+    };
+    let mut help: String = key.doc.replace('`', "");
+    help.get_mut(..1)?.make_ascii_uppercase();
+    let argument = Arg::new(flag.long)
+        .long(flag.long)
+        .value_name(flag.value)
+        .allow_hyphen_values(true)
+        .help(help + &default)
+        .help_heading(flag.heading);
+    Some(match key.name {
+        "simulate.sensor" => argument.value_hint(ValueHint::AnyPath),
+        _ => argument,
+    })
+}
