@@ -268,13 +268,12 @@ pub fn write_header(out: &mut impl Write, descr: &str, shape: &[usize]) -> std::
     out.write_all(text.as_bytes())
 }
 
-/// Reads a two-dimensional `.npy`, values as they are.
+/// Reads a two-dimensional `.npy` in C or Fortran order, values as they are.
 ///
 /// # Errors
 /// [`SimError`] if it cannot be read or has another number of dimensions.
 pub fn read_image(path: &Path) -> Result<Frame> {
     let (header, mut reader) = Header::open(path)?;
-    header.require_c_order(path)?;
     let &[height, width] = header.shape.as_slice() else {
         return Err(SimError::data(
             format!("an array of shape {:?} where one image is expected", header.shape),
@@ -285,7 +284,11 @@ pub fn read_image(path: &Path) -> Result<Frame> {
     let size = Size::new(height, width, &path.display().to_string())?;
     let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
     reader.read_exact(&mut bytes).map_err(|e| SimError::io("read the data", path, e))?;
-    let data = bytes.chunks_exact(header.sample.bytes()).map(|b| header.sample.decode(b)).collect();
+    let length = header.sample.bytes();
+    let value = |at: usize| header.sample.decode(&bytes[at * length..][..length]);
+    // In Fortran order columns come one after the other.
+    let place = |y: usize, x: usize| if header.fortran { x * height + y } else { y * width + x };
+    let data = (0..size.pixels()).map(|i| value(place(i / width, i % width))).collect();
     Ok(Frame { size, data })
 }
 

@@ -7,6 +7,7 @@
 pub(crate) mod bit_order;
 pub(crate) mod byte_kind;
 mod calibrate;
+pub(crate) mod format_options;
 pub(crate) mod info;
 pub(crate) mod levels;
 pub(crate) mod options;
@@ -19,11 +20,13 @@ mod view;
 
 pub use bit_order::{SURE, bit_order_z_score};
 pub use calibrate::{Calibration, calibrate};
+pub use format_options::FormatOption;
 pub use info::{CaptureInfo, Certainty, Packing};
 pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 pub use summary::{BitOrderCheck, Summary};
 
 use crate::codec;
+use crate::frames::depth::DepthChecked;
 use crate::frames::{CountFrames, memory};
 use pipe::{FIRST_WINDOW, STDIN};
 use qudi_core::Size;
@@ -91,6 +94,19 @@ fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     }
 }
 
+/// Who says how deep the counts of a capture are.
+fn depth_source(options: &ReadOptions, info: &CaptureInfo) -> &'static str {
+    if options.levels.is_some() {
+        "`levels`"
+    } else if info.reasons.iter().any(|reason| reason == codec::RECORD) {
+        "the record beside it"
+    } else if options.bits.is_some() {
+        "`bits`"
+    } else {
+        "the file itself"
+    }
+}
+
 impl Capture {
     /// Opens the capture at `path`. `sensor` is asked for its dark map and its bad pixels, if
     /// `options` name none.
@@ -127,6 +143,9 @@ impl Capture {
             state_depth(&mut info, bits)?;
         }
         info.binary |= info.max_count == Some(1);
+        if let Some(max) = info.max_count.filter(|_| info.packing.is_none()) {
+            native = Box::new(DepthChecked::new(native, max, depth_source(options, &info), path));
+        }
         if let Some(orient) = options.orient {
             info.orient = orient;
         }

@@ -1,6 +1,7 @@
 //! Every format that captures come in: one file and one line each.
 
 mod array;
+mod crc;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod images;
@@ -18,14 +19,19 @@ mod tiff;
 mod video;
 mod visionsim;
 
+pub(crate) use crc::mismatch as crc_mismatch;
 pub(crate) use piped::open_pipe;
 
+use crate::capture::format_options::{FormatOption, refuse_others};
 use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use qudi_core::{Result, SimError};
 use std::path::Path;
+
+/// Why a format is sure where a record of ours lies beside the file.
+pub(crate) const RECORD: &str = "the record beside it";
 
 /// One way to store a capture.
 #[derive(Debug)]
@@ -36,6 +42,8 @@ pub struct Format {
     pub title: &'static str,
     /// Whether a path is of this format, and why.
     probe: fn(&Probe) -> Result<Option<Recognition>>,
+    /// The options that it takes.
+    pub options: &'static [FormatOption],
     /// Opens it.
     open: fn(&Probe, &ReadOptions, &mut CaptureInfo) -> Result<Box<dyn CountFrames>>,
 }
@@ -86,7 +94,7 @@ pub(crate) fn open(
         let format = by_name(name)?;
         let mut info = CaptureInfo::new(format.name, format.title);
         info.reasons.push("--format".to_owned());
-        return Ok(((format.open)(&probe, options, &mut info)?, info));
+        return open_as(format, &probe, options, info);
     }
     let mut found = Vec::new();
     for format in FORMATS {
@@ -105,8 +113,61 @@ pub(crate) fn open(
     let mut info = CaptureInfo::new(format.name, format.title);
     info.certainty = fit.certainty;
     info.reasons = fit.reasons;
-    Ok(((format.open)(&probe, options, &mut info)?, info))
+    open_as(format, &probe, options, info)
 }
+
+fn open_as(
+    format: &Format,
+    probe: &Probe,
+    options: &ReadOptions,
+    mut info: CaptureInfo,
+) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
+    refuse_others(options, format.options, format.name)?;
+    let frames = (format.open)(probe, options, &mut info)?;
+    info.notes.extend(probe.note_on_skipped());
+    Ok((frames, info))
+}
+
+/// Options of arrays: axes, packing, colour.
+const ARRAY: &[FormatOption] = &[
+    FormatOption::Axes,
+    FormatOption::Channel,
+    FormatOption::BitOrder,
+    FormatOption::PackAxis,
+    FormatOption::Size,
+    FormatOption::Levels,
+];
+
+/// Options of files that hold several arrays.
+const ARRAYS: &[FormatOption] = &[
+    FormatOption::Axes,
+    FormatOption::Channel,
+    FormatOption::Array,
+    FormatOption::BitOrder,
+    FormatOption::PackAxis,
+    FormatOption::Size,
+    FormatOption::Levels,
+];
+
+/// Options of pictures.
+const PICTURES: &[FormatOption] = &[FormatOption::Levels];
+
+/// Options of headerless files of packed bits, whose frame size the format knows.
+const BIT_FILES: &[FormatOption] = &[
+    FormatOption::BitOrder,
+    FormatOption::Header,
+    FormatOption::Trailer,
+    FormatOption::FramesPerFile,
+];
+
+/// Options of headerless files of packed bits of any size.
+const SIZED_BIT_FILES: &[FormatOption] = &[
+    FormatOption::BitOrder,
+    FormatOption::Size,
+    FormatOption::Header,
+    FormatOption::Trailer,
+    FormatOption::FramesPerFile,
+];
 
 fn by_name(name: &str) -> Result<&'static Format> {
     FORMATS.iter().find(|format| format.name == name).ok_or_else(|| {

@@ -3,6 +3,7 @@
 pub(crate) mod bit_sums;
 pub(crate) mod chain;
 mod count_frames;
+pub(crate) mod depth;
 pub(crate) mod frame_bytes;
 pub(crate) mod memory;
 pub(crate) mod packed;

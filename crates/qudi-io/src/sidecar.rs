@@ -170,6 +170,15 @@ impl Record {
     }
 }
 
+/// The error of a record that says one thing about the file at `path`, which holds another.
+pub(crate) fn contradiction(recorded: &str, found: &str, path: &Path) -> SimError {
+    SimError::data(
+        format!("the record beside it describes {recorded}, and {found}"),
+        path,
+        format!("remove {} if it belongs to another burst", beside(path).display()),
+    )
+}
+
 fn read_file(path: &Path) -> Result<Vec<u8>> {
     let read = |e| SimError::io("read the record", path, e);
     let length = std::fs::metadata(path).map_err(read)?.len();

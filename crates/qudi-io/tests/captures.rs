@@ -7,8 +7,12 @@ mod arrays;
 mod bit_order;
 #[path = "captures/cameras.rs"]
 mod cameras;
+#[path = "captures/damage.rs"]
+mod damage;
 #[path = "captures/foreign.rs"]
 mod foreign;
+#[path = "captures/options.rs"]
+mod options;
 #[path = "captures/pipes.rs"]
 mod pipes;
 #[path = "captures/pixels.rs"]

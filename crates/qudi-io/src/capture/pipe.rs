@@ -152,8 +152,8 @@ impl Pipe {
         Ok(())
     }
 
-    /// Bytes of the frames that are kept, for a look at what they hold.
-    pub(crate) fn look(&self) -> Vec<u8> {
+    /// Bytes of the frames that are kept.
+    pub(crate) fn kept_bytes(&self) -> Vec<u8> {
         self.kept.iter().flatten().copied().collect()
     }
 }

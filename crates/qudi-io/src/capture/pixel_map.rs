@@ -3,6 +3,7 @@
 use super::options::{MaskChoice, ReadOptions};
 use super::{Capture, MAX_SAMPLE_FRAMES};
 use crate::codec::read_mat_map;
+use crate::regular_file;
 use qudi_core::Frame;
 use qudi_core::Transfer;
 use qudi_core::bad_pixels::{BadPixels, Repair};
@@ -111,6 +112,7 @@ fn load(capture: &Capture, path: &Path) -> Result<Frame> {
 }
 
 fn read(path: &Path) -> Result<Frame> {
+    regular_file::require(path)?;
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match extension.as_str() {
         "npy" => read_image(path),

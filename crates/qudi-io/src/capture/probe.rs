@@ -31,7 +31,7 @@ pub(crate) struct Probe {
     pub(crate) extension: String,
     /// The first bytes of a file.
     pub(crate) head: Vec<u8>,
-    files: OnceCell<Vec<PathBuf>>,
+    files: OnceCell<Listing>,
     /// Filled by [`RawSample::at`], which several formats ask.
     pub(crate) raw_sample: OnceCell<Option<RawSample>>,
 }
@@ -52,7 +52,7 @@ impl Probe {
             }
         } else if !found.is_dir() {
             return Err(SimError::data(
-                "neither a file nor a folder",
+                "not a regular file or folder",
                 path,
                 "store the capture in a file first, or pipe it into `qudi restore -`",
             ));
@@ -85,18 +85,29 @@ impl Probe {
             return Ok(vec![self.path.clone()]);
         }
         if self.files.get().is_none() {
-            let mut files = Vec::new();
-            list(&self.path, DEPTH, &mut files)?;
+            let mut listing = Listing::default();
+            list(&self.path, DEPTH, &mut listing)?;
             let relative =
                 |p: &Path| p.strip_prefix(&self.path).unwrap_or(p).to_string_lossy().into_owned();
-            files.sort_by_cached_key(|p| Natural(relative(p)));
-            let _ = self.files.set(files);
+            listing.files.sort_by_cached_key(|p| Natural(relative(p)));
+            let _ = self.files.set(listing);
         }
         let matches = |path: &&PathBuf| {
             let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
             extensions.contains(&extension.as_str())
         };
-        Ok(self.files.get().into_iter().flatten().filter(matches).cloned().collect())
+        let listed = self.files.get().into_iter().flat_map(|listing| &listing.files);
+        Ok(listed.filter(matches).cloned().collect())
+    }
+
+    /// What is to be said of the entries of the folder that were passed over.
+    pub(crate) fn note_on_skipped(&self) -> Option<String> {
+        let skipped = &self.files.get()?.skipped;
+        let name = skipped.first()?.file_name()?.to_string_lossy().into_owned();
+        Some(format!(
+            "{} entries of the folder are no regular files and were skipped, `{name}` among them",
+            skipped.len()
+        ))
     }
 
     /// Bytes from the middle of a file, at a multiple of `align` bytes.
@@ -121,7 +132,15 @@ pub(crate) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
+/// What lies in a folder and in those below it.
+#[derive(Debug, Default)]
+struct Listing {
+    files: Vec<PathBuf>,
+    /// Broken links, pipes, devices, and folders named like pictures.
+    skipped: Vec<PathBuf>,
+}
+
+fn list(folder: &Path, depth: usize, listing: &mut Listing) -> Result<()> {
     let io = |e| SimError::io("list the folder", folder, e);
     for entry in std::fs::read_dir(folder).map_err(io)? {
         let path = entry.map_err(io)?.path();
@@ -130,14 +149,18 @@ fn list(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
             continue;
         }
         if path.is_dir() {
-            if depth > 1 {
-                list(&path, depth - 1, files)?;
+            if path.extension().is_some_and(|e| e == "png" || e == "tif" || e == "tiff") {
+                listing.skipped.push(path);
+            } else if depth > 1 {
+                list(&path, depth - 1, listing)?;
             }
         } else if path.is_file() {
+            listing.files.push(path);
+        } else {
             // A named pipe would keep the reader waiting for ever.
-            files.push(path);
+            listing.skipped.push(path);
         }
-        if files.len() > MOST_FILES {
+        if listing.files.len() > MOST_FILES {
             return Err(SimError::data(
                 format!("more than {MOST_FILES} files"),
                 folder,

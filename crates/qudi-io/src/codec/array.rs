@@ -1,13 +1,16 @@
 //! Arrays of counts, whatever file they lie in: axes, packing, colour.
 
 use crate::capture::byte_kind::ByteKind;
+use crate::capture::format_options::refuse_packing;
 use crate::capture::info::{CaptureInfo, Packing};
 use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::pipe::{FIRST_WINDOW, Pipe};
 use crate::frames::CountFrames;
-use crate::frames::frame_bytes::{Fetch, FrameBytes, Opener, Segment, strewn};
+use crate::frames::frame_bytes::{Checksum, Fetch, FrameBytes, Opener, Segment, StreamEnd, strewn};
 use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
 use crate::frames::samples::{Channel, MONO, SampleFrames, Scale};
+use crate::sidecar::{self, BurstLayout};
+use crate::writer::BurstFormat;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Result, SimError};
@@ -17,8 +20,8 @@ use std::path::PathBuf;
 
 /// Where the data of an array lie.
 pub(crate) enum Place {
-    /// In place, `available` bytes from byte `start` on.
-    File { start: u64, available: u64 },
+    /// In place, `available` bytes from byte `start` on, with the checksum that the container notes.
+    File { start: u64, available: u64, checksum: Option<Checksum> },
     /// Compressed; the opener stands at the first byte of the data.
     Stream(Opener),
     /// Fetched in groups of frames.
@@ -41,12 +44,14 @@ pub(crate) struct Array {
     pub(crate) place: Place,
 }
 
-/// What a record beside the array says about it.
+/// What lies beside an array and describes it.
 #[derive(Default)]
 pub(crate) struct Hints {
     pub(crate) stored: Stored,
     /// True frame size.
     pub(crate) size: Option<Size>,
+    /// What a record of ours says.
+    pub(crate) recorded: Option<BurstLayout>,
 }
 
 /// What samples are.
@@ -67,8 +72,8 @@ impl From<Option<Packing>> for Stored {
     }
 }
 
-/// Bytes looked at to tell packed bits from counts.
-const LOOK: usize = 1 << 20;
+/// Bytes read to tell packed bits from counts.
+const SAMPLE_BYTES: usize = 1 << 20;
 
 impl Array {
     /// The frames of this array.
@@ -99,7 +104,8 @@ impl Array {
         if let Place::Pipe(pipe) = &mut self.place {
             pipe.lay_out(frame_bytes, frames as u64);
         }
-        let sample_bytes = self.look(frames as u64, frame_bytes)?;
+        self.check_record(hints, frames as u64, stored, options)?;
+        let sample_bytes = self.sample_bytes(frames as u64, frame_bytes, info)?;
         let packing = self.packing(options, hints, channel, stored, &sample_bytes)?;
         let size = self.true_size(stored, packing, options.size.or(hints.size))?;
         let scale = if hints.stored != Stored::Unsaid && options.levels.is_none() {
@@ -111,12 +117,20 @@ impl Array {
         let bytes = self.bytes(axes, dims, frame_bytes, options, info)?;
         info.packing = packing;
         if let Some(packing) = packing {
+            if options.levels.is_some() {
+                return Err(SimError::request(
+                    "`levels` does not apply to packed bits",
+                    "levels",
+                    "leave it out: single bits are no means",
+                ));
+            }
             info.max_count = Some(1);
             let placement = Placement::packed(size, packing.axis, axes.transposed());
             return Ok(Box::new(PackedFrames::new(bytes, packing.order, size, placement)));
         }
+        refuse_packing(options, "an array of counts")?;
         if sample == Sample::Bool {
-            info.max_count = Some(1);
+            info.max_count = info.max_count.filter(|_| scale != Scale::Counts).or(Some(1));
             if frames == 1 {
                 info.notes.push(
                     "a single boolean image: if it is a map of bad pixels, it belongs to --mask"
@@ -150,7 +164,14 @@ impl Array {
 
     fn channel(&self, channels: usize, axes: Axes, options: &ReadOptions) -> Result<Channel> {
         if channels == 1 {
-            return Ok(MONO);
+            return match options.channel {
+                None | Some(0) => Ok(MONO),
+                Some(index) => Err(SimError::request(
+                    format!("channel {index} of a gray capture, shape {:?}", self.shape),
+                    "channel",
+                    "leave it out: there is no colour to choose from",
+                )),
+            };
         }
         let Some(index) = options.channel else {
             return Err(self.fault(
@@ -173,7 +194,7 @@ impl Array {
         hints: &Hints,
         channel: Channel,
         stored: Size,
-        looked: &[u8],
+        sampled: &[u8],
     ) -> Result<Option<Packing>> {
         let order = options.bit_order.unwrap_or(BitOrder::Msb);
         let packing = match options.pack_axis {
@@ -195,8 +216,8 @@ impl Array {
                     if let Some(axis) = implied {
                         return Ok(Some(Packing { axis, order }));
                     }
-                    match ByteKind::of(looked) {
-                        ByteKind::Packed if looked.iter().all(|&byte| byte == 0 || byte == 255) => None,
+                    match ByteKind::of(sampled) {
+                        ByteKind::Packed if sampled.iter().all(|&byte| byte == 0 || byte == 255) => None,
                         ByteKind::Packed => Some(Packing { axis: PackAxis::Width, order }),
                         ByteKind::Counts | ByteKind::WideCounts => None,
                         ByteKind::Unclear => return Err(self.fault(
@@ -247,7 +268,12 @@ impl Array {
         Size::new(size.height, size.width, &self.path.display().to_string())
     }
 
-    fn scale(&self, options: &ReadOptions, info: &mut CaptureInfo, looked: &[u8]) -> Result<Scale> {
+    fn scale(
+        &self,
+        options: &ReadOptions,
+        info: &mut CaptureInfo,
+        sampled: &[u8],
+    ) -> Result<Scale> {
         let full = self.sample.full_scale();
         match (self.sample, full) {
             (_, Some(full)) if options.levels.is_some() => {
@@ -258,7 +284,7 @@ impl Array {
                 "leave --levels out, or save the means as float",
             )),
             (Sample::U8 | Sample::U16 { .. }, Some(full)) => {
-                let samples = looked.chunks_exact(self.sample.bytes());
+                let samples = sampled.chunks_exact(self.sample.bytes());
                 let values = samples.map(|bytes| self.sample.decode(bytes) as u16).collect();
                 Ok(Scale::seen(values, full as u16, info))
             }
@@ -266,20 +292,65 @@ impl Array {
         }
     }
 
+    /// Refuses a record that belongs to another array, with what both say.
+    fn check_record(
+        &self,
+        hints: &Hints,
+        frames: u64,
+        stored: Size,
+        options: &ReadOptions,
+    ) -> Result<()> {
+        let Some(layout) = &hints.recorded else { return Ok(()) };
+        let packed = layout.format == BurstFormat::NpyPacked;
+        let axis = if packed { PackAxis::Width } else { PackAxis::None };
+        if options.pack_axis.is_none()
+            && stored_bytes(layout.size, axis) != (stored.height, stored.width)
+        {
+            let what = if packed { "packed frames" } else { "frames" };
+            let found = format!("the array holds {} x {} bytes", stored.height, stored.width);
+            return Err(sidecar::contradiction(
+                &format!("{what} of {}", layout.size),
+                &format!("{found} a frame"),
+                &self.path,
+            ));
+        }
+        if layout.frames != frames {
+            return Err(sidecar::contradiction(
+                &format!("{} frames", layout.frames),
+                &format!("the array holds {frames}"),
+                &self.path,
+            ));
+        }
+        let bytes = if layout.format == BurstFormat::NpyU16 { 2 } else { 1 };
+        if self.sample.bytes() != bytes {
+            return Err(sidecar::contradiction(
+                &format!("counts of {bytes} bytes"),
+                &format!("the array holds samples of {} bytes", self.sample.bytes()),
+                &self.path,
+            ));
+        }
+        Ok(())
+    }
+
     /// Some bytes of the data: from the middle where that is possible.
-    fn look(&mut self, frames: u64, frame_bytes: usize) -> Result<Vec<u8>> {
+    fn sample_bytes(
+        &mut self,
+        frames: u64,
+        frame_bytes: usize,
+        info: &mut CaptureInfo,
+    ) -> Result<Vec<u8>> {
         let io = |e| SimError::io("read", &self.path, e);
         let mut bytes = Vec::new();
         match &mut self.place {
-            Place::File { start, available } => {
-                let from = (*available / 2).saturating_sub(LOOK as u64 / 2) & !63;
+            Place::File { start, available, .. } => {
+                let from = (*available / 2).saturating_sub(SAMPLE_BYTES as u64 / 2) & !63;
                 let mut file = File::open(&self.path).map_err(io)?;
                 file.seek(SeekFrom::Start(*start + from)).map_err(io)?;
-                let there = (*available - from).min(LOOK as u64);
+                let there = (*available - from).min(SAMPLE_BYTES as u64);
                 file.take(there).read_to_end(&mut bytes).map_err(io)?;
             }
             Place::Stream(opener) => {
-                let read = opener()?.take(LOOK as u64).read_to_end(&mut bytes);
+                let read = opener()?.take(SAMPLE_BYTES as u64).read_to_end(&mut bytes);
                 // What is damaged further on shows when it is read.
                 if let Err(e) = read
                     && bytes.is_empty()
@@ -291,12 +362,12 @@ impl Array {
                 }
             }
             Place::Fetch { fetch, .. } => {
-                let count = (LOOK / frame_bytes).clamp(1, frames as usize) as u64;
+                let count = (SAMPLE_BYTES / frame_bytes).clamp(1, frames as usize) as u64;
                 bytes = fetch((frames - count) / 2, count)?;
             }
             Place::Pipe(pipe) => {
-                pipe.wait_for(frames.min(FIRST_WINDOW), &mut Vec::new())?;
-                bytes = pipe.look();
+                pipe.wait_for(frames.min(FIRST_WINDOW), &mut info.notes)?;
+                bytes = pipe.kept_bytes();
             }
         }
         Ok(bytes)
@@ -318,7 +389,13 @@ impl Array {
             Place::Stream(opener) if options.lenient => {
                 // What follows a damaged place is lost anyway.
                 let mut counted = Counter(0);
-                let _ = std::io::copy(&mut opener()?.take(promised.unwrap_or(0)), &mut counted);
+                let mut stream = opener()?;
+                let whole = promised.unwrap_or(0);
+                let read = std::io::copy(&mut stream.by_ref().take(whole), &mut counted)
+                    .and_then(|_| std::io::copy(&mut stream, &mut std::io::sink()));
+                if let Err(e) = read {
+                    info.notes.push(format!("the compressed data are damaged: {e}"));
+                }
                 counted.0
             }
             // Of a pipe, nobody knows before its end.
@@ -337,9 +414,12 @@ impl Array {
             info.notes.push(format!("truncated: {} of {frames} frames dropped", frames - whole));
         }
         Ok(match self.place {
-            Place::File { start, .. } if at == 0 => {
+            Place::File { start, checksum, .. } if at == 0 => {
                 let segment = Segment { path: self.path, start, frames: whole };
-                FrameBytes::files(vec![segment], frame_bytes)
+                match checksum.filter(|_| !options.lenient) {
+                    Some(checksum) => FrameBytes::checked(segment, frame_bytes, checksum),
+                    None => FrameBytes::files(vec![segment], frame_bytes),
+                }
             }
             Place::File { start, .. } => {
                 let outer = dims[..at].iter().product();
@@ -348,7 +428,8 @@ impl Array {
                 strewn(&self.path, start, self.sample.bytes(), layout)
             }
             Place::Stream(opener) if at == 0 => {
-                FrameBytes::stream(opener, whole, frame_bytes, &self.path)
+                let after = if options.lenient { StreamEnd::Ignored } else { StreamEnd::Verified };
+                FrameBytes::stream(opener, whole, frame_bytes, after, &self.path)
             }
             Place::Fetch { fetch, group } if at == 0 => {
                 FrameBytes::batched(fetch, whole, frame_bytes, group)

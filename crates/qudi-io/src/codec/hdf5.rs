@@ -18,6 +18,7 @@ use std::path::Path;
 pub(crate) const FORMAT: Format = Format {
     name: "hdf5",
     title: "HDF5 or MATLAB 7.3",
+    options: super::ARRAYS,
     probe: |probe| {
         let magic = b"\x89HDF\r\n\x1a\n";
         let found = [0, 512, 1024, 2048]

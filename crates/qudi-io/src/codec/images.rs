@@ -8,15 +8,19 @@ use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use crate::frames::samples::{Scale, no_count};
+use crate::regular_file;
 use image::DynamicImage;
 use qudi_core::Size;
 use qudi_core::{Result, SimError};
 use qudi_sim::clip::decode_image;
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 pub(crate) const FORMAT: Format = Format {
     name: "images",
     title: "folder of images",
+    options: super::PICTURES,
     probe: |probe| {
         if probe.path.join("burst.json").is_file() {
             return Ok(Some(Recognition::new(Certainty::Certain, &["burst.json in the folder"])));
@@ -52,8 +56,24 @@ fn open(
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let files = files(probe)?;
-    let recorded = described(&probe.path.join("burst.json"), info).is_some();
-    open_files(files, &probe.path, recorded, options, info)
+    let recorded = described(&probe.path.join("burst.json"), info);
+    let frames = open_files(files, &probe.path, recorded.is_some(), options, info)?;
+    match recorded {
+        Some(layout) if (layout.frames, layout.size) != (frames.frames(), frames.size()) => {
+            Err(SimError::data(
+                format!(
+                    "burst.json in it describes {} frames of {}, and it holds {} of {}",
+                    layout.frames,
+                    layout.size,
+                    frames.frames(),
+                    frames.size()
+                ),
+                &probe.path,
+                "copy the missing frames, or remove burst.json if it belongs to another burst",
+            ))
+        }
+        _ => Ok(frames),
+    }
 }
 
 /// Opens images as frames, in this order.
@@ -71,6 +91,9 @@ pub(crate) fn open_files(
             "put frames into it as PNG or TIFF",
         ));
     };
+    for file in &files {
+        regular_file::require(file)?;
+    }
     let (size, samples, full) = gray(first)?;
     if lossy(first) {
         info.notes.push("JPEG is lossy: its values are not photon counts".to_owned());
@@ -129,9 +152,11 @@ fn spread(frames: usize) -> impl Iterator<Item = usize> {
     (0..sampled).map(move |i| i * frames / sampled)
 }
 
+/// Whether the file is a JPEG, whatever its name says.
 fn lossy(path: &Path) -> bool {
-    path.extension()
-        .is_some_and(|e| e.eq_ignore_ascii_case("jpg") || e.eq_ignore_ascii_case("jpeg"))
+    let mut magic = [0; 3];
+    let read = File::open(path).and_then(|mut file| file.read_exact(&mut magic));
+    read.is_ok() && magic == [0xff, 0xd8, 0xff]
 }
 
 /// Gray samples of an image, its size, and full scale.

@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 pub(crate) const FORMAT: Format = Format {
     name: "mat",
     title: "MATLAB arrays (level 5)",
+    options: super::ARRAYS,
     probe: |probe| {
         if probe.is_folder {
             let parts = !parts(probe)?.is_empty();
@@ -148,7 +149,7 @@ fn frames(
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let place = if let Some((start, available)) = array.in_place() {
-        Place::File { start, available }
+        Place::File { start, available, checksum: None }
     } else {
         array.refuse_bomb(path)?;
         Place::Stream(array.opener(path))
@@ -162,6 +163,6 @@ fn frames(
         place,
     };
     // Samples of MATLAB arrays are never packed.
-    let hints = Hints { stored: Stored::Counts, size: None };
+    let hints = Hints { stored: Stored::Counts, ..Hints::default() };
     array.open(options, &hints, info)
 }

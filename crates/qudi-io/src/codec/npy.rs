@@ -7,6 +7,7 @@ use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::Opener;
+use crate::regular_file;
 use crate::sidecar::{self, BurstLayout, Sidecar};
 use crate::writer::BurstFormat;
 use flate2::read::MultiGzDecoder;
@@ -20,6 +21,7 @@ use std::path::Path;
 pub(crate) const FORMAT: Format = Format {
     name: "npy",
     title: "NumPy array",
+    options: super::ARRAY,
     probe: |probe| {
         let found = probe.head.starts_with(b"\x93NUMPY");
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["NumPy's magic number"])))
@@ -34,6 +36,7 @@ pub(crate) const FORMAT: Format = Format {
 pub(crate) const COMPRESSED: Format = Format {
     name: "npy-gz",
     title: "gzipped NumPy array",
+    options: super::ARRAY,
     probe: |probe| {
         let found =
             probe.head.starts_with(&[0x1f, 0x8b]) && probe.stem().to_lowercase().ends_with(".npy");
@@ -48,13 +51,13 @@ pub(crate) const MOST_COMPRESSION: u64 = 1032;
 
 /// A `.npy` file as an array; sizes are checked by [`Array::open`].
 pub(crate) fn open_array(path: &Path) -> Result<Array> {
-    let io = |e| SimError::io("open", path, e);
-    let file = File::open(path).map_err(io)?;
-    let length = file.metadata().map_err(io)?.len();
+    let file = regular_file::open(path)?;
+    let length = file.metadata().map_err(|e| SimError::io("open", path, e))?.len();
     let header = Header::read(&mut BufReader::new(file), path)?;
     let place = Place::File {
         start: header.data_start,
         available: length.saturating_sub(header.data_start),
+        checksum: None,
     };
     Ok(array(path, header, place))
 }
@@ -114,7 +117,7 @@ fn hints(path: &Path, info: &mut CaptureInfo) -> Hints {
     let Some(layout) = described(&sidecar::beside(path), info) else { return Hints::default() };
     let packed = layout.format == BurstFormat::NpyPacked;
     let packing = packed.then_some(Packing { axis: PackAxis::Width, order: BitOrder::Msb });
-    Hints { stored: packing.into(), size: Some(layout.size) }
+    Hints { stored: packing.into(), size: Some(layout.size), recorded: Some(layout) }
 }
 
 /// What our record at `path` says of its burst, if it exists; what it says about the camera goes
@@ -130,7 +133,7 @@ pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayo
             return None;
         }
     };
-    info.reasons.push("the record beside it".to_owned());
+    info.reasons.push(super::RECORD.to_owned());
     let layout = match record {
         Sidecar::Simulated(record) => {
             info.binary = record.simulation.sensor.response == Response::Binary;

@@ -1,13 +1,14 @@
 //! NumPy `.npz`: the one array in it that is a capture.
 
 use super::array::{Hints, Place};
+use super::crc::CrcReader;
 use super::npy::{array, refuse_bomb};
 use super::{Format, Recognition};
 use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
-use crate::frames::frame_bytes::Opener;
+use crate::frames::frame_bytes::{Checksum, Opener};
 use flate2::read::DeflateDecoder;
 use qudi_core::npy::Header;
 use qudi_core::{Result, SimError};
@@ -19,6 +20,7 @@ use zip::{CompressionMethod, ZipArchive};
 pub(crate) const FORMAT: Format = Format {
     name: "npz",
     title: "NumPy archive",
+    options: super::ARRAYS,
     probe: |probe| {
         let found = probe.head.starts_with(b"PK\x03\x04") && probe.extension == "npz";
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["zip's magic number", "the name"])))
@@ -33,6 +35,7 @@ struct Entry {
     start: u64,
     compressed: u64,
     deflated: bool,
+    crc32: u32,
     header: Header,
 }
 
@@ -60,6 +63,10 @@ fn open(
         Place::File {
             start: entry.start + data_start,
             available: entry.compressed.saturating_sub(data_start),
+            checksum: Some(Checksum {
+                expected: entry.crc32,
+                range: entry.start..entry.start + entry.compressed,
+            }),
         }
     };
     array(path, entry.header, place).open(options, &Hints::default(), info)
@@ -67,7 +74,8 @@ fn open(
 
 impl Entry {
     fn stream(&self, path: &Path) -> Result<Box<dyn Read + Send>> {
-        stream(path, self.start, self.compressed, self.deflated)
+        let stream = stream(path, self.start, self.compressed, self.deflated)?;
+        Ok(Box::new(CrcReader::new(stream, self.crc32)))
     }
 }
 
@@ -102,6 +110,14 @@ fn entries(path: &Path) -> Result<Vec<Entry>> {
         let file = archive.by_index_raw(i).map_err(damaged)?;
         let name = file.name().map_err(damaged)?;
         let Some(name) = name.strip_suffix(".npy").map(str::to_owned) else { continue };
+        if file.encrypted() {
+            return Err(SimError::data(
+                format!("array `{name}` is encrypted"),
+                path,
+                "unpack it with its password, and write it again with numpy.savez",
+            ));
+        }
+        let crc32 = file.crc32();
         let deflated = match file.compression() {
             CompressionMethod::Stored => false,
             CompressionMethod::Deflated => true,
@@ -119,7 +135,7 @@ fn entries(path: &Path) -> Result<Vec<Entry>> {
         // Arrays of text, say, are not what is looked for.
         let header = Header::read(&mut stream(path, start, compressed, deflated)?, path);
         if let Ok(header) = header {
-            entries.push(Entry { name, start, compressed, deflated, header });
+            entries.push(Entry { name, start, compressed, deflated, crc32, header });
         }
     }
     Ok(entries)

@@ -3,6 +3,7 @@
 use super::array::{Hints, Place};
 use super::npy::array;
 use super::raw::piped as piped_raw;
+use crate::capture::format_options::refuse_others;
 use crate::capture::info::CaptureInfo;
 use crate::capture::options::ReadOptions;
 use crate::capture::pipe::{Pipe, STDIN, Tail};
@@ -52,6 +53,7 @@ pub(crate) fn open_pipe(
             ))
         });
     }
+    refuse_others(options, super::ARRAY, "npy")?;
     let mut start = Vec::new();
     (&mut reader)
         .take(MAGIC)

@@ -14,8 +14,13 @@ use crate::frames::packed::{PackedFrames, Placement};
 use qudi_core::Size;
 use qudi_core::{Result, SimError};
 
-pub(crate) const FORMAT: Format =
-    Format { name: "qvga", title: "Edinburgh QVGA SPAD raw file", probe: recognise, open };
+pub(crate) const FORMAT: Format = Format {
+    name: "qvga",
+    title: "Edinburgh QVGA SPAD raw file",
+    options: super::SIZED_BIT_FILES,
+    probe: recognise,
+    open,
+};
 
 const WIDTH: usize = 320;
 const HEIGHT: usize = 240;

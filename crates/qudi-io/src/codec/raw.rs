@@ -4,6 +4,7 @@
 pub(super) mod files;
 
 use super::Format;
+use crate::capture::format_options::{FormatOption, refuse_others};
 use crate::capture::info::{CaptureInfo, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::pipe::{Pipe, STDIN, Tail};
@@ -22,6 +23,7 @@ use std::path::Path;
 pub(crate) const BITS: Format = Format {
     name: "raw-bits",
     title: "packed bits without header",
+    options: &BITS_OPTIONS,
     probe: |_| Ok(None),
     open: |probe, options, info| bits(options, info, &mut from_files(probe, options)),
 };
@@ -29,6 +31,7 @@ pub(crate) const BITS: Format = Format {
 pub(crate) const BYTES: Format = Format {
     name: "raw-u8",
     title: "one byte per count without header",
+    options: &SAMPLES_OPTIONS,
     probe: |_| Ok(None),
     open: |probe, options, info| {
         samples(Sample::U8, &probe.path, options, info, &mut from_files(probe, options))
@@ -38,11 +41,31 @@ pub(crate) const BYTES: Format = Format {
 pub(crate) const WORDS: Format = Format {
     name: "raw-u16",
     title: "two little-endian bytes per count without header",
+    options: &SAMPLES_OPTIONS,
     probe: |_| Ok(None),
     open: |probe, options, info| {
         samples(WORD, &probe.path, options, info, &mut from_files(probe, options))
     },
 };
+
+const BITS_OPTIONS: [FormatOption; 7] = [
+    FormatOption::Axes,
+    FormatOption::BitOrder,
+    FormatOption::PackAxis,
+    FormatOption::Size,
+    FormatOption::Header,
+    FormatOption::Trailer,
+    FormatOption::FramesPerFile,
+];
+
+const SAMPLES_OPTIONS: [FormatOption; 6] = [
+    FormatOption::Axes,
+    FormatOption::Size,
+    FormatOption::Levels,
+    FormatOption::Header,
+    FormatOption::Trailer,
+    FormatOption::FramesPerFile,
+];
 
 const WORD: Sample = Sample::U16 { big_endian: false };
 
@@ -86,6 +109,9 @@ pub(crate) fn piped(
     options: &ReadOptions,
 ) -> Option<Result<(Box<dyn CountFrames>, CaptureInfo)>> {
     let format = [BITS, BYTES, WORDS].into_iter().find(|format| format.name == name)?;
+    if let Err(e) = refuse_others(options, format.options, format.name) {
+        return Some(Err(e));
+    }
     let mut info = CaptureInfo::new(format.name, format.title);
     info.reasons.push("--format".to_owned());
     let mut reader = Some(reader);
@@ -108,6 +134,19 @@ pub(crate) fn piped(
     Some(frames.map(|frames| (frames, info)))
 }
 
+/// Whether columns are stored before rows. Frames of raw files come one after the other.
+fn transposed(options: &ReadOptions) -> Result<bool> {
+    let axes = options.axes.unwrap_or_default();
+    if axes.frame_position() == 0 {
+        return Ok(axes.transposed());
+    }
+    Err(SimError::request(
+        "frames of files without header come one after the other",
+        "axes",
+        "use thw or twh; another order is read from .npy",
+    ))
+}
+
 fn bits(
     options: &ReadOptions,
     info: &mut CaptureInfo,
@@ -116,14 +155,21 @@ fn bits(
     let size = size(options)?;
     let axis = match options.pack_axis {
         Some(axis @ (PackAxis::Width | PackAxis::Height)) => axis,
-        Some(PackAxis::None) | None => PackAxis::Width,
+        None => PackAxis::Width,
+        Some(PackAxis::None) => {
+            return Err(SimError::request(
+                "raw-bits holds packed bits",
+                "pack_axis",
+                "name the axis, width or height, or read one byte per count as raw-u8",
+            ));
+        }
     };
     let (rows, columns) = stored_bytes(size, axis);
     let bytes = source(rows * columns, info)?;
     let order = options.bit_order.unwrap_or(BitOrder::Msb);
     info.max_count = Some(1);
     info.packing = Some(Packing { axis, order });
-    let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
+    let transposed = transposed(options)?;
     let placement = Placement::packed(size, axis, transposed);
     Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
 }
@@ -139,6 +185,6 @@ fn samples(
     let bytes = source(size.pixels() * sample.bytes(), info)?;
     let full = sample.full_scale().unwrap_or(1.0);
     let scale = Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts);
-    let transposed = options.axes.is_some_and(crate::capture::options::Axes::transposed);
+    let transposed = transposed(options)?;
     Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, place)))
 }

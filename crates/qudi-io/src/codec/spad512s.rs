@@ -4,6 +4,7 @@
 
 use super::{Format, Recognition};
 use crate::capture::byte_kind::ByteKind;
+use crate::capture::format_options::FormatOption;
 use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, Orientation, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
@@ -16,12 +17,17 @@ use qudi_core::Result;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 
+/// Options of files of one count a pixel.
+const COUNTS: &[FormatOption] =
+    &[FormatOption::Size, FormatOption::Header, FormatOption::Trailer, FormatOption::FramesPerFile];
+
 /// The whole array; narrower read-outs are given with `--size`.
 const ARRAY: Size = Size { height: 512, width: 512 };
 
 pub(crate) const BINARY: Format = Format {
     name: "spad512s",
     title: "SPAD512S raw files, 1 bit",
+    options: super::SIZED_BIT_FILES,
     probe: |probe| recognise(probe, ByteKind::Packed, FRAME as u64),
     open: open_binary,
 };
@@ -29,6 +35,7 @@ pub(crate) const BINARY: Format = Format {
 pub(crate) const BYTES: Format = Format {
     name: "spad512s-8",
     title: "SPAD512S raw files, 4 to 8 bits",
+    options: COUNTS,
     probe: |probe| recognise(probe, ByteKind::Counts, 8 * FRAME as u64),
     open: |probe, options, info| open_samples(probe, options, info, Sample::U8),
 };
@@ -36,6 +43,7 @@ pub(crate) const BYTES: Format = Format {
 pub(crate) const WORDS: Format = Format {
     name: "spad512s-16",
     title: "SPAD512S raw files, 9 to 12 bits",
+    options: COUNTS,
     probe: |probe| recognise(probe, ByteKind::WideCounts, 16 * FRAME as u64),
     open: |probe, options, info| {
         open_samples(probe, options, info, Sample::U16 { big_endian: false })

@@ -1,6 +1,7 @@
 //! SPAD512S sparse mode: 32-bit little-endian indices of fired pixels, a delimiter ends each frame.
 
 use super::{Format, Recognition};
+use crate::capture::format_options::FormatOption;
 use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::{Orientation, ReadOptions};
 use crate::capture::probe::Probe;
@@ -14,6 +15,7 @@ use std::path::{Path, PathBuf};
 pub(crate) const FORMAT: Format = Format {
     name: "spad512s-sparse",
     title: "SPAD512S sparse index stream",
+    options: &[FormatOption::Size],
     probe: |probe| {
         if !probe.has_extension(&["bin", "raw"]) || !probe.length.is_multiple_of(4) {
             return Ok(None);

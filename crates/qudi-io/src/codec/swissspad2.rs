@@ -19,6 +19,7 @@ use qudi_core::Size;
 pub(crate) const HALF: Format = Format {
     name: "swissspad2",
     title: "SwissSPAD2 raw files, half array",
+    options: super::BIT_FILES,
     probe: |probe| recognise(probe, false),
     open: |probe, options, info| {
         open(probe, options, info, Size { height: 256, width: 512 }, Placement::Straight)
@@ -28,6 +29,7 @@ pub(crate) const HALF: Format = Format {
 pub(crate) const FULL: Format = Format {
     name: "swissspad2-full",
     title: "SwissSPAD2 raw files, full array",
+    options: super::BIT_FILES,
     probe: |probe| recognise(probe, true),
     open: |probe, options, info| {
         let size = Size { height: 512, width: 512 };

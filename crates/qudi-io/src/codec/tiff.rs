@@ -8,20 +8,22 @@ use super::{Format, Recognition};
 use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
-use crate::codec::tiff::pages::{TiffPages, decoder, fault};
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
-use crate::sidecar;
+use crate::sidecar::{self, BurstLayout};
+use pages::{TiffPages, bits_reversed, decoder, fault};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Result, SimError};
+use std::path::Path;
 use tiff::ColorType;
 use tiff::tags::{ByteOrder, Tag};
 
 pub(crate) const FORMAT: Format = Format {
     name: "tiff",
     title: "TIFF stack",
+    options: super::PICTURES,
     probe: |probe| {
         let magic = [&b"II*\0"[..], b"MM\0*", b"II+\0", b"MM\0+"];
         let found = magic.iter().any(|magic| probe.head.starts_with(magic));
@@ -47,9 +49,10 @@ fn open(
     if probe.is_folder {
         return Err(SimError::data("a folder", path, "use --format images, or name one file"));
     }
-    let recorded = described(&sidecar::beside(path), info).is_some();
+    let recorded = described(&sidecar::beside(path), info);
     let Some(block) = block(probe)? else {
-        let pages = TiffPages::open(path, options, recorded, info)?;
+        let pages = TiffPages::open(path, options, recorded.is_some(), info)?;
+        check_record(recorded.as_ref(), &pages, options, path)?;
         return Ok(Box::new(pages));
     };
     info.reasons.push(format!("ImageJ's description: {} images", block.frames));
@@ -73,7 +76,28 @@ fn open(
     let full = block.sample.full_scale().unwrap_or(1.0);
     let scale = Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts);
     let frames = SampleFrames::new(bytes, block.sample, block.size, false, MONO, scale, path);
+    check_record(recorded.as_ref(), &frames, options, path)?;
     Ok(Box::new(frames))
+}
+
+/// Refuses a record that belongs to another stack, with what both say.
+pub(super) fn check_record(
+    recorded: Option<&BurstLayout>,
+    frames: &dyn CountFrames,
+    options: &ReadOptions,
+    path: &Path,
+) -> Result<()> {
+    let Some(layout) = recorded else { return Ok(()) };
+    let found = (frames.frames(), frames.size());
+    let shorter = options.lenient && found.0 < layout.frames;
+    if (layout.frames, layout.size) == found || (shorter && layout.size == found.1) {
+        return Ok(());
+    }
+    Err(sidecar::contradiction(
+        &format!("{} frames of {}", layout.frames, layout.size),
+        &format!("it holds {} frames of {}", found.0, found.1),
+        path,
+    ))
 }
 
 /// ImageJ's block of frames, if this is one.
@@ -91,7 +115,7 @@ fn block(probe: &Probe) -> Result<Option<Block>> {
         });
     let Some(frames) = images.filter(|&n| n > 1) else { return Ok(None) };
     let compression = tag(&mut decoder, Tag::Compression).and_then(|v| v.into_u16().ok());
-    if compression.unwrap_or(1) != 1 {
+    if compression.unwrap_or(1) != 1 || bits_reversed(&mut decoder, path)? {
         return Ok(None);
     }
     let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;

@@ -16,6 +16,7 @@ use std::io::{BufWriter, Write};
 pub(crate) const FORMAT: Format = Format {
     name: "video",
     title: "video, decoded by ffmpeg",
+    options: super::PICTURES,
     probe: |probe| {
         let found = probe.has_extension(&["mp4", "avi", "mkv", "mov", "webm", "m4v"]);
         Ok(found.then(|| Recognition::new(Certainty::Likely, &["the name"])))

@@ -4,6 +4,7 @@ use super::array::{Hints, Stored};
 use super::images::open_files;
 use super::npy::open_array;
 use super::{Format, Recognition};
+use crate::capture::format_options::refuse_others;
 use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
@@ -16,6 +17,7 @@ use std::path::{Component, Path, PathBuf};
 pub(crate) const FORMAT: Format = Format {
     name: "visionsim",
     title: "visionsim dataset",
+    options: super::ARRAY,
     probe: |probe| {
         let found = document(probe).is_file();
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["transforms.json"])))
@@ -84,6 +86,7 @@ fn open(
             inside(folder, name).ok_or_else(|| fault(format!("its data lie at `{name}`")))?;
         return open_array(&data)?.open(options, &transforms.hints(&path)?, info);
     }
+    refuse_others(options, super::PICTURES, "a data set of images")?;
     let files: Option<Vec<PathBuf>> =
         transforms.frames.iter().map(|pose| inside(folder, pose.file_path.as_deref()?)).collect();
     let files = files.ok_or_else(|| fault("frames without file_path".to_owned()))?;
@@ -117,6 +120,6 @@ impl Transforms {
         };
         let packed = axis != PackAxis::None;
         let packing = packed.then_some(Packing { axis, order: BitOrder::Msb });
-        Ok(Hints { stored: Stored::from(packing), size })
+        Ok(Hints { stored: Stored::from(packing), size, recorded: None })
     }
 }

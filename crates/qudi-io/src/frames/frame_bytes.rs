@@ -44,15 +44,29 @@ impl FrameBytes {
         Self::Files(Files { open: Some((0, file)), ..Files::new(vec![segment], frame_bytes) })
     }
 
-    pub(crate) fn stream(opener: Opener, frames: u64, frame_bytes: usize, path: &Path) -> Self {
+    /// Frames of a stream; `after` says what its reader does once the last frame is read.
+    pub(crate) fn stream(
+        opener: Opener,
+        frames: u64,
+        frame_bytes: usize,
+        after: StreamEnd,
+        path: &Path,
+    ) -> Self {
         Self::Stream(Stream {
             opener,
             reader: None,
             at: 0,
             frames,
             frame_bytes,
+            after,
             path: path.to_owned(),
         })
+    }
+
+    /// Frames of one file, checked against a CRC-32 when they are read one after the other.
+    pub(crate) fn checked(segment: Segment, frame_bytes: usize, checksum: Checksum) -> Self {
+        let files = Files::new(vec![segment], frame_bytes);
+        Self::Files(Files { checksum: Some(RunningChecksum::new(checksum)), ..files })
     }
 
     /// Frames that `fetch` gives, in multiples of `group` frames where memory allows.
@@ -133,6 +147,71 @@ pub(crate) struct Files {
     total: u64,
     frame_bytes: usize,
     open: Option<(usize, File)>,
+    checksum: Option<RunningChecksum>,
+}
+
+/// The CRC-32 of a part of a file that holds frames, and a header before them.
+#[derive(Clone, Debug)]
+pub(crate) struct Checksum {
+    pub(crate) expected: u32,
+    /// The bytes that the checksum covers, in the file.
+    pub(crate) range: Range<u64>,
+}
+
+/// A checksum that grows while frames are read in turn. Frames read out of turn are not checked.
+struct RunningChecksum {
+    checksum: Checksum,
+    hasher: crc32fast::Hasher,
+    next: u64,
+}
+
+impl RunningChecksum {
+    fn new(checksum: Checksum) -> Self {
+        Self { checksum, hasher: crc32fast::Hasher::new(), next: 0 }
+    }
+
+    /// Takes in `bytes`, frames from `first` on, just read from `file`, whose frames are those of `segment`.
+    fn add(
+        &mut self,
+        first: u64,
+        bytes: &[u8],
+        frame_bytes: usize,
+        segment: &Segment,
+        file: &mut File,
+    ) -> std::io::Result<()> {
+        if first == 0 {
+            self.hasher = crc32fast::Hasher::new();
+            self.next = 0;
+            file.seek(SeekFrom::Start(self.checksum.range.start))?;
+            self.hash(file, segment.start - self.checksum.range.start)?;
+        }
+        if first != self.next {
+            return Ok(());
+        }
+        self.hasher.update(bytes);
+        self.next += (bytes.len() / frame_bytes) as u64;
+        if self.next < segment.frames {
+            return Ok(());
+        }
+        let end = segment.start + segment.frames * frame_bytes as u64;
+        file.seek(SeekFrom::Start(end))?;
+        self.hash(file, self.checksum.range.end.saturating_sub(end))?;
+        let found = self.hasher.clone().finalize();
+        let expected = self.checksum.expected;
+        if found == expected { Ok(()) } else { Err(crate::codec::crc_mismatch(found, expected)) }
+    }
+
+    fn hash(&mut self, file: &mut File, bytes: u64) -> std::io::Result<()> {
+        let mut piece = vec![0; 1 << 16];
+        let mut left = bytes;
+        while left > 0 {
+            let n = left.min(piece.len() as u64) as usize;
+            file.read_exact(&mut piece[..n])?;
+            self.hasher.update(&piece[..n]);
+            left -= n as u64;
+        }
+        Ok(())
+    }
 }
 
 impl Files {
@@ -145,7 +224,7 @@ impl Files {
                 total - segment.frames
             })
             .collect();
-        Self { segments, firsts, total, frame_bytes, open: None }
+        Self { segments, firsts, total, frame_bytes, open: None, checksum: None }
     }
 
     fn read(&mut self, mut first: u64, mut bytes: &mut [u8]) -> Result<()> {
@@ -164,11 +243,39 @@ impl Files {
             file.seek(SeekFrom::Start(start + within * self.frame_bytes as u64))
                 .and_then(|_| file.read_exact(piece))
                 .map_err(|e| SimError::io(format!("read frame {first} of"), path, e))?;
+            if let Some(checksum) = &mut self.checksum {
+                let segment = &self.segments[at];
+                checksum.add(first, piece, self.frame_bytes, segment, file).map_err(|e| {
+                    let ends = e.kind() == std::io::ErrorKind::UnexpectedEof;
+                    if ends || e.kind() == std::io::ErrorKind::InvalidData {
+                        return damaged(&e, path);
+                    }
+                    SimError::io("check", path, e)
+                })?;
+            }
             bytes = rest;
             first += here;
         }
         Ok(())
     }
+}
+
+/// What follows the last frame of a stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum StreamEnd {
+    /// Its end, where decoders compare checksums: it is read to there.
+    Verified,
+    /// Nothing that is asked for, in a stream that is damaged there.
+    Ignored,
+}
+
+/// The error of data that differ from their checksum.
+fn damaged(e: &std::io::Error, path: &Path) -> SimError {
+    SimError::data(
+        format!("the stored data are damaged: {e}"),
+        path,
+        "copy or export the file again",
+    )
 }
 
 pub(crate) struct Stream {
@@ -177,6 +284,7 @@ pub(crate) struct Stream {
     at: u64,
     frames: u64,
     frame_bytes: usize,
+    after: StreamEnd,
     path: PathBuf,
 }
 
@@ -212,6 +320,9 @@ impl Stream {
         self.at = first;
         reader.read_exact(bytes).map_err(|e| fault(first, &self.path, e))?;
         self.at += (bytes.len() / self.frame_bytes) as u64;
+        if self.at == self.frames && self.after == StreamEnd::Verified {
+            std::io::copy(reader, &mut std::io::sink()).map_err(|e| damaged(&e, &self.path))?;
+        }
         Ok(())
     }
 }

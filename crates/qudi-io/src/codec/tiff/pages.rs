@@ -11,6 +11,7 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use tiff::ColorType;
 use tiff::decoder::{Decoder, DecodingResult};
+use tiff::tags::Tag;
 
 pub(crate) type TiffDecoder = Decoder<BufReader<File>>;
 
@@ -22,6 +23,8 @@ pub(crate) struct TiffPages {
     scale: Scale,
     /// Rows of single bits, padded to bytes.
     bits: bool,
+    /// Whether the first pixel of a byte is its lowest bit.
+    reversed: bool,
 }
 
 pub(crate) fn fault(path: &Path, e: tiff::TiffError) -> SimError {
@@ -42,6 +45,30 @@ pub(crate) fn decoder(path: &Path) -> Result<TiffDecoder> {
     Decoder::new(BufReader::with_capacity(1 << 16, file)).map_err(|e| fault(path, e))
 }
 
+/// Whether the bits of each byte of the current page are stored lowest first (FillOrder 2, TIFF 6.0 section 8).
+/// The decoder does not honour it, so that only uncompressed bytes can be turned round.
+pub(super) fn bits_reversed(decoder: &mut TiffDecoder, path: &Path) -> Result<bool> {
+    let mut tag = |tag| -> Result<Option<u16>> {
+        let value = decoder.find_tag(tag).map_err(|e| fault(path, e))?;
+        Ok(value.and_then(|value| value.into_u16().ok()))
+    };
+    if tag(Tag::FillOrder)?.unwrap_or(1) != 2 {
+        return Ok(false);
+    }
+    let compression = tag(Tag::Compression)?.unwrap_or(1);
+    let depth = decoder.colortype().map_err(|e| fault(path, e))?.bit_depth();
+    if compression == 1 && depth <= 8 {
+        return Ok(true);
+    }
+    Err(SimError::data(
+        format!(
+            "bits stored lowest first (FillOrder 2) in samples of {depth} bits, compression {compression}"
+        ),
+        path,
+        "save the stack again uncompressed, as 8-bit gray",
+    ))
+}
+
 impl TiffPages {
     pub(crate) fn open(
         path: &Path,
@@ -60,6 +87,7 @@ impl TiffPages {
         };
         let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;
         let size = Size::new(height as usize, width as usize, &path.display().to_string())?;
+        let reversed = bits_reversed(&mut decoder, path)?;
         let mut frames = 1u64;
         while decoder.more_images() {
             if let Err(e) = decoder.next_image() {
@@ -73,7 +101,7 @@ impl TiffPages {
         }
         let path = path.to_owned();
         let scale = Scale::Counts;
-        let mut pages = Self { decoder, path, size, frames, scale, bits: bits == 1 };
+        let mut pages = Self { decoder, path, size, frames, scale, bits: bits == 1, reversed };
         pages.drop_unreadable(options, info)?;
         pages.scale = pages.find_scale(bits, options, recorded, info)?;
         Ok(pages)
@@ -139,7 +167,18 @@ impl TiffPages {
                 "colour is not supported yet; save the stack as 8- or 16-bit gray",
             ));
         }
-        self.decoder.read_image().map_err(fault)
+        if bits_reversed(&mut self.decoder, &self.path)? != self.reversed {
+            return Err(SimError::data(
+                format!("frame {frame} has another order of bits (FillOrder) than the first"),
+                &self.path,
+                "save the stack again as 8- or 16-bit gray",
+            ));
+        }
+        let mut image = self.decoder.read_image().map_err(fault)?;
+        if let (true, DecodingResult::U8(bytes)) = (self.reversed, &mut image) {
+            bytes.iter_mut().for_each(|byte| *byte = byte.reverse_bits());
+        }
+        Ok(image)
     }
 
     fn wrong_length(&self, frame: u64, length: usize) -> SimError {

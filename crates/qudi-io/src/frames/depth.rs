@@ -1,0 +1,69 @@
+//! Frames whose counts are checked against the depth that is known of them.
+
+use super::count_frames::CountFrames;
+use qudi_core::{Result, SimError, Size};
+use std::path::{Path, PathBuf};
+
+/// Frames in which no count may exceed `max_count`.
+pub(crate) struct DepthChecked {
+    inner: Box<dyn CountFrames>,
+    max_count: u16,
+    /// Who says so, as in "`bits`" or "the record beside it".
+    source: &'static str,
+    path: PathBuf,
+}
+
+impl DepthChecked {
+    pub(crate) fn new(
+        inner: Box<dyn CountFrames>,
+        max_count: u16,
+        source: &'static str,
+        path: &Path,
+    ) -> Self {
+        Self { inner, max_count, source, path: path.to_owned() }
+    }
+}
+
+impl CountFrames for DepthChecked {
+    fn frames(&self) -> u64 {
+        self.inner.frames()
+    }
+
+    fn size(&self) -> Size {
+        self.inner.size()
+    }
+
+    // Sums are made of frames that are read one by one, so that each is checked.
+    fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
+        self.inner.read(frame, counts)?;
+        let Some(&largest) = counts.iter().max().filter(|&&largest| largest > self.max_count)
+        else {
+            return Ok(());
+        };
+        let (max, bits) = (self.max_count, 16 - self.max_count.leading_zeros());
+        Err(SimError::data(
+            format!(
+                "frame {frame} holds a count of {largest}, beyond the {max} ({bits} bit) that {} allows",
+                self.source
+            ),
+            &self.path,
+            "check `format`, `bits` and `levels`, and that a record beside the file belongs to it",
+        ))
+    }
+
+    fn length(&self) -> Option<u64> {
+        self.inner.length()
+    }
+
+    fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
+        self.inner.wait_for(frames, notes)
+    }
+
+    fn discard_before(&mut self, frame: u64) {
+        self.inner.discard_before(frame);
+    }
+
+    fn forward_only(&self) -> bool {
+        self.inner.forward_only()
+    }
+}

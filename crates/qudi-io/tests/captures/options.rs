@@ -1,0 +1,126 @@
+//! Every format with every option: applied, or refused by name.
+
+use crate::{npy, pack, plain, refusal, scene, scratch, write};
+use qudi_io::capture::{Axes, BitOrder, Capture, FormatOption, PackAxis, ReadOptions};
+use qudi_io::codec::FORMATS;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// Options that give one of them, and what the file needs to be read at all.
+fn with(option: FormatOption, base: &ReadOptions) -> ReadOptions {
+    let base = base.clone();
+    match option {
+        FormatOption::Axes => ReadOptions { axes: Some(Axes::Twh), ..base },
+        FormatOption::Channel => ReadOptions { channel: Some(9), ..base },
+        FormatOption::Array => ReadOptions { array: Some("other".to_owned()), ..base },
+        FormatOption::BitOrder => ReadOptions { bit_order: Some(BitOrder::Lsb), ..base },
+        FormatOption::PackAxis => ReadOptions { pack_axis: Some(PackAxis::Width), ..base },
+        FormatOption::Size => ReadOptions { size: Some("3x5".parse().unwrap()), ..base },
+        FormatOption::Levels => ReadOptions { levels: Some(2), ..base },
+        FormatOption::Header => ReadOptions { header: Some(1), ..base },
+        FormatOption::Trailer => ReadOptions { trailer: Some(1), ..base },
+        FormatOption::FramesPerFile => ReadOptions { frames_per_file: Some(1), ..base },
+    }
+}
+
+/// A file that is opened as `format`; `None` where one takes more than a few bytes to make.
+fn file(format: &str, folder: &Path) -> Option<PathBuf> {
+    let frames = scene(4, 16, 24, 9);
+    let counts: Vec<u8> = frames.iter().flatten().map(|&c| c as u8).collect();
+    let array = npy("|b1", "False", "(4, 16, 24)", &counts);
+    Some(match format {
+        "npy" => write(folder, "a.npy", &array),
+        "npy-gz" => {
+            let mut gzip =
+                flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
+            gzip.write_all(&array).unwrap();
+            write(folder, "a.npy.gz", &gzip.finish().unwrap())
+        }
+        "npz" => {
+            let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+            archive.start_file("a.npy", zip::write::SimpleFileOptions::default()).unwrap();
+            archive.write_all(&array).unwrap();
+            write(folder, "a.npz", &archive.finish().unwrap().into_inner())
+        }
+        "images" => {
+            let pixels = frames[0].iter().map(|&c| c as u8).collect();
+            let path = folder.join("images");
+            std::fs::create_dir_all(&path).unwrap();
+            image::GrayImage::from_raw(24, 16, pixels).unwrap().save(path.join("a.png")).unwrap();
+            path
+        }
+        "raw-bits" => {
+            let bits: Vec<u8> = frames.iter().flat_map(|f| pack(f, 24, false)).collect();
+            write(folder, "bits.bin", &bits)
+        }
+        "raw-u8" | "raw-u16" => write(folder, "counts.bin", &counts),
+        "spad512s-sparse" => {
+            let words = [5u32, 512 * 512];
+            write(folder, "sparse.bin", &words.map(u32::to_le_bytes).concat())
+        }
+        "qvga" => {
+            let path = folder.join("qvga");
+            std::fs::create_dir_all(&path).unwrap();
+            write(&path, "zeros.bin", &[0; 3 * 9600])
+        }
+        "swissspad2" | "swissspad2-full" | "spad512s" | "spad512s-8" | "spad512s-16" => {
+            write(folder, "zeros.bin", &[0; 1 << 21])
+        }
+        _ => return None,
+    })
+}
+
+#[test]
+fn options_that_a_format_does_not_take_are_refused_by_name() {
+    let folder = scratch();
+    for format in FORMATS {
+        // Refused before anything is read, so that any file will do.
+        let path = file(format.name, folder.path())
+            .unwrap_or_else(|| write(folder.path(), "any.bin", &[0; 64]));
+        let base = ReadOptions { format: Some(format.name.to_owned()), ..plain() };
+        for option in FormatOption::ALL.into_iter().filter(|o| !format.options.contains(o)) {
+            let words = refusal(Capture::open(&path, &with(option, &base), None));
+            let expected = format!("`{}` does not apply to {}", option.name(), format.name);
+            assert!(words.contains(&expected), "{}: {words}", format.name);
+        }
+    }
+}
+
+/// What options make of a capture: all counts of its first frame and what is known, or the refusal.
+fn outcome(path: &Path, options: &ReadOptions) -> String {
+    let read = || -> qudi_core::Result<String> {
+        let mut capture = Capture::open(path, options, None)?;
+        let mut counts = vec![0; capture.size().pixels()];
+        capture.read(0, &mut counts)?;
+        let info = capture.info();
+        let known = (info.max_count, info.packing, info.binary);
+        Ok(format!("{} frames of {}: {counts:?}, {known:?}", capture.frames(), capture.size()))
+    };
+    read().unwrap_or_else(|e| e.to_string())
+}
+
+#[test]
+fn options_that_a_format_takes_are_not_ignored() {
+    let folder = scratch();
+    for format in FORMATS {
+        let Some(path) = file(format.name, folder.path()) else { continue };
+        let raw = format.name.starts_with("raw");
+        let base = ReadOptions {
+            format: Some(format.name.to_owned()),
+            size: raw.then(|| "16x24".parse().unwrap()),
+            ..plain()
+        };
+        let usual = outcome(&path, &base);
+        for &option in format.options {
+            let zeros = path.ends_with("zeros.bin") && option == FormatOption::BitOrder;
+            let implied = format.name == "raw-bits" && option == FormatOption::PackAxis;
+            let options = if implied {
+                ReadOptions { pack_axis: Some(PackAxis::Height), ..base.clone() }
+            } else {
+                with(option, &base)
+            };
+            let other = outcome(&path, &options);
+            assert!(zeros || other != usual, "{} ignores {}", format.name, option.name());
+        }
+    }
+}
