@@ -11,7 +11,7 @@ use tempfile::{NamedTempFile, TempDir};
 pub enum Overwrite {
     /// Refuse.
     No,
-    /// Replace a file; a folder only if it holds `owned`, which our folders do.
+    /// Replace a file; a folder only if all that it holds is ours.
     Yes,
 }
 
@@ -88,7 +88,6 @@ impl PendingFile {
         SimError::io("write", &self.path, e)
     }
 
-    /// The file itself, everything written so far flushed.
     /// The open file, everything written so far flushed to it.
     ///
     /// # Errors
@@ -132,31 +131,73 @@ impl std::io::Seek for PendingFile {
     }
 }
 
+/// Describes the folders that a writer makes, so that no other is replaced.
+#[derive(Clone, Copy, Debug)]
+pub struct OwnFolder {
+    /// A file that every such folder holds.
+    pub marker: &'static str,
+    /// Whether a file of this name is written into such folders.
+    pub is_own_file: fn(&str) -> bool,
+}
+
+impl OwnFolder {
+    /// Refuses a folder at `path` that holds anything else. An empty one is fine.
+    ///
+    /// # Errors
+    /// [`SimError`] that names a foreign file.
+    fn check(&self, path: &Path) -> Result<()> {
+        let list = |e| SimError::io("list the output", path, e);
+        let help = "choose another name, or remove it yourself";
+        if !path.is_dir() {
+            return Err(SimError::data("the output exists and is not a folder", path, help));
+        }
+        let mut marked = false;
+        let mut entries = 0;
+        for entry in std::fs::read_dir(path).map_err(list)? {
+            let entry = entry.map_err(list)?;
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let is_file = entry.file_type().map_err(list)?.is_file();
+            if !is_file || !(name == self.marker || (self.is_own_file)(&name)) {
+                return Err(SimError::data(
+                    format!("the output holds `{name}`, which this program did not write"),
+                    path,
+                    "choose another name, or move that file away",
+                ));
+            }
+            marked |= name == self.marker;
+            entries += 1;
+        }
+        if marked || entries == 0 {
+            return Ok(());
+        }
+        let marker = self.marker;
+        Err(SimError::data(
+            format!("the output exists and was not made by this program (no {marker} in it)"),
+            path,
+            help,
+        ))
+    }
+}
+
 /// A folder that appears under its name only when finished.
 #[derive(Debug)]
 pub struct PendingFolder {
     folder: TempDir,
     path: PathBuf,
     overwrite: Overwrite,
+    own: OwnFolder,
 }
 
 impl PendingFolder {
-    /// Starts a folder beside where it will be. To be overwritten, a folder must hold `owned`, the
-    /// file that marks it as ours, or be empty.
+    /// Starts a folder beside where it will be. A folder is overwritten only if all its files are of `own`, or if it
+    /// is empty.
     ///
     /// # Errors
     /// [`SimError`] if the name is taken or the parent folder cannot be written.
-    pub fn create(path: &Path, overwrite: Overwrite, owned: &str) -> Result<Self> {
+    pub fn create(path: &Path, overwrite: Overwrite, own: OwnFolder) -> Result<Self> {
         refuse_taken(path, overwrite)?;
-        let foreign = path.symlink_metadata().is_ok()
-            && !path.join(owned).is_file()
-            && !std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_none());
-        if foreign {
-            return Err(SimError::data(
-                format!("the output exists and was not made by this program (no {owned} in it)"),
-                path,
-                "choose another name, or remove it yourself",
-            ));
+        if path.symlink_metadata().is_ok() {
+            own.check(path)?;
         }
         let mut builder = tempfile::Builder::new();
         builder.prefix(".qudi-").suffix(".tmp");
@@ -165,7 +206,7 @@ impl PendingFolder {
         let folder = builder
             .tempdir_in(parent(path))
             .map_err(|e| SimError::io("create the output", path, e))?;
-        Ok(Self { folder, path: path.to_owned(), overwrite })
+        Ok(Self { folder, path: path.to_owned(), overwrite, own })
     }
 
     /// The name of a file inside, for writing.
@@ -185,6 +226,8 @@ impl PendingFolder {
     pub fn finish(self) -> Result<()> {
         let fault = |e| SimError::io("rename the finished folder to", &self.path, e);
         if self.overwrite == Overwrite::Yes && self.path.is_dir() {
+            // Something else may have been put there since the start.
+            self.own.check(&self.path)?;
             // The old folder steps aside first, and comes back if the new one cannot take its place.
             let aside = self.folder.path().with_extension("old");
             std::fs::rename(&self.path, &aside).map_err(fault)?;

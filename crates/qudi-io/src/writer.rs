@@ -3,6 +3,7 @@
 mod array;
 mod burst;
 mod clip;
+mod frame_name;
 mod gif;
 mod mp4;
 mod picture;
@@ -12,6 +13,7 @@ pub use array::ArrayWriter;
 pub use burst::{BurstFormat, BurstWriter, pack_row, unpack_row, write_npy_stream};
 pub use clip::ClipWriter;
 pub(crate) use clip::save_png16;
+pub(crate) use frame_name::{frame_name, is_frame_name};
 pub use gif::GifWriter;
 pub use mp4::Mp4Writer;
 pub use picture::Picture;

@@ -4,14 +4,15 @@ use super::array::ArrayWriter;
 use super::gif::GifWriter;
 use super::mp4::Mp4Writer;
 use super::tiff_stack::{TiffSamples, TiffStack};
+use super::{frame_name, is_frame_name};
 use image::{ImageBuffer, Luma};
-use qudi_core::atomic_file::{Overwrite, PendingFolder};
+use qudi_core::atomic_file::{Overwrite, OwnFolder, PendingFolder};
 use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
 use std::path::Path;
 
-/// The first file of a folder; it also marks the folder as ours.
-const FIRST: &str = "frame_000000.png";
+/// A folder of frames and nothing else, which begins with the first.
+const FRAMES: OwnFolder = OwnFolder { marker: "frame_000000.png", is_own_file: is_frame_name };
 
 /// A clip of images as a TIFF stack.
 pub struct TiffWriter {
@@ -41,7 +42,7 @@ pub enum ClipWriter {
         /// The folder.
         folder: PendingFolder,
         /// Frames so far.
-        frames: usize,
+        frames: u64,
     },
 }
 
@@ -67,7 +68,7 @@ impl ClipWriter {
             Some("gif") => GifWriter::create(path, overwrite, size, u16::MAX).map(Self::Gif),
             Some("mp4") => Mp4Writer::create(path, size, overwrite).map(Self::Mp4Writer),
             None => {
-                let folder = PendingFolder::create(path, overwrite, FIRST)?;
+                let folder = PendingFolder::create(path, overwrite, FRAMES)?;
                 Ok(Self::Folder { folder, frames: 0 })
             }
             Some(other) => Err(SimError::data(
@@ -94,7 +95,7 @@ impl ClipWriter {
             Self::Gif(gif) => gif.push(&sixteen_bits(frame)),
             Self::Mp4Writer(film) => film.push(frame),
             Self::Folder { folder, frames } => {
-                let file = folder.file(&format!("frame_{frames:06}.png"));
+                let file = folder.file(&frame_name(*frames));
                 *frames += 1;
                 save_png16(frame, &file)
                     .map_err(|e| SimError::io("write a frame into", folder.path(), e))

@@ -1,8 +1,9 @@
 //! Counts as a folder of gray PNG files: `frame_000000.png`, ...
 
+use crate::writer::{frame_name, is_frame_name};
 use image::{ImageBuffer, Luma};
 use qudi_core::Size;
-use qudi_core::atomic_file::{Overwrite, PendingFolder};
+use qudi_core::atomic_file::{Overwrite, OwnFolder, PendingFolder};
 use qudi_core::{Result, SimError};
 use std::path::Path;
 
@@ -10,7 +11,7 @@ pub(crate) struct PngFolder {
     folder: PendingFolder,
     size: Size,
     deep: bool,
-    frames: usize,
+    frames: u64,
 }
 
 impl PngFolder {
@@ -23,12 +24,13 @@ impl PngFolder {
         max_count: u16,
         overwrite: Overwrite,
     ) -> Result<Self> {
-        let folder = PendingFolder::create(path, overwrite, Self::RECORD)?;
+        let own = OwnFolder { marker: Self::RECORD, is_own_file: is_frame_name };
+        let folder = PendingFolder::create(path, overwrite, own)?;
         Ok(Self { folder, size, deep: max_count > 255, frames: 0 })
     }
 
     pub(crate) fn push(&mut self, counts: &[u16]) -> Result<()> {
-        let name = format!("frame_{:06}.png", self.frames);
+        let name = frame_name(self.frames);
         self.frames += 1;
         let (width, height) = (self.size.width as u32, self.size.height as u32);
         let file = self.folder.file(&name);
