@@ -1,7 +1,11 @@
 //! Restoring a capture window by window, to frames in a folder or anywhere else.
 
 mod frame_folder;
+mod inputs;
+mod lock;
 mod run;
 
-pub use frame_folder::{FrameFolder, MANIFEST};
+pub use frame_folder::{FolderRun, FrameFolder, MANIFEST};
+pub use inputs::{Fingerprint, Inputs};
+pub use lock::Share;
 pub use run::{RestoreSink, run};

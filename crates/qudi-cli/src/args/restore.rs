@@ -2,6 +2,7 @@
 
 use super::{Network, Reading};
 use clap::{Args as ClapArgs, ValueHint};
+use qudi_io::restore::Share;
 use std::path::PathBuf;
 
 /// Restore video from a capture
@@ -70,6 +71,11 @@ pub(crate) struct Shard {
 }
 
 impl Shard {
+    /// What it locks in the folder that the parts share.
+    pub(crate) fn share(self) -> Share {
+        Share::Part { number: self.number, of: self.of }
+    }
+
     /// Its part of `frames`.
     pub(crate) fn range(self, frames: u64) -> std::ops::Range<u64> {
         let start = |n: u64| (u128::from(frames) * u128::from(n) / u128::from(self.of)) as u64;

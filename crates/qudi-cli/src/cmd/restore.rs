@@ -1,6 +1,6 @@
 //! `qudi restore`: a capture through a method into frames.
 
-use crate::args::{Global, Network, Restore};
+use crate::args::{Global, Network, Restore, Shard};
 use crate::cmd::capture_info::{open_capture, remarks, required_sensor, unknown_sensor};
 use crate::cmd::capture_light::{Stated, acquisition};
 use crate::cmd::methods::{method, usual_method};
@@ -18,7 +18,7 @@ use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::windows::Windows;
 use qudi_io::capture::{Capture, MaskChoice};
-use qudi_io::restore::run as run_method;
+use qudi_io::restore::{FolderRun, Inputs, Share, run as run_method};
 use qudi_io::writer::{ArrayWriter, Picture};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -57,7 +57,8 @@ pub(crate) fn run(
         refuse_for_pipes(args, overwrite)?;
     }
     let mut job = Job::prepare(args, settings)?;
-    let mut output = Output::open(&args.output, &job.capture, &job.settings, tiff, overwrite)?;
+    let run = job.folder_run(args)?;
+    let mut output = Output::open(&args.output, &job.capture, run, tiff, overwrite)?;
     let start = Instant::now();
     // A pipe may not have told how many frames come.
     let frames = job.capture.length().unwrap_or(u64::MAX);
@@ -199,6 +200,31 @@ impl Job {
             "repaired_pixels": capture.bad_pixels().len(),
         });
         Ok(Self { capture, acquisition, source, restorer, choice, windows, settings })
+    }
+
+    /// What the manifest of an output folder notes. Weights are among the settings by their SHA-256.
+    fn folder_run(&self, args: &Restore) -> Result<FolderRun> {
+        let mut inputs = Inputs::default();
+        if !is_pipe(args) && Path::new(&args.output).extension().is_none() && args.output != "-" {
+            inputs.add("capture", &args.capture)?;
+            let options = args.reading.options(MaskChoice::Auto);
+            if let MaskChoice::File(mask) = &options.mask {
+                inputs.add("mask", mask)?;
+            }
+            if let Some(map) = &options.dcr {
+                inputs.add("dcr", map)?;
+            }
+            let defects = &self.acquisition.sensor.defects;
+            for (name, file) in
+                [("dark_map", &defects.dark_map), ("bad_pixels", &defects.bad_pixels)]
+            {
+                if let Some(file) = file {
+                    inputs.add(name, Path::new(file))?;
+                }
+            }
+        }
+        let share = args.shard.map_or(Share::Whole, Shard::share);
+        Ok(FolderRun { settings: self.settings.clone(), inputs, share })
     }
 
     fn run(

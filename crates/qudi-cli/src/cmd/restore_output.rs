@@ -7,7 +7,7 @@ use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
 use qudi_core::{Frame, SimError, Size};
 use qudi_io::capture::Capture;
-use qudi_io::restore::{FrameFolder, RestoreSink};
+use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink};
 use qudi_io::writer::{ClipWriter, Picture, TiffSamples};
 use serde_json::Value;
 use std::io::Write;
@@ -44,7 +44,7 @@ impl Output {
     pub(crate) fn open(
         name: &str,
         capture: &Capture,
-        settings: &Value,
+        run: FolderRun,
         tiff: TiffSamples,
         overwrite: Overwrite,
     ) -> Result<Self> {
@@ -54,7 +54,7 @@ impl Output {
             return Ok(Self::Pipe);
         }
         if path.extension().is_none() {
-            return Ok(Self::Folder(FrameFolder::open(path, size, settings.clone(), overwrite)?));
+            return Ok(Self::Folder(FrameFolder::open(path, size, run, overwrite)?));
         }
         Ok(Self::File(Some(ClipWriter::create(path, size, tiff, overwrite)?)))
     }

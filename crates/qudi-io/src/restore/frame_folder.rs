@@ -1,7 +1,9 @@
 //! A folder of restored frames that survives being killed: finished frames stay, and a manifest
 //! says how they were made, so that nothing else is mixed in.
 
-use crate::writer::save_png16;
+use super::inputs::Inputs;
+use super::lock::{FolderLock, Share};
+use crate::writer::{frame_name, is_frame_name, save_png16};
 use qudi_core::Transfer;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::{Frame, Size};
@@ -18,63 +20,112 @@ pub const MANIFEST: &str = "manifest.json";
 /// Manifests are short; anything much larger is something else.
 const MAX_MANIFEST: u64 = 1 << 24;
 
+/// Describes the run that writes a folder, as the manifest notes it.
+#[derive(Clone, Debug)]
+pub struct FolderRun {
+    /// Everything that decides what the frames look like.
+    pub settings: Value,
+    /// What the run reads.
+    pub inputs: Inputs,
+    /// How much of the work it does.
+    pub share: Share,
+}
+
 /// Restored frames as 16-bit PNG: `frame_000000.png`, ..., 65535 for 1.
 #[derive(Debug)]
 pub struct FrameFolder {
     path: PathBuf,
     size: Size,
-    settings: Value,
+    run: FolderRun,
+    _lock: FolderLock,
 }
 
 impl FrameFolder {
-    /// Opens `path` for frames of `size` made with `settings`: a new folder, or one of an
-    /// interrupted run with the same settings.
+    /// Opens `path` for the frames of `size` of `run`: a new folder, or one of an interrupted run with the same
+    /// settings, inputs and version of the program. It stays locked until it is dropped.
     ///
     /// # Errors
-    /// [`SimError`] if the folder holds something else, or frames made with other settings.
-    pub fn open(path: &Path, size: Size, settings: Value, overwrite: Overwrite) -> Result<Self> {
+    /// [`SimError`] if the folder holds something else or frames of another run, or if a run is writing into it.
+    pub fn open(path: &Path, size: Size, run: FolderRun, overwrite: Overwrite) -> Result<Self> {
         let io = |e| SimError::io("create the output", path, e);
-        let folder = Self { path: path.to_owned(), size, settings };
-        let manifest = path.join(MANIFEST);
         if !path.exists() {
             std::fs::create_dir(path).map_err(io)?;
-            folder.write_manifest(false, &Value::Null)?;
-            return Ok(folder);
         }
+        let manifest = path.join(MANIFEST);
         if !manifest.is_file() {
-            let empty = std::fs::read_dir(path).map_err(io)?.next().is_none();
-            if empty {
-                folder.write_manifest(false, &Value::Null)?;
-                return Ok(folder);
-            }
-            return Err(SimError::data(
-                format!("the output exists and was not made by this program (no {MANIFEST} in it)"),
-                path,
-                "choose another name, or remove it yourself",
-            ));
-        }
-        let found = read_manifest(&manifest)?;
-        let difference = difference(&found["settings"], &folder.settings);
-        match (difference, overwrite) {
-            (None, Overwrite::No) => {}
-            (_, Overwrite::Yes) => {
-                folder.clear()?;
-                folder.write_manifest(false, &Value::Null)?;
-            }
-            (Some((key, was, is)), Overwrite::No) => {
+            let foreign = std::fs::read_dir(path).map_err(io)?.flatten().find_map(|entry| {
+                let name = entry.file_name().to_string_lossy().into_owned();
+                (!name.starts_with('.')).then_some(name)
+            });
+            if let Some(name) = foreign {
                 return Err(SimError::data(
-                    format!("frames made with other settings lie there: {key} was {was}, now {is}"),
+                    format!(
+                        "the output exists and was not made by this program (no {MANIFEST} beside `{name}` in it)"
+                    ),
                     path,
-                    "choose another name, go on with the old settings, or start over with --force",
+                    "choose another name, or remove it yourself",
                 ));
             }
         }
+        let lock = FolderLock::take(path, run.share)?;
+        let folder = Self { path: path.to_owned(), size, run, _lock: lock };
+        if !manifest.is_file() {
+            folder.write_manifest(false, &Value::Null)?;
+            return Ok(folder);
+        }
+        let found = read_manifest(&manifest)?;
+        if overwrite == Overwrite::Yes {
+            if folder.run.share != Share::Whole {
+                return Err(SimError::data(
+                    "starting over with one part would remove the frames of the others",
+                    path,
+                    "start over without parts, or remove the folder yourself",
+                ));
+            }
+            folder.clear()?;
+            folder.write_manifest(false, &Value::Null)?;
+            return Ok(folder);
+        }
+        folder.check(&found)?;
         Ok(folder)
+    }
+
+    /// Refuses to go on with the frames of another run, with what differs.
+    fn check(&self, found: &Value) -> Result<()> {
+        let refuse = |what: String| {
+            Err(SimError::data(
+                what,
+                &self.path,
+                "choose another name, go on as before, or start over with `force`",
+            ))
+        };
+        let (was, is) = (found["program"].as_str().unwrap_or_default(), program());
+        if was != is {
+            return refuse(format!("frames made by {was} lie there, and this is {is}"));
+        }
+        if let Some((key, was, is)) = difference(&found["settings"], &self.run.settings) {
+            return refuse(format!(
+                "frames made with other settings lie there: {key} was {was}, now {is}"
+            ));
+        }
+        let Ok(earlier) = serde_json::from_value::<Inputs>(found["inputs"].clone()) else {
+            // Manifests of old do not note their inputs; what is complete is only read.
+            if found["complete"] == Value::Bool(true) || self.run.inputs == Inputs::default() {
+                return Ok(());
+            }
+            return refuse(format!("{MANIFEST} does not say which data the frames there are of"));
+        };
+        if let Some((option, was, is)) = self.run.inputs.difference(&earlier) {
+            return refuse(format!(
+                "frames made from other data lie there: `{option}` was {was}, now {is}"
+            ));
+        }
+        Ok(())
     }
 
     /// The file of a frame.
     pub fn file(&self, frame: u64) -> PathBuf {
-        self.path.join(format!("frame_{frame:06}.png"))
+        self.path.join(frame_name(frame))
     }
 
     /// How many frames from the start of `range` on are finished.
@@ -108,7 +159,7 @@ impl FrameFolder {
             return Err(SimError::data(
                 format!("a frame of {} among frames of {}", image.size, self.size),
                 &path,
-                "it is not of this run: start over with --force",
+                "it is not of this run: start over with `force`",
             ));
         }
         Ok(image)
@@ -125,9 +176,10 @@ impl FrameFolder {
     fn write_manifest(&self, complete: bool, results: &Value) -> Result<()> {
         let manifest = json!({
             "version": 1,
-            "program": format!("qudi {}", env!("CARGO_PKG_VERSION")),
+            "program": program(),
             "complete": complete,
-            "settings": self.settings,
+            "settings": self.run.settings,
+            "inputs": self.run.inputs,
             "results": results,
         });
         let mut file = PendingFile::create(&self.path.join(MANIFEST), Overwrite::Yes)?;
@@ -142,10 +194,7 @@ impl FrameFolder {
         for entry in std::fs::read_dir(&self.path).map_err(io)? {
             let path = entry.map_err(io)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let frame = name.trim_start_matches('.').strip_prefix("frame_");
-            let ours = frame.and_then(|rest| rest.strip_suffix(".png")).is_some_and(|number| {
-                number.len() >= 6 && number.chars().all(|c| c.is_ascii_digit())
-            });
+            let ours = is_frame_name(name.trim_start_matches('.'));
             if ours {
                 std::fs::remove_file(&path).map_err(io)?;
             }
@@ -156,13 +205,30 @@ impl FrameFolder {
 
 fn read_manifest(path: &Path) -> Result<Value> {
     let read = |e| SimError::io("read the manifest", path, e);
-    let fault = |what: String| SimError::data(what, path, "choose another output, or use --force");
+    let fault =
+        |what: String| SimError::data(what, path, "choose another output, or remove it yourself");
     let length = std::fs::metadata(path).map_err(read)?.len();
     if length > MAX_MANIFEST {
         return Err(fault(format!("a manifest of {length} bytes")));
     }
     let text = std::fs::read(path).map_err(read)?;
-    serde_json::from_slice(&text).map_err(|e| fault(format!("not a manifest: {e}")))
+    let manifest: Value =
+        serde_json::from_slice(&text).map_err(|e| fault(format!("not a manifest: {e}")))?;
+    let ours = manifest["program"].as_str().is_some_and(|program| program.starts_with("qudi "))
+        && manifest["settings"].is_object();
+    if ours {
+        return Ok(manifest);
+    }
+    Err(SimError::data(
+        format!("the output exists, and its {MANIFEST} was not written by this program"),
+        path,
+        "choose another name, or remove it yourself",
+    ))
+}
+
+/// The program and its version, as the manifest notes it.
+fn program() -> String {
+    format!("qudi {}", env!("CARGO_PKG_VERSION"))
 }
 
 /// The first key whose value differs, with both values.
@@ -189,22 +255,32 @@ fn difference(was: &Value, is: &Value) -> Option<(String, String, String)> {
 mod tests {
     use super::*;
 
+    const SIZE: Size = Size { height: 3, width: 4 };
+
+    fn run(settings: Value) -> FolderRun {
+        FolderRun { settings, inputs: Inputs::default(), share: Share::Whole }
+    }
+
+    fn image() -> Frame {
+        Frame::from_fn(SIZE, |x, y| (x + y) as f32 / 7.3)
+    }
+
     #[test]
-    fn finished_frames_stay_and_other_settings_are_refused() {
+    fn resumes_with_equal_settings_and_refuses_others() {
         let scratch = tempfile::tempdir().unwrap();
         let path = scratch.path().join("out");
-        let size = Size { height: 3, width: 4 };
         let settings = json!({"method": "mle", "sensor": {"dark": 1.6}});
         let open = |settings: &Value, overwrite| {
-            FrameFolder::open(&path, size, settings.clone(), overwrite)
+            FrameFolder::open(&path, SIZE, run(settings.clone()), overwrite)
         };
         let folder = open(&settings, Overwrite::No).unwrap();
-        let image = Frame::from_fn(size, |x, y| (x + y) as f32 / 7.3);
-        let seen = folder.push(0, &image).unwrap();
-        folder.push(2, &image).unwrap();
+        let seen = folder.push(0, &image()).unwrap();
+        folder.push(2, &image()).unwrap();
+        drop(folder);
         let again = open(&settings, Overwrite::No).unwrap();
         assert_eq!((again.finished(0..5), again.finished(2..5)), (1, 1));
-        assert_eq!(again.read(0).unwrap(), seen, "what was promised is what is read");
+        assert_eq!(again.read(0).unwrap(), seen, "push returns what is read");
+        drop(again);
         let other = json!({"method": "mle", "sensor": {"dark": 1.5}});
         let words = open(&other, Overwrite::No).unwrap_err().to_string();
         assert!(words.contains("sensor.dark was 1.6, now 1.5"), "{words}");
@@ -212,9 +288,87 @@ mod tests {
         let fresh = open(&other, Overwrite::Yes).unwrap();
         assert_eq!(fresh.finished(0..5), 0);
         assert!(path.join("notes.txt").is_file(), "only our own files are removed");
+    }
+
+    #[test]
+    fn leaves_folders_and_manifests_of_others_alone() {
+        let scratch = tempfile::tempdir().unwrap();
         let foreign = scratch.path().join("foreign");
         std::fs::create_dir(&foreign).unwrap();
-        std::fs::write(foreign.join("x"), "y").unwrap();
-        assert!(FrameFolder::open(&foreign, size, settings, Overwrite::Yes).is_err());
+        std::fs::write(foreign.join("frame_000000.png"), "theirs").unwrap();
+        let open = || FrameFolder::open(&foreign, SIZE, run(json!({})), Overwrite::Yes);
+        let words = open().unwrap_err().to_string();
+        assert!(words.contains("frame_000000.png"), "{words}");
+        std::fs::write(foreign.join(MANIFEST), r#"{"name": "a web page"}"#).unwrap();
+        let words = open().unwrap_err().to_string();
+        assert!(words.contains("not written by this program"), "{words}");
+        assert!(foreign.join("frame_000000.png").is_file());
+    }
+
+    #[test]
+    fn refuses_to_resume_with_another_capture() {
+        let scratch = tempfile::tempdir().unwrap();
+        let (path, capture) = (scratch.path().join("out"), scratch.path().join("a.npy"));
+        let open = |bytes: &[u8]| {
+            std::fs::write(&capture, bytes).unwrap();
+            let mut inputs = Inputs::default();
+            inputs.add("capture", &capture).unwrap();
+            FrameFolder::open(&path, SIZE, FolderRun { inputs, ..run(json!({})) }, Overwrite::No)
+        };
+        drop(open(b"one").unwrap());
+        drop(open(b"one").unwrap());
+        let words = open(b"two").unwrap_err().to_string();
+        assert!(words.contains("`capture` was 3 bytes with CRC-32"), "{words}");
+    }
+
+    #[test]
+    fn refuses_to_resume_frames_of_another_version() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("out");
+        let open = || FrameFolder::open(&path, SIZE, run(json!({})), Overwrite::No);
+        drop(open().unwrap());
+        let manifest = std::fs::read_to_string(path.join(MANIFEST)).unwrap();
+        let older = manifest.replace(&program(), "qudi 0.0.1");
+        std::fs::write(path.join(MANIFEST), older).unwrap();
+        let words = open().unwrap_err().to_string();
+        assert!(words.contains("made by qudi 0.0.1"), "{words}");
+    }
+
+    #[test]
+    fn reads_complete_manifests_that_note_no_inputs() {
+        let scratch = tempfile::tempdir().unwrap();
+        let (path, capture) = (scratch.path().join("out"), scratch.path().join("a.npy"));
+        std::fs::create_dir(&path).unwrap();
+        std::fs::write(&capture, "counts").unwrap();
+        let mut inputs = Inputs::default();
+        inputs.add("capture", &capture).unwrap();
+        let open = |complete: bool| {
+            let manifest = json!({
+                "version": 1, "program": program(), "complete": complete, "settings": {}, "results": null,
+            });
+            std::fs::write(path.join(MANIFEST), manifest.to_string()).unwrap();
+            let run = FolderRun { inputs: inputs.clone(), ..run(json!({})) };
+            FrameFolder::open(&path, SIZE, run, Overwrite::No)
+        };
+        assert!(open(true).is_ok());
+        assert!(open(false).is_err());
+    }
+
+    #[test]
+    fn locks_whole_runs_and_equal_parts_against_each_other() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("out");
+        let open = |share| {
+            FrameFolder::open(&path, SIZE, FolderRun { share, ..run(json!({})) }, Overwrite::No)
+        };
+        let part = |number| Share::Part { number, of: 2 };
+        let whole = open(Share::Whole).unwrap();
+        assert!(open(Share::Whole).is_err() && open(part(1)).is_err());
+        drop(whole);
+        let first = open(part(1)).unwrap();
+        assert!(open(part(1)).is_err() && open(Share::Whole).is_err());
+        let second = open(part(2)).unwrap();
+        drop((first, second));
+        assert!(open(Share::Whole).is_ok());
     }
 }

@@ -7,6 +7,7 @@ use qudi_core::windows::{CrossFade, Windows};
 use qudi_core::{Result, SimError};
 use std::collections::VecDeque;
 use std::ops::{ControlFlow, Range};
+use std::path::Path;
 
 /// What becomes of restored frames.
 pub trait RestoreSink {
@@ -25,6 +26,24 @@ pub trait RestoreSink {
         let _ = (number, uncertainty);
         Ok(())
     }
+}
+
+/// Refuses restored frames that hold NaN or infinite values, and names the first.
+fn refuse_not_finite(first: u64, frames: &[Frame], path: &Path) -> Result<()> {
+    for (number, frame) in (first..).zip(frames) {
+        if let Some(at) = frame.data.iter().position(|value| !value.is_finite()) {
+            let (row, column) = (at / frame.size.width, at % frame.size.width);
+            return Err(SimError::data(
+                format!(
+                    "restored frame {number} holds {} at row {row}, column {column}",
+                    frame.data[at]
+                ),
+                path,
+                "check the light, the gain, dark maps and the weights for values that are not finite",
+            ));
+        }
+    }
+    Ok(())
 }
 
 /// Restores the frames `wanted` of `capture` and hands them to `sink`. A window is computed if it
@@ -77,6 +96,7 @@ pub fn run(
         let acquisition = Acquisition { first_frame: range.start, ..acquisition.clone() };
         let burst = BurstView { size, frames: counts.make_contiguous() };
         let restored = restorer.restore(burst, &acquisition)?;
+        refuse_not_finite(range.start, &restored.frames, capture.path())?;
         fade.push(range.start, restored.frames);
         if let Some(uncertainty) = restored.std {
             uncertainties.push(range.start, uncertainty);
