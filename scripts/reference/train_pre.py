@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("weights")
     parser.add_argument("bursts", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--draft", action="store_true", help="train the first draft, not the last pre-denoiser")
+    parser.add_argument("--first-stage", "--draft", dest="draft", action="store_true", help="train the first pre-denoiser, not the last one")
     parser.add_argument("--sizes", type=Path, help="a recipe whose pre-denoisers are larger")
     parser.add_argument("--validation", type=Path, help="bursts of other clips, kept likewise, to see how far it has come")
     parser.add_argument("--minutes", type=float, default=60)
