@@ -167,9 +167,9 @@ fn the_usual_method_follows_the_capture() {
     let cases = [
         ("--ppp 3.25", 4, "by qudi on cpu"),
         ("--sensor spad512s --sum 7 --ppp 3.25", 4, "by qudi"),
-        ("--sensor qis16-gj --ppp 3.25", 4, "by guide"),
-        ("--ppp 3.25", 2, "by guide"),
-        ("--ppp 900", 4, "by guide"),
+        ("--sensor qis16-gj --ppp 3.25", 4, "by qbp-refined"),
+        ("--ppp 3.25", 2, "by qbp-refined"),
+        ("--ppp 900", 4, "by qbp-refined"),
     ];
     for (number, (options, frames, expected)) in cases.into_iter().enumerate() {
         let burst = format!("b{number}.npy");

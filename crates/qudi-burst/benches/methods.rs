@@ -2,7 +2,7 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use qudi_burst::bm3d;
-use qudi_burst::{Finish, Qbp, Transform, TransformDenoise};
+use qudi_burst::{PostFilter, Qbp, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
@@ -31,8 +31,8 @@ fn methods(c: &mut Criterion) {
     let methods: [Box<dyn Restorer>; 4] = [
         Box::new(TransformDenoise::new(Transform::Integral, 1)),
         Box::new(TransformDenoise::new(Transform::Identity, 1)),
-        Box::new(Qbp::new(Finish::Plain)),
-        Box::new(Qbp::new(Finish::Bm3d)),
+        Box::new(Qbp::new(PostFilter::None)),
+        Box::new(Qbp::new(PostFilter::Bm3d)),
     ];
     for mut method in methods {
         group.bench_function(format!("{}, 11 frames", method.name()), |b| {

@@ -6,8 +6,8 @@
 //! FOLDER holds clips; the first FRAMES frames and the middle SIDE x SIDE pixels of each are used.
 #![allow(clippy::print_stdout)]
 
-use qudi_burst::half_of_least_risk;
-use qudi_burst::{Finish, Qbp, QbpSettings, Transform, TransformDenoise};
+use qudi_burst::sure_window_radius;
+use qudi_burst::{PostFilter, Qbp, QbpSettings, Transform, TransformDenoise};
 use qudi_core::metrics::gain_aligned_psnr;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
@@ -69,29 +69,33 @@ fn sweep(clips: &[Exposed], ppp: f64) -> Result<()> {
         for noise_left in [1.0, 0.3, 0.2, 0.1, 0.07, 0.05, 0.03, 0.02, 0.01] {
             let chosen = mean(&|i| {
                 let samples = [clips[i].burst()];
-                figures[i][half_of_least_risk(&samples, &clips[i].acquisition, noise_left)]
+                figures[i][sure_window_radius(&samples, &clips[i].acquisition, noise_left)]
             });
             println!("  {transform:?}, chosen with {noise_left}: {chosen:.2} dB");
         }
         let best = mean(&|i| figures[i].iter().copied().fold(f64::MIN, f64::max));
         println!("  {transform:?}, best length of every clip: {best:.2} dB");
     }
-    let mean = |finish, settings| -> Result<f64> {
+    let mean = |post_filter, settings| -> Result<f64> {
         let figures: Result<Vec<f64>> = clips
             .iter()
-            .map(|clip| psnr(clip, &mut Qbp::with_settings(finish, settings)))
+            .map(|clip| psnr(clip, &mut Qbp::with_settings(post_filter, settings)))
             .collect();
         Ok(figures?.iter().sum::<f64>() / clips.len() as f64)
     };
-    let of = |detections, trust, noise| QbpSettings { detections, trust, noise };
-    let plain = [16.0, 32.0, 64.0].map(|trust| [of(4.0, trust, 1.0), of(8.0, trust, 1.0)]);
+    let of = |detections_per_block, wiener_c, bm3d_sigma_factor| QbpSettings {
+        detections_per_block,
+        wiener_c,
+        bm3d_sigma_factor,
+    };
+    let plain = [16.0, 32.0, 64.0].map(|c| [of(4.0, c, 1.0), of(8.0, c, 1.0)]);
     for settings in plain.into_iter().flatten() {
-        println!("  qbp, {settings:?}: {:.2} dB", mean(Finish::Plain, settings)?);
+        println!("  qbp, {settings:?}: {:.2} dB", mean(PostFilter::None, settings)?);
     }
-    let trust = [8.0, 16.0, 32.0].map(|trust| of(4.0, trust, 1.3));
+    let filtered = [8.0, 16.0, 32.0].map(|c| of(4.0, c, 1.3));
     let others = [of(8.0, 16.0, 1.3), of(4.0, 16.0, 1.1), of(4.0, 16.0, 1.5)];
-    for settings in trust.into_iter().chain(others) {
-        println!("  qbp-bm3d, {settings:?}: {:.2} dB", mean(Finish::Bm3d, settings)?);
+    for settings in filtered.into_iter().chain(others) {
+        println!("  qbp-bm3d, {settings:?}: {:.2} dB", mean(PostFilter::Bm3d, settings)?);
     }
     Ok(())
 }

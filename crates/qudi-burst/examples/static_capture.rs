@@ -11,7 +11,7 @@
 #![allow(clippy::print_stdout)]
 
 use qudi_burst::{Average, Mle};
-use qudi_burst::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
+use qudi_burst::{PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
@@ -110,7 +110,7 @@ fn main() -> qudi_core::Result<()> {
     let choose = |transform| TransformDenoise::choose(transform, &[burst], &acquisition);
     let mut stabilized = choose(Transform::Integral);
     let mut plain = choose(Transform::Identity);
-    let (mut qbp, mut qbp_bm3d) = (Qbp::new(Finish::Plain), Qbp::new(Finish::Bm3d));
+    let (mut qbp, mut qbp_bm3d) = (Qbp::new(PostFilter::None), Qbp::new(PostFilter::Bm3d));
     let methods: [&mut dyn Restorer; 7] = [
         &mut Average,
         &mut mle,
@@ -118,7 +118,7 @@ fn main() -> qudi_core::Result<()> {
         &mut plain,
         &mut qbp,
         &mut qbp_bm3d,
-        &mut TwoRounds,
+        &mut QbpRefined,
     ];
     for method in methods {
         let restored = method.restore(burst, &acquisition)?.frames;

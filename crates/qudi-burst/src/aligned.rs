@@ -2,8 +2,8 @@
 //! trust. A robust merge decides by a formula; a network that sees them all can learn to.
 
 use super::steady::steadied;
-use crate::denoise::stabilizer::Stabilizer;
-use crate::guide::Guide;
+use crate::denoise::stabilizer::VarianceStabilizer;
+use crate::guide::ReferenceEstimate;
 use crate::merge::blocks::Blocks;
 use crate::merge::dft::SIDE;
 use crate::methods::qbp::{Merged, Merger, Patchwise, Pilots, at_least, nearest};
@@ -21,9 +21,9 @@ const LEAST_VARIANCE: f64 = 1e-4;
 
 /// A third round of alignment, on the guide.
 #[derive(Debug)]
-pub struct Alignment<'a> {
+pub struct AlignedBurst<'a> {
     merger: Merger,
-    stabilizer: Stabilizer,
+    stabilizer: VarianceStabilizer,
     acquisition: &'a Acquisition,
     /// Dark detections of an ordinary pixel.
     ordinary: f64,
@@ -40,48 +40,48 @@ struct Motion {
     matched: Patchwise,
 }
 
-/// Along what neighbours are laid upon a frame.
+/// Alignments what neighbours are laid upon a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Along {
+pub enum Alignments {
     /// The likeliest paths of their patches.
-    Likeliest,
+    Selected,
     /// These, and once more the paths as matched frame by frame: freer, and fitting the noise of what they were matched on.
-    Both,
+    WithMatched,
     /// Both, and pixel by pixel along whichever of the motions around fits best: freer still.
-    Pixels,
+    WithPerPixel,
 }
 
-impl Along {
+impl Alignments {
     /// How often each neighbour is laid upon the frame.
-    pub fn motions(self) -> usize {
+    pub fn count(self) -> usize {
         match self {
-            Self::Likeliest => 1,
-            Self::Both => 2,
-            Self::Pixels => 3,
+            Self::Selected => 1,
+            Self::WithMatched => 2,
+            Self::WithPerPixel => 3,
         }
     }
 }
 
 /// What is known of a frame. Deviations are those of the noise of one frame's counts where the guide is right.
 #[derive(Clone, Debug)]
-pub struct Aligned {
+pub struct AlignedFrame {
     /// The guide's restored frame, in image units.
-    pub clean: Frame,
-    /// Aligned and merged: unbiased and still noisy, in image units.
+    pub reference: Frame,
+    /// AlignedFrame and merged: unbiased and still noisy, in image units.
     pub merged: Frame,
     /// Deviation of the merged frame's noise at each pixel, in image units.
-    pub noise: Frame,
-    /// Counts of the frame itself, then of its neighbours, nearest first, laid upon it, for each way of [`Along`]: less what
+    pub noise_sigma: Frame,
+    /// Counts of the frame itself, then of its neighbours, nearest first, laid upon it, for each way of [`Alignments`]: less what
     /// the guide expects of the frame, in deviations. Zero past the ends of the window and of the image.
-    pub seen: Vec<Frame>,
+    pub counts: Vec<Frame>,
     /// What the guide expects of the neighbours, laid upon the frame likewise: less what it expects of the frame, in deviations.
     pub expected: Vec<Frame>,
 }
 
-impl<'a> Alignment<'a> {
+impl<'a> AlignedBurst<'a> {
     /// Of the window that `guide` was found for.
-    pub fn new(guide: Guide, acquisition: &'a Acquisition) -> Self {
-        let Guide { clean, means, merger, stabilizer, ordinary } = guide;
+    pub fn new(guide: ReferenceEstimate, acquisition: &'a Acquisition) -> Self {
+        let ReferenceEstimate { clean, means, merger, stabilizer, ordinary } = guide;
         let (none, flows) = (Vec::new(), Vec::new());
         Self { merger, stabilizer, acquisition, ordinary, clean: none, flows }.led_by(clean, means)
     }
@@ -95,7 +95,7 @@ impl<'a> Alignment<'a> {
 
     /// Once more, on better frames of the window in image units.
     #[must_use]
-    pub fn on(self, clean: Vec<Frame>) -> Self {
+    pub fn realign(self, clean: Vec<Frame>) -> Self {
         let units = units(self.acquisition);
         let size = self.merger.frames[0].size;
         let means = clean.iter().map(|frame| {
@@ -117,12 +117,12 @@ impl<'a> Alignment<'a> {
     }
 
     /// Frames of the window.
-    pub fn frames(&self) -> usize {
+    pub fn frame_count(&self) -> usize {
         self.clean.len()
     }
 
     /// What is known of frame `reference`, with so many neighbours laid upon it.
-    pub fn of(&self, reference: usize, neighbours: usize, along: Along) -> Aligned {
+    pub fn frame(&self, reference: usize, neighbours: usize, along: Alignments) -> AlignedFrame {
         let Self { merger, stabilizer, acquisition, ordinary, clean, .. } = self;
         let motion = self.motion(reference);
         let flow = &motion.likeliest;
@@ -146,7 +146,7 @@ impl<'a> Alignment<'a> {
         };
         let mut seen = vec![less(merger.cropped(&merger.frames[reference]))];
         let mut expected = Vec::new();
-        for way in 0..along.motions() {
+        for way in 0..along.count() {
             let along = |flow: &Patchwise, k: usize| {
                 [&merger.frames, guide].map(|list| merger.laid(&list[k], &flow[k], reference))
             };
@@ -164,10 +164,10 @@ impl<'a> Alignment<'a> {
             seen.resize(1 + end, Frame::filled(here.size, 0.0));
             expected.resize(end, Frame::filled(here.size, 0.0));
         }
-        Aligned {
-            clean: clean[reference].clone(),
-            noise: self.noise(&here, &noises),
-            seen,
+        AlignedFrame {
+            reference: clean[reference].clone(),
+            noise_sigma: self.noise(&here, &noises),
+            counts: seen,
             expected,
             merged,
         }
@@ -176,7 +176,7 @@ impl<'a> Alignment<'a> {
     /// `frames`, restored ones of this window in image units, each merged with its neighbours along their motion: each was
     /// denoised for itself and errs in its own way. `errors` are the variances of the errors that they do not share, pixel by
     /// pixel, about. One of each for every frame.
-    pub fn steadied(&self, frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
+    pub fn temporal_filter(&self, frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
         let flows: Vec<&Patchwise> =
             (0..frames.len()).map(|frame| &self.motion(frame).likeliest).collect();
         steadied(frames, errors, &flows)
@@ -198,7 +198,7 @@ impl<'a> Alignment<'a> {
         let deviation = |(&mean, &noise): (&f32, &f32)| {
             let z = self.stabilizer.transform(n * f64::from(mean));
             let z = self.stabilizer.possible(z);
-            let one = self.stabilizer.deviation(z) * (n * f64::from(noise)).sqrt();
+            let one = self.stabilizer.sigma(z) * (n * f64::from(noise)).sqrt();
             let span = self.stabilizer.invert(z + one) - self.stabilizer.invert(z - one);
             (0.5 * span * units) as f32
         };

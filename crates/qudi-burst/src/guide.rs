@@ -3,8 +3,8 @@
 //! 2007, section III-B), here applied to the whole of quanta burst photography with BM3D.
 
 use crate::denoise::bm3d::Profile;
-use crate::denoise::stabilizer::{Stabilizer, Transform};
-use crate::methods::qbp::{Finish, Merged, Merger, Pilots, Qbp, QbpSettings, at_least};
+use crate::denoise::stabilizer::{Transform, VarianceStabilizer};
+use crate::methods::qbp::{Merged, Merger, Pilots, PostFilter, Qbp, QbpSettings, at_least};
 use crate::methods::transform_denoise::{denoise, image};
 use crate::motion::camera::Camera;
 use crate::motion::paths::Even;
@@ -29,36 +29,36 @@ const THOROUGH: Profile = Profile { radius: 12, step: [4, 3] };
 
 /// The best classical estimate of a window, for a network to go on from.
 #[derive(Debug)]
-pub struct Guide {
+pub struct ReferenceEstimate {
     /// Restored frames, in image units.
     pub clean: Vec<Frame>,
     /// The same in mean counts, at least as large as a patch.
     pub(crate) means: Vec<Frame>,
     /// What found them.
     pub(crate) merger: Merger,
-    pub(crate) stabilizer: Stabilizer,
+    pub(crate) stabilizer: VarianceStabilizer,
     /// Dark detections of an ordinary pixel.
     pub(crate) ordinary: f64,
 }
 
-impl Guide {
+impl ReferenceEstimate {
     /// Restores the window twice.
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown.
-    pub fn find(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Self> {
+    pub fn compute(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Self> {
         let ordinary = acquisition.sensor.dark_per_frame()?;
         let count = burst.frames.len();
         let n = count as f64;
-        let stabilizer = Stabilizer::new(
+        let stabilizer = VarianceStabilizer::new(
             Transform::Integral,
             &acquisition.sensor,
             acquisition.gain,
             count as u32,
         );
-        let qbp = Qbp::new(Finish::Bm3d);
-        let QbpSettings { trust, noise: first_noise, .. } = qbp.settings;
-        let mut merger = Merger::new(burst, acquisition, qbp.block(acquisition)?, trust);
+        let qbp = Qbp::new(PostFilter::Bm3d);
+        let QbpSettings { wiener_c, bm3d_sigma_factor: first_noise, .. } = qbp.settings;
+        let mut merger = Merger::new(burst, acquisition, qbp.block(acquisition)?, wiener_c);
         merger.even = Even::find(&merger);
         merger.camera = Camera::find(&merger.frames, &merger.moments, 1.0);
         let round = |merger: &Merger, profile, assumed| {
@@ -86,11 +86,11 @@ impl Guide {
 
 /// The guide's restored frames as a method.
 #[derive(Clone, Copy, Debug)]
-pub struct TwoRounds;
+pub struct QbpRefined;
 
-impl Restorer for TwoRounds {
+impl Restorer for QbpRefined {
     fn name(&self) -> &'static str {
-        "guide"
+        "qbp-refined"
     }
 
     fn window(&self) -> usize {
@@ -98,7 +98,7 @@ impl Restorer for TwoRounds {
     }
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        Ok(Restored { frames: Guide::find(burst, acquisition)?.clean, std: None })
+        Ok(Restored { frames: ReferenceEstimate::compute(burst, acquisition)?.clean, std: None })
     }
 }
 

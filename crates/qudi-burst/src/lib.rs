@@ -3,7 +3,7 @@
 //!
 //! All are [`Restorer`](qudi_core::restorer::Restorer)s: a window of counts `[frames][height][width]` in,
 //! all its frames out, in image units. Constants were chosen on training clips, but those of
-//! the [`Guide`]; docs/results.md tells how.
+//! the [`ReferenceEstimate`]; docs/results.md tells how.
 #![warn(missing_docs)]
 
 mod aligned;
@@ -14,11 +14,11 @@ pub mod methods;
 pub mod motion;
 mod steady;
 
-pub use aligned::{Aligned, Alignment, Along};
+pub use aligned::{AlignedBurst, AlignedFrame, Alignments};
 pub use denoise::bm3d::bm3d;
-pub use denoise::stabilizer::{Stabilizer, Transform};
-pub use guide::{Guide, TwoRounds};
+pub use denoise::stabilizer::{Transform, VarianceStabilizer};
+pub use guide::{QbpRefined, ReferenceEstimate};
 pub use methods::qbp::PatchFlow;
 pub use methods::{
-    Average, Finish, Mle, Qbp, QbpSettings, TransformDenoise, half_of_least_risk, moving_sums,
+    Average, Mle, PostFilter, Qbp, QbpSettings, TransformDenoise, moving_sums, sure_window_radius,
 };

@@ -8,6 +8,6 @@ pub(crate) mod transform_denoise;
 
 pub use average::Average;
 pub use mle::Mle;
-pub use moving::{half_of_least_risk, moving_sums};
-pub use qbp::{Finish, Qbp, QbpSettings};
+pub use moving::{moving_sums, sure_window_radius};
+pub use qbp::{PostFilter, Qbp, QbpSettings};
 pub use transform_denoise::TransformDenoise;

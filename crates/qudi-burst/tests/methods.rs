@@ -3,7 +3,8 @@
 
 use qudi_burst::Average;
 use qudi_burst::{
-    Aligned, Alignment, Along, Finish, Guide, Qbp, Transform, TransformDenoise, TwoRounds,
+    AlignedBurst, AlignedFrame, Alignments, PostFilter, Qbp, QbpRefined, ReferenceEstimate,
+    Transform, TransformDenoise,
 };
 use qudi_core::metrics::gain_aligned_psnr;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
@@ -16,9 +17,9 @@ fn methods() -> Vec<Box<dyn Restorer>> {
         Box::new(TransformDenoise::new(Transform::Integral, 1)),
         Box::new(TransformDenoise::new(Transform::Anscombe, 5)),
         Box::new(TransformDenoise::new(Transform::Identity, 1)),
-        Box::new(Qbp::new(Finish::Plain)),
-        Box::new(Qbp::new(Finish::Bm3d)),
-        Box::new(TwoRounds),
+        Box::new(Qbp::new(PostFilter::None)),
+        Box::new(Qbp::new(PostFilter::Bm3d)),
+        Box::new(QbpRefined),
     ]
 }
 
@@ -73,13 +74,14 @@ fn the_second_round_beats_the_first() {
         let (counts, truth) = exposed(size, &sensor, ppp, 11);
         let acquisition = acquisition(sensor, ppp);
         let burst = BurstView { size, frames: &counts };
-        let first = Qbp::new(Finish::Bm3d).restore(burst, &acquisition).unwrap().frames;
-        let guide = Guide::find(burst, &acquisition).unwrap();
-        let alignment = Alignment::new(guide, &acquisition);
-        let aligned: Vec<Aligned> =
-            (0..truth.len()).map(|frame| alignment.of(frame, 10, Along::Likeliest)).collect();
+        let first = Qbp::new(PostFilter::Bm3d).restore(burst, &acquisition).unwrap().frames;
+        let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
+        let alignment = AlignedBurst::new(guide, &acquisition);
+        let aligned: Vec<AlignedFrame> = (0..truth.len())
+            .map(|frame| alignment.frame(frame, 10, Alignments::Selected))
+            .collect();
         let merged: Vec<Frame> = aligned.iter().map(|aligned| aligned.merged.clone()).collect();
-        let clean: Vec<Frame> = aligned.iter().map(|aligned| aligned.clean.clone()).collect();
+        let clean: Vec<Frame> = aligned.iter().map(|aligned| aligned.reference.clone()).collect();
         let [first, second, merged] =
             [&first, &clean, &merged].map(|frames| mean_psnr(frames, &truth));
         println!("{name} at {ppp} PPP: {first:.2} dB, {second:.2} dB, merged {merged:.2} dB");
@@ -87,8 +89,8 @@ fn the_second_round_beats_the_first() {
         assert!(second > merged, "{name}: BM3D makes {second} dB of {merged} dB");
         // Half of all normal errors are within 0.6745 deviations; ghosts, which no noise explains, are few.
         let errors = aligned.iter().zip(&truth).flat_map(|(aligned, truth)| {
-            let Aligned { merged, noise, .. } = aligned;
-            let pixels = merged.data.iter().zip(&noise.data).zip(&truth.data);
+            let AlignedFrame { merged, noise_sigma, .. } = aligned;
+            let pixels = merged.data.iter().zip(&noise_sigma.data).zip(&truth.data);
             pixels.map(|((m, s), t)| ((m - t) / s).abs()).collect::<Vec<_>>()
         });
         let mut errors: Vec<f32> = errors.collect();
@@ -112,43 +114,47 @@ fn neighbours_are_seen_in_deviations() {
     let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
     let acquisition = Acquisition { exposure: still.mean(), ..acquisition(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
-    let guide = Guide::find(burst, &acquisition).unwrap();
-    let aligned = Alignment::new(guide, &acquisition).of(2, 8, Along::Likeliest);
-    assert_eq!((aligned.seen.len(), aligned.expected.len()), (9, 8));
+    let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
+    let aligned = AlignedBurst::new(guide, &acquisition).frame(2, 8, Alignments::Selected);
+    assert_eq!((aligned.counts.len(), aligned.expected.len()), (9, 8));
     let deviation = |frame: &Frame| {
         let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
         (squares / frame.data.len() as f64).sqrt()
     };
-    let own = deviation(&aligned.seen[0]);
+    let own = deviation(&aligned.counts[0]);
     assert!((0.9..1.1).contains(&own), "{own}");
-    for (seen, expected) in aligned.seen[1..7].iter().zip(&aligned.expected) {
+    for (seen, expected) in aligned.counts[1..7].iter().zip(&aligned.expected) {
         // Between pixels some of the noise averages out.
         let (seen, expected) = (deviation(seen), deviation(expected));
         assert!((0.55..1.1).contains(&seen) && expected < 0.2, "{seen}, expected {expected}");
     }
-    assert!(aligned.seen[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
+    assert!(aligned.counts[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
 
     // The truth in the guide's place shows it as well: what it expects is what the camera counts.
-    let guide = Guide::find(burst, &acquisition).unwrap();
-    let aligned =
-        Alignment::new(guide, &acquisition).on(vec![still.clone(); 7]).of(2, 8, Along::Likeliest);
-    assert_eq!(aligned.clean, still);
-    let thrice = Alignment::new(Guide::find(burst, &acquisition).unwrap(), &acquisition)
-        .on(vec![still.clone(); 7])
-        .of(2, 8, Along::Pixels);
-    assert_eq!((thrice.seen.len(), thrice.expected.len()), (25, 24));
-    assert_eq!(
-        (&thrice.seen[..9], &thrice.expected[..8]),
-        (&aligned.seen[..], &aligned.expected[..])
+    let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
+    let aligned = AlignedBurst::new(guide, &acquisition).realign(vec![still.clone(); 7]).frame(
+        2,
+        8,
+        Alignments::Selected,
     );
-    for (seen, expected) in thrice.seen[17..23].iter().zip(&thrice.expected[16..]) {
+    assert_eq!(aligned.reference, still);
+    let thrice =
+        AlignedBurst::new(ReferenceEstimate::compute(burst, &acquisition).unwrap(), &acquisition)
+            .realign(vec![still.clone(); 7])
+            .frame(2, 8, Alignments::WithPerPixel);
+    assert_eq!((thrice.counts.len(), thrice.expected.len()), (25, 24));
+    assert_eq!(
+        (&thrice.counts[..9], &thrice.expected[..8]),
+        (&aligned.counts[..], &aligned.expected[..])
+    );
+    for (seen, expected) in thrice.counts[17..23].iter().zip(&thrice.expected[16..]) {
         let (seen, expected) = (deviation(seen), deviation(expected));
         assert!((0.55..1.1).contains(&seen) && expected < 0.1, "{seen}, expected {expected}");
     }
-    assert!(thrice.seen[23..].iter().chain(&thrice.expected[22..]).all(|f| deviation(f) == 0.0));
-    let own = deviation(&aligned.seen[0]);
+    assert!(thrice.counts[23..].iter().chain(&thrice.expected[22..]).all(|f| deviation(f) == 0.0));
+    let own = deviation(&aligned.counts[0]);
     assert!((0.95..1.05).contains(&own), "{own}");
-    let mean = aligned.seen[0].mean();
+    let mean = aligned.counts[0].mean();
     assert!(mean.abs() < 0.06, "{mean}");
     let differences = aligned.expected[..6].iter().map(deviation).fold(0.0, f64::max);
     // On a smooth slope a path may be a little off.

@@ -2,7 +2,7 @@
 //! against simulated counts.
 #![allow(clippy::unwrap_used)]
 
-use qudi_burst::{Stabilizer, Transform};
+use qudi_burst::{Transform, VarianceStabilizer};
 use qudi_core::sensor::{Gain, Sensor};
 use qudi_core::{Camera, Frame, Light, Size};
 use std::path::Path;
@@ -20,11 +20,11 @@ fn the_binomial_transform_is_scipys() {
         let value = |key: &str| figure[key].as_f64().unwrap();
         let mut sensor = Sensor::load("spad512s").unwrap();
         sensor.frames_summed = value("trials") as u32;
-        let stabilizer = Stabilizer::new(Transform::Anscombe, &sensor, 1.0, 1);
+        let stabilizer = VarianceStabilizer::new(Transform::Anscombe, &sensor, 1.0, 1);
         let detections = -value("trials") * (-value("p")).ln_1p();
         let (z, variance) = (value("mean"), value("variance"));
         assert!((stabilizer.invert(z) / detections - 1.0).abs() < 1e-3, "{figure}");
-        assert!((stabilizer.deviation(z).powi(2) / variance - 1.0).abs() < 5e-3, "{figure}");
+        assert!((stabilizer.sigma(z).powi(2) / variance - 1.0).abs() < 5e-3, "{figure}");
         // The variance of sums of 77 is 1 everywhere, that of 7 only in the middle.
         let (trials, p) = (value("trials"), value("p"));
         if trials > 70.0 || (p > 0.2 && p < 0.8) {
@@ -43,12 +43,12 @@ fn the_generalized_transform_is_scipys() {
         sensor.bits = 12;
         sensor.gain = Gain::Unit;
         sensor.read_noise = value("read_noise");
-        let closed = Stabilizer::new(Transform::Anscombe, &sensor, 1.0, 1);
+        let closed = VarianceStabilizer::new(Transform::Anscombe, &sensor, 1.0, 1);
         sensor.bits = 6;
-        let exact = Stabilizer::new(Transform::Anscombe, &sensor, 1.0, 1);
+        let exact = VarianceStabilizer::new(Transform::Anscombe, &sensor, 1.0, 1);
         let (z, electrons) = (value("mean"), value("electrons"));
         assert!((exact.invert(z) / electrons - 1.0).abs() < 2e-3, "{figure}: {}", exact.invert(z));
-        assert!((exact.deviation(z).powi(2) / value("variance") - 1.0).abs() < 0.01, "{figure}");
+        assert!((exact.sigma(z).powi(2) / value("variance") - 1.0).abs() < 0.01, "{figure}");
         // The closed form is asymptotic, and knows no cut at zero counts.
         if electrons > 4.0 {
             assert!((closed.invert(z) / electrons - 1.0).abs() < 0.03, "{}", closed.invert(z));
@@ -82,7 +82,8 @@ fn inverses_are_unbiased_on_simulated_counts() {
                 }
                 let detections = sensor.quantum_efficiency * ppp * f64::from(image) / 0.45 + dark;
                 for transform in [Transform::Identity, Transform::Anscombe, Transform::Integral] {
-                    let stabilizer = Stabilizer::new(transform, &sensor, camera.gain(), frames);
+                    let stabilizer =
+                        VarianceStabilizer::new(transform, &sensor, camera.gain(), frames);
                     let z: Vec<f64> = sums.iter().map(|&sum| stabilizer.transform(sum)).collect();
                     let mean = z.iter().sum::<f64>() / z.len() as f64;
                     let variance =
@@ -97,7 +98,7 @@ fn inverses_are_unbiased_on_simulated_counts() {
                         (found - detections).abs() < slope.abs() + 2e-3 * detections,
                         "{case}: {found}, truth {detections}"
                     );
-                    let expected = stabilizer.deviation(mean).powi(2);
+                    let expected = stabilizer.sigma(mean).powi(2);
                     // That of deep samples is the asymptotic one, too large for a few electrons.
                     assert!(
                         (variance / expected - 1.0).abs() < 0.06 || name == "qis4-gj",
@@ -114,10 +115,10 @@ fn inverses_are_unbiased_on_simulated_counts() {
 fn the_integral_follows_counts_into_saturation() {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let gain = sensor.gain_at(3.25).unwrap();
-    let of = |transform| Stabilizer::new(transform, &sensor, gain, 1);
+    let of = |transform| VarianceStabilizer::new(transform, &sensor, gain, 1);
     let (anscombe, integral) = (of(Transform::Anscombe), of(Transform::Integral));
     // Of a mean count of 6 of 7.
-    let deviation = |s: &Stabilizer| s.deviation(s.transform(6.0));
+    let deviation = |s: &VarianceStabilizer| s.sigma(s.transform(6.0));
     assert!(deviation(&anscombe) < 0.75, "{}", deviation(&anscombe));
     assert!((deviation(&integral) - 1.0).abs() < 0.2, "{}", deviation(&integral));
 }
@@ -127,7 +128,7 @@ fn the_ends_are_finite_and_in_order() {
     for name in ["qudi-paper", "ideal", "swissspad2", "qis4-gj"] {
         let sensor = Sensor::load(name).unwrap();
         for transform in [Transform::Identity, Transform::Anscombe, Transform::Integral] {
-            let stabilizer = Stabilizer::new(transform, &sensor, 1.0, 3);
+            let stabilizer = VarianceStabilizer::new(transform, &sensor, 1.0, 3);
             let (low, high) = (
                 stabilizer.invert(stabilizer.transform(0.0)),
                 stabilizer.invert(stabilizer.transform(3.0 * f64::from(sensor.max_count()))),

@@ -1,7 +1,7 @@
 //! Sizes of the network, read from TOML; the presets.
 
 use crate::measurement::Laid;
-use qudi_burst::Along;
+use qudi_burst::Alignments;
 use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
 
@@ -77,10 +77,10 @@ impl PreConfig {
     /// The frames that are laid upon each.
     pub fn laid(&self) -> Laid {
         let along = match self.motions {
-            1 => Along::Likeliest,
+            1 => Alignments::Selected,
             // What a guide shows of single pixels is too poor to follow them.
-            3 if self.rounds > 1 => Along::Pixels,
-            _ => Along::Both,
+            3 if self.rounds > 1 => Alignments::WithPerPixel,
+            _ => Alignments::WithMatched,
         };
         Laid { neighbours: self.neighbours, along }
     }

@@ -6,7 +6,7 @@ use crate::measurement::{BRIGHTEST, GuidePlanes, Laid};
 use crate::network::{PreDenoiser, Qudi};
 use crate::restorer::layout::Layout;
 use burn::tensor::{Device, Tensor};
-use qudi_burst::Alignment;
+use qudi_burst::AlignedBurst;
 use qudi_core::{Frame, Result};
 
 /// Deviation of the errors that a pre-denoised frame does not share with the next one, in that of the merged frame's noise.
@@ -44,7 +44,7 @@ impl Draft {
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the device fails.
-    pub fn restore(&self, alignment: &Alignment<'_>) -> Result<Vec<Frame>> {
+    pub fn restore(&self, alignment: &AlignedBurst<'_>) -> Result<Vec<Frame>> {
         let layout = Layout::new(alignment.size(), self.fold, self.tile);
         let denoise = |guide: &Tensor<4>| vec![self.denoiser.denoise(guide)];
         let Denoised { frames, noises, .. } =
@@ -65,16 +65,16 @@ pub(crate) struct Denoised {
 
 /// What `denoise` makes of the frames of a window, one by one: the frame, and the deviation of its errors if it tells it.
 pub(crate) fn denoised(
-    alignment: &Alignment<'_>,
+    alignment: &AlignedBurst<'_>,
     laid: Laid,
     layout: &Layout,
     device: &Device,
     denoise: impl Fn(&Tensor<4>) -> Vec<Tensor<4>>,
 ) -> Result<Denoised> {
     let mut all = Denoised::default();
-    for number in 0..alignment.frames() {
+    for number in 0..alignment.frame_count() {
         let aligned = laid.of(alignment, number);
-        all.noises.push(aligned.noise.clone());
+        all.noises.push(aligned.noise_sigma.clone());
         let guide = GuidePlanes::of_frame(aligned).map(|plane| layout.padded(plane));
         let mut images = layout.denoised(&guide, device, &denoise)?.into_iter();
         all.frames.extend(images.next());
@@ -86,7 +86,7 @@ pub(crate) fn denoised(
 /// Frames of a window that were denoised each for itself, steadied, in [0, `brightest`]; `noises` are the deviations of the
 /// merged frames' noise.
 pub(crate) fn settled(
-    alignment: &Alignment<'_>,
+    alignment: &AlignedBurst<'_>,
     frames: Vec<Frame>,
     noises: Vec<Frame>,
     brightest: f32,
@@ -101,7 +101,7 @@ pub(crate) fn settled(
     let possible = |value: f32| value.clamp(0.0, brightest);
     let frames = changed(frames, &possible);
     let errors = changed(noises, &|noise| (UNSHARED * noise).powi(2));
-    changed(alignment.steadied(&frames, &errors), &possible)
+    changed(alignment.temporal_filter(&frames, &errors), &possible)
 }
 
 #[cfg(test)]
@@ -110,7 +110,7 @@ mod tests {
     use crate::config::PreConfig;
     use crate::measurement::{IMAGES, aligned};
     use crate::network::fill;
-    use qudi_burst::Guide;
+    use qudi_burst::ReferenceEstimate;
     use qudi_core::Size;
     use qudi_core::restorer::{Acquisition, BurstView};
     use qudi_core::sensor::Sensor;
@@ -149,8 +149,9 @@ mod tests {
         let (config, network) = network(1, 1);
         let network = network.with_round_more(0);
         let [whole, tiled] = [512, 32].map(|tile| {
-            let guide = Guide::find(burst, &acquisition).unwrap_or_else(|e| panic!("{e}"));
-            let alignment = Alignment::new(guide, &acquisition);
+            let guide =
+                ReferenceEstimate::compute(burst, &acquisition).unwrap_or_else(|e| panic!("{e}"));
+            let alignment = AlignedBurst::new(guide, &acquisition);
             let draft = Draft::all(&network, &config, tile, &device).remove(0);
             draft.restore(&alignment).unwrap_or_else(|e| panic!("{e}"))
         });

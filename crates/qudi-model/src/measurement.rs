@@ -4,7 +4,7 @@ use crate::draft::Draft;
 use crate::network::SENSOR_NUMBERS;
 use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
-use qudi_burst::{Aligned, Alignment, Along, Guide};
+use qudi_burst::{AlignedBurst, AlignedFrame, Alignments, ReferenceEstimate};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, Response, Sensor};
 use qudi_core::{Result, Size};
@@ -50,19 +50,19 @@ impl Planes {
 pub struct Laid {
     /// So many, the nearest ones.
     pub neighbours: usize,
-    /// Along which motions.
-    pub along: Along,
+    /// Along which alignments.
+    pub along: Alignments,
 }
 
 impl Laid {
     /// How many planes that makes.
     pub fn frames(self) -> usize {
-        self.along.motions() * self.neighbours
+        self.along.count() * self.neighbours
     }
 
     /// What is known of a frame of an aligned window.
-    pub(crate) fn of(self, alignment: &Alignment<'_>, frame: usize) -> Aligned {
-        alignment.of(frame, self.neighbours, self.along)
+    pub(crate) fn of(self, alignment: &AlignedBurst<'_>, frame: usize) -> AlignedFrame {
+        alignment.frame(frame, self.neighbours, self.along)
     }
 }
 
@@ -75,11 +75,12 @@ pub fn aligned<'a>(
     burst: BurstView<'_>,
     acquisition: &'a Acquisition,
     drafts: &[Draft],
-) -> Result<Alignment<'a>> {
-    let mut alignment = Alignment::new(Guide::find(burst, acquisition)?, acquisition);
+) -> Result<AlignedBurst<'a>> {
+    let mut alignment =
+        AlignedBurst::new(ReferenceEstimate::compute(burst, acquisition)?, acquisition);
     for draft in drafts {
         let better = draft.restore(&alignment)?;
-        alignment = alignment.on(better);
+        alignment = alignment.realign(better);
     }
     Ok(alignment)
 }
@@ -87,7 +88,7 @@ pub fn aligned<'a>(
 /// What classical methods make of a burst, for a network to go on from; frame after frame, row-major. In this order: the
 /// restored image, the merely merged one and the deviation of the latter's noise, in image units, in [0, 2]; the counts of the
 /// frame and of its neighbours laid upon it, and what is expected of the neighbours, in deviations (see
-/// [`Aligned`]).
+/// [`AlignedFrame`]).
 #[derive(Clone, Debug, Default)]
 pub struct GuidePlanes(pub Vec<Vec<f32>>);
 
@@ -101,7 +102,7 @@ impl GuidePlanes {
     }
 
     /// Those of some frames of an aligned window.
-    pub fn of(alignment: &Alignment<'_>, laid: Laid, frames: Range<usize>) -> Self {
+    pub fn of(alignment: &AlignedBurst<'_>, laid: Laid, frames: Range<usize>) -> Self {
         let mut planes = Self::default();
         for frame in frames {
             planes.extend(Self::of_frame(laid.of(alignment, frame)));
@@ -110,13 +111,13 @@ impl GuidePlanes {
     }
 
     /// The planes of one frame.
-    pub(crate) fn of_frame(frame: Aligned) -> Self {
-        let Aligned { clean, merged, noise, seen, expected } = frame;
-        let images = [clean, merged, noise].into_iter().map(|mut image| {
+    pub(crate) fn of_frame(frame: AlignedFrame) -> Self {
+        let AlignedFrame { reference, merged, noise_sigma, counts, expected } = frame;
+        let images = [reference, merged, noise_sigma].into_iter().map(|mut image| {
             image.data.iter_mut().for_each(|value| *value = value.min(BRIGHTEST as f32));
             image
         });
-        Self(images.chain(seen).chain(expected).map(|plane| plane.data).collect())
+        Self(images.chain(counts).chain(expected).map(|plane| plane.data).collect())
     }
 
     /// Every plane changed by `f`.

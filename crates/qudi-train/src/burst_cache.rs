@@ -170,7 +170,7 @@ impl BurstCache {
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,
             neighbours: recipe.network.pre.neighbours,
-            motions: recipe.network.pre.laid().along.motions(),
+            motions: recipe.network.pre.laid().along.count(),
             exposure: !recipe.network.lacks(Part::Exposure),
             drafts: drafts.iter().map(sha256).collect::<Result<_>>()?,
         };

@@ -38,7 +38,7 @@ const STEPS: usize = 4096;
 
 /// A transform of the sum of some frames of one sensor.
 #[derive(Clone, Debug)]
-pub struct Stabilizer {
+pub struct VarianceStabilizer {
     frames: f64,
     forward: Forward,
     /// Detections per frame, expected transform and its deviation, rising; empty for deep samples.
@@ -89,7 +89,7 @@ impl Forward {
     }
 }
 
-impl Stabilizer {
+impl VarianceStabilizer {
     /// For sums of `frames` frames of `sensor` at `gain` DN/e-.
     pub fn new(transform: Transform, sensor: &Sensor, gain: f64, frames: u32) -> Self {
         let law = CountLaw::new(sensor, gain);
@@ -151,7 +151,7 @@ impl Stabilizer {
 
     /// The deviation of the transform where it is expected to be `z`: close to 1, or that of the mean
     /// count.
-    pub fn deviation(&self, z: f64) -> f64 {
+    pub fn sigma(&self, z: f64) -> f64 {
         match (&self.forward, self.nodes.is_empty()) {
             (_, false) => self.look_up(z, 2),
             (Forward::Identity, true) => (self.moments.variance_at_mean(z) / self.frames).sqrt(),

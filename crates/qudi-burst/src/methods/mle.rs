@@ -1,7 +1,7 @@
 //! The most likely flux of a moving mean: response inverted, dark counts subtracted, over as many
 //! frames as the motion allows.
 
-use crate::{half_of_least_risk, moving_sums};
+use crate::{moving_sums, sure_window_radius};
 use qudi_core::Frame;
 use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
@@ -19,9 +19,9 @@ impl Mle {
         Self { half }
     }
 
-    /// Chooses the length on windows of the clip, by [`half_of_least_risk`].
+    /// Chooses the length on windows of the clip, by [`sure_window_radius`].
     pub fn choose(samples: &[BurstView<'_>], acquisition: &Acquisition) -> Self {
-        Self { half: half_of_least_risk(samples, acquisition, 1.0) }
+        Self { half: sure_window_radius(samples, acquisition, 1.0) }
     }
 
     /// Frames that it sums.

@@ -34,7 +34,7 @@ pub fn moving_sums(burst: BurstView<'_>, half: usize, mut f: impl FnMut(&[u32], 
 /// With `y` a frame's counts and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y`
 /// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise; the
 /// sensor says what `Var y` is.
-pub fn half_of_least_risk(
+pub fn sure_window_radius(
     samples: &[BurstView<'_>],
     acquisition: &Acquisition,
     noise_left: f64,
@@ -108,7 +108,7 @@ mod tests {
                 dark: None,
             };
             for noise_left in [1.0, 0.1] {
-                let half = half_of_least_risk(
+                let half = sure_window_radius(
                     &[BurstView { size, frames: &frames }],
                     &acquisition,
                     noise_left,

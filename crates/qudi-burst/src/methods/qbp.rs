@@ -5,7 +5,7 @@
 //! Every frame of the window is the reference once. Binary and few-bit counts are treated alike.
 
 use crate::denoise::bm3d::Profile;
-use crate::denoise::stabilizer::{Stabilizer, Transform};
+use crate::denoise::stabilizer::{Transform, VarianceStabilizer};
 use crate::merge::blocks::Blocks;
 use crate::merge::cubic::{cubic_within, squares};
 use crate::merge::dft::SIDE;
@@ -24,9 +24,9 @@ use rayon::prelude::*;
 
 /// What follows the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Finish {
-    /// Nothing.
-    Plain,
+pub enum PostFilter {
+    /// Nothing follows.
+    None,
     /// The variance is stabilised and BM3D removes the noise that is left.
     Bm3d,
 }
@@ -35,48 +35,50 @@ pub enum Finish {
 #[derive(Clone, Copy, Debug)]
 pub struct QbpSettings {
     /// Blocks hold as many frames as it takes for this many detections per pixel, at most 5.
-    pub detections: f64,
-    /// Squared difference, in that which noise makes, at which a block counts half.
-    pub trust: f32,
-    /// Deviation that BM3D assumes, in that of the merge's own noise.
-    pub noise: f64,
+    pub detections_per_block: f64,
+    /// The constant of the Wiener filter: the squared difference, in units of that which noise makes, at which a
+    /// block gets half its weight.
+    pub wiener_c: f32,
+    /// The noise sigma that BM3D assumes, in units of the merge's own.
+    pub bm3d_sigma_factor: f64,
 }
 
 impl QbpSettings {
     /// Those of docs/results.md, chosen on training clips. Where BM3D follows it pays to merge less:
     /// noise can still be removed, ghosts cannot.
-    pub fn of(finish: Finish) -> Self {
-        let trust = match finish {
-            Finish::Plain => 64.0,
-            Finish::Bm3d => 16.0,
+    pub fn new(post_filter: PostFilter) -> Self {
+        let wiener_c = match post_filter {
+            PostFilter::None => 64.0,
+            PostFilter::Bm3d => 16.0,
         };
-        Self { detections: 4.0, trust, noise: 1.3 }
+        Self { detections_per_block: 4.0, wiener_c, bm3d_sigma_factor: 1.3 }
     }
 }
 
 /// Align and merge.
 #[derive(Clone, Copy, Debug)]
 pub struct Qbp {
-    pub(crate) finish: Finish,
+    pub(crate) post_filter: PostFilter,
     pub(crate) settings: QbpSettings,
 }
 
 impl Qbp {
     /// With the settings of docs/results.md.
-    pub fn new(finish: Finish) -> Self {
-        Self::with_settings(finish, QbpSettings::of(finish))
+    pub fn new(post_filter: PostFilter) -> Self {
+        Self::with_settings(post_filter, QbpSettings::new(post_filter))
     }
 
     /// With others.
-    pub fn with_settings(finish: Finish, settings: QbpSettings) -> Self {
-        Self { finish, settings }
+    pub fn with_settings(post_filter: PostFilter, settings: QbpSettings) -> Self {
+        Self { post_filter, settings }
     }
 
     /// Frames in a block.
     pub(crate) fn block(self, acquisition: &Acquisition) -> Result<usize> {
         let sensor = &acquisition.sensor;
         let detections = sensor.quantum_efficiency * acquisition.ppp + sensor.dark_per_frame()?;
-        let frames = (self.settings.detections / detections).ceil().clamp(1.0, 5.0) as usize;
+        let frames =
+            (self.settings.detections_per_block / detections).ceil().clamp(1.0, 5.0) as usize;
         // Odd, so that a block has a middle.
         Ok(frames | 1)
     }
@@ -84,9 +86,9 @@ impl Qbp {
 
 impl Restorer for Qbp {
     fn name(&self) -> &'static str {
-        match self.finish {
-            Finish::Plain => "qbp",
-            Finish::Bm3d => "qbp-bm3d",
+        match self.post_filter {
+            PostFilter::None => "qbp",
+            PostFilter::Bm3d => "qbp-bm3d",
         }
     }
 
@@ -96,23 +98,24 @@ impl Restorer for Qbp {
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
         let ordinary = acquisition.sensor.dark_per_frame()?;
-        let transform = match self.finish {
-            Finish::Plain => Transform::Identity,
-            Finish::Bm3d => Transform::Integral,
+        let transform = match self.post_filter {
+            PostFilter::None => Transform::Identity,
+            PostFilter::Bm3d => Transform::Integral,
         };
         let n = burst.frames.len() as f64;
-        let stabilizer = Stabilizer::new(
+        let stabilizer = VarianceStabilizer::new(
             transform,
             &acquisition.sensor,
             acquisition.gain,
             burst.frames.len() as u32,
         );
-        let merger = Merger::new(burst, acquisition, self.block(acquisition)?, self.settings.trust);
+        let merger =
+            Merger::new(burst, acquisition, self.block(acquisition)?, self.settings.wiener_c);
         let finish = |frame: usize| {
             let Merged { counts, noise, .. } = merger.merge(frame);
             let mut z = stabilizer.stabilized(&counts);
-            if self.finish == Finish::Bm3d {
-                let scale = self.settings.noise * (n * noise).sqrt();
+            if self.post_filter == PostFilter::Bm3d {
+                let scale = self.settings.bm3d_sigma_factor * (n * noise).sqrt();
                 z = denoise(Profile::NORMAL, z, &stabilizer, scale);
             }
             image(&z, &stabilizer, acquisition, ordinary)
@@ -139,8 +142,9 @@ impl PatchFlow {
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown.
     pub fn find(burst: BurstView<'_>, acquisition: &Acquisition, reference: usize) -> Result<Self> {
-        let qbp = Qbp::new(Finish::Plain);
-        let merger = Merger::new(burst, acquisition, qbp.block(acquisition)?, qbp.settings.trust);
+        let qbp = Qbp::new(PostFilter::None);
+        let merger =
+            Merger::new(burst, acquisition, qbp.block(acquisition)?, qbp.settings.wiener_c);
         let (_, flow) = merger.flow(reference);
         let corners = (0..merger.grid.len()).map(|i| merger.grid.corner(i)).collect();
         Ok(Self { corners, flow })

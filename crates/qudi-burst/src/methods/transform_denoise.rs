@@ -4,8 +4,8 @@
 
 use crate::denoise::bm3d::{Profile, bm3d_as};
 use crate::denoise::plane::{Spread, spread};
-use crate::denoise::stabilizer::{Stabilizer, Transform};
-use crate::{half_of_least_risk, moving_sums};
+use crate::denoise::stabilizer::{Transform, VarianceStabilizer};
+use crate::{moving_sums, sure_window_radius};
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
@@ -33,7 +33,7 @@ impl TransformDenoise {
         samples: &[BurstView<'_>],
         acquisition: &Acquisition,
     ) -> Self {
-        Self::new(transform, half_of_least_risk(samples, acquisition, NOISE_LEFT))
+        Self::new(transform, sure_window_radius(samples, acquisition, NOISE_LEFT))
     }
 
     /// Frames that it sums.
@@ -53,11 +53,11 @@ impl Restorer for TransformDenoise {
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
         let ordinary = acquisition.sensor.dark_per_frame()?;
-        let mut stabilizers: Vec<Option<Stabilizer>> = vec![None; self.length() + 1];
+        let mut stabilizers: Vec<Option<VarianceStabilizer>> = vec![None; self.length() + 1];
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, self.half, |sums, n| {
             let stabilizer = stabilizers[n as usize].get_or_insert_with(|| {
-                Stabilizer::new(self.transform, &acquisition.sensor, acquisition.gain, n)
+                VarianceStabilizer::new(self.transform, &acquisition.sensor, acquisition.gain, n)
             });
             let z = sums.iter().map(|&sum| stabilizer.transform(f64::from(sum)) as f32).collect();
             let z = Frame { size: burst.size, data: z };
@@ -72,11 +72,11 @@ impl Restorer for TransformDenoise {
 pub(crate) fn denoise(
     profile: Profile,
     mut z: Frame,
-    stabilizer: &Stabilizer,
+    stabilizer: &VarianceStabilizer,
     scale: f64,
 ) -> Frame {
     let Spread { low, high, variance } =
-        spread(&z, |mean| (scale * stabilizer.deviation(mean)).powi(2));
+        spread(&z, |mean| (scale * stabilizer.sigma(mean)).powi(2));
     let sigma = variance.sqrt();
     // BM3D's thresholds are for contents within [0, 1].
     let range = (high - low).max(sigma).max(f64::MIN_POSITIVE);
@@ -94,7 +94,7 @@ pub(crate) fn units(acquisition: &Acquisition) -> f64 {
 /// The image behind a denoised transform: inverse, dark counts subtracted.
 pub(crate) fn image(
     z: &Frame,
-    stabilizer: &Stabilizer,
+    stabilizer: &VarianceStabilizer,
     acquisition: &Acquisition,
     ordinary: f64,
 ) -> Frame {

@@ -19,8 +19,8 @@ pub(crate) struct Restore {
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
     /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen), transform-denoise, bm3d, qbp,
-    /// qbp-bm3d, guide (that twice), or qudi (the network) [default: qudi; guide for sensors and light that the built-in weights
-    /// do not know, and mle where the dark rate is unknown, too]
+    /// qbp-bm3d, qbp-refined (in two passes), or qudi (the network) [default: qudi; qbp-refined for sensors and light that
+    /// the built-in weights do not know, and mle where the dark rate is unknown, too]
     #[arg(long, value_name = "NAME")]
     pub(crate) method: Option<String>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]

@@ -9,7 +9,7 @@ use crate::interrupt;
 use crate::report::{Bar, Cell, Column, Report, Table, json};
 use crate::settings::Settings;
 use qudi_burst::Average;
-use qudi_burst::{Finish, Qbp, TwoRounds};
+use qudi_burst::{PostFilter, Qbp, QbpRefined};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
@@ -86,8 +86,8 @@ pub(crate) fn run(
     let truth = &truths[CENTRE];
     let mut methods: Vec<(&str, Box<dyn Restorer>)> = vec![
         ("AVERAGE OF 11", Box::new(Average)),
-        ("QBP + BM3D", Box::new(Qbp::new(Finish::Bm3d))),
-        ("GUIDE", Box::new(TwoRounds)),
+        ("QBP + BM3D", Box::new(Qbp::new(PostFilter::Bm3d))),
+        ("QBP REFINED", Box::new(QbpRefined)),
     ];
     if demo.network.weights.is_some() || network::built_in_knows(&acquisition)? {
         methods.push(("QUDI", network::restorer(&demo.network, &acquisition, SIZE)?.0));

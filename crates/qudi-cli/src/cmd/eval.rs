@@ -8,7 +8,7 @@ use crate::cmd::eval_exposing::Exposing;
 use crate::cmd::eval_html::html;
 use crate::cmd::eval_score::{Figure, FlowKind, Row};
 use crate::cmd::eval_table::{frames, summary};
-use crate::cmd::methods::METHODS;
+use crate::cmd::methods::{METHODS, is_method};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::{Output, Report, csv, markdown};
@@ -35,7 +35,7 @@ pub(crate) fn run(
         refuse_taken(folder, overwrite)?;
     }
     checked_exposure(args.exposure)?;
-    if let Some(unknown) = args.method.iter().find(|name| !METHODS.contains(&name.as_str())) {
+    if let Some(unknown) = args.method.iter().find(|name| !is_method(name)) {
         return Err(Fault::new(
             format!("no method named `{unknown}`"),
             "--method",

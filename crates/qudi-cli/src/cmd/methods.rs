@@ -4,14 +4,22 @@ use crate::args::Network;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
 use qudi_burst::{Average, Mle};
-use qudi_burst::{Finish, Qbp, Transform, TransformDenoise, TwoRounds};
+use qudi_burst::{PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_io::capture::Capture;
 use qudi_model::restorer::FEWEST_FRAMES;
 
 /// All methods.
 pub(crate) const METHODS: &[&str] =
-    &["average", "mle", "transform-denoise", "bm3d", "qbp", "qbp-bm3d", "guide", "qudi"];
+    &["average", "mle", "transform-denoise", "bm3d", "qbp", "qbp-bm3d", "qbp-refined", "qudi"];
+
+/// The former name of `qbp-refined`, which scripts may still use.
+const FORMER_QBP_REFINED: &str = "guide";
+
+/// Whether a method has this name or had it formerly.
+pub(crate) fn is_method(name: &str) -> bool {
+    METHODS.contains(&name) || name == FORMER_QBP_REFINED
+}
 
 /// Windows of a clip that a method's settings are chosen on.
 const SAMPLES: u64 = 4;
@@ -36,9 +44,9 @@ pub(crate) fn method(
                 sampled(capture, |views| TransformDenoise::choose(transform, views, acquisition))?;
             Ok((Box::new(chosen), over(chosen.length())))
         }
-        "qbp" => Ok((Box::new(Qbp::new(Finish::Plain)), String::new())),
-        "qbp-bm3d" => Ok((Box::new(Qbp::new(Finish::Bm3d)), String::new())),
-        "guide" => Ok((Box::new(TwoRounds), String::new())),
+        "qbp" => Ok((Box::new(Qbp::new(PostFilter::None)), String::new())),
+        "qbp-bm3d" => Ok((Box::new(Qbp::new(PostFilter::Bm3d)), String::new())),
+        "qbp-refined" | FORMER_QBP_REFINED => Ok((Box::new(QbpRefined), String::new())),
         other => Err(Fault::new(
             format!("no method named `{other}`"),
             "--method",
@@ -61,7 +69,7 @@ pub(crate) fn usual_method(
     } else if long_enough && network::built_in_knows(acquisition)? {
         "qudi"
     } else {
-        "guide"
+        "qbp-refined"
     })
 }
 
