@@ -381,7 +381,8 @@ mod tests {
         let whole = restorer.restore(burst, &acquisition).unwrap().frames;
         let laid = config.pre.laid();
         let alignment = aligned(burst, &acquisition, &[]).unwrap();
-        let noises = (0..counts.len()).map(|frame| laid.of(&alignment, frame).noise_sigma).collect();
+        let noises =
+            (0..counts.len()).map(|frame| laid.of(&alignment, frame).noise_sigma).collect();
         let whole = settled(&alignment, whole, noises, 1.0);
         for (short, whole) in short.iter().zip(&whole) {
             for (short, whole) in short.data.iter().zip(&whole.data) {
