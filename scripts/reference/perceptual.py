@@ -2,14 +2,13 @@
 # requires-python = ">=3.11"
 # dependencies = ["lpips", "numpy", "safetensors", "torch", "torchvision"]
 # ///
-"""Golden values of the perceptual distances for the Rust tests, in tests/golden/perceptual.
+"""Golden values of LPIPS for the Rust tests, in tests/golden/perceptual.
 
     python scripts/reference/perceptual.py [FOLDER HEADS]
 
 LPIPS is the authors' package with torchvision's networks, their weights made by a formula: weight
-NAME of network NET (`vgg`, `alex`, `squeeze`) is sqrt(6 / fan-in) * uniform("NET.NAME") and a bias
+NAME of network NET (`vgg`, `alex`) is sqrt(6 / fan-in) * uniform("NET.NAME") and a bias
 0.05 * uniform("NET.NAME"), heads are uniform squared / 10 (`uniform.py`), all rounded to float32.
-MS-SSIM and the oriented filters are written here a second time, from their definitions.
 
 `distances.safetensors`: `p`, `q` [2, 64, 75] are images in 255ths, `q` a blurred, darker, noisy `p`.
 Per kind, computed in float64: `KIND/distance` [2], and of the gradient of their mean by `p`
@@ -20,7 +19,7 @@ at the flat indices 149 i.
 uniform(name)), `half` (16 bits), `turned` (not in rows) and `bad` (holds a NaN). `code.pth` calls a function.
 
 With a FOLDER, for checking by hand: writes there the networks of the formula under torchvision's names, copies
-of the published heads (HEADS/{vgg,alex,squeeze}.pth), and prints the distances with these.
+of the published heads (HEADS/{vgg,alex}.pth), and prints the distances with these.
 """
 
 import math
@@ -38,7 +37,7 @@ from torch import Tensor
 from uniform import uniform
 
 OUT = Path(__file__).resolve().parents[2] / "tests/golden/perceptual"
-NETS = {"vgg": "vgg16-397923af", "alex": "alexnet-owt-7be5be79", "squeeze": "squeezenet1_1-b8a52dc0"}
+NETS = {"vgg": "vgg16-397923af", "alex": "alexnet-owt-7be5be79"}
 
 
 def images() -> tuple[Tensor, Tensor]:
@@ -88,53 +87,6 @@ def formula(net: str) -> tuple[lpips.LPIPS, dict[str, Tensor], dict[str, Tensor]
 def lpips_distance(model: lpips.LPIPS, p: Tensor, q: Tensor) -> Tensor:
     gray = lambda x: x.expand(-1, 3, -1, -1)
     return model(gray(p), gray(q), normalize=True).flatten()
-
-
-def ms_ssim_distance(p: Tensor, q: Tensor) -> Tensor:
-    """Wang et al. 2003, with a window in two dimensions."""
-    place = torch.arange(11, dtype=p.dtype) - 5
-    window = torch.exp(-(place[:, None] ** 2 + place**2) / (2 * 1.5**2))
-    window = (window / window.sum())[None, None]
-    mean = lambda x: F.conv2d(x, window)
-    weights = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333]
-    weights = [w for k, w in enumerate(weights) if k == 0 or min(p.shape[2:]) >> k >= 11]
-    similarity = torch.ones(len(p), dtype=p.dtype)
-    for k, weight in enumerate(weights):
-        mp, mq = mean(p), mean(q)
-        vp, vq, cov = mean(p * p) - mp**2, mean(q * q) - mq**2, mean(p * q) - mp * mq
-        value = (2 * cov + 0.03**2) / (vp + vq + 0.03**2)
-        if k + 1 == len(weights):
-            value = value * (2 * mp * mq + 0.01**2) / (mp**2 + mq**2 + 0.01**2)
-        similarity = similarity * value.mean((1, 2, 3)).clamp(min=1e-3) ** (weight / sum(weights))
-        p, q = F.avg_pool2d(p, 2), F.avg_pool2d(q, 2)
-    return 1 - similarity
-
-
-def gabor(angle: float, phase: float) -> np.ndarray:
-    rows, columns = np.mgrid[-4:5, -4:5]
-    window = np.exp(-(rows**2 + columns**2) / 8)
-    wave = np.cos(np.pi / 2 * (columns * np.cos(angle) + rows * np.sin(angle)) - phase)
-    even = window * (wave - (window * wave).sum() / window.sum())
-    return even / (even * wave).sum()
-
-
-def oriented_distance(p: Tensor, q: Tensor) -> Tensor:
-    """Teo and Heeger 1994, small."""
-    angles = [k * np.pi / 4 for k in range(4)]
-    even, odd = (torch.from_numpy(np.stack([gabor(a, f) for a in angles]))[:, None].to(p.dtype) for f in (0, np.pi / 2))
-    parts = []
-    for k in range(4):
-        if k and min(p.shape[2:]) < 9:
-            break
-        features = []
-        for x in (p, q):
-            e, o = F.conv2d(x, even), F.conv2d(x, odd)
-            power = e**2 + o**2
-            total = power.sum(1, keepdim=True) + 0.02**2
-            features.append((e / total.sqrt(), o / total.sqrt(), power / total))
-        parts.append(sum(((a - b) ** 2).sum(1).mean((1, 2)) for a, b in zip(*features)))
-        p, q = F.avg_pool2d(p, 2), F.avg_pool2d(q, 2)
-    return sum(parts) / len(parts)
 
 
 def add(tensors: dict[str, Tensor], kind: str, distance, p: Tensor, q: Tensor) -> None:
@@ -191,8 +143,6 @@ def main() -> None:
     for net in NETS:
         model = formula(net)[0].double()
         add(tensors, f"lpips-{net}", lambda p, q: lpips_distance(model, p, q), p, q)
-    add(tensors, "ms-ssim", ms_ssim_distance, p, q)
-    add(tensors, "oriented", oriented_distance, p, q)
     save_file(tensors, OUT / "distances.safetensors")
     state_dicts()
     for path in OUT.iterdir():

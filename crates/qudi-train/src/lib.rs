@@ -18,7 +18,6 @@ mod learning_rate;
 pub mod loss;
 mod optimizer;
 mod parameters;
-pub mod perceptual;
 mod prefetch;
 mod recipe;
 mod run;

@@ -1,7 +1,7 @@
 //! Recipes: everything that decides what a training gives, in one TOML document.
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
-use crate::perceptual::PerceptualKind;
+use crate::loss::lpips::PerceptualKind;
 use qudi_core::{Result, SimError};
 use qudi_kernels::ComputePrecision;
 use qudi_model::config::{NetworkConfig, PRESETS};

@@ -6,8 +6,8 @@ use super::optimizer::Adam;
 use super::parameters::{gradients, parameters, with_parameters};
 use super::prefetch::Prefetcher;
 use super::recipe::{LossConfig, Recipe};
+use crate::loss::lpips::Lpips;
 use crate::loss::{LoopOptions, LossWeights, SelfConditioning, loss_terms};
-use crate::perceptual::{Perceptual, PerceptualKind};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Result, SimError, Size};
@@ -71,7 +71,7 @@ pub struct Trainer {
     pub(super) network: Qudi,
     pub(super) average: Vec<Tensor<1>>,
     pub(super) adam: Adam,
-    perceptual: Vec<Perceptual>,
+    perceptual: Vec<Lpips>,
 }
 
 /// One batch's gradients and losses, and the seconds that they took.
@@ -107,19 +107,14 @@ impl Trainer {
             learner = with_parameters(learner, parameters(&network));
         }
         let start = parameters(&learner);
-        let term = recipe.train.loss.term;
         let (_, side) = recipe.sample_size();
-        let size = Size { height: side, width: side };
-        let load = |device: &Device| {
-            let loaded = Perceptual::load(term, backbones, device)?;
-            loaded.check(size)?;
-            Ok(loaded)
-        };
-        let perceptual = if term == PerceptualKind::None {
-            Vec::new()
-        } else {
-            devices.iter().map(load).collect::<Result<_>>()?
-        };
+        let mut perceptual = Vec::new();
+        for device in &devices {
+            if let Some(lpips) = Lpips::load(recipe.train.loss.term, backbones, device)? {
+                lpips.check(Size { height: side, width: side })?;
+                perceptual.push(lpips);
+            }
+        }
         Ok(Self {
             recipe: recipe.clone(),
             adam: Adam::new(&start),

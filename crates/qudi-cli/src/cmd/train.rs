@@ -11,7 +11,7 @@ use crate::settings::{Settings, toml_text};
 use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, load};
 use qudi_train::dataset::{Pack, write_pack};
-use qudi_train::perceptual::fetch;
+use qudi_train::loss::lpips::fetch;
 use qudi_train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bursts};
 use serde_json::json;
 use std::path::{Path, PathBuf};

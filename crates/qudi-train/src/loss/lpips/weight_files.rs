@@ -1,30 +1,30 @@
-//! Where the weights of LPIPS are looked for.
+//! The published files of weights of LPIPS, and where they are looked for.
 
-use super::lpips::Net;
+use super::backbone::Net;
 use qudi_core::{Result, SimError};
 use std::path::{Path, PathBuf};
 
-/// One file of weights.
+/// A published file of weights.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct WeightFile {
-    /// The name it is fetched under, and what else it may be called.
+    /// The name that it is fetched under, and another that it may have.
     pub(super) names: [&'static str; 2],
-    /// Folder of its publisher.
+    /// The publisher's folder.
     pub(super) base: &'static str,
-    /// Name there.
+    /// The name in that folder.
     pub(super) remote: &'static str,
-    /// SHA-256 in hexadecimal, or its first digits.
+    /// The SHA-256 in hexadecimal, or its first digits.
     pub(super) sha256: &'static str,
 }
 
-/// Of the backbones: torchvision's.
+/// The address of torchvision's backbones.
 const BACKBONES: &str = "https://download.pytorch.org/models";
 
-/// Of the heads: the authors of LPIPS.
+/// The address of the heads by the authors of LPIPS.
 const HEADS: &str =
     "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1";
 
-/// Backbone and heads. Their second names are those of the framework's own LPIPS, and of the authors.
+/// The files of backbone and heads. Their second names are those of the framework's own LPIPS, and of the authors.
 pub(super) fn files(net: Net) -> [WeightFile; 2] {
     let backbone = |name, cached, sha256| WeightFile {
         names: [name, cached],
@@ -51,27 +51,19 @@ pub(super) fn files(net: Net) -> [WeightFile; 2] {
                 "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
             ),
         ],
-        Net::Squeeze => [
-            backbone("squeezenet1_1-b8a52dc0.pth", "squeeze_backbone.pth", "b8a52dc0"),
-            heads(
-                "squeeze_lpips.pth",
-                "squeeze.pth",
-                "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76",
-            ),
-        ],
     }
 }
 
-/// Paths of backbone and heads: in `folder`, if one is given, or else where Burn keeps them.
+/// The paths of backbone and heads: in `folder`, if one is given, or else where Burn keeps them.
 ///
 /// # Errors
 /// [`SimError::Request`] that names the missing files, where they were looked for, and how to get them.
-pub(super) fn find(net: Net, kind: &str, folder: Option<&Path>) -> Result<[PathBuf; 2]> {
-    let folders: Vec<PathBuf> = folder.map(Path::to_owned).into_iter().chain(cache()).collect();
-    locate(&files(net), kind, &folders)
+pub(super) fn find(net: Net, folder: Option<&Path>) -> Result<[PathBuf; 2]> {
+    let folders: Vec<PathBuf> = folder.map(Path::to_owned).into_iter().chain(cache_folder()).collect();
+    locate(&files(net), &folders)
 }
 
-fn locate(files: &[WeightFile; 2], kind: &str, folders: &[PathBuf]) -> Result<[PathBuf; 2]> {
+fn locate(files: &[WeightFile; 2], folders: &[PathBuf]) -> Result<[PathBuf; 2]> {
     let found = files.map(|file| {
         let mut paths =
             folders.iter().flat_map(|folder| file.names.iter().map(|name| folder.join(name)));
@@ -89,17 +81,18 @@ fn locate(files: &[WeightFile; 2], kind: &str, folders: &[PathBuf]) -> Result<[P
         .map(|file| format!("{}/{} as {}", file.base, file.remote, file.names[0]))
         .collect();
     Err(SimError::request(
-        format!("the perceptual term `{kind}` needs {}, not found", names.join(" and ")),
+        format!("LPIPS needs {}, not found", names.join(" and ")),
         if places.is_empty() { "no folder given".into() } else { places.join(", ") },
         format!(
-            "fetch them, or download {} into that folder; or choose a term without weights (ms-ssim, oriented)",
+            "fetch them, or download {} into that folder; or set train.loss.term to \"none\"",
             urls.join(" and ")
         ),
     ))
 }
 
-/// Where Burn's own LPIPS keeps its downloads.
-pub(super) fn cache() -> Option<PathBuf> {
+/// The folder where weights are looked for if none is given: where Burn's own LPIPS keeps its downloads. None if the
+/// system names no home.
+pub fn cache_folder() -> Option<PathBuf> {
     let variable =
         |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let home = std::env::home_dir;
@@ -124,17 +117,17 @@ mod tests {
         let [given, cached] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let folders = [given.path().to_owned(), cached.path().to_owned()];
         let files = files(Net::Alex);
-        let error = locate(&files, "lpips-alex", &folders).unwrap_err();
+        let error = locate(&files, &folders).unwrap_err();
         let text = format!("{error} {} {}", error.place().unwrap(), error.help().unwrap());
         let place = given.path().display().to_string();
-        for word in ["alexnet-owt-7be5be79.pth", "alex_lpips.pth", "https://", "ms-ssim", &place] {
+        for word in ["alexnet-owt-7be5be79.pth", "alex_lpips.pth", "https://", "train.loss.term", &place] {
             assert!(text.contains(word), "{word} is not in: {text}");
         }
         std::fs::write(cached.path().join("alex_backbone.pth"), b"").unwrap();
-        let error = locate(&files, "lpips-alex", &folders).unwrap_err().to_string();
+        let error = locate(&files, &folders).unwrap_err().to_string();
         assert!(!error.contains("alexnet-owt") && error.contains("alex_lpips.pth"), "{error}");
         std::fs::write(given.path().join("alex.pth"), b"").unwrap();
-        let found = locate(&files, "lpips-alex", &folders).unwrap();
+        let found = locate(&files, &folders).unwrap();
         assert_eq!(found, [cached.path().join("alex_backbone.pth"), given.path().join("alex.pth")]);
     }
 }

@@ -5,7 +5,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::conv::{Activation, Options, conv_2d};
 use qudi_model::network::fold;
 
-/// One convolution. Its weights are constants: no gradient is kept for them.
+/// A convolution. Its weights are constants: no gradient is kept for them.
 #[derive(Clone, Debug)]
 pub(super) struct Convolution {
     /// `[outputs, inputs, rows, columns]`
@@ -30,7 +30,7 @@ struct Strided {
 }
 
 impl Convolution {
-    /// Stride 1, padding half the kernel. `sizes` are outputs, inputs and the odd side of the kernel.
+    /// Makes a convolution of stride 1 and padding of half the kernel. `sizes` are outputs, inputs and the odd side of the kernel.
     pub(super) fn new(
         weight: Vec<f32>,
         bias: Vec<f32>,
@@ -45,7 +45,7 @@ impl Convolution {
         }
     }
 
-    /// Any stride and padding.
+    /// Makes a convolution of any stride and padding.
     pub(super) fn strided(
         weight: &[f32],
         bias: Vec<f32>,
@@ -68,7 +68,11 @@ impl Convolution {
         Self { strided: Some(Strided { kernel, stride, padding, folded }), ..plain }
     }
 
-    /// `[images, inputs, height, width]` to `[images, outputs, rows, columns]`.
+    /// Convolves and applies the ReLU.
+    ///
+    /// # Shapes
+    /// - x: `[images, inputs, height, width]`
+    /// - output: `[images, outputs, rows, columns]`
     pub(super) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let options = Options { activation: Activation::Relu, ..Options::default() };
         let (weight, bias) = (self.weight.clone(), self.bias.clone());

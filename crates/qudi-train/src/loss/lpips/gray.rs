@@ -8,19 +8,19 @@
 
 use burn::tensor::Tensor;
 
-/// The planes: the image, ones.
+/// The number of planes: the image and ones.
 pub(super) const PLANES: usize = 2;
 
-/// Channels of the original.
+/// The number of channels of the original.
 const CHANNELS: usize = 3;
 
 /// LPIPS's ScalingLayer: means of red, green and blue on [-1, 1].
 const SHIFT: [f64; CHANNELS] = [-0.030, -0.088, -0.188];
 
-/// LPIPS's ScalingLayer: deviations.
+/// LPIPS's ScalingLayer: standard deviations.
 const SCALE: [f64; CHANNELS] = [0.458, 0.448, 0.450];
 
-/// First-layer weights `[outputs, 3, taps]` for [`planes`], `[outputs, 2, taps]`.
+/// Turns first-layer weights `[outputs, 3, taps]` into those for [`planes`], `[outputs, 2, taps]`.
 pub(super) fn fold(weight: &[f32], taps: usize) -> Vec<f32> {
     let outputs = weight.chunks_exact(CHANNELS * taps);
     let mut folded = Vec::with_capacity(outputs.len() * PLANES * taps);
@@ -34,7 +34,11 @@ pub(super) fn fold(weight: &[f32], taps: usize) -> Vec<f32> {
     folded
 }
 
-/// `[images, 1, height, width]` in [0, 1] with a plane of ones, `[images, 2, height, width]`.
+/// Adds a plane of ones to images.
+///
+/// # Shapes
+/// - images: `[images, 1, height, width]` in [0, 1]
+/// - output: `[images, 2, height, width]`
 pub(super) fn planes(images: Tensor<4>) -> Tensor<4> {
     let ones = images.clone().detach().ones_like();
     Tensor::cat(vec![images, ones], 1)

@@ -1,7 +1,7 @@
 //! Downloads by the `curl` program on PATH: it brings the certificates of the system, and this program needs no
 //! network code.
 
-use super::files::WeightFile;
+use super::weight_files::WeightFile;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::{Result, SimError};
 use sha2::{Digest, Sha256};
@@ -45,7 +45,7 @@ pub(super) fn fetch(file: &WeightFile, base: &str, folder: &Path) -> Result<Path
             "check the network; or download the address by other means to this place",
         ));
     }
-    let help = "what came is not the published file: fetch it again, or check the network for a proxy that answers instead";
+    let help = "the download is not the published file: fetch it again, or check for a proxy that answers instead";
     check(file, &sum, &path, help)?;
     pending.finish()?;
     Ok(path)
@@ -121,13 +121,14 @@ mod tests {
     };
 
     #[test]
-    fn only_the_published_file_is_kept() {
+    fn keeps_only_files_with_the_published_hash() {
         let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let base = format!("file://{}", from.path().display());
         let error = fetch(&ABC, &base, to.path()).unwrap_err().to_string();
         assert!(error.contains("curl"), "{error}");
         if error.contains("no `curl`") {
-            return; // that it says so is all that can be checked here
+            eprintln!("skipped: there is no `curl` on PATH");
+            return;
         }
         std::fs::write(from.path().join("abc.pth"), b"abd").unwrap();
         let error = fetch(&ABC, &base, to.path()).unwrap_err().to_string();

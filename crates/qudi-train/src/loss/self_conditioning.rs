@@ -1,0 +1,133 @@
+//! The inputs of a training pass: the noisy images, and what the step before would have left.
+
+use super::Example;
+use super::timesteps::previous_timestep;
+use burn::module::Module;
+use burn::tensor::Tensor;
+use qudi_core::{Result, SimError, Size};
+use qudi_model::diffusion::physics::LoopSensor;
+use qudi_model::diffusion::sampler::TIMES;
+use qudi_model::diffusion::schedule::NoiseSchedule;
+use qudi_model::measurement::Planes;
+use qudi_model::network::{Measured, Qudi, Simulated, State};
+use qudi_model::tensor::{read, to_tensor};
+
+/// Which results of the previous step the network is given.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LoopOptions {
+    /// Whether it is given the previous estimate as the sensor would measure it.
+    pub forward_model: bool,
+    /// Whether it is given the previous estimate.
+    pub self_conditioning: bool,
+}
+
+impl LoopOptions {
+    /// The options with everything on.
+    pub const ALL: Self = Self { forward_model: true, self_conditioning: true };
+    /// The options with everything off: a first pass would be in vain.
+    pub const NONE: Self = Self { forward_model: false, self_conditioning: false };
+}
+
+/// Whether a first pass makes the estimate that the network is given, as after the first step of sampling (Chen et
+/// al. 2023, "Analog Bits", section 3.2).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SelfConditioning {
+    /// The network starts from nothing.
+    Off,
+    /// The network is given its own estimate from a noisier image, and that estimate measured again with photons
+    /// of this seed.
+    On(u64),
+}
+
+/// The network's inputs at an example's timesteps.
+pub(super) fn network_inputs(
+    network: &Qudi,
+    example: &Example<'_>,
+    self_conditioning: SelfConditioning,
+    options: LoopOptions,
+) -> Result<(State, Option<Simulated>)> {
+    let timesteps = example.timesteps;
+    let (x0_prev, known, simulated) = match self_conditioning {
+        // Where sampling begins, nothing comes before.
+        SelfConditioning::On(seed) if timesteps.iter().any(|&t| t < TIMES - 1) => {
+            let (x0_prev, simulated) = first_estimate(network, example, seed)?;
+            let known = simulated.exists.iter().map(|&exists| exists && options.self_conditioning);
+            (x0_prev, known.collect(), Some(simulated).filter(|_| options.forward_model))
+        }
+        _ => (example.truth.zeros_like(), vec![false; timesteps.len()], None),
+    };
+    let state =
+        State { x_t: noisy_images(example, timesteps), x0_prev, known, times: timesteps.to_vec() };
+    Ok((state, simulated))
+}
+
+/// The true images in [-1, 1] with the example's noise of these timesteps, one per burst.
+fn noisy_images(example: &Example<'_>, timesteps: &[usize]) -> Tensor<4> {
+    let schedule = NoiseSchedule::cosine(TIMES);
+    let clean = example.truth.clone() * 2.0 - 1.0;
+    let bursts = timesteps.len();
+    let [images, _, height, width] = clean.dims();
+    let level = |f: fn(f64) -> f64| {
+        let values: Vec<f32> =
+            timesteps.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32).collect();
+        let values = Tensor::<1>::from_floats(values.as_slice(), &clean.device());
+        values.reshape([bursts, 1]).repeat_dim(1, images / bursts).reshape([images, 1, 1, 1])
+    };
+    let signal = level(f64::sqrt).expand([images, 1, height, width]);
+    let noise = level(|a| (1.0 - a).sqrt()).expand([images, 1, height, width]);
+    clean * signal + example.noise.clone() * noise
+}
+
+/// The network's own estimate at the timesteps before the example's, without gradient, and its simulated measurement.
+/// Bursts at the noisiest timestep have neither: there sampling starts.
+fn first_estimate(
+    network: &Qudi,
+    example: &Example<'_>,
+    seed: u64,
+) -> Result<(Tensor<4>, Simulated)> {
+    let device = example.truth.device();
+    let measured = Measured {
+        u: example.measured.u.clone().inner(),
+        guide: example.measured.guide.clone().inner(),
+        sensor: example.measured.sensor.clone().inner(),
+        frames: example.measured.frames,
+    };
+    let network = network.valid();
+    let previous: Vec<usize> = example.timesteps.iter().map(|&t| previous_timestep(t)).collect();
+    let x_t = noisy_images(example, &previous).inner();
+    let known = vec![false; previous.len()];
+    let state = State { x0_prev: x_t.zeros_like(), x_t, known, times: previous };
+    let prediction = network.forward(&network.prepare(&measured), None, &state, None);
+    let [_, _, height, width] = example.truth.dims();
+    let size = Size { height, width };
+    let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;
+    if !x0.iter().all(|value| value.is_finite()) {
+        return Err(SimError::request(
+            "the network's first estimate is not finite: the last checkpoint is good",
+            "self-conditioning",
+            "lower train.lr or train.clip, and resume from the checkpoint",
+        ));
+    }
+    let burst = measured.frames * size.pixels();
+    let mut planes = Planes { y: Vec::new(), u: Vec::new() };
+    let exists: Vec<bool> = example.timesteps.iter().map(|&t| t < TIMES - 1).collect();
+    for (number, (x0, acquisition)) in
+        x0.chunks_exact_mut(burst).zip(example.acquisitions).enumerate()
+    {
+        if !exists[number] {
+            x0.fill(0.0);
+            planes.y.resize(planes.y.len() + burst, 0.0);
+            planes.u.resize(planes.u.len() + burst, 0.0);
+            continue;
+        }
+        let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
+        let sensor = LoopSensor::at(acquisition, example.timesteps[number], TIMES);
+        let first = (number * measured.frames) as u64;
+        let more = sensor.measure(&images, size, first, seed)?;
+        planes.y.extend(more.y);
+        planes.u.extend(more.u);
+    }
+    let tensor = |values| to_tensor(values, size, &device);
+    let simulated = Simulated { y: tensor(planes.y), u: tensor(planes.u), exists };
+    Ok((tensor(x0), simulated))
+}
