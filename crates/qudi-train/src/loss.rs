@@ -126,8 +126,7 @@ pub fn loss_terms(
     let perceptual = perceptual
         .map(|lpips| with_precision(ComputePrecision::F32, || lpips.loss(image, truth.clone())));
     let pre = pre_denoiser_loss(example, result.d);
-    let flow =
-        (weights.flow > 0.0).then(|| result.flows.misfit(truth.clone(), measured.frames));
+    let flow = (weights.flow > 0.0).then(|| result.flows.misfit(truth.clone(), measured.frames));
     // The uncertainty is that of the frames before any simulated measurement.
     let uncertainty = network.tells_errors().then(|| network.denoise(&measured.guide));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));

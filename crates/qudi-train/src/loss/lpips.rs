@@ -161,7 +161,9 @@ impl Lpips {
             return Ok(());
         }
         Err(SimError::request(
-            format!("LPIPS needs images of at least {smallest} x {smallest} pixels, these are {size}"),
+            format!(
+                "LPIPS needs images of at least {smallest} x {smallest} pixels, these are {size}"
+            ),
             "train.loss.term",
             "take larger crops, or set the term to \"none\"",
         ))

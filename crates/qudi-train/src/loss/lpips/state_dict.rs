@@ -22,7 +22,8 @@ impl StateDict {
         // The reader names no file where one is missing.
         std::fs::metadata(path).map_err(|e| SimError::io("read the weights", path, e))?;
         let reader = PytorchReader::new(path).map_err(|e| {
-            let help = "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
+            let help =
+                "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
             SimError::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
         Ok(Self { path: path.to_owned(), reader })
@@ -37,8 +38,7 @@ impl StateDict {
             let help = "these are weights of another network, or the file is damaged";
             SimError::data(what, &self.path, help)
         };
-        let tensor =
-            self.reader.get(name).ok_or_else(|| wrong(format!("`{name}` is missing")))?;
+        let tensor = self.reader.get(name).ok_or_else(|| wrong(format!("`{name}` is missing")))?;
         if tensor.shape() != shape {
             return Err(wrong(format!("`{name}` is {:?}, expected {shape:?}", tensor.shape())));
         }
@@ -52,7 +52,10 @@ impl StateDict {
         let words = bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
         let values: Vec<f32> = words.map(f32::from_le_bytes).collect();
         if values.len() != shape.iter().product::<usize>() {
-            return Err(wrong(format!("`{name}` has {} values, not those of its shape", values.len())));
+            return Err(wrong(format!(
+                "`{name}` has {} values, not those of its shape",
+                values.len()
+            )));
         }
         if !values.iter().all(|value| value.is_finite()) {
             return Err(wrong(format!("`{name}` holds values that are not finite")));
@@ -106,7 +109,8 @@ mod tests {
     /// The file calls a function in the place of a tensor: nothing is called, and there is no tensor.
     #[test]
     fn executes_nothing() {
-        let file = StateDict::open(&golden("code.pth")).and_then(|file| file.read("a.weight", &[2, 3]));
+        let file =
+            StateDict::open(&golden("code.pth")).and_then(|file| file.read("a.weight", &[2, 3]));
         assert!(file.is_err());
     }
 

@@ -59,7 +59,8 @@ pub(super) fn files(net: Net) -> [WeightFile; 2] {
 /// # Errors
 /// [`SimError::Request`] that names the missing files, where they were looked for, and how to get them.
 pub(super) fn find(net: Net, folder: Option<&Path>) -> Result<[PathBuf; 2]> {
-    let folders: Vec<PathBuf> = folder.map(Path::to_owned).into_iter().chain(cache_folder()).collect();
+    let folders: Vec<PathBuf> =
+        folder.map(Path::to_owned).into_iter().chain(cache_folder()).collect();
     locate(&files(net), &folders)
 }
 
@@ -120,7 +121,9 @@ mod tests {
         let error = locate(&files, &folders).unwrap_err();
         let text = format!("{error} {} {}", error.place().unwrap(), error.help().unwrap());
         let place = given.path().display().to_string();
-        for word in ["alexnet-owt-7be5be79.pth", "alex_lpips.pth", "https://", "train.loss.term", &place] {
+        for word in
+            ["alexnet-owt-7be5be79.pth", "alex_lpips.pth", "https://", "train.loss.term", &place]
+        {
             assert!(text.contains(word), "{word} is not in: {text}");
         }
         std::fs::write(cached.path().join("alex_backbone.pth"), b"").unwrap();
