@@ -97,7 +97,7 @@ fn io_help(kind: io::ErrorKind) -> &'static str {
     match kind {
         io::ErrorKind::NotFound => "check the name; relative paths start at the current folder",
         io::ErrorKind::PermissionDenied => "check the permissions of the file and of its folder",
-        io::ErrorKind::StorageFull => "free some space, or write to another disk with -o",
+        io::ErrorKind::StorageFull => "free some space, or write to another disk",
         io::ErrorKind::IsADirectory => "name a file, not a folder",
         io::ErrorKind::UnexpectedEof => "the file ends too early: copy or export it again",
         _ => "the system gave this reason; check the path and the device it is on",

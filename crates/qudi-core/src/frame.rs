@@ -1,6 +1,7 @@
 //! One gray image, `[height][width]`, in the unit of the scene (0 is black, 1 is white).
 
 use crate::error::{Result, SimError};
+use crate::limits::FRAME_PIXELS;
 
 /// Width and height of an image in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
@@ -11,9 +12,6 @@ pub struct Size {
     pub width: usize,
 }
 
-/// More pixels than any sensor has; a header that asks for more is wrong or hostile.
-const MAX_PIXELS: usize = 1 << 29;
-
 impl Size {
     /// A size whose pixel count is positive and below 2^29.
     ///
@@ -21,11 +19,11 @@ impl Size {
     /// [`SimError::Request`] naming `place` otherwise.
     pub fn new(height: usize, width: usize, place: &str) -> Result<Self> {
         match height.checked_mul(width) {
-            Some(1..=MAX_PIXELS) => Ok(Self { height, width }),
+            Some(1..=FRAME_PIXELS) => Ok(Self { height, width }),
             _ => Err(SimError::request(
                 format!("a frame of {height} x {width} pixels is not possible"),
                 place,
-                format!("frames hold between 1 and {MAX_PIXELS} pixels"),
+                format!("frames hold between 1 and {FRAME_PIXELS} pixels"),
             )),
         }
     }

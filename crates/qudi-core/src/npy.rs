@@ -4,6 +4,8 @@
 
 use crate::error::{Result, SimError};
 use crate::frame::{Frame, Size};
+use crate::limits::ARRAY_HEADER_BYTES;
+use crate::regular_file::open_regular;
 use std::fs::File;
 use std::io::{BufReader, Read, Write};
 use std::path::Path;
@@ -127,9 +129,6 @@ pub struct Header {
     pub data_start: u64,
 }
 
-/// The longest header worth reading; NumPy itself writes about 100 bytes.
-const MAX_HEADER: usize = 1 << 16;
-
 impl Header {
     /// Reads a header from `reader`; `path` is for messages.
     ///
@@ -161,7 +160,7 @@ impl Header {
             }
             version => return Err(fault(&format!("a .npy file of unknown version {version}"))),
         };
-        if length > MAX_HEADER {
+        if length > ARRAY_HEADER_BYTES {
             return Err(fault(&format!("a .npy header of {length} bytes")));
         }
         let mut text = vec![0u8; length];
@@ -202,7 +201,7 @@ impl Header {
     /// [`SimError`] if it cannot be read, is malformed, or is too short.
     pub fn open(path: &Path) -> Result<(Self, BufReader<File>)> {
         let io = |e| SimError::io("open the file", path, e);
-        let file = File::open(path).map_err(io)?;
+        let file = open_regular(path, "open the file")?;
         let length = file.metadata().map_err(io)?.len();
         let mut reader = BufReader::with_capacity(1 << 16, file);
         let header = Self::read(&mut reader, path)?;

@@ -2,11 +2,10 @@
 
 use super::{PRESETS, Sensor, preset};
 use crate::error::{Result, SimError};
+use crate::limits::TEXT_BYTES;
+use crate::regular_file::read_text;
 use serde_json::Value;
 use std::path::Path;
-
-/// Sensor files are a page long; anything much larger is something else.
-const MAX_FILE: u64 = 1 << 20;
 
 impl Sensor {
     /// A preset by name, or a TOML file by path.
@@ -43,7 +42,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
     }
     let path = Path::new(name_or_path);
     if path.extension().is_none_or(|e| e != "toml") {
-        let names: Vec<_> = PRESETS.iter().map(|p| p.name).collect();
+        let names = preset_names();
         let nearest = crate::nearest::nearest(name_or_path, &names);
         let hint = nearest.map_or(String::new(), |n| format!("did you mean `{n}`?  "));
         return Err(SimError::request(
@@ -52,17 +51,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
             format!("{hint}list them with `qudi info --sensors`, or pass a .toml file"),
         ));
     }
-    let size =
-        std::fs::metadata(path).map_err(|e| SimError::io("read the sensor file", path, e))?.len();
-    if size > MAX_FILE {
-        return Err(SimError::data(
-            format!("a sensor file of {size} bytes is over the limit of {MAX_FILE}"),
-            path,
-            "pass the sensor's TOML file",
-        ));
-    }
-    let text =
-        std::fs::read_to_string(path).map_err(|e| SimError::io("read the sensor file", path, e))?;
+    let text = read_text(path, TEXT_BYTES, "read the sensor file")?;
     let mut document = parse(&text, name_or_path)?;
     if let Some(base) = document.as_object_mut().and_then(|d| d.shift_remove("base")) {
         let base = base.as_str().map(str::to_owned).unwrap_or_default();
@@ -70,7 +59,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
             return Err(SimError::data(
                 format!("no preset named `{base}` to start from"),
                 path,
-                "list the presets with `qudi info --sensors`",
+                format!("there are {}", preset_names().join(", ")),
             ));
         };
         let mut merged = parse(preset.toml, preset.name)?;
@@ -89,6 +78,11 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         }
     }
     Ok(document)
+}
+
+/// The names of all built-in sensors.
+fn preset_names() -> Vec<&'static str> {
+    PRESETS.iter().map(|preset| preset.name).collect()
 }
 
 fn parse(text: &str, place: &str) -> Result<Value> {

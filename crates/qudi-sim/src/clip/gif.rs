@@ -5,8 +5,8 @@ use image::codecs::gif::GifDecoder;
 use image::{AnimationDecoder, ImageDecoder};
 use qudi_core::Transfer;
 use qudi_core::{Frame, Size};
+use qudi_core::regular_file::open_regular;
 use qudi_core::{Result, SimError};
-use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ pub(super) struct Gif {
 
 impl Gif {
     pub(super) fn open(path: &Path, transfer: Transfer) -> Result<Self> {
-        let file = File::open(path).map_err(|e| SimError::io("open the GIF", path, e))?;
+        let file = open_regular(path, "open the GIF")?;
         let decoder = GifDecoder::new(BufReader::new(file)).map_err(|e| damaged(path, &e))?;
         let (width, height) = decoder.dimensions();
         let size = Size::new(height as usize, width as usize, &path.display().to_string())?;

@@ -1,9 +1,12 @@
 //! PNG, JPEG and TIFF images as gray frames.
 
-use image::{DynamicImage, ImageError, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits};
 use qudi_core::Transfer;
 use qudi_core::{Frame, Size};
+use qudi_core::limits::IMAGE_PIXELS;
+use qudi_core::regular_file::open_regular;
 use qudi_core::{Result, SimError};
+use std::io::BufReader;
 use std::path::Path;
 
 /// Extensions of image files.
@@ -28,10 +31,33 @@ pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
 /// # Errors
 /// [`SimError`] if it cannot be read, is damaged, or is too large.
 pub fn decode_image(path: &Path) -> Result<DynamicImage> {
-    let open = |e| SimError::io("open the image", path, e);
-    let decoded =
-        ImageReader::open(path).map_err(open)?.with_guessed_format().map_err(open)?.decode();
-    decoded.map_err(|e| match e {
+    let file = BufReader::new(open_regular(path, "open the image")?);
+    let guessed = ImageReader::new(file).with_guessed_format();
+    let reader = guessed.map_err(|e| SimError::io("open the image", path, e))?;
+    // A few kilobytes can stand for gigabytes of pixels: the header is asked before anything is decoded.
+    let decoder = reader.into_decoder().map_err(|e| unreadable(e, path))?;
+    let (width, height) = decoder.dimensions();
+    if u64::from(width) * u64::from(height) > IMAGE_PIXELS {
+        return Err(SimError::data(
+            format!("an image of {height} x {width} pixels is over the limit of {IMAGE_PIXELS} pixels"),
+            path,
+            "cut it into smaller images",
+        ));
+    }
+    let most = Limits::default().max_alloc.unwrap_or(u64::MAX);
+    if decoder.total_bytes() > most {
+        return Err(SimError::data(
+            format!("an image of {} bytes is over the limit of {most}", decoder.total_bytes()),
+            path,
+            "cut it into smaller images, or save it with fewer channels",
+        ));
+    }
+    DynamicImage::from_decoder(decoder).map_err(|e| unreadable(e, path))
+}
+
+/// Says why an image cannot be decoded.
+fn unreadable(e: ImageError, path: &Path) -> SimError {
+    match e {
         ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
             SimError::io("read the image", path, e)
         }
@@ -40,7 +66,7 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
             path,
             "open it in a viewer to see whether it is damaged, and save it again as PNG",
         ),
-    })
+    }
 }
 
 fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame> {

@@ -12,6 +12,8 @@ use super::{ExposureSource, FrameReader};
 use crate::scene::{PROCEDURAL, Procedural, ProceduralScene, StillMotion, still_scene};
 use qudi_core::Size;
 use qudi_core::Transfer;
+use qudi_core::limits::EXPOSURE_INSTANTS;
+use qudi_core::regular_file::open_regular;
 use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
@@ -90,9 +92,6 @@ impl Default for Sampling {
 
 /// Length of synthetic clips unless said otherwise: one window of the paper's network.
 const SYNTHETIC_FRAMES: u64 = 11;
-
-/// More instants per exposure than any motion needs.
-const MAX_INSTANTS: usize = 4096;
 
 impl Input {
     /// What `text` names: a file, a folder, `scene:NAME`, or `-` for Y4M on standard input.
@@ -198,7 +197,7 @@ impl Input {
     /// # Errors
     /// [`SimError`] if it cannot be read or the sampling does not fit.
     pub fn open(&self, sampling: &Sampling) -> Result<Box<dyn ExposureSource>> {
-        if !(1..=MAX_INSTANTS).contains(&sampling.instants) {
+        if !(1..=EXPOSURE_INSTANTS).contains(&sampling.instants) {
             return Err(SimError::request(
                 format!("{} instants per exposure", sampling.instants),
                 "instants",
@@ -222,8 +221,7 @@ impl Input {
             Self::Npy { path } => Box::new(NpyFrames::open(path, transfer, sampling.white)?),
             Self::Video { path } => Box::new(Video::open(path, transfer)?),
             Self::Y4m { path } => {
-                let file =
-                    File::open(path).map_err(|e| SimError::io("open the Y4M file", path, e))?;
+                let file = open_regular(path, "open the Y4M file")?;
                 Box::new(Y4m::open(BufReader::with_capacity(1 << 18, file), path, transfer)?)
             }
             Self::Pipe { spool } => {

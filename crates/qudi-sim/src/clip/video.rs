@@ -4,6 +4,7 @@ use super::FrameReader;
 use super::ppm::PpmStream;
 use qudi_core::Transfer;
 use qudi_core::{Frame, Size};
+use qudi_core::regular_file::open_regular;
 use qudi_core::{Result, SimError};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -31,8 +32,8 @@ impl Video {
     /// # Errors
     /// [`SimError`] if `ffmpeg` is missing or cannot decode it.
     pub fn open(path: &Path, transfer: Transfer) -> Result<Self> {
-        // Opened here first, so that a missing file is not reported by ffmpeg.
-        File::open(path).map_err(|e| SimError::io("open the video", path, e))?;
+        // Opened here first, so that ffmpeg neither reports a missing file nor waits for a pipe.
+        open_regular(path, "open the video")?;
         let scratch = |e| SimError::io("make a temporary file for ffmpeg's messages", path, e);
         let mut words = tempfile::tempfile().map_err(scratch)?;
         // `file:` keeps ffmpeg from taking the name for a URL or an option.

@@ -3,14 +3,12 @@
 use super::FrameReader;
 use qudi_core::Transfer;
 use qudi_core::{Frame, Size};
+use qudi_core::limits::VIDEO_FRAME_BYTES;
 use qudi_core::{Result, SimError};
 use std::cell::Cell;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
-
-/// Bytes that one frame may claim.
-const MAX_FRAME_BYTES: usize = 1 << 30;
 
 /// Counts the bytes that the decoder takes: it reports a cut-off frame as a plain end.
 struct Counted<R> {
@@ -42,7 +40,7 @@ impl<R: Read> Y4m<R> {
     pub(super) fn open(reader: R, path: &Path, transfer: Transfer) -> Result<Self> {
         let bytes = Rc::new(Cell::new(0));
         let reader = Counted { inner: reader, bytes: Rc::clone(&bytes) };
-        let limits = y4m::Limits { bytes: MAX_FRAME_BYTES };
+        let limits = y4m::Limits { bytes: VIDEO_FRAME_BYTES };
         let decoder =
             y4m::Decoder::new_with_limits(reader, limits).map_err(|e| damaged(path, &e))?;
         let size =
@@ -64,7 +62,7 @@ fn contains(text: &[u8], word: &[u8]) -> bool {
 fn damaged(path: &Path, e: &y4m::Error) -> SimError {
     let what = match e {
         y4m::Error::EOF => "the stream is empty or ends inside a frame".to_owned(),
-        y4m::Error::OutOfMemory => format!("a frame of more than {MAX_FRAME_BYTES} bytes"),
+        y4m::Error::OutOfMemory => format!("a frame of more than {VIDEO_FRAME_BYTES} bytes"),
         y4m::Error::IoError(e) => format!("cannot read the stream: {e}"),
         other => format!("not a readable Y4M stream: {other}"),
     };
