@@ -22,6 +22,12 @@ pub const TEXT_BYTES: u64 = 1 << 20;
 /// one line a frame at most.
 pub const RECORD_BYTES: u64 = 1 << 24;
 
+/// The most bytes of a weight file: the paper's network has 0.2 GiB.
+pub const WEIGHT_BYTES: u64 = 4 << 30;
+
+/// The most bytes of one entry in a pack of training clips: an image of 64 megapixels has fewer.
+pub const PACK_ENTRY_BYTES: u64 = 64 << 20;
+
 /// The most bytes of an index of another program that lists every frame (`transforms.json` of visionsim).
 pub const INDEX_BYTES: u64 = 1 << 28;
 

@@ -31,15 +31,13 @@ use crate::frames::{CountFrames, memory};
 use pipe::{FIRST_WINDOW, STDIN};
 use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
+use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Result, SimError};
 use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use view::View;
-
-/// Frames looked at for statistics at most.
-pub const MAX_SAMPLE_FRAMES: u64 = 1000;
 
 /// A capture, read as output frames: turned, cropped, summed, repaired.
 pub struct Capture {
@@ -463,7 +461,7 @@ impl Capture {
     /// the same place in theirs, since lamps flicker; or the first frames, where going through the
     /// whole file would take long.
     pub fn sample_frames(&self) -> Vec<u64> {
-        let sampled = self.frames().min(MAX_SAMPLE_FRAMES);
+        let sampled = self.frames().min(SAMPLE_FRAMES);
         if self.forward_only() {
             return (0..sampled).collect();
         }

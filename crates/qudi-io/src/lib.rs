@@ -4,7 +4,6 @@
 pub mod capture;
 pub mod codec;
 pub mod frames;
-mod regular_file;
 pub mod restore;
 pub mod sidecar;
 pub mod writer;

@@ -4,6 +4,8 @@ use crate::capture::ReadOptions;
 use crate::writer::BurstFormat;
 use qudi_core::Light;
 use qudi_core::Size;
+use qudi_core::limits::RECORD_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Result, SimError};
 use qudi_sim::Simulation;
@@ -12,9 +14,6 @@ use std::path::{Path, PathBuf};
 
 /// Version of this layout.
 pub const VERSION: u32 = 1;
-
-/// Records are a few pages of JSON; anything much larger is something else.
-const MAX_FILE: u64 = 1 << 24;
 
 /// Where the record of the file at `path` lies: `NAME.npy.json` beside `NAME.npy`.
 pub fn beside(path: &Path) -> PathBuf {
@@ -180,16 +179,7 @@ pub(crate) fn contradiction(recorded: &str, found: &str, path: &Path) -> SimErro
 }
 
 fn read_file(path: &Path) -> Result<Vec<u8>> {
-    let read = |e| SimError::io("read the record", path, e);
-    let length = std::fs::metadata(path).map_err(read)?.len();
-    if length > MAX_FILE {
-        return Err(SimError::data(
-            format!("a record of {length} bytes"),
-            path,
-            "name the .json beside a burst",
-        ));
-    }
-    std::fs::read(path).map_err(read)
+    read_limited(path, RECORD_BYTES, "read the record")
 }
 
 fn parse<T: serde::de::DeserializeOwned>(bytes: &[u8], path: &Path) -> Result<T> {

@@ -5,6 +5,8 @@ use crate::network::{Qudi, fill, parameters};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Tensor, f16};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::limits::WEIGHT_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_core::{Result, SimError};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -13,9 +15,6 @@ use std::path::Path;
 
 /// The key of the description among a file's metadata.
 const KEY: &str = "qudi";
-
-/// Largest file that is read: the paper's network has 0.2 GiB.
-const LARGEST: u64 = 4 << 30;
 
 /// What a weight file says about itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -172,16 +171,7 @@ struct File {
 
 impl File {
     fn open(path: &Path) -> Result<Self> {
-        let failed = |e| SimError::io("read the weights", path, e);
-        let length = std::fs::metadata(path).map_err(failed)?.len();
-        if length > LARGEST {
-            return Err(SimError::data(
-                format!("{length} bytes are too many for weights"),
-                path,
-                "name a file that `qudi train` wrote",
-            ));
-        }
-        let bytes = std::fs::read(path).map_err(failed)?;
+        let bytes = read_limited(path, WEIGHT_BYTES, "read the weights")?;
         let description = description(&bytes, path)?;
         Ok(Self { bytes, description })
     }

@@ -2,14 +2,13 @@
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 use crate::loss::lpips::PerceptualKind;
+use qudi_core::limits::TEXT_BYTES;
+use qudi_core::regular_file::read_text;
 use qudi_core::{Result, SimError};
 use qudi_kernels::ComputePrecision;
 use qudi_model::config::{NetworkConfig, PRESETS};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-
-/// Recipes are a page long; anything much larger is something else.
-const LARGEST: u64 = 1 << 20;
 
 /// A recipe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -293,15 +292,8 @@ fn read(name: &str) -> Result<String> {
         }
         _ => SimError::io("read the recipe", path, e),
     };
-    let length = std::fs::metadata(path).map_err(failed)?.len();
-    if length > LARGEST {
-        return Err(SimError::data(
-            format!("a recipe of {length} bytes"),
-            path,
-            "name a .toml file",
-        ));
-    }
-    std::fs::read_to_string(path).map_err(failed)
+    std::fs::metadata(path).map_err(failed)?;
+    read_text(path, TEXT_BYTES, "read the recipe")
 }
 
 /// Former names of keys and their names now; both are read (`#[serde(alias)]` on the fields).

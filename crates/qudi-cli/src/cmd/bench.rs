@@ -7,9 +7,11 @@ use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::memory::Peak;
 use crate::report::Report;
+use qudi_core::limits::RECORD_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Light, SimError};
+use qudi_core::{Camera, Light};
 use qudi_io::capture::Capture;
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use serde::{Deserialize, Serialize};
@@ -20,9 +22,6 @@ use std::time::Instant;
 
 /// The clip's mean image value, close enough for a benchmark.
 const EXPOSURE: f64 = 0.45;
-
-/// Results files are short.
-const MAX_FILE: u64 = 1 << 24;
 
 /// Figures of one method.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -122,11 +121,7 @@ pub(crate) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Acquisition)> {
 }
 
 fn load(path: &Path) -> Result<Results> {
-    let read = |e| SimError::io("read the old results", path, e);
-    if std::fs::metadata(path).map_err(read)?.len() > MAX_FILE {
-        return Err(Fault::new("a file of more than 16 MiB", path.display(), "name old results"));
-    }
-    let text = std::fs::read(path).map_err(read)?;
+    let text = read_limited(path, RECORD_BYTES, "read the old results")?;
     serde_json::from_slice(&text).map_err(|e| {
         Fault::new(
             format!("not the results of a benchmark: {e}"),

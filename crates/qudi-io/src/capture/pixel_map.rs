@@ -1,13 +1,14 @@
 //! Which pixels of a capture are bad, and how dark each one is: from files, or from the capture.
 
+use super::Capture;
 use super::options::{MaskChoice, ReadOptions};
-use super::{Capture, MAX_SAMPLE_FRAMES};
 use crate::codec::read_mat_map;
-use crate::regular_file;
 use qudi_core::Frame;
 use qudi_core::Transfer;
 use qudi_core::bad_pixels::{BadPixels, Repair};
+use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::npy::read_image;
+use qudi_core::regular_file::require_regular;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Result, SimError};
 use qudi_sim::clip::read_still;
@@ -76,7 +77,7 @@ fn find(capture: &mut Capture) -> Result<BadPixels> {
     let mut sums = vec![0u32; size.pixels()];
     let mut one = vec![0u32; size.pixels()];
     let sampled = capture.sample_frames();
-    debug_assert!(sampled.len() as u64 <= MAX_SAMPLE_FRAMES);
+    debug_assert!(sampled.len() as u64 <= SAMPLE_FRAMES);
     for &frame in &sampled {
         capture.stored_total(frame..frame + 1, &mut one)?;
         for (sum, one) in sums.iter_mut().zip(&one) {
@@ -112,7 +113,7 @@ fn load(capture: &Capture, path: &Path) -> Result<Frame> {
 }
 
 fn read(path: &Path) -> Result<Frame> {
-    regular_file::require(path)?;
+    require_regular(path, "read the map")?;
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match extension.as_str() {
         "npy" => read_image(path),

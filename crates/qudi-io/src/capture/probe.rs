@@ -1,6 +1,7 @@
 //! A first look at a path, shared by all formats that try to recognise it.
 
 use super::raw_sample::RawSample;
+use qudi_core::limits::FOLDER_FILES;
 use qudi_core::natural_order::natural_order;
 use qudi_core::{Result, SimError};
 use std::cell::OnceCell;
@@ -13,9 +14,6 @@ const HEAD: u64 = 4096;
 
 /// Bytes looked at from the middle of a file.
 const SAMPLE: u64 = 1 << 20;
-
-/// No capture has more files.
-const MOST_FILES: usize = 4_000_000;
 
 /// SwissSPAD2 spreads its files over two levels of folders.
 const DEPTH: usize = 3;
@@ -160,9 +158,9 @@ fn list(folder: &Path, depth: usize, listing: &mut Listing) -> Result<()> {
             // A named pipe would keep the reader waiting for ever.
             listing.skipped.push(path);
         }
-        if listing.files.len() > MOST_FILES {
+        if listing.files.len() > FOLDER_FILES {
             return Err(SimError::data(
-                format!("more than {MOST_FILES} files"),
+                format!("more than {FOLDER_FILES} files"),
                 folder,
                 "name the folder of one capture",
             ));

@@ -9,7 +9,7 @@ use qudi_core::sensor::{CountLaw, DarkRate, Response, Sensor};
 use qudi_core::{Frame, Size};
 use serde::Serialize;
 
-/// Statistics of at most [`MAX_SAMPLE_FRAMES`](super::MAX_SAMPLE_FRAMES) output frames.
+/// Statistics of at most [`SAMPLE_FRAMES`](qudi_core::limits::SAMPLE_FRAMES) output frames.
 #[derive(Clone, Debug)]
 pub struct Summary {
     /// Frames looked at.

@@ -8,9 +8,9 @@ use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use crate::frames::samples::{Scale, no_count};
-use crate::regular_file;
 use image::DynamicImage;
 use qudi_core::Size;
+use qudi_core::regular_file::require_regular;
 use qudi_core::{Result, SimError};
 use qudi_sim::clip::decode_image;
 use std::fs::File;
@@ -92,7 +92,7 @@ pub(crate) fn open_files(
         ));
     };
     for file in &files {
-        regular_file::require(file)?;
+        require_regular(file, "open the image")?;
     }
     let (size, samples, full) = gray(first)?;
     if lossy(first) {

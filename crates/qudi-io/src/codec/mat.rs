@@ -10,6 +10,8 @@ use crate::capture::probe::{Probe, stem};
 use crate::codec::mat::file::{MatArray, arrays, is_level_5};
 use crate::frames::CountFrames;
 use crate::frames::chain::Chain;
+use qudi_core::limits::RECORD_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_core::{Result, SimError};
 use std::path::{Path, PathBuf};
 
@@ -84,7 +86,7 @@ fn check_info(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<()> {
-    let Ok(text) = std::fs::read(path) else { return Ok(()) };
+    let Ok(text) = read_limited(path, RECORD_BYTES, "read the notes") else { return Ok(()) };
     let Ok(noted) = serde_json::from_slice::<serde_json::Value>(&text) else {
         info.notes.push("info.json is not JSON: ignored".to_owned());
         return Ok(());

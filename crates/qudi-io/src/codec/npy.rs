@@ -7,11 +7,12 @@ use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::Opener;
-use crate::regular_file;
 use crate::sidecar::{self, BurstLayout, Sidecar};
 use crate::writer::BurstFormat;
 use flate2::read::MultiGzDecoder;
+use qudi_core::limits::DEFLATE_RATIO;
 use qudi_core::npy::Header;
+use qudi_core::regular_file::open_regular;
 use qudi_core::sensor::{Response, preset};
 use qudi_core::{Result, SimError};
 use std::fs::File;
@@ -46,12 +47,9 @@ pub(crate) const COMPRESSED: Format = Format {
     open: |probe, options, info| open_gzip(probe, options, info),
 };
 
-/// Deflate never shrinks data by more than this.
-pub(crate) const MOST_COMPRESSION: u64 = 1032;
-
 /// A `.npy` file as an array; sizes are checked by [`Array::open`].
 pub(crate) fn open_array(path: &Path) -> Result<Array> {
-    let file = regular_file::open(path)?;
+    let file = open_regular(path, "open the file")?;
     let length = file.metadata().map_err(|e| SimError::io("open", path, e))?.len();
     let header = Header::read(&mut BufReader::new(file), path)?;
     let place = Place::File {
@@ -98,7 +96,7 @@ fn open_gzip(
 
 /// Refuses a header that promises more than its compressed bytes can hold.
 pub(crate) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Result<()> {
-    let most = compressed.saturating_mul(MOST_COMPRESSION);
+    let most = compressed.saturating_mul(DEFLATE_RATIO);
     match header.data_bytes() {
         Some(bytes) if bytes <= most => Ok(()),
         _ => Err(SimError::data(

@@ -10,6 +10,8 @@ use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use qudi_core::Size;
+use qudi_core::limits::INDEX_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_core::{Result, SimError};
 use serde::Deserialize;
 use std::path::{Component, Path, PathBuf};
@@ -24,9 +26,6 @@ pub(crate) const FORMAT: Format = Format {
     },
     open,
 };
-
-/// Lists of camera poses are long; longer ones are something else.
-const MAX_FILE: u64 = 1 << 28;
 
 #[derive(Deserialize)]
 struct Transforms {
@@ -58,7 +57,6 @@ fn open(
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let path = document(probe);
-    let io = |e| SimError::io("read", &path, e);
     let fault = |what: String| {
         SimError::data(
             what,
@@ -66,10 +64,7 @@ fn open(
             "write the data set again with visionsim, or name the .npy itself",
         )
     };
-    if std::fs::metadata(&path).map_err(io)?.len() > MAX_FILE {
-        return Err(fault("a transforms.json of more than 256 MiB".to_owned()));
-    }
-    let bytes = std::fs::read(&path).map_err(io)?;
+    let bytes = read_limited(&path, INDEX_BYTES, "read the list of frames")?;
     let transforms: Transforms = serde_json::from_slice(&bytes)
         .map_err(|e| fault(format!("not visionsim's transforms.json: {e}")))?;
     let folder = path.parent().unwrap_or(Path::new("."));

@@ -6,6 +6,8 @@ use super::lock::{FolderLock, Share};
 use crate::writer::{frame_name, is_frame_name, save_png16};
 use qudi_core::Transfer;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::limits::RECORD_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
 use qudi_sim::clip::read_still;
@@ -16,9 +18,6 @@ use std::path::{Path, PathBuf};
 
 /// The manifest's name; it also marks a folder as ours.
 pub const MANIFEST: &str = "manifest.json";
-
-/// Manifests are short; anything much larger is something else.
-const MAX_MANIFEST: u64 = 1 << 24;
 
 /// Describes the run that writes a folder, as the manifest notes it.
 #[derive(Clone, Debug)]
@@ -204,14 +203,9 @@ impl FrameFolder {
 }
 
 fn read_manifest(path: &Path) -> Result<Value> {
-    let read = |e| SimError::io("read the manifest", path, e);
     let fault =
         |what: String| SimError::data(what, path, "choose another output, or remove it yourself");
-    let length = std::fs::metadata(path).map_err(read)?.len();
-    if length > MAX_MANIFEST {
-        return Err(fault(format!("a manifest of {length} bytes")));
-    }
-    let text = std::fs::read(path).map_err(read)?;
+    let text = read_limited(path, RECORD_BYTES, "read the manifest")?;
     let manifest: Value =
         serde_json::from_slice(&text).map_err(|e| fault(format!("not a manifest: {e}")))?;
     let ours = manifest["program"].as_str().is_some_and(|program| program.starts_with("qudi "))

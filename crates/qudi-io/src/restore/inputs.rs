@@ -42,7 +42,7 @@ impl Fingerprint {
     /// [`SimError`] if it cannot be read, or is neither a regular file nor a folder.
     pub fn of(path: &Path) -> Result<Self> {
         if !path.is_dir() {
-            crate::regular_file::require(path)?;
+            qudi_core::regular_file::require_regular(path, "read the input")?;
         }
         let mut files = Vec::new();
         list(path, DEPTH, &mut files)?;

@@ -2,9 +2,9 @@
 
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits};
 use qudi_core::Transfer;
-use qudi_core::{Frame, Size};
 use qudi_core::limits::IMAGE_PIXELS;
 use qudi_core::regular_file::open_regular;
+use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
 use std::io::BufReader;
 use std::path::Path;
@@ -39,7 +39,9 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
     let (width, height) = decoder.dimensions();
     if u64::from(width) * u64::from(height) > IMAGE_PIXELS {
         return Err(SimError::data(
-            format!("an image of {height} x {width} pixels is over the limit of {IMAGE_PIXELS} pixels"),
+            format!(
+                "an image of {height} x {width} pixels is over the limit of {IMAGE_PIXELS} pixels"
+            ),
             path,
             "cut it into smaller images",
         ));
@@ -117,4 +119,42 @@ pub(super) fn check_values(data: &[f32], path: &Path) -> Result<()> {
         path,
         "replace missing values; for other scales give the value of white, such as 255",
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A PNG whose header claims `side` x `side` gray pixels, without any.
+    fn empty_png(side: u32) -> Vec<u8> {
+        let mut header = b"IHDR".to_vec();
+        header.extend(side.to_be_bytes());
+        header.extend(side.to_be_bytes());
+        header.extend([8, 0, 0, 0, 0]);
+        let mut png = b"\x89PNG\r\n\x1a\n".to_vec();
+        for chunk in [header.as_slice(), b"IDAT"] {
+            png.extend((chunk.len() as u32 - 4).to_be_bytes());
+            png.extend(chunk);
+            png.extend(crc32fast::hash(chunk).to_be_bytes());
+        }
+        png
+    }
+
+    #[test]
+    fn refuses_images_of_too_many_pixels_before_decoding() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("bomb.png");
+        std::fs::write(&path, empty_png(20_000)).unwrap();
+        let error = decode_image(&path).unwrap_err().to_string();
+        assert!(error.contains("over the limit of 134217728 pixels"), "{error}");
+        std::fs::write(&path, empty_png(20)).unwrap();
+        assert!(decode_image(&path).unwrap_err().to_string().contains("not a readable image"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn refuses_devices() {
+        let error = decode_image(Path::new("/dev/zero")).unwrap_err().to_string();
+        assert_eq!(error, "cannot open the image: not a regular file");
+    }
 }

@@ -73,3 +73,19 @@ impl FrameReader for ImageFolder {
 fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn skips_attribute_files_of_macos() {
+        let folder = tempfile::tempdir().unwrap();
+        let image = image::GrayImage::from_pixel(3, 2, image::Luma([51]));
+        image.save(folder.path().join("a.png")).unwrap();
+        std::fs::write(folder.path().join("._a.png"), b"\0\x05\x16\x07").unwrap();
+        let mut clip = ImageFolder::open(folder.path(), Transfer::AsIs).unwrap();
+        assert_eq!((clip.frames(), clip.size()), (Some(1), Size { height: 2, width: 3 }));
+        assert_eq!(clip.next().unwrap().unwrap().data, [0.2; 6]);
+    }
+}

@@ -201,7 +201,7 @@ impl Input {
             return Err(SimError::request(
                 format!("{} instants per exposure", sampling.instants),
                 "instants",
-                format!("between 1 (no motion during an exposure) and {MAX_INSTANTS}"),
+                format!("between 1 (no motion during an exposure) and {EXPOSURE_INSTANTS}"),
             ));
         }
         if let Some(white) = sampling.white

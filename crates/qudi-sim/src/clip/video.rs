@@ -3,8 +3,8 @@
 use super::FrameReader;
 use super::ppm::PpmStream;
 use qudi_core::Transfer;
-use qudi_core::{Frame, Size};
 use qudi_core::regular_file::open_regular;
+use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};

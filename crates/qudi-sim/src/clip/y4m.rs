@@ -2,8 +2,8 @@
 
 use super::FrameReader;
 use qudi_core::Transfer;
-use qudi_core::{Frame, Size};
 use qudi_core::limits::VIDEO_FRAME_BYTES;
+use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
 use std::cell::Cell;
 use std::io::Read;

@@ -1,6 +1,7 @@
 //! Decoded training data in one file: a ZIP archive of gray 8-bit PNG images with an index, which any tool opens.
 
 use image::{ImageFormat, ImageReader, Limits};
+use qudi_core::limits::PACK_ENTRY_BYTES;
 use qudi_core::{Frame, Size};
 use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
@@ -13,8 +14,6 @@ use zip::ZipArchive;
 pub(super) const INDEX: &str = "index.json";
 /// Version of the layout.
 pub(super) const VERSION: u32 = 1;
-/// Larger indices and images are damage: an image of 64 Mpixel has fewer bytes.
-const LARGEST_ENTRY: u64 = 64 << 20;
 
 /// A clip, or a still, in a pack.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -124,7 +123,7 @@ impl Pack {
 fn entry(archive: &mut ZipArchive<BufReader<File>>, name: &str, path: &Path) -> Result<Vec<u8>> {
     let entry = archive.by_name(name).map_err(|e| damaged(path, format!("{name}: {e}")))?;
     let mut bytes = Vec::new();
-    let mut limited = entry.take(LARGEST_ENTRY);
+    let mut limited = entry.take(PACK_ENTRY_BYTES);
     limited.read_to_end(&mut bytes).map_err(|e| damaged(path, format!("{name}: {e}")))?;
     Ok(bytes)
 }

@@ -6,22 +6,14 @@
 //! panic, no abort and no hang.
 
 use hdf5_pure::{Dataset, File, FormatError, Group, Layout, Source};
+use qudi_core::limits::{
+    HDF5_BYTES_AT_ONCE, HDF5_CHUNK_BYTES, HDF5_CHUNKS, HDF5_DEPTH, HDF5_OBJECTS,
+};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::sync::atomic::AtomicU64;
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, Mutex, PoisonError};
-
-/// Bytes of the largest chunk.
-const MOST_CHUNK: u64 = 1 << 28;
-/// Chunks of one dataset.
-const MOST_CHUNKS: u64 = 1 << 22;
-/// Bytes read at once.
-const MOST_AT_ONCE: u64 = 1 << 30;
-/// Groups and datasets of one file.
-const MOST_OBJECTS: usize = 1_000_000;
-/// Groups inside groups.
-const MOST_DEPTH: u32 = 16;
 
 #[derive(Default)]
 struct Budget {
@@ -121,7 +113,7 @@ impl Hdf5 {
     /// Calls `f` with the path and handle of every dataset.
     pub(crate) fn walk(&self, f: &mut dyn FnMut(String, Dataset)) -> Words<()> {
         self.refill();
-        let mut left = MOST_OBJECTS;
+        let mut left = HDF5_OBJECTS;
         walk(&self.file.root(), "", 0, &mut left, f)
     }
 
@@ -160,12 +152,12 @@ impl Hdf5 {
         let mut group = 1;
         if let Layout::Chunked { chunk_shape, .. } = dataset.layout().map_err(words)? {
             let chunk = product(&chunk_shape, element)?;
-            if chunk == 0 || chunk > MOST_CHUNK || chunk_shape.len() != shape.len() {
+            if chunk == 0 || chunk > HDF5_CHUNK_BYTES || chunk_shape.len() != shape.len() {
                 return Err(format!("chunks of {chunk} bytes, shape {chunk_shape:?}"));
             }
             let along = shape.iter().zip(&chunk_shape).map(|(d, c)| d.div_ceil(*c));
             let chunks = product(&along.collect::<Vec<_>>(), 1)?;
-            if chunks > MOST_CHUNKS {
+            if chunks > HDF5_CHUNKS {
                 return Err(format!("{chunks} chunks"));
             }
             for stored in dataset.chunks().map_err(words)? {
@@ -185,7 +177,8 @@ impl Hdf5 {
     /// Entries `first..first + count` of the first axis, in stored byte order.
     pub(crate) fn rows(&self, checked: &Checked, first: u64, count: u64) -> Words<Vec<u8>> {
         let there = checked.shape.first().copied().unwrap_or(1);
-        let bytes = count.checked_mul(checked.row_bytes).filter(|&bytes| bytes <= MOST_AT_ONCE);
+        let bytes =
+            count.checked_mul(checked.row_bytes).filter(|&bytes| bytes <= HDF5_BYTES_AT_ONCE);
         let Some(bytes) =
             bytes.filter(|_| first.checked_add(count).is_some_and(|end| end <= there))
         else {
@@ -204,10 +197,10 @@ fn walk(
     left: &mut usize,
     f: &mut dyn FnMut(String, Dataset),
 ) -> Words<()> {
-    if depth > MOST_DEPTH {
+    if depth > HDF5_DEPTH {
         return Ok(());
     }
-    let many = || format!("more than {MOST_OBJECTS} groups and datasets");
+    let many = || format!("more than {HDF5_OBJECTS} groups and datasets");
     for (name, dataset) in group.iter_datasets().map_err(words)? {
         *left = left.checked_sub(1).ok_or_else(many)?;
         f(format!("{at}/{name}"), dataset);

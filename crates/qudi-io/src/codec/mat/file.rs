@@ -6,6 +6,7 @@
 
 use crate::frames::frame_bytes::Opener;
 use flate2::read::ZlibDecoder;
+use qudi_core::limits::{ARRAY_HEADER_BYTES, DEFLATE_RATIO, MAT_VARIABLES};
 use qudi_core::npy::Sample;
 use qudi_core::{Result, SimError};
 use std::fs::File;
@@ -14,12 +15,6 @@ use std::path::Path;
 
 const MATRIX: u32 = 14;
 const COMPRESSED: u32 = 15;
-
-/// Variables of one file: more is damage.
-const MOST_VARIABLES: usize = 4096;
-
-/// Dimensions and names are short.
-const MOST_HEADER: usize = 1 << 16;
 
 /// A numeric array in a `.mat` file.
 #[derive(Clone, Debug)]
@@ -45,7 +40,7 @@ impl MatArray {
 
     /// Refuses an array that its bytes in the file cannot hold, however well compressed.
     pub(crate) fn refuse_bomb(&self, path: &Path) -> Result<()> {
-        if self.bytes <= self.element.1.saturating_mul(crate::codec::npy::MOST_COMPRESSION) {
+        if self.bytes <= self.element.1.saturating_mul(DEFLATE_RATIO) {
             return Ok(());
         }
         Err(damaged(
@@ -106,8 +101,8 @@ pub(crate) fn arrays(path: &Path) -> Result<Vec<MatArray>> {
     let mut found = Vec::new();
     let mut at = 128u64;
     while at + 8 <= length {
-        if found.len() >= MOST_VARIABLES {
-            return Err(damaged(format!("more than {MOST_VARIABLES} variables"), path));
+        if found.len() >= MAT_VARIABLES {
+            return Err(damaged(format!("more than {MAT_VARIABLES} variables"), path));
         }
         let mut tag = [0u8; 8];
         file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut tag)).map_err(io)?;
@@ -184,7 +179,7 @@ impl Elements<'_> {
         if let Some(data) = data {
             return Ok((kind, data));
         }
-        if bytes > MOST_HEADER as u64 {
+        if bytes > ARRAY_HEADER_BYTES as u64 {
             return Err(damaged(format!("a header element of {bytes} bytes"), self.path));
         }
         let mut data = self.take((bytes as usize).next_multiple_of(8))?;
