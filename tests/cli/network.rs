@@ -165,7 +165,7 @@ fn the_usual_method_follows_the_capture() {
         String::from_utf8_lossy(&output.stdout).into_owned()
     };
     let cases = [
-        ("--ppp 3.25", 4, "by qudi on cpu"),
+        ("--ppp 3.25", 4, "by qudi (regression) on cpu"),
         ("--sensor spad512s --sum 7 --ppp 3.25", 4, "by qudi"),
         ("--sensor qis16-gj --ppp 3.25", 4, "by qbp-refined"),
         ("--ppp 3.25", 2, "by qbp-refined"),

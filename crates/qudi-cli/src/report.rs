@@ -4,10 +4,12 @@
 
 mod console;
 pub(crate) mod csv;
+pub(crate) mod html;
 pub(crate) mod json;
 pub(crate) mod markdown;
 mod output;
 mod printable;
+pub(crate) mod svg;
 mod table;
 
 pub(crate) use console::{Bar, Report, print};

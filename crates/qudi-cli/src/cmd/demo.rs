@@ -6,11 +6,11 @@ use crate::cmd::demo_html::html;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
 use crate::interrupt;
-use crate::report::{Bar, Cell, Column, Report, Table, json};
+use crate::report::{Bar, Cell, Column, Output, Report, Table, json};
 use crate::settings::Settings;
 use qudi_burst::Average;
 use qudi_burst::{PostFilter, Qbp, QbpRefined};
-use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::atomic_file::Overwrite;
 use qudi_core::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
@@ -26,24 +26,33 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 /// Frames of the paper's window, and the one in its middle.
-const FRAMES: usize = 11;
+pub(crate) const FRAMES: usize = 11;
 const CENTRE: usize = FRAMES / 2;
 const SIZE: Size = Size { height: 256, width: 256 };
 
 /// Errors and uncertainty are shown this many times brighter than images.
-const ERROR_GAIN: f32 = 4.0;
+pub(crate) const ERROR_GAIN: f32 = 4.0;
 
-/// Bursts drawn from the result for its uncertainty, where the method does not tell it.
+/// Bursts drawn from the result for its uncertainty, where the method does not predict one.
 const REDRAWN: u64 = 4;
 
-/// What the uncertainty is: of methods that tell it, and of others.
-const TOLD: &str = "it expects, without the truth,";
-const REDRAWN_TELLS: &str = "where photons are drawn again from its result, it varies by";
+/// Where the uncertainty comes from: for the console, and for the page.
+type Origin = [&'static str; 2];
+const PREDICTED: Origin = [
+    "it predicts, without the truth,",
+    "the standard deviation of its errors that the method predicts",
+];
+const BOOTSTRAP: Origin = [
+    "where photons are drawn again from its result, it varies by",
+    "how its result varies where photons are drawn again from that result",
+];
 
 /// What a method made of the centre frame.
 pub(crate) struct Shown {
     label: &'static str,
     pub(crate) name: &'static str,
+    /// How it makes frames.
+    pub(crate) how: String,
     frame: Frame,
     pub(crate) psnr_a: f64,
     pub(crate) psnr: f64,
@@ -65,6 +74,7 @@ pub(crate) fn run(
     }
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
+    let page_file = Output::open(Some(&page), overwrite)?;
     let sensor = settings.sensor(&demo.sensor)?;
     let mut bar = report.bar();
     let truths = render(&mut bar);
@@ -84,13 +94,23 @@ pub(crate) fn run(
         dark: None,
     };
     let truth = &truths[CENTRE];
-    let mut methods: Vec<(&str, Box<dyn Restorer>)> = vec![
-        ("AVERAGE OF 11", Box::new(Average)),
-        ("QBP + BM3D", Box::new(Qbp::new(PostFilter::Bm3d))),
-        ("QBP REFINED", Box::new(QbpRefined)),
+    let how = |how: &str| how.to_owned();
+    let mut methods: Vec<(&str, Box<dyn Restorer>, String)> = vec![
+        ("AVERAGE OF 11", Box::new(Average), how("the mean of all frames, without motion")),
+        (
+            "QBP + BM3D",
+            Box::new(Qbp::new(PostFilter::Bm3d)),
+            how("frames aligned and merged patch by patch, then BM3D on every frame"),
+        ),
+        (
+            "QBP REFINED",
+            Box::new(QbpRefined),
+            how("a burst merged twice, the second time along better motion"),
+        ),
     ];
     if demo.network.weights.is_some() || network::built_in_knows(&acquisition)? {
-        methods.push(("QUDI", network::restorer(&demo.network, &acquisition, SIZE)?.0));
+        let (restorer, how) = network::restorer(&demo.network, &acquisition, SIZE)?;
+        methods.push(("QUDI", restorer, format!("the network{how}")));
     } else {
         report.remark(
             "note: the built-in weights do not know this sensor or light; the other methods do",
@@ -99,7 +119,7 @@ pub(crate) fn run(
     let mut shown = Vec::new();
     let mut last = Restored { frames: Vec::new(), std: None };
     let count = methods.len() as u64;
-    for (done, (label, method)) in (1..).zip(&mut methods) {
+    for (done, (label, method, how)) in (1..).zip(&mut methods) {
         let start = Instant::now();
         let view = BurstView { size: SIZE, frames: &burst };
         last = method.restore(view, &acquisition)?;
@@ -107,6 +127,7 @@ pub(crate) fn run(
         shown.push(Shown {
             label,
             name: method.name(),
+            how: how.clone(),
             psnr_a: gain_aligned_psnr(&frame, truth),
             psnr: psnr(&frame, truth),
             ssim: ssim(&frame, truth).unwrap_or(f64::NAN),
@@ -116,24 +137,24 @@ pub(crate) fn run(
         bar.update("restoring", done, Some(count));
         stop_if_asked()?;
     }
-    let (deviation, source) = if let Some(mut deviations) = last.std {
-        (deviations.swap_remove(CENTRE), TOLD)
+    let (deviation, [origin, explained]) = if let Some(mut deviations) = last.std {
+        (deviations.swap_remove(CENTRE), PREDICTED)
     } else {
-        let (_, method) = methods.last_mut().expect("there are three at least");
-        (redrawn(method.as_mut(), &last.frames, &acquisition, &mut bar)?, REDRAWN_TELLS)
+        let (_, method, _) = methods.last_mut().expect("there are three at least");
+        (redrawn(method.as_mut(), &last.frames, &acquisition, &mut bar)?, BOOTSTRAP)
     };
     drop(bar);
 
     let picture = picture(&shown, &burst, &deviation, truth, &sensor, demo.ppp);
     picture.save(&path, overwrite)?;
     let table = table(&shown);
-    let text = table.to_text() + &text(&shown, &deviation, source, truth);
+    let text = table.to_text() + &text(&shown, &deviation, origin, truth);
     let foot = format!(
         "{} at {} photons/pixel/frame, seed {}; psnr in dB, -a after the best gain",
         sensor.name, demo.ppp, demo.seed
     );
     let png = std::fs::read(&path).map_err(|e| SimError::io("read", &path, e))?;
-    PendingFile::write_whole(&page, html(&png, &shown, &foot).as_bytes(), overwrite)?;
+    page_file.write(|| html(&png, &shown, &table, explained, &foot))?;
     let text = format!("{text}\n{}   {foot}\n{}\n", path.display(), page.display());
     report.result(
         &text,
@@ -259,12 +280,12 @@ fn table(shown: &[Shown]) -> Table {
     table
 }
 
-fn text(shown: &[Shown], deviation: &Frame, source: &str, truth: &Frame) -> String {
+fn text(shown: &[Shown], deviation: &Frame, origin: &str, truth: &Frame) -> String {
     let mut text = String::new();
     if let Some(method) = shown.last() {
         let error = rms(&error_map(&method.frame, truth)) / f64::from(ERROR_GAIN);
         let _ =
-            writeln!(text, "\n{} errs by {error:.3}; {source} {:.3}", method.name, rms(deviation));
+            writeln!(text, "\n{} errs by {error:.3}; {origin} {:.3}", method.name, rms(deviation));
     }
     text
 }

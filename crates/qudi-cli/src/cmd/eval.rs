@@ -48,7 +48,7 @@ pub(crate) fn run(
         judge_clips(args, settings, report, overwrite)?
     };
     csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
-    html_file.write(|| Ok(html(&rows, &pictures, &about)))?;
+    html_file.write(|| html(&rows, &pictures, &about))?;
     let table = summary(&rows);
     markdown_file.write(|| Ok(markdown::table(&table)))?;
     let text = format!("{}\n{about}\n", table.to_text());
@@ -142,6 +142,11 @@ fn judge_clips(
                     (None, Protocol::Strict) => exposed.score_method(name, args)?,
                     (None, Protocol::Quiver) => exposed.score_windows(name, args)?,
                 };
+                if args.html.is_some()
+                    && let Some(pictures) = pictures.last_mut()
+                {
+                    pictures.add(name, &score);
+                }
                 rows[j * names.len() + k].scores.push(score);
             }
         }

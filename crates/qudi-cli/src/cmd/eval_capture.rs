@@ -50,17 +50,14 @@ pub(crate) fn judge(args: &Eval, overrides: &Settings, report: &Report) -> Resul
     let full = f32::from(acquisition.sensor.max_count());
     let data = counts.iter().map(|&count| f32::from(count) / full).collect();
     let clip = stem(path);
-    let pictures = vec![Pictures {
-        clip: clip.clone(),
-        ppp: acquisition.ppp,
-        counts: Frame { size: capture.size(), data },
-        truth: None,
-    }];
+    let counts = Frame { size: capture.size(), data };
+    let mut pictures = Pictures::new(clip.clone(), acquisition.ppp, counts, None);
     let mut rows = Vec::new();
     let mut bar = report.bar();
     for (n, name) in args.method.iter().enumerate() {
         bar.update("evaluating", n as u64, Some(args.method.len() as u64));
         let score = score(name, &clip, &mut capture, frames, &acquisition, args)?;
+        pictures.add(name, &score);
         rows.push(Row { method: name.clone(), ppp: acquisition.ppp, scores: vec![score] });
     }
     drop(bar);
@@ -83,7 +80,7 @@ pub(crate) fn judge(args: &Eval, overrides: &Settings, report: &Report) -> Resul
         "exposure": acquisition.exposure,
         "overlap": args.overlap,
     });
-    Ok(Judged { rows, pictures, about, settings })
+    Ok(Judged { rows, pictures: vec![pictures], about, settings })
 }
 
 fn refuse_what_needs_truth(args: &Eval) -> Result<()> {
@@ -130,7 +127,7 @@ fn score(
     };
     let peak = Peak::start();
     let start = Instant::now();
-    let (mut restorer, _) = method(name, capture, acquisition, &args.network)?;
+    let (mut restorer, how) = method(name, capture, acquisition, &args.network)?;
     let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(
@@ -152,6 +149,7 @@ fn score(
         peak_mib: peak.grown_mib(),
         frames: sink.frames,
         picture: sink.picture.unwrap_or(Frame::filled(capture.size(), 0.0)),
+        how,
     })
 }
 

@@ -204,7 +204,7 @@ impl ExposedClip {
             Capture::in_memory(&self.name, self.size, self.kept.counts.clone(), sensor)?;
         let peak = Peak::start();
         let start = Instant::now();
-        let (mut restorer, _) = method(name, &mut capture, &self.acquisition, &args.network)?;
+        let (mut restorer, how) = method(name, &mut capture, &self.acquisition, &args.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, args.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
@@ -221,7 +221,7 @@ impl ExposedClip {
             seconds_per_frame: start.elapsed().as_secs_f64() / sink.0.len() as f64,
             peak_mib: peak.grown_mib(),
         };
-        self.score(&sink.0, Some(cost))
+        self.score(&sink.0, Some(cost), how)
     }
 
     /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
@@ -238,7 +238,7 @@ impl ExposedClip {
         }
         let sensor = &self.acquisition.sensor;
         let (mut frames, mut middles) = (Vec::new(), Vec::new());
-        let (mut seconds, mut highest) = (0.0, None::<f64>);
+        let (mut seconds, mut highest, mut how) = (0.0, None::<f64>, String::new());
         let windows = truth.len() - WINDOW + 1;
         for first in 0..windows {
             if interrupt::check().is_break() {
@@ -257,7 +257,8 @@ impl ExposedClip {
             let peak = Peak::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
-            let (mut restorer, _) = method(name, &mut capture, &acquisition, &args.network)?;
+            let (mut restorer, chosen) = method(name, &mut capture, &acquisition, &args.network)?;
+            how = chosen;
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();
@@ -276,6 +277,7 @@ impl ExposedClip {
             seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
             peak_mib: highest,
             picture,
+            how,
         })
     }
 
@@ -325,10 +327,10 @@ impl ExposedClip {
                 "restore every frame of the burst that --export-photons wrote",
             ));
         }
-        self.score(&frames, None)
+        self.score(&frames, None, " (another program)".to_owned())
     }
 
-    fn score(&self, restored: &[Frame], cost: Option<Cost>) -> Result<Score> {
+    fn score(&self, restored: &[Frame], cost: Option<Cost>, how: String) -> Result<Score> {
         let mut consistency = Consistency::new(self.size, &self.acquisition);
         let mut frames = Vec::with_capacity(restored.len());
         for ((image, truth), counts) in restored.iter().zip(&self.kept.truth).zip(&self.kept.counts)
@@ -349,6 +351,7 @@ impl ExposedClip {
             seconds_per_frame: cost.map(|cost| cost.seconds_per_frame),
             peak_mib: cost.and_then(|cost| cost.peak_mib),
             picture: aligned(&restored[restored.len() / 2], &self.kept.truth[restored.len() / 2]),
+            how,
         })
     }
 }
@@ -359,12 +362,9 @@ impl ExposedClip {
         let middle = self.kept.truth.len() / 2;
         let full = f32::from(self.acquisition.sensor.max_count());
         let counts = self.kept.counts[middle].iter().map(|&count| f32::from(count) / full);
-        Pictures {
-            clip: self.name.clone(),
-            ppp: self.ppp,
-            counts: Frame { size: self.size, data: counts.collect() },
-            truth: Some(self.kept.truth[middle].clone()),
-        }
+        let counts = Frame { size: self.size, data: counts.collect() };
+        let truth = self.kept.truth[middle].clone();
+        Pictures::new(self.name.clone(), self.ppp, counts, Some(truth))
     }
 
     fn flicker(&self, restored: &[Frame]) -> Option<f64> {

@@ -59,6 +59,9 @@ pub(crate) struct Score {
     /// The middle frame; after the best gain where there is a truth.
     #[serde(skip)]
     pub(crate) picture: Frame,
+    /// How the method made it, after its name: ` over 5 frames`, ` (regression) on cpu`.
+    #[serde(skip)]
+    pub(crate) how: String,
 }
 
 /// All scores of one method at one light level.

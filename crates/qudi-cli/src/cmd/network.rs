@@ -16,7 +16,7 @@ use qudi_model::restorer::{QudiRestorer, SampleOptions};
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const TOLERATED: f64 = 10.0;
 
-/// The restorer, and what it runs on.
+/// The restorer, and how it makes frames: by regression or diffusion, and on which device.
 pub(crate) fn restorer(
     options: &Network,
     acquisition: &Acquisition,
@@ -31,12 +31,12 @@ pub(crate) fn restorer(
     let (config, window) = (&description.network, description.window);
     let sampling = sample_options(options);
     let restorer = QudiRestorer::new(network, config, window, sampling, &device.device)?;
-    let steps = match options.steps() {
-        0 => String::new(),
-        1 => " in 1 step".to_owned(),
-        steps => format!(" in {steps} steps"),
+    let way = match options.steps() {
+        0 => "regression".to_owned(),
+        1 => "diffusion in 1 step".to_owned(),
+        steps => format!("diffusion in {steps} steps"),
     };
-    Ok((Box::new(restorer), format!("{steps} on {}", device.name)))
+    Ok((Box::new(restorer), format!(" ({way}) on {}", device.name)))
 }
 
 pub(crate) fn sample_options(options: &Network) -> SampleOptions {

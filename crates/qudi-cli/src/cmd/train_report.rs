@@ -1,139 +1,204 @@
-//! A run's report as one HTML file: curves, the last pictures, recipe, environment. Nothing is fetched.
+//! The page of a training run: curves, the last pictures, recipe, environment.
 
-use crate::cmd::eval_html::escape;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use crate::error::Result;
+use crate::report::html::{TableView, data_url, render};
+use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
+use crate::report::{Cell, Column, Table};
+use serde::Serialize;
 use serde_json::Value;
-use std::fmt::Write;
 
 /// Points of a curve at most: single steps jump, means of neighbours show where it goes.
 const POINTS: usize = 120;
 
-/// Curves of fewer points show them.
-const FEW: usize = 40;
+/// Parts of the loss, by their keys in the metrics.
+const LOSSES: [(&str, &str); 5] = [
+    ("total", "total"),
+    ("prediction", "prediction"),
+    ("pre", "pre-denoiser"),
+    ("perceptual", "perceptual"),
+    ("flow", "flow"),
+];
 
-/// Size of a plot in pixels, and the margins for its numbers.
-const SIZE: [f64; 2] = [680.0, 260.0];
-const MARGIN: [f64; 2] = [64.0, 30.0];
+/// Parts of a step whose time is measured, by their keys in the metrics.
+const TIMES: [(&str, &str); 4] = [
+    ("data_s", "waiting for data"),
+    ("forward_s", "forward"),
+    ("backward_s", "backward"),
+    ("optimizer_s", "optimizer"),
+];
 
-const COLOURS: [&str; 6] = ["#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b"];
-
-/// A named curve.
-struct Curve {
-    name: String,
-    points: Vec<(f64, f64)>,
+/// The files of a run that its page is made of.
+pub(crate) struct Source<'a> {
+    /// One JSON document a line.
+    pub(crate) metrics: &'a str,
+    pub(crate) recipe: &'a str,
+    pub(crate) environment: &'a str,
+    /// The last validation's PNG.
+    pub(crate) picture: Option<&'a [u8]>,
 }
 
-/// The page, from the run's metrics (one JSON document a line), its recipe and environment, and the last picture.
-pub(crate) fn page(
-    metrics: &str,
-    recipe: &str,
-    environment: &str,
-    picture: Option<&[u8]>,
-) -> String {
-    let lines: Vec<Value> =
-        metrics.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
-    let of_kind = |kind: &'static str| lines.iter().filter(move |line| line["kind"] == kind);
-    let steps: Vec<&Value> = of_kind("step").collect();
-    let curve = |key: &str| {
-        let points =
-            steps.iter().filter_map(|line| Some((line["step"].as_f64()?, line[key].as_f64()?)));
-        Curve { name: key.to_owned(), points: thinned(&points.collect::<Vec<_>>()) }
+/// The context of the template.
+#[derive(Serialize)]
+struct Page<'a> {
+    title: &'a str,
+    summary: Vec<String>,
+    plots: Vec<Drawing>,
+    table: Option<TableView>,
+    picture: Option<String>,
+    /// How restored frames were made.
+    made: String,
+    documents: [Document<'a>; 2],
+}
+
+#[derive(Serialize)]
+struct Document<'a> {
+    title: &'a str,
+    text: &'a str,
+}
+
+/// The whole page.
+pub(crate) fn page(source: &Source<'_>) -> Result<String> {
+    let lines = source.metrics.lines();
+    let lines: Vec<Value> = lines.filter_map(|line| serde_json::from_str(line).ok()).collect();
+    let of_kind = |kind: &str| lines.iter().filter(|line| line["kind"] == kind).collect();
+    let (steps, validations): (Vec<_>, Vec<_>) = (of_kind("step"), of_kind("validation"));
+    render(
+        "train.html",
+        Page {
+            title: "Training run",
+            summary: summary(&steps),
+            plots: plots(&steps, &validations).iter().filter_map(Plot::draw).collect(),
+            table: validations.last().map(|last| TableView::from(&clips(last))),
+            picture: source.picture.map(data_url),
+            made: made(source.recipe),
+            documents: [
+                Document { title: "Recipe", text: source.recipe },
+                Document { title: "Environment", text: source.environment },
+            ],
+        },
+    )
+}
+
+/// The number of steps, and where their time went.
+fn summary(steps: &[&Value]) -> Vec<String> {
+    let Some(last) = steps.last() else { return Vec::new() };
+    let sum = |key: &str| steps.iter().filter_map(|line| line[key].as_f64()).sum::<f64>();
+    let times = TIMES.map(|(key, name)| (name, sum(key)));
+    let total: f64 = times.iter().map(|time| time.1).sum();
+    let share =
+        |(name, time): &(&str, f64)| format!("{name} {:.1} %", 100.0 * time / total.max(1e-9));
+    vec![
+        format!("{} steps took {:.1} minutes.", last["step"], total / 60.0),
+        format!("Time: {}.", times.iter().map(share).collect::<Vec<_>>().join(", ")),
+    ]
+}
+
+/// How the recipe's validation restores frames.
+fn made(recipe: &str) -> String {
+    let recipe: Option<toml::Table> = recipe.parse().ok();
+    let steps =
+        recipe.as_ref().and_then(|recipe| recipe.get("validation")?.get("steps")?.as_integer());
+    match steps {
+        Some(0) => "Restored by regression.".to_owned(),
+        Some(1) => "Restored by diffusion in 1 step.".to_owned(),
+        Some(steps) => format!("Restored by diffusion in {steps} steps."),
+        None => String::new(),
+    }
+}
+
+fn plots(steps: &[&Value], validations: &[&Value]) -> Vec<Plot> {
+    let step_axis = || Axis::linear("step");
+    let plot = |title: &str, caption: &str, y: Axis, curves: Vec<Curve>| Plot {
+        title: title.to_owned(),
+        caption: caption.to_owned(),
+        x: step_axis(),
+        y,
+        curves,
     };
-    let losses = ["total", "prediction", "pre", "perceptual", "flow"].map(curve);
-    // With errors told, whose term is a logarithm, the total may be negative.
-    let shown = |curve: &Curve| {
-        curve.points.iter().all(|p| p.1 >= 0.0) && curve.points.iter().any(|p| p.1 > 0.0)
+    // With predicted uncertainty, whose term is a logarithm, the total may be negative.
+    let on_log_axis = |curve: &Curve| {
+        curve.points.iter().all(|p| p.y >= 0.0) && curve.points.iter().any(|p| p.y > 0.0)
     };
-    let losses = losses.into_iter().filter(shown);
-    let mut page = format!(
-        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>qudi train</title>\n<style>{STYLE}</style></head><body>\n<h1>qudi train</h1>\n"
-    );
-    if let Some(last) = steps.last() {
-        let seconds: f64 = steps.iter().map(|line| seconds(line).iter().sum::<f64>()).sum();
-        let _ = writeln!(
-            page,
-            "<p>{} steps in {:.1} minutes of learning.</p>",
-            last["step"],
-            seconds / 60.0
-        );
-        page += &shares(&steps);
+    let losses = LOSSES.map(|(key, name)| curve(steps, key, name)).into_iter().filter(on_log_axis);
+    let uncertainty = curve(steps, "error", "uncertainty");
+    let has_uncertainty = uncertainty.points.iter().any(|p| p.y != 0.0);
+    let mut plots = vec![plot(
+        "Loss",
+        "The loss and its terms, each the mean over neighbouring steps. Lower is better.",
+        Axis::logarithmic("loss"),
+        losses.collect(),
+    )];
+    if has_uncertainty {
+        plots.push(plot(
+            "Loss of the predicted uncertainty",
+            "Negative log-likelihood of the errors under the predicted uncertainty. Lower is better.",
+            Axis::linear("nats"),
+            vec![uncertainty],
+        ));
     }
-    page += &plot("Loss (logarithmic)", &losses.collect::<Vec<_>>(), true);
-    let error = curve("error");
-    if error.points.iter().any(|p| p.1 != 0.0) {
-        page += &plot("Negative log-likelihood of the errors told", &[error], false);
-    }
-    let validations: Vec<&Value> = of_kind("validation").collect();
-    for (key, title) in
-        [("psnr_a", "Gain-aligned PSNR on the validation clips, dB"), ("ssim", "SSIM")]
-    {
-        page += &plot(title, &quality(&validations, key), false);
-    }
-    page += &plot("Norm of the gradient (logarithmic)", &[curve("norm")], true);
-    page += &plot("Learning rate", &[curve("rate")], false);
-    if let Some(last) = validations.last() {
-        page += &table(last);
-    }
-    if let Some(picture) = picture {
-        let _ = writeln!(
-            page,
-            "<h2>Validation clips: counts, restored, truth</h2>\n<img alt=\"validation clips\" src=\"data:image/png;base64,{}\">",
-            STANDARD.encode(picture)
-        );
-    }
-    for (title, text) in [("Recipe", recipe), ("Environment", environment)] {
-        let _ = writeln!(page, "<h2>{title}</h2>\n<pre>{}</pre>", escape(text));
-    }
-    page + "</body></html>\n"
+    plots.push(plot(
+        "Validation: PSNR",
+        "PSNR after the best gain, mean over validation clips, at each light level. Higher is better.",
+        Axis::linear("dB"),
+        quality(validations, "psnr_a"),
+    ));
+    plots.push(plot(
+        "Validation: SSIM",
+        "Structural similarity, mean over validation clips, at each light level. Higher is better.",
+        Axis::linear("SSIM"),
+        quality(validations, "ssim"),
+    ));
+    plots.push(plot(
+        "Gradient",
+        "Norm of the gradient before clipping.",
+        Axis::logarithmic("norm"),
+        vec![curve(steps, "norm", "norm")],
+    ));
+    plots.push(plot(
+        "Learning rate",
+        "The rate that each step was taken with.",
+        Axis::linear("rate"),
+        vec![curve(steps, "rate", "learning rate")],
+    ));
+    plots
 }
 
-/// Seconds of data, forward, backward and optimizer in a step.
-fn seconds(line: &Value) -> [f64; 4] {
-    ["data_s", "forward_s", "backward_s", "optimizer_s"]
-        .map(|key| line[key].as_f64().unwrap_or(0.0))
-}
-
-/// Where the time goes.
-fn shares(steps: &[&Value]) -> String {
-    let mut sums = [0.0; 4];
-    for line in steps {
-        for (sum, part) in sums.iter_mut().zip(seconds(line)) {
-            *sum += part;
-        }
-    }
-    let total: f64 = sums.iter().sum::<f64>().max(1e-9);
-    let names = ["waiting for data", "forward", "backward", "optimizer"];
-    let parts =
-        names.iter().zip(sums).map(|(name, sum)| format!("{name} {:.1} %", 100.0 * sum / total));
-    format!("<p>Time: {}.</p>\n", parts.collect::<Vec<_>>().join(", "))
+/// A number of every step.
+fn curve(steps: &[&Value], key: &str, name: &str) -> Curve {
+    let point = |line: &&Value| {
+        Some(Point { x: line["step"].as_f64()?, y: line[key].as_f64()?, error: 0.0 })
+    };
+    let points: Vec<Point> = steps.iter().filter_map(point).collect();
+    Curve { name: name.to_owned(), points: thinned(&points) }
 }
 
 /// Means of neighbouring points, so that the trend is seen.
-fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+fn thinned(points: &[Point]) -> Vec<Point> {
     let run = points.len().div_ceil(POINTS).max(1);
-    let mean = |part: &[(f64, f64)]| {
+    let mean = |part: &[Point]| {
         let n = part.len() as f64;
-        (part.iter().map(|p| p.0).sum::<f64>() / n, part.iter().map(|p| p.1).sum::<f64>() / n)
+        let (x, y) = part.iter().fold((0.0, 0.0), |(x, y), p| (x + p.x, y + p.y));
+        Point { x: x / n, y: y / n, error: 0.0 }
     };
     points.chunks(run).map(mean).collect()
 }
 
-/// A curve for every light, the mean over clips.
+/// A curve for every light level, the mean over clips.
 fn quality(validations: &[&Value], key: &str) -> Vec<Curve> {
     let mut curves: Vec<Curve> = Vec::new();
     for validation in validations {
         let mut sums: Vec<(String, f64, f64)> = Vec::new();
         for clip in validation["clips"].as_array().into_iter().flatten() {
-            let (name, value) =
-                (format!("{} PPP", clip["ppp"]), clip[key].as_f64().unwrap_or(f64::NAN));
+            let name = format!("{} PPP", clip["ppp"]);
+            let value = clip[key].as_f64().unwrap_or(f64::NAN);
             match sums.iter_mut().find(|sum| sum.0 == name) {
                 Some(sum) => (sum.1, sum.2) = (sum.1 + value, sum.2 + 1.0),
                 None => sums.push((name, value, 1.0)),
             }
         }
         for (name, sum, count) in sums {
-            let point = (validation["step"].as_f64().unwrap_or(0.0), sum / count);
+            let x = validation["step"].as_f64().unwrap_or(0.0);
+            let point = Point { x, y: sum / count, error: 0.0 };
             match curves.iter_mut().find(|curve| curve.name == name) {
                 Some(curve) => curve.points.push(point),
                 None => curves.push(Curve { name, points: vec![point] }),
@@ -143,99 +208,77 @@ fn quality(validations: &[&Value], key: &str) -> Vec<Curve> {
     curves
 }
 
-/// Curves in one coordinate system, as SVG.
-fn plot(title: &str, curves: &[Curve], logarithmic: bool) -> String {
-    let scale = |value: f64| if logarithmic { value.max(1e-12).log10() } else { value };
-    let all = || curves.iter().flat_map(|curve| &curve.points).filter(|p| p.1.is_finite());
-    let bounds = |of: &dyn Fn(&(f64, f64)) -> f64| {
-        all().map(of).fold([f64::INFINITY, f64::NEG_INFINITY], |[a, b], v| [a.min(v), b.max(v)])
-    };
-    let ([x0, x1], [y0, y1]) = (bounds(&|p| p.0), bounds(&|p| scale(p.1)));
-    if !(x0.is_finite() && y0.is_finite()) {
-        return String::new();
+/// A validation, clip by clip.
+fn clips(validation: &Value) -> Table {
+    let mut table = Table::new(vec![
+        Column::new("clip", "clip"),
+        Column::new("ppp", "PPP"),
+        Column::new("psnr_a", "psnr-a").with_unit("dB"),
+        Column::new("psnr", "psnr").with_unit("dB"),
+        Column::new("ssim", "ssim"),
+    ]);
+    for clip in validation["clips"].as_array().into_iter().flatten() {
+        let number = |key: &str| clip[key].as_f64();
+        table.rows.push(vec![
+            Cell::text(clip["name"].as_str().unwrap_or_default()),
+            number("ppp").map_or(Cell::Unknown, Cell::Exact),
+            Cell::number(number("psnr_a"), 2),
+            Cell::number(number("psnr"), 2),
+            Cell::number(number("ssim"), 3),
+        ]);
     }
-    let place = |value: f64, [from, to]: [f64; 2], [low, high]: [f64; 2]| {
-        low + (value - from) / (to - from).max(1e-12) * (high - low)
-    };
-    let across = |x: f64| place(x, [x0, x1], [MARGIN[0], SIZE[0] - 10.0]);
-    let down = |y: f64| place(y, [y0, y1], [SIZE[1] - MARGIN[1], 10.0]);
-    let mut svg = format!(
-        "<h2>{}</h2>\n<svg viewBox=\"0 0 {} {}\" role=\"img\" aria-label=\"{0}\">\n",
-        escape(title),
-        SIZE[0],
-        SIZE[1]
-    );
-    for i in 0..=4 {
-        let share = f64::from(i) / 4.0;
-        let (x, y) = (x0 + share * (x1 - x0), y0 + share * (y1 - y0));
-        let value = if logarithmic { 10f64.powf(y) } else { y };
-        let _ = writeln!(
-            svg,
-            "<line class=\"grid\" x1=\"{0}\" x2=\"{1}\" y1=\"{2:.1}\" y2=\"{2:.1}\"/><text x=\"4\" y=\"{2:.1}\">{5}</text><text x=\"{3:.1}\" y=\"{4}\" text-anchor=\"middle\">{x:.0}</text>",
-            MARGIN[0],
-            SIZE[0] - 10.0,
-            down(y),
-            across(x),
-            SIZE[1] - 6.0,
-            number(value)
-        );
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const METRICS: &str = "\
+{\"kind\":\"step\",\"step\":1,\"rate\":0.001,\"total\":0.5,\"prediction\":0.4,\"norm\":2.0,\"data_s\":1.0,\"forward_s\":3.0}
+{\"kind\":\"step\",\"step\":2,\"rate\":0.001,\"total\":0.4,\"prediction\":0.3,\"norm\":1.5,\"data_s\":1.0,\"forward_s\":3.0}
+{\"kind\":\"validation\",\"step\":2,\"clips\":[{\"name\":\"<dog>\",\"ppp\":3.25,\"psnr_a\":21.5,\"psnr\":20.0,\"ssim\":0.7}]}
+not json
+";
+
+    fn made_of(metrics: &str, recipe: &str) -> String {
+        let source = Source { metrics, recipe, environment: "{}", picture: Some(b"png") };
+        page(&source).unwrap_or_else(|e| panic!("{e:?}"))
     }
-    for (curve, colour) in curves.iter().zip(COLOURS.iter().cycle()) {
-        let points = curve.points.iter().filter(|p| p.1.is_finite());
-        let points: Vec<String> =
-            points.map(|&(x, y)| format!("{:.1},{:.1}", across(x), down(scale(y)))).collect();
-        let _ = writeln!(
-            svg,
-            "<polyline points=\"{}\" stroke=\"{colour}\"><title>{}</title></polyline>",
-            points.join(" "),
-            escape(&curve.name)
-        );
-        for &(x, y) in curve.points.iter().filter(|p| p.1.is_finite() && curve.points.len() < FEW) {
-            let (x, y) = (across(x), down(scale(y)));
-            let _ = write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3\" fill=\"{colour}\"/>");
+
+    #[test]
+    fn shows_curves_clips_and_time() {
+        let page = made_of(METRICS, "[validation]\nsteps = 4\n");
+        for part in [
+            "2 steps took 0.1 minutes.",
+            "waiting for data 25.0 %",
+            "Loss",
+            "3.25 PPP",
+            "&lt;dog&gt;",
+            "21.50",
+            "Restored by diffusion in 4 steps.",
+        ] {
+            assert!(page.contains(part), "{part}");
         }
     }
-    svg += "</svg>\n<p>";
-    for (curve, colour) in curves.iter().zip(COLOURS.iter().cycle()) {
-        let last = curve.points.last().map_or(f64::NAN, |p| p.1);
-        let _ = write!(
-            svg,
-            "<span style=\"color:{colour}\">&#9632;</span> {} ({}) ",
-            escape(&curve.name),
-            number(last)
-        );
-    }
-    svg + "</p>\n"
-}
 
-/// A number with about four digits.
-fn number(value: f64) -> String {
-    let size = value.abs();
-    if size == 0.0 || !(1e-3..1e5).contains(&size) {
-        return if size == 0.0 { "0".to_owned() } else { format!("{value:.2e}") };
+    #[test]
+    fn makes_a_page_of_a_run_that_has_not_taken_a_step() {
+        let page = made_of("", "");
+        assert!(page.contains("Recipe") && !page.contains("<polyline"));
     }
-    let digits = (3.0 - size.log10().floor()).max(0.0) as usize;
-    format!("{value:.digits$}")
-}
 
-/// The last validation, clip by clip.
-fn table(validation: &Value) -> String {
-    let mut text = "<h2>Validation clips</h2>\n<table><tr><th>clip</th><th>PPP</th><th>psnr-a</th><th>psnr</th><th>ssim</th></tr>\n".to_owned();
-    for clip in validation["clips"].as_array().into_iter().flatten() {
-        let number = |key: &str| clip[key].as_f64().unwrap_or(f64::NAN);
-        let _ = writeln!(
-            text,
-            "<tr><td>{}</td><td>{}</td><td>{:.2}</td><td>{:.2}</td><td>{:.3}</td></tr>",
-            escape(clip["name"].as_str().unwrap_or_default()),
-            clip["ppp"],
-            number("psnr_a"),
-            number("psnr"),
-            number("ssim")
-        );
+    #[test]
+    fn names_regression() {
+        assert!(made_of("", "[validation]\nsteps = 0\n").contains("Restored by regression."));
     }
-    text + "</table>\n"
-}
 
-const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;max-width:760px;margin:2em auto;padding:0 1em;color:#222}
-svg{width:100%;background:#fafafa}polyline{fill:none;stroke-width:1.5}.grid{stroke:#ddd}text{font-size:11px;fill:#666}
-img{max-width:100%}pre{background:#f4f4f4;padding:1em;overflow:auto}td,th{padding:.2em .8em;text-align:right}td:first-child,th:first-child{text-align:left}";
+    #[test]
+    fn curves_are_thinned_to_means() {
+        let points: Vec<_> =
+            (0..1000).map(|n| Point { x: f64::from(n), y: 2.0, error: 0.0 }).collect();
+        let thinned = thinned(&points);
+        assert!(thinned.len() <= POINTS && thinned.iter().all(|p| p.y == 2.0));
+        assert_eq!(thinned[0].x, 4.0, "the mean of steps 0 to 8");
+    }
+}

@@ -3,7 +3,7 @@
 use crate::cmd::train_environment::ENVIRONMENT;
 use crate::cmd::train_events::EventFile;
 use crate::cmd::train_pictures::strip;
-use crate::cmd::train_report::page;
+use crate::cmd::train_report::{Source, page};
 use crate::error::{Fault, Result};
 use crate::interrupt;
 use crate::report::{Bar, Report};
@@ -137,6 +137,11 @@ pub(crate) fn write_report(folder: &Path) -> Result<()> {
     let pictures = std::fs::read_dir(folder.join(SAMPLES)).into_iter().flatten().flatten();
     let last: Option<PathBuf> = pictures.map(|entry| entry.path()).max();
     let picture = last.and_then(|path| std::fs::read(path).ok());
-    let text = page(&read(METRICS)?, &read(RECIPE)?, &read(ENVIRONMENT)?, picture.as_deref());
+    let text = page(&Source {
+        metrics: &read(METRICS)?,
+        recipe: &read(RECIPE)?,
+        environment: &read(ENVIRONMENT)?,
+        picture: picture.as_deref(),
+    })?;
     write(folder, "report.html", text.as_bytes())
 }
