@@ -1,4 +1,4 @@
-//! Reads the golden files that scripts/reference/network_goldens.py writes; its docstring gives the format.
+//! Reads the golden files that tests/golden/generate/network_goldens.py writes; its docstring gives the format.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::struct_field_names)]
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -191,7 +191,7 @@ impl Case<'_> {
     }
 }
 
-/// Numbers in [-1, 1) that depend on the name and the place alone (scripts/reference/uniform.py).
+/// Numbers in [-1, 1) that depend on the name and the place alone (tests/golden/generate/uniform.py).
 pub fn uniform(name: &str, count: usize) -> Vec<f64> {
     let key = u64::from(crc32fast::hash(name.as_bytes())) << 32;
     (0..count as u64)

@@ -1,5 +1,5 @@
 //! BM3D against the reference package's figures: `tests/golden/baselines`, made by
-//! `scripts/reference/baselines.py`.
+//! `tests/golden/generate/baselines.py`.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_burst::bm3d;

@@ -1,4 +1,4 @@
-//! Variances and exact inverses of the transforms: against SciPy (`scripts/reference/baselines.py`) and
+//! Variances and exact inverses of the transforms: against SciPy (`tests/golden/generate/baselines.py`) and
 //! against simulated counts.
 #![allow(clippy::unwrap_used)]
 

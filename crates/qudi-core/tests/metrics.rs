@@ -1,5 +1,5 @@
 //! PSNR and SSIM against scikit-image: `tests/golden/metrics`, made by
-//! `scripts/reference/metrics.py`.
+//! `tests/golden/generate/metrics.py`.
 #![allow(clippy::unwrap_used)]
 
 use qudi_core::metrics::{gain_aligned_psnr, gaussian_ssim, psnr, ssim};

@@ -106,7 +106,7 @@ fn counts_follow_the_exact_law_at_every_light_level_and_depth() {
 #[test]
 fn flat_scenes_have_the_moments_of_the_published_simulator() {
     // Mean and deviation of y/7 from an independent NumPy simulation of the same equations,
-    // scripts/reference/sensor_moments.py.
+    // tests/golden/generate/sensor_moments.py.
     for (ppp, mean, deviation) in
         [(3.25, 0.607, 0.273), (9.75, 0.484, 0.163), (19.5, 0.441, 0.114), (26.0, 0.431, 0.100)]
     {

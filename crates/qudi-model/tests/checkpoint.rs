@@ -195,5 +195,5 @@ fn every_parameter_has_a_name_of_its_own() {
     names.dedup();
     assert_eq!(names.len(), list.len());
     let count: usize = list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
-    assert_eq!(count, 182_440); // scripts/reference/network.py info tiny
+    assert_eq!(count, 182_440); // tests/golden/generate/network.py info tiny
 }

@@ -1,5 +1,5 @@
 //! Captures that other programs wrote: `tests/golden/captures`, made by
-//! `scripts/reference/captures.py`. All hold the same 6 frames.
+//! `tests/golden/generate/captures.py`. All hold the same 6 frames.
 
 use crate::{counts, open, plain, refusal};
 use qudi_io::capture::{Certainty, MaskChoice, PackAxis, ReadOptions};

@@ -101,7 +101,7 @@ impl NoiseSchedule {
 mod tests {
     use super::*;
 
-    /// scripts/reference/schedule.py
+    /// tests/golden/generate/schedule.py
     #[test]
     #[allow(clippy::excessive_precision, clippy::unreadable_literal)]
     fn alpha_bar_is_that_of_the_numpy_reference() {

@@ -2,9 +2,9 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy", "scikit-image"]
 # ///
-"""PSNR and SSIM of scikit-image on small images, for crates/qudi-sim/tests/metrics.rs.
+"""PSNR and SSIM of scikit-image on small images, for crates/qudi-core/tests/metrics.rs.
 
-    python scripts/reference/metrics.py tests/golden/metrics
+    python tests/golden/generate/metrics.py tests/golden/metrics
 """
 
 import json

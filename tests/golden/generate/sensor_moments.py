@@ -7,7 +7,7 @@
 Independent of qudi, written from the equations of the forward model (Poisson detections,
 full well, Gaussian read noise, gain, rounding, clipping).
 
-    python scripts/reference/sensor_moments.py
+    python tests/golden/generate/sensor_moments.py
 """
 
 import time

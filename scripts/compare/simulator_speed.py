@@ -5,16 +5,19 @@
 """qudi and NumPy expose the same 3-bit frames, alternating, so that both see the same machine.
 
     cargo build --release -p qudi-sim --example speed
-    python scripts/reference/speed.py target/release/examples/speed
+    python scripts/compare/simulator_speed.py target/release/examples/speed
 """
 
 import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
-from sensor_moments import expose
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests/golden/generate"))
+from sensor_moments import expose  # noqa: E402
 
 SIZE, ROUNDS = 512, 7
 

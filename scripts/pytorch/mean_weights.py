@@ -12,7 +12,7 @@ EMA = 0.999  # configs/small.toml
 
 
 class MeanWeights:
-    """Reads a weight file. What of it learns is told by `learn`; what does not is written as it was."""
+    """Reads a weight file. `learn` names the weights that learn; the others are written as they were."""
 
     def __init__(self, weights: str) -> None:
         with safe_open(weights, "pt") as file:

@@ -4,11 +4,11 @@
 # ///
 """Time and memory of the PyTorch network on the processor, as JSON, for comparison with the Rust one.
 
-    python scripts/reference/network_speed.py small --threads 2             # one reverse step
-    python scripts/reference/network_speed.py small --backward              # and its gradients, 128x128
-    python scripts/reference/network_speed.py small --per-block
-    python scripts/reference/network_speed.py small --mode steps            # the ten-step loop
-    python scripts/reference/network_speed.py small --mode train --frames 7 --size 96 --batch 2
+    python scripts/compare/network_speed.py small --threads 2             # one reverse step
+    python scripts/compare/network_speed.py small --backward              # and its gradients, 128x128
+    python scripts/compare/network_speed.py small --per-block
+    python scripts/compare/network_speed.py small --mode steps            # the ten-step loop
+    python scripts/compare/network_speed.py small --mode train --frames 7 --size 96 --batch 2
 
 Times are seconds, medians after a warm-up; `cpu` is the sum over threads (on a shared machine the
 wall clock says little, PyTorch's threads wait for each other). `loop` times the network's calls and the simulated
@@ -21,13 +21,17 @@ import argparse
 import json
 import resource
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
-import network
 import numpy as np
 import torch
 from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests/golden/generate"))
+import network  # noqa: E402
 
 PPP, EXPOSURE = 3.25, 0.45
 

@@ -4,9 +4,9 @@
 # ///
 """The `bm3d` package (non-commercial licence: only ever an oracle) and SciPy's laws beside qudi-burst.
 
-    python scripts/reference/baselines.py golden tests/golden/baselines
-    python scripts/reference/baselines.py compare target/release/examples/denoise THREADS FOLDER...
-    python scripts/reference/baselines.py restore PHOTONS OUT
+    python tests/golden/generate/baselines.py golden tests/golden/baselines
+    python tests/golden/generate/baselines.py compare target/release/examples/denoise THREADS FOLDER...
+    python tests/golden/generate/baselines.py restore PHOTONS OUT
 
 `golden` writes what crates/qudi-burst/tests compare with. `compare` denoises the top left 256 x 256
 pixels of every eighth image of each folder with both programs, in turns, and prints mean PSNR and seconds.

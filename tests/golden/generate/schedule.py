@@ -4,7 +4,7 @@
 # ///
 """The cosine noise schedule in NumPy; writes tests/golden/cosine_schedule.in.
 
-    python scripts/reference/schedule.py
+    python tests/golden/generate/schedule.py
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ def alpha_bar() -> np.ndarray:
 def main() -> None:
     values = alpha_bar()
     rows = ",\n    ".join(f"({t}, {values[t]:.17e})" for t in (0, 1, 99, 250, 499, 750, 899, 990, 998, 999))
-    path = Path(__file__).parents[2] / "tests/golden/cosine_schedule.in"
+    path = Path(__file__).parents[1] / "cosine_schedule.in"
     path.write_text(f"[\n    {rows},\n]\n")
 
 

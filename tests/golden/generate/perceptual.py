@@ -4,7 +4,7 @@
 # ///
 """Golden values of LPIPS for the Rust tests, in tests/golden/perceptual.
 
-    python scripts/reference/perceptual.py [FOLDER HEADS]
+    python tests/golden/generate/perceptual.py [FOLDER HEADS]
 
 LPIPS is the authors' package with torchvision's networks, their weights made by a formula: weight
 NAME of network NET (`vgg`, `alex`) is sqrt(6 / fan-in) * uniform("NET.NAME") and a bias
@@ -36,7 +36,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from uniform import uniform
 
-OUT = Path(__file__).resolve().parents[2] / "tests/golden/perceptual"
+OUT = Path(__file__).resolve().parents[1] / "perceptual"
 NETS = {"vgg": "vgg16-397923af", "alex": "alexnet-owt-7be5be79"}
 
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Small captures written by other programs, for crates/qudi-sim/tests/captures/foreign.rs.
+"""Small captures written by other programs, for crates/qudi-io/tests/captures/foreign.rs.
 
     pip install numpy scipy pillow tifffile h5py
-    python scripts/reference/captures.py tests/golden/captures
+    python tests/golden/generate/captures.py tests/golden/captures
 
 Every file holds the same 6 frames of 12 x 20 pixels: `counts.npy` (3 bit) or `bits.npy` (1 bit).
 """

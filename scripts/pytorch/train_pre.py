@@ -2,19 +2,21 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Trains a pre-denoiser of a network in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16. The last one
-learns together with what tells its errors. All other weights stay as they are.
+"""Trains a pre-denoiser in PyTorch, in bfloat16, on bursts that `qudi train` cached, with the same loss. The last one
+is trained together with the predicted uncertainty. All other weights stay as they are.
 
-    qudi train small --pack small.zip --init W.safetensors --bursts kept --draw-only
-    python scripts/reference/train_pre.py W.safetensors kept pre.safetensors --minutes 60
+    qudi train small --pack small.zip --init W.safetensors --bursts bursts --draw-only
+    python scripts/pytorch/train_pre.py W.safetensors bursts pre.safetensors --minutes 60
     qudi publish pre.safetensors -o small.safetensors
 
-Bursts must have been drawn with the drafts of W, or with `network.pre.rounds=1` to train its first draft (`--draft`). With `--sizes RECIPE.toml` pre-denoisers of W that are smaller than that recipe's grow
-to them: what is new starts without any say. Where the recipe has two motions (`network.pre.motions`) the bursts must have them, too.
+Bursts must have been drawn with the earlier stages of W, or with `network.pre.rounds=1` to train its first stage
+(`--first-stage`). With `--sizes RECIPE.toml`, pre-denoisers of W that are smaller than that recipe's grow to them; new
+weights start without effect. Where the recipe has two alignments (`network.pre.motions`), the bursts must have them.
 """
 
 import argparse
 import math
+import sys
 import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
@@ -22,12 +24,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kept import Burst, Part, kept
+from burst_cache import Burst, Part, cached_bursts
 from mean_weights import MeanWeights
-from network import ErrorHead, PreDenoiser, laid, of_drafts
 from torch import Tensor, nn
 
-VARIATION, LEAST_ERROR = 0.01, 1e-4  # crates/qudi-model/src/objective.rs
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests/golden/generate"))
+from network import ErrorHead, PreDenoiser, aligned_neighbours, of_earlier_stages  # noqa: E402
+
+VARIATION, LEAST_ERROR = 0.01, 1e-4  # crates/qudi-train/src/loss
 WARMUP, CLIP = 200, 1.0  # configs/small.toml
 SEEN = 176  # side of what is seen of bursts held back
 MOST = 16  # of which so many are seen
@@ -39,7 +43,7 @@ def grown(old: Tensors, before: dict, config: dict) -> Tensors:
     """A pre-denoiser's weights in a larger one."""
     torch.manual_seed(1)
     new = PreDenoiser(config).state_dict()
-    cells, few, many = config["fold"] ** 2, laid(before), laid(config)
+    cells, few, many = config["fold"] ** 2, aligned_neighbours(before), aligned_neighbours(config)
     for name, value in new.items():
         if name not in old:
             # He's for what comes in, nothing for what goes out.
@@ -64,15 +68,15 @@ def part_of(tensors: Tensors, prefix: str) -> Tensors:
 
 
 class Trainer(MeanWeights):
-    def __init__(self, weights: str, sizes: Path | None, draft: bool = False) -> None:
+    def __init__(self, weights: str, sizes: Path | None, first_stage: bool = False) -> None:
         super().__init__(weights)
         before = self.about["network"]
         recipe = tomllib.loads(sizes.read_text())["network"] if sizes else before
         config = {**before, "pre": recipe["pre"]}
         rounds = ["pre.", *(f"drafts.{k}." for k in range(config["pre"].get("rounds", 1) - 1))]
-        prefix = "drafts.0." if draft else "pre."
+        prefix = "drafts.0." if first_stage else "pre."
         for name in rounds:
-            sizes_of = [before, config] if name == "pre." else [of_drafts(before), of_drafts(config)]
+            sizes_of = [before, config] if name == "pre." else [of_earlier_stages(before), of_earlier_stages(config)]
             larger = grown(part_of(self.tensors, name), *sizes_of)
             self.tensors |= {name + key: value for key, value in larger.items()}
         self.about["network"] = config
@@ -80,11 +84,11 @@ class Trainer(MeanWeights):
             self.about["preset"] = sizes.stem if config == recipe else None
         # It has seen no simulated measurement.
         self.tensors[prefix + "simulated_in.weight"].zero_()
-        self.network, self.error = PreDenoiser(of_drafts(config) if draft else config), None
+        self.network, self.error = PreDenoiser(of_earlier_stages(config) if first_stage else config), None
         self.network.load_state_dict(part_of(self.tensors, prefix))
         self.network.simulated_in.requires_grad_(False)
-        learning = nn.ModuleDict({"drafts": nn.ModuleList([self.network])} if draft else {"pre": self.network})
-        if config["pre"].get("error") and not draft:
+        learning = nn.ModuleDict({"drafts": nn.ModuleList([self.network])} if first_stage else {"pre": self.network})
+        if config["pre"].get("error") and not first_stage:
             self.error = ErrorHead(config)
             self.error.load_state_dict(part_of(self.tensors, "error."))
             learning["error"] = self.error
@@ -92,20 +96,20 @@ class Trainer(MeanWeights):
         self.learn(learning)
 
     def denoised(self, guide: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Frames, and the deviation told of their errors, which changes no frame."""
+        """Frames, and the predicted uncertainty, which changes no frame."""
         nothing = torch.zeros_like(guide[:, :1])
         with torch.autocast("cpu", torch.bfloat16):
             d, g = self.network(guide, nothing, nothing, torch.zeros(len(guide)))
             return d.float(), self.error(g.detach(), guide).float() if self.error else None
 
     def loss(self, guide: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-        """Relative to the guide's error; and the surprise at the errors (crates/qudi-model/src/objective.rs)."""
+        """The loss relative to the reference estimate's error, and the negative log-likelihood of the errors.."""
         before = (guide[:, :1] - truth).square().mean((1, 2, 3), keepdim=True).clamp(min=LEAST_ERROR)
-        d, told = self.denoised(guide)
+        d, sigma = self.denoised(guide)
         error = (d - truth) / before.sqrt()
         variation = error.diff(dim=3).abs().mean() + error.diff(dim=2).abs().mean()
-        surprise = ((d.detach() - truth).square() / (2 * told**2) + told.log()).mean() if self.error else torch.zeros(())
-        return error.square().mean() + VARIATION * variation, surprise
+        nll = ((d.detach() - truth).square() / (2 * sigma**2) + sigma.log()).mean() if self.error else torch.zeros(())
+        return error.square().mean() + VARIATION * variation, nll
 
     @torch.no_grad()
     def gain(self, bursts: list[Burst]) -> float:
@@ -127,19 +131,19 @@ def main() -> None:
     parser.add_argument("weights")
     parser.add_argument("bursts", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--first-stage", "--draft", dest="draft", action="store_true", help="train the first pre-denoiser, not the last one")
+    parser.add_argument("--first-stage", "--draft", dest="first_stage", action="store_true", help="train the first pre-denoiser, not the last one")
     parser.add_argument("--sizes", type=Path, help="a recipe whose pre-denoisers are larger")
-    parser.add_argument("--validation", type=Path, help="bursts of other clips, kept likewise, to see how far it has come")
+    parser.add_argument("--validation", type=Path, help="cached bursts of other clips, to follow the progress on")
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--side", type=int, default=96)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    bursts, held = kept(args.bursts)
+    bursts, held = cached_bursts(args.bursts)
     held = held[:: math.ceil(len(held) / MOST)]
     others = [Burst(path) for path in sorted(args.validation.glob("*.safetensors"))] if args.validation else []
-    trainer = Trainer(args.weights, args.sizes, args.draft)
+    trainer = Trainer(args.weights, args.sizes, args.first_stage)
     # Each with gradients of its own: neither shortens the other's steps.
     learning = [list(module.parameters()) for module in (trainer.network, trainer.error) if module]
     optimizer = torch.optim.Adam(trainer.learning.values(), args.rate)
@@ -162,18 +166,18 @@ def main() -> None:
                 loss = " and ".join(f"{value:.4f}" for value in np.mean(losses, 0)) if losses else "none yet"
                 print(f"{gone * args.minutes:.1f} min, step {step}, loss {loss}, gain {', '.join(gains)}", flush=True)
                 losses.clear()
-                bursts, _ = kept(args.bursts)  # there may be more by now
+                bursts, _ = cached_bursts(args.bursts)  # there may be more by now
             step += 1
             batch = following.result()
             following = reader.submit(draw, step + 1)
             for group in optimizer.param_groups:
                 group["lr"] = args.rate * min(1, step / WARMUP) * 0.5 * (1 + math.cos(math.pi * gone))
-            loss, surprise = trainer.loss(*batch)
+            loss, nll = trainer.loss(*batch)
             optimizer.zero_grad()
-            (loss + surprise).backward()
+            (loss + nll).backward()
             for parameters in learning:
                 nn.utils.clip_grad_norm_([p for p in parameters if p.grad is not None], CLIP)
-            losses.append((loss.item(), surprise.item()))
+            losses.append((loss.item(), nll.item()))
             if not np.isfinite(losses[-1]).all():
                 raise SystemExit(f"step {step}: the loss is no number; {args.out} holds the last good weights")
             optimizer.step()

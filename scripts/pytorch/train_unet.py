@@ -2,18 +2,19 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Trains all of a network but its pre-denoisers in PyTorch, on the bursts that `qudi train` keeps: the same objective, in bfloat16,
-which is several times as fast on processors with matrix units (docs/results.md, "The diffusion").
+"""Trains all of a network but its pre-denoisers in PyTorch, in bfloat16, on bursts that `qudi train` cached, with the
+same loss, which is several times as fast on processors with matrix units.
 
-    qudi train small --pack small.zip --init W.safetensors --bursts kept --draw-only
-    python scripts/reference/train_unet.py W.safetensors kept unet.safetensors --minutes 60
+    qudi train small --pack small.zip --init W.safetensors --bursts bursts --draw-only
+    python scripts/pytorch/train_unet.py W.safetensors bursts unet.safetensors --minutes 60
     qudi publish unet.safetensors -o small.safetensors
 
-Bursts must have been drawn with the drafts of W, and with more than one frame kept.
+Bursts must have been drawn with the earlier stages of W, and have more than one cached frame.
 """
 
 import argparse
 import math
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,16 +22,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kept import Burst, Part, Sensor, kept
+from burst_cache import Burst, Part, Sensor, cached_bursts
 from mean_weights import MeanWeights
-from network import Preconditioned, Qudi
-from schedule import T as TIMES
-from schedule import alpha_bar
 from torch import Tensor, nn
 
-LEAST_UNIT = 0.004  # crates/qudi-model/src/objective.rs
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests/golden/generate"))
+from network import Preconditioned, Qudi  # noqa: E402
+from schedule import T as TIMES  # noqa: E402
+from schedule import alpha_bar  # noqa: E402
+
+LEAST_UNIT = 0.004  # crates/qudi-train/src/loss
 WARMUP, CLIP = 200, 1.0  # configs/small.toml
-NOISE, SPREAD = 0.08, 0.6  # crates/qudi-model/src/schedule.rs
+NOISE, SPREAD = 0.08, 0.6  # crates/qudi-model/src/diffusion/schedule.rs
 SQUARE = 160  # side of what is seen of bursts held back
 
 
@@ -159,7 +162,7 @@ def main() -> None:
     parser.add_argument("--first", type=float, default=0.5, help="share of batches with an earlier estimate")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    bursts, held = kept(args.bursts)
+    bursts, held = cached_bursts(args.bursts)
     trainer = Trainer(args.weights)
     weights = list(trainer.learning.values())
     optimizer = torch.optim.Adam(weights, args.rate)
@@ -174,7 +177,7 @@ def main() -> None:
         times = np.array([TIMES - 1 if rng.random() < args.start else late() for _ in drawn])
         return Batch.of(drawn, parts, times, rng), rng.random() < args.first
 
-    start, step, losses, told = time.monotonic(), 0, [], 0.0
+    start, step, losses, reported = time.monotonic(), 0, [], 0.0
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(draw, 1)
         while (gone := (time.monotonic() - start) / 60 / args.minutes) < 1:
@@ -192,8 +195,8 @@ def main() -> None:
                 raise SystemExit(f"step {step}: the loss is no number; {args.out} holds the last good weights")
             optimizer.step()
             trainer.average(step)
-            if gone - told > 0.2:
-                told = gone
+            if gone - reported > 0.2:
+                reported = gone
                 trainer.write(args.out, step)
                 trainer.swap()
                 gains = ", ".join(trainer.judged(held, time, args.frames) for time in (TIMES - 1, 150, 50, 10))

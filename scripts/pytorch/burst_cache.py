@@ -1,4 +1,4 @@
-"""The bursts that `qudi train --bursts` keeps, read in Python (crates/qudi-model/src/train/kept.rs), and their sensors."""
+"""Reads the cached bursts of `qudi train --bursts` (crates/qudi-train/src/burst_cache.rs), and models their sensors."""
 
 import json
 import math
@@ -15,7 +15,7 @@ HELD = 13  # one burst of so many is not learnt from
 
 
 class Sensor:
-    """A sensor and its light, `factor` times as much as in the capture (crates/qudi-model/src/physics.rs)."""
+    """A sensor and its light, `factor` times as much as in the capture (crates/qudi-core/src/sensor/law.rs)."""
 
     def __init__(self, label: dict, factor: float = 1.0) -> None:
         about, self.ppp, self.exposure = label["sensor"], label["ppp"], label["exposure"]
@@ -63,7 +63,7 @@ class Sensor:
         return math.sqrt(max(chances @ (values - chances @ values) ** 2, 0))
 
     def numbers(self) -> list[float]:
-        """As the network is told of it (docs/network.md, "Inputs")."""
+        """The numbers of the sensor that the network is given (docs/network.md, "Inputs")."""
         deviations = [math.log10(max(self.deviation(image), 1e-4)) for image in (0.0, self.exposure)]
         light = [math.log10(max(self.ppp, 1e-6)), self.exposure, self.efficiency, self.dark, self.read_noise]
         depth = [math.log10(max(self.gain, 1e-6)), math.log2(self.full_scale + 1) / 8]
@@ -82,7 +82,7 @@ class Sensor:
 
 @dataclass
 class Part:
-    """Squares of all frames of a burst: guide [frames, planes, side, side], truth and linear estimate [frames, 1, side, side]."""
+    """Squares of frames of a burst: inputs [frames, planes, side, side], truth and linear estimate [frames, 1, side, side]."""
 
     guide: np.ndarray
     truth: np.ndarray
@@ -90,7 +90,7 @@ class Part:
 
 
 class Burst:
-    """A kept burst, read where it is needed."""
+    """A cached burst, read where it is needed."""
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as file:
@@ -137,7 +137,7 @@ class Burst:
         return self.part(side, rng, slice(first, first + 1))
 
 
-def kept(folder: Path) -> tuple[list[Burst], list[Burst]]:
+def cached_bursts(folder: Path) -> tuple[list[Burst], list[Burst]]:
     """The bursts of a folder to learn from, and those held back, which more bursts do not change."""
     paths = sorted(folder.glob("*.safetensors"))
     held = [int(path.stem.rpartition("-")[2]) % HELD == 0 for path in paths]

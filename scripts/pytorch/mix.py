@@ -2,9 +2,9 @@
 # requires-python = ">=3.11"
 # dependencies = ["safetensors", "torch"]
 # ///
-"""The weighted mean of weights that learnt on from the same start, on different bursts (Wortsman et al. 2022, "Model soups").
+"""The weighted mean of weights that were trained further on different bursts (Wortsman et al. 2022, "Model soups").
 
-    python scripts/reference/mix.py out.safetensors start.safetensors=0.4 one.safetensors=0.3 other.safetensors=0.3
+    python scripts/pytorch/mix.py out.safetensors start.safetensors=0.4 one.safetensors=0.3 other.safetensors=0.3
 
 Tensors that are the same in all files stay as they are, bit for bit.
 """

@@ -4,7 +4,7 @@
 # ///
 """Sums windows of a long packed capture with qudi and photoncube, alternating: speed and memory.
 
-    python scripts/reference/capture_speed.py target/release/qudi /tmp/capture.npy
+    python scripts/compare/capture_speed.py target/release/qudi /tmp/capture.npy
 
 Makes the capture first if it does not exist: 100,000 binary frames of 256 x 512, 1.6 GB. Both
 programs sum windows of 1000 frames; photoncube writes its means as PNG, qudi its sums as .npy.

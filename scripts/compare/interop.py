@@ -4,7 +4,7 @@
 # ///
 """Opens a packed burst of qudi in photoncube and visionsim and compares every pixel.
 
-    python scripts/reference/interop.py path/to/qudi
+    python scripts/compare/interop.py path/to/qudi
 
 The burst is 130 x 203 pixels, so that rows end inside a byte; photoncube knows widths of whole
 bytes only and is compared on a second burst of 128 x 208.

@@ -6,7 +6,7 @@
 
 Modules are named as on the page, so the keys of `state_dict()` are the names of weight files.
 
-    python scripts/reference/network.py info small
+    python tests/golden/generate/network.py info small
 """
 
 import math
@@ -23,7 +23,7 @@ from schedule import alpha_bar
 from torch import Tensor, nn
 
 Flows = tuple[Tensor, Tensor]
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def load(preset: str) -> dict:
@@ -121,20 +121,20 @@ def mean_variance(sensor: Tensor, frames: int) -> Tensor:
     return variance.repeat_interleave(frames)[:, None, None, None]
 
 
-def laid(config: dict) -> int:
-    """Frames laid upon each, counted once for each motion: single pixels' is seen after a first round only."""
+def aligned_neighbours(config: dict) -> int:
+    """Aligned neighbours of a frame, counted once for each alignment; the per-pixel one needs an earlier stage."""
     motions, rounds = config["pre"].get("motions", 1), config["pre"].get("rounds", 1)
     return config["pre"]["neighbours"] * (motions if rounds > 1 else min(2, motions))
 
 
-def of_drafts(config: dict) -> dict:
+def of_earlier_stages(config: dict) -> dict:
     """For the pre-denoisers before the last one: they see what an only one sees."""
     return {**config, "pre": {**config["pre"], "rounds": 1}}
 
 
 def guide_planes(config: dict) -> int:
     """Channels of a guide: three images, counts of the frame and of its neighbours, expectations of the neighbours."""
-    return 4 + 2 * laid(config)
+    return 4 + 2 * aligned_neighbours(config)
 
 
 def aligned(guide: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ def aligned(guide: Tensor) -> Tensor:
     return torch.cat([seen.clamp(-8, 8) / 2, torch.asinh(2 * expected)], 1)
 
 
-def evidence(guide: Tensor) -> tuple[Tensor, ...]:
+def normalized_input(guide: Tensor) -> tuple[Tensor, ...]:
     """Restored image, deviation of the merged one's noise, and what of both the networks see."""
     clean, merged, noise = guide[:, :3].split(1, 1)
     deviation = noise.clamp(min=1e-3)
@@ -172,11 +172,11 @@ class Trust(nn.Module):
         each = lambda x: x.unflatten(0, (images, neighbours))
         pairs = F.pixel_unshuffle(torch.stack([seen, expected], 2).flatten(0, 1), self.fold)
         around = self.around(frame).repeat_interleave(neighbours, 0)
-        told = F.relu(self.inner(F.relu(self.neighbour(pairs) + around)))
-        weight = each(torch.sigmoid(self.out(told)))
+        hidden = F.relu(self.inner(F.relu(self.neighbour(pairs) + around)))
+        weight = each(torch.sigmoid(self.out(hidden)))
         own, others = frame[:, -self.fold**2 :], each(pairs[:, : self.fold**2])
         merged = (own + (weight * others).sum(1)) / (1 + weight.square().sum(1)).sqrt()
-        return torch.cat([merged, (1 + weight.sum(1)).log(), each(told).mean(1)], 1)
+        return torch.cat([merged, (1 + weight.sum(1)).log(), each(hidden).mean(1)], 1)
 
 
 class PreDenoiser(nn.Module):
@@ -184,7 +184,7 @@ class PreDenoiser(nn.Module):
         super().__init__()
         self.fold = config["fold"]
         cells, pre = self.fold**2, config["pre"]
-        self.laid, width = laid(config), pre["width"]
+        self.neighbours, width = aligned_neighbours(config), pre["width"]
         self.static_in = conv((guide_planes(config) + 1) * cells, width, 3)
         if pre.get("trust"):
             self.trust = Trust(config)
@@ -197,19 +197,19 @@ class PreDenoiser(nn.Module):
 
     def prepare(self, guide: Tensor) -> Tensor:
         """What no simulated measurement changes."""
-        clean, _, difference, contrast, level = evidence(guide)
+        clean, _, difference, contrast, level = normalized_input(guide)
         planes = [difference, contrast, 2 * clean - 1, level, aligned(guide)]
         static = F.pixel_unshuffle(torch.cat(planes, 1), self.fold)
         s = self.static_in(static)
         if hasattr(self, "trust"):
-            seen, expected = planes[4].split([self.laid + 1, self.laid], 1)
+            seen, expected = planes[4].split([self.neighbours + 1, self.neighbours], 1)
             s = s + self.trusted_in(self.trust(static[:, : 5 * self.fold**2], seen[:, 1:], expected))
         return s
 
     def forward(
         self, guide: Tensor, y_sim: Tensor, u_sim: Tensor, flag: Tensor
     ) -> tuple[Tensor, Tensor]:
-        clean, deviation, *_ = evidence(guide)
+        clean, deviation, *_ = normalized_input(guide)
         s = self.prepare(guide)
         simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
         frames = len(guide) // len(flag)
@@ -232,7 +232,7 @@ class ErrorHead(nn.Module):
 
     def forward(self, g: Tensor, guide: Tensor) -> Tensor:
         ratio = self.out(F.relu(self.enter(g))).clamp(-5, 3).exp()
-        return 0.3 * evidence(guide)[1] * F.pixel_shuffle(ratio, self.fold)
+        return 0.3 * normalized_input(guide)[1] * F.pixel_shuffle(ratio, self.fold)
 
 
 class Features(nn.Module):
@@ -537,7 +537,7 @@ class UNet(nn.Module):
         self, noisy: Preconditioned, guide: Tensor, fused: list[Tensor], t: Tensor, sensor: Tensor, frames: int
     ) -> Tensor:
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
-        clean, _, difference, _, _ = evidence(guide)
+        clean, _, difference, _, _ = normalized_input(guide)
         images = [noisy.base, noisy.residual, noisy.earlier, 2 * clean - 1, difference, noisy.clarity]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
@@ -592,7 +592,7 @@ class Qudi(nn.Module):
 
     def errors(self, g: Tensor, guide: Tensor) -> Tensor:
         """Deviation of the pre-denoised frames' errors, in image units."""
-        return self.error(g, guide).detach() if hasattr(self, "error") else 0.3 * evidence(guide)[1]
+        return self.error(g, guide).detach() if hasattr(self, "error") else 0.3 * normalized_input(guide)[1]
 
     def correct(
         self,

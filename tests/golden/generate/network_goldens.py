@@ -4,7 +4,7 @@
 # ///
 """Golden values of the network for the Rust tests, in tests/golden/network/*.safetensors.
 
-    python scripts/reference/network_goldens.py [FILE ...]
+    python tests/golden/generate/network_goldens.py [FILE ...]
 
 Values are computed in float64 from float32 weights and inputs and rounded to float32; the program
 prints how far PyTorch's own float32 is from them, and how near the warps come to a kink.
@@ -438,7 +438,7 @@ def unet_file() -> File:
         def run(**x: Tensor) -> Tensors:
             fused = [x.pop(f"fused_{k}") for k in range(3)]
             images = [2 * x["d"] - 1, x["x_t"], x["x0_prev"], x["flag"]]
-            noisy = network.Preconditioned(*images, 0.6 * network.evidence(x["guide"])[1], x["t"], 3)
+            noisy = network.Preconditioned(*images, 0.6 * network.normalized_input(x["guide"])[1], x["t"], 3)
             return {"x0": module(noisy, x["guide"], fused, x["t"], x["sensor"], 3)}
 
         file.case(name, run, inputs, module, "unet", {"config": config, "frames": 3})
