@@ -77,7 +77,7 @@ fn same(a: &Sample, b: &Sample) -> bool {
 }
 
 #[test]
-fn packs_hold_the_files_pixels() {
+fn pack_holds_the_pixels_of_the_files() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let path = pack(&all_sources(), folder.path()).unwrap();
@@ -104,7 +104,7 @@ fn packs_hold_the_files_pixels() {
 }
 
 #[test]
-fn samples_depend_on_seed_and_number_alone() {
+fn samples_depend_on_seed_and_number_only() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = all_sources();
@@ -123,7 +123,7 @@ fn samples_depend_on_seed_and_number_alone() {
 
 /// A clip's pixels relative to its exposure are those of the file: rescaling changes both alike.
 #[test]
-fn exposure_is_that_of_the_whole_clip() {
+fn mean_level_is_that_of_the_whole_clip() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
@@ -151,7 +151,7 @@ fn exposure_is_that_of_the_whole_clip() {
 
 /// Clips become smaller by factors between one and what the recipe says: their slopes steeper.
 #[test]
-fn samples_shrink_as_the_recipe_says() {
+fn clips_are_downscaled_up_to_max_downscale() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let mut config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
@@ -179,7 +179,7 @@ fn samples_shrink_as_the_recipe_says() {
 
 /// As many stills rest as the recipe says, all frames alike; the others move.
 #[test]
-fn stills_rest_as_often_as_the_recipe_says() {
+fn static_fraction_of_the_stills_does_not_move() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let mut config = config(vec![source("stills", SourceKind::Stills, &["stills"])]);
@@ -198,7 +198,7 @@ fn stills_rest_as_often_as_the_recipe_says() {
 
 /// Light is log-uniform, and the photons are those that it gives.
 #[test]
-fn light_covers_its_range_and_counts_follow_it() {
+fn light_is_log_uniform_and_counts_follow_it() {
     let config = config(vec![source("scenes", SourceKind::Scenes, &["dead-leaves"])]);
     let mut dataset = Dataset::new(&config, None).unwrap();
     let (mut logs, mut seen, mut expected) = (Vec::new(), 0.0, 0.0);
@@ -225,7 +225,7 @@ fn light_covers_its_range_and_counts_follow_it() {
 }
 
 #[test]
-fn what_cannot_be_drawn_is_refused() {
+fn rejects_data_that_cannot_be_sampled() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = all_sources();
@@ -270,7 +270,7 @@ fn pack_in(config: &DataConfig, folder: &Path) -> Result<PathBuf, SimError> {
 
 /// Damage anywhere gives an error or other pixels, never a panic.
 #[test]
-fn damaged_packs_are_refused() {
+fn rejects_damaged_packs() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = super_config("clips/c0");

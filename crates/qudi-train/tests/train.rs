@@ -1,4 +1,4 @@
-//! Training is exact: it goes on from a state as if never stopped, whatever draws the data and wherever batches go.
+//! Training is reproducible: results depend neither on workers nor devices, and a resumed run equals an undisturbed one.
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::{Device, Tensor};
@@ -56,7 +56,7 @@ fn learn(run: &mut Run, stop_after: u64) -> Result<(), SimError> {
 
 /// Adam of Burn's own, on the same gradients.
 #[test]
-fn adam_is_that_of_the_framework() {
+fn adam_matches_burn() {
     use burn::module::{Module, Param};
     use burn::optim::{AdamConfig, GradientsParams};
     #[derive(Module, Debug)]
@@ -87,7 +87,7 @@ fn adam_is_that_of_the_framework() {
 }
 
 #[test]
-fn threads_that_draw_make_no_difference() {
+fn weights_do_not_depend_on_the_number_of_workers() {
     let recipe = recipe(&[]);
     let (one, steps) = trained(&recipe, &[Device::flex()], 1);
     let (three, _) = trained(&recipe, &[Device::flex()], 3);
@@ -101,7 +101,7 @@ fn threads_that_draw_make_no_difference() {
 
 /// Two devices with a batch each, one device with both in turn, and one device with both at once.
 #[test]
-fn devices_share_batches_without_changing_the_result() {
+fn weights_do_not_depend_on_the_number_of_devices() {
     let accumulated = recipe(&[("train.batch", "1"), ("train.accumulate", "2")]);
     let (turns, _) = trained(&accumulated, &[Device::flex()], 1);
     let (pair, _) = trained(&accumulated, &[Device::flex(), Device::flex()], 1);
@@ -124,7 +124,7 @@ fn devices_share_batches_without_changing_the_result() {
 
 /// The second half after a stop, in another process as it were, gives the bits of an undisturbed run.
 #[test]
-fn a_run_goes_on_exactly() {
+fn resumed_run_equals_undisturbed_run() {
     let recipe = recipe(&[]);
     let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     let mut run = open(folders[0].path(), &recipe, From::Start(None)).unwrap();
@@ -159,7 +159,7 @@ fn a_run_goes_on_exactly() {
 
 /// Killed between the renames of a new state, a run has the old one; half a new one is ignored.
 #[test]
-fn one_whole_state_is_always_there() {
+fn interrupted_state_write_leaves_a_whole_state() {
     let recipe = recipe(&[]);
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
@@ -178,7 +178,7 @@ fn one_whole_state_is_always_there() {
 }
 
 #[test]
-fn damaged_states_are_refused() {
+fn rejects_damaged_states() {
     let recipe = recipe(&[]);
     let folder = tempfile::tempdir().unwrap();
     let mut run = open(folder.path(), &recipe, From::Start(None)).unwrap();
@@ -197,9 +197,9 @@ fn damaged_states_are_refused() {
     open(folder.path(), &recipe, From::State).unwrap();
 }
 
-/// The first stage: the pre-denoiser alone, from single frames of bursts that are kept. Nothing else moves.
+/// The first stage: the pre-denoiser alone, on single frames of cached bursts. No other weight changes.
 #[test]
-fn the_pre_denoiser_learns_from_parts() {
+fn first_stage_trains_the_pre_denoiser_on_crops() {
     let recipe = recipe(&[
         ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }"),
         (
@@ -239,10 +239,9 @@ fn the_pre_denoiser_learns_from_parts() {
     }
 }
 
-/// What an earlier round has learnt stays as it was, bit for bit, in the average of weights, too; a run that stopped goes on
-/// with the same bursts.
+/// Weights of earlier stages stay as they were, bit for bit, in the average, too; a resumed run has the same bursts.
 #[test]
-fn drafts_do_not_learn() {
+fn earlier_stages_keep_their_weights() {
     let recipe = recipe(&[("network.pre.rounds", "2")]);
     let start = recipe.network.init(1, &Device::flex());
     let start = fill(start, |_, shape| {
@@ -272,9 +271,9 @@ fn drafts_do_not_learn() {
     assert_eq!(weights(&whole), weights(&parts));
 }
 
-/// A network that has gone wrong stops the run before it spoils the state, and the term is named.
+/// A loss that is not finite stops the run before it spoils the state.
 #[test]
-fn refuses_to_step_on_nan_loss() {
+fn nan_loss_stops_the_step_and_names_the_term() {
     let recipe = recipe(&[]);
     let bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let broken = recipe.network.init(1, &Device::flex());
@@ -289,9 +288,8 @@ fn refuses_to_step_on_nan_loss() {
     assert_eq!(trainer.step_number(), 0);
 }
 
-/// Numbers of 16 bits change a step by their rounding.
 #[test]
-fn products_may_have_16_bits() {
+fn bf16_changes_a_step_by_rounding() {
     let few =
         |precision: &str| trained(&recipe(&[("train.precision", precision)]), &[Device::flex()], 1);
     let (exact_weights, exact) = few("f32");
@@ -305,7 +303,7 @@ fn products_may_have_16_bits() {
 }
 
 #[test]
-fn a_device_without_such_numbers_is_refused() {
+fn rejects_bf16_on_devices_without_it() {
     #[allow(deprecated)] // asked for by name
     let device = Device::ndarray();
     let recipe = recipe(&[("train.precision", "bf16")]);
@@ -314,7 +312,7 @@ fn a_device_without_such_numbers_is_refused() {
 }
 
 #[test]
-fn recipes_say_what_is_wrong_with_them() {
+fn rejects_wrong_recipes_by_key() {
     let load = |key: &str, value: &str| Recipe::load("tiny", &[(key.to_owned(), value.to_owned())]);
     for (key, value, word) in [
         ("train.steps", "0", "train.steps"),
@@ -343,7 +341,7 @@ fn recipes_say_what_is_wrong_with_them() {
     assert_eq!(again.len(), 2);
 }
 
-/// Recipes of the first version, with the keys' former names, are those of today.
+/// Recipes with the former names of keys equal today's.
 #[test]
 fn reads_recipes_with_former_key_names() {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/old");

@@ -1,4 +1,4 @@
-//! Learning works: gradients reach every parameter, one burst can be learnt by heart, and a step runs on ndarray.
+//! The loss and its gradients: they reach every parameter, one burst can be overfitted, and backends agree.
 #![allow(clippy::unwrap_used)]
 
 use burn::module::{Module, ModuleVisitor, Param};
@@ -28,6 +28,18 @@ struct Burst {
     size: Size,
 }
 
+impl Burst {
+    fn example<'a>(&'a self, noise: Tensor<4>, timesteps: &'a [usize]) -> Example<'a> {
+        Example {
+            measured: &self.measured,
+            truth: self.truth.clone(),
+            acquisitions: std::slice::from_ref(&self.acquisition),
+            noise,
+            timesteps,
+        }
+    }
+}
+
 fn tiny() -> NetworkConfig {
     NetworkConfig::preset("tiny").unwrap()
 }
@@ -45,15 +57,7 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let truth: Vec<Frame> = (0..frames).map(scene).collect();
     let counts: Vec<Vec<u16>> =
         truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
-    let acquisition = Acquisition {
-        seed: 0,
-        first_frame: 0,
-        ppp: light.ppp,
-        exposure: light.exposure,
-        gain: camera.gain(),
-        sensor,
-        dark: None,
-    };
+    let acquisition = Acquisition::new(sensor, light.ppp, light.exposure).unwrap();
     let view = BurstView { size, frames: &counts };
     let planes = Planes::of(view, &acquisition);
     let guide = GuidePlanes::of(
@@ -78,35 +82,25 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
     let noise = Noise::new(number, 1);
     let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
     let place = (number as f64 * 0.618_034).fract();
-    let time = training_timestep((number as f64 * 0.414_214).fract(), place, 0.2);
-    let example = Example {
-        measured: &burst.measured,
-        truth: burst.truth.clone(),
-        acquisitions: std::slice::from_ref(&burst.acquisition),
-        noise: to_tensor(values, burst.size, &burst.truth.device()),
-        timesteps: &[time],
-    };
+    let timestep = training_timestep((number as f64 * 0.414_214).fract(), place, 0.2);
+    let noise = to_tensor(values, burst.size, &burst.truth.device());
+    let timesteps = [timestep];
+    let example = burst.example(noise, &timesteps);
     let self_conditioning =
         if number.is_multiple_of(2) { SelfConditioning::Off } else { SelfConditioning::On(number) };
     loss_terms(network, &example, self_conditioning, LossWeights::default(), LoopOptions::ALL, None)
         .unwrap()
 }
 
-/// The first stage computes what the whole network would of pre-denoiser and flow, and nothing else learns.
+/// The first stage computes the same terms of pre-denoiser and flow as the whole network, and nothing else learns.
 #[test]
-fn the_first_stage_is_a_part_of_the_whole() {
+fn first_stage_terms_equal_those_of_the_whole_network() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
     let network = tiny().init(3, &device);
     let with = |prediction: f32| {
         let weights = LossWeights { prediction, pre: 1.0, flow: 0.5, ..LossWeights::default() };
-        let example = Example {
-            measured: &burst.measured,
-            truth: burst.truth.clone(),
-            acquisitions: std::slice::from_ref(&burst.acquisition),
-            noise: burst.truth.zeros_like(),
-            timesteps: &[500],
-        };
+        let example = burst.example(burst.truth.zeros_like(), &[500]);
         loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
             .unwrap()
     };
@@ -117,17 +111,17 @@ fn the_first_stage_is_a_part_of_the_whole() {
     assert_eq!(flows[0], flows[1]);
     assert!((value(&part.total) - value(&part.pre) - 0.5 * flows[0]).abs() < 1e-7);
     let grads = part.total.backward();
-    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
-    network.visit(&mut without);
-    let idle = |part: &str| without.names.iter().any(|name| name.starts_with(part));
+    let mut missing = MissingGradients { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut missing);
+    let idle = |part: &str| missing.names.iter().any(|name| name.starts_with(part));
     // Other layers of the two lie behind last layers that start at zero.
     assert!(!idle("pre.out") && !idle("flow.levels.0.layers.4"));
     assert!(idle("unet.") && idle("fusion.") && idle("low.") && idle("high."));
 }
 
-/// The layers that tell errors learn from the frames' errors, and nothing else learns from that.
+/// Only the uncertainty head learns from the uncertainty loss.
 #[test]
-fn errors_are_told_without_changing_frames() {
+fn uncertainty_loss_has_no_gradient_to_the_frames() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
     let mut config = tiny();
@@ -135,32 +129,26 @@ fn errors_are_told_without_changing_frames() {
     let network = config.init(3, &device);
     let terms_of = |prediction: f32| {
         let weights = LossWeights { prediction, pre: 0.0, ..LossWeights::default() };
-        let example = Example {
-            measured: &burst.measured,
-            truth: burst.truth.clone(),
-            acquisitions: std::slice::from_ref(&burst.acquisition),
-            noise: burst.truth.zeros_like(),
-            timesteps: &[500],
-        };
+        let example = burst.example(burst.truth.zeros_like(), &[500]);
         loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
             .unwrap()
     };
     let (part, whole) = (terms_of(0.0), terms_of(1.0));
     let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
-    let [told, again] = [&part, &whole].map(|terms| value(terms.uncertainty.as_ref().unwrap()));
-    assert_eq!(told, again);
-    assert_eq!(told, value(&part.total));
+    let [first, again] = [&part, &whole].map(|terms| value(terms.uncertainty.as_ref().unwrap()));
+    assert_eq!(first, again);
+    assert_eq!(first, value(&part.total));
     let grads = part.total.backward();
-    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
-    network.visit(&mut without);
-    let idle = |part: &str| without.names.iter().any(|name| name.starts_with(part));
+    let mut missing = MissingGradients { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut missing);
+    let idle = |part: &str| missing.names.iter().any(|name| name.starts_with(part));
     // What enters lies behind a last layer that starts at zero.
     assert!(!idle("error.out") && idle("error.enter") && idle("pre.out"));
 }
 
-/// The U-Net's corrections are as large as errors are told to be; at first as without telling.
+/// The U-Net's corrections scale with the predicted uncertainty; an untrained head leaves them as they are.
 #[test]
-fn told_errors_scale_the_diffusion() {
+fn predicted_uncertainty_scales_the_prediction_loss() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
     let prediction = |error: bool, bias: f32| {
@@ -168,31 +156,25 @@ fn told_errors_scale_the_diffusion() {
         config.pre.error = error;
         let mut network = config.init(3, &device);
         if error {
-            let told = |name: &str, shape: &[usize]| {
+            let biased = |name: &str, shape: &[usize]| {
                 let initial = vec![bias; shape.iter().product()];
                 (name == "error.out.bias").then_some(initial)
             };
-            let kept = values_by_name(&network);
+            let values = values_by_name(&network);
             network = fill(network, |name, shape| {
-                told(name, shape).unwrap_or_else(|| kept[name].clone())
+                biased(name, shape).unwrap_or_else(|| values[name].clone())
             });
         }
-        let example = Example {
-            measured: &burst.measured,
-            truth: burst.truth.clone(),
-            acquisitions: std::slice::from_ref(&burst.acquisition),
-            noise: burst.truth.ones_like(),
-            timesteps: &[100],
-        };
+        let example = burst.example(burst.truth.ones_like(), &[100]);
         let weights = LossWeights::default();
         let terms =
             loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
                 .unwrap();
         terms.prediction.into_scalar::<f32>()
     };
-    let without = prediction(false, 0.0);
-    assert!((prediction(true, 0.0) - without).abs() < 1e-5 * without);
-    assert!((prediction(true, 1.0) - without).abs() > 1e-3 * without);
+    let without_head = prediction(false, 0.0);
+    assert!((prediction(true, 0.0) - without_head).abs() < 1e-5 * without_head);
+    assert!((prediction(true, 1.0) - without_head).abs() > 1e-3 * without_head);
 }
 
 fn values_by_name(network: &Qudi) -> HashMap<String, Vec<f32>> {
@@ -202,9 +184,9 @@ fn values_by_name(network: &Qudi) -> HashMap<String, Vec<f32>> {
     names.zip(lists).collect()
 }
 
-/// Least where the deviations are those of the errors: 0.5 and their logarithm.
+/// The minimum is 0.5 plus the logarithm of sigma.
 #[test]
-fn surprise_is_least_where_deviations_are_right() {
+fn gaussian_nll_is_least_at_the_true_sigma() {
     let device = Device::flex();
     let noise: Vec<f32> = Noise::new(5, 1).frame(0, 0, 64 * 64).collect();
     let scale = (noise.iter().map(|n| n * n).sum::<f32>() / noise.len() as f32).sqrt();
@@ -218,13 +200,13 @@ fn surprise_is_least_where_deviations_are_right() {
 }
 
 /// Names of parameters whose gradient is missing or zero.
-struct Without<'a> {
+struct MissingGradients<'a> {
     grads: &'a Gradients,
     path: Vec<String>,
     names: Vec<String>,
 }
 
-impl ModuleVisitor for Without<'_> {
+impl ModuleVisitor for MissingGradients<'_> {
     fn enter_module(&mut self, name: &str, _container: &str) {
         self.path.push(name.into());
     }
@@ -258,13 +240,13 @@ fn gradients_reach_every_parameter() {
     // A step with a first pass: only then the simulated measurement matters. Its time is not the last one.
     let number = (1..).step_by(2).find(|&n| (f64::from(n) * 0.414_214).fract() > 0.2).unwrap();
     let grads = loss(&network, &burst, number as u64).total.backward();
-    let mut without = Without { grads: &grads, path: vec![], names: vec![] };
-    network.visit(&mut without);
-    assert!(without.names.is_empty(), "no gradient: {}", without.names.join(", "));
+    let mut missing = MissingGradients { grads: &grads, path: vec![], names: vec![] };
+    network.visit(&mut missing);
+    assert!(missing.names.is_empty(), "no gradient: {}", missing.names.join(", "));
 }
 
 #[test]
-fn gradients_in_16_bits_are_those_in_32() {
+fn bf16_gradients_match_f32() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 64, width: 64 }, 5, &device);
     let mut network = tiny().init(3, &device);
@@ -291,7 +273,7 @@ fn gradients_in_16_bits_are_those_in_32() {
 }
 
 #[test]
-fn one_burst_is_learnt_by_heart() {
+fn overfits_a_single_burst() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 16, width: 16 }, 5, &device);
     let mut network = tiny().init(3, &device);
@@ -315,7 +297,7 @@ fn one_burst_is_learnt_by_heart() {
 }
 
 #[test]
-fn a_step_on_ndarray_is_that_on_flex() {
+fn step_on_ndarray_matches_flex() {
     #[allow(deprecated)] // asked for by name
     let devices = [Device::flex(), Device::ndarray()];
     let losses = devices.map(|device| {
