@@ -133,7 +133,7 @@ fn runs_are_gone_on_with_and_never_lost() {
 #[test]
 fn all_bursts_can_be_drawn_before_learning() {
     let folder = scratch("train-draw");
-    let parts = format!("{QUICK} --set train.parts={{bursts=5,kept=3,frames=3,side=16}}");
+    let parts = format!("{QUICK} --set train.crops={{bursts=5,cached_frames=3,frames=3,side=16}}");
     run(&folder, &format!("train tiny --bursts kept --draw-only --workers 2 {parts}"));
     let names: Vec<_> = (0..5).map(|number| format!("1-{number:06}.safetensors")).collect();
     assert_eq!(listing(&folder.join("kept")), names);
@@ -147,9 +147,9 @@ fn all_bursts_can_be_drawn_before_learning() {
     assert!(std::fs::read(path(3)).unwrap() == before && written(4) == at);
     run(&folder, &format!("train tiny --bursts kept -o run {parts}"));
     assert!(std::fs::read(path(4)).unwrap() == kept);
-    refused(&folder, "train tiny --bursts kept --draw-only", &["train.parts"]);
+    refused(&folder, "train tiny --bursts kept --draw-only", &["train.crops"]);
     let other = format!("train tiny --bursts kept --draw-only {parts} --set data.crop=40");
-    refused(&folder, &other, &["something else"]);
+    refused(&folder, &other, &["drawn with other"]);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Samples as planes, noise and times, ready to go to a device.
 
-use super::burst_sampler::{BurstSampler, ConditionedBurst};
+use super::burst::ConditionedBurst;
+use super::burst_sampler::BurstSampler;
 use super::recipe::Recipe;
 use crate::loss::{Example, training_timestep};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -13,10 +14,10 @@ use qudi_model::tensor::to_tensor;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
-/// Samples for one pass.
+/// The samples of one pass.
 #[derive(Clone, Debug)]
 pub struct Batch {
-    /// Number of the batch in its run.
+    /// The number of the batch in its run.
     pub number: u64,
     size: Size,
     frames: usize,
@@ -30,7 +31,7 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Batch `number` of a recipe.
+    /// Draws batch `number` of a recipe.
     ///
     /// # Errors
     /// [`qudi_core::SimError`] if the data cannot be read.
@@ -61,23 +62,23 @@ impl Batch {
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
-            let time = training_timestep(
+            let timestep = training_timestep(
                 random.random(),
                 random.random(),
                 recipe.train.noise_start_fraction,
             );
-            batch.timesteps.push(time);
+            batch.timesteps.push(timestep);
             batch.acquisitions.push(drawn.acquisition);
         }
         Ok(batch)
     }
 
-    /// Samples in it.
+    /// The number of samples.
     pub fn len(&self) -> usize {
         self.acquisitions.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no samples.
     pub fn is_empty(&self) -> bool {
         self.acquisitions.is_empty()
     }
@@ -93,7 +94,7 @@ impl Batch {
         }
     }
 
-    /// The batch as an example of the objective, on the device of `measured`.
+    /// The batch as an example for the loss, on the device of `measured`.
     pub(super) fn example<'a>(&'a self, measured: &'a Measured) -> Example<'a> {
         let device = measured.u.device();
         Example {

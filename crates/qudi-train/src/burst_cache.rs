@@ -1,6 +1,6 @@
-//! Bursts with their guides, small in memory, and on disk: a guide takes longer to find than to learn from.
+//! Cached bursts, small in memory, and on disk: a reference estimate takes ten times as long as a training step.
 
-use super::burst_sampler::ConditionedBurst;
+use super::burst::ConditionedBurst;
 use super::parameters::parameters;
 use super::recipe::{CropsConfig, Recipe};
 use crate::dataset::{DataConfig, Sample};
@@ -19,7 +19,7 @@ use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// A burst: planes of deviations in bytes, finer than any noise.
+/// A burst whose aligned counts are rounded to bytes, in steps finer than any noise.
 #[derive(Debug)]
 pub(super) struct CachedBurst {
     size: Size,
@@ -28,7 +28,7 @@ pub(super) struct CachedBurst {
     deviations: Vec<Vec<i8>>,
 }
 
-/// Steps of a byte: a 64th of a deviation near zero, wider far from it.
+/// The steps of a byte: a 64th of a standard deviation near zero, wider far from it.
 const STEPS: f32 = 32.0;
 
 fn compressed(deviation: f32) -> i8 {
@@ -47,7 +47,7 @@ impl CachedBurst {
         Self { size, sample, images, deviations: deviations.collect() }
     }
 
-    /// Some frames, some square of them, turned and mirrored somehow.
+    /// Cuts random frames and a random square, rotated and mirrored at random.
     pub(super) fn crop(&self, crops: CropsConfig, random: &mut impl Rng) -> ConditionedBurst {
         let (frames, side) = (crops.frames, crops.side);
         let first = random.random_range(0..=self.sample.truth.len() - frames);
@@ -90,7 +90,7 @@ fn picked<T: Copy>(values: &[T], places: &[usize]) -> Vec<T> {
     places.iter().map(|&place| values[place]).collect()
 }
 
-/// A folder with a file for every burst that was drawn.
+/// A folder with a SafeTensors file for every burst.
 #[derive(Debug)]
 pub(super) struct BurstCache {
     folder: PathBuf,
@@ -129,7 +129,7 @@ impl CacheKey {
     }
 }
 
-/// Hash of a draft's weights.
+/// The hash of a draft's weights.
 fn sha256(draft: &Draft) -> Result<String> {
     let mut hash = Sha256::new();
     for list in parameters(draft.denoiser()) {
@@ -138,7 +138,7 @@ fn sha256(draft: &Draft) -> Result<String> {
     Ok(format!("{:x}", hash.finalize()))
 }
 
-/// What a file tells besides its planes.
+/// The metadata of a file, as TOML.
 #[derive(Serialize, Deserialize)]
 struct Label {
     drawn: String,
@@ -148,10 +148,10 @@ struct Label {
     sensor: Sensor,
 }
 
-/// The one entry of a file's metadata.
+/// The key of the only entry of a file's metadata.
 const KEY: &str = "burst";
 
-/// Most bytes of a file that are not pixels.
+/// The most bytes of a file that are not pixels.
 const HEADER: usize = 1 << 16;
 
 impl BurstCache {

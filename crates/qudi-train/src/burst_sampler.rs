@@ -1,8 +1,9 @@
 //! Samples with their reference estimates: drawn one by one, or cut from cached bursts.
 
+use super::burst::ConditionedBurst;
 use super::burst_cache::{BurstCache, CachedBurst};
 use super::recipe::{CropsConfig, Recipe};
-use crate::dataset::{Dataset, Sample};
+use crate::dataset::Dataset;
 use qudi_core::restorer::BurstView;
 use qudi_core::{Result, SimError, Size, USUAL_EXPOSURE};
 use qudi_model::config::Part;
@@ -16,15 +17,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, OnceLock};
 
-/// Frames of a burst and what classical methods make of all of them.
-#[derive(Clone, Debug)]
-pub(super) struct ConditionedBurst {
-    pub(super) size: Size,
-    pub(super) sample: Sample,
-    pub(super) guide: GuidePlanes,
-}
-
-/// Where samples come from, for one thread.
+/// The source of samples for one thread.
 #[derive(Debug)]
 pub struct BurstSampler {
     dataset: Dataset,
@@ -41,7 +34,7 @@ pub struct BurstSampler {
 type Cached = Arc<Vec<OnceLock<CachedBurst>>>;
 
 impl BurstSampler {
-    /// Those of a recipe, with the drafts of the network that learns.
+    /// The sampler of a recipe, with the drafts of the network that learns.
     pub fn new(recipe: &Recipe, dataset: Dataset, drafts: Vec<Draft>) -> Self {
         let cells = |crops: CropsConfig| {
             let cached = (0..crops.bursts).map(|_| OnceLock::new()).collect();
@@ -59,7 +52,7 @@ impl BurstSampler {
         }
     }
 
-    /// Writes drawn bursts into `folder`, which exists, and reads those that lie there.
+    /// Writes drawn bursts into `folder`, which exists, and reads those that are there.
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the recipe has no `train.crops`.
@@ -68,7 +61,7 @@ impl BurstSampler {
         Ok(Self { cache, ..self })
     }
 
-    /// The same for another thread.
+    /// Makes the same sampler for another thread.
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the data cannot be opened again.

@@ -26,7 +26,7 @@ pub fn draw_bursts(
     on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
 ) -> Result<()> {
     let Some(folder) = &files.bursts else {
-        return Err(SimError::request("no folder for bursts", "--bursts", "name one"));
+        return Err(SimError::request("no folder for bursts", "bursts", "name one"));
     };
     let dataset = Dataset::new(&recipe.data, files.pack)?;
     let drafts = Draft::all(network, &recipe.network, TILE, device);

@@ -10,10 +10,12 @@
 mod cases;
 
 mod batch;
+mod burst;
 mod burst_cache;
 mod burst_sampler;
 pub mod dataset;
 mod draw_bursts;
+mod ema;
 mod learning_rate;
 pub mod loss;
 mod optimizer;

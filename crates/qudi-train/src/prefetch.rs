@@ -1,4 +1,4 @@
-//! Batches drawn ahead on threads of their own, in order.
+//! Batches drawn ahead on threads of their own.
 
 use super::batch::Batch;
 use super::burst_sampler::BurstSampler;
@@ -6,10 +6,10 @@ use super::recipe::Recipe;
 use qudi_core::{Result, SimError};
 use std::sync::mpsc::{Receiver, sync_channel};
 
-/// Batches that a thread keeps ready.
+/// The number of batches that a thread keeps ready.
 const AHEAD: usize = 2;
 
-/// Gives batch after batch; which thread drew them makes no difference.
+/// Gives batches in order; they do not depend on the number of threads.
 #[derive(Debug)]
 pub struct Prefetcher {
     workers: Vec<Receiver<Result<Batch>>>,
@@ -17,7 +17,7 @@ pub struct Prefetcher {
 }
 
 impl Prefetcher {
-    /// Draws from batch `first` on, on `workers` threads.
+    /// Starts `workers` threads that draw batches from number `first` on.
     ///
     /// # Errors
     /// [`SimError`] if the data cannot be opened.
@@ -37,7 +37,7 @@ impl Prefetcher {
                 |e| {
                     SimError::request(
                         format!("no thread for the data: {e}"),
-                        "--workers",
+                        "workers",
                         "use fewer",
                     )
                 },
@@ -48,7 +48,7 @@ impl Prefetcher {
         Ok(Self { workers, next: 0 })
     }
 
-    /// The next batch.
+    /// Waits for the next batch.
     ///
     /// # Errors
     /// [`SimError`] if it could not be drawn.

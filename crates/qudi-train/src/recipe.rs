@@ -229,7 +229,7 @@ impl Recipe {
         for (key, good, problem) in rules {
             if !good {
                 let what = format!("{key} {problem}");
-                return Err(SimError::request(what, key, "correct the recipe, or --set it"));
+                return Err(SimError::request(what, key, "correct the recipe"));
             }
         }
         if let Some(validation) = &self.validation {
@@ -286,7 +286,7 @@ fn read(name: &str) -> Result<String> {
             let what = format!("`{name}` is no recipe");
             SimError::request(
                 what,
-                "RECIPE",
+                name,
                 format!("name a .toml file, or one of {}", names.join(", ")),
             )
         }
@@ -350,7 +350,7 @@ fn modern_key(key: &str) -> String {
 fn set(document: &mut toml::Table, key: &str, text: &str) -> Result<()> {
     let unknown = || {
         let help = "name keys of the recipe, as in train.steps or data.source.0.weight";
-        SimError::request(format!("`{key}` is no key of the recipe"), "--set", help)
+        SimError::request(format!("`{key}` is no key of the recipe"), key, help)
     };
     let value = format!("v = {text}").parse::<toml::Table>().ok();
     let value = value.and_then(|mut table| table.remove("v"));

@@ -1,4 +1,4 @@
-//! The state that a run goes on from: a folder of weights, their average, the optimizer's moments and counters, which
+//! The state that a run resumes from: a folder of weights, their average, the optimizer's moments and counters, which
 //! is replaced whole or not at all.
 
 use super::optimizer::Adam;
@@ -15,7 +15,7 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Counters of a run.
+/// The counters of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct Counters {
     step: u64,
@@ -49,7 +49,7 @@ impl Trainer {
         }
         std::fs::create_dir(&new).map_err(failed(&new))?;
         let weights = super::parameters::parameters(&self.network);
-        let lists = [&weights, &self.average, &self.adam.mean, &self.adam.square];
+        let lists = [&weights, &self.ema.average, &self.adam.mean, &self.adam.square];
         let names = parameter_shapes(&self.network);
         let mut tensors = Vec::new();
         for (prefix, list) in LISTS.iter().zip(lists) {
@@ -96,7 +96,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Goes on from the state in a run's folder.
+    /// Resumes from the state in a run's folder.
     ///
     /// # Errors
     /// [`SimError`] if there is none, or it is damaged or of another recipe.
@@ -113,7 +113,7 @@ impl Trainer {
             SimError::data(
                 format!("the training state cannot be used: {what}"),
                 &folder,
-                "start anew in another folder, with --init and this run's weights.safetensors",
+                "start a new run in another folder from this run's weights.safetensors",
             )
         };
         let open = |name: &str| {
@@ -126,7 +126,7 @@ impl Trainer {
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
         let mut trainer = Self::new(recipe, None, devices, backbones)?;
         let names = parameter_shapes(&trainer.network);
-        let device = trainer.average[0].device();
+        let device = trainer.ema.average[0].device();
         let list = |prefix: &str| {
             let values = names.iter().map(|(name, shape)| {
                 let name = format!("{prefix}/{name}");
@@ -143,7 +143,7 @@ impl Trainer {
         };
         let [weights, average, mean, square] = LISTS.map(list);
         trainer.network = with_parameters(trainer.network, weights?);
-        trainer.average = average?;
+        trainer.ema.average = average?;
         trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
         Ok(trainer)
     }

@@ -1,6 +1,7 @@
-//! The network while it learns: weights, their average, the optimizer's state.
+//! The network during training: its weights, their average, the optimizer's state.
 
 use super::batch::Batch;
+use super::ema::Ema;
 use super::learning_rate::learning_rate;
 use super::optimizer::Adam;
 use super::parameters::{gradients, parameters, with_parameters};
@@ -21,36 +22,36 @@ use serde::Serialize;
 use std::path::Path;
 use std::time::Instant;
 
-/// Means of the loss's terms over a step.
+/// The terms of the loss, each the mean over a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct LossValues {
     /// The weighted sum.
     pub total: f64,
-    /// Of the prediction.
+    /// The term of the prediction.
     pub prediction: f64,
-    /// Of the pre-denoised frames.
+    /// The term of the pre-denoised frames.
     pub pre: f64,
-    /// Of the perceptual term.
+    /// The perceptual term.
     pub perceptual: f64,
-    /// Of the flows.
+    /// The term of the flows.
     pub flow: f64,
-    /// Of the errors that the pre-denoiser tells.
+    /// The term of the predicted uncertainty.
     #[serde(rename = "error")]
     pub uncertainty: f64,
 }
 
-/// What a step did.
+/// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct StepReport {
-    /// Steps taken, this one included.
+    /// The number of steps taken, this one included.
     pub step: u64,
-    /// Learning rate.
+    /// The learning rate.
     #[serde(rename = "rate")]
     pub lr: f64,
     /// The loss.
     #[serde(flatten)]
     pub loss: LossValues,
-    /// Norm of the gradient before it was shortened.
+    /// The norm of the gradient before clipping.
     pub norm: f64,
     /// Seconds that the step waited for data.
     pub data_s: f64,
@@ -62,19 +63,19 @@ pub struct StepReport {
     pub optimizer_s: f64,
 }
 
-/// See the module.
+/// Trains a network step by step on one or more devices.
 #[derive(Debug)]
 pub struct Trainer {
     recipe: Recipe,
-    /// With autodiff; the first one holds weights and optimizer.
+    /// Devices with autodiff; the first one holds weights and optimizer.
     devices: Vec<Device>,
     pub(super) network: Qudi,
-    pub(super) average: Vec<Tensor<1>>,
+    pub(super) ema: Ema,
     pub(super) adam: Adam,
     perceptual: Vec<Lpips>,
 }
 
-/// One batch's gradients and losses, and the seconds that they took.
+/// The gradients and losses of one batch, and the seconds that they took.
 struct Pass {
     gradients: Vec<Tensor<1>>,
     loss: LossValues,
@@ -96,7 +97,7 @@ impl Trainer {
     ) -> Result<Self> {
         let devices: Vec<Device> = devices.iter().map(|device| device.clone().autodiff()).collect();
         let Some(main) = devices.first() else {
-            return Err(SimError::request("no device", "--device", "name at least one"));
+            return Err(SimError::request("no device", "devices", "name at least one"));
         };
         let precision = recipe.train.precision;
         if let Some(device) = devices.iter().find(|device| !precision.is_supported(device)) {
@@ -118,19 +119,19 @@ impl Trainer {
         Ok(Self {
             recipe: recipe.clone(),
             adam: Adam::new(&start),
-            average: start,
+            ema: Ema::new(start, recipe.train.ema),
             network: learner,
             devices,
             perceptual,
         })
     }
 
-    /// Steps taken.
+    /// The number of steps taken.
     pub fn step_number(&self) -> u64 {
         self.adam.steps
     }
 
-    /// Batches used.
+    /// The number of batches used.
     pub fn batches(&self) -> u64 {
         self.step_number() * self.recipe.train.accumulate as u64
     }
@@ -140,7 +141,7 @@ impl Trainer {
         let network = self.network.valid();
         // Drafts do not learn, and an average of equal numbers is not always that number.
         let drafts = network.drafts().to_vec();
-        with_parameters(network, self.average.clone()).with_drafts(drafts)
+        with_parameters(network, self.ema.average.clone()).with_drafts(drafts)
     }
 
     /// Takes one step.
@@ -175,10 +176,7 @@ impl Trainer {
         let lr = learning_rate(train, taken);
         let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
         let moved = self.adam.step(parameters(&self.network), gradients, scale, lr);
-        // An average over few steps at first, or the initial weights would stay in it for long.
-        let keep = train.ema.min((1 + taken) as f64 / (10 + taken) as f64);
-        let average = std::mem::take(&mut self.average).into_iter().zip(&moved);
-        self.average = average.map(|(a, b)| a * keep + b.clone() * (1.0 - keep)).collect();
+        self.ema.update(&moved, taken);
         self.network = with_parameters(self.network.clone(), moved);
         let optimizer_s = start.elapsed().as_secs_f64();
         Ok(StepReport {
@@ -193,7 +191,7 @@ impl Trainer {
         })
     }
 
-    /// Gradients of all batches, in their order, each on the first device.
+    /// Computes the gradients of all batches, in their order, on the first device.
     fn passes(&self, batches: &[Batch]) -> Result<Vec<Pass>> {
         let main = self.devices[0].clone().inner();
         if self.devices.len() == 1 {
@@ -214,7 +212,7 @@ impl Trainer {
             let handles: Vec<_> =
                 (0..self.devices.len()).map(|number| scope.spawn(work(number))).collect();
             let failed =
-                || Err(SimError::request("a device's thread failed", "--device", "report this"));
+                || Err(SimError::request("a device's thread failed", "devices", "report this"));
             let lists =
                 handles.into_iter().map(|handle| handle.join().unwrap_or_else(|_| failed()));
             lists.collect::<Result<Vec<_>>>()
@@ -228,7 +226,7 @@ impl Trainer {
         Ok(lists.into_iter().map(home).collect())
     }
 
-    /// One batch through `network`, on device `number`.
+    /// Passes one batch through `network`, on device `number`.
     fn pass(&self, network: &Qudi, batch: &Batch, number: usize) -> Result<Pass> {
         let start = Instant::now();
         let device = &self.devices[number];
@@ -290,7 +288,7 @@ impl Trainer {
                 self.step_number() + 1
             ),
             what,
-            "lower train.lr or train.clip and go on from the checkpoint with --resume",
+            "lower train.lr or train.clip, and resume from the checkpoint",
         ))
     }
 }
@@ -314,7 +312,7 @@ fn unsupported(precision: ComputePrecision, device: &Device) -> SimError {
     )
 }
 
-/// Euclidean norm over all lists.
+/// The Euclidean norm over all lists.
 fn norm(gradients: &[Tensor<1>]) -> Result<f64> {
     let squares = gradients.iter().map(|g| g.clone().powi_scalar(2).sum()).collect();
     let squares = read(Tensor::cat(squares, 0))?;

@@ -75,8 +75,9 @@ impl Validator {
         }
         if recipe.validation_data().is_some() {
             let Some(pack) = pack else {
-                let help = "name the data folder, or a pack";
-                return Err(SimError::request("the validation clips need files", "--data", help));
+                let help = "give the data folder, or a pack";
+                let what = "the validation clips need files";
+                return Err(SimError::request(what, "validation.from", help));
             };
             let mut pack = pack.try_clone()?;
             for number in 0..pack.clips().len() {
@@ -143,15 +144,8 @@ impl Validator {
                 let mut camera = Camera::new(&self.sensor, size, light, SEED + number as u64)?;
                 let counts = (0..).zip(truth).map(|(t, frame)| camera.expose(t, &[frame]));
                 let counts: Vec<Vec<u16>> = counts.collect::<Result<_>>()?;
-                let mut acquisition = Acquisition {
-                    seed: SEED,
-                    first_frame: 0,
-                    ppp,
-                    exposure: USUAL_EXPOSURE,
-                    sensor: self.sensor.clone(),
-                    gain: camera.gain(),
-                    dark: None,
-                };
+                let mut acquisition =
+                    Acquisition::new(self.sensor.clone(), ppp, USUAL_EXPOSURE)?.with_seed(SEED);
                 let read = |frame: u64| Ok(counts[frame as usize].clone());
                 acquisition.exposure =
                     fitting_exposure(size, counts.len() as u64, &acquisition, read)?;

@@ -242,7 +242,7 @@ fn rejects_data_that_cannot_be_sampled() {
     other.source[0].name = "others".into();
     let error = Dataset::new(&other, open()).unwrap_err();
     assert!(error.to_string().contains("others"), "{error}");
-    assert!(Dataset::new(&config, None).unwrap_err().place().is_some_and(|p| p == "--data"));
+    assert!(Dataset::new(&config, None).unwrap_err().place().is_some_and(|p| p == "data.source"));
     for (key, broken) in [
         ("frames", DataConfig { frames: 2, ..config.clone() }),
         ("crop", DataConfig { crop: 0, ..config.clone() }),

@@ -362,3 +362,14 @@ fn reads_recipes_with_former_key_names() {
     }
     assert!(!change("train.rate", "2e-3").text().contains("rate ="));
 }
+
+#[test]
+fn recipes_with_removed_terms_are_refused_with_the_reason() {
+    for name in ["ms-ssim", "oriented", "lpips-squeeze"] {
+        let changes = [("train.loss.term", name), ("train.loss.perceptual", "0.1")];
+        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
+        let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
+        assert!(error.contains(&format!("`{name}` was removed")), "{error}");
+        assert!(error.contains("lpips-alex"), "{error}");
+    }
+}

@@ -23,13 +23,13 @@ pub(crate) struct Train {
     /// Decoded data in one file; made from --data if it is not there [default: pack.zip in the run's folder]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) pack: Option<PathBuf>,
-    /// Folder for the bursts of recipes with train.parts, with their guides: what lies there is not drawn again
+    /// Folder for the bursts of recipes with train.crops, with their reference estimates: those there are not drawn again
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
     pub(crate) bursts: Option<PathBuf>,
     /// Make the pack, and stop
     #[arg(long, requires = "pack")]
     pub(crate) cache_only: bool,
-    /// Draw all bursts of a recipe with train.parts into --bursts, and stop
+    /// Draw all bursts of a recipe with train.crops into --bursts, and stop
     #[arg(long, requires = "bursts", conflicts_with_all = ["cache_only", "output"])]
     pub(crate) draw_only: bool,
     /// Go on from the run's last state

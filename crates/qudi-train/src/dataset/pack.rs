@@ -66,7 +66,7 @@ impl Pack {
         if index.version != VERSION {
             let what =
                 format!("the pack's layout is {}, this program reads {VERSION}", index.version);
-            return Err(SimError::data(what, path, "make it again with --cache-only"));
+            return Err(SimError::data(what, path, "make the pack again from its recipe"));
         }
         for clip in &index.clips {
             let size = Size::new(clip.size.height, clip.size.width, &clip.name);
@@ -130,5 +130,5 @@ fn entry(archive: &mut ZipArchive<BufReader<File>>, name: &str, path: &Path) -> 
 
 fn damaged(path: &Path, what: impl Into<String>) -> SimError {
     let what = format!("not a whole training pack: {}", what.into());
-    SimError::data(what, path, "make it again with `qudi train --cache-only`")
+    SimError::data(what, path, "make the pack again from its recipe")
 }

@@ -84,15 +84,7 @@ impl Dataset {
         let mut camera = Camera::new(&sensor, truth[0].size, light, seed)?;
         let counts = (0..).zip(&truth).map(|(t, frame)| camera.expose(t, &[frame]));
         let counts = counts.collect::<Result<_>>()?;
-        let acquisition = Acquisition {
-            seed,
-            first_frame: 0,
-            ppp: light.ppp,
-            exposure,
-            gain: camera.gain(),
-            sensor,
-            dark: None,
-        };
+        let acquisition = Acquisition::new(sensor, light.ppp, exposure)?.with_seed(seed);
         Ok(Sample { truth, counts, acquisition })
     }
 
@@ -180,13 +172,13 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
     }
     let Some(pack) = pack else {
         let what = format!("source `{}` needs files", source.name);
-        return Err(SimError::request(what, "--data", "name the data folder, or a pack"));
+        return Err(SimError::request(what, "data.source", "give the data folder, or a pack"));
     };
     let mine = pack.clips().iter().enumerate().filter(|(_, clip)| clip.source == source.name);
     let list: Vec<usize> = mine.map(|(number, _)| number).collect();
     if list.is_empty() {
         let what = format!("the pack holds nothing of source `{}`", source.name);
-        let help = "make it again with `qudi train --cache-only`, from this recipe";
+        let help = "make the pack again from this recipe";
         return Err(SimError::data(what, pack.path(), help));
     }
     let frames = if source.kind == SourceKind::Clips { config.frames } else { 1 };

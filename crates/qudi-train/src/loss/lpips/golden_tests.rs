@@ -2,7 +2,6 @@
 #![allow(clippy::unwrap_used)]
 
 use super::{Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
-use crate::Recipe;
 use crate::cases::uniform;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
@@ -235,15 +234,4 @@ fn perceptual_kinds_have_one_name_in_recipes_and_errors() {
     }
     let error = PerceptualKind::by_name("lpips-vg").unwrap_err();
     assert!(error.help().unwrap().contains("did you mean `lpips-vgg`"), "{error:?}");
-}
-
-#[test]
-fn recipes_with_removed_terms_are_refused_with_the_reason() {
-    for name in ["ms-ssim", "oriented", "lpips-squeeze"] {
-        let changes = [("train.loss.term", name), ("train.loss.perceptual", "0.1")];
-        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
-        let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
-        assert!(error.contains(&format!("`{name}` was removed")), "{error}");
-        assert!(error.contains("lpips-alex"), "{error}");
-    }
 }

@@ -1,0 +1,25 @@
+//! An exponential moving average of the network's parameters, which generalises better than the last ones.
+
+use burn::tensor::Tensor;
+
+/// The average, in the order of [`parameters`](crate::parameters).
+#[derive(Clone, Debug)]
+pub(super) struct Ema {
+    decay: f64,
+    pub(super) average: Vec<Tensor<1>>,
+}
+
+impl Ema {
+    /// Starts at `parameters`. `decay` is the fraction of the average that a step keeps.
+    pub(super) fn new(parameters: Vec<Tensor<1>>, decay: f64) -> Self {
+        Self { decay, average: parameters }
+    }
+
+    /// Moves the average towards `parameters`, after `steps` steps before this one.
+    pub(super) fn update(&mut self, parameters: &[Tensor<1>], steps: u64) {
+        // An average over few steps at first, or the initial weights would stay in it for long.
+        let keep = self.decay.min((1 + steps) as f64 / (10 + steps) as f64);
+        let average = std::mem::take(&mut self.average).into_iter().zip(parameters);
+        self.average = average.map(|(a, b)| a * keep + b.clone() * (1.0 - keep)).collect();
+    }
+}
