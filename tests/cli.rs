@@ -14,6 +14,8 @@ mod outputs;
 #[cfg(feature = "remote")]
 #[path = "cli/remote.rs"]
 mod remote;
+#[path = "cli/report.rs"]
+mod report;
 #[path = "cli/restore.rs"]
 mod restore;
 #[path = "cli/settings.rs"]

@@ -69,8 +69,8 @@ impl Clip {
         };
         let clips: Vec<_> = inside.into_iter().filter(is_clip).collect();
         let clips = if clips.is_empty() { vec![path.to_owned()] } else { clips };
-        let named = |path: PathBuf| Self::new(stem(&path), path.display().to_string());
-        Ok(clips.into_iter().map(named).collect())
+        let named = clip_names(&clips).into_iter().zip(&clips);
+        Ok(named.map(|(name, path)| Self::new(name, path.display().to_string())).collect())
     }
 
     fn new(name: String, place: String) -> Self {
@@ -153,6 +153,22 @@ fn burst_name(clip: &str, ppp: f64) -> String {
 
 pub(crate) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Names of clips: of files without the extension, of folders in full, since `run.1` and `run.2` are two clips. Files
+/// that differ in the extension alone keep it.
+fn clip_names(clips: &[PathBuf]) -> Vec<String> {
+    let short = |path: &PathBuf| if path.is_dir() { full_name(path) } else { stem(path) };
+    let names: Vec<String> = clips.iter().map(short).collect();
+    let is_unique = |name: &String| names.iter().filter(|other| *other == name).count() == 1;
+    let name = |(path, name): (&PathBuf, &String)| {
+        if is_unique(name) { name.clone() } else { full_name(path) }
+    };
+    clips.iter().zip(&names).map(name).collect()
+}
+
+fn full_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// FNV-1a: the seed of a clip must not depend on what else lies beside it.
