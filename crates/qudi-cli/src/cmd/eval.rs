@@ -165,7 +165,9 @@ fn judge_clips(
     };
     let about = format!(
         "{number} clips, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
-        exposing.sensor.name, exposing.seed
+        if number == 1 { "clip" } else { "clips" },
+        exposing.sensor.name,
+        exposing.seed
     );
     let settings = json!({
         "protocol": args.protocol,
