@@ -1,5 +1,6 @@
 //! Removing noise from single images.
 
+pub(crate) mod block_statistics;
 pub(crate) mod bm3d;
-pub(crate) mod plane;
-pub(crate) mod stabilizer;
+pub(crate) mod stabilized;
+pub(crate) mod vst;

@@ -1,24 +1,25 @@
-//! The classical methods of the field's tables, written from their papers: a tool that beats
-//! methods should beat them at their best.
+//! Classical restoration of single-photon bursts: the methods of the field, written from their papers, and the reference
+//! estimate that a network goes on from.
 //!
-//! All are [`Restorer`](qudi_core::restorer::Restorer)s: a window of counts `[frames][height][width]` in,
-//! all its frames out, in image units. Constants were chosen on training clips, but those of
-//! the [`ReferenceEstimate`]; docs/results.md tells how.
+//! All methods are [`Restorer`](qudi_core::restorer::Restorer)s: a window of counts `[frames][height][width]` in, all its
+//! frames out, in image units. Constants were chosen on training clips, those of the [`ReferenceEstimate`] on validation
+//! clips.
 #![warn(missing_docs)]
 
-mod aligned;
+mod aligned_burst;
 mod denoise;
-mod guide;
 mod merge;
 pub mod methods;
 pub mod motion;
-mod steady;
+mod moving_sums;
+mod patch;
+mod prepared_burst;
+mod reference;
+mod temporal_filter;
 
-pub use aligned::{AlignedBurst, AlignedFrame, Alignments};
+pub use aligned_burst::{AlignedBurst, AlignedFrame, Alignments};
 pub use denoise::bm3d::bm3d;
-pub use denoise::stabilizer::{Transform, VarianceStabilizer};
-pub use guide::{QbpRefined, ReferenceEstimate};
-pub use methods::qbp::PatchFlow;
-pub use methods::{
-    Average, Mle, PostFilter, Qbp, QbpSettings, TransformDenoise, moving_sums, sure_window_radius,
-};
+pub use denoise::vst::{Transform, VarianceStabilizer};
+pub use methods::{Average, Mle, PatchFlow, PostFilter, Qbp, QbpSettings, TransformDenoise};
+pub use moving_sums::{moving_sums, sure_window_radius};
+pub use reference::{QbpRefined, ReferenceEstimate};

@@ -2,6 +2,7 @@
 
 pub(crate) mod blocks;
 pub(crate) mod cubic;
-pub(crate) mod dft;
-pub(crate) mod hot;
+mod dft16;
+pub(crate) mod hot_pixels;
+pub(crate) mod merged_frame;
 pub(crate) mod wiener;

@@ -1,13 +1,11 @@
-//! The methods, one a file.
+//! The classical methods, as published; one a file.
 
 mod average;
 mod mle;
-pub(crate) mod moving;
-pub(crate) mod qbp;
-pub(crate) mod transform_denoise;
+mod qbp;
+mod transform_denoise;
 
 pub use average::Average;
 pub use mle::Mle;
-pub use moving::{moving_sums, sure_window_radius};
-pub use qbp::{PostFilter, Qbp, QbpSettings};
+pub use qbp::{PatchFlow, PostFilter, Qbp, QbpSettings};
 pub use transform_denoise::TransformDenoise;

@@ -1,14 +1,18 @@
 //! Motion between the frames of a burst.
 
-pub(crate) mod affine;
-pub(crate) mod align;
+mod affine;
+pub(crate) mod block_alignment;
 mod block_flow;
-pub(crate) mod camera;
-pub(crate) mod closest;
+pub(crate) mod constant_velocity;
+pub(crate) mod global_motion;
 pub(crate) mod grid;
-pub(crate) mod paths;
+pub(crate) mod hypotheses;
+pub(crate) mod patch_matching;
+mod patch_refinement;
+pub(crate) mod per_pixel_selection;
 pub(crate) mod pyramid;
-pub(crate) mod velocity;
+pub(crate) mod reference_frames;
+mod velocity_search;
 mod warping_error;
 
 pub use block_flow::estimate_flow;

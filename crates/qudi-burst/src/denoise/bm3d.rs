@@ -15,19 +15,19 @@ use matching::Search;
 use pass::pass;
 use qudi_core::{Frame, Size};
 
-/// Blocks in a group of the first and of the second pass (table I).
+/// The most blocks in a group of the first and of the second pass (table I).
 const MOST: [usize; 2] = [16, 32];
 
-/// How hard to look.
+/// Settings of the search for similar blocks.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Profile {
+pub(crate) struct SearchSettings {
     /// Largest displacement of similar blocks, in pixels.
     pub(crate) radius: usize,
     /// Pixels between the blocks that are looked for, in the first and in the second pass.
     pub(crate) step: [usize; 2],
 }
 
-impl Profile {
+impl SearchSettings {
     /// Windows of 39 x 39 (table I, "normal profile"). The second pass looks for a block every 2 pixels instead
     /// of 3: 0.02 dB for half as much time again (docs/results.md).
     pub(crate) const NORMAL: Self = Self { radius: 19, step: [3, 2] };
@@ -46,11 +46,11 @@ const SIMILAR: [f32; 2] = [500.0, 400.0];
 /// size: below a block's 8 pixels the border is repeated. Without noise the image comes back as
 /// it is.
 pub fn bm3d(image: &Frame, sigma: f32) -> Frame {
-    bm3d_as(Profile::NORMAL, image, sigma)
+    bm3d_with(SearchSettings::NORMAL, image, sigma)
 }
 
-/// [`bm3d`] in another profile.
-pub(crate) fn bm3d_as(profile: Profile, image: &Frame, sigma: f32) -> Frame {
+/// [`bm3d`] in another search_settings.
+pub(crate) fn bm3d_with(search_settings: SearchSettings, image: &Frame, sigma: f32) -> Frame {
     // Also where sigma is no number.
     if !(sigma > 0.0 && sigma.is_finite()) {
         return image.clone();
@@ -59,13 +59,13 @@ pub(crate) fn bm3d_as(profile: Profile, image: &Frame, sigma: f32) -> Frame {
     let size = Size { height: height.max(block::BLOCK), width: width.max(block::BLOCK) };
     if size != image.size {
         let inside = |x: usize, y: usize| image.row(y.min(height - 1))[x.min(width - 1)];
-        let whole = bm3d_as(profile, &Frame::from_fn(size, inside), sigma);
+        let whole = bm3d_with(search_settings, &Frame::from_fn(size, inside), sigma);
         return Frame::from_fn(image.size, |x, y| whole.row(y)[x]);
     }
     let variance = sigma * sigma;
     let search = |pass: usize, noise: f32| Search {
-        step: profile.step[pass],
-        radius: profile.radius,
+        step: search_settings.step[pass],
+        radius: search_settings.radius,
         most: MOST[pass],
         threshold: noise + SIMILAR[pass] / (255.0 * 255.0),
     };

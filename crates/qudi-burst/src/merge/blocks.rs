@@ -1,6 +1,7 @@
 //! Blocks of consecutive frames around a reference frame, and the motion of each frame from that
 //! of the blocks.
 
+use crate::patch::PatchMotion;
 use std::ops::Range;
 
 /// Consecutive blocks that cover a window.
@@ -12,7 +13,7 @@ pub(crate) struct Blocks {
 }
 
 impl Blocks {
-    /// Blocks of `length` frames (odd) out of `frames`, one of them around `reference`; those at the ends
+    /// Divides `frames` frames into blocks of `length` frames (odd), one of them around `reference`; those at the ends
     /// may be shorter.
     pub(crate) fn around(reference: usize, frames: usize, length: usize) -> Self {
         let half = length / 2;
@@ -37,13 +38,15 @@ impl Blocks {
         Self { ranges, reference: number }
     }
 
-    /// The motion of every patch to every frame, `[frame][patch]`: linear between the middles of blocks,
+    /// Lists the ranges of the blocks, the reference's first.
+    pub(crate) fn reference_first(&self) -> impl Iterator<Item = &Range<usize>> {
+        let others = (0..self.ranges.len()).filter(|&k| k != self.reference);
+        std::iter::once(self.reference).chain(others).map(|k| &self.ranges[k])
+    }
+
+    /// Interpolates the motion of every patch to every frame, `[frame][patch]`: linear between the middles of blocks,
     /// and beyond them. The reference block's motion is zero at `reference`.
-    pub(crate) fn interpolate(
-        &self,
-        flows: &[Vec<[f32; 2]>],
-        reference: usize,
-    ) -> Vec<Vec<[f32; 2]>> {
+    pub(crate) fn interpolate(&self, flows: &PatchMotion, reference: usize) -> PatchMotion {
         let middle = |k: usize| {
             let range = &self.ranges[k];
             if k == self.reference {
@@ -76,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn blocks_cover_the_window_once() {
+    fn covers_the_window_once() {
         for frames in 1..14 {
             for reference in 0..frames {
                 for length in [1, 3, 5] {
@@ -90,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn even_motion_is_even_in_every_frame() {
+    fn interpolates_constant_velocity_exactly() {
         for (reference, length) in [(5, 3), (0, 3), (10, 5), (4, 1)] {
             let blocks = Blocks::around(reference, 11, length);
             // 2 pixels per frame, as the blocks' middles show it.

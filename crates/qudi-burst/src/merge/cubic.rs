@@ -1,8 +1,7 @@
 //! Patches between pixels by cubic convolution (Keys, "Cubic convolution interpolation for digital image
 //! processing", IEEE TASSP 29(6), 1981), which keeps fine texture that bilinear means lose.
 
-use super::dft::{Patch, SIDE};
-use crate::motion::grid::inside;
+use crate::patch::{Patch, SIDE, inside};
 use qudi_core::Frame;
 
 /// Weights of the samples at -1, 0, 1 and 2 for the place `part` between 0 and 1 (Keys 1981, eq. 15).
@@ -12,12 +11,12 @@ fn taps(part: f32) -> [f32; 4] {
     [far(1.0 + part), near(part), near(1.0 - part), far(2.0 - part)]
 }
 
-/// What the taps leave of the variance of white noise.
-pub(crate) fn squares(part: f32) -> f32 {
+/// What the taps leave of the variance of white noise along an axis.
+pub(crate) fn noise_factor(part: f32) -> f32 {
     taps(part).iter().map(|tap| tap * tap).sum()
 }
 
-/// The patch whose corner is at `corner`, borders repeated.
+/// Samples the patch whose corner is at `corner`; the image's borders are repeated.
 fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     let (width, height) = (image.size.width as isize, image.size.height as isize);
     let [x, y] = corner.map(|c| c.floor() as isize - 1);
@@ -48,7 +47,7 @@ fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     patch
 }
 
-/// The same, but what lies outside the image is `own`'s at `corner`.
+/// Samples the patch whose corner is at `at`; what lies outside the image is taken from `own` at `corner`.
 pub(crate) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [usize; 2]) -> Patch {
     let mut patch = cubic(image, at);
     let (columns, rows) = (inside(at[0], image.size.width), inside(at[1], image.size.height));
@@ -76,7 +75,7 @@ mod tests {
 
     /// Cubic convolution reproduces parabolas (Keys 1981, section III).
     #[test]
-    fn parabolas_are_exact_inside() {
+    fn reproduces_parabolas() {
         let parabola = |x: f32, y: f32| 0.02 * x * x - 0.03 * y * y + 0.01 * x * y + x - 0.5 * y;
         let size = Size { height: 30, width: 34 };
         let image = Frame::from_fn(size, |x, y| parabola(x as f32, y as f32));
@@ -90,11 +89,11 @@ mod tests {
     }
 
     #[test]
-    fn whole_pixels_come_back_and_borders_repeat() {
+    fn returns_whole_pixels_and_repeats_borders() {
         let size = Size { height: SIDE, width: SIDE };
         let image = Frame::from_fn(size, |x, y| (x * 31 + y * 17) as f32);
         assert_eq!(cubic(&image, [0.0, 0.0])[3][9], image.row(3)[9]);
         assert_eq!(cubic(&image, [40.0, -40.0])[0][0], image.row(0)[SIDE - 1]);
-        assert!((squares(0.0) - 1.0).abs() < 1e-6 && squares(0.5) < 0.7);
+        assert!((noise_factor(0.0) - 1.0).abs() < 1e-6 && noise_factor(0.5) < 0.7);
     }
 }

@@ -1,7 +1,7 @@
 //! The mean of the window, scaled: what everyone tries first. No response is inverted and no dark
 //! count subtracted; motion blurs.
 
-use crate::moving_sums;
+use crate::moving_sums::moving_sums;
 use qudi_core::Frame;
 use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};

@@ -1,7 +1,7 @@
 //! The most likely flux of a moving mean: response inverted, dark counts subtracted, over as many
 //! frames as the motion allows.
 
-use crate::{moving_sums, sure_window_radius};
+use crate::moving_sums::{moving_sums, sure_window_radius};
 use qudi_core::Frame;
 use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
@@ -10,23 +10,23 @@ use qudi_core::windows::LONGEST_HALF;
 /// Maximum-likelihood estimate over a window of 1 to 11 frames.
 #[derive(Clone, Copy, Debug)]
 pub struct Mle {
-    half: usize,
+    radius: usize,
 }
 
 impl Mle {
-    /// Over `half` frames on either side.
-    pub fn new(half: usize) -> Self {
-        Self { half }
+    /// Estimates over `radius` frames on either side.
+    pub fn new(radius: usize) -> Self {
+        Self { radius }
     }
 
     /// Chooses the length on windows of the clip, by [`sure_window_radius`].
     pub fn choose(samples: &[BurstView<'_>], acquisition: &Acquisition) -> Self {
-        Self { half: sure_window_radius(samples, acquisition, 1.0) }
+        Self { radius: sure_window_radius(samples, acquisition, 1.0) }
     }
 
-    /// Frames that it sums.
+    /// The number of frames in each sum.
     pub fn length(self) -> usize {
-        2 * self.half + 1
+        2 * self.radius + 1
     }
 }
 
@@ -43,7 +43,7 @@ impl Restorer for Mle {
         let ordinary = acquisition.sensor.dark_per_frame()?;
         let units = 1.0 / acquisition.photons_per_unit();
         let mut frames = Vec::with_capacity(burst.frames.len());
-        moving_sums(burst, self.half, |sums, n| {
+        moving_sums(burst, self.radius, |sums, n| {
             let pixel = |(i, &sum): (usize, &u32)| {
                 let dark = acquisition.dark_of(i, ordinary);
                 let flux =

@@ -1,15 +1,7 @@
 //! Patches that cover an image.
 
-use crate::merge::dft::{Patch, SIDE};
+use crate::patch::{Patch, SIDE};
 use qudi_core::{Frame, Size};
-use std::ops::Range;
-
-/// Samples of a patch at `start`, along one axis, that lie in an image of `length` pixels.
-pub(crate) fn inside(start: f32, length: usize) -> Range<usize> {
-    let first = (-0.5 - start).ceil().clamp(0.0, SIDE as f32);
-    let end = ((length as f32 - 0.5 - start).floor() + 1.0).clamp(first, SIDE as f32);
-    first as usize..end as usize
-}
 
 /// Corners of square patches, the last ones at the borders.
 #[derive(Clone, Debug)]
@@ -29,6 +21,12 @@ impl Grid {
         Self { side, xs: corners(size.width), ys: corners(size.height) }
     }
 
+    /// Lays out the patches of alignment and merging: each overlaps the next by half (Ma et al. 2020, section 5.1).
+    pub(crate) fn half_overlapping(size: Size) -> Self {
+        Self::new(size, SIDE, SIDE / 2)
+    }
+
+    /// The number of patches.
     pub(crate) fn len(&self) -> usize {
         self.xs.len() * self.ys.len()
     }
@@ -156,17 +154,5 @@ mod tests {
             sorted.sort_unstable_by(f32::total_cmp);
             assert_eq!(median_of_nine(values), sorted[4], "{values:?}");
         }
-    }
-
-    #[test]
-    fn samples_inside_are_counted_to_half_a_pixel() {
-        assert_eq!(inside(0.0, 40), 0..16);
-        assert_eq!(inside(-3.0, 40), 3..16);
-        assert_eq!(inside(-2.6, 40), 3..16);
-        assert_eq!(inside(-2.4, 40), 2..16);
-        assert_eq!(inside(24.4, 40), 0..16);
-        assert_eq!(inside(24.6, 40), 0..15);
-        assert_eq!(inside(38.0, 40), 0..2);
-        assert!(inside(60.0, 40).is_empty() && inside(-60.0, 40).is_empty());
     }
 }

@@ -1,6 +1,6 @@
 //! A block of frames at the scales that alignment works on.
 
-use crate::merge::dft::SIDE;
+use crate::patch::SIDE;
 use qudi_core::{Frame, Size};
 
 /// Coarser levels: by which factor than the level before, and the side of the patches matched on it.

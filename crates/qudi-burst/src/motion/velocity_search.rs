@@ -1,4 +1,4 @@
-//! Even motion that the counts of all frames agree on.
+//! ConstantVelocity motion that the counts of all frames agree on.
 //!
 //! Two frames of a few photons say little of how a faint texture moves from one to the other. Along the right path, though,
 //! all frames of a window show the same, and differ by noise alone. Of all velocities on a lattice every patch takes the
@@ -37,14 +37,14 @@ const CORRELATION: f32 = 2.0 / 3.0;
 
 /// Frames small enough to try every velocity.
 #[derive(Debug)]
-pub(crate) struct Coarse {
+pub(crate) struct VelocitySearch {
     frames: Vec<Frame>,
     /// Of the noise of each pixel.
     variance: Vec<f32>,
     size: Size,
 }
 
-impl Coarse {
+impl VelocitySearch {
     /// Of the counts of a window.
     pub(crate) fn new(frames: &[Frame], moments: &CountMoments) -> Self {
         let size = frames[0].size;
@@ -296,7 +296,7 @@ mod tests {
             .collect();
         let moments = CountMoments::new(&CountLaw::new(&sensor, camera.gain()));
         let grid = Grid::new(size, 16, 8);
-        let found = Coarse::new(&frames, &moments).velocities(&grid, 5);
+        let found = VelocitySearch::new(&frames, &moments).velocities(&grid, 5);
         let error = |v: &[f32; 2]| (v[0] - velocity[0]).hypot(v[1] - velocity[1]);
         let mut errors: Vec<f32> = found.iter().map(error).collect();
         errors.sort_unstable_by(f32::total_cmp);

@@ -1,17 +1,17 @@
-//! Moving sums of frames, and how many frames they should span.
+//! Moving sums of frames, and the window radius of least estimated risk.
 
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, CountMoments};
 use qudi_core::windows::LONGEST_HALF;
 
-/// Sums of the frames within `half` of each frame, and how many those are; the window's ends have
-/// fewer.
-pub fn moving_sums(burst: BurstView<'_>, half: usize, mut f: impl FnMut(&[u32], u32)) {
+/// Calls `f` for every frame with the sum of the frames within `radius` of it and how many those are; the window's ends
+/// have fewer.
+pub fn moving_sums(burst: BurstView<'_>, radius: usize, mut f: impl FnMut(&[u32], u32)) {
     let n = burst.frames.len();
     let mut sums = vec![0u32; burst.size.pixels()];
     let (mut from, mut to) = (0, 0);
     for frame in 0..n {
-        let (low, high) = (frame.saturating_sub(half), (frame + half + 1).min(n));
+        let (low, high) = (frame.saturating_sub(radius), (frame + radius + 1).min(n));
         while to < high {
             for (sum, &count) in sums.iter_mut().zip(&burst.frames[to]) {
                 *sum += u32::from(count);
@@ -28,8 +28,8 @@ pub fn moving_sums(burst: BurstView<'_>, half: usize, mut f: impl FnMut(&[u32], 
     }
 }
 
-/// Frames on either side whose mean has the least risk on windows of the clip, if `noise_left` of
-/// the variance of a mean is left by what follows (1 if nothing does).
+/// Chooses the radius of moving means by Stein's unbiased risk estimate (SURE) on windows of the clip, if what follows
+/// leaves `noise_left` of the variance of a mean (1 if nothing follows).
 ///
 /// With `y` a frame's counts and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y`
 /// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise; the
@@ -40,9 +40,9 @@ pub fn sure_window_radius(
     noise_left: f64,
 ) -> usize {
     let moments = CountMoments::new(&CountLaw::new(&acquisition.sensor, acquisition.gain));
-    let risk = |burst: BurstView<'_>, variances: &[f64], half: usize| -> f64 {
+    let risk = |burst: BurstView<'_>, variances: &[f64], radius: usize| -> f64 {
         let (mut total, mut frame) = (0.0, 0);
-        moving_sums(burst, half, |sums, n| {
+        moving_sums(burst, radius, |sums, n| {
             let n = f64::from(n);
             for (&sum, &own) in sums.iter().zip(&burst.frames[frame]) {
                 total += (f64::from(sum) / n - f64::from(own)).powi(2);
@@ -62,8 +62,8 @@ pub fn sure_window_radius(
             let of = |&sum: &u32| unbiased_variance(&moments, f64::from(sum) / n, n, full);
             variances.push(sums.iter().map(of).sum());
         });
-        for (half, total) in risks.iter_mut().enumerate() {
-            *total += risk(*burst, &variances, half);
+        for (radius, total) in risks.iter_mut().enumerate() {
+            *total += risk(*burst, &variances, radius);
         }
     }
     (0..risks.len()).min_by(|&a, &b| risks[a].total_cmp(&risks[b])).unwrap_or(0)
@@ -88,7 +88,7 @@ mod tests {
 
     /// Single binary frames of a still scene, too: none of them shows that it varies.
     #[test]
-    fn still_scenes_want_all_frames() {
+    fn chooses_long_windows_for_static_scenes() {
         let size = Size { height: 48, width: 64 };
         let scene = Frame::from_fn(size, |x, y| 0.2 + 0.01 * ((x + 2 * y) % 50) as f32);
         let light = Light { ppp: 1.0, exposure: 0.45 };
@@ -97,24 +97,15 @@ mod tests {
             let mut camera = qudi_core::Camera::new(&sensor, size, light, 1).unwrap();
             let frames: Vec<Vec<u16>> =
                 (0..11).map(|t| camera.expose(t, &[&scene]).unwrap()).collect();
-            let gain = camera.gain();
-            let acquisition = Acquisition {
-                seed: 0,
-                first_frame: 0,
-                ppp: light.ppp,
-                exposure: light.exposure,
-                sensor,
-                gain,
-                dark: None,
-            };
+            let acquisition = Acquisition::new(sensor, light.ppp, light.exposure).unwrap();
             for noise_left in [1.0, 0.1] {
-                let half = sure_window_radius(
+                let radius = sure_window_radius(
                     &[BurstView { size, frames: &frames }],
                     &acquisition,
                     noise_left,
                 );
                 // 7 frames or more: from there on hardly anything is to be won.
-                assert!(half >= 3, "{name}, {noise_left} left: {half}");
+                assert!(radius >= 3, "{name}, {noise_left} left: {radius}");
             }
         }
     }

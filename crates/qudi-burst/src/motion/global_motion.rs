@@ -6,7 +6,7 @@
 
 use super::affine::{Affine, Freedom, centre};
 use super::pyramid::{shrink, smooth};
-use super::velocity::lowest_between;
+use super::velocity_search::lowest_between;
 use qudi_core::sensor::CountMoments;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
@@ -36,13 +36,13 @@ const STEPS: usize = 2;
 
 /// See the module.
 #[derive(Clone, Debug)]
-pub(crate) struct Camera {
+pub(crate) struct GlobalMotion {
     centre: [f32; 2],
     /// From where the middle frame is, about, to each.
     maps: Vec<Affine>,
 }
 
-impl Camera {
+impl GlobalMotion {
     /// Of a window's frames of mean counts, whose errors are `error` times the variance of counts; nothing if frames are too
     /// few or too small to tell.
     pub(crate) fn find(frames: &[Frame], moments: &CountMoments, error: f32) -> Option<Self> {
@@ -231,7 +231,7 @@ mod tests {
     #[test]
     fn most_of_the_image_decides_and_uneven_motion_is_found() {
         let moments = moments();
-        let camera = Camera::find(&frames(&moments), &moments, 1.0).unwrap();
+        let camera = GlobalMotion::find(&frames(&moments), &moments, 1.0).unwrap();
         let [cx, cy] = centre(SIZE);
         for (reference, k) in [(3, 0), (3, 6), (1, 5), (6, 2), (4, 4)] {
             let [from, to] = [PATH[reference], PATH[k]];
@@ -252,11 +252,11 @@ mod tests {
     fn where_nothing_is_seen_nothing_moves() {
         let moments = moments();
         let flat = vec![Frame::filled(SIZE, 1.0); 5];
-        let camera = Camera::find(&flat, &moments, 1.0).unwrap();
+        let camera = GlobalMotion::find(&flat, &moments, 1.0).unwrap();
         let moved = camera.displacement([10.0, 90.0], 0, 4);
         assert!(moved.iter().all(|d| d.abs() < 1e-3), "{moved:?}");
-        assert!(Camera::find(&flat[..2], &moments, 1.0).is_none());
+        assert!(GlobalMotion::find(&flat[..2], &moments, 1.0).is_none());
         let small = Frame::filled(Size { height: 47, width: 300 }, 1.0);
-        assert!(Camera::find(&vec![small; 5], &moments, 1.0).is_none());
+        assert!(GlobalMotion::find(&vec![small; 5], &moments, 1.0).is_none());
     }
 }

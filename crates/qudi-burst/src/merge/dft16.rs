@@ -1,13 +1,8 @@
 //! Discrete Fourier transform of 16 x 16 patches, sixteen columns at a time.
 
+use crate::patch::{Patch, SIDE};
 use std::f32::consts::PI;
 use std::sync::LazyLock;
-
-/// Side of a patch in pixels (Ma et al. 2020, section 5).
-pub(crate) const SIDE: usize = 16;
-
-/// Samples of a patch, by row.
-pub(crate) type Patch = [[f32; SIDE]; SIDE];
 
 /// Coefficients of a patch; transposed, which nothing here minds.
 #[derive(Clone, Debug)]

@@ -1,0 +1,90 @@
+//! Constant velocity of every patch, as the counts of all frames agree on.
+
+use super::grid::Grid;
+use super::pyramid::smooth;
+use super::velocity_search::VelocitySearch;
+use crate::patch::PatchMotion;
+use crate::prepared_burst::PreparedBurst;
+use qudi_core::Frame;
+use rayon::prelude::*;
+
+/// Frames from one whose velocities are searched to the next; those of the others follow from these.
+const ANCHORS: usize = 6;
+
+/// The constant velocity of every patch of a window, from its counts alone.
+#[derive(Debug)]
+pub(crate) struct ConstantVelocity {
+    /// Counts, smoothed.
+    pub(crate) smoothed: Vec<Frame>,
+    /// Velocities of the patches of every frame, `[frame][patch]`.
+    velocities: PatchMotion,
+}
+
+impl ConstantVelocity {
+    /// Finds the velocities of a window; none if there are too few frames to agree.
+    pub(crate) fn find(burst: &PreparedBurst) -> Option<Self> {
+        let frames = &burst.frames;
+        if frames.len() < 3 {
+            return None;
+        }
+        let search = VelocitySearch::new(frames, &burst.moments);
+        let grid = &burst.grid;
+        let anchors = ((frames.len() - 1) % ANCHORS / 2..frames.len()).step_by(ANCHORS);
+        let found: Vec<_> = anchors.map(|k| (k, search.velocities(grid, k))).collect();
+        let of = |frame: usize| {
+            let (anchor, velocities) = found.iter().min_by_key(|(k, _)| k.abs_diff(frame))?;
+            let time = *anchor as f32 - frame as f32;
+            Some((0..grid.len()).map(|i| carried(grid, velocities, i, time)).collect())
+        };
+        let velocities = (0..frames.len()).map(of).collect::<Option<_>>()?;
+        Some(Self { smoothed: frames.par_iter().map(smooth).collect(), velocities })
+    }
+
+    /// The motion of every patch of frame `reference` to every frame.
+    pub(crate) fn motion(&self, reference: usize) -> PatchMotion {
+        let velocities = &self.velocities[reference];
+        let time = |k: usize| k as f32 - reference as f32;
+        (0..self.smoothed.len())
+            .map(|k| velocities.iter().map(|v| v.map(|v| v * time(k))).collect())
+            .collect()
+    }
+}
+
+/// The velocity of patch `i` from those of the patches `time` frames later: that of the patch which it has moved to.
+fn carried(grid: &Grid, velocities: &[[f32; 2]], i: usize, time: f32) -> [f32; 2] {
+    let centre = grid.corner(i).map(|corner| (corner + grid.side / 2) as f32);
+    let mut v = velocities[i];
+    for _ in 0..2 {
+        let there = [centre[0] + time * v[0], centre[1] + time * v[1]];
+        v = velocities[grid.around(there)[0]];
+    }
+    v
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::patch::SIDE;
+    use qudi_core::Size;
+
+    const SIZE: Size = Size { height: 96, width: 112 };
+
+    #[test]
+    fn carries_velocities_along_their_own_motion() {
+        let grid = Grid::new(SIZE, SIDE, SIDE / 2);
+        // The left half moves right, two pixels per frame, the right half rests.
+        let border = |x: usize| if x < 48 { [2.0, 0.0] } else { [0.0, 0.0] };
+        let velocities: Vec<[f32; 2]> =
+            (0..grid.len()).map(|i| border(grid.corner(i)[0])).collect();
+        for i in 0..grid.len() {
+            let [x, _] = grid.corner(i);
+            let found = carried(&grid, &velocities, i, 2.0);
+            // Four pixels on, a patch within two of the border has crossed it.
+            if x < 40 {
+                assert_eq!(found, [2.0, 0.0]);
+            } else if x > 48 {
+                assert_eq!(found, [0.0, 0.0]);
+            }
+        }
+    }
+}

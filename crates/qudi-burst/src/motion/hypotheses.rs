@@ -1,0 +1,410 @@
+//! Selection of motion hypotheses: every patch moves as it was matched frame by frame, with constant velocity, or with
+//! most of the image, whichever the counts of all frames make most likely.
+//!
+//! Matching reference frames repeats their errors: what they lost cannot be matched, and what they made up moves as it
+//! was merged. Counts are independent from frame to frame. A hypothesis is judged by the likelihood of all frames'
+//! counts: the patch is what the reference estimate shows plus something unknown, the same in all frames, plus noise.
+
+use super::constant_velocity::ConstantVelocity;
+use super::global_motion::GlobalMotion;
+use super::patch_refinement::refine;
+use super::pyramid::smooth;
+use super::reference_frames::ReferenceFrames;
+use crate::patch::{Patch, PatchMotion, SIDE, bilinear, inside};
+use crate::prepared_burst::PreparedBurst;
+use qudi_core::Frame;
+use rayon::prelude::*;
+
+/// By how much a frame may fit worse on a selected hypothesis, in units of the noise's variance. Beyond it, something
+/// came in between, and the frame's own match is kept.
+const WORSE: f32 = 100.0;
+
+/// Settings of the selection, which depend on what the reference's patch is known from.
+#[derive(Clone, Copy)]
+struct Settings {
+    /// Variance of one frame's noise in units of that of the reference's errors, both smoothed; 0 where nothing is known.
+    known: f32,
+    /// Penalty of each pixel that leaves the image, in units of the noise's variance.
+    outside: f32,
+    /// Side of the judged windows, in patches.
+    window: usize,
+}
+
+impl Settings {
+    /// The reference is a frame of counts.
+    const COUNTS: Self = Self { known: 0.0, outside: 10.0, window: 2 };
+    /// The reference is an estimate.
+    const ESTIMATE: Self = Self { known: 6.0, outside: 0.1, window: 1 };
+}
+
+/// Penalties of hypotheses on reference frames, in units of the noise's variance. Reference frames hold the noise of the
+/// counts that judge hypotheses found in them, and the more freely one was found, the more of that noise it fits: then
+/// noise is merged with itself.
+mod penalty {
+    pub(crate) const MATCHED: f32 = 200.0;
+    pub(crate) const CONSTANT: f32 = 200.0;
+    pub(crate) const CONSTANT_REFINED: f32 = 150.0;
+    pub(crate) const GLOBAL_REFINED: f32 = 100.0;
+    pub(crate) const GLOBAL: f32 = 0.0;
+    pub(crate) const REST: f32 = 0.0;
+}
+
+/// Variance that smoothing leaves of white noise along an axis, and the correlation of neighbours after it.
+const LEFT: f32 = 70.0 / 256.0;
+const CORRELATION: f32 = 0.8;
+
+/// The motion that a hypothesis gives every patch, and its penalty.
+type Hypothesis = (f32, PatchMotion);
+
+/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and global motion, by
+/// the counts alone. Without velocities the matched motion stays.
+pub(crate) fn select_on_counts(
+    burst: &PreparedBurst,
+    velocity: Option<&ConstantVelocity>,
+    global: Option<&GlobalMotion>,
+    reference: usize,
+    matched: PatchMotion,
+) -> PatchMotion {
+    let Some(velocity) = velocity else { return matched };
+    let global = global.map(|global| global_hypothesis(burst, global, reference));
+    let hypotheses = [matched, velocity.motion(reference)].into_iter().chain(global);
+    let hypotheses: Vec<Hypothesis> = hypotheses.map(|motion| (0.0, motion)).collect();
+    let template = &velocity.smoothed[reference];
+    let selector = HypothesisSelector {
+        burst,
+        frames: &velocity.smoothed,
+        template,
+        settings: Settings::COUNTS,
+    };
+    selector.select_all(reference, &hypotheses)
+}
+
+/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and global motion, both
+/// as they are and refined on the reference frames, and rest. Without velocities the matched motion stays.
+pub(crate) fn select_on_estimates(
+    burst: &PreparedBurst,
+    velocity: Option<&ConstantVelocity>,
+    references: &ReferenceFrames,
+    reference: usize,
+    matched: PatchMotion,
+) -> PatchMotion {
+    let Some(velocity) = velocity else { return matched };
+    let constant = velocity.motion(reference);
+    let refined = refine_all(burst, references, &constant, reference);
+    let rest = vec![vec![[0.0; 2]; burst.grid.len()]; burst.frames.len()];
+    let mut hypotheses = vec![
+        (penalty::MATCHED, matched),
+        (penalty::CONSTANT, constant),
+        (penalty::CONSTANT_REFINED, refined),
+        (penalty::REST, rest),
+    ];
+    if let Some(global) = &references.global_motion {
+        let motion = global_hypothesis(burst, global, reference);
+        let refined = refine_all(burst, references, &motion, reference);
+        hypotheses.push((penalty::GLOBAL_REFINED, refined));
+        hypotheses.push((penalty::GLOBAL, motion));
+    }
+    let template = &smooth(&references.frames[reference]);
+    let settings = Settings::ESTIMATE;
+    let selector = HypothesisSelector { burst, frames: &velocity.smoothed, template, settings };
+    selector.select_all(reference, &hypotheses)
+}
+
+/// The global motion at the centres of all patches.
+fn global_hypothesis(
+    burst: &PreparedBurst,
+    global: &GlobalMotion,
+    reference: usize,
+) -> PatchMotion {
+    let half = 0.5 * (SIDE - 1) as f32;
+    let centres: Vec<[f32; 2]> = (0..burst.grid.len())
+        .map(|i| burst.grid.corner(i).map(|corner| corner as f32 + half))
+        .collect();
+    let motion = |k| centres.iter().map(|&at| global.displacement(at, reference, k)).collect();
+    (0..burst.frames.len()).map(motion).collect()
+}
+
+/// Refines displacements on the reference frames.
+fn refine_all(
+    burst: &PreparedBurst,
+    references: &ReferenceFrames,
+    motion: &PatchMotion,
+    reference: usize,
+) -> PatchMotion {
+    let variance = burst.matching_variance(reference, references.error_variance);
+    let image = |k: usize| &references.pyramids[k].levels[0].image;
+    let of = |(k, motion): (usize, &Vec<[f32; 2]>)| {
+        if k == reference {
+            return motion.clone();
+        }
+        let images = [image(reference), image(k)];
+        refine(images, &burst.grid, motion.iter().copied(), variance)
+    };
+    motion.par_iter().enumerate().map(of).collect()
+}
+
+/// Selects the most likely hypothesis of each patch.
+struct HypothesisSelector<'a> {
+    burst: &'a PreparedBurst,
+    /// Smoothed counts.
+    frames: &'a [Frame],
+    /// The smoothed counts, or the smoothed estimate, of the reference.
+    template: &'a Frame,
+    settings: Settings,
+}
+
+impl HypothesisSelector<'_> {
+    /// Selects the hypothesis of every patch; what was matched comes first in `hypotheses`.
+    fn select_all(&self, reference: usize, hypotheses: &[Hypothesis]) -> PatchMotion {
+        let paths: Vec<Vec<[f32; 2]>> = (0..self.burst.grid.len())
+            .into_par_iter()
+            .map(|i| {
+                let path = |motion: &PatchMotion| motion.iter().map(|patches| patches[i]).collect();
+                let paths: Vec<(f32, Vec<[f32; 2]>)> =
+                    hypotheses.iter().map(|(penalty, motion)| (*penalty, path(motion))).collect();
+                self.select(self.burst.grid.corner(i), reference, &paths)
+            })
+            .collect();
+        let frames = 0..self.burst.frames.len();
+        frames.map(|k| paths.iter().map(|path| path[k]).collect()).collect()
+    }
+
+    /// Selects the most likely path of a patch. A frame that denies it keeps the first path's displacement.
+    fn select(
+        &self,
+        corner: [usize; 2],
+        reference: usize,
+        paths: &[(f32, Vec<[f32; 2]>)],
+    ) -> Vec<[f32; 2]> {
+        let costs: Vec<f32> =
+            paths.iter().map(|(penalty, path)| penalty + self.cost(corner, path)).collect();
+        let best = (0..paths.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0);
+        let mut path = paths[best].1.clone();
+        if best == 0 {
+            return path;
+        }
+        let own = self.own(corner.map(|c| c as f32));
+        let variance = self.variance(corner);
+        for (k, d) in path.iter_mut().enumerate().filter(|(k, _)| *k != reference) {
+            let matched = paths[0].1[k];
+            let [new, old] = [*d, matched].map(|d| {
+                let mut sums = Sums::new();
+                self.add(&own, k, d, &mut sums);
+                sums.misfit(variance, self.settings.outside)
+            });
+            if new - old >= WORSE {
+                *d = matched;
+            }
+        }
+        path
+    }
+
+    /// Variance of the smoothed counts where the patch lies.
+    fn variance(&self, [x, y]: [usize; 2]) -> f32 {
+        let rows = (y..y + SIDE).map(|y| self.template.row(y)[x..x + SIDE].iter().sum::<f32>());
+        let mean = rows.sum::<f32>() / (SIDE * SIDE) as f32;
+        let variance = self.burst.moments.variance_at_mean(f64::from(mean)) as f32;
+        variance.max(1e-4) * LEFT * LEFT
+    }
+
+    /// Twice the negative log-likelihood of a path but for a constant, as if pixels were independent.
+    fn cost(&self, corner: [usize; 2], path: &[[f32; 2]]) -> f32 {
+        let variance = self.variance(corner);
+        let margin = ((self.settings.window - 1) * SIDE) as f32 / 2.0;
+        let mut cost = 0.0;
+        for part in 0..self.settings.window * self.settings.window {
+            let part = [part % self.settings.window, part / self.settings.window]
+                .map(|k| (k * SIDE) as f32 - margin);
+            let own = self.own([corner[0] as f32 + part[0], corner[1] as f32 + part[1]]);
+            let mut sums = Sums::new();
+            for (k, &d) in path.iter().enumerate() {
+                self.add(&own, k, d, &mut sums);
+            }
+            cost += sums.misfit(variance, self.settings.outside)
+                - sums.common(self.settings.known, variance);
+        }
+        cost
+    }
+
+    /// The reference's own patch at `corner`.
+    fn own(&self, corner: [f32; 2]) -> Own {
+        Own { corner, patch: bilinear(self.template, corner) }
+    }
+
+    /// Adds the residuals of frame `k`, displaced by `d`, to `sums`.
+    fn add(&self, own: &Own, k: usize, d: [f32; 2], sums: &mut Sums) {
+        let Own { corner, patch: here } = own;
+        let at = [corner[0] + d[0], corner[1] + d[1]];
+        let there = bilinear(&self.frames[k], at);
+        let size = self.template.size;
+        let both = |axis: usize, length: usize| {
+            let (a, b) = (inside(corner[axis], length), inside(at[axis], length));
+            a.start.max(b.start)..a.end.min(b.end)
+        };
+        let left = |d: f32| {
+            let part = d - d.floor();
+            1.0 - 2.0 * part * (1.0 - part) * (1.0 - CORRELATION)
+        };
+        let noise = left(d[0]) * left(d[1]);
+        let (rows, columns) = (both(1, size.height), both(0, size.width));
+        sums.outside += (SIDE * SIDE - rows.len() * columns.len()) as f32;
+        for y in rows {
+            for x in columns.clone() {
+                let residual = there[y][x] - here[y][x];
+                sums.sum[y][x] += residual;
+                sums.squares[y][x] += residual * residual;
+                sums.count[y][x] += 1.0;
+                sums.noise[y][x] += noise;
+            }
+        }
+    }
+}
+
+/// A patch of the template.
+struct Own {
+    corner: [f32; 2],
+    patch: Patch,
+}
+
+/// Sums of the differences from the template over the frames of a path, by pixel.
+struct Sums {
+    sum: [[f32; SIDE]; SIDE],
+    squares: [[f32; SIDE]; SIDE],
+    count: [[f32; SIDE]; SIDE],
+    /// Variances of the noise, in that of a whole pixel.
+    noise: [[f32; SIDE]; SIDE],
+    /// Pixels of frames that lie outside.
+    outside: f32,
+}
+
+impl Sums {
+    fn new() -> Self {
+        let zero = [[0.0; SIDE]; SIDE];
+        Self { sum: zero, squares: zero, count: zero, noise: zero, outside: 0.0 }
+    }
+
+    /// Squared differences over what noise makes.
+    fn misfit(&self, variance: f32, outside: f32) -> f32 {
+        let squares: f32 = self.squares.iter().flatten().sum();
+        let noise: f32 = self.noise.iter().flatten().sum();
+        squares / variance - noise + outside * self.outside
+    }
+
+    /// As much of it as a difference common to all frames explains.
+    fn common(&self, known: f32, variance: f32) -> f32 {
+        let mut common = 0.0;
+        for y in 0..SIDE {
+            for x in 0..SIDE {
+                let weight = 1.0 / (known + self.count[y][x]).max(1.0);
+                common += weight * (self.sum[y][x] * self.sum[y][x] / variance - self.noise[y][x]);
+            }
+        }
+        common
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion::block_alignment::BlockAligner;
+    use qudi_core::restorer::{Acquisition, BurstView};
+    use qudi_core::sensor::{CountLaw, Sensor};
+    use qudi_core::{Camera, Light, Size};
+
+    const SIZE: Size = Size { height: 96, width: 112 };
+
+    /// A window of a texture that moves, and the mean counts of its frames.
+    fn burst(ppp: f64, moved: impl Fn(f32) -> [f32; 2]) -> (PreparedBurst, Vec<Frame>) {
+        let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
+        let light = Light { ppp, exposure: 0.45 };
+        let mut camera = Camera::new(&sensor, SIZE, light, 5).unwrap_or_else(|e| panic!("{e}"));
+        let mut counts = Vec::new();
+        let mut frames = Vec::new();
+        for k in 0..11u8 {
+            let [dx, dy] = moved(f32::from(k));
+            let scene = Frame::from_fn(SIZE, |x, y| {
+                let (x, y) = (x as f32 - dx, y as f32 - dy);
+                let wave = (0.31 * x + 0.12 * y).sin() + (0.23 * y - 0.17 * x + 1.0).sin();
+                0.45 + 0.04 * wave + 0.03 * (0.41 * (x - y)).cos()
+            });
+            counts.push(camera.expose(u64::from(k), &[&scene]).unwrap_or_else(|e| panic!("{e}")));
+            frames.push(scene);
+        }
+        let gain = camera.gain();
+        let acquisition = Acquisition::new(sensor, ppp, 0.45).unwrap_or_else(|e| panic!("{e}"));
+        let burst = PreparedBurst::new(BurstView { size: SIZE, frames: &counts }, &acquisition);
+        let law = CountLaw::new(&acquisition.sensor, gain);
+        let dark = acquisition.sensor.dark_per_frame().unwrap_or_else(|e| panic!("{e}"));
+        let light = acquisition.sensor.quantum_efficiency * ppp / 0.45;
+        for value in frames.iter_mut().flat_map(|frame| &mut frame.data) {
+            *value = law.mean(light * f64::from(*value) + dark) as f32;
+        }
+        (burst, frames)
+    }
+
+    /// Mean distance from the truth of the flow from frame 5 to all others, of patches off the border.
+    fn error(burst: &PreparedBurst, motion: &PatchMotion, moved: impl Fn(f32) -> [f32; 2]) -> f32 {
+        let mut errors = Vec::new();
+        for (k, patches) in motion.iter().enumerate() {
+            let [from, to] = [5.0, k as f32].map(&moved);
+            for (i, d) in patches.iter().enumerate() {
+                let [x, y] = burst.grid.corner(i);
+                if (24..64).contains(&x) && (24..56).contains(&y) {
+                    errors.push((d[0] - to[0] + from[0]).hypot(d[1] - to[1] + from[1]));
+                }
+            }
+        }
+        errors.iter().sum::<f32>() / errors.len() as f32
+    }
+
+    fn velocity(burst: &PreparedBurst) -> ConstantVelocity {
+        ConstantVelocity::find(burst).unwrap_or_else(|| panic!("enough frames"))
+    }
+
+    #[test]
+    fn faint_texture_follows_the_motion_of_all_frames() {
+        let moved = |t: f32| [1.7 * t, -0.9 * t];
+        let (burst, _) = burst(3.25, moved);
+        let (_, matched) = BlockAligner::new(&burst, 1).align(&burst, 5);
+        let before = error(&burst, &matched, moved);
+        let selected = select_on_counts(&burst, Some(&velocity(&burst)), None, 5, matched);
+        let after = error(&burst, &selected, moved);
+        assert!(after < 0.5 * before, "{before} before, {after} px after");
+    }
+
+    /// With light and good reference frames matching is right.
+    #[test]
+    fn accelerated_motion_stays_as_it_was_matched() {
+        let moved = |t: f32| [0.25 * (t - 5.0) * (t - 5.0), 0.0];
+        let (burst, frames) = burst(100.0, moved);
+        let references = ReferenceFrames::new(&burst, frames, 0.1);
+        let matched = references.align(&burst, 5);
+        let before = error(&burst, &matched, moved);
+        let selected =
+            select_on_estimates(&burst, Some(&velocity(&burst)), &references, 5, matched);
+        let after = error(&burst, &selected, moved);
+        assert!(before < 0.3 && after < before + 0.05, "{before} before, {after} px after");
+    }
+
+    /// Reference frames of a scene at rest that hold a fifth of their frames' counts, smoothed: matching follows the
+    /// noise of these, which judges hypotheses, too.
+    #[test]
+    fn noise_in_reference_frames_does_not_move_patches() {
+        let moved = |_: f32| [0.0, 0.0];
+        let (burst, mut frames) = burst(3.25, moved);
+        let noise: Vec<Frame> = burst.frames.iter().map(|frame| smooth(&smooth(frame))).collect();
+        for (frame, counts) in frames.iter_mut().zip(&noise) {
+            for (value, count) in frame.data.iter_mut().zip(&counts.data) {
+                *value += 0.2 * (count - *value);
+            }
+        }
+        let references = ReferenceFrames::new(&burst, frames, 0.1);
+        let references = ReferenceFrames { global_motion: None, ..references };
+        let matched = references.align(&burst, 5);
+        let before = error(&burst, &matched, moved);
+        let selected =
+            select_on_estimates(&burst, Some(&velocity(&burst)), &references, 5, matched);
+        let after = error(&burst, &selected, moved);
+        assert!(after < 0.1 * before, "{before} before, {after} px after");
+    }
+}

@@ -1,0 +1,133 @@
+//! Where each patch of a reference lies in another block of frames (Ma et al. 2020, section 5.1).
+//!
+//! From coarse to fine, every patch starts at the best of what its parent, the parent's neighbours and
+//! the median of all found, and searches around it; at the finest level, steps of Lucas and Kanade (1981)
+//! refine it below a pixel.
+
+use super::grid::Grid;
+use super::patch_refinement::refine;
+use super::pyramid::{Level, Pyramid};
+use qudi_core::Frame;
+
+/// Cost of a search's step per squared pixel, in nats, at each level: where there is little to see, a
+/// patch moves as its parent does. The coarsest knows no parent, and may go far.
+const RELUCTANCE: [f32; 3] = [0.5, 0.5, 0.1];
+
+/// Search radius at each level, finest first, in its pixels.
+const RADII: [isize; 3] = [1, 4, 8];
+
+/// The displacement of every patch of `reference` in `other`, in pixels, right and down. `variance` is
+/// that of the noise of any two pixels' difference.
+pub(crate) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<[f32; 2]> {
+    let mut parents: Option<(Grid, Vec<[isize; 2]>)> = None;
+    for (number, (level, there)) in reference.levels.iter().zip(&other.levels).enumerate().rev() {
+        let side = level.side;
+        let step = if number == 0 { side / 2 } else { side };
+        let ratio = reference.levels.get(number + 1).map_or(1, |coarser: &Level| coarser.ratio);
+        let grid = Grid::new(level.image.size, side, step);
+        let scale: usize = reference.levels[..=number].iter().map(|level| level.ratio).product();
+        let noise = variance / (scale * scale) as f32;
+        let matching = Matching {
+            image: &level.image,
+            there: &there.image,
+            side,
+            radius: RADII[number],
+            // Squared differences count in nats: over twice the variance.
+            reluctance: RELUCTANCE[number] * 2.0 * noise,
+        };
+        // The camera's own motion: for patches whose parent saw too little of it.
+        let overall = parents.as_ref().map_or([0; 2], |(_, flow)| median(flow));
+        let search = |i: usize| {
+            let corner = grid.corner(i);
+            let Some((coarse, flow)) = &parents else { return matching.best(corner, &[[0; 2]]) };
+            let centre = corner.map(|c| (c as f32 + 0.5 * side as f32) / ratio as f32);
+            let [a, b, c, d, e] = coarse.around(centre).map(|p| flow[p]);
+            let starts = [a, b, c, d, e, overall].map(|d| d.map(|d| d * ratio as isize));
+            matching.best(corner, &starts)
+        };
+        let flow = (0..grid.len()).map(search).collect();
+        parents = Some((grid, flow));
+    }
+    let Some((grid, flow)) = parents else { return Vec::new() };
+    let (image, there) = (&reference.levels[0].image, &other.levels[0].image);
+    let starts = flow.iter().map(|start| start.map(|d| d as f32));
+    refine([image, there], &grid, starts, variance)
+}
+
+/// Medians of both components.
+fn median(flow: &[[isize; 2]]) -> [isize; 2] {
+    std::array::from_fn(|k| {
+        let mut values: Vec<isize> = flow.iter().map(|d| d[k]).collect();
+        values.sort_unstable();
+        values[values.len() / 2]
+    })
+}
+
+/// The search for one level's patches.
+struct Matching<'a> {
+    image: &'a Frame,
+    there: &'a Frame,
+    side: usize,
+    radius: isize,
+    /// Squared difference that a step of a pixel must win.
+    reluctance: f32,
+}
+
+impl Matching<'_> {
+    /// The displacement of least squared difference within `radius` of the best of `starts`.
+    fn best(&self, corner: [usize; 2], starts: &[[isize; 2]]) -> [isize; 2] {
+        let mut start = (f32::INFINITY, [0; 2]);
+        for (i, &d) in starts.iter().enumerate() {
+            let d = self.inside(corner, d);
+            let difference = self.difference(corner, d);
+            if !starts[..i].contains(&d) && difference < start.0 {
+                start = (difference, d);
+            }
+        }
+        let (mut best, start) = (start, start.1);
+        for dy in -self.radius..=self.radius {
+            for dx in -self.radius..=self.radius {
+                let d = self.inside(corner, [start[0] + dx, start[1] + dy]);
+                let cost =
+                    self.difference(corner, d) + self.reluctance * (dx * dx + dy * dy) as f32;
+                if cost < best.0 {
+                    best = (cost, d);
+                }
+            }
+        }
+        best.1
+    }
+
+    /// Kept inside the image: what has left it cannot be found.
+    fn inside(&self, corner: [usize; 2], d: [isize; 2]) -> [isize; 2] {
+        let size = self.image.size;
+        let most = [size.width - self.side, size.height - self.side];
+        std::array::from_fn(|k| {
+            (corner[k] as isize + d[k]).clamp(0, most[k] as isize) - corner[k] as isize
+        })
+    }
+
+    fn difference(&self, corner: [usize; 2], d: [isize; 2]) -> f32 {
+        let at = [0, 1].map(|k| corner[k].wrapping_add_signed(d[k]));
+        squared_difference(self.image, corner, self.there, at, self.side)
+    }
+}
+
+fn squared_difference(
+    a: &Frame,
+    [ax, ay]: [usize; 2],
+    b: &Frame,
+    [bx, by]: [usize; 2],
+    side: usize,
+) -> f32 {
+    let mut lanes = [0.0f32; 8];
+    for r in 0..side {
+        let (a, b) = (&a.row(ay + r)[ax..ax + side], &b.row(by + r)[bx..bx + side]);
+        for (a, b) in a.chunks_exact(8).zip(b.chunks_exact(8)) {
+            for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
+                *lane += (a - b) * (a - b);
+            }
+        }
+    }
+    lanes.iter().sum()
+}

@@ -1,0 +1,188 @@
+//! Per-pixel selection of motion: one patch has one motion, but where things move past each other it holds two. What
+//! reference frames show of a pixel's surroundings selects among the motions of the patches around it.
+
+use super::reference_frames::ReferenceFrames;
+use crate::patch::{Patch, PatchMotion, SIDE, inside};
+use crate::prepared_burst::PreparedBurst;
+use qudi_core::Frame;
+use rayon::prelude::*;
+
+/// Radius of the squares that are compared, in pixels.
+const RADIUS: usize = 2;
+
+/// Motions less than so many pixels apart in both components are one.
+const SAME: f32 = 0.4;
+
+/// By how much any other motion must fit better than the patch's own, in the variance of the noise of two pixels' difference: where all
+/// fit, noise would choose.
+const RELUCTANCE: f32 = 0.1;
+
+/// Pixels of a square.
+const AREA: f32 = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as f32;
+
+/// Warps the counts of frame `k`, and its estimate, onto the reference pixel by pixel along whichever motion in `motions`,
+/// of the patch or of those around it, makes the estimates the most alike. The first motion is kept where all fit.
+pub(crate) fn per_pixel_selection(
+    burst: &PreparedBurst,
+    references: &ReferenceFrames,
+    reference: usize,
+    k: usize,
+    motions: [&PatchMotion; 2],
+) -> [Frame; 2] {
+    let sample = |image: &Frame, i, d| references.sample(burst, image, i, d, reference);
+    let estimates = &references.frames;
+    let variance = burst.matching_variance(reference, references.error_variance);
+    let reluctance = AREA * RELUCTANCE * variance;
+    let motions = motions.map(|motion| &motion[k]);
+    let patch = |i: usize| {
+        let here = sample(&estimates[reference], i, [0.0; 2]);
+        let around = motions_around(burst, i, motions);
+        let mut least = [[f32::INFINITY; SIDE]; SIDE];
+        let mut best = [[[0.0; SIDE]; SIDE]; 2];
+        for (number, &d) in around.iter().enumerate() {
+            let there = sample(&estimates[k], i, d);
+            let mut misfit = misfit(&here, &there);
+            exclude_outside(burst, &mut misfit, i, d);
+            let own = number == 0;
+            if !own {
+                misfit.iter_mut().flatten().for_each(|value| *value += reluctance);
+                let mut pairs = misfit.iter().flatten().zip(least.iter().flatten());
+                // Most motions fit no pixel better, and then nobody asks for their counts.
+                if !pairs.any(|(value, least)| value < least) {
+                    continue;
+                }
+            }
+            let counts = sample(&burst.frames[k], i, d);
+            for y in 0..SIDE {
+                for x in 0..SIDE {
+                    if own || misfit[y][x] < least[y][x] {
+                        least[y][x] = misfit[y][x];
+                        best[0][y][x] = counts[y][x];
+                        best[1][y][x] = there[y][x];
+                    }
+                }
+            }
+        }
+        best
+    };
+    let patches: Vec<[Patch; 2]> = (0..burst.grid.len()).into_par_iter().map(patch).collect();
+    [0, 1].map(|image| burst.blended(|i| patches[i][image]))
+}
+
+/// Lists the motions of patch `i`, of those that touch it, and rest; each once.
+fn motions_around(burst: &PreparedBurst, i: usize, motions: [&Vec<[f32; 2]>; 2]) -> Vec<[f32; 2]> {
+    let mut distinct: Vec<[f32; 2]> = Vec::with_capacity(20);
+    let all = motions.iter().flat_map(|motion| {
+        std::iter::once(i).chain(burst.grid.touching(i)).map(|patch| motion[patch])
+    });
+    for d in all.chain(std::iter::once([0.0; 2])) {
+        let known = |m: &[f32; 2]| (m[0] - d[0]).abs() < SAME && (m[1] - d[1]).abs() < SAME;
+        if !distinct.iter().any(known) {
+            distinct.push(d);
+        }
+    }
+    distinct
+}
+
+/// Lets what lies outside of the image fit nothing.
+fn exclude_outside(burst: &PreparedBurst, misfit: &mut Patch, i: usize, d: [f32; 2]) {
+    let corner = burst.grid.corner(i);
+    let size = burst.padded_size();
+    let columns = inside(corner[0] as f32 + d[0], size.width);
+    let rows = inside(corner[1] as f32 + d[1], size.height);
+    if columns.len() * rows.len() == SIDE * SIDE {
+        return;
+    }
+    for (y, row) in misfit.iter_mut().enumerate() {
+        for (x, value) in row.iter_mut().enumerate() {
+            if !rows.contains(&y) || !columns.contains(&x) {
+                *value = f32::INFINITY;
+            }
+        }
+    }
+}
+
+/// Squared differences, summed over the squares around each pixel as far as they lie in the patch.
+fn misfit(a: &Patch, b: &Patch) -> Patch {
+    let mut rows = [[0.0f32; SIDE]; SIDE + 2 * RADIUS];
+    for y in 0..SIDE {
+        let mut squares = [0.0f32; SIDE + 2 * RADIUS];
+        for x in 0..SIDE {
+            let difference = a[y][x] - b[y][x];
+            squares[x + RADIUS] = difference * difference;
+        }
+        for x in 0..SIDE {
+            rows[y + RADIUS][x] = squares[x..=x + 2 * RADIUS].iter().sum();
+        }
+    }
+    let mut sums = [[0.0f32; SIDE]; SIDE];
+    for y in 0..SIDE {
+        for row in &rows[y..=y + 2 * RADIUS] {
+            for (sum, value) in sums[y].iter_mut().zip(row) {
+                *sum += value;
+            }
+        }
+    }
+    sums
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_core::Size;
+    use qudi_core::restorer::{Acquisition, BurstView};
+    use qudi_core::sensor::Sensor;
+
+    const SIZE: Size = Size { height: 64, width: 80 };
+
+    /// Mean counts of two textures: the right one rests, the left one comes before it, three pixels per frame.
+    fn scene(t: usize) -> Frame {
+        Frame::from_fn(SIZE, |x, y| {
+            let (x, y) = (x as f32, y as f32);
+            let front = x < 20.0 + 3.0 * t as f32;
+            let x = if front { x - 3.0 * t as f32 } else { x };
+            let phase = if front { 0.0 } else { 1.5 };
+            3.0 + (0.7 * x + 0.3 * y + phase).sin() + (0.5 * y - 0.4 * x + 2.0 * phase).cos()
+        })
+    }
+
+    /// Errors of frame 1 warped onto frame 4 by patches and by pixels, if patches left of `border` move with the front.
+    fn errors(border: usize) -> [f32; 2] {
+        let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
+        let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
+        let counts = vec![vec![3; SIZE.pixels()]; 6];
+        let view = BurstView { size: SIZE, frames: &counts };
+        let burst = PreparedBurst::new(view, &acquisition);
+        let frames: Vec<Frame> = (0..6).map(scene).collect();
+        let references = ReferenceFrames::new(&burst, frames.clone(), 0.1);
+        let motion =
+            |i| if burst.grid.corner(i)[0] + SIDE / 2 < border { [-9.0, 0.0] } else { [0.0; 2] };
+        let there: Vec<[f32; 2]> = (0..burst.grid.len()).map(motion).collect();
+        let rest = vec![[0.0; 2]; burst.grid.len()];
+        let flow: PatchMotion =
+            (0..6).map(|k| if k == 1 { there.clone() } else { rest.clone() }).collect();
+        let patchwise = burst.blended(|i| references.sample(&burst, &frames[1], i, flow[1][i], 4));
+        let [_, pixelwise] = per_pixel_selection(&burst, &references, 4, 1, [&flow, &flow]);
+        [patchwise, pixelwise].map(|warped| {
+            let mut sum = 0.0;
+            for y in 8..56 {
+                for x in 18..46 {
+                    sum += (warped.row(y)[x] - frames[4].row(y)[x]).powi(2) / (48.0 * 28.0);
+                }
+            }
+            sum
+        })
+    }
+
+    /// In frame 4 the border lies at 32; patches up to half a patch beyond are said to move with the front, too.
+    #[test]
+    fn pixels_at_a_motion_border_move_on_their_own() {
+        for border in [32, 40] {
+            let [patchwise, pixelwise] = errors(border);
+            assert!(
+                pixelwise < 0.2 * patchwise,
+                "{pixelwise}, {patchwise} by patches, border {border}"
+            );
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! Patches of 16 x 16 pixels: the unit of alignment and merging (Ma et al. 2020, section 5).
+
+use qudi_core::{Frame, Size};
+use std::ops::Range;
+
+/// Side of a patch in pixels (Ma et al. 2020, section 5).
+pub(crate) const SIDE: usize = 16;
+
+/// The samples of a patch, by row.
+pub(crate) type Patch = [[f32; SIDE]; SIDE];
+
+/// The displacements or velocities of all patches, `[frame][patch]`, right and down in pixels.
+pub(crate) type PatchMotion = Vec<Vec<[f32; 2]>>;
+
+/// Enlarges an image of size `from` to `size` by repeating its last row and column.
+pub(crate) fn padded(values: &[f32], from: Size, size: Size) -> Frame {
+    Frame::from_fn(size, |x, y| values[y.min(from.height - 1) * from.width + x.min(from.width - 1)])
+}
+
+/// The size of an image enlarged to hold at least one patch.
+pub(crate) fn padded_size(size: Size) -> Size {
+    Size { height: size.height.max(SIDE), width: size.width.max(SIDE) }
+}
+
+/// Finds the samples of a patch that starts at `start` which lie in an image of `length` pixels, along one axis.
+pub(crate) fn inside(start: f32, length: usize) -> Range<usize> {
+    let first = (-0.5 - start).ceil().clamp(0.0, SIDE as f32);
+    let end = ((length as f32 - 0.5 - start).floor() + 1.0).clamp(first, SIDE as f32);
+    first as usize..end as usize
+}
+
+/// Samples the patch whose corner is at `corner` bilinearly; the image's borders are repeated.
+pub(crate) fn bilinear(image: &Frame, corner: [f32; 2]) -> Patch {
+    let (width, height) = (image.size.width as isize, image.size.height as isize);
+    let [x, y] = corner.map(|c| c.floor() as isize);
+    let [fx, fy] = corner.map(|c| c - c.floor());
+    let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+    let side = SIDE as isize;
+    let mut around = [[0.0; SIDE + 1]; SIDE + 1];
+    if x >= 0 && y >= 0 && x + side < width && y + side < height {
+        for (r, row) in around.iter_mut().enumerate() {
+            if let Some(source) = image.row(y as usize + r)[x as usize..].first_chunk() {
+                *row = *source;
+            }
+        }
+    } else {
+        for (r, row) in around.iter_mut().enumerate() {
+            let source = image.row((y + r as isize).clamp(0, height - 1) as usize);
+            for (c, value) in row.iter_mut().enumerate() {
+                *value = source[(x + c as isize).clamp(0, width - 1) as usize];
+            }
+        }
+    }
+    std::array::from_fn(|r| {
+        let (upper, lower) = (&around[r], &around[r + 1]);
+        std::array::from_fn(|c| {
+            upper[c] * weights[0]
+                + upper[c + 1] * weights[1]
+                + lower[c] * weights[2]
+                + lower[c + 1] * weights[3]
+        })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_samples_inside_the_image_to_half_a_pixel() {
+        assert_eq!(inside(0.0, 40), 0..16);
+        assert_eq!(inside(-3.0, 40), 3..16);
+        assert_eq!(inside(-2.6, 40), 3..16);
+        assert_eq!(inside(-2.4, 40), 2..16);
+        assert_eq!(inside(24.4, 40), 0..16);
+        assert_eq!(inside(24.6, 40), 0..15);
+        assert_eq!(inside(38.0, 40), 0..2);
+        assert!(inside(60.0, 40).is_empty() && inside(-60.0, 40).is_empty());
+    }
+}
