@@ -82,7 +82,10 @@ impl MergedFrame {
     }
 
     /// Blends merged patches, each with the variance of its noise.
-    fn from_patches(burst: &PreparedBurst, patch: impl Fn(usize) -> (Patch, f32) + Send + Sync) -> Self {
+    fn from_patches(
+        burst: &PreparedBurst,
+        patch: impl Fn(usize) -> (Patch, f32) + Send + Sync,
+    ) -> Self {
         let patches: Vec<_> = (0..burst.grid.len()).into_par_iter().map(patch).collect();
         let mut counts = burst.blended(|i| patches[i].0);
         counts.data.iter_mut().for_each(|count| *count = count.max(0.0));

@@ -11,9 +11,9 @@ use crate::merge::merged_frame::MergedFrame;
 use crate::motion::block_alignment::BlockAligner;
 use crate::patch::PatchMotion;
 use crate::prepared_burst::PreparedBurst;
+use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
-use qudi_core::Result;
 
 /// The filter that follows the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
