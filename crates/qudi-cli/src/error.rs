@@ -1,6 +1,6 @@
 //! Errors of the command line: what happened, where, what to do.
 
-use crate::fields::flags;
+use crate::fields::{flags, flags_in_text};
 use qudi_core::SimError;
 use std::fmt::Display;
 use std::io;
@@ -40,9 +40,9 @@ impl From<SimError> for Fault {
                 Self::BrokenPipe
             }
             _ => Self::Error {
-                what: e.to_string(),
+                what: flags_in_text(&e.to_string()),
                 place: e.place().map(|place| flags(&place)),
-                help: e.help(),
+                help: e.help().map(|help| flags_in_text(&help)),
             },
         }
     }

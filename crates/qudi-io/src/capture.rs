@@ -72,17 +72,13 @@ impl std::fmt::Debug for Capture {
 /// What the user says of the depth, unless the file knows better.
 fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     if !(1..=16).contains(&bits) {
-        return Err(SimError::request(
-            format!("{bits} bits"),
-            "--bits",
-            "counts have 1 to 16 bits",
-        ));
+        return Err(SimError::request(format!("{bits} bits"), "bits", "counts have 1 to 16 bits"));
     }
     let max = ((1u32 << bits) - 1) as u16;
     match info.max_count {
         Some(known) if known != max => Err(SimError::request(
             format!("{bits} bits, where the file has counts up to {known}"),
-            "--bits",
+            "bits",
             "leave it out: the file knows its depth",
         )),
         _ => {
@@ -160,21 +156,21 @@ impl Capture {
             let range = start..options.end.unwrap_or(frames);
             return Err(SimError::request(
                 format!("frames {} to {} of {frames}", range.start, range.end),
-                "--start, --end",
-                format!("frames count from 0; --end is one past the last, at most {frames}"),
+                "start, end",
+                format!("frames count from 0; `end` is one past the last, at most {frames}"),
             ));
         }
         if sum == 0 || u64::from(sum) > range.end - range.start {
             return Err(SimError::request(
                 format!("{sum} frames summed into one, of {}", range.end - range.start),
-                "--sum",
+                "sum",
                 "sum between 1 and all frames",
             ));
         }
         if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
             return Err(SimError::request(
                 format!("sums of {sum} frames do not fit into 16 bits"),
-                "--sum",
+                "sum",
                 "counts go up to 65535: sum fewer frames",
             ));
         }
@@ -296,7 +292,7 @@ impl Capture {
         }
         if let Some(end) = self.end.filter(|&end| end > self.range.end) {
             let text =
-                format!("the pipe ended after {} frames, before --end {end}", self.range.end);
+                format!("the pipe ended after {} frames, before `end {end}`", self.range.end);
             self.info.notes.push(text);
         }
         let left_over = self.native_frames() % u64::from(self.sum);
@@ -333,7 +329,7 @@ impl Capture {
         if linear && self.sum > 1 {
             return Err(SimError::request(
                 format!("sums of {} frames of `{}`, a linear sensor", self.sum, sensor.name),
-                "--sum",
+                "sum",
                 "only binary frames are summed: leave it out",
             ));
         }
@@ -341,7 +337,7 @@ impl Capture {
             _ if linear && self.info.binary => Err(SimError::request(
                 format!("binary frames, and `{}` is a linear sensor", sensor.name),
                 place,
-                "name the sensor that took them, as in --sensor swissspad2",
+                "name the sensor that took them, as in `sensor swissspad2`",
             )),
             Some(max) if linear && max != sensor.max_count() => Err(SimError::request(
                 format!(
@@ -350,13 +346,13 @@ impl Capture {
                     sensor.max_count()
                 ),
                 place,
-                "name the sensor that took them, or the depth with --bits",
+                "name the sensor that took them, or the depth with `bits N`",
             )),
             Some(max) if !linear => Ok(Sensor { frames_summed: u32::from(max), ..sensor.clone() }),
             None if !linear => Err(SimError::request(
                 "how many binary frames a count sums is not known",
                 place,
-                "say the depth of counts with --bits (3 for sums of 7), or --levels for scaled means",
+                "say the depth of counts with `bits 3` (for sums of 7), or `levels` for scaled means",
             )),
             _ => Ok(sensor.clone()),
         }
@@ -398,7 +394,7 @@ impl Capture {
                 *count = u16::try_from(sum).map_err(|_| {
                     SimError::request(
                         format!("frame {frame} sums to {sum}, which does not fit into 16 bits"),
-                        "--sum",
+                        "sum",
                         "sum fewer frames",
                     )
                 })?;

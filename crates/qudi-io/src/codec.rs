@@ -36,7 +36,7 @@ pub(crate) const RECORD: &str = "the record beside it";
 /// One way to store a capture.
 #[derive(Debug)]
 pub struct Format {
-    /// Name, as `--format` takes it.
+    /// The name that the option `format` takes.
     pub name: &'static str,
     /// In words.
     pub title: &'static str,
@@ -93,7 +93,7 @@ pub(crate) fn open(
     if let Some(name) = &options.format {
         let format = by_name(name)?;
         let mut info = CaptureInfo::new(format.name, format.title);
-        info.reasons.push("--format".to_owned());
+        info.reasons.push("`format`".to_owned());
         return open_as(format, &probe, options, info);
     }
     let mut found = Vec::new();
@@ -176,7 +176,7 @@ fn by_name(name: &str) -> Result<&'static Format> {
             .map_or(String::new(), |n| format!("did you mean `{n}`?  "));
         SimError::request(
             format!("no format named `{name}`"),
-            "--format",
+            "format",
             format!("{hint}there are {}", names.join(", ")),
         )
     })
@@ -203,7 +203,7 @@ fn unknown(probe: &Probe) -> SimError {
     SimError::data(
         what,
         &probe.path,
-        "`qudi info --formats` lists what is read; a file without header is read with --format raw-bits, raw-u8 or raw-u16 and --size HxW",
+        "`qudi info --formats` lists what is read; a file without header is read with `format raw-bits`, raw-u8 or raw-u16 and `size HxW`",
     )
 }
 
@@ -228,7 +228,7 @@ fn ambiguous(probe: &Probe, found: &[(&Format, Recognition)]) -> SimError {
     SimError::data(
         format!("the format is ambiguous: {}", candidates.join("; ")),
         &probe.path,
-        format!("say which it is, as in --format {}", found[0].0.name),
+        format!("say which it is, as in `format {}`", found[0].0.name),
     )
 }
 

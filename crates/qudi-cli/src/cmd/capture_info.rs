@@ -3,6 +3,7 @@
 use crate::args::{Global, Info};
 use crate::cmd::info::{origin, record_document};
 use crate::error::{Fault, Result};
+use crate::fields::flags_in_text;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
@@ -111,7 +112,7 @@ pub(crate) fn open_capture(
 /// Says on standard error what the user should know about a capture.
 pub(crate) fn remarks(capture: &Capture, report: &Report) {
     for remark in &capture.info().notes {
-        report.remark(&format!("note: {remark}"));
+        report.remark(&format!("note: {}", flags_in_text(remark)));
     }
 }
 
@@ -128,7 +129,7 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "{key:<11}{value}");
     };
-    let evidence = about.reasons.join(", ");
+    let evidence = flags_in_text(&about.reasons.join(", "));
     line(
         "format",
         format!("{}: {} ({}: {evidence})", about.format, about.title, about.certainty.name()),
@@ -186,7 +187,7 @@ fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> St
     line("pixels", capture.bad_pixels().describe(capture.size()));
     histogram(&mut text, &summary.histogram);
     for remark in &about.notes {
-        let _ = writeln!(text, "note       {remark}");
+        let _ = writeln!(text, "note       {}", flags_in_text(remark));
     }
     text
 }

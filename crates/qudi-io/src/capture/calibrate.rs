@@ -56,7 +56,7 @@ pub fn calibrate(
     if !binary && capture.summed() > 1 {
         return Err(SimError::request(
             "a sum of frames cannot tell read noise from dark counts",
-            "--sum",
+            "sum",
             "leave it out",
         ));
     }
@@ -81,7 +81,7 @@ pub fn calibrate(
     let gain = gain.ok_or_else(|| {
         SimError::request(
             format!("the gain of `{}` follows the light, and a dark capture has none", sensor.name),
-            "--gain",
+            "gain",
             "give the gain of this capture in DN per electron",
         )
     })?;
@@ -173,7 +173,7 @@ fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f6
                         sensor.max_count()
                     ),
                     capture.path(),
-                    "give the sensor that took it: --sensor, or --bits",
+                    "give the sensor that took it: `sensor`, or `bits N`",
                 ));
             };
             *bin += 1;

@@ -123,7 +123,7 @@ impl Pipe {
         Err(SimError::data(
             what,
             Path::new(STDIN),
-            "look for what went wrong before the pipe, check --size and --format, or keep the whole frames with --lenient",
+            "look for what went wrong before the pipe, check `size` and `format`, or keep the whole frames with `lenient`",
         ))
     }
 

@@ -48,7 +48,7 @@ pub(crate) fn plan(
                 capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
             }
             None => capture.info.notes.push(
-                "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a --sensor knows its rate)"
+                "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a `sensor` knows its rate)"
                     .to_owned(),
             ),
         }
@@ -64,8 +64,8 @@ pub(crate) fn plan(
     if capture.repair.count() < capture.bad.len() {
         return Err(SimError::request(
             "every pixel is bad",
-            "--mask",
-            "a mask is nonzero at bad pixels only; use --mask none to repair none",
+            "mask",
+            "a mask is nonzero at bad pixels only; use `mask none` to repair none",
         ));
     }
     Ok(())

@@ -30,7 +30,7 @@ impl View {
         if crop.bottom > turned.height || crop.right > turned.width {
             return Err(SimError::request(
                 format!("rows and columns {crop} of a frame of {turned}"),
-                "--crop",
+                "crop",
                 "the crop applies to the turned frame, and ends inside it",
             ));
         }

@@ -133,7 +133,7 @@ impl Array {
             info.max_count = info.max_count.filter(|_| scale != Scale::Counts).or(Some(1));
             if frames == 1 {
                 info.notes.push(
-                    "a single boolean image: if it is a map of bad pixels, it belongs to --mask"
+                    "a single boolean image: if it is a map of bad pixels, it belongs to `mask`"
                         .to_owned(),
                 );
             }
@@ -176,7 +176,7 @@ impl Array {
         let Some(index) = options.channel else {
             return Err(self.fault(
                 format!("a colour capture of {channels} channels, shape {:?}", self.shape),
-                "colour is not supported yet; read one channel as gray with --channel 0, 1 or 2",
+                "colour is not supported yet; read one channel as gray with `channel 0`, 1 or 2",
             ));
         };
         if index >= channels || axes.frame_position() != 0 || self.fortran {
@@ -222,7 +222,7 @@ impl Array {
                         ByteKind::Counts | ByteKind::WideCounts => None,
                         ByteKind::Unclear => return Err(self.fault(
                             "the array is nearly empty, so that packed bits cannot be told from counts",
-                            "say what its bytes are: --pack-axis width (8 pixels each), height, or none (one count each)",
+                            "say what its bytes are: `pack_axis width` (8 pixels each), height, or none (one count each)",
                         )),
                     }
                 }
@@ -237,7 +237,7 @@ impl Array {
                     "a packed colour capture"
                 },
                 if channel.of == 1 {
-                    "use --pack-axis none"
+                    "use `pack_axis none`"
                 } else {
                     "colour is not supported yet; in Python, save one channel: numpy.save(NAME, cube[..., 0])"
                 },
@@ -262,7 +262,7 @@ impl Array {
         if stored_bytes(size, axis) != (stored.height, stored.width) {
             return Err(self.fault(
                 format!("the array holds frames of {implied}, not of {size}"),
-                "leave --size out, or give the true size, up to 7 pixels smaller on the packed axis",
+                "check the option `size`: give the true size, up to 7 pixels smaller on the packed axis",
             ));
         }
         Size::new(size.height, size.width, &self.path.display().to_string())
@@ -280,8 +280,8 @@ impl Array {
                 Ok(Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts))
             }
             (_, None) if options.levels.is_some() => Err(self.fault(
-                "--levels on wide integers, which have no full scale",
-                "leave --levels out, or save the means as float",
+                "`levels` on wide integers, which have no full scale",
+                "leave `levels` out, or save the means as float",
             )),
             (Sample::U8 | Sample::U16 { .. }, Some(full)) => {
                 let samples = sampled.chunks_exact(self.sample.bytes());
@@ -408,7 +408,7 @@ impl Array {
                     format!(
                         "the file is truncated: its header promises {frames} frames, it holds {whole} whole ones"
                     ),
-                    "copy or export it again, or read the whole frames with --lenient",
+                    "copy or export it again, or read the whole frames with `lenient`",
                 ));
             }
             info.notes.push(format!("truncated: {} of {frames} frames dropped", frames - whole));

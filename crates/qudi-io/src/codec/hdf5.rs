@@ -164,7 +164,7 @@ fn metadata(
             return Err(SimError::data(
                 format!("a capture behind a colour filter array ({pattern})"),
                 path,
-                "colour is not supported yet; read the mosaic as if it were gray with --channel 0",
+                "colour is not supported yet; read the mosaic as if it were gray with `channel 0`",
             ));
         }
     }
@@ -206,7 +206,7 @@ fn choose(found: &[&Candidate], options: &ReadOptions, path: &Path) -> Result<us
         (Some(_), Some(_)) => Err(SimError::data(
             format!("several datasets could be the capture: {}", listed()),
             path,
-            "name one with --array",
+            "name one with `array`",
         )),
     }
 }

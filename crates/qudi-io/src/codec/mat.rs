@@ -97,7 +97,7 @@ fn check_info(
         return Err(SimError::data(
             format!("{parts} parts, where info.json notes {}", promised.unwrap_or(0)),
             path,
-            "copy the missing parts, or read those that are there with --lenient",
+            "copy the missing parts, or read those that are there with `lenient`",
         ));
     }
     // Some converters note the frames of a part, some those of the capture.
@@ -123,7 +123,7 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
         return Err(SimError::data(
             "a simulated colour-filter capture (`imbs`)",
             path,
-            "colour is not supported yet; read the mosaic as if it were gray with --array imbs",
+            "colour is not supported yet; read the mosaic as if it were gray with `array imbs`",
         ));
     }
     let captures: Vec<_> = found.iter().filter(|a| a.dims.len() >= 3).collect();
@@ -134,12 +134,12 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
         (None, []) => Err(SimError::data(
             format!("no array of frames in it; there are: {}", listed()),
             path,
-            "a capture is an array of height x width x frames; dark maps go to --dcr",
+            "a capture is an array of height x width x frames; dark maps go to `dcr`",
         )),
         (None, _) => Err(SimError::data(
             format!("several arrays could be the capture: {}", listed()),
             path,
-            "name one with --array",
+            "name one with `array`",
         )),
     }
 }

@@ -167,7 +167,7 @@ fn choose<'a>(entries: &'a [Entry], options: &ReadOptions, path: &Path) -> Resul
         (Some(_), Some(_)) => Err(SimError::data(
             format!("several arrays could be the capture: {}", listed()),
             path,
-            "name one with --array",
+            "name one with `array`",
         )),
     }
 }

@@ -21,7 +21,7 @@ const OTHERS: &[(&[u8], &str, &str)] = &[
     (
         b"YUV4MPEG2",
         "a Y4M stream: pictures, not photon counts",
-        "make counts of it with `qudi simulate - -o -`; a camera's 8-bit counts come through as `-f rawvideo`, read with --format raw-u8 --size HxW",
+        "make counts of it with `qudi simulate - -o -`; a camera's 8-bit counts come through as `-f rawvideo`, read with `format raw-u8` `size HxW`",
     ),
     (b"\x1f\x8b", "gzipped data", "unpack them on the way: `gunzip -c FILE | qudi restore - ...`"),
     (b"II*\0", "a TIFF file", "name the file itself: its pages cannot be read in turn"),
@@ -40,15 +40,15 @@ pub(crate) fn open_pipe(
     if options.frames_per_file.is_some() {
         return Err(SimError::request(
             "a pipe has no files to count frames in",
-            "--frames-per-file",
-            "leave it out, or end with --end",
+            "frames_per_file",
+            "leave it out, or end with `end`",
         ));
     }
     if let Some(name) = options.format.as_deref().filter(|&name| name != "npy") {
         return piped_raw(name, reader, options).unwrap_or_else(|| {
             Err(SimError::request(
                 format!("`{name}` cannot be read from a pipe"),
-                "--format",
+                "format",
                 "pipes carry npy, raw-bits, raw-u8 and raw-u16: name the file itself, or `qudi convert` it",
             ))
         });
@@ -71,7 +71,7 @@ pub(crate) fn open_pipe(
         let (what, help) = other.map_or(
             (
                 "no known format",
-                "a .npy is recognised; raw frames are read with --format raw-bits, raw-u8 or raw-u16 and --size HxW",
+                "a .npy is recognised; raw frames are read with `format raw-bits`, raw-u8 or raw-u16 and `size HxW`",
             ),
             |&(_, what, help)| (what, help),
         );

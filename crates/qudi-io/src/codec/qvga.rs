@@ -95,7 +95,7 @@ fn open(
     if !size.width.is_multiple_of(8) {
         return Err(SimError::request(
             format!("rows of {} bits are not whole bytes", size.width),
-            "--size",
+            "size",
             "this sensor has 320 columns",
         ));
     }

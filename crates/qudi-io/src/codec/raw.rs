@@ -1,5 +1,5 @@
-//! Files without header of any camera, described by the user: `--size`, `--bitorder`, `--header`,
-//! `--trailer`. Never guessed.
+//! Files without header of any camera, as the options `size`, `bitorder`, `header` and `trailer` describe them.
+//! Never guessed.
 
 pub(super) mod files;
 
@@ -73,8 +73,8 @@ fn size(options: &ReadOptions) -> Result<Size> {
     options.size.ok_or_else(|| {
         SimError::request(
             "files without header do not say how large a frame is",
-            "--size",
-            "give height and width, as in --size 256x512",
+            "size",
+            "give height and width, as in `size 256x512`",
         )
     })
 }
@@ -113,7 +113,7 @@ pub(crate) fn piped(
         return Some(Err(e));
     }
     let mut info = CaptureInfo::new(format.name, format.title);
-    info.reasons.push("--format".to_owned());
+    info.reasons.push("`format`".to_owned());
     let mut reader = Some(reader);
     let mut source = |frame_bytes: usize, _: &mut CaptureInfo| {
         // Asked once: the reader goes with the frames.

@@ -21,7 +21,7 @@ use qudi_core::npy::Sample;
 const COUNTS: &[FormatOption] =
     &[FormatOption::Size, FormatOption::Header, FormatOption::Trailer, FormatOption::FramesPerFile];
 
-/// The whole array; narrower read-outs are given with `--size`.
+/// The whole array; narrower read-outs are given with `size`.
 const ARRAY: Size = Size { height: 512, width: 512 };
 
 pub(crate) const BINARY: Format = Format {

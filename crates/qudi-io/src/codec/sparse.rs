@@ -92,7 +92,7 @@ fn index(
                 return Err(SimError::data(
                     format!("word {} is {word}, beyond the last pixel of {size}", at - 1),
                     path,
-                    "not a sparse stream of this array: check --format and --size",
+                    "not a sparse stream of this array: check `format` and `size`",
                 ));
             }
         }
@@ -110,13 +110,13 @@ fn index(
             return Err(SimError::data(
                 what,
                 path,
-                "the stream was cut off: copy it again, or drop the last frame with --lenient",
+                "the stream was cut off: copy it again, or drop the last frame with `lenient`",
             ));
         }
         info.notes.push(format!("{what}: dropped"));
     }
     if starts.len() < 2 {
-        return Err(SimError::data("no whole frame", path, "check --format and --size"));
+        return Err(SimError::data("no whole frame", path, "check `format` and `size`"));
     }
     Ok(starts)
 }

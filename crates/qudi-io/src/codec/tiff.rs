@@ -47,7 +47,7 @@ fn open(
 ) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     if probe.is_folder {
-        return Err(SimError::data("a folder", path, "use --format images, or name one file"));
+        return Err(SimError::data("a folder", path, "use `format images`, or name one file"));
     }
     let recorded = described(&sidecar::beside(path), info);
     let Some(block) = block(probe)? else {
@@ -66,7 +66,7 @@ fn open(
                     block.frames
                 ),
                 path,
-                "copy or export it again, or read the whole frames with --lenient",
+                "copy or export it again, or read the whole frames with `lenient`",
             ));
         }
         info.notes.push(format!("truncated: {} frames dropped", block.frames - whole));

@@ -73,7 +73,7 @@ fn open(
         return Err(SimError::data(
             format!("a colour capture of {} channels", transforms.c.unwrap_or(0)),
             &path,
-            "colour is not supported yet; read one channel of unpacked frames with --channel",
+            "colour is not supported yet; read one channel of unpacked frames with `channel`",
         ));
     }
     if let Some(name) = &transforms.file_path {

@@ -19,7 +19,7 @@ pub(crate) enum Scale {
 }
 
 impl Scale {
-    /// What `--levels` asks for; `full` is the value that stands for all ones.
+    /// The scale that the option `levels` asks for; `full` is the value that stands for all ones.
     pub(crate) fn asked(levels: Option<u16>, full: f32, info: &mut CaptureInfo) -> Option<Self> {
         let levels = levels?;
         info.max_count = Some(levels);
@@ -34,7 +34,7 @@ impl Scale {
         let Some(levels) = infer_levels(&values, full) else { return Self::Counts };
         info.max_count = Some(levels);
         info.notes.push(format!(
-            "values are multiples of {full}/{levels}: read as counts up to {levels}; --levels says otherwise"
+            "values are multiples of {full}/{levels}: read as counts up to {levels}; `levels` says otherwise"
         ));
         Self::Means { levels, full: f32::from(full) }
     }
@@ -151,6 +151,6 @@ pub(crate) fn no_count(value: f32, frame: u64, path: &Path) -> SimError {
     SimError::data(
         format!("frame {frame} holds {value}, and photon counts are whole numbers from 0 to 65535"),
         path,
-        "means of N binary frames are read with --levels N; an image without photon counts is not a capture",
+        "means of N binary frames are read with `levels N`; an image without photon counts is not a capture",
     )
 }

@@ -95,7 +95,7 @@ impl FrameFolder {
             Err(SimError::data(
                 what,
                 &self.path,
-                "choose another name, go on as before, or start over with `force`",
+                "choose another name, go on with the old settings, or start over with `force`",
             ))
         };
         let (was, is) = (found["program"].as_str().unwrap_or_default(), program());

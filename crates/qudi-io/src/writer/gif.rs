@@ -36,7 +36,7 @@ impl GifWriter {
             return Err(SimError::data(
                 format!("frames of {size} do not fit into a GIF"),
                 path,
-                "GIF ends at 65535 pixels: leave out --preview",
+                "GIF ends at 65535 pixels: leave out `preview`",
             ));
         };
         let file = PendingFile::create(path, overwrite)?;

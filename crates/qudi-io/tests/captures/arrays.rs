@@ -59,7 +59,7 @@ fn packed_bits_and_counts_are_told_apart() {
     }
     let dark = npy("|u1", "False", "(4, 32, 8)", &[0; 4 * 32 * 8]);
     let path = write(folder.path(), "dark.npy", &dark);
-    assert!(refusal(open(&path, &plain())).contains("--pack-axis"));
+    assert!(refusal(open(&path, &plain())).contains("`pack_axis width`"));
 }
 
 #[test]
@@ -208,7 +208,7 @@ fn truncated_arrays_are_refused_or_trimmed() {
     let path = write(folder.path(), "a.npy", &bytes);
     let words = refusal(open(&path, &plain()));
     assert!(
-        words.contains("promises 3 frames, it holds 1") && words.contains("--lenient"),
+        words.contains("promises 3 frames, it holds 1") && words.contains("`lenient`"),
         "{words}"
     );
     let lenient = ReadOptions { lenient: true, ..plain() };

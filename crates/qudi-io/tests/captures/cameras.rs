@@ -105,7 +105,7 @@ fn the_server_s_error_is_reported_and_a_torn_frame_refused() {
     assert!(capture.info().notes[0].contains("ERROR"));
     let torn = write(folder.path(), "RAW00001.bin", &bytes[..bytes.len() - 100]);
     let words = refusal(open(&torn, &named));
-    assert!(words.contains("19 frames") && words.contains("--lenient"), "{words}");
+    assert!(words.contains("19 frames") && words.contains("`lenient`"), "{words}");
     let lenient = ReadOptions { lenient: true, ..named.clone() };
     assert_eq!(open(&torn, &lenient).unwrap().frames(), 19);
     let trailer = ReadOptions { trailer: Some(32_768 - 95), ..named.clone() };
@@ -222,7 +222,7 @@ fn a_length_alone_decides_nothing() {
         .collect();
     let path = write(folder.path(), "noise.bin", &noise);
     let words = refusal(open(&path, &plain()));
-    assert!(words.contains("ambiguous") && words.contains("--format"), "{words}");
+    assert!(words.contains("ambiguous") && words.contains("`format "), "{words}");
     // A name decides where the picture does not.
     let path = write(folder.path(), "filename7.bin", &noise);
     assert_eq!(open(&path, &plain()).unwrap().info().format, "swissspad2");
@@ -245,7 +245,7 @@ fn any_other_camera_is_described_by_hand() {
     };
     assert_eq!(counts(&mut open(&path, &options).unwrap()), frames);
     let sizeless = ReadOptions { size: None, ..options.clone() };
-    assert!(refusal(open(&path, &sizeless)).contains("--size"));
+    assert!(refusal(open(&path, &sizeless)).contains("`size 256x512`"));
     let misspelt = ReadOptions { format: Some("raw-bit".into()), ..options };
     assert!(refusal(open(&path, &misspelt)).contains("did you mean `raw-bits`"));
     let bytes: Vec<u8> = frames.iter().flatten().flat_map(|&c| (c * 300).to_le_bytes()).collect();

@@ -94,10 +94,10 @@ fn what_is_known_is_said() {
 #[test]
 fn what_is_open_is_asked() {
     let words = refusal(open(&golden("two.npz"), &plain()));
-    assert!(words.contains("left") && words.contains("--array"), "{words}");
+    assert!(words.contains("left") && words.contains("`array`"), "{words}");
     let left = ReadOptions { array: Some("left".into()), ..plain() };
     assert_eq!(frames("two.npz", &left), expected("counts.npy"));
-    assert!(refusal(open(&golden("bayer.mat"), &plain())).contains("--array imbs"));
+    assert!(refusal(open(&golden("bayer.mat"), &plain())).contains("`array imbs`"));
     let mosaic = ReadOptions { array: Some("imbs".into()), ..plain() };
     assert_eq!(frames("bayer.mat", &mosaic), expected("counts.npy"));
     assert!(refusal(open(&golden("visionsim_colour"), &plain())).contains("colour"));

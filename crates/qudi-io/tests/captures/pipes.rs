@@ -136,7 +136,7 @@ fn released_frames_are_gone_and_the_end_is_said() {
     assert!(gone.to_string().contains("frame 14 of a pipe"), "{gone}");
     assert_eq!(pipe.wait_for(50).unwrap(), 30);
     assert_eq!(pipe.length(), Some(30));
-    assert_eq!(pipe.info().notes, ["the pipe ended after 30 frames, before --end 50"]);
+    assert_eq!(pipe.info().notes, ["the pipe ended after 30 frames, before `end 50`"]);
 }
 
 #[test]

@@ -30,7 +30,7 @@ pub(crate) fn frame_files(
                 return Err(SimError::data(
                     format!("the file holds {} frames instead of {per_file}", segment.frames),
                     path,
-                    "only the last file may be shorter; leave --frames-per-file out, or copy the file again",
+                    "only the last file may be shorter; leave `frames_per_file` out, or copy the file again",
                 ));
             }
         }
@@ -51,7 +51,7 @@ pub(crate) fn frame_files(
         return Err(SimError::data(
             format!("no whole frame of {frame_bytes} bytes"),
             place,
-            "check --format and --size",
+            "check `format` and `size`",
         ));
     }
     Ok(FrameBytes::files(segments, frame_bytes))
@@ -72,7 +72,7 @@ fn segment(
         SimError::data(
             format!("{length} bytes, shorter than its header and trailer"),
             path,
-            "check --header and --trailer, or copy the file again",
+            "check `header` and `trailer`, or copy the file again",
         )
     };
     let body = length.checked_sub(header).ok_or_else(too_short)?;
@@ -91,7 +91,7 @@ fn segment(
                 ),
                 path,
                 format!(
-                    "drop an incomplete last frame with --lenient, or a trailer with --trailer {rest}; or check --format and --size"
+                    "drop an incomplete last frame with `lenient`, or a trailer with `trailer {rest}`; or check `format` and `size`"
                 ),
             ));
         }
