@@ -18,6 +18,8 @@ mod remote;
 mod report;
 #[path = "cli/restore.rs"]
 mod restore;
+#[path = "cli/safety.rs"]
+mod safety;
 #[path = "cli/settings.rs"]
 mod settings;
 #[path = "cli/train.rs"]

@@ -35,6 +35,7 @@ fn weights(path: &Path, value: f32) {
         steps: 0,
         commit: None,
         licence: "MIT OR Apache-2.0".into(),
+        default_steps: None,
     };
     let mut module = network.init(1, &Device::flex());
     if value != 0.0 {

@@ -35,4 +35,5 @@ mod train_environment;
 mod train_events;
 mod train_pictures;
 mod train_report;
+mod train_resume;
 mod train_watch;

@@ -1,6 +1,7 @@
 //! Errors of the command line: what happened, where, what to do.
 
 use crate::fields::{flags, flags_in_text};
+use clap::error::{ContextKind, ErrorKind};
 use qudi_core::SimError;
 use std::fmt::Display;
 use std::io;
@@ -29,6 +30,21 @@ impl Fault {
             place: Some(place.to_string()),
             help: Some(help.to_string()),
         }
+    }
+}
+
+impl Fault {
+    /// A value that a flag cannot have, in the three parts of all errors.
+    pub(crate) fn of_value(refusal: &clap::Error) -> Option<Self> {
+        if refusal.kind() != ErrorKind::ValueValidation {
+            return None;
+        }
+        let text = |kind| refusal.get(kind).map(ToString::to_string);
+        let argument = text(ContextKind::InvalidArg)?;
+        let flag = argument.split_whitespace().next().unwrap_or_default();
+        let value = text(ContextKind::InvalidValue)?;
+        let help = std::error::Error::source(refusal)?.to_string();
+        Some(Self::new(format!("{flag} is {value}"), flag, help))
     }
 }
 

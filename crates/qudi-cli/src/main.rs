@@ -5,9 +5,9 @@ mod cmd;
 mod device;
 mod error;
 mod fields;
-mod files;
 mod interrupt;
 mod memory;
+mod places;
 #[cfg(feature = "remote")]
 mod remote;
 mod report;
@@ -16,6 +16,7 @@ mod weights;
 
 use args::{Args, Command};
 use clap::Parser;
+use error::Fault;
 use std::process::ExitCode;
 
 /// See [`memory::keep_freed_pages`].
@@ -27,7 +28,13 @@ fn main() -> ExitCode {
     if let Err(fault) = check_arguments() {
         return report::Report::plain().fault(&fault);
     }
-    let args = Args::parse();
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(refusal) => match Fault::of_value(&refusal) {
+            Some(fault) => return report::Report::plain().fault(&fault),
+            None => refusal.exit(),
+        },
+    };
     let report = report::Report::new(&args.global);
     match run(&args, &report) {
         Ok(()) => ExitCode::SUCCESS,
@@ -39,7 +46,7 @@ fn main() -> ExitCode {
 fn check_arguments() -> error::Result<()> {
     match std::env::args_os().find(|argument| argument.to_str().is_none()) {
         None => Ok(()),
-        Some(argument) => Err(error::Fault::new(
+        Some(argument) => Err(Fault::new(
             "an argument is not UTF-8, so no record could name it",
             argument.display(),
             "rename the file or folder",
@@ -50,7 +57,7 @@ fn check_arguments() -> error::Result<()> {
 fn run(args: &Args, report: &report::Report) -> error::Result<()> {
     interrupt::install();
     if let Some(threads) = args.global.threads {
-        rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build_global()?;
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }
     // Loaded for every command, so that none ignores what it was told.
     let settings = settings::Settings::load(&args.global, args.command.name())?;

@@ -13,10 +13,10 @@ pub(crate) use keys::KEYS;
 
 use crate::args::Global;
 use crate::error::{Fault, Result};
-use crate::files::read_small;
 use keys::Kind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::nearest::nearest;
+use qudi_core::regular_file::read_text;
 use qudi_core::sensor::{Sensor, load_document, merge_documents};
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
@@ -86,7 +86,7 @@ impl Settings {
     fn add_file(&mut self, path: &Path) -> Result<()> {
         let place = path.display().to_string();
         let help = "see `qudi config docs` for the keys and configs/ for examples";
-        let text = read_small(path, "the settings", TEXT_BYTES, help)?;
+        let text = read_text(path, TEXT_BYTES, "read the settings")?;
         let document: Value = toml::from_str(&text).map_err(|e| {
             Fault::new(format!("not a TOML document: {}", e.message()), &place, help)
         })?;

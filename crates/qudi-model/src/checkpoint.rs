@@ -39,6 +39,18 @@ pub struct Description {
     pub commit: Option<String>,
     /// Licence of the weights.
     pub licence: String,
+    /// Reverse diffusion steps unless the user says otherwise; 0 for regression. Older files do not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub default_steps: Option<usize>,
+}
+
+impl Description {
+    /// Reverse diffusion steps unless the user says otherwise.
+    ///
+    /// Older files do not say. Among them, weights that predict their own uncertainty were made for regression.
+    pub fn reverse_steps(&self) -> usize {
+        self.default_steps.unwrap_or(usize::from(!self.network.pre.error))
+    }
 }
 
 /// How exactly numbers are written.
@@ -61,10 +73,18 @@ pub fn save(
     path: &Path,
     overwrite: Overwrite,
 ) -> Result<()> {
-    let mut values = Values { precision, path: Vec::new(), list: Vec::new(), error: None };
+    let mut values =
+        Values { precision, path: Vec::new(), list: Vec::new(), broken: None, error: None };
     network.visit(&mut values);
     if let Some(error) = values.error {
         return Err(error);
+    }
+    if let Some(name) = values.broken {
+        return Err(SimError::data(
+            format!("`{name}` holds values beyond {:e}", precision.largest()),
+            path,
+            "the training that wrote it had failed: use an earlier checkpoint",
+        ));
     }
     let text = serde_json::to_string(description).expect("plain data");
     // One entry only: the library writes several in any order, and equal weights should make equal files.
@@ -228,6 +248,14 @@ impl Precision {
         }
     }
 
+    /// The largest value that can be written.
+    fn largest(self) -> f32 {
+        match self {
+            Self::Single => f32::MAX,
+            Self::Half => f16::MAX.to_f32(),
+        }
+    }
+
     fn bytes(self, values: &[f32]) -> Vec<u8> {
         match self {
             Self::Single => values.iter().flat_map(|value| value.to_le_bytes()).collect(),
@@ -244,6 +272,8 @@ struct Values {
     precision: Precision,
     path: Vec<String>,
     list: Vec<(String, Vec<usize>, Vec<u8>)>,
+    /// The first parameter with values that cannot be written.
+    broken: Option<String>,
     error: Option<SimError>,
 }
 
@@ -259,6 +289,10 @@ impl ModuleVisitor for Values {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         match crate::tensor::read(param.val()) {
             Ok(values) => {
+                let largest = self.precision.largest();
+                if self.broken.is_none() && !values.iter().all(|value| value.abs() <= largest) {
+                    self.broken = Some(self.path.join("."));
+                }
                 let bytes = self.precision.bytes(&values);
                 self.list.push((self.path.join("."), param.shape().to_vec(), bytes));
             }

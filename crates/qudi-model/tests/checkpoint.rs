@@ -20,6 +20,7 @@ fn description() -> Description {
         steps: 0,
         commit: None,
         licence: "MIT OR Apache-2.0".into(),
+        default_steps: None,
     }
 }
 

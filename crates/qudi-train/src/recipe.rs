@@ -164,6 +164,14 @@ impl Recipe {
         self.train.crops.map_or(whole, |crops| (crops.frames, crops.side))
     }
 
+    /// Reverse diffusion steps that the weights are made for: none where nothing but regression learns.
+    pub(super) fn default_steps(&self) -> usize {
+        if self.train.loss.prediction == 0.0 {
+            return 0;
+        }
+        self.validation.as_ref().map_or(1, |validation| validation.steps)
+    }
+
     /// Whether only the pre-denoiser learns: frame by frame.
     pub(super) fn learns_frames(&self) -> bool {
         let loss = &self.train.loss;

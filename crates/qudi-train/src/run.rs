@@ -199,6 +199,7 @@ impl Run {
             steps: self.trainer.step_number(),
             commit: self.commit.clone(),
             licence: recipe.train.licence.clone(),
+            default_steps: Some(recipe.default_steps()),
         };
         let path = self.folder.join(WEIGHTS);
         save(&self.trainer.averaged(), &description, Precision::Single, &path, Overwrite::Yes)

@@ -1,6 +1,7 @@
 //! Options of `qudi convert` and `qudi calibrate`.
 
 use super::Reading;
+use super::number;
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
@@ -40,7 +41,7 @@ pub(crate) struct Calibrate {
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
     /// Gain of this capture in DN per electron, for sensors whose gain follows the light
-    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, value_parser = number::real(number::GAIN))]
     pub(crate) gain: Option<f64>,
     /// Dark rate beyond which a pixel is hot: per frame, or per second as in 100/s [default: 10 x the median]
     #[arg(long, value_name = "RATE")]

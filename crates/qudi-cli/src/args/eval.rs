@@ -1,5 +1,6 @@
 //! Options of `qudi eval` and `qudi bench`.
 
+use super::number;
 use super::{Network, Reading, Shard};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_core::Size;
@@ -28,29 +29,29 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
     pub(crate) method: Vec<String>,
     /// Incident photons per pixel and frame [default: 3.25,9.75,26; of a capture: from its record, or estimated]
-    #[arg(long, value_name = "PPP,...", value_delimiter = ',')]
+    #[arg(long, value_name = "PPP,...", value_delimiter = ',', allow_negative_numbers = true, value_parser = number::real(number::PPP))]
     pub(crate) ppp: Vec<f64>,
     /// Sensor: a name or a .toml file [default: qudi-paper; of a capture: known from record or format]
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
     /// Gain of a capture in DN per electron, for sensors whose gain follows the light
-    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, requires = "capture")]
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, requires = "capture", value_parser = number::real(number::GAIN))]
     pub(crate) gain: Option<f64>,
     /// Frames of each clip, or of the capture, at most [default: 33]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     pub(crate) frames: Option<u64>,
     /// How photons are drawn: strict (once per clip) or quiver (anew for every window of 11, light
     /// normalised by the window, middle frames judged)
     #[arg(long, value_name = "NAME", default_value = "strict")]
     pub(crate) protocol: Protocol,
     /// Seed; each clip gets one made from it and its name [default: 1]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: Option<u64>,
     /// Mean image value that methods are told [default: as `qudi restore` finds it in each capture]
-    #[arg(long, value_name = "VALUE")]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
     pub(crate) exposure: Option<f64>,
     /// Frames that neighbouring windows share, blended
-    #[arg(long, value_name = "N", default_value_t = 3)]
+    #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1000))]
     pub(crate) overlap: u64,
     /// Write the exact bursts here, for programs of any kind
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
@@ -71,7 +72,7 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) html: Option<PathBuf>,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
-    #[arg(long, value_name = "DB", allow_negative_numbers = true)]
+    #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,
     #[command(flatten)]
     pub(crate) network: Network,
@@ -92,10 +93,10 @@ pub(crate) struct Bench {
     #[arg(long, value_name = "HxW", default_value = "256x256")]
     pub(crate) size: Size,
     /// Frames of the window
-    #[arg(long, value_name = "N", default_value_t = 11)]
+    #[arg(long, value_name = "N", default_value_t = 11, allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     pub(crate) frames: usize,
     /// Measured rounds
-    #[arg(long, value_name = "N", default_value_t = 7)]
+    #[arg(long, value_name = "N", default_value_t = 7, allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=10_000))]
     pub(crate) rounds: usize,
     /// Results of an earlier run (--json) to compare with
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]

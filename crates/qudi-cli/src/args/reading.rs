@@ -1,11 +1,12 @@
 //! How captures are read: the same options for every command that reads one.
 
+use super::number;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
 use qudi_io::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 use serde::de::DeserializeOwned;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What the user says about a capture that its file does not.
 #[derive(Clone, Debug, ClapArgs)]
@@ -31,37 +32,37 @@ pub(crate) struct Reading {
     #[arg(long, value_name = "AXES", value_parser = words::<Axes>(&["thw", "twh", "hwt", "wht", "htw", "wth"]))]
     axes: Option<Axes>,
     /// Colour channel to read as gray, from 0
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=4095))]
     channel: Option<usize>,
     /// Array (variable, data set) in a file that holds several
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
     /// Values are means of N binary frames, full scale for all ones
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u16>(1..=65535))]
     levels: Option<u16>,
     /// Bits of a count, where the file does not say
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u8>(1..=16))]
     bits: Option<u8>,
     /// Bytes before the first frame of each raw file
-    #[arg(long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1 << 40))]
     header: Option<u64>,
     /// Bytes after the last frame of each raw file
-    #[arg(long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1 << 40))]
     trailer: Option<u64>,
     /// Frames in each raw file but the last
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     frames_per_file: Option<u64>,
     /// First frame, from 0
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1 << 40))]
     start: Option<u64>,
     /// One past the last frame
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     end: Option<u64>,
     /// Rows and columns to keep after turning, as in 2:256,0:496
     #[arg(long, value_name = "Y0:Y1,X0:X1")]
     crop: Option<Crop>,
     /// Sum N frames into one (7 binary frames make 3 bits)
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u32>(1..=1 << 24))]
     sum: Option<u32>,
     /// Pixels to repair: a .npy or image nonzero at bad ones, auto (found in the capture), or none
     #[arg(long, value_name = "FILE|auto|none")]
@@ -75,6 +76,15 @@ pub(crate) struct Reading {
 }
 
 impl Reading {
+    /// Files that are read besides the capture.
+    pub(crate) fn files(&self) -> Vec<&Path> {
+        let mask = match &self.mask {
+            Some(MaskChoice::File(path)) => Some(path),
+            _ => None,
+        };
+        mask.into_iter().chain(&self.dcr).map(PathBuf::as_path).collect()
+    }
+
     /// The options; without --mask, pixels are treated as `mask` says.
     pub(crate) fn options(&self, mask: MaskChoice) -> ReadOptions {
         let given = self.clone();

@@ -1,5 +1,6 @@
 //! Options of `qudi restore`.
 
+use super::number;
 use super::{Network, Reading};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_io::restore::Share;
@@ -27,20 +28,20 @@ pub(crate) struct Restore {
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
     /// Incident photons per pixel and frame [default: from the record, or estimated]
-    #[arg(long, value_name = "PPP", allow_negative_numbers = true)]
+    #[arg(long, value_name = "PPP", allow_negative_numbers = true, value_parser = number::real(number::PPP))]
     pub(crate) ppp: Option<f64>,
     /// Gain in DN per electron, for sensors whose gain follows the light [default: from the record]
-    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true)]
+    #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, value_parser = number::real(number::GAIN))]
     pub(crate) gain: Option<f64>,
     /// Image value that PPP photons become: counts do not fix the brightness of a picture [default: 0.45, or less where parts
     /// of the scene would be brighter than white]
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true)]
+    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
     pub(crate) exposure: Option<f64>,
     /// Seed of methods that draw
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: u64,
     /// Frames that neighbouring windows share, blended
-    #[arg(long, value_name = "N", default_value_t = 3)]
+    #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1000))]
     pub(crate) overlap: u64,
     /// Do part I of N (from 1), into the same folder as the other parts
     #[arg(long, value_name = "I/N")]

@@ -1,7 +1,7 @@
 //! Options of `qudi train`.
 
+use super::number;
 use clap::{Args as ClapArgs, ValueHint};
-use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 /// Learn a network from videos, stills and procedural scenes
@@ -42,8 +42,8 @@ pub(crate) struct Train {
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
     pub(crate) device: Vec<String>,
     /// Threads that draw samples
-    #[arg(long, value_name = "N", default_value = "1")]
-    pub(crate) workers: NonZeroUsize,
+    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MOST_THREADS))]
+    pub(crate) workers: usize,
     /// Download the weights of the recipe's LPIPS term into --backbones first, with curl
     #[arg(long, requires = "backbones")]
     pub(crate) fetch: bool,

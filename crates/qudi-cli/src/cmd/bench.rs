@@ -51,6 +51,7 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
     if !args.preset.is_empty() {
         return bench_network::run(args, report);
     }
+    args.network.check_methods(args.method.iter().map(String::as_str))?;
     let old = args.compare.as_deref().map(load).transpose()?;
     if args.rounds == 0 || args.frames == 0 {
         return Err(Fault::new("nothing to measure", "--rounds, --frames", "ask for at least 1"));

@@ -54,12 +54,13 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         let help = "ask for at least 1 round of 3 frames";
         return Err(Fault::new("nothing to measure", "--rounds, --frames", help));
     }
-    let device = device::open(&args.network.device)?;
+    let device = device::open(args.network.device())?;
     let precision = args.precision.precision();
     if !precision.is_supported(&device.device) {
         let what = format!("{} cannot compute with {precision} numbers", device.name);
         return Err(Fault::new(what, "--precision", "ask for another, or another --device"));
     }
+    let steps = args.network.steps()?;
     let mut bar = report.bar();
     let mut all = Vec::new();
     for preset in &args.preset {
@@ -69,7 +70,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         all.push(figures);
     }
     drop(bar);
-    report.result(&describe(&all, args, &device), || {
+    report.result(&describe(&all, args, steps, &device), || {
         json!({
             "program": format!("qudi {}", env!("CARGO_PKG_VERSION")),
             "device": device.name,
@@ -79,7 +80,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
             "width": args.size.width,
             "frames": args.frames,
             "rounds": args.rounds,
-            "steps": args.network.steps(),
+            "steps": steps,
             "networks": all,
         })
     })
@@ -127,7 +128,7 @@ fn measure(
     }
     drop((differentiable, of_step));
     let (counts, acquisition) = burst(args)?;
-    let options = sample_options(&args.network);
+    let options = sample_options(&args.network)?;
     let mut restorer = QudiRestorer::new(network, &config, args.frames, options, &device.device)?;
     let peak = Peak::start();
     let start = Instant::now();
@@ -194,7 +195,7 @@ fn forward_backward(network: &Qudi, inputs: &Inputs, device: &Device) -> f64 {
     start.elapsed().as_secs_f64()
 }
 
-fn describe(all: &[Figures], args: &Bench, device: &Opened) -> String {
+fn describe(all: &[Figures], args: &Bench, steps: usize, device: &Opened) -> String {
     let mut text = format!(
         "{:<8}{:>12}{:>13}{:>9}{:>10}{:>10}{:>10}{:>11}\n",
         "preset",
@@ -229,7 +230,7 @@ fn describe(all: &[Figures], args: &Bench, device: &Opened) -> String {
          forward and backward on {CROP}",
         args.frames,
         args.size,
-        args.network.steps(),
+        steps,
         device.name,
         rayon::current_num_threads(),
         args.precision.precision(),

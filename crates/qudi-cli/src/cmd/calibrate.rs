@@ -4,6 +4,7 @@ use crate::args::{Calibrate, Global};
 use crate::cmd::capture_info::{remarks, required_sensor};
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::places::Places;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
@@ -30,6 +31,13 @@ pub(crate) fn run(
         ));
     }
     let maps = ["dark", "bad"].map(|map| args.output.with_extension(format!("{map}.npy")));
+    Places::default()
+        .reads_burst(&args.capture)
+        .reads(args.reading.files())
+        .reads(args.sensor.as_deref())
+        .writes(&maps)
+        .writes([&args.output])
+        .check()?;
     for path in maps.iter().chain([&args.output]) {
         refuse_taken(path, overwrite)?;
     }

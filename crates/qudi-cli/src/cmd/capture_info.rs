@@ -4,6 +4,7 @@ use crate::args::{Global, Info};
 use crate::cmd::info::{origin, record_document};
 use crate::error::{Fault, Result};
 use crate::fields::flags_in_text;
+use crate::places::Places;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
@@ -32,6 +33,12 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    Places::default()
+        .reads_burst(path)
+        .reads(info.reading.files())
+        .reads(info.look.sensor.as_deref())
+        .writes(&info.look.preview)
+        .check()?;
     if let Some(preview) = &info.look.preview {
         refuse_taken(preview, overwrite)?;
     }

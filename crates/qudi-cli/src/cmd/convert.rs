@@ -4,6 +4,7 @@ use crate::args::{Convert, Global};
 use crate::cmd::capture_info::remarks;
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::places::Places;
 use crate::report::{Bar, Report};
 use qudi_core::SimError;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
@@ -16,6 +17,14 @@ use std::path::Path;
 pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
     let options = args.reading.options(MaskChoice::None);
+    let format = BurstFormat::for_path(&args.output, 1, true);
+    let record = format.ok().map(|format| format.record_path(&args.output));
+    Places::default()
+        .reads_burst(&args.capture)
+        .reads(args.reading.files())
+        .writes([&args.output])
+        .writes(record.filter(|record| !record.starts_with(&args.output)))
+        .check()?;
     refuse_taken(&args.output, overwrite)?;
     let mut capture = Capture::open(&args.capture, &options, None)?;
     let max_count = largest_count(&mut capture)?;

@@ -6,6 +6,7 @@ use crate::cmd::demo_html::html;
 use crate::cmd::network;
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::places::Places;
 use crate::report::{Bar, Cell, Column, Output, Report, Table, json};
 use crate::settings::Settings;
 use qudi_burst::Average;
@@ -72,6 +73,11 @@ pub(crate) fn run(
         let help = "name a .png; the page lies beside it";
         return Err(Fault::new("the picture and the page are one file", path.display(), help));
     }
+    Places::default()
+        .reads([&demo.sensor])
+        .reads(&demo.network.weights)
+        .writes([&path, &page])
+        .check()?;
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
     let page_file = Output::open(Some(&page), overwrite)?;

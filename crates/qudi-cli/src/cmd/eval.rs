@@ -11,6 +11,7 @@ use crate::cmd::eval_table::{frames, summary};
 use crate::cmd::methods::{METHODS, is_method};
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::places::Places;
 use crate::report::{Output, Report, csv, markdown};
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
@@ -28,6 +29,17 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let clips = if args.capture { Vec::new() } else { Clip::places(&args.data)? };
+    let outputs = [&args.csv, &args.markdown, &args.html, &args.export_photons];
+    let external = args.external.iter().map(|external| &external.folder);
+    Places::default()
+        .reads(args.capture.then_some(&args.data))
+        .reads(clips)
+        .reads(external)
+        .reads(args.sensor.as_deref())
+        .reads(&args.network.weights)
+        .writes(outputs.into_iter().flatten())
+        .check()?;
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
     let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
     let html_file = output(&args.html)?;
@@ -42,6 +54,7 @@ pub(crate) fn run(
             format!("there are {}", METHODS.join(", ")),
         ));
     }
+    args.network.check_methods(args.method.iter().map(String::as_str))?;
     let Judged { rows, pictures, about, settings } = if args.capture {
         judge(args, settings, report)?
     } else {
@@ -55,7 +68,8 @@ pub(crate) fn run(
     report.result(&text, || document(settings, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
     match args.min_psnr {
-        Some(bar) => match rows.iter().find(|row| psnr_a(row) < bar) {
+        // What is no number passes no bar.
+        Some(bar) => match rows.iter().find(|row| psnr_a(row).is_nan() || psnr_a(row) < bar) {
             Some(row) => Err(Fault::Missed(format!(
                 "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
                 row.method,
@@ -164,7 +178,7 @@ fn judge_clips(
         Protocol::Quiver => "quiver",
     };
     let about = format!(
-        "{number} clips, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
+        "{number} {}, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
         if number == 1 { "clip" } else { "clips" },
         exposing.sensor.name,
         exposing.seed

@@ -73,6 +73,12 @@ impl Clip {
         Ok(named.map(|(name, path)| Self::new(name, path.display().to_string())).collect())
     }
 
+    /// The clips' files and folders; none of a scene.
+    pub(crate) fn places(data: &str) -> Result<Vec<PathBuf>> {
+        let clips = if data.starts_with("scene:") { Vec::new() } else { Self::find(data)? };
+        Ok(clips.into_iter().map(|clip| PathBuf::from(clip.place)).collect())
+    }
+
     fn new(name: String, place: String) -> Self {
         Self { name, place, estimated_flow: OnceCell::new() }
     }
@@ -151,15 +157,18 @@ fn burst_name(clip: &str, ppp: f64) -> String {
     format!("{clip}-ppp{}", ppp.to_string().replace('.', "_"))
 }
 
+/// Name of a clip: a file's without its extension, a folder's as it is, dots and all.
 pub(crate) fn stem(path: &Path) -> String {
+    if path.is_dir() {
+        return full_name(path);
+    }
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// Names of clips: of files without the extension, of folders in full, since `run.1` and `run.2` are two clips. Files
 /// that differ in the extension alone keep it.
 fn clip_names(clips: &[PathBuf]) -> Vec<String> {
-    let short = |path: &PathBuf| if path.is_dir() { full_name(path) } else { stem(path) };
-    let names: Vec<String> = clips.iter().map(short).collect();
+    let names: Vec<String> = clips.iter().map(|path| stem(path)).collect();
     let is_unique = |name: &String| names.iter().filter(|other| *other == name).count() == 1;
     let name = |(path, name): (&PathBuf, &String)| {
         if is_unique(name) { name.clone() } else { full_name(path) }

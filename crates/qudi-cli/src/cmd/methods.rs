@@ -62,7 +62,7 @@ pub(crate) fn usual_method(
     acquisition: &Acquisition,
 ) -> Result<&'static str> {
     let long_enough = capture.length().is_none_or(|frames| frames >= FEWEST_FRAMES as u64);
-    Ok(if options.weights.is_some() {
+    Ok(if options.meant().is_some() {
         "qudi"
     } else if acquisition.sensor.dark_per_frame().is_err() {
         "mle"

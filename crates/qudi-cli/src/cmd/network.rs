@@ -22,37 +22,34 @@ pub(crate) fn restorer(
     acquisition: &Acquisition,
     size: Size,
 ) -> Result<(Box<dyn Restorer>, String)> {
-    let device = device::open(&options.device)?;
+    let device = device::open(options.device())?;
+    options.check_steps()?;
     let (network, description) = options.weights().load(&device.device)?;
     check(&description, acquisition)?;
     if matches!(device.name.as_str(), "cpu" | "ndarray") {
-        check_memory(&description, options.tile, size, available_bytes())?;
+        check_memory(&description, options.tile(), size, available_bytes())?;
     }
     let (config, window) = (&description.network, description.window);
-    let sampling = sample_options(options);
+    let sampling = sample_options(options)?;
     let restorer = QudiRestorer::new(network, config, window, sampling, &device.device)?;
-    let way = match options.steps() {
-        0 => "regression".to_owned(),
-        1 => "diffusion in 1 step".to_owned(),
-        steps => format!("diffusion in {steps} steps"),
-    };
+    let way = options.mode()?;
     Ok((Box::new(restorer), format!(" ({way}) on {}", device.name)))
 }
 
-pub(crate) fn sample_options(options: &Network) -> SampleOptions {
-    SampleOptions {
-        steps: options.steps(),
-        spacing: match options.spacing {
+pub(crate) fn sample_options(options: &Network) -> Result<SampleOptions> {
+    Ok(SampleOptions {
+        steps: options.steps()?,
+        spacing: match options.spacing() {
             SpacingName::Linear => Spacing::Linear,
             SpacingName::Learnt => Spacing::Learnt,
         },
-        sampler: match options.sampler {
+        sampler: match options.sampler() {
             SamplerName::Ddim => Sampler::Ddim,
             SamplerName::Ancestral => Sampler::Ancestral,
         },
-        samples: options.samples,
-        tile: options.tile,
-    }
+        samples: options.samples(),
+        tile: options.tile(),
+    })
 }
 
 /// Refuses tiles that memory cannot hold, before the system ends the program for it.
@@ -88,7 +85,7 @@ fn check_memory(
 
 /// What went wrong on a device, with a way out; `problem` are its own words.
 pub(crate) fn device_failed(problem: &str, options: &Network) -> Fault {
-    let half = options.tile / 2 / 32 * 32;
+    let half = options.tile() / 2 / 32 * 32;
     let help = if half >= 64 {
         format!(
             "--tile {half} needs a quarter of the memory; `qudi selftest` checks the device; or --device cpu"
@@ -96,7 +93,7 @@ pub(crate) fn device_failed(problem: &str, options: &Network) -> Fault {
     } else {
         "check the device with `qudi selftest`, or use --device cpu".to_owned()
     };
-    Fault::new(format!("the device failed: {problem}"), &options.device, help)
+    Fault::new(format!("the device failed: {problem}"), options.device(), help)
 }
 
 /// Whether a sensor counts like one that the weights were trained for: the same response, and full scales within a
@@ -164,6 +161,7 @@ mod tests {
             steps: 0,
             commit: None,
             licence: String::new(),
+            default_steps: None,
         }
     }
 

@@ -2,6 +2,7 @@
 
 use crate::args::{Global, Publish};
 use crate::error::{Fault, Result};
+use crate::places::Places;
 use crate::report::Report;
 use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
@@ -20,8 +21,14 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
             "name a .safetensors file",
         ));
     }
+    Places::default()
+        .reads([&args.weights])
+        .writes([path, &path.with_extension("sha256")])
+        .check()?;
     let device = Device::flex();
-    let (network, description) = Weights::File(args.weights.clone()).load(&device)?;
+    let (network, mut description) = Weights::File(args.weights.clone()).load(&device)?;
+    // Said from now on, whatever later versions take for granted.
+    description.default_steps = Some(description.reverse_steps());
     save(&network, &description, Precision::Half, path, overwrite)?;
     let bytes = std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
     let hash = sha256(&bytes);

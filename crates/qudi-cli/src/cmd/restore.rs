@@ -11,6 +11,7 @@ use crate::cmd::tiff_samples::tiff_samples;
 use crate::device;
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::places::Places;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::SimError;
@@ -41,7 +42,17 @@ pub(crate) fn run(
         ));
     }
     let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
-    for path in [&args.chi_map, &args.side_by_side, &args.deviation].into_iter().flatten() {
+    let beside = [&args.chi_map, &args.side_by_side, &args.deviation];
+    Places::default()
+        .reads_burst(&args.capture)
+        .reads(args.reading.files())
+        .reads(args.sensor.as_deref())
+        .reads(&args.network.weights)
+        .reads(&global.config)
+        .writes([&args.output])
+        .writes(beside.into_iter().flatten())
+        .check()?;
+    for path in beside.into_iter().flatten() {
         refuse_taken(path, overwrite)?;
     }
     if args.shard.is_some() && args.side_by_side.is_some() {
@@ -50,6 +61,9 @@ pub(crate) fn run(
             "--side-by-side",
             "ask for it when all parts are done: the same command without --shard",
         ));
+    }
+    if let Some(method) = &args.method {
+        args.network.check_methods(std::iter::once(method.as_str()))?;
     }
     let tiff = tiff_samples(args.float, Path::new(&args.output))?;
     Output::refuse_taken(&args.output, args.shard.is_some(), overwrite)?;
@@ -78,7 +92,9 @@ pub(crate) fn run(
     }
     let frames = job.capture.frames();
     let part = part.start..part.end.min(frames);
-    let results = json!({"chi_square": misfit.chi_square()});
+    let is_network = !job.settings["network"].is_null();
+    let mode = is_network.then(|| args.network.mode()).transpose()?;
+    let results = json!({"chi_square": misfit.chi_square(), "mode": mode});
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
     deviation.finish()?;
@@ -254,7 +270,7 @@ impl Job {
         };
         if restorer_is_network {
             // Devices report too little memory and broken drivers by panicking.
-            let run = device::guarded(&network.device, run);
+            let run = device::guarded(network.device(), run);
             return Ok(run.map_err(|problem| device_failed(&problem, network))??);
         }
         Ok(run()?)
@@ -270,11 +286,11 @@ fn network_settings(method: &str, options: &Network) -> Result<Option<Value>> {
     Ok(Some(json!({
         "weights": weights.to_string(),
         "weights_sha256": weights.sha256()?,
-        "steps": options.steps(),
-        "spacing": format!("{:?}", options.spacing).to_lowercase(),
-        "sampler": format!("{:?}", options.sampler).to_lowercase(),
-        "samples": options.samples,
-        "tile": options.tile,
+        "steps": options.steps()?,
+        "spacing": format!("{:?}", options.spacing()).to_lowercase(),
+        "sampler": format!("{:?}", options.sampler()).to_lowercase(),
+        "samples": options.samples(),
+        "tile": options.tile(),
     })))
 }
 

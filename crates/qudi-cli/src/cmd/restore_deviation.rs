@@ -15,7 +15,7 @@ pub(crate) struct Deviation(Option<ArrayWriter>);
 
 /// Whether the network, asked so, tells its errors without samples.
 pub(crate) fn tells_errors(network: &Network) -> Result<bool> {
-    Ok(network.steps() == 0 && network.weights().describe()?.network.pre.error)
+    Ok(network.steps()? == 0 && network.weights().describe()?.network.pre.error)
 }
 
 impl Deviation {
@@ -32,7 +32,7 @@ impl Deviation {
             let what = format!("{method} does not tell how far it may be off");
             return Err(Fault::new(what, "--deviation", "use --method qudi"));
         }
-        if args.network.samples < 2 && !tells_errors(&args.network)? {
+        if args.network.samples() < 2 && !tells_errors(&args.network)? {
             return Err(Fault::new(
                 "there is no deviation of one sample",
                 "--deviation",

@@ -4,6 +4,7 @@ use crate::args::{Global, Simulate};
 use crate::cmd::tiff_samples::tiff_samples;
 use crate::error::{Fault, Result};
 use crate::interrupt;
+use crate::places::Places;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::SimError;
@@ -58,6 +59,22 @@ pub(crate) fn run(
             "leave it out, or use a still in motion or a procedural scene",
         ));
     }
+    let input = args.input.as_deref().filter(|input| !input.starts_with("scene:"));
+    let format = BurstFormat::for_path(Path::new(&args.output), 1, true);
+    let record = format.ok().map(|format| format.record_path(Path::new(&args.output)));
+    // The record of a folder lies in the folder.
+    let record = record.filter(|record| !record.starts_with(&args.output));
+    let beside = [&args.truth, &args.flow, &args.preview];
+    Places::default()
+        .reads(input)
+        .reads(&args.from)
+        .reads([simulation.input.place()])
+        .reads(&global.config)
+        .writes([&args.output])
+        .writes(record.filter(|_| args.output != "-"))
+        .writes(beside.into_iter().flatten())
+        .writes(args.visionsim.then(|| transforms_path(args)))
+        .check()?;
     let mut outputs = Outputs::new(args, &simulation.sensor, overwrite)?;
     simulation.input.spool(&mut std::io::stdin().lock(), &mut interrupt::check)?;
     let mut bar = report.bar();

@@ -2,6 +2,7 @@
 
 use crate::args::{Global, Train};
 use crate::cmd::train_environment::{ENVIRONMENT, environment};
+use crate::cmd::train_resume::{check_pack, check_recipe};
 use crate::cmd::train_watch::{Watch, told, write, write_report};
 use crate::device::{self, Opened};
 use crate::error::{Fault, Result};
@@ -12,7 +13,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, load};
 use qudi_train::dataset::{Pack, write_pack};
 use qudi_train::loss::lpips::fetch;
-use qudi_train::{Files, From, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bursts};
+use qudi_train::{Files, From, METRICS, RECIPE, Recipe, Run, Validation, WEIGHTS, draw_bursts};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -38,6 +39,11 @@ pub(crate) fn run(
     let folder = args.output.clone().unwrap_or_default();
     let exists = Run::exists(&folder);
     check_folder(args, global, &folder, exists)?;
+    let pack_path = pack_path(args, &folder);
+    if args.resume {
+        check_recipe(&folder, &recipe)?;
+        check_pack(&folder, &pack_path)?;
+    }
     let devices = args.device.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
     make_folder(&folder, "the run's folder", "choose another with -o")?;
     if let (true, Some(backbones)) = (args.fetch, &args.backbones) {
@@ -57,11 +63,10 @@ pub(crate) fn run(
     let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
     let mut run =
         Run::open(&folder, &recipe, from, files, &list, args.backbones.as_deref(), commit)?;
-    write(&folder, ENVIRONMENT, environment(&devices).as_bytes())?;
+    write(&folder, ENVIRONMENT, environment(&devices, &pack_path)?.as_bytes())?;
     let mut watch = Watch::new(&recipe, &folder, report)?;
-    let learnt = device::guarded("training", || {
-        run.learn(args.workers.get(), &mut |event| watch.event(&event))
-    });
+    let learnt =
+        device::guarded("training", || run.learn(args.workers, &mut |event| watch.event(&event)));
     let [step, steps] = run.progress();
     let last = watch.finish()?;
     match learnt {
@@ -104,7 +109,7 @@ fn draw_only(args: &Train, recipe: &Recipe, report: &Report) -> Result<()> {
     let mut bar = report.bar();
     let mut bursts = 0;
     let drawn = device::guarded("drawing", || {
-        let workers = args.workers.get();
+        let workers = args.workers;
         draw_bursts(recipe, &network, files, &opened.device, workers, &mut |[done, all]| {
             bursts = all;
             bar.update("drawing", done, Some(all));
@@ -170,7 +175,8 @@ fn check_folder(args: &Train, global: &Global, folder: &Path, exists: bool) -> R
             "start without --resume, or name the run's folder with -o",
         ));
     }
-    let taken = exists || folder.join(WEIGHTS).exists();
+    let own = [WEIGHTS, RECIPE, METRICS, ENVIRONMENT, "report.html"];
+    let taken = exists || own.iter().any(|name| folder.join(name).exists());
     if !args.resume && taken && !global.force {
         return Err(Fault::new(
             "the folder holds a run already",
@@ -183,9 +189,14 @@ fn check_folder(args: &Train, global: &Global, folder: &Path, exists: bool) -> R
         for name in ["state", "state.old", "state.new"] {
             let _ = std::fs::remove_dir_all(folder.join(name));
         }
-        let _ = std::fs::remove_file(folder.join(qudi_train::METRICS));
+        let _ = std::fs::remove_file(folder.join(METRICS));
     }
     Ok(())
+}
+
+/// Where the decoded files lie.
+fn pack_path(args: &Train, folder: &Path) -> PathBuf {
+    args.pack.clone().unwrap_or_else(|| folder.join("pack.zip"))
 }
 
 /// The recipe's files, decoded; made first if they are not there.
@@ -193,7 +204,7 @@ fn pack(args: &Train, recipe: &Recipe, folder: &Path, report: &Report) -> Result
     if !recipe.data.needs_files() && recipe.validation_data().is_none() {
         return Ok(None);
     }
-    let path: PathBuf = args.pack.clone().unwrap_or_else(|| folder.join("pack.zip"));
+    let path = pack_path(args, folder);
     if !path.exists() {
         make_pack(args, recipe, &path, Overwrite::No, report)?;
     }

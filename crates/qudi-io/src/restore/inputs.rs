@@ -78,7 +78,7 @@ impl Fingerprint {
     }
 
     /// Whether `other` is of the same content. Times are compared only where the content was sampled.
-    fn agrees(&self, other: &Self) -> bool {
+    pub fn agrees(&self, other: &Self) -> bool {
         let content =
             (self.bytes, self.crc32, self.whole) == (other.bytes, other.crc32, other.whole);
         content && (self.whole || self.modified == other.modified)
