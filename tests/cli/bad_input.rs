@@ -101,7 +101,7 @@ fn unsuitable_inputs_and_outputs_are_refused() {
         (vec![scene, "--motion", "spin:1", "-o", "out.npy"], "`spin` is no motion"),
         (vec![scene, "-o", "out.mp4"], "not written as .mp4"),
         (vec![scene, "-o", "taken.npy"], "exists already"),
-        (vec![scene, "-o", "nothing", "--force", "--truth", "mixed"], "not made by this program"),
+        (vec![scene, "-o", "nothing", "--force", "--truth", "mixed"], "did not write"),
         (vec![scene, "-o", "no/such/folder/out.npy"], "cannot create the output"),
         (vec![scene, "-o", "out.npy", "--visionsim"], "visionsim"),
         (vec![scene, "-o", "-", "--json"], "standard output"),

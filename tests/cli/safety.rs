@@ -99,7 +99,7 @@ fn frames_of_another_capture_are_not_gone_on_with() {
     let mut bad = [0; 32 * 40];
     bad[7] = 1;
     std::fs::write(folder.join("mask.npy"), npy_bytes("|u1", "(32, 40)", &bad)).unwrap();
-    refused(&folder, restore, &["mask"]);
+    refused(&folder, restore, &["repaired_pixels was 0, now 1"]);
     std::fs::write(folder.join("mask.npy"), npy_bytes("|u1", "(32, 40)", &[0; 32 * 40])).unwrap();
     run(&folder, restore);
     run(&folder, "simulate scene:text --size 32x40 --frames 13 --ppp 9.75 --seed 4 -o b.npy -q -f");
@@ -110,7 +110,7 @@ fn frames_of_another_capture_are_not_gone_on_with() {
 fn a_bar_is_not_passed_by_what_is_no_number() {
     let folder = scratch("safety-nan");
     let args = "eval scene:gratings --frames 11 --ppp 1e6 --method average --min-psnr 99";
-    qudi(&folder).args(args.split(' ')).assert().code(1);
+    refused(&folder, args, &["NaN"]);
 }
 
 #[test]
@@ -120,7 +120,6 @@ fn clips_of_one_stem_keep_names_of_their_own() {
         let args = format!(
             "simulate scene:text --size {size} --frames 3 --ppp 9 --seed 1 -o s.npy -q -f --truth"
         );
-        qudi(&folder).args(args.split(' ')).arg(format!("clips/{name}.npy")).assert().code(2);
         std::fs::create_dir_all(folder.join("clips")).unwrap();
         qudi(&folder).args(args.split(' ')).arg("t").assert().success();
         std::fs::rename(folder.join("t"), folder.join("clips").join(name)).unwrap();
