@@ -37,7 +37,7 @@ pub fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
         return Err(SimError::data(
             "the output exists already",
             path,
-            "choose another name, or allow overwriting",
+            "choose another name, or overwrite it with `force`",
         ));
     }
     Ok(())

@@ -42,9 +42,9 @@ pub(super) fn is_known(key: &str, value: &Value) -> bool {
     if names().iter().any(|name| *name == generic || name.starts_with(&below)) {
         return true;
     }
-    // A key that no recipe writes, since it is optional.
-    let change = (key.to_owned(), super::toml_text(value));
-    Recipe::load(SHOWN, &[change]).is_ok()
+    // A key that no recipe writes, since it is optional or has another name by now.
+    let change = [(key.to_owned(), super::toml_text(value))];
+    PRESETS.iter().any(|(preset, _)| Recipe::load(preset, &change).is_ok())
 }
 
 /// The key with every number of a list as `0`.
