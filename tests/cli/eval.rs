@@ -189,7 +189,7 @@ fn a_capture_is_judged_without_truth() {
     assert_eq!(read("f.csv").lines().count(), 1 + 2 * 20);
     assert!(read("f.csv").lines().nth(1).unwrap().contains(",0,,,,,"), "empty, not zero");
     let page = read("r.html");
-    assert!(page.contains(">counts<") && page.contains("mle chi-square"));
+    assert!(page.contains(">counts<") && page.contains("mle over 11 frames: chi-square"));
     assert!(!page.contains(">truth<") && !page.contains(": error") && !page.contains("<svg"));
     for refused in [
         "c.npy",

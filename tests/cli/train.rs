@@ -127,7 +127,7 @@ fn runs_are_gone_on_with_and_never_lost() {
     // But for rounding in the mean of weights that stay.
     assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
     let report = std::fs::read_to_string(folder.join("told/report.html")).unwrap();
-    assert!(report.contains("errors told"));
+    assert!(report.contains("predicted uncertainty"));
 }
 
 #[test]
