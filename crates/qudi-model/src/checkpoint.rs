@@ -290,7 +290,9 @@ impl ModuleVisitor for Values {
         match crate::tensor::read(param.val()) {
             Ok(values) => {
                 let largest = self.precision.largest();
-                if self.broken.is_none() && values.iter().any(|value| value.is_finite() && value.abs() > largest) {
+                if self.broken.is_none()
+                    && values.iter().any(|value| value.is_finite() && value.abs() > largest)
+                {
                     self.broken = Some(self.path.join("."));
                 }
                 let bytes = self.precision.bytes(&values);
