@@ -40,7 +40,12 @@ fn read_frame(reader: &mut impl BufRead, path: &Path, transfer: Transfer) -> Res
     if rest.is_empty() {
         return Ok(None);
     }
-    let broken = |e: image::ImageError| damaged(path, &e.to_string());
+    let broken = |e: image::ImageError| match &e {
+        image::ImageError::IoError(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => {
+            damaged(path, "it ends inside a frame")
+        }
+        _ => damaged(path, &e.to_string()),
+    };
     let decoder = PnmDecoder::new(reader).map_err(broken)?;
     if decoder.color_type() != ColorType::Rgb8 {
         return Err(damaged(path, "it is not 8-bit RGB"));
