@@ -32,7 +32,9 @@ impl Identity {
 impl Places {
     /// Adds what the command reads; `-` and names that are no path are left out.
     pub(crate) fn reads<P: AsRef<Path>>(mut self, paths: impl IntoIterator<Item = P>) -> Self {
-        self.inputs.extend(paths.into_iter().map(|path| path.as_ref().to_owned()).filter(is_path));
+        self.inputs.extend(
+            paths.into_iter().map(|path| path.as_ref().to_owned()).filter(|path| is_path(path)),
+        );
         self
     }
 
@@ -45,7 +47,9 @@ impl Places {
 
     /// Adds what the command writes.
     pub(crate) fn writes<P: AsRef<Path>>(mut self, paths: impl IntoIterator<Item = P>) -> Self {
-        self.outputs.extend(paths.into_iter().map(|path| path.as_ref().to_owned()).filter(is_path));
+        self.outputs.extend(
+            paths.into_iter().map(|path| path.as_ref().to_owned()).filter(|path| is_path(path)),
+        );
         self
     }
 
@@ -104,7 +108,7 @@ fn refuse_impossible(output: &Path) -> Result<()> {
     }
 }
 
-fn is_path(path: &PathBuf) -> bool {
+fn is_path(path: &Path) -> bool {
     !path.as_os_str().is_empty() && path.as_os_str() != "-"
 }
 

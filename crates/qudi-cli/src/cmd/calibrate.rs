@@ -111,12 +111,11 @@ fn base_sensor(
     settings: &Settings,
     capture: &Capture,
 ) -> Result<(Option<String>, Sensor)> {
-    let (name, sensor) = match &args.sensor {
-        Some(name) => (name.clone(), settings.sensor(name)?),
-        None => {
-            let sensor = required_sensor(capture)?;
-            (sensor.name.clone(), settings.adjusted(sensor)?)
-        }
+    let (name, sensor) = if let Some(name) = &args.sensor {
+        (name.clone(), settings.sensor(name)?)
+    } else {
+        let sensor = required_sensor(capture)?;
+        (sensor.name.clone(), settings.adjusted(sensor)?)
     };
     // A preset with changes has no name to build on.
     let preset = preset(&name).is_some() && !settings.overrides_sensor();

@@ -173,10 +173,7 @@ fn judge_clips(
         }
         None => "",
     };
-    let protocol = match args.protocol {
-        Protocol::Strict => "strict",
-        Protocol::Quiver => "quiver",
-    };
+    let protocol = args.protocol.name();
     let about = format!(
         "{number} {}, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
         if number == 1 { "clip" } else { "clips" },

@@ -67,7 +67,7 @@ impl Exposing {
 
     /// The simulation of the clip at `place`.
     pub(crate) fn simulation(&self, place: &str, ppp: f64, seed: u64) -> Result<Simulation> {
-        let (motion, size) = (self.motion.clone(), self.size);
+        let (motion, size) = (self.motion, self.size);
         Ok(Simulation {
             input: Input::parse(place, motion, size, self.scene_seed, self.speed)?,
             sampling: self.sampling,
