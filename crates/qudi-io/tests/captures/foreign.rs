@@ -102,7 +102,7 @@ fn what_is_open_is_asked() {
     assert_eq!(frames("bayer.mat", &mosaic), expected("counts.npy"));
     assert!(refusal(open(&golden("visionsim_colour"), &plain())).contains("colour"));
     assert!(refusal(open(&golden("rgb.tif"), &plain())).contains("colour"));
-    assert!(refusal(open(&golden("dcr.mat"), &plain())).contains("--dcr"));
+    assert!(refusal(open(&golden("dcr.mat"), &plain())).contains("`dcr`"));
     let folder = crate::scratch();
     crate::write(folder.path(), "run/binary.npy", b"x");
     assert!(refusal(open(folder.path(), &plain())).contains("binary.npy"));
