@@ -1,7 +1,7 @@
 //! Samples as planes, noise and times, ready to go to a device.
 
-use super::burst::ConditionedBurst;
-use super::burst_sampler::BurstSampler;
+use super::burst_cache::BurstSampler;
+use super::burst_cache::burst::ConditionedBurst;
 use super::recipe::Recipe;
 use crate::loss::{Example, training_timestep};
 use burn::tensor::{Device, Tensor, TensorData};

@@ -1,9 +1,13 @@
 //! Cached bursts, small in memory, and on disk: a reference estimate takes ten times as long as a training step.
 
-use super::burst::ConditionedBurst;
-use super::parameters::parameters;
-use super::recipe::{CropsConfig, Recipe};
-use crate::dataset::{DataConfig, Sample};
+pub(crate) mod burst;
+mod draw;
+mod sampler;
+
+use crate::dataset::{DataConfig, Pack, Sample};
+use crate::parameters::parameters;
+use crate::recipe::{CropsConfig, Recipe};
+use burst::ConditionedBurst;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
@@ -18,6 +22,19 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+
+pub use draw::draw_bursts;
+pub use sampler::BurstSampler;
+
+/// The files that a run learns from.
+#[derive(Debug, Default)]
+pub struct Files {
+    /// Decoded clips and stills, for recipes that name any.
+    pub pack: Option<Pack>,
+    /// The folder of cached bursts, which exists: those there are not drawn again. Only for recipes with
+    /// `train.crops`.
+    pub bursts: Option<PathBuf>,
+}
 
 /// A burst whose aligned counts are rounded to bytes, in steps finer than any noise.
 #[derive(Debug)]

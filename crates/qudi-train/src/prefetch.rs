@@ -1,7 +1,7 @@
 //! Batches drawn ahead on threads of their own.
 
 use super::batch::Batch;
-use super::burst_sampler::BurstSampler;
+use super::burst_cache::BurstSampler;
 use super::recipe::Recipe;
 use qudi_core::{Result, SimError};
 use std::sync::mpsc::{Receiver, sync_channel};

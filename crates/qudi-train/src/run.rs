@@ -1,12 +1,12 @@
 //! A training run in a folder: recipe, metrics, weights, state, pictures.
 
-use super::burst_sampler::BurstSampler;
+use super::burst_cache::{BurstSampler, Files};
 use super::prefetch::Prefetcher;
 use super::recipe::Recipe;
 use super::state;
 use super::trainer::{StepReport, Trainer};
 use super::validate::{Validation, Validator};
-use crate::dataset::{Dataset, Pack};
+use crate::dataset::Dataset;
 use burn::tensor::Device;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::{Result, SimError};
@@ -49,16 +49,6 @@ pub struct Run {
     validator: Option<Validator>,
     device: Device,
     commit: Option<String>,
-}
-
-/// Files that a run learns from.
-#[derive(Debug, Default)]
-pub struct Files {
-    /// Decoded clips and stills, for recipes that name any.
-    pub pack: Option<Pack>,
-    /// A folder, which exists, for bursts with their guides: those there are not drawn again. Only for recipes with
-    /// `train.crops`.
-    pub bursts: Option<PathBuf>,
 }
 
 /// Where a run starts.

@@ -2,8 +2,7 @@
 
 use super::batch::Batch;
 use super::ema::Ema;
-use super::learning_rate::learning_rate;
-use super::optimizer::Adam;
+use super::optimizer::{Adam, learning_rate};
 use super::parameters::{gradients, parameters, with_parameters};
 use super::prefetch::Prefetcher;
 use super::recipe::{LossConfig, Recipe};

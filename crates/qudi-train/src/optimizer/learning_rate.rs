@@ -1,6 +1,6 @@
 //! The learning rate over a run: linear warm-up, then half a cosine down to a floor.
 
-use super::recipe::TrainConfig;
+use crate::recipe::TrainConfig;
 use std::f64::consts::PI;
 
 /// The rate of step `step`, from 0.

@@ -1,9 +1,8 @@
 //! Drawing all bursts of a recipe before anything learns from them.
 
-use super::burst_sampler::BurstSampler;
-use super::recipe::Recipe;
-use super::run::Files;
+use super::{BurstSampler, Files};
 use crate::dataset::Dataset;
+use crate::recipe::Recipe;
 use burn::tensor::Device;
 use qudi_core::{Result, SimError};
 use qudi_model::draft::Draft;

@@ -6,8 +6,8 @@ use qudi_model::measurement::GuidePlanes;
 
 /// Frames of a burst and what classical restoration makes of all of its frames.
 #[derive(Clone, Debug)]
-pub(super) struct ConditionedBurst {
-    pub(super) size: Size,
-    pub(super) sample: Sample,
-    pub(super) guide: GuidePlanes,
+pub(crate) struct ConditionedBurst {
+    pub(crate) size: Size,
+    pub(crate) sample: Sample,
+    pub(crate) guide: GuidePlanes,
 }

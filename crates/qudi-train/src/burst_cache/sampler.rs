@@ -1,9 +1,9 @@
 //! Samples with their reference estimates: drawn one by one, or cut from cached bursts.
 
 use super::burst::ConditionedBurst;
-use super::burst_cache::{BurstCache, CachedBurst};
-use super::recipe::{CropsConfig, Recipe};
+use super::{BurstCache, CachedBurst};
 use crate::dataset::Dataset;
+use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Result, SimError, Size, USUAL_EXPOSURE};
 use qudi_model::config::Part;
@@ -72,7 +72,7 @@ impl BurstSampler {
     }
 
     /// Sample `number`.
-    pub(super) fn sample(&mut self, number: u64) -> Result<ConditionedBurst> {
+    pub(crate) fn sample(&mut self, number: u64) -> Result<ConditionedBurst> {
         let Some((crops, cached)) = self.crops.clone() else { return self.draw(number, None) };
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(number);
