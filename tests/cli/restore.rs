@@ -208,7 +208,7 @@ fn a_running_pipe_is_restored_as_it_comes() {
     // One window, and as much as the next one adds.
     camera.write_all(&array[128..128 + 19 * 5120]).unwrap();
     camera.flush().unwrap();
-    let header = b"YUV4MPEG2 W80 H64 F25:1 Ip A1:1 Cmono\n";
+    let header = b"YUV4MPEG2 W80 H64 F25:1 Ip A1:1 Cmono XCOLORRANGE=FULL\n";
     let mut first = vec![0; header.len() + 8 * (6 + 5120)];
     screen.read_exact(&mut first).unwrap();
     assert!(first.starts_with(header));

@@ -1,4 +1,4 @@
-//! How bright a picture to make of photons that do not tell: as scenes usually are, unless it would not fit.
+//! The mean level of a restored picture where nothing is known about it: that of usual scenes, or less.
 
 use crate::error::Result;
 use crate::frame::Size;
@@ -7,21 +7,24 @@ use crate::restorer::{Acquisition, BurstView};
 use crate::sensor::{CountLaw, Response};
 use crate::windows::LONGEST_HALF;
 
-/// Side of the squares over which photons are counted, in pixels: single ones are mostly noise.
+/// The side of the squares over which photons are counted, in pixels: single ones are mostly noise.
 const SIDE: usize = 8;
 
-/// The square's brightest and darkest pixels that do not count, one in so many each: hot and dead ones.
+/// The share of a square's brightest and of its darkest pixels that do not count, as one in so many: hot and
+/// dead ones.
 const TRIMMED: usize = 16;
 
-/// Squares that may be brighter than what fits: one in so many.
+/// The share of squares that may be brighter than white, as one in so many.
 const BRIGHTER: usize = 1000;
 
-/// What the brightest square of the others becomes: what moves, or is smaller than a square, is brighter still.
+/// The image value of the brightest square that counts: details smaller than a square are brighter still.
 const BRIGHT: f64 = 0.75;
 
-/// The image value that should receive `acquisition.ppp` photons, whatever `acquisition.exposure` says: [`USUAL_EXPOSURE`], or less
-/// where parts of the scene would be brighter than white. Looks at the first, the middle and the last 11 of the
-/// `frames` frames that `read` knows, in this order.
+/// The image value that should receive `acquisition.ppp` photons: [`USUAL_EXPOSURE`], or less where parts of the
+/// scene would be brighter than white.
+///
+/// `acquisition.exposure` is not used. `read` is asked for the first, the middle and the last 11 of `frames`
+/// frames, in this order.
 ///
 /// # Errors
 /// [`SimError`](crate::SimError) if the sensor's dark rate is unknown, and what `read` returns.
@@ -45,7 +48,7 @@ pub fn fitting_exposure(
 
 /// Photons per pixel and frame that a thousandth of the squares exceed.
 fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
-    let ordinary = acquisition.sensor.dark_per_frame()?;
+    let typical = acquisition.sensor.dark_per_frame()?;
     let size = burst.size;
     let mut sums = vec![0u32; size.pixels()];
     for frame in burst.frames {
@@ -58,7 +61,7 @@ fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
             let columns = left..(left + SIDE).min(size.width);
             let places = rows.flat_map(|y| columns.clone().map(move |x| y * size.width + x));
             let mut pixels: Vec<(u32, f64)> =
-                places.map(|i| (sums[i], acquisition.dark_of(i, ordinary))).collect();
+                places.map(|i| (sums[i], acquisition.dark_of(i, typical))).collect();
             pixels.sort_unstable_by_key(|&(sum, _)| sum);
             let trimmed = pixels.len() / TRIMMED;
             let pixels = &pixels[trimmed..pixels.len() - trimmed];
@@ -75,7 +78,7 @@ fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
     if acquisition.sensor.response == Response::Binary {
         return Ok(flux);
     }
-    // What full scale cuts off, the law knows; asking it of every square takes seconds where counts are deep.
+    // Full scale cuts off bright counts. The law corrects that, but takes seconds for all squares of deep counts.
     let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
     Ok((law.detections_for_mean(mean) - dark) / acquisition.sensor.quantum_efficiency)
 }
@@ -91,7 +94,7 @@ mod tests {
 
     const SIZE: Size = Size { height: 64, width: 80 };
 
-    /// What is told for 11 frames of a scene whose mean gets `ppp` photons, and every `hot`-th pixel of which counts the most.
+    /// The exposure found for a scene whose mean gets `ppp` photons, every `hot`-th pixel at full scale.
     fn estimated(scene: &Frame, sensor: &str, ppp: f64, hot: usize) -> f64 {
         let sensor = Sensor::load(sensor).unwrap();
         let light = Light { ppp, exposure: scene.mean() };
@@ -114,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn scenes_that_fit_are_exposed_as_usual() {
+    fn chooses_the_usual_exposure_where_the_scene_fits() {
         let even = Frame::from_fn(SIZE, |x, _| 0.5 + 0.004 * x as f32);
         assert_eq!(estimated(&even, "qudi-paper", 3.25, usize::MAX), USUAL_EXPOSURE);
         assert_eq!(estimated(&even, "spad512s", 0.3, usize::MAX), USUAL_EXPOSURE);
@@ -123,9 +126,9 @@ mod tests {
     }
 
     #[test]
-    fn the_brightest_stays_below_white() {
+    fn keeps_the_brightest_squares_below_white() {
         for (sensor, ppp) in [("qudi-paper", 2.0), ("qudi-paper", 26.0), ("spad512s", 2.0)] {
-            // The scene's mean is 0.467 where its brightest is 1; what is told does not depend on the scale, and
+            // The scene's mean is 0.467 where its brightest is 1; the exposure does not depend on the scale, and
             // is 0.35 but for the noise of the brightest square.
             for brightest in [1.0, 0.2] {
                 let exposure = estimated(&lamp(brightest), sensor, ppp, usize::MAX);

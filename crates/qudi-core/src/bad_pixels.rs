@@ -64,8 +64,7 @@ impl BadPixels {
         bad
     }
 
-    /// Number of bad pixels.
-    /// The number of repaired pixels.
+    /// The number of bad pixels.
     pub fn len(&self) -> usize {
         self.hot.len() + self.dead.len()
     }

@@ -4,7 +4,7 @@ use crate::error::{Result, SimError};
 use crate::sensor::{CountLaw, Gain, Response, Sensor};
 use serde::{Deserialize, Serialize};
 
-/// Mean value of scenes as they usually are: what is told where nobody knows the true exposure.
+/// The mean value of usual scenes, assumed where the true one is unknown.
 pub const USUAL_EXPOSURE: f64 = 0.45;
 
 /// What a number of "photons per pixel" counts.

@@ -1,4 +1,4 @@
-//! The path that every method takes: windows of a burst in, restored frames out.
+//! The interface of every method: windows of a burst in, restored frames out.
 
 use crate::error::Result;
 use crate::frame::{Frame, Size};
@@ -7,18 +7,18 @@ use crate::sensor::Sensor;
 /// Counts of consecutive frames, `[frames][height][width]`.
 #[derive(Clone, Copy, Debug)]
 pub struct BurstView<'a> {
-    /// Frame size.
+    /// The size of every frame.
     pub size: Size,
-    /// The frames.
+    /// The counts of each frame, row by row.
     pub frames: &'a [Vec<u16>],
 }
 
-/// What a method knows besides the counts.
+/// The acquisition of a burst: what a method knows besides the counts.
 #[derive(Clone, Debug)]
 pub struct Acquisition {
-    /// Seed of any random draws.
+    /// The seed of random draws.
     pub seed: u64,
-    /// Number of the window's first frame in the capture.
+    /// The number of the window's first frame in the capture.
     pub first_frame: u64,
     /// Incident photons per pixel and frame, where the image is `exposure`.
     pub ppp: f64,
@@ -26,27 +26,27 @@ pub struct Acquisition {
     pub exposure: f64,
     /// The sensor of these frames, `frames_summed` included.
     pub sensor: Sensor,
-    /// Its gain in DN/e-.
+    /// The gain in DN/e-.
     pub gain: f64,
     /// Dark electrons per frame of every pixel, where a map is known.
     pub dark: Option<Vec<f32>>,
 }
 
-/// Restored frames of a window.
+/// The restored frames of a window.
 #[derive(Clone, Debug)]
 pub struct Restored {
-    /// One per frame of the window, in image units.
+    /// The restored frames, one per frame of the window, in image units.
     pub frames: Vec<Frame>,
-    /// Deviation of each pixel's error, for methods that tell it.
+    /// The standard deviation (sigma) of each pixel's error, where the method predicts it.
     pub std: Option<Vec<Frame>>,
 }
 
 /// A method: turns all frames of a window into images at once.
 pub trait Restorer {
-    /// Its name in tables and on the command line.
+    /// The name in tables and on the command line.
     fn name(&self) -> &'static str;
 
-    /// Frames that it wants at once; shorter captures come as one shorter window.
+    /// The number of frames that it restores together; shorter captures come as one shorter window.
     fn window(&self) -> usize;
 
     /// Restores every frame of `burst`.
@@ -84,8 +84,8 @@ impl Acquisition {
         self.ppp / self.exposure
     }
 
-    /// Dark electrons per frame of pixel `i`; `ordinary` where no map is known.
-    pub fn dark_of(&self, i: usize, ordinary: f64) -> f64 {
-        self.dark.as_ref().map_or(ordinary, |map| f64::from(map[i]))
+    /// Dark electrons per frame of pixel `i`; `typical` where no map is known.
+    pub fn dark_of(&self, i: usize, typical: f64) -> f64 {
+        self.dark.as_ref().map_or(typical, |map| f64::from(map[i]))
     }
 }

@@ -7,22 +7,22 @@
 //! frame, `frames_summed` of which make one count (Ma et al. 2020, section 3).
 //! `theta` is in photons per pixel and frame.
 
+mod count_table;
 mod defects;
 mod document;
 mod draw;
 mod law;
 mod moments;
 mod presets;
-mod table;
 mod units;
 
+pub(crate) use count_table::{CountTable, RowScratch};
 pub use defects::{Defects, PixelMaps};
 pub use document::{load_document, merge_documents};
 pub(crate) use draw::{binomial, counted, poisson};
 pub use law::CountLaw;
 pub use moments::CountMoments;
 pub use presets::{PRESETS, Preset, preset};
-pub(crate) use table::{CountTable, RowScratch};
 pub use units::{DarkRate, FullWell, Gain};
 
 use crate::error::{Result, SimError};

@@ -105,17 +105,17 @@ fn counts_follow_the_exact_law_at_every_light_level_and_depth() {
 
 #[test]
 fn flat_scenes_have_the_moments_of_the_published_simulator() {
-    // Mean and deviation of y/7 from an independent NumPy simulation of the same equations,
+    // Mean and sigma of y/7 from an independent NumPy simulation of the same equations,
     // tests/golden/generate/sensor_moments.py.
-    for (ppp, mean, deviation) in
+    for (ppp, mean, sigma) in
         [(3.25, 0.607, 0.273), (9.75, 0.484, 0.163), (19.5, 0.441, 0.114), (26.0, 0.431, 0.100)]
     {
         let sensor = Sensor::load("qudi-paper").unwrap();
         let detections = 0.8 * ppp + 1.6;
         let (m, v) = moments(&expose_flat(&sensor, detections, 8));
-        println!("ppp {ppp:>5}: mean {:.4} deviation {:.4}", m / 7.0, v.sqrt() / 7.0);
+        println!("ppp {ppp:>5}: mean {:.4} sigma {:.4}", m / 7.0, v.sqrt() / 7.0);
         assert!((m / 7.0 - mean).abs() < 1e-3, "{ppp}: mean {}", m / 7.0);
-        assert!((v.sqrt() / 7.0 - deviation).abs() < 1e-3, "{ppp}: deviation {}", v.sqrt() / 7.0);
+        assert!((v.sqrt() / 7.0 - sigma).abs() < 1e-3, "{ppp}: sigma {}", v.sqrt() / 7.0);
     }
 }
 
@@ -199,12 +199,9 @@ fn afterpulsing_reaches_its_stationary_rate() {
     let frames = expose_flat(&sensor, -(-p).ln_1p(), 20);
     let (first, _) = moments(&frames[..1]);
     assert!((first - p).abs() < 6.0 * (p * (1.0 - p) / 262_144.0).sqrt());
-    let (settled, _) = moments(&frames[10..]);
+    let (late, _) = moments(&frames[10..]);
     let expected = p / (1.0 - (1.0 - p) * pa);
-    assert!(
-        (settled - expected).abs() < 6.0 * (expected / 2_621_440.0).sqrt(),
-        "{settled} {expected}"
-    );
+    assert!((late - expected).abs() < 6.0 * (expected / 2_621_440.0).sqrt(), "{late} {expected}");
 }
 
 #[test]

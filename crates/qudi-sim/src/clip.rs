@@ -5,7 +5,7 @@
 
 mod gif;
 mod image_file;
-mod image_folder;
+mod images;
 mod input;
 mod npy;
 mod ppm;

@@ -200,7 +200,11 @@ impl Misfit {
 fn write_y4m_header(size: Size, fps: Option<f64>) -> Result<()> {
     // Frame rates of thousands confuse players; without one, 25 is customary.
     let fps = fps.map_or(25, |fps| fps.round().max(1.0) as u64);
-    let header = format!("YUV4MPEG2 W{} H{} F{fps}:1 Ip A1:1 Cmono\n", size.width, size.height);
+    // Without the tag, readers take luma for the limited range of video, 16 to 235.
+    let header = format!(
+        "YUV4MPEG2 W{} H{} F{fps}:1 Ip A1:1 Cmono XCOLORRANGE=FULL\n",
+        size.width, size.height
+    );
     std::io::stdout().write_all(header.as_bytes()).map_err(crate::error::stdout_fault)
 }
 

@@ -96,6 +96,12 @@ pub(crate) fn run(
             "restore the old input; `simulation.input` in the record names it",
         ));
     }
+    if let Some(asked) = simulation.sampling.frames
+        && summary.frames < asked
+    {
+        report
+            .remark(&format!("the clip gives {} frames of the {asked} asked for", summary.frames));
+    }
     let record = record_of(simulation, &summary, outputs.format);
     let written = outputs.finish(&record)?;
     let text = describe(&record, &summary, &written, args);

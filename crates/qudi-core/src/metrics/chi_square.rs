@@ -37,16 +37,16 @@ impl Consistency {
         counts: &[u16],
         acquisition: &Acquisition,
     ) -> Result<f64> {
-        let ordinary = acquisition.sensor.dark_per_frame()?;
+        let typical = acquisition.sensor.dark_per_frame()?;
         let photons = acquisition.photons_per_unit() * acquisition.sensor.quantum_efficiency;
         let mut total = 0.0;
         for (i, (&image, &count)) in restored.data.iter().zip(counts).enumerate() {
-            let detections = f64::from(image).max(0.0) * photons + acquisition.dark_of(i, ordinary);
+            let detections = f64::from(image).max(0.0) * photons + acquisition.dark_of(i, typical);
             let (mean, variance) = self.moments.at(detections);
             if variance > LEAST_VARIANCE {
-                let misfit = (f64::from(count) - mean).powi(2) / variance;
-                self.map[i] += misfit;
-                total += misfit;
+                let chi_square = (f64::from(count) - mean).powi(2) / variance;
+                self.map[i] += chi_square;
+                total += chi_square;
             }
         }
         self.frames += 1;

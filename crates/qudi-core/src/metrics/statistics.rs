@@ -1,9 +1,9 @@
-//! What a handful of figures says: mean, how sure it is, and the worst of them.
+//! Mean, confidence interval and worst case of a few values.
 
 /// Mean of some values with its uncertainty.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Statistics {
-    /// How many.
+    /// The number of values.
     pub n: usize,
     /// Arithmetic mean.
     pub mean: f64,
@@ -24,7 +24,7 @@ const STUDENT: [f64; 30] = [
 const NORMAL: f64 = 1.96;
 
 impl Statistics {
-    /// Of `values`; `None` if there are none.
+    /// The statistics of `values`; `None` if there are none.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n = values.len();
         if n == 0 {
@@ -33,8 +33,8 @@ impl Statistics {
         let mean = values.iter().sum::<f64>() / n as f64;
         let ci95 = (n > 1).then(|| {
             let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-            let deviation = (squares / (n - 1) as f64 / n as f64).sqrt();
-            STUDENT.get(n - 2).copied().unwrap_or(NORMAL) * deviation
+            let error = (squares / (n - 1) as f64 / n as f64).sqrt();
+            STUDENT.get(n - 2).copied().unwrap_or(NORMAL) * error
         });
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);

@@ -2,7 +2,7 @@
 
 use super::gif::Gif;
 use super::image_file::{EXTENSIONS, read_still};
-use super::image_folder::ImageFolder;
+use super::images::ImageFolder;
 use super::npy::NpyFrames;
 use super::recorded::Recorded;
 use super::synthetic::Synthetic;
@@ -166,7 +166,7 @@ impl Input {
     /// Does nothing for other kinds. `on` is asked between pieces whether to go on.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read or stored; [`SimError::Interrupted`] if told to stop.
+    /// [`SimError`] if it cannot be read or stored; [`SimError::Interrupted`] if `on` breaks.
     pub fn spool(
         &mut self,
         from: &mut impl Read,

@@ -108,7 +108,7 @@ fn bars(position: f64, period: f64) -> f64 {
     step(period / TAU * (TAU * position / period).sin())
 }
 
-/// The chart on a plane of `size`: it is laid out in units of the shorter side.
+/// The chart on a plane of `size`: drawn in units of the shorter side.
 fn chart(size: Size, x: f64, y: f64) -> f64 {
     let unit = size.height.min(size.width) as f64;
     let (dx, dy) = (x - 0.5 * (size.width - 1) as f64, y - 0.5 * (size.height - 1) as f64);
