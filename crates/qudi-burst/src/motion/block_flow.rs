@@ -1,5 +1,5 @@
 //! Optical flow between two clean frames by block matching: for recorded clips, whose true motion
-//! nobody knows. VelocitySearch to fine over a pyramid; each block starts from the vectors around it one level
+//! nobody knows. Coarse to fine over a pyramid; each block starts from the vectors around it one level
 //! up and searches nearby; the finest level is refined to a fraction of a pixel by Gauss-Newton
 //! steps (Lucas, Kanade 1981). Made for truth: noise would be matched as well.
 

@@ -1,4 +1,4 @@
-//! ConstantVelocity motion that the counts of all frames agree on.
+//! Search for the constant velocity that the counts of all frames agree on.
 //!
 //! Two frames of a few photons say little of how a faint texture moves from one to the other. Along the right path, though,
 //! all frames of a window show the same, and differ by noise alone. Of all velocities on a lattice every patch takes the
