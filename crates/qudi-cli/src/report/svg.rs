@@ -359,13 +359,13 @@ mod tests {
         plot.x.ticks = vec![3.25];
         let Some(drawing) = plot.draw() else { panic!("nothing drawn") };
         let mark = &drawing.curves[0].marks[0];
-        assert_eq!(mark.x, tenth((drawing.left + drawing.right) / 2.0));
+        assert_eq!(mark.x, tenth(f64::midpoint(drawing.left, drawing.right)));
         assert_eq!(drawing.x_ticks[0].label, "3.25");
     }
 
     #[test]
     fn numbers_have_about_four_digits() {
-        let shown = [0.0, 0.012345, 1.23456, 12345.6, 1e-5, -250.0].map(number);
+        let shown = [0.0, 0.012_345, 1.23456, 12345.6, 1e-5, -250.0].map(number);
         assert_eq!(shown, ["0", "0.01235", "1.235", "12346", "1.00e-5", "-250.0"]);
     }
 }

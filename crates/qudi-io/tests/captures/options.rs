@@ -61,10 +61,10 @@ fn file(format: &str, folder: &Path) -> Option<PathBuf> {
         "qvga" => {
             let path = folder.join("qvga");
             std::fs::create_dir_all(&path).unwrap();
-            write(&path, "zeros.bin", &[0; 3 * 9600])
+            write(&path, "zeros.bin", &vec![0; 3 * 9600])
         }
         "swissspad2" | "swissspad2-full" | "spad512s" | "spad512s-8" | "spad512s-16" => {
-            write(folder, "zeros.bin", &[0; 1 << 21])
+            write(folder, "zeros.bin", &vec![0; 1 << 21])
         }
         _ => return None,
     })

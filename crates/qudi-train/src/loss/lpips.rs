@@ -67,14 +67,13 @@ impl PerceptualKind {
         }
         let names: Vec<_> = PERCEPTUAL_KINDS.iter().map(|kind| kind.name()).collect();
         let list = format!("use one of {}", names.join(", "));
-        let (what, help) = match REMOVED.iter().find(|(removed, _)| *removed == name) {
-            Some((_, why)) => (format!("the perceptual term `{name}` was removed: {why}"), list),
-            None => {
-                let hint = nearest(name, &names)
-                    .map_or(String::new(), |name| format!("did you mean `{name}`?  "));
-                (format!("no perceptual term named `{name}`"), format!("{hint}{list}"))
-            }
-        };
+        if let Some((_, why)) = REMOVED.iter().find(|(removed, _)| *removed == name) {
+            let what = format!("the perceptual term `{name}` was removed: {why}");
+            return Err(SimError::request(what, "train.loss.term", list));
+        }
+        let hint =
+            nearest(name, &names).map_or(String::new(), |name| format!("did you mean `{name}`?  "));
+        let (what, help) = (format!("no perceptual term named `{name}`"), format!("{hint}{list}"));
         Err(SimError::request(what, "train.loss.term", help))
     }
 

@@ -176,7 +176,9 @@ impl TiffPages {
         }
         let mut image = self.decoder.read_image().map_err(fault)?;
         if let (true, DecodingResult::U8(bytes)) = (self.reversed, &mut image) {
-            bytes.iter_mut().for_each(|byte| *byte = byte.reverse_bits());
+            for byte in bytes.iter_mut() {
+                *byte = byte.reverse_bits();
+            }
         }
         Ok(image)
     }

@@ -127,7 +127,10 @@ mod tests {
         let error = fetch(&ABC, &base, to.path()).unwrap_err().to_string();
         assert!(error.contains("curl"), "{error}");
         if error.contains("no `curl`") {
-            eprintln!("skipped: there is no `curl` on PATH");
+            #[expect(clippy::print_stderr, reason = "tells that the test was skipped")]
+            {
+                eprintln!("skipped: there is no `curl` on PATH");
+            }
             return;
         }
         std::fs::write(from.path().join("abc.pth"), b"abd").unwrap();
