@@ -11,7 +11,8 @@ use serde::Serialize;
 struct Page<'a> {
     title: &'a str,
     frames: usize,
-    error_gain: f32,
+    /// How many times brighter errors are shown.
+    error_gain: u32,
     picture: String,
     uncertainty: &'a str,
     table: TableView,
@@ -32,7 +33,7 @@ pub(crate) fn html(
         Page {
             title: "Video from single photons",
             frames: FRAMES,
-            error_gain: ERROR_GAIN,
+            error_gain: ERROR_GAIN as u32,
             picture: data_url(png),
             uncertainty,
             table: table.into(),

@@ -223,7 +223,8 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     // A constant lies in the middle of a range as large as itself.
     let span = if high > low { high - low } else { low.abs().max(1e-9) };
     let decade = 10f64.powf((span / TICKS as f64).log10().floor());
-    for multiple in [1.0, 2.0, 5.0, 10.0] {
+    // Rounding outwards adds up to two steps, so that ten times the decade may still be too fine.
+    for multiple in [1.0, 2.0, 5.0, 10.0, 20.0] {
         let step = multiple * decade;
         let (mut first, mut last) = ((low / step).floor(), (high / step).ceil());
         if first == last {
@@ -315,6 +316,17 @@ mod tests {
         assert_eq!(labels(&linear_ticks(21.3, 28.9)), ["20", "22", "24", "26", "28", "30"]);
         assert_eq!(labels(&linear_ticks(-0.3, 0.2)), ["-0.3", "-0.2", "-0.1", "0", "0.1", "0.2"]);
         assert_eq!(linear_ticks(5.0, 5.0).len(), 3, "around a constant");
+        assert_eq!(labels(&linear_ticks(14.9001, 20.9851)), ["14", "16", "18", "20", "22"]);
+        for n in 1..2000 {
+            let (low, high) =
+                (f64::from(n) * 0.37, f64::from(n) * 0.37 + f64::from(n % 97) * 0.013 + 0.001);
+            let ticks = linear_ticks(low, high);
+            assert!(
+                ticks[0] <= low + 1e-9 && ticks[ticks.len() - 1] >= high - 1e-9,
+                "{low} {high}: {ticks:?}"
+            );
+            assert!(ticks.iter().all(|&tick| label(tick).len() <= 7), "{low} {high}: {ticks:?}");
+        }
     }
 
     #[test]
