@@ -84,7 +84,7 @@ fn a_burst_is_restored_and_gone_on_with() {
 fn errors_are_told_beside_the_frames() {
     let folder = prepared("network-errors");
     let run = |args: &str| qudi(&folder).args(args.split_whitespace()).assert().success();
-    run("restore b.npy -o s.npy --deviation d.npy -q");
+    run("restore b.npy -o s.npy --uncertainty d.npy -q");
     run("restore b.npy -o t.npy -q");
     let [frames, alone, deviations] =
         ["s.npy", "t.npy", "d.npy"].map(|name| std::fs::read(folder.join(name)).unwrap());

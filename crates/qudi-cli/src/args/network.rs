@@ -24,7 +24,7 @@ pub(crate) struct Network {
     /// How noise leaves [default: ddim]
     #[arg(long, value_name = "NAME")]
     sampler: Option<SamplerName>,
-    /// Pictures drawn; the result is their mean, --deviation their spread [default: 1]
+    /// Pictures drawn; the result is their mean, --uncertainty their spread [default: 1]
     #[arg(long, value_name = "K", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info --devices`)

@@ -55,8 +55,8 @@ pub(crate) struct Restore {
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
-    /// Write how far every pixel may be off, .npy: the deviation of its error that the network tells, or that over --samples K
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over --samples K
+    #[arg(long = "uncertainty", alias = "deviation", value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) deviation: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) network: Network,

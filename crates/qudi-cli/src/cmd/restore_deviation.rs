@@ -30,12 +30,12 @@ impl Deviation {
         let Some(path) = &args.deviation else { return Ok(Self(None)) };
         if method != "qudi" {
             let what = format!("{method} does not tell how far it may be off");
-            return Err(Fault::new(what, "--deviation", "use --method qudi"));
+            return Err(Fault::new(what, "--uncertainty", "use --method qudi"));
         }
         if args.network.samples() < 2 && !tells_errors(&args.network)? {
             return Err(Fault::new(
                 "there is no deviation of one sample",
-                "--deviation",
+                "--uncertainty",
                 "draw several with --samples K, or none with --steps 0 if the weights tell errors (`qudi info FILE`)",
             ));
         }
