@@ -1,6 +1,6 @@
 //! BM3D on one image, for comparison with other programs.
 //!
-//!     cargo run --release -p qudi-baselines --example denoise -- NOISY.npy SIGMA OUT.npy
+//!     cargo run --release -p qudi-burst --example denoise -- NOISY.npy SIGMA OUT.npy
 //!
 //! Prints the fastest of three runs in seconds. RAYON_NUM_THREADS sets the threads.
 #![allow(clippy::print_stdout)]

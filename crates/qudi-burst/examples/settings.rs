@@ -1,7 +1,7 @@
 //! Chooses the constants of the methods on training clips: gain-aligned PSNR of all frames, mean over
 //! clips, for every setting tried.
 //!
-//!     cargo run --release -p qudi-baselines --example settings -- FOLDER FRAMES SIDE
+//!     cargo run --release -p qudi-burst --example settings -- FOLDER FRAMES SIDE
 //!
 //! FOLDER holds clips; the first FRAMES frames and the middle SIDE x SIDE pixels of each are used.
 #![allow(clippy::print_stdout)]

@@ -1,10 +1,10 @@
 //! Methods on a real static capture: a mean of many binary frames holds exact counts, which are
 //! split at random into 11 sums of 7 frames and a reference of all others.
 //!
-//!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED
-//!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED write BURST
+//!     cargo run --release -p qudi-burst --example static_capture -- FOLDER 256 SEED
+//!     cargo run --release -p qudi-burst --example static_capture -- FOLDER 256 SEED write BURST
 //!     qudi restore BURST.npy --sensor BURST.toml --bits 3 --ppp PPP -o RESTORED.npy
-//!     cargo run --release -p qudi-baselines --example static_capture -- FOLDER 256 SEED score RESTORED.npy
+//!     cargo run --release -p qudi-burst --example static_capture -- FOLDER 256 SEED score RESTORED.npy
 //!
 //! FOLDER holds one image of means of 256 binary frames. The split is hypergeometric, so that input
 //! and reference are independent; the reference's own variance is subtracted from the error.

@@ -34,7 +34,7 @@ fn it_reaches_the_reference_package() {
         let found = psnr(&bm3d(&noisy(&truth, &noise, sigma), sigma), &truth);
         let expected = figure["psnr"].as_f64().unwrap();
         println!("{name} {:2.0}: {found:.3} dB, package {expected:.3}", sigma * 255.0);
-        // One small image differs more than the mean of many: docs/results.md has those.
+        // One small image differs more than the mean of many: docs/notes/burst/bm3d.md has those.
         assert!(found > expected - 0.25, "{name} {sigma}: {found} dB, package {expected} dB");
         shortfall.push(expected - found);
     }

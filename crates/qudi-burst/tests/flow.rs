@@ -1,6 +1,6 @@
 //! The motion that QBP finds, on procedural scenes whose motion is known.
 //!
-//!     cargo test --release -p qudi-baselines --test flow -- --nocapture
+//!     cargo test --release -p qudi-burst --test flow -- --nocapture
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_burst::PatchFlow;

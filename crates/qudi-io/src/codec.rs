@@ -1,7 +1,6 @@
 //! Every format that captures come in: one file and one line each.
 
 mod array;
-mod crc;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod images;
@@ -19,7 +18,6 @@ mod tiff;
 mod video;
 mod visionsim;
 
-pub(crate) use crc::mismatch as crc_mismatch;
 pub(crate) use piped::open_pipe;
 
 use crate::capture::format_options::{FormatOption, refuse_others};

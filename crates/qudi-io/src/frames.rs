@@ -2,6 +2,7 @@
 
 pub(crate) mod bit_sums;
 pub(crate) mod chain;
+pub(crate) mod checksum;
 mod count_frames;
 pub(crate) mod depth;
 pub(crate) mod frame_bytes;

@@ -3,7 +3,7 @@
 //! have 32 bits.
 //!
 //! Of the two kinds of 16 bits only that with the range of 32 will do: nothing holds the U-Net's residual sums below what the
-//! other one can hold (docs/results.md).
+//! other one can hold (docs/notes/training/sixteen-bits.md).
 
 use crate::backend::{Switch, is_native};
 use burn::tensor::{DType, Device, FloatDType, Tensor};

@@ -1,13 +1,13 @@
 //! NumPy `.npz`: the one array in it that is a capture.
 
 use super::array::{Hints, Place};
-use super::crc::CrcReader;
 use super::npy::{array, refuse_bomb};
 use super::{Format, Recognition};
 use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
+use crate::frames::checksum::CrcReader;
 use crate::frames::frame_bytes::{Checksum, Opener};
 use flate2::read::DeflateDecoder;
 use qudi_core::npy::Header;

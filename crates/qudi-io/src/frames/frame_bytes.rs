@@ -198,7 +198,7 @@ impl RunningChecksum {
         self.hash(file, self.checksum.range.end.saturating_sub(end))?;
         let found = self.hasher.clone().finalize();
         let expected = self.checksum.expected;
-        if found == expected { Ok(()) } else { Err(crate::codec::crc_mismatch(found, expected)) }
+        if found == expected { Ok(()) } else { Err(super::checksum::mismatch(found, expected)) }
     }
 
     fn hash(&mut self, file: &mut File, bytes: u64) -> std::io::Result<()> {

@@ -93,7 +93,7 @@ fn a_pipe_restores_to_the_frames_of_a_file() {
         let options = raw("6x9");
         let file = restored(&mut open(&path, &options).unwrap()).unwrap();
         let mut pipe = piped(&data, &options).unwrap();
-        assert_eq!(pipe.length(), (frames < 11).then_some(frames as u64), "not told yet");
+        assert_eq!(pipe.length(), (frames < 11).then_some(frames as u64), "not known yet");
         let pipe = restored(&mut pipe).unwrap();
         assert_eq!(file.len(), frames);
         assert!(file == pipe, "{frames} frames");

@@ -5,7 +5,7 @@ use burn::tensor::Tensor;
 use qudi_kernels::warp;
 
 /// Weight of the prior, in variances of a pixel's noise: where that hides what moves, a motion stays as it was. Found
-/// on the validation clips (docs/results.md).
+/// on the validation clips (docs/notes/network/start.md).
 const PRIOR: f32 = 0.005;
 
 /// Radius of the window that moves as one, in cells.

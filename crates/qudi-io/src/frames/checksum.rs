@@ -1,4 +1,4 @@
-//! CRC-32 checks of what a zip archive stores, while it is read.
+//! CRC-32 checks of stored data while it is read.
 
 use crc32fast::Hasher;
 use std::io::{Error, ErrorKind, Read, Result};
