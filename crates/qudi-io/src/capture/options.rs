@@ -9,7 +9,7 @@ use std::str::FromStr;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReadOptions {
-    /// Name of a format in [`FORMATS`](super::FORMATS).
+    /// Name of a format in [`FORMATS`](crate::codec::FORMATS).
     pub format: Option<String>,
     /// Which pixel of a packed byte comes first.
     pub bit_order: Option<BitOrder>,
