@@ -1,6 +1,7 @@
 """Weights that learn, their running mean, and the file that both come from and the mean goes to."""
 
 import json
+import sys
 from pathlib import Path
 
 import torch
@@ -8,7 +9,17 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests/golden/generate"))
+from network import with_former_keys  # noqa: E402
+
 EMA = 0.999  # configs/small.toml
+
+# Parts of parameter names, and their former names, by which these programs know them. `qudi` reads both.
+FORMER_PARTS = {"stages": "drafts", "uncertainty": "error", "weighting": "trust", "weighted_in": "trusted_in"}
+
+
+def former_name(name: str) -> str:
+    return ".".join(FORMER_PARTS.get(part, part) for part in name.split("."))
 
 
 class MeanWeights:
@@ -17,7 +28,9 @@ class MeanWeights:
     def __init__(self, weights: str) -> None:
         with safe_open(weights, "pt") as file:
             self.about = json.loads(file.metadata()["qudi"])
-            self.tensors = {name: file.get_tensor(name).float() for name in file.keys()}
+            self.about["network"] = with_former_keys(self.about["network"])
+            self.about.pop("kind", None)  # follows from the weights
+            self.tensors = {former_name(name): file.get_tensor(name).float() for name in file.keys()}
 
     def learn(self, module: nn.Module) -> None:
         """The parameters of `module` that take gradients, by their names in the file."""

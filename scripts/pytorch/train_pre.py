@@ -9,9 +9,9 @@ is trained together with the predicted uncertainty. All other weights stay as th
     python scripts/pytorch/train_pre.py W.safetensors bursts pre.safetensors --minutes 60
     qudi publish pre.safetensors -o small.safetensors
 
-Bursts must have been drawn with the earlier stages of W, or with `network.pre.rounds=1` to train its first stage
+Bursts must have been drawn with the earlier stages of W, or with `network.pre.stages=1` to train its first stage
 (`--first-stage`). With `--sizes RECIPE.toml`, pre-denoisers of W that are smaller than that recipe's grow to them; new
-weights start without effect. Where the recipe has two alignments (`network.pre.motions`), the bursts must have them.
+weights start without effect. Where the recipe has two alignments (`network.pre.alignments`), the bursts must have them.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from mean_weights import MeanWeights
 from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests/golden/generate"))
-from network import ErrorHead, PreDenoiser, aligned_neighbours, of_earlier_stages  # noqa: E402
+from network import ErrorHead, PreDenoiser, aligned_neighbours, of_earlier_stages, with_former_keys  # noqa: E402
 
 VARIATION, LEAST_ERROR = 0.01, 1e-4  # crates/qudi-train/src/loss
 WARMUP, CLIP = 200, 1.0  # configs/small.toml
@@ -71,7 +71,7 @@ class Trainer(MeanWeights):
     def __init__(self, weights: str, sizes: Path | None, first_stage: bool = False) -> None:
         super().__init__(weights)
         before = self.about["network"]
-        recipe = tomllib.loads(sizes.read_text())["network"] if sizes else before
+        recipe = with_former_keys(tomllib.loads(sizes.read_text())["network"]) if sizes else before
         config = {**before, "pre": recipe["pre"]}
         rounds = ["pre.", *(f"drafts.{k}." for k in range(config["pre"].get("rounds", 1) - 1))]
         prefix = "drafts.0." if first_stage else "pre."

@@ -5,7 +5,7 @@ use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, Precision, save};
 use qudi_model::config::NetworkConfig;
-use qudi_model::network::fill;
+use qudi_model::network::init_parameters;
 use std::path::{Path, PathBuf};
 
 /// A folder with a burst and untrained weights of the smallest network.
@@ -36,10 +36,11 @@ fn weights(path: &Path, value: f32) {
         commit: None,
         licence: "MIT OR Apache-2.0".into(),
         default_steps: None,
+        kind: None,
     };
     let mut module = network.init(1, &Device::flex());
     if value != 0.0 {
-        module = fill(module, |_, shape| vec![value; shape.iter().product()]);
+        module = init_parameters(module, |_, shape| vec![value; shape.iter().product()]);
     }
     save(&module, &description, Precision::Single, path, Overwrite::Yes).unwrap();
 }

@@ -98,12 +98,12 @@ fn runs_are_gone_on_with_and_never_lost() {
     );
     refused(&folder, &wide, &["other sizes"]);
     // A round more goes on from what the others restore; two more have nothing to go on from.
-    let rounds = |weights: &str, rounds: usize, to: &str| {
-        format!("train tiny -o {to} --init {weights} --set network.pre.rounds={rounds} {QUICK}")
+    let stages = |weights: &str, stages: usize, to: &str| {
+        format!("train tiny -o {to} --init {weights} --set network.pre.stages={stages} {QUICK}")
     };
-    refused(&folder, &rounds("run/weights.safetensors", 3, "third"), &["other sizes"]);
-    run(&folder, &rounds("run/weights.safetensors", 2, "second"));
-    run(&folder, &rounds("second/weights.safetensors", 3, "third"));
+    refused(&folder, &stages("run/weights.safetensors", 3, "third"), &["other sizes"]);
+    run(&folder, &stages("run/weights.safetensors", 2, "second"));
+    run(&folder, &stages("second/weights.safetensors", 3, "third"));
     run(&folder, "simulate scene:text --size 48x32 --frames 3 --sensor qudi-paper -o b.npy -q");
     let restored = |weights: &str, to: &str| {
         run(&folder, &format!("restore b.npy --weights {weights} --device cpu -o {to} -q"));
@@ -112,7 +112,8 @@ fn runs_are_gone_on_with_and_never_lost() {
     let first = restored("run/weights.safetensors", "first.npy");
     assert!(restored("third/weights.safetensors", "third.npy") != first);
     // To tell errors is learnt beside what has been learnt.
-    let told = "--set network.pre.error=true --set train.loss.pre=0 --set train.loss.prediction=0";
+    let told =
+        "--set network.pre.uncertainty=true --set train.loss.pre=0 --set train.loss.prediction=0";
     let told = format!("{told} --set train.loss.flow=0");
     run(&folder, &format!("train tiny -o told --init run/weights.safetensors {told} {QUICK}"));
     let [first, same] = ["run", "told"].map(|name| {

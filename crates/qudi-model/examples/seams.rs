@@ -11,7 +11,7 @@ use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_model::checkpoint::load;
-use qudi_model::restorer::{QudiRestorer, SampleOptions};
+use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use std::path::PathBuf;
 
@@ -25,8 +25,7 @@ fn burst(size: Size, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>, Acquisition) 
     let light = Light { ppp: 9.75, exposure };
     let mut camera = Camera::new(&sensor, size, light, seed).unwrap();
     let counts = (0..).zip(&truth).map(|(t, f)| camera.expose(t, &[f]).unwrap()).collect();
-    let (ppp, gain, dark) = (light.ppp, camera.gain(), None);
-    (counts, truth, Acquisition { seed: 1, first_frame: 0, ppp, exposure, sensor, gain, dark })
+    (counts, truth, Acquisition::new(sensor, light.ppp, exposure).unwrap().with_seed(1))
 }
 
 fn main() {
@@ -40,8 +39,9 @@ fn main() {
     let restore = |tile: usize| {
         let (network, description) = load(&weights, &device).unwrap();
         let options = SampleOptions { tile, steps: reverse, ..SampleOptions::default() };
-        let mut restorer =
-            QudiRestorer::new(network, &description.network, 11, options, &device).unwrap();
+        let (config, kind) = (description.network, description.kind.unwrap());
+        let model = Model { network, config, kind, window: 11 };
+        let mut restorer = QudiRestorer::new(model, options, &device).unwrap();
         restorer.restore(BurstView { size, frames: &counts }, &acquisition).unwrap().frames
     };
     let mean = |a: &[Frame], b: &[Frame]| {

@@ -1,7 +1,9 @@
-//! Weights in one SafeTensors file that says what it is.
+//! Weights in one SafeTensors file that describes itself.
 
-use crate::config::NetworkConfig;
-use crate::network::{Qudi, fill, parameters};
+mod description;
+mod model_kind;
+
+use crate::network::{Qudi, former_name, init_parameters, parameter_shapes};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Tensor, f16};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
@@ -9,49 +11,14 @@ use qudi_core::limits::WEIGHT_BYTES;
 use qudi_core::regular_file::read_limited;
 use qudi_core::{Result, SimError};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
-use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
 
+pub use description::Description;
+pub use model_kind::ModelKind;
+
 /// The key of the description among a file's metadata.
 const KEY: &str = "qudi";
-
-/// What a weight file says about itself.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Description {
-    /// Version of the program that wrote it.
-    pub program: String,
-    /// Name of the preset, if its sizes are one's.
-    pub preset: Option<String>,
-    /// Sizes of the network.
-    pub network: NetworkConfig,
-    /// Frames of a window that it was trained on.
-    pub window: usize,
-    /// Sensors that it was trained for.
-    pub sensors: Vec<String>,
-    /// Photons per pixel and frame that it was trained for: least and most.
-    pub ppp: [f64; 2],
-    /// What it was trained on.
-    pub data: Vec<String>,
-    /// Optimisation steps.
-    pub steps: u64,
-    /// Commit of the program that trained it.
-    pub commit: Option<String>,
-    /// Licence of the weights.
-    pub licence: String,
-    /// Reverse diffusion steps unless the user says otherwise; 0 for regression. Older files do not say.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub default_steps: Option<usize>,
-}
-
-impl Description {
-    /// Reverse diffusion steps unless the user says otherwise.
-    ///
-    /// Older files do not say. Among them, weights that predict their own uncertainty were made for regression.
-    pub fn reverse_steps(&self) -> usize {
-        self.default_steps.unwrap_or(usize::from(!self.network.pre.error))
-    }
-}
 
 /// How exactly numbers are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,7 +53,9 @@ pub fn save(
             "the training that wrote it had failed: use an earlier checkpoint",
         ));
     }
-    let text = serde_json::to_string(description).expect("plain data");
+    let kind = Some(ModelKind::from_zeros(|name| values.is_zero(name)));
+    let description = Description { kind, ..description.clone() };
+    let text = serde_json::to_string(&description).expect("plain data");
     // One entry only: the library writes several in any order, and equal weights should make equal files.
     let metadata = HashMap::from([(KEY.to_owned(), text)]);
     let views = values.list.iter().map(|(name, shape, bytes)| {
@@ -99,10 +68,10 @@ pub fn save(
     PendingFile::write_whole(path, &bytes, overwrite)
 }
 
-/// Reads the description alone.
+/// Reads the description of a weight file alone.
 ///
 /// # Errors
-/// [`SimError::Data`] if it is no weight file of ours.
+/// [`SimError::Data`] if it is not a weight file of this program.
 pub fn describe(path: &Path) -> Result<Description> {
     Ok(File::open(path)?.description)
 }
@@ -110,7 +79,7 @@ pub fn describe(path: &Path) -> Result<Description> {
 /// The description of a weight file that is in memory; `place` names it in errors.
 ///
 /// # Errors
-/// [`SimError::Data`] if it is no weight file of ours.
+/// [`SimError::Data`] if it is not a weight file of this program.
 pub fn describe_bytes(bytes: &[u8], place: &Path) -> Result<Description> {
     description(bytes, place)
 }
@@ -140,33 +109,31 @@ fn network(
     device: &Device,
 ) -> Result<(Qudi, Description)> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| damaged(path, e))?;
-    let network = description.network.shell(device);
-    let expected = parameters(&network);
+    let network = description.network.uninitialized(device);
+    let expected = parameter_shapes(&network);
+    let stored = |name: &str| tensors.tensor(name).or_else(|_| tensors.tensor(&former_name(name)));
     for (name, shape) in &expected {
-        let Ok(tensor) = tensors.tensor(name) else {
+        let Ok(tensor) = stored(name) else {
             return Err(mismatch(path, format!("`{name}` is missing")));
         };
         if tensor.shape() != shape.as_slice() {
             let what = format!("`{name}` is {:?}, the network wants {shape:?}", tensor.shape());
             return Err(mismatch(path, what));
         }
-        if !matches!(tensor.dtype(), Dtype::F32 | Dtype::F16) {
+        if !is_float(&tensor) {
             return Err(mismatch(
                 path,
                 format!("`{name}` holds {:?}, not F32 or F16", tensor.dtype()),
             ));
         }
     }
-    if let Some(name) = tensors
-        .names()
-        .into_iter()
-        .find(|name| !expected.iter().any(|(expected, _)| expected == name))
-    {
+    let known = |name: &str| expected.iter().any(|(e, _)| e == name || former_name(e) == name);
+    if let Some(name) = tensors.names().into_iter().find(|name| !known(name)) {
         return Err(mismatch(path, format!("`{name}` belongs to no part of the network")));
     }
     let mut broken = None;
-    let network = fill(network, |name, shape| {
-        let values = tensors.tensor(name).map(|tensor| numbers(&tensor)).unwrap_or_default();
+    let network = init_parameters(network, |name, shape| {
+        let values = stored(name).map(|tensor| numbers(&tensor)).unwrap_or_default();
         if broken.is_none() && !values.iter().all(|value| value.is_finite()) {
             broken = Some(name.to_owned());
         }
@@ -175,7 +142,7 @@ fn network(
     });
     match broken {
         Some(name) => Err(SimError::data(
-            format!("`{name}` holds values that are no numbers"),
+            format!("`{name}` holds values that are not finite"),
             path,
             "the training that wrote it had failed: use an earlier checkpoint",
         )),
@@ -213,7 +180,24 @@ fn description(bytes: &[u8], path: &Path) -> Result<Description> {
     if !(3..=1000).contains(&description.window) {
         return Err(mismatch(path, format!("a window of {} frames", description.window)));
     }
-    Ok(Description { network, ..description })
+    let kind = match description.kind {
+        Some(kind) => kind,
+        None => inferred_kind(bytes, path)?,
+    };
+    Ok(Description { network, kind: Some(kind), ..description })
+}
+
+/// The kind of a network whose file does not say.
+fn inferred_kind(bytes: &[u8], path: &Path) -> Result<ModelKind> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| damaged(path, e))?;
+    Ok(ModelKind::from_zeros(|name| {
+        let stored = tensors.tensor(name).ok().filter(is_float);
+        stored.is_none_or(|tensor| numbers(&tensor).iter().all(|&value| value == 0.0))
+    }))
+}
+
+fn is_float(tensor: &TensorView<'_>) -> bool {
+    matches!(tensor.dtype(), Dtype::F32 | Dtype::F16)
 }
 
 fn damaged(path: &Path, error: impl std::fmt::Display) -> SimError {
@@ -275,6 +259,17 @@ struct Values {
     /// The first parameter with values that cannot be written.
     broken: Option<String>,
     error: Option<SimError>,
+}
+
+impl Values {
+    /// Whether a parameter is zero as it will be read back.
+    fn is_zero(&self, name: &str) -> bool {
+        let list = self.list.iter().find(|(stored, ..)| stored == name);
+        list.is_none_or(|(_, shape, bytes)| {
+            let view = TensorView::new(self.precision.kind(), shape.clone(), bytes);
+            view.is_ok_and(|view| numbers(&view).iter().all(|&value| value == 0.0))
+        })
+    }
 }
 
 impl ModuleVisitor for Values {

@@ -1,6 +1,6 @@
 //! Sizes of the network, read from TOML; the presets.
 
-use crate::measurement::Laid;
+use crate::conditioning::AlignedNeighbours;
 use qudi_burst::Alignments;
 use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
@@ -30,14 +30,16 @@ pub struct NetworkConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Part {
-    /// The measurement of every estimate by the sensor model.
-    Physics,
+    /// The forward model: the measurement of every estimate by the sensor model.
+    #[serde(alias = "physics")]
+    ForwardModel,
     /// Optical flow: neighbours are taken as they are.
     Flow,
     /// The previous estimate as an input.
     SelfConditioning,
-    /// The exposure as an input.
-    Exposure,
+    /// The mean level of the image as an input.
+    #[serde(alias = "exposure")]
+    MeanLevel,
 }
 
 /// Sizes of the pre-denoiser.
@@ -50,39 +52,40 @@ pub struct PreConfig {
     pub blocks: usize,
     /// Channels that each layer of a block adds.
     pub growth: usize,
-    /// Frames around each that are laid upon it and seen, the nearest ones.
+    /// Neighbours that are aligned with each frame, the nearest ones.
     pub neighbours: usize,
-    /// Motions along which each is laid upon it: the likeliest; with 2 also the one matched for it alone; with 3 also whichever fits
-    /// best pixel by pixel, but only on frames that a draft has restored.
-    #[serde(default = "one", skip_serializing_if = "is_one")]
-    pub motions: usize,
-    /// Channels of the layers that weigh neighbours pixel by pixel; 0 if neighbours are only added up.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub trust: usize,
-    /// Pre-denoisers, one after the other: all but the first see the frames aligned by what the one before restored.
-    #[serde(default = "one", skip_serializing_if = "is_one")]
-    pub rounds: usize,
-    /// Whether the last of them tells how far its frames may be off.
-    #[serde(default, skip_serializing_if = "is_false")]
-    pub error: bool,
+    /// Alignments of each neighbour: by the selected motion; with 2 also as matched frame by frame; with 3 also pixel by
+    /// pixel, but only on frames that a refinement stage has restored.
+    #[serde(default = "one", alias = "motions", skip_serializing_if = "is_one")]
+    pub alignments: usize,
+    /// Channels of the layers that weight neighbours pixel by pixel; 0 for no such layers.
+    #[serde(default, alias = "trust", skip_serializing_if = "is_zero")]
+    pub weight_channels: usize,
+    /// Pre-denoisers, one after the other. All but the last are refinement stages: the window is aligned again on what
+    /// each of them restores.
+    #[serde(default = "one", alias = "rounds", skip_serializing_if = "is_one")]
+    pub stages: usize,
+    /// Whether the last of them predicts the uncertainty of its frames.
+    #[serde(default, alias = "error", skip_serializing_if = "is_false")]
+    pub uncertainty: bool,
 }
 
 impl PreConfig {
-    /// Those of the pre-denoisers before the last one: what they see is what an only one sees.
+    /// The sizes of the pre-denoiser of a refinement stage, which sees what the only one of a network would see.
     #[must_use]
-    pub fn of_drafts(&self) -> Self {
-        Self { rounds: 1, ..self.clone() }
+    pub fn stage(&self) -> Self {
+        Self { stages: 1, ..self.clone() }
     }
 
-    /// The frames that are laid upon each.
-    pub fn laid(&self) -> Laid {
-        let along = match self.motions {
+    /// The neighbours that are aligned with each frame.
+    pub fn aligned_neighbours(&self) -> AlignedNeighbours {
+        let alignments = match self.alignments {
             1 => Alignments::Selected,
-            // What a guide shows of single pixels is too poor to follow them.
-            3 if self.rounds > 1 => Alignments::WithPerPixel,
+            // The reference estimate shows too little of single pixels to follow them.
+            3 if self.stages > 1 => Alignments::WithPerPixel,
             _ => Alignments::WithMatched,
         };
-        Laid { neighbours: self.neighbours, along }
+        AlignedNeighbours { neighbours: self.neighbours, alignments }
     }
 }
 
@@ -91,8 +94,8 @@ fn one() -> usize {
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref)]
-fn is_one(rounds: &usize) -> bool {
-    *rounds == 1
+fn is_one(number: &usize) -> bool {
+    *number == 1
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref)]
@@ -109,9 +112,9 @@ fn is_false(switch: &bool) -> bool {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FeaturesConfig {
-    /// Of the measurements.
+    /// Channels of the measurements' features.
     pub low: [usize; 3],
-    /// Of the noisy image.
+    /// Channels of the noisy image's features.
     pub high: [usize; 3],
 }
 
@@ -127,7 +130,7 @@ pub struct FlowConfig {
     pub networks: usize,
     /// Channels of the layers of a level's network but the last.
     pub widths: [usize; 4],
-    /// Reverse steps, from 1, that estimate the flow anew; others keep the last one.
+    /// Reverse steps, from 1, that estimate the flow again; others keep the last one.
     pub steps: Vec<usize>,
 }
 
@@ -157,11 +160,11 @@ pub struct UNetConfig {
     pub attention: Vec<usize>,
     /// Whether the middle also attends over the frames of every cell.
     pub temporal: bool,
-    /// Size of the embedding of time and sensor.
+    /// Size of the embedding of timestep and sensor.
     pub embedding: usize,
 }
 
-/// A preset's file.
+/// The file of a preset.
 #[derive(Deserialize)]
 struct Document {
     network: NetworkConfig,
@@ -184,7 +187,7 @@ impl NetworkConfig {
         let Some((_, text)) = PRESETS.iter().find(|preset| preset.0 == name) else {
             let names: Vec<_> = PRESETS.iter().map(|preset| preset.0).collect();
             let help = format!("there are {}", names.join(", "));
-            return Err(SimError::request(format!("no preset named `{name}`"), "--preset", help));
+            return Err(SimError::request(format!("no preset named `{name}`"), "preset", help));
         };
         let document: Document = toml::from_str(text)
             .map_err(|e| SimError::request(e.message(), name, "correct the preset's file"))?;
@@ -192,7 +195,7 @@ impl NetworkConfig {
     }
 
     /// Whether a part is left out.
-    pub fn lacks(&self, part: Part) -> bool {
+    pub fn ablates(&self, part: Part) -> bool {
         self.ablate.contains(&part)
     }
 
@@ -215,9 +218,9 @@ impl NetworkConfig {
             ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
             ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
             ("pre.neighbours", self.pre.neighbours <= 64, "must be at most 64"),
-            ("pre.motions", (1..=3).contains(&self.pre.motions), "must be 1, 2 or 3"),
-            ("pre.trust", self.pre.trust <= 4096, "must be at most 4096"),
-            ("pre.rounds", (1..=4).contains(&self.pre.rounds), "must be from 1 to 4"),
+            ("pre.alignments", (1..=3).contains(&self.pre.alignments), "must be 1, 2 or 3"),
+            ("pre.weight_channels", self.pre.weight_channels <= 4096, "must be at most 4096"),
+            ("pre.stages", (1..=4).contains(&self.pre.stages), "must be from 1 to 4"),
             ("pre.blocks", (1..=64).contains(&self.pre.blocks), "must be from 1 to 64"),
             ("features", widths(&[self.features.low, self.features.high].concat()), SIZES),
             ("flow.scale", matches!(self.flow.scale, 1 | 2 | 4 | 8), "must be 1, 2, 4 or 8"),
@@ -267,7 +270,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn presets_are_read_and_good() {
+    fn presets_are_valid() {
         let multiples: Vec<usize> = PRESETS
             .iter()
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
@@ -276,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_sizes_name_their_key() {
+    fn rejects_invalid_sizes_by_key() {
         let mut config = NetworkConfig::preset("tiny").unwrap();
         config.unet.embedding = 7;
         let error = config.checked().unwrap_err();

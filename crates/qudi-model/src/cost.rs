@@ -1,14 +1,14 @@
 //! What a step costs, from the sizes alone.
 
 use crate::config::NetworkConfig;
-use crate::network::parameters;
+use crate::network::parameter_shapes;
 use burn::tensor::Device;
 use qudi_core::Size;
 
 impl NetworkConfig {
     /// Number of parameters.
     pub fn parameters(&self, device: &Device) -> usize {
-        let list = parameters(&self.shell(device));
+        let list = parameter_shapes(&self.uninitialized(device));
         list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum()
     }
 
@@ -30,7 +30,7 @@ impl NetworkConfig {
         let pixels = size.pixels() as f64;
         let mut sum = 0.0;
         // Names and shapes only: no weights are made.
-        for (name, shape) in parameters(&self.shell(device)) {
+        for (name, shape) in parameter_shapes(&self.uninitialized(device)) {
             if shape.len() < 4 {
                 continue;
             }

@@ -1,9 +1,5 @@
 //! The network: photon counts and the noisy image in, the clean image out (docs/network.md).
 
-mod attention;
-mod embedding;
-mod error;
-mod evidence;
 mod features;
 mod flow;
 mod fusion;
@@ -11,21 +7,19 @@ mod fusion;
 mod golden_tests;
 mod layers;
 mod lucas_kanade;
-mod pre;
+mod neighbour_weighting;
+mod normalized_input;
+mod parameters;
+mod predenoiser;
 mod qudi;
-mod resample;
-mod trust;
+mod uncertainty;
 mod unet;
-mod variance;
-mod weights;
-
-pub use embedding::SENSOR_NUMBERS;
 
 pub use features::{HighFeatures, LowFeatures, Pyramid};
 pub use flow::{Flow, Flows};
 pub use fusion::Fusion;
-pub use pre::PreDenoiser;
-pub use qudi::{Measured, Prediction, Prepared, Qudi, Simulated, State};
-pub use resample::{fold, halve};
+pub use layers::resample::{avg_pool2, pixel_unshuffle};
+pub use parameters::{former_name, init_parameters, parameter_shapes};
+pub use predenoiser::PreDenoiser;
+pub use qudi::{Encoded, Prediction, Qudi, Simulated};
 pub use unet::UNet;
-pub use weights::{fill, parameters};

@@ -3,9 +3,9 @@
 
 use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
-use qudi_model::checkpoint::{Description, Precision, describe, load, load_bytes, save};
+use qudi_model::checkpoint::{Description, ModelKind, Precision, describe, load, load_bytes, save};
 use qudi_model::config::NetworkConfig;
-use qudi_model::network::{Qudi, fill, parameters};
+use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use std::path::{Path, PathBuf};
 
 fn description() -> Description {
@@ -21,6 +21,7 @@ fn description() -> Description {
         commit: None,
         licence: "MIT OR Apache-2.0".into(),
         default_steps: None,
+        kind: None,
     }
 }
 
@@ -62,10 +63,11 @@ fn refused(path: &Path) -> String {
 }
 
 #[test]
-fn what_was_saved_comes_back() {
+fn saved_weights_load_unchanged() {
     let (_folder, path) = saved();
     let (back, description_back) = load(&path, &Device::flex()).unwrap();
-    assert_eq!(description_back, description());
+    let kind = Some(ModelKind::Regression);
+    assert_eq!(description_back, Description { kind, ..description() });
     assert_eq!(values(back), values(network(5)));
     assert_ne!(values(network(6)), values(network(5)));
     let taken =
@@ -75,7 +77,7 @@ fn what_was_saved_comes_back() {
 
 /// Sixteen bits keep eleven of the leading ones, in half the space.
 #[test]
-fn half_precision_is_close_and_small() {
+fn half_precision_file_is_small_and_accurate() {
     let (folder, path) = saved();
     let half = folder.path().join("half.safetensors");
     save(&network(5), &description(), Precision::Half, &half, Overwrite::No).unwrap();
@@ -91,14 +93,14 @@ fn half_precision_is_close_and_small() {
 }
 
 #[test]
-fn initial_weights_do_not_depend_on_the_backend() {
+fn initial_weights_are_equal_on_all_backends() {
     #[allow(deprecated)] // asked for by name
     let ndarray = NetworkConfig::preset("tiny").unwrap().init(5, &Device::ndarray());
     assert_eq!(values(ndarray), values(network(5)));
 }
 
 #[test]
-fn half_precision_is_read() {
+fn loads_half_precision() {
     let (folder, path) = saved();
     let bytes = std::fs::read(&path).unwrap();
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
@@ -123,7 +125,7 @@ fn half_precision_is_read() {
 }
 
 #[test]
-fn broken_files_are_refused_with_reasons() {
+fn rejects_damaged_and_mismatched_files() {
     let (folder, path) = saved();
     let whole = std::fs::read(&path).unwrap();
     let write = |bytes: &[u8]| {
@@ -154,8 +156,8 @@ fn broken_files_are_refused_with_reasons() {
 }
 
 #[test]
-fn weights_that_are_no_numbers_are_refused() {
-    let broken = fill(network(5), |name, shape| {
+fn rejects_weights_that_are_not_finite() {
+    let broken = init_parameters(network(5), |name, shape| {
         let value = if name == "unet.norm.bias" { f32::NAN } else { 0.1 };
         vec![value; shape.iter().product()]
     });
@@ -167,7 +169,7 @@ fn weights_that_are_no_numbers_are_refused() {
 }
 
 #[test]
-fn random_damage_never_panics() {
+fn randomly_damaged_files_never_panic() {
     let (folder, path) = saved();
     let whole = std::fs::read(&path).unwrap();
     let header = 8 + u64::from_le_bytes(whole[..8].try_into().unwrap()) as usize;
@@ -189,12 +191,28 @@ fn random_damage_never_panics() {
 }
 
 #[test]
-fn every_parameter_has_a_name_of_its_own() {
-    let list = parameters(&network(1));
+fn parameter_names_are_unique() {
+    let list = parameter_shapes(&network(1));
     let mut names: Vec<_> = list.iter().map(|(name, _)| name).collect();
     names.sort();
     names.dedup();
     assert_eq!(names.len(), list.len());
     let count: usize = list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
     assert_eq!(count, 182_440); // tests/golden/generate/network.py info tiny
+}
+
+/// A file that version 0.1 wrote before parameters and sizes got their names of now.
+#[test]
+fn loads_weights_with_former_names() {
+    let path =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/old/weights.safetensors");
+    let (network, description) = load(&path, &Device::flex()).unwrap();
+    let pre = &description.network.pre;
+    assert_eq!((pre.stages, pre.weight_channels, pre.alignments, pre.uncertainty), (2, 2, 2, true));
+    assert_eq!(description.kind, Some(ModelKind::Regression));
+    assert_eq!(description.reverse_steps(), 0);
+    let names: Vec<String> = values(network).into_iter().map(|(name, _)| name).collect();
+    for part in ["stages.0.", "pre.weighting.", "pre.weighted_in.", "uncertainty."] {
+        assert!(names.iter().any(|name| name.starts_with(part)), "{part}");
+    }
 }

@@ -5,10 +5,11 @@ use burn::tensor::Device;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
+use qudi_model::checkpoint::ModelKind;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::sampler::Sampler;
-use qudi_model::network::fill;
-use qudi_model::restorer::{QudiRestorer, SampleOptions};
+use qudi_model::network::init_parameters;
+use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 
 fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
     let sensor = Sensor::load("qudi-paper").unwrap();
@@ -19,7 +20,7 @@ fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
 /// A tiny network whose last layers are not zero, so that everything matters.
 fn restorer(options: SampleOptions, device: &Device) -> QudiRestorer {
     let config = NetworkConfig::preset("tiny").unwrap();
-    let network = fill(config.init(2, device), |name, shape| {
+    let network = init_parameters(config.init(2, device), |name, shape| {
         let count: usize = shape.iter().product();
         let seed = name.bytes().fold(7u32, |h, b| h.wrapping_mul(31).wrapping_add(b.into()));
         let bound = if shape.len() > 1 { (1.5 / (count / shape[0]) as f32).sqrt() } else { 0.1 };
@@ -33,7 +34,8 @@ fn restorer(options: SampleOptions, device: &Device) -> QudiRestorer {
             })
             .collect()
     });
-    QudiRestorer::new(network, &config, 11, options, device).unwrap()
+    let model = Model { network, config, kind: ModelKind::Diffusion, window: 11 };
+    QudiRestorer::new(model, options, device).unwrap()
 }
 
 fn counts(size: Size, frames: usize) -> Vec<Vec<u16>> {
@@ -62,7 +64,7 @@ fn quick() -> SampleOptions {
 }
 
 #[test]
-fn any_size_and_length_comes_back_as_it_was() {
+fn restores_any_size_and_length() {
     for (height, width, frames) in [(21, 38, 4), (8, 8, 3), (1, 50, 5), (40, 33, 12)] {
         let size = Size { height, width };
         let restored = restore(quick(), &acquisition(1, 0), size, frames);
@@ -76,7 +78,7 @@ fn any_size_and_length_comes_back_as_it_was() {
 }
 
 #[test]
-fn the_result_depends_on_the_seed_and_on_nothing_else() {
+fn result_depends_on_the_seed_alone() {
     for sampler in [Sampler::Ddim, Sampler::Ancestral] {
         let options = SampleOptions { sampler, ..quick() };
         let frames = |seed| restore(options, &acquisition(seed, 40), SIZE, 3).frames;
@@ -86,7 +88,7 @@ fn the_result_depends_on_the_seed_and_on_nothing_else() {
 }
 
 #[test]
-fn samples_have_a_mean_and_a_deviation() {
+fn samples_give_a_mean_and_an_uncertainty() {
     let options = SampleOptions { samples: 3, ..quick() };
     let three = restore(options, &acquisition(1, 0), SIZE, 3);
     let std = three.std.unwrap();
@@ -98,7 +100,7 @@ fn samples_have_a_mean_and_a_deviation() {
 }
 
 #[test]
-fn ndarray_restores_what_flex_does() {
+fn ndarray_and_flex_restore_alike() {
     #[allow(deprecated)] // asked for by name
     let ndarray = Device::ndarray();
     let size = Size { height: 16, width: 16 };
@@ -118,7 +120,7 @@ fn ndarray_restores_what_flex_does() {
 }
 
 #[test]
-fn tiles_agree_on_their_noise_and_cover_the_frame() {
+fn tiled_result_resembles_the_whole() {
     let size = Size { height: 48, width: 80 };
     let options = SampleOptions { steps: 2, tile: 32, ..SampleOptions::default() };
     let tiled = restore(options, &acquisition(1, 0), size, 3);
@@ -136,7 +138,7 @@ fn tiles_agree_on_their_noise_and_cover_the_frame() {
 }
 
 #[test]
-fn what_makes_no_sense_is_refused() {
+fn rejects_short_bursts_and_impossible_options() {
     let device = Device::flex();
     let size = Size { height: 16, width: 16 };
     let two = counts(size, 2);
@@ -151,8 +153,14 @@ fn what_makes_no_sense_is_refused() {
         SampleOptions { samples: 0, ..quick() },
         SampleOptions { tile: 8, ..quick() },
     ] {
-        let network = config.init(1, &device);
-        let error = QudiRestorer::new(network, &config, 11, options, &device).unwrap_err();
-        assert!(error.place().unwrap().starts_with("--") && error.help().is_some(), "{error}");
+        let (network, config, kind) =
+            (config.init(1, &device), config.clone(), ModelKind::Diffusion);
+        let model = Model { network, config, kind, window: 11 };
+        let error = QudiRestorer::new(model, options, &device).unwrap_err();
+        let field = error.place().unwrap();
+        assert!(
+            ["steps", "samples", "tile"].contains(&field.as_str()) && error.help().is_some(),
+            "{error}"
+        );
     }
 }

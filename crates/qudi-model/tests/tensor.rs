@@ -6,7 +6,7 @@ use qudi_core::Size;
 use qudi_model::tensor::{read, to_tensor};
 
 #[test]
-fn images_become_tensors_and_come_back() {
+fn tensors_hold_images_unchanged() {
     #[allow(deprecated)] // asked for by name
     let devices = [Device::flex(), Device::ndarray()];
     let values: Vec<f32> = (0..30).map(|i| i as f32).collect();

@@ -7,9 +7,10 @@ use crate::loss::{Example, training_timestep};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
+use qudi_model::conditioning::{
+    AlignedPlanes, Conditioning, SENSOR_NUMBERS, linear_estimates, sensor_numbers,
+};
 use qudi_model::diffusion::noise::Noise;
-use qudi_model::measurement::{GuidePlanes, Planes, sensor_numbers};
-use qudi_model::network::{Measured, SENSOR_NUMBERS};
 use qudi_model::tensor::to_tensor;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -21,8 +22,8 @@ pub struct Batch {
     pub number: u64,
     size: Size,
     frames: usize,
-    u: Vec<f32>,
-    guide: GuidePlanes,
+    linear_estimates: Vec<f32>,
+    aligned: AlignedPlanes,
     truth: Vec<f32>,
     noise: Vec<f32>,
     numbers: Vec<f32>,
@@ -43,8 +44,8 @@ impl Batch {
             number,
             size,
             frames,
-            u: Vec::new(),
-            guide: GuidePlanes::default(),
+            linear_estimates: Vec::new(),
+            aligned: AlignedPlanes::default(),
             truth: Vec::new(),
             noise: Vec::new(),
             numbers: Vec::new(),
@@ -52,10 +53,10 @@ impl Batch {
             timesteps: Vec::new(),
         };
         for sample in (number * count as u64..).take(count) {
-            let ConditionedBurst { sample: drawn, guide, .. } = bursts.sample(sample)?;
+            let ConditionedBurst { sample: drawn, aligned, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
-            batch.u.extend(Planes::of(view, &drawn.acquisition).u);
-            batch.guide.extend(guide);
+            batch.linear_estimates.extend(linear_estimates(view, &drawn.acquisition));
+            batch.aligned.extend(aligned);
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
             let noise = Noise::new(drawn.acquisition.seed, 0);
             let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
@@ -83,22 +84,22 @@ impl Batch {
         self.acquisitions.is_empty()
     }
 
-    /// What was measured, on `device`.
-    pub(super) fn measured(&self, device: &Device) -> Measured {
+    /// The conditioning of the batch, on `device`.
+    pub(super) fn conditioning(&self, device: &Device) -> Conditioning {
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
-        Measured {
-            u: to_tensor(self.u.clone(), self.size, device),
-            guide: self.guide.clone().into_tensor(self.size, device),
+        Conditioning {
+            linear_estimate: to_tensor(self.linear_estimates.clone(), self.size, device),
+            aligned: self.aligned.clone().into_tensors(self.size, device),
             sensor: Tensor::from_data(numbers, device),
             frames: self.frames,
         }
     }
 
-    /// The batch as an example for the loss, on the device of `measured`.
-    pub(super) fn example<'a>(&'a self, measured: &'a Measured) -> Example<'a> {
-        let device = measured.u.device();
+    /// The batch as an example for the loss, on the device of `conditioning`.
+    pub(super) fn example<'a>(&'a self, conditioning: &'a Conditioning) -> Example<'a> {
+        let device = conditioning.linear_estimate.device();
         Example {
-            measured,
+            conditioning,
             truth: to_tensor(self.truth.clone(), self.size, &device),
             acquisitions: &self.acquisitions,
             noise: to_tensor(self.noise.clone(), self.size, &device),

@@ -12,9 +12,9 @@ use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, Result, SimError, Size};
+use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
 use qudi_model::config::Part;
-use qudi_model::draft::Draft;
-use qudi_model::measurement::{GuidePlanes, IMAGES, Laid};
+use qudi_model::refinement::RefinementStage;
 use qudi_model::tensor::read as read_tensor;
 use rand::{Rng, RngExt};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -41,15 +41,20 @@ pub struct Files {
 pub(super) struct CachedBurst {
     size: Size,
     sample: Sample,
+    /// Reference estimate, merged frame, and sigma of its noise.
     images: Vec<Vec<f32>>,
-    deviations: Vec<Vec<i8>>,
+    /// Standardized counts, then expectations.
+    standardized: Vec<Vec<i8>>,
 }
+
+/// The planes of a burst that are images.
+const IMAGES: usize = 3;
 
 /// The steps of a byte: a 64th of a standard deviation near zero, wider far from it.
 const STEPS: f32 = 32.0;
 
-fn compressed(deviation: f32) -> i8 {
-    (STEPS * (2.0 * deviation).asinh()).round() as i8
+fn compressed(z: f32) -> i8 {
+    (STEPS * (2.0 * z).asinh()).round() as i8
 }
 
 fn expanded(byte: i8) -> f32 {
@@ -58,10 +63,12 @@ fn expanded(byte: i8) -> f32 {
 
 impl CachedBurst {
     pub(super) fn new(burst: ConditionedBurst) -> Self {
-        let ConditionedBurst { size, sample, guide: GuidePlanes(mut images) } = burst;
-        let deviations = images.split_off(IMAGES).into_iter();
-        let deviations = deviations.map(|plane| plane.into_iter().map(compressed).collect());
-        Self { size, sample, images, deviations: deviations.collect() }
+        let ConditionedBurst { size, sample, aligned } = burst;
+        let AlignedPlanes { reference, merged, noise_sigma, counts, expected } = aligned;
+        let standardized = counts.into_iter().chain(expected);
+        let standardized = standardized.map(|plane| plane.into_iter().map(compressed).collect());
+        let images = vec![reference, merged, noise_sigma];
+        Self { size, sample, images, standardized: standardized.collect() }
     }
 
     /// Cuts random frames and a random square, rotated and mirrored at random.
@@ -93,13 +100,20 @@ impl CachedBurst {
         let image = |plane: &Vec<f32>| -> Vec<f32> {
             range.clone().flat_map(|frame| picked(&plane[place(frame)], &places)).collect()
         };
-        let deviation = |plane: &Vec<i8>| -> Vec<f32> {
+        let standardized = |plane: &Vec<i8>| -> Vec<f32> {
             let bytes = range.clone().flat_map(|frame| picked(&plane[place(frame)], &places));
             bytes.map(expanded).collect()
         };
-        let planes = self.images.iter().map(image).chain(self.deviations.iter().map(deviation));
-        let guide = GuidePlanes(planes.collect());
-        ConditionedBurst { size, sample: Sample { truth, counts, acquisition }, guide }
+        let mut counts_and_expected = self.standardized.iter().map(standardized);
+        let neighbours = self.standardized.len() / 2;
+        let aligned = AlignedPlanes {
+            reference: image(&self.images[0]),
+            merged: image(&self.images[1]),
+            noise_sigma: image(&self.images[2]),
+            counts: counts_and_expected.by_ref().take(1 + neighbours).collect(),
+            expected: counts_and_expected.collect(),
+        };
+        ConditionedBurst { size, sample: Sample { truth, counts, acquisition }, aligned }
     }
 }
 
@@ -116,7 +130,7 @@ pub(super) struct BurstCache {
     key: CacheKey,
     /// Frames, height, width.
     shape: [usize; 3],
-    laid: Laid,
+    neighbours: AlignedNeighbours,
 }
 
 /// Everything that decides a burst, its number aside. Files hold it as JSON.
@@ -128,11 +142,13 @@ struct CacheKey {
     #[serde(alias = "kept")]
     cached_frames: usize,
     neighbours: usize,
-    motions: usize,
-    exposure: bool,
-    /// Hashes of the drafts' weights.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    drafts: Vec<String>,
+    #[serde(alias = "motions")]
+    alignments: usize,
+    #[serde(alias = "exposure")]
+    mean_level: bool,
+    /// Hashes of the weights of the refinement stages.
+    #[serde(default, alias = "drafts", skip_serializing_if = "Vec::is_empty")]
+    stages: Vec<String>,
 }
 
 impl CacheKey {
@@ -146,10 +162,10 @@ impl CacheKey {
     }
 }
 
-/// The hash of a draft's weights.
-fn sha256(draft: &Draft) -> Result<String> {
+/// The hash of the weights of a refinement stage.
+fn sha256(stage: &RefinementStage) -> Result<String> {
     let mut hash = Sha256::new();
-    for list in parameters(draft.denoiser()) {
+    for list in parameters(stage.predenoiser()) {
         read_tensor(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
     }
     Ok(format!("{:x}", hash.finalize()))
@@ -172,7 +188,7 @@ const KEY: &str = "burst";
 const HEADER: usize = 1 << 16;
 
 impl BurstCache {
-    pub(super) fn new(folder: &Path, recipe: &Recipe, drafts: &[Draft]) -> Result<Self> {
+    pub(super) fn new(folder: &Path, recipe: &Recipe, stages: &[RefinementStage]) -> Result<Self> {
         let Some(crops) = recipe.train.crops else {
             let what = "the recipe draws every sample anew";
             return Err(SimError::request(
@@ -187,9 +203,9 @@ impl BurstCache {
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,
             neighbours: recipe.network.pre.neighbours,
-            motions: recipe.network.pre.laid().along.count(),
-            exposure: !recipe.network.lacks(Part::Exposure),
-            drafts: drafts.iter().map(sha256).collect::<Result<_>>()?,
+            alignments: recipe.network.pre.aligned_neighbours().alignments.count(),
+            mean_level: !recipe.network.ablates(Part::MeanLevel),
+            stages: stages.iter().map(sha256).collect::<Result<_>>()?,
         };
         Ok(Self {
             folder: folder.to_owned(),
@@ -200,7 +216,7 @@ impl BurstCache {
                 recipe.data.crop,
                 recipe.data.crop,
             ],
-            laid: recipe.network.pre.laid(),
+            neighbours: recipe.network.pre.aligned_neighbours(),
         })
     }
 
@@ -212,8 +228,8 @@ impl BurstCache {
     fn tensors(&self) -> Vec<(String, Dtype)> {
         let mut list = vec![("truth".to_owned(), Dtype::F32), ("counts".to_owned(), Dtype::U16)];
         list.extend((0..IMAGES).map(|i| (format!("image.{i}"), Dtype::F32)));
-        let deviations = GuidePlanes::count(self.laid) - IMAGES;
-        list.extend((0..deviations).map(|i| (format!("deviation.{i}"), Dtype::I8)));
+        let standardized = self.neighbours.standardized_planes();
+        list.extend((0..standardized).map(|i| (format!("deviation.{i}"), Dtype::I8)));
         list
     }
 
@@ -232,11 +248,11 @@ impl BurstCache {
         let truth = burst.sample.truth.iter().flat_map(|frame| words(&frame.data)).collect();
         let counts = burst.sample.counts.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
         let images = burst.images.iter().map(|plane| words(plane));
-        let deviations = burst.deviations.iter();
-        let deviations =
-            deviations.map(|plane| plane.iter().flat_map(|v| v.to_le_bytes()).collect());
+        let standardized = burst.standardized.iter();
+        let standardized =
+            standardized.map(|plane| plane.iter().flat_map(|v| v.to_le_bytes()).collect());
         let bytes: Vec<Vec<u8>> =
-            [truth, counts].into_iter().chain(images).chain(deviations).collect();
+            [truth, counts].into_iter().chain(images).chain(standardized).collect();
         let views = self.tensors().into_iter().zip(&bytes).map(|((name, kind), bytes)| {
             Ok((name, TensorView::new(kind, self.shape.to_vec(), bytes).map_err(|e| report(&e))?))
         });
@@ -317,10 +333,10 @@ impl BurstCache {
         };
         let sample = Sample { truth, counts: counts.collect(), acquisition };
         let images = planes[2..2 + IMAGES].iter().map(|plane| words(plane)).collect();
-        let deviations = planes[2 + IMAGES..].iter();
-        let deviations =
-            deviations.map(|plane| plane.iter().map(|&b| b.cast_signed()).collect()).collect();
-        Ok(Some(CachedBurst { size, sample, images, deviations }))
+        let standardized = planes[2 + IMAGES..].iter();
+        let standardized =
+            standardized.map(|plane| plane.iter().map(|&b| b.cast_signed()).collect()).collect();
+        Ok(Some(CachedBurst { size, sample, images, standardized }))
     }
 }
 
@@ -331,9 +347,9 @@ mod tests {
     #[test]
     fn bytes_are_finer_than_noise() {
         for i in -800..=800 {
-            let deviation = i as f32 * 0.01;
-            let error = (expanded(compressed(deviation)) - deviation).abs();
-            assert!(error <= 0.008 + 0.016 * deviation.abs(), "{deviation}: {error}");
+            let z = i as f32 * 0.01;
+            let error = (expanded(compressed(z)) - z).abs();
+            assert!(error <= 0.008 + 0.016 * z.abs(), "{z}: {error}");
         }
         let far = [1e9, -1e9, f32::NAN].map(|value| expanded(compressed(value)));
         assert!(far[0] > 13.0 && far[1] < -13.0 && far[2] == 0.0, "{far:?}");

@@ -16,7 +16,8 @@ use lpips::Lpips;
 use qudi_core::Result;
 use qudi_core::restorer::Acquisition;
 use qudi_kernels::{ComputePrecision, with_precision};
-use qudi_model::network::{Measured, Qudi};
+use qudi_model::conditioning::Conditioning;
+use qudi_model::network::Qudi;
 use reconstruction::relative_reconstruction;
 use self_conditioning::network_inputs;
 
@@ -54,7 +55,7 @@ impl Default for LossWeights {
 #[derive(Clone, Debug)]
 pub struct Example<'a> {
     /// The network's inputs.
-    pub measured: &'a Measured,
+    pub conditioning: &'a Conditioning,
     /// The true frames in [0, 1].
     pub truth: Tensor<4>,
     /// Sensor and light of every burst.
@@ -115,20 +116,22 @@ pub fn loss_terms(
     if weights.prediction == 0.0 && perceptual.is_none() {
         return Ok(first_stage_terms(network, example, weights));
     }
-    let Example { measured, truth, .. } = example;
+    let Example { conditioning, truth, .. } = example;
     let (state, simulated) = network_inputs(network, example, self_conditioning, options)?;
-    let prepared = network.prepare(measured);
-    let result = network.forward(&prepared, simulated.as_ref(), &state, None);
+    let encoded = network.encode(conditioning);
+    let result = network.forward(&encoded, simulated.as_ref(), &state, None);
     let error = result.x0.clone() - (truth.clone() * 2.0 - 1.0);
-    let prediction = (error / result.unit.clamp_min(LEAST_UNIT)).powi_scalar(2).mean();
+    let prediction = (error / result.c_out.clamp_min(LEAST_UNIT)).powi_scalar(2).mean();
     let image = (result.x0 + 1.0) * 0.5;
     // Feature differences are small differences of large numbers.
     let perceptual = perceptual
         .map(|lpips| with_precision(ComputePrecision::F32, || lpips.loss(image, truth.clone())));
     let pre = pre_denoiser_loss(example, result.d);
-    let flow = (weights.flow > 0.0).then(|| result.flows.misfit(truth.clone(), measured.frames));
+    let flow = (weights.flow > 0.0)
+        .then(|| result.flows.warping_error(truth.clone(), conditioning.frames));
     // The uncertainty is that of the frames before any simulated measurement.
-    let uncertainty = network.tells_errors().then(|| network.denoise(&measured.guide));
+    let uncertainty =
+        network.predicts_uncertainty().then(|| network.predenoise(&conditioning.aligned));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));
     let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     Ok(LossTerms { total, prediction, pre, perceptual, flow, uncertainty }.weighted(weights))
@@ -137,25 +140,26 @@ pub fn loss_terms(
 /// Computes the terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no weight: a first
 /// stage, at a fifth of the cost or less, for what must work before the rest can learn from it.
 fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> LossTerms {
-    let Example { measured, truth, .. } = example;
+    let Example { conditioning, truth, .. } = example;
     let (d, sigma, flows) = if weights.flow > 0.0 {
-        let (d, flows) = network.denoise_and_align(&network.prepare(measured));
-        let sigma = network.tells_errors().then(|| network.denoise(&measured.guide).1);
+        let (d, flows) = network.predenoise_and_align(&network.encode(conditioning));
+        let sigma =
+            network.predicts_uncertainty().then(|| network.predenoise(&conditioning.aligned).1);
         (d, sigma.flatten(), Some(flows))
     } else {
-        let (d, sigma) = network.denoise(&measured.guide);
+        let (d, sigma) = network.predenoise(&conditioning.aligned);
         (d, sigma, None)
     };
     let uncertainty = uncertainty_loss(&d, truth, sigma);
     let pre = pre_denoiser_loss(example, d);
-    let flow = flows.map(|flows| flows.misfit(truth.clone(), measured.frames));
+    let flow = flows.map(|flows| flows.warping_error(truth.clone(), conditioning.frames));
     let (total, prediction) = (pre.clone() * weights.pre, pre.zeros_like());
     LossTerms { total, prediction, pre, perceptual: None, flow, uncertainty }.weighted(weights)
 }
 
 /// The error of pre-denoised frames relative to the reference estimate's.
 fn pre_denoiser_loss(example: &Example<'_>, frames: Tensor<4>) -> Tensor<1> {
-    let Example { measured, truth, .. } = example;
-    let reference = measured.guide.clone().narrow(1, 0, 1);
-    relative_reconstruction(frames, truth.clone(), reference, measured.frames)
+    let Example { conditioning, truth, .. } = example;
+    let reference = conditioning.aligned.reference.clone();
+    relative_reconstruction(frames, truth.clone(), reference, conditioning.frames)
 }

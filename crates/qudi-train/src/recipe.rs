@@ -66,7 +66,7 @@ pub struct TrainConfig {
     pub licence: String,
 }
 
-/// What samples are cut from: guides of whole bursts, which take long to compute and see no borders.
+/// What samples are cut from: reference estimates of whole bursts, which take long to compute and see no borders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CropsConfig {
@@ -307,6 +307,10 @@ fn read(name: &str) -> Result<String> {
 /// Former names of keys and their names now; both are read (`#[serde(alias)]` on the fields).
 const RENAMED: &[(&str, &str)] = &[
     ("network.without", "network.ablate"),
+    ("network.pre.motions", "network.pre.alignments"),
+    ("network.pre.trust", "network.pre.weight_channels"),
+    ("network.pre.rounds", "network.pre.stages"),
+    ("network.pre.error", "network.pre.uncertainty"),
     ("data.source.rest", "data.source.static_fraction"),
     ("data.source.shrink", "data.source.max_downscale"),
     ("train.rate", "train.lr"),

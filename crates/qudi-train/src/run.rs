@@ -12,8 +12,8 @@ use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::{Result, SimError};
 use qudi_model::checkpoint::{Description, Precision, save};
 use qudi_model::config::{NetworkConfig, PRESETS};
-use qudi_model::draft::Draft;
 use qudi_model::network::Qudi;
+use qudi_model::refinement::RefinementStage;
 use qudi_model::restorer::TILE;
 use serde::Serialize;
 use std::fs::OpenOptions;
@@ -90,8 +90,8 @@ impl Run {
             From::State => Trainer::resume(folder, recipe, devices, backbones)?,
         };
         let dataset = Dataset::new(&recipe.data, files.pack)?;
-        let drafts = Draft::all(&trainer.averaged(), &recipe.network, TILE, &devices[0]);
-        let mut bursts = BurstSampler::new(recipe, dataset, drafts);
+        let stages = RefinementStage::all(&trainer.averaged(), &recipe.network, TILE, &devices[0]);
+        let mut bursts = BurstSampler::new(recipe, dataset, stages);
         if let Some(folder) = &files.bursts {
             bursts = bursts.with_cache(folder, recipe)?;
         }
@@ -190,6 +190,7 @@ impl Run {
             commit: self.commit.clone(),
             licence: recipe.train.licence.clone(),
             default_steps: Some(recipe.default_steps()),
+            kind: None,
         };
         let path = self.folder.join(WEIGHTS);
         save(&self.trainer.averaged(), &description, Precision::Single, &path, Overwrite::Yes)

@@ -8,9 +8,10 @@ use qudi_core::Result;
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
+use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
 use qudi_model::config::NetworkConfig;
-use qudi_model::measurement::GuidePlanes;
-use qudi_model::network::{Measured, SENSOR_NUMBERS, Simulated, State};
+use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::network::Simulated;
 use qudi_model::tensor::read;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
@@ -234,21 +235,29 @@ fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let config = NetworkConfig::preset("tiny")?;
     let network = config.init(1, &device);
     let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
-    let planes = GuidePlanes::count(config.pre.laid());
-    let mut guide = vec![image(29), image(30), image(31) * 0.5 + 0.2];
-    guide.extend((guide.len()..planes).map(|plane| image(29 + plane as u32)));
-    let measured = Measured {
-        u: image(22),
-        guide: Tensor::cat(guide, 1),
+    let neighbours = config.pre.aligned_neighbours().count();
+    let planes = |first: u32, count| {
+        Tensor::cat((0..count).map(|plane| image(first + plane as u32)).collect(), 1)
+    };
+    let conditioning = Conditioning {
+        linear_estimate: image(22),
+        aligned: AlignedTensors {
+            reference: image(29),
+            merged: image(30),
+            noise_sigma: image(31) * 0.5 + 0.2,
+            counts: planes(32, 1 + neighbours),
+            expected: Some(planes(100, neighbours)),
+        },
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
     };
     let simulated = Simulated { y: image(24), u: image(25), exists: vec![true] };
     let x_t = values(26, [4, 1, 32, 48], &device).require_grad();
     let x0_prev = values(27, [4, 1, 32, 48], &device);
-    let state = State { x_t: x_t.clone(), x0_prev, known: vec![true], times: vec![500] };
-    let prepared = network.prepare(&measured);
-    let prediction = network.forward(&prepared, Some(&simulated), &state, None);
+    let (has_previous, timesteps) = (vec![true], vec![500]);
+    let state = DiffusionState { x_t: x_t.clone(), x0_prev, has_previous, timesteps };
+    let encoded = network.encode(&conditioning);
+    let prediction = network.forward(&encoded, Some(&simulated), &state, None);
     let loss = reconstruction((prediction.x0.clone() + 1.0) * 0.5, image(28));
     let grads = loss.backward();
     Ok(vec![

@@ -7,7 +7,7 @@ use super::recipe::Recipe;
 use super::trainer::Trainer;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::{Result, SimError};
-use qudi_model::network::parameters as parameter_shapes;
+use qudi_model::network::{former_name, parameter_shapes};
 use qudi_model::tensor::read;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -129,8 +129,10 @@ impl Trainer {
         let device = trainer.ema.average[0].device();
         let list = |prefix: &str| {
             let values = names.iter().map(|(name, shape)| {
+                let former = format!("{prefix}/{}", former_name(name));
                 let name = format!("{prefix}/{name}");
-                let tensor = tensors.tensor(&name).map_err(|e| damaged(e.to_string()))?;
+                let tensor = tensors.tensor(&name).or_else(|_| tensors.tensor(&former));
+                let tensor = tensor.map_err(|e| damaged(e.to_string()))?;
                 let count = shape.iter().product::<usize>();
                 if tensor.dtype() != Dtype::F32 || tensor.shape() != [count] {
                     return Err(damaged(format!("`{name}` has another size than the recipe's")));

@@ -138,9 +138,9 @@ impl Trainer {
     /// The network with averaged weights, for use.
     pub fn averaged(&self) -> Qudi {
         let network = self.network.valid();
-        // Drafts do not learn, and an average of equal numbers is not always that number.
-        let drafts = network.drafts().to_vec();
-        with_parameters(network, self.ema.average.clone()).with_drafts(drafts)
+        // Refinement stages do not learn, and an average of equal numbers is not always that number.
+        let stages = network.stages().to_vec();
+        with_parameters(network, self.ema.average.clone()).with_stages(stages)
     }
 
     /// Takes one step.
@@ -204,7 +204,8 @@ impl Trainer {
                 move || -> Result<Vec<(usize, Pass)>> {
                     let inner = device.clone().inner();
                     let weights = weights.into_iter().map(|w| w.to_device(&inner)).collect();
-                    let network = with_parameters(self.recipe.network.shell(device), weights);
+                    let network =
+                        with_parameters(self.recipe.network.uninitialized(device), weights);
                     mine.map(|(at, batch)| Ok((at, self.pass(&network, batch, number)?))).collect()
                 }
             };
@@ -229,7 +230,7 @@ impl Trainer {
     fn pass(&self, network: &Qudi, batch: &Batch, number: usize) -> Result<Pass> {
         let start = Instant::now();
         let device = &self.devices[number];
-        let measured = batch.measured(device);
+        let conditioning = batch.conditioning(device);
         let mut random = ChaCha8Rng::seed_from_u64(self.recipe.train.seed);
         random.set_stream(batch.number);
         let (weights, loop_options) = self.options();
@@ -240,7 +241,7 @@ impl Trainer {
         } else {
             SelfConditioning::On(random.next_u64())
         };
-        let example = batch.example(&measured);
+        let example = batch.example(&conditioning);
         let perceptual = self.perceptual.get(number);
         let terms = with_precision(self.recipe.train.precision, || {
             loss_terms(network, &example, self_conditioning, weights, loop_options, perceptual)
@@ -271,8 +272,8 @@ impl Trainer {
         let LossConfig { prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
         let network = &self.recipe.network;
         let loop_options = LoopOptions {
-            forward_model: !network.lacks(Part::Physics),
-            self_conditioning: !network.lacks(Part::SelfConditioning),
+            forward_model: !network.ablates(Part::ForwardModel),
+            self_conditioning: !network.ablates(Part::SelfConditioning),
         };
         (LossWeights { prediction, pre, perceptual, flow }, loop_options)
     }

@@ -8,9 +8,10 @@ use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Result, SimError, Size, USUAL_EXPOSURE};
+use qudi_model::checkpoint::ModelKind;
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::Qudi;
-use qudi_model::restorer::{QudiRestorer, SampleOptions};
+use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use serde::Serialize;
 
@@ -133,8 +134,13 @@ impl Validator {
         step: u64,
     ) -> Result<Validation> {
         let options = SampleOptions { steps: self.config.steps, ..SampleOptions::default() };
-        let mut restorer =
-            QudiRestorer::new(network.clone(), sizes, self.config.frames, options, device)?;
+        let model = Model {
+            network: network.clone(),
+            config: sizes.clone(),
+            kind: ModelKind::of(network)?,
+            window: self.config.frames,
+        };
+        let mut restorer = QudiRestorer::new(model, options, device)?;
         let mut clips = Vec::new();
         for &ppp in &self.config.ppp {
             for (number, (name, truth)) in self.clips.iter().enumerate() {

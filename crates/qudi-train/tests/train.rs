@@ -4,7 +4,7 @@
 use burn::tensor::{Device, Tensor};
 use qudi_core::SimError;
 use qudi_model::checkpoint::load;
-use qudi_model::network::{Qudi, fill, parameters as parameter_shapes};
+use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::{
     Adam, Batch, BurstSampler, Event, Files, From, METRICS, Prefetcher, Recipe, Run, StepReport,
@@ -242,22 +242,22 @@ fn first_stage_trains_the_pre_denoiser_on_crops() {
 /// Weights of earlier stages stay as they were, bit for bit, in the average, too; a resumed run has the same bursts.
 #[test]
 fn earlier_stages_keep_their_weights() {
-    let recipe = recipe(&[("network.pre.rounds", "2")]);
+    let recipe = recipe(&[("network.pre.stages", "2")]);
     let start = recipe.network.init(1, &Device::flex());
-    let start = fill(start, |_, shape| {
+    let start = init_parameters(start, |_, shape| {
         let count = shape.iter().product::<usize>();
         (0..count).map(|i| 0.03 * ((i * 37 % 101) as f32 / 50.0 - 1.0)).collect()
     });
     let split = |network: &Qudi| -> [Vec<f32>; 2] {
         let names = parameter_shapes(network).into_iter().map(|(name, _)| name);
         let lists = names.zip(parameters(network)).map(|(name, values)| {
-            (name.starts_with("drafts."), values.into_data().try_into_vec::<f32>().unwrap())
+            (name.starts_with("stages."), values.into_data().try_into_vec::<f32>().unwrap())
         });
-        let (drafts, others): (Vec<_>, Vec<_>) = lists.partition(|(draft, _)| *draft);
-        [drafts, others].map(|lists| lists.into_iter().flat_map(|(_, values)| values).collect())
+        let (stages, others): (Vec<_>, Vec<_>) = lists.partition(|(is_stage, _)| *is_stage);
+        [stages, others].map(|lists| lists.into_iter().flat_map(|(_, values)| values).collect())
     };
-    let [drafts, others] = split(&start);
-    assert!(!drafts.is_empty() && drafts.len() < others.len());
+    let [stages, others] = split(&start);
+    assert!(!stages.is_empty() && stages.len() < others.len());
     let folders = [0, 1].map(|_| tempfile::tempdir().unwrap());
     let [whole, parts] = [0, 1].map(|i| folders[i].path());
     let from = || From::Start(Some(Box::new(start.clone())));
@@ -267,7 +267,7 @@ fn earlier_stages_keep_their_weights() {
     let [whole, parts] =
         [whole, parts].map(|folder| load(&folder.join(WEIGHTS), &Device::flex()).unwrap().0);
     let [kept, learnt] = split(&whole);
-    assert!(kept == drafts && learnt != others);
+    assert!(kept == stages && learnt != others);
     assert_eq!(weights(&whole), weights(&parts));
 }
 
@@ -277,7 +277,7 @@ fn nan_loss_stops_the_step_and_names_the_term() {
     let recipe = recipe(&[]);
     let bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let broken = recipe.network.init(1, &Device::flex());
-    let broken = fill(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
+    let broken = init_parameters(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
     let mut prefetcher = Prefetcher::new(&recipe, &bursts, 0, 1).unwrap();
     let error = trainer.step(&mut prefetcher).unwrap_err().to_string();
@@ -357,6 +357,8 @@ fn reads_recipes_with_former_key_names() {
         ("train.parts.kept", "train.crops.cached_frames", "7"),
         ("data.source.1.rest", "data.source.1.static_fraction", "0.5"),
         ("network.without", "network.ablate", "[\"flow\"]"),
+        ("network.pre.trust", "network.pre.weight_channels", "8"),
+        ("network.pre.rounds", "network.pre.stages", "1"),
     ] {
         assert_eq!(change(old, value), change(new, value), "{old}");
     }

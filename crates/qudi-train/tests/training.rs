@@ -7,10 +7,13 @@ use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
+use qudi_model::conditioning::{
+    AlignedPlanes, Conditioning, SENSOR_NUMBERS, linear_estimates, sensor_numbers,
+};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::noise::Noise;
-use qudi_model::measurement::{GuidePlanes, Planes, aligned, sensor_numbers};
-use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, fill, parameters as parameter_shapes};
+use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
+use qudi_model::refinement::align;
 use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::{
@@ -22,7 +25,7 @@ use std::collections::HashMap;
 
 /// A burst of a moving disk, its truth and its light.
 struct Burst {
-    measured: Measured,
+    conditioning: Conditioning,
     truth: Tensor<4>,
     acquisition: Acquisition,
     size: Size,
@@ -31,7 +34,7 @@ struct Burst {
 impl Burst {
     fn example<'a>(&'a self, noise: Tensor<4>, timesteps: &'a [usize]) -> Example<'a> {
         Example {
-            measured: &self.measured,
+            conditioning: &self.conditioning,
             truth: self.truth.clone(),
             acquisitions: std::slice::from_ref(&self.acquisition),
             noise,
@@ -59,26 +62,23 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
         truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
     let acquisition = Acquisition::new(sensor, light.ppp, light.exposure).unwrap();
     let view = BurstView { size, frames: &counts };
-    let planes = Planes::of(view, &acquisition);
-    let guide = GuidePlanes::of(
-        &aligned(view, &acquisition, &[]).unwrap(),
-        tiny().pre.laid(),
-        0..view.frames.len(),
-    );
+    let aligned = align(view, &acquisition, &[]).unwrap();
+    let neighbours = tiny().pre.aligned_neighbours();
+    let aligned = AlignedPlanes::new(&aligned, neighbours, 0..view.frames.len());
     let numbers = TensorData::new(sensor_numbers(&acquisition).to_vec(), [1, SENSOR_NUMBERS]);
-    let measured = Measured {
-        u: to_tensor(planes.u, size, device),
-        guide: guide.into_tensor(size, device),
+    let conditioning = Conditioning {
+        linear_estimate: to_tensor(linear_estimates(view, &acquisition), size, device),
+        aligned: aligned.into_tensors(size, device),
         sensor: Tensor::from_data(numbers, device),
         frames,
     };
     let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
-    Burst { measured, truth: to_tensor(truth, size, device), acquisition, size }
+    Burst { conditioning, truth: to_tensor(truth, size, device), acquisition, size }
 }
 
 /// The loss of step `number`, at a time and with noise of its own.
 fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
-    let frames = burst.measured.frames;
+    let frames = burst.conditioning.frames;
     let noise = Noise::new(number, 1);
     let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
     let place = (number as f64 * 0.618_034).fract();
@@ -125,7 +125,7 @@ fn uncertainty_loss_has_no_gradient_to_the_frames() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
     let mut config = tiny();
-    config.pre.error = true;
+    config.pre.uncertainty = true;
     let network = config.init(3, &device);
     let terms_of = |prediction: f32| {
         let weights = LossWeights { prediction, pre: 0.0, ..LossWeights::default() };
@@ -143,7 +143,7 @@ fn uncertainty_loss_has_no_gradient_to_the_frames() {
     network.visit(&mut missing);
     let idle = |part: &str| missing.names.iter().any(|name| name.starts_with(part));
     // What enters lies behind a last layer that starts at zero.
-    assert!(!idle("error.out") && idle("error.enter") && idle("pre.out"));
+    assert!(!idle("uncertainty.out") && idle("uncertainty.enter") && idle("pre.out"));
 }
 
 /// The U-Net's corrections scale with the predicted uncertainty; an untrained head leaves them as they are.
@@ -151,17 +151,17 @@ fn uncertainty_loss_has_no_gradient_to_the_frames() {
 fn predicted_uncertainty_scales_the_prediction_loss() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
-    let prediction = |error: bool, bias: f32| {
+    let prediction = |uncertainty: bool, bias: f32| {
         let mut config = tiny();
-        config.pre.error = error;
+        config.pre.uncertainty = uncertainty;
         let mut network = config.init(3, &device);
-        if error {
+        if uncertainty {
             let biased = |name: &str, shape: &[usize]| {
                 let initial = vec![bias; shape.iter().product()];
-                (name == "error.out.bias").then_some(initial)
+                (name == "uncertainty.out.bias").then_some(initial)
             };
             let values = values_by_name(&network);
-            network = fill(network, |name, shape| {
+            network = init_parameters(network, |name, shape| {
                 biased(name, shape).unwrap_or_else(|| values[name].clone())
             });
         }
@@ -190,10 +190,10 @@ fn gaussian_nll_is_least_at_the_true_sigma() {
     let device = Device::flex();
     let noise: Vec<f32> = Noise::new(5, 1).frame(0, 0, 64 * 64).collect();
     let scale = (noise.iter().map(|n| n * n).sum::<f32>() / noise.len() as f32).sqrt();
-    let of = |deviation: f32| {
+    let of = |sigma: f32| {
         let errors = noise.iter().map(|n| 0.2 * n / scale).collect();
         let errors = to_tensor(errors, Size { height: 64, width: 64 }, &device);
-        gaussian_nll(errors.clone(), errors.ones_like() * deviation).into_scalar::<f32>()
+        gaussian_nll(errors.clone(), errors.ones_like() * sigma).into_scalar::<f32>()
     };
     assert!((of(0.2) - (0.5 + 0.2f32.ln())).abs() < 1e-5, "{}", of(0.2));
     assert!(of(0.2) < of(0.19) && of(0.2) < of(0.21));

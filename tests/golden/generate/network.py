@@ -26,9 +26,18 @@ Flows = tuple[Tensor, Tensor]
 ROOT = Path(__file__).resolve().parents[3]
 
 
+# Keys of `pre`, and their former names, by which golden values and this reference know them.
+FORMER_KEYS = {"alignments": "motions", "weight_channels": "trust", "stages": "rounds", "uncertainty": "error"}
+
+
+def with_former_keys(config: dict) -> dict:
+    """A [network] table by the former names of its keys."""
+    return {**config, "pre": {FORMER_KEYS.get(key, key): value for key, value in config["pre"].items()}}
+
+
 def load(preset: str) -> dict:
     """The [network] table of a preset."""
-    return tomllib.loads((ROOT / "configs" / f"{preset}.toml").read_text())["network"]
+    return with_former_keys(tomllib.loads((ROOT / "configs" / f"{preset}.toml").read_text())["network"])
 
 
 def multiple(config: dict) -> int:
@@ -154,7 +163,7 @@ def normalized_input(guide: Tensor) -> tuple[Tensor, ...]:
 
 
 class Trust(nn.Module):
-    """Says pixel by pixel how far each neighbour is to be trusted, and merges the counts so weighed."""
+    """Says pixel by pixel how far each neighbour is to be trusted, and merges the counts by these weights."""
 
     def __init__(self, config: dict):
         super().__init__()

@@ -11,10 +11,12 @@ use crate::report::{Bar, Report};
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
 use qudi_core::restorer::{BurstView, Restorer};
+use qudi_model::checkpoint::ModelKind;
+use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
 use qudi_model::config::NetworkConfig;
-use qudi_model::measurement::GuidePlanes;
-use qudi_model::network::{Measured, Qudi, SENSOR_NUMBERS, Simulated, State};
-use qudi_model::restorer::QudiRestorer;
+use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::network::{Qudi, Simulated};
+use qudi_model::restorer::{Model, QudiRestorer};
 use qudi_model::with_precision;
 use qudi_train::loss::reconstruction;
 use serde::Serialize;
@@ -129,7 +131,10 @@ fn measure(
     drop((differentiable, of_step));
     let (counts, acquisition) = burst(args)?;
     let options = sample_options(&args.network)?;
-    let mut restorer = QudiRestorer::new(network, &config, args.frames, options, &device.device)?;
+    // Initial weights change nothing in the U-Net; its time is measured all the same.
+    let kind = ModelKind::Diffusion;
+    let model = Model { network, config: config.clone(), kind, window: args.frames };
+    let mut restorer = QudiRestorer::new(model, options, &device.device)?;
     let peak = Peak::start();
     let start = Instant::now();
     restorer.restore(BurstView { size: args.size, frames: &counts }, &acquisition)?;
@@ -151,22 +156,30 @@ fn measure(
     })
 }
 
-type Inputs = (Measured, Simulated, State);
+type Inputs = (Conditioning, Simulated, DiffusionState);
 
 /// Inputs of a step: values do not matter for speed.
 fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) -> Inputs {
     let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
     let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
-    let guide = image().repeat_dim(1, GuidePlanes::count(config.pre.laid()));
-    let measured = Measured { u: image(), guide, sensor, frames };
+    let neighbours = config.pre.aligned_neighbours().count();
+    let aligned = AlignedTensors {
+        reference: image(),
+        merged: image(),
+        noise_sigma: image(),
+        counts: image().repeat_dim(1, 1 + neighbours),
+        expected: (neighbours > 0).then(|| image().repeat_dim(1, neighbours)),
+    };
+    let conditioning = Conditioning { linear_estimate: image(), aligned, sensor, frames };
     let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
-    let state = State { x_t: image(), x0_prev: image(), known: vec![true], times: vec![500] };
-    (measured, simulated, state)
+    let (has_previous, timesteps) = (vec![true], vec![500]);
+    let state = DiffusionState { x_t: image(), x0_prev: image(), has_previous, timesteps };
+    (conditioning, simulated, state)
 }
 
 /// Seconds of the preparation and of every block of one step.
 fn step(network: &Qudi, inputs: &Inputs, device: &Device) -> Vec<(&'static str, f64)> {
-    let (measured, simulated, state) = inputs;
+    let (conditioning, simulated, state) = inputs;
     let mut last = Instant::now();
     let mut times = Vec::new();
     let mut mark = |block: &'static str| {
@@ -175,19 +188,19 @@ fn step(network: &Qudi, inputs: &Inputs, device: &Device) -> Vec<(&'static str, 
         times.push((block, last.elapsed().as_secs_f64()));
         last = Instant::now();
     };
-    let prepared = network.prepare(measured);
+    let encoded = network.encode(conditioning);
     mark("prepare");
-    network.forward_observed(&prepared, Some(simulated), state, None, &mut mark);
+    network.forward_observed(&encoded, Some(simulated), state, None, &mut mark);
     times
 }
 
 fn forward_backward(network: &Qudi, inputs: &Inputs, device: &Device) -> f64 {
-    let (measured, simulated, state) = inputs;
-    let frames = measured.frames;
+    let (conditioning, simulated, state) = inputs;
+    let frames = conditioning.frames;
     let truth = Tensor::<4>::zeros([frames, 1, CROP.height, CROP.width], device);
     let start = Instant::now();
-    let prepared = network.prepare(measured);
-    let prediction = network.forward(&prepared, Some(simulated), state, None);
+    let encoded = network.encode(conditioning);
+    let prediction = network.forward(&encoded, Some(simulated), state, None);
     let loss = reconstruction((prediction.x0 + 1.0) * 0.5, truth.clone())
         + reconstruction(prediction.d, truth) * 0.2;
     let _grads = loss.backward();

@@ -7,7 +7,7 @@ use qudi_burst::{Average, Mle};
 use qudi_burst::{PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_io::capture::Capture;
-use qudi_model::restorer::FEWEST_FRAMES;
+use qudi_model::restorer::MIN_FRAMES;
 
 /// All methods.
 pub(crate) const METHODS: &[&str] =
@@ -61,7 +61,7 @@ pub(crate) fn usual_method(
     capture: &Capture,
     acquisition: &Acquisition,
 ) -> Result<&'static str> {
-    let long_enough = capture.length().is_none_or(|frames| frames >= FEWEST_FRAMES as u64);
+    let long_enough = capture.length().is_none_or(|frames| frames >= MIN_FRAMES as u64);
     Ok(if options.meant().is_some() {
         "qudi"
     } else if acquisition.sensor.dark_per_frame().is_err() {

@@ -8,10 +8,10 @@ use crate::weights::Weights;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_model::checkpoint::Description;
+use qudi_model::checkpoint::{Description, ModelKind};
 use qudi_model::diffusion::sampler::Sampler;
-use qudi_model::diffusion::schedule::Spacing;
-use qudi_model::restorer::{QudiRestorer, SampleOptions};
+use qudi_model::diffusion::timesteps::TimestepSpacing;
+use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const TOLERATED: f64 = 10.0;
@@ -29,9 +29,13 @@ pub(crate) fn restorer(
     if matches!(device.name.as_str(), "cpu" | "ndarray") {
         check_memory(&description, options.tile(), size, available_bytes())?;
     }
-    let (config, window) = (&description.network, description.window);
-    let sampling = sample_options(options)?;
-    let restorer = QudiRestorer::new(network, config, window, sampling, &device.device)?;
+    let model = Model {
+        network,
+        config: description.network,
+        kind: description.kind.unwrap_or(ModelKind::Diffusion),
+        window: description.window,
+    };
+    let restorer = QudiRestorer::new(model, sample_options(options)?, &device.device)?;
     let way = options.mode()?;
     Ok((Box::new(restorer), format!(" ({way}) on {}", device.name)))
 }
@@ -40,8 +44,8 @@ pub(crate) fn sample_options(options: &Network) -> Result<SampleOptions> {
     Ok(SampleOptions {
         steps: options.steps()?,
         spacing: match options.spacing() {
-            SpacingName::Linear => Spacing::Linear,
-            SpacingName::Learnt => Spacing::Learnt,
+            SpacingName::Linear => TimestepSpacing::Linear,
+            SpacingName::Learnt => TimestepSpacing::LogLogistic,
         },
         sampler: match options.sampler() {
             SamplerName::Ddim => Sampler::Ddim,
@@ -162,6 +166,7 @@ mod tests {
             commit: None,
             licence: String::new(),
             default_steps: None,
+            kind: None,
         }
     }
 

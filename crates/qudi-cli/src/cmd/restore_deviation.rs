@@ -15,7 +15,7 @@ pub(crate) struct Deviation(Option<ArrayWriter>);
 
 /// Whether the network, asked so, tells its errors without samples.
 pub(crate) fn tells_errors(network: &Network) -> Result<bool> {
-    Ok(network.steps()? == 0 && network.weights().describe()?.network.pre.error)
+    Ok(network.steps()? == 0 && network.weights().describe()?.network.pre.uncertainty)
 }
 
 impl Deviation {

@@ -244,23 +244,23 @@ fn initial(
     device: &Opened,
 ) -> Result<Box<qudi_model::network::Qudi>> {
     let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
-    let seen = sizes.pre.laid();
-    // What sees more than a draft does cannot become one.
-    let draft = seen == sizes.pre.of_drafts().laid();
-    if sizes.pre.rounds + 1 == recipe.network.pre.rounds && draft {
-        sizes.pre.rounds += 1;
-        network = network.with_round_more(sizes.pre.laid().frames() - seen.frames());
+    let before = sizes.pre.aligned_neighbours();
+    // A pre-denoiser that sees more than a refinement stage does cannot become one.
+    let is_stage = before == sizes.pre.stage().aligned_neighbours();
+    if sizes.pre.stages + 1 == recipe.network.pre.stages && is_stage {
+        sizes.pre.stages += 1;
+        network = network.with_stage_added(sizes.pre.aligned_neighbours().count() - before.count());
     }
-    if recipe.network.pre.error && !sizes.pre.error {
+    if recipe.network.pre.uncertainty && !sizes.pre.uncertainty {
         let fresh = recipe.network.init(recipe.train.seed, &device.device);
-        network = network.with_error_of(fresh);
-        sizes.pre.error = true;
+        network = network.with_uncertainty_head_of(fresh);
+        sizes.pre.uncertainty = true;
     }
     if sizes != recipe.network {
         return Err(Fault::new(
             "these weights are for a network of other sizes than the recipe's",
             path.display(),
-            "choose the recipe that they were trained with, its [network] table, or that with one round more or with errors told",
+            "choose the recipe that they were trained with, its [network] table, or that with one more refinement stage or with an uncertainty head",
         ));
     }
     Ok(Box::new(network))

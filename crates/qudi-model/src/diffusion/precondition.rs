@@ -1,71 +1,74 @@
-//! The diffusion's images around the pre-denoised one, in numbers of unit variance at every diffusion time (Karras et al. 2022,
-//! section 5 and table 1, "EDM", around a mean that is known).
+//! Preconditioning around the pre-denoised image: inputs and output of unit variance at every timestep (Karras et al.
+//! 2022, section 5 and table 1, "EDM", around a known mean).
 //!
-//! Late in sampling, noise is as small as what the pre-denoiser has left wrong. A network that must tell a few hundredths of
-//! difference between two images, and give them back, learns little else for a long time.
+//! Late in sampling, noise is as small as what the pre-denoiser has left wrong. A network that must find a few
+//! hundredths of difference between two images, and give them back, learns little else for a long time.
 
-use crate::diffusion::sampler::TIMES;
 use crate::diffusion::schedule::NoiseSchedule;
-use crate::network::State;
+use crate::diffusion::state::DiffusionState;
+use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use burn::tensor::Tensor;
 
-/// Most errors that the previous estimate's difference counts.
-const MOST: f32 = 5.0;
+/// The largest difference of the previous estimate, in sigmas.
+const MAX_PREVIOUS: f32 = 5.0;
 
-/// Most of the logarithm of how clear the noisy image is.
-const CLEAREST: f32 = 4.0;
+/// The largest magnitude of the logarithm of the signal-to-noise ratio.
+const MAX_LOG_SNR: f32 = 4.0;
 
-/// A noisy image and the estimate before it, `[images, 1, H, W]` each.
+/// The network's diffusion inputs, and how its output becomes an image; `[images, 1, H, W]` each.
+///
+/// The names are those of Karras et al. 2022, table 1.
 #[derive(Clone, Debug)]
 pub(crate) struct Preconditioned {
-    /// The pre-denoised image in [-1, 1].
-    pub(crate) base: Tensor<4>,
-    /// The noisy image's difference from what the pre-denoised one would be at this time, in deviations.
+    /// The pre-denoised image in [-1, 1]: the mean of what is possible before any noise is seen.
+    pub(crate) mean: Tensor<4>,
+    /// The noisy image's difference from the noisy mean, in its sigma.
     pub(crate) residual: Tensor<4>,
-    /// The previous estimate's difference from the pre-denoised image in deviations of its errors; zero where there is none.
-    pub(crate) earlier: Tensor<4>,
-    /// Half the logarithm of how large those errors are beside the noise.
-    pub(crate) clarity: Tensor<4>,
-    /// What the prediction takes of the residual.
-    known: Tensor<4>,
-    /// What it takes of the correction: the deviation of what is still unknown if errors are white.
-    pub(crate) unknown: Tensor<4>,
+    /// The previous estimate's difference from the mean in sigmas of the mean's errors; zero where there is none.
+    pub(crate) previous: Tensor<4>,
+    /// Half the logarithm of the ratio of the mean's errors to the noise.
+    pub(crate) log_snr: Tensor<4>,
+    /// The share of the residual in the prediction.
+    c_skip: Tensor<4>,
+    /// The factor of the correction in the prediction: sigma of what is unknown if errors are white.
+    pub(crate) c_out: Tensor<4>,
 }
 
 impl Preconditioned {
-    /// Of a state; `error` the deviation of the errors of `base`, both in [-1, 1].
-    pub(crate) fn new(base: Tensor<4>, error: Tensor<4>, state: &State) -> Self {
-        let schedule = NoiseSchedule::cosine(TIMES);
-        let images = base.dims()[0];
-        let bursts = state.times.len();
+    /// Preconditions a state around `mean`, whose errors have `sigma`; both in [-1, 1].
+    pub(crate) fn new(mean: Tensor<4>, sigma: Tensor<4>, state: &DiffusionState) -> Self {
+        let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+        let images = mean.dims()[0];
+        let bursts = state.timesteps.len();
         let each = |values: Vec<f32>| {
-            let values = Tensor::<1>::from_floats(values.as_slice(), &base.device());
+            let values = Tensor::<1>::from_floats(values.as_slice(), &mean.device());
             let values = values.reshape([bursts, 1]).repeat_dim(1, images / bursts);
-            values.reshape([images, 1, 1, 1]).expand(base.dims())
+            values.reshape([images, 1, 1, 1]).expand(mean.dims())
         };
         let level = |f: fn(f64) -> f64| {
-            let value = |&time: &usize| f(schedule.alpha_bar(Some(time))) as f32;
-            each(state.times.iter().map(value).collect())
+            let value = |&timestep: &usize| f(schedule.alpha_bar(Some(timestep))) as f32;
+            each(state.timesteps.iter().map(value).collect())
         };
         let (signal, noise) = (level(f64::sqrt), level(|a| (1.0 - a).sqrt()));
-        let flag = each(state.known.iter().map(|&known| f32::from(u8::from(known))).collect());
-        let left = error.clone() * signal.clone();
-        let scale = (left.clone().powi_scalar(2) + noise.clone().powi_scalar(2)).sqrt();
-        let earlier = (state.x0_prev.clone() - base.clone()) / error.clone();
-        let clarity = (left.clone() / noise.clone()).log().clamp(-CLEAREST, CLEAREST);
+        let flags = state.has_previous.iter().map(|&has| f32::from(u8::from(has)));
+        let flag = each(flags.collect());
+        let scaled = sigma.clone() * signal.clone();
+        let total = (scaled.clone().powi_scalar(2) + noise.clone().powi_scalar(2)).sqrt();
+        let previous = (state.x0_prev.clone() - mean.clone()) / sigma.clone();
+        let log_snr = (scaled.clone() / noise.clone()).log().clamp(-MAX_LOG_SNR, MAX_LOG_SNR);
         Self {
-            residual: (state.x_t.clone() - base.clone() * signal) / scale.clone(),
-            earlier: earlier.clamp(-MOST, MOST) * flag,
-            clarity: clarity * 0.5,
-            known: error.clone() * left / scale.clone(),
-            unknown: error * noise / scale,
-            base,
+            residual: (state.x_t.clone() - mean.clone() * signal) / total.clone(),
+            previous: previous.clamp(-MAX_PREVIOUS, MAX_PREVIOUS) * flag,
+            log_snr: log_snr * 0.5,
+            c_skip: sigma.clone() * scaled / total.clone(),
+            c_out: sigma * noise / total,
+            mean,
         }
     }
 
-    /// The clean image in [-1, 1]: what is expected if errors of the pre-denoised image were white, and a `correction`.
+    /// The clean image in [-1, 1]: the posterior mean if the errors of the mean were white, and a `correction`.
     pub(crate) fn prediction(self, correction: Tensor<4>) -> Tensor<4> {
-        self.base + self.residual * self.known + correction * self.unknown
+        self.mean + self.residual * self.c_skip + correction * self.c_out
     }
 }
 
@@ -79,43 +82,44 @@ mod tests {
         Tensor::full([1, 1, 2, 2], value, &Device::flex())
     }
 
-    fn noisy(time: usize, error: f32, known: bool) -> Preconditioned {
+    fn noisy(timestep: usize, sigma: f32, has_previous: bool) -> Preconditioned {
         let (x_t, x0_prev) = (image(0.5), image(0.3));
-        let state = State { x_t, x0_prev, known: vec![known], times: vec![time] };
-        Preconditioned::new(image(0.2), image(error), &state)
+        let (has_previous, timesteps) = (vec![has_previous], vec![timestep]);
+        let state = DiffusionState { x_t, x0_prev, has_previous, timesteps };
+        Preconditioned::new(image(0.2), image(sigma), &state)
     }
 
     fn first(image: Tensor<4>) -> f32 {
         read(image).unwrap_or_else(|e| panic!("{e}"))[0]
     }
 
-    fn prediction(time: usize, error: f32, correction: f32) -> f32 {
-        first(noisy(time, error, true).prediction(image(correction)))
+    fn prediction(timestep: usize, sigma: f32, correction: f32) -> f32 {
+        first(noisy(timestep, sigma, true).prediction(image(correction)))
     }
 
     /// Bayes' rule for a normal prior around the pre-denoised image and normal noise.
     #[test]
-    fn what_is_expected_without_a_correction_is_the_posterior_mean() {
-        let schedule = NoiseSchedule::cosine(TIMES);
-        for (time, error) in [(20, 0.1), (50, 0.05), (300, 0.3)] {
-            let signal = schedule.alpha_bar(Some(time));
-            let (prior, noise) = (1.0 / (error * error), signal / (1.0 - signal));
+    fn prediction_without_correction_is_the_posterior_mean() {
+        let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+        for (timestep, sigma) in [(20, 0.1), (50, 0.05), (300, 0.3)] {
+            let signal = schedule.alpha_bar(Some(timestep));
+            let (prior, noise) = (1.0 / (sigma * sigma), signal / (1.0 - signal));
             let expected = (prior * 0.2 + noise * 0.5 / signal.sqrt()) / (prior + noise);
-            let got = f64::from(prediction(time, error as f32, 0.0));
-            assert!((got - expected).abs() < 1e-6, "{got} and {expected} at {time}");
+            let got = f64::from(prediction(timestep, sigma as f32, 0.0));
+            assert!((got - expected).abs() < 1e-6, "{got} and {expected} at {timestep}");
         }
     }
 
     #[test]
-    fn noise_alone_says_nothing() {
-        assert!((prediction(TIMES - 1, 0.1, 0.5) - (0.2 + 0.1 * 0.5)).abs() < 1e-5);
-        assert_eq!(first(noisy(TIMES - 1, 0.1, true).clarity), -2.0);
+    fn noise_alone_leaves_the_mean() {
+        assert!((prediction(NUM_TIMESTEPS - 1, 0.1, 0.5) - (0.2 + 0.1 * 0.5)).abs() < 1e-5);
+        assert_eq!(first(noisy(NUM_TIMESTEPS - 1, 0.1, true).log_snr), -2.0);
     }
 
     #[test]
-    fn an_estimate_is_seen_only_where_there_is_one() {
-        assert!((first(noisy(100, 0.1, true).earlier) - 1.0).abs() < 1e-6);
-        assert_eq!(first(noisy(100, 0.001, true).earlier), MOST);
-        assert_eq!(first(noisy(100, 0.1, false).earlier), 0.0);
+    fn previous_estimate_is_seen_only_where_it_exists() {
+        assert!((first(noisy(100, 0.1, true).previous) - 1.0).abs() < 1e-6);
+        assert_eq!(first(noisy(100, 0.001, true).previous), MAX_PREVIOUS);
+        assert_eq!(first(noisy(100, 0.1, false).previous), 0.0);
     }
 }

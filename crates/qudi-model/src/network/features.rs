@@ -1,7 +1,7 @@
 //! Spatio-temporal features: 3-D convolutions over the frames, on three levels.
 
+use super::layers::resample::pixel_unshuffle;
 use super::layers::{Bias, Conv3d};
-use super::resample::fold;
 use crate::config::FeaturesConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -29,7 +29,7 @@ pub struct HighFeatures {
 }
 
 impl FeaturesConfig {
-    /// The features of the measurements, weights zero.
+    /// The features of the measurements, all weights zero.
     pub fn init_low(&self, fold: usize, device: &Device) -> LowFeatures {
         let [full, half, quarter] = self.low;
         let planes = fold * fold;
@@ -42,7 +42,7 @@ impl FeaturesConfig {
         }
     }
 
-    /// The features of the noisy image, weights zero.
+    /// The features of the noisy image, all weights zero.
     pub fn init_high(&self, fold: usize, device: &Device) -> HighFeatures {
         let [full, half, quarter] = self.high;
         HighFeatures {
@@ -55,34 +55,44 @@ impl FeaturesConfig {
 }
 
 impl LowFeatures {
-    /// What does not depend on the step: `u` is `[images, 1, H, W]`.
-    pub fn prepare(&self, u: Tensor<4>, frames: usize) -> Tensor<4> {
-        self.static_in.linear(fold(u, self.fold), frames)
+    /// Encodes what does not depend on the step.
+    ///
+    /// # Shapes
+    /// - u: `[images, 1, height, width]`
+    pub fn encode(&self, u: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.static_in.linear(pixel_unshuffle(u, self.fold), frames)
     }
 
-    /// `prepared` as from [`Self::prepare`]; `u_sim` and the pre-denoised `d` are `[images, 1, H, W]`.
+    /// The features of encoded measurements, simulated measurements and pre-denoised frames `d`.
+    ///
+    /// # Shapes
+    /// - encoded: as [`Self::encode`] gives it
+    /// - u_sim, d: `[images, 1, height, width]`
     pub fn forward(
         &self,
-        prepared: Tensor<4>,
+        encoded: Tensor<4>,
         u_sim: Tensor<4>,
         d: Tensor<4>,
         frames: usize,
     ) -> Pyramid {
-        let moving = fold(Tensor::cat(vec![u_sim, d], 1), self.fold);
-        let full = self.moving_in.add_relu(moving, frames, prepared);
-        let half = self.half.halve_relu(full.clone(), frames);
-        let quarter = self.quarter.halve_relu(half.clone(), frames);
+        let moving = pixel_unshuffle(Tensor::cat(vec![u_sim, d], 1), self.fold);
+        let full = self.moving_in.add_relu(moving, frames, encoded);
+        let half = self.half.stride2_relu(full.clone(), frames);
+        let quarter = self.quarter.stride2_relu(half.clone(), frames);
         [full, half, quarter]
     }
 }
 
 impl HighFeatures {
-    /// `residual`, `earlier`: the noisy image and the estimate before it around the pre-denoised one, `[images, 1, H, W]`.
-    pub fn forward(&self, residual: Tensor<4>, earlier: Tensor<4>, frames: usize) -> Pyramid {
-        let planes = fold(Tensor::cat(vec![residual, earlier], 1), self.fold);
+    /// The features of the noisy image and of the previous estimate, both relative to the pre-denoised frames.
+    ///
+    /// # Shapes
+    /// - residual, previous: `[images, 1, height, width]`
+    pub fn forward(&self, residual: Tensor<4>, previous: Tensor<4>, frames: usize) -> Pyramid {
+        let planes = pixel_unshuffle(Tensor::cat(vec![residual, previous], 1), self.fold);
         let full = self.first.relu(planes, frames);
-        let half = self.half.halve_relu(full.clone(), frames);
-        let quarter = self.quarter.halve_relu(half.clone(), frames);
+        let half = self.half.stride2_relu(full.clone(), frames);
+        let quarter = self.quarter.stride2_relu(half.clone(), frames);
         [full, half, quarter]
     }
 }

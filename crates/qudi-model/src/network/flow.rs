@@ -1,9 +1,9 @@
-//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what steps of Lucas
-//! and Kanade find on every level.
+//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what steps of
+//! Lucas and Kanade find on every level.
 
+use super::layers::resample::{avg_pool2, by_burst, rescale_flow, shrink, upsample2};
 use super::layers::{Bias, Conv2d, FLOW_CORRECTION};
 use super::lucas_kanade::lucas_kanade;
-use super::resample::{by_burst, double, halve, rescale_flow, shrink};
 use crate::config::FlowConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -27,7 +27,7 @@ struct Level {
     layers: Vec<Conv2d>,
 }
 
-/// See the module.
+/// The flow network.
 #[derive(Module, Debug)]
 pub struct Flow {
     /// Finest first.
@@ -40,7 +40,7 @@ pub struct Flow {
 }
 
 impl FlowConfig {
-    /// The flow network, weights zero; `off` says that nothing moves.
+    /// The flow network, all weights zero; `off` says that nothing moves.
     pub fn init(&self, off: bool, device: &Device) -> Flow {
         let [a, b, c, d] = self.widths;
         let sizes = [[4, a], [a, b], [b, c], [c, d], [d, 2]];
@@ -56,13 +56,16 @@ impl FlowConfig {
 }
 
 impl Flow {
-    /// Flows between frames: registered are the guide's `clean` images; the networks see the pre-denoised frames `d`.
-    /// Both `[bursts * frames, 1, height, width]`;
-    /// `variance` is that of the linear estimate's noise at the mean light, `[bursts * frames, 1, 1, 1]`.
+    /// Estimates the flows between frames. Lucas and Kanade's steps register the `reference` estimate; the networks
+    /// see the pre-denoised frames `d`.
+    ///
+    /// # Shapes
+    /// - d, reference: `[bursts * frames, 1, height, width]`
+    /// - variance, of the linear estimate's noise at the mean light: `[bursts * frames, 1, 1, 1]`
     pub fn forward(
         &self,
         d: Tensor<4>,
-        clean: Tensor<4>,
+        reference: Tensor<4>,
         variance: Tensor<4>,
         frames: usize,
     ) -> Flows {
@@ -73,21 +76,21 @@ impl Flow {
             return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
         }
         // Both directions of every pair of neighbours at once; both kinds of image as channels.
-        let finest = shrink(Tensor::cat(vec![d, clean.detach()], 1), self.scale);
-        let mut references = both(finest, frames);
+        let finest = shrink(Tensor::cat(vec![d, reference.detach()], 1), self.scale);
+        let mut finer = both(finest, frames);
         let mut pyramid = Vec::with_capacity(self.pyramid);
         for _ in 1..self.pyramid {
-            let coarser = (halve(references.0.clone()), halve(references.1.clone()));
-            pyramid.push(std::mem::replace(&mut references, coarser));
+            let coarser = (avg_pool2(finer.0.clone()), avg_pool2(finer.1.clone()));
+            pyramid.push(std::mem::replace(&mut finer, coarser));
         }
-        pyramid.push(references);
+        pyramid.push(finer);
         let (variance, _) = both(variance, frames);
         let [pairs, _, h, w] = pyramid[self.pyramid - 1].0.dims();
         let mut flow = Tensor::zeros([pairs, 2, h, w], &variance.device());
         // Coarsest first.
         for (number, (reference, neighbour)) in pyramid.into_iter().enumerate().rev() {
             if number + 1 < self.pyramid {
-                flow = double(flow) * 2.0;
+                flow = upsample2(flow) * 2.0;
             }
             let kind = |x: &Tensor<4>, channel| x.clone().narrow(1, channel, 1);
             let (i, j) = (kind(&reference, 1), kind(&neighbour, 1));
@@ -125,9 +128,11 @@ impl Level {
 }
 
 impl Flows {
-    /// How far warped neighbours are from the images, mean of absolute differences, `[1]`. `images` are the true frames,
-    /// `[bursts * frames, 1, height, width]`; flow is judged on its own grid.
-    pub fn misfit(&self, images: Tensor<4>, frames: usize) -> Tensor<1> {
+    /// The mean absolute difference between warped neighbours and frames, `[1]`, on the grid of the flow.
+    ///
+    /// # Shapes
+    /// - images, the true frames: `[bursts * frames, 1, height, width]`
+    pub fn warping_error(&self, images: Tensor<4>, frames: usize) -> Tensor<1> {
         let images = shrink(images, self.scale);
         let one = |next: bool, flow: &Tensor<4>| {
             let warped = warp(shifted(images.clone(), frames, next), flow.clone());

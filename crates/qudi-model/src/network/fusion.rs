@@ -2,9 +2,9 @@
 
 use super::features::Pyramid;
 use super::flow::{Flows, shifted};
+use super::layers::dense_block::DenseBlock;
+use super::layers::resample::{avg_pool2, by_burst};
 use super::layers::{Bias, Conv2d};
-use super::pre::DenseBlock;
-use super::resample::{by_burst, halve};
 use crate::config::{FeaturesConfig, FusionConfig};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -18,7 +18,7 @@ struct Cell {
     leave: Conv2d,
 }
 
-/// See the module.
+/// The temporal fusion.
 #[derive(Module, Debug)]
 pub struct Fusion {
     enter: Vec<Conv2d>,
@@ -29,7 +29,7 @@ pub struct Fusion {
 }
 
 impl FusionConfig {
-    /// The fusion of features of these widths and of `pre` features of the pre-denoiser, weights zero.
+    /// The fusion of features of these widths and of `pre` features of the pre-denoiser, all weights zero.
     pub fn init(
         &self,
         features: &FeaturesConfig,
@@ -62,7 +62,7 @@ impl FusionConfig {
 }
 
 impl Fusion {
-    /// Fused features on three levels from those of measurements, noisy image and pre-denoiser (level 0).
+    /// Fuses the features of measurements, noisy image and pre-denoiser (level 0), on three levels.
     pub fn forward(
         &self,
         low: Pyramid,
@@ -79,7 +79,7 @@ impl Fusion {
                 inputs.push(pre.clone());
             }
             if k > level {
-                inputs.push(halve(fused[k - 1].clone()));
+                inputs.push(avg_pool2(fused[k - 1].clone()));
             }
             let x = self.enter[k].relu(&inputs);
             fused.push(if k > level {

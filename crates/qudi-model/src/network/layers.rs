@@ -1,15 +1,20 @@
 //! Layers that several blocks use.
 
+pub(super) mod attention;
+pub(super) mod dense_block;
+pub(super) mod embedding;
+pub(super) mod resample;
+
 use burn::module::{Module, Param, ParamId};
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 
-/// What of a last layer's output corrects a flow, in cells. Adam moves all weights by the same amount: the sum of a whole
-/// layer's would jump.
+/// The factor of a last layer's output that corrects a flow, in cells. Adam moves all weights by the same amount: the
+/// sum of a whole layer's would jump.
 pub(super) const FLOW_CORRECTION: f32 = 0.1;
 
-/// What of a last layer's output corrects an image, in deviations of the guide's noise.
+/// The factor of a last layer's output that corrects an image, in sigmas of the merged frame's noise.
 pub(super) const CORRECTION: f32 = 0.3;
 
 /// A convolution of frames one by one.
@@ -69,7 +74,7 @@ fn bias_or_zeros<const D: usize>(bias: Option<&Param<Tensor<1>>>, weight: &Tenso
 }
 
 impl Conv2d {
-    /// A layer of zeros; [`super::fill`] gives weights their values by name.
+    /// A layer of zeros; [`super::init_parameters`] gives weights their values by name.
     pub(super) fn zeros(
         [inputs, outputs]: [usize; 2],
         kernel: usize,
@@ -82,29 +87,24 @@ impl Conv2d {
         }
     }
 
-    /// With `more` inputs after the first `at` ones, without any weight.
-    pub(super) fn with_silent(self, at: usize, more: usize) -> Self {
+    /// Inserts `more` inputs of zero weight after the first `at` ones.
+    pub(super) fn with_zero_inputs(self, at: usize, more: usize) -> Self {
         if more == 0 {
             return self;
         }
-        let weight = self.weights();
+        let weight = self.weight.val();
         let [outputs, inputs, rows, columns] = weight.dims();
-        let silent = Tensor::zeros([outputs, more, rows, columns], &weight.device());
-        let mut parts = vec![weight.clone().narrow(1, 0, at), silent];
+        let zeros = Tensor::zeros([outputs, more, rows, columns], &weight.device());
+        let mut parts = vec![weight.clone().narrow(1, 0, at), zeros];
         if at < inputs {
             parts.push(weight.narrow(1, at, inputs - at));
         }
         Self { weight: Param::from_tensor(Tensor::cat(parts, 1)), ..self }
     }
 
-    /// Its weights, `[outputs, inputs, rows, columns]`.
-    pub(super) fn weights(&self) -> Tensor<4> {
-        self.weight.val()
-    }
-
-    /// Its biases, `[outputs]`; zeros if it has none.
-    pub(super) fn biases(&self) -> Tensor<1> {
-        bias_or_zeros(self.bias.as_ref(), &self.weight.val())
+    /// The number of inputs.
+    pub(super) fn inputs(&self) -> usize {
+        self.weight.lazy_shape().as_slice()[1]
     }
 
     /// The sum alone. `inputs` are joined by channel, `[images, channels, height, width]`.
@@ -117,19 +117,19 @@ impl Conv2d {
         self.call(inputs, Options { addend: Some(addend), ..Options::default() })
     }
 
-    /// The sum and an addend, cut at zero.
+    /// The sum and an addend, then ReLU.
     pub(super) fn add_relu(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
         let activation = Activation::Relu;
         self.call(inputs, Options { addend: Some(addend), activation, ..Options::default() })
     }
 
-    /// The sum, cut at zero.
+    /// The sum, then ReLU.
     pub(super) fn relu(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options { activation: Activation::Relu, ..Options::default() })
     }
 
     /// The sum at every second row and column.
-    pub(super) fn halve(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+    pub(super) fn stride2(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options { stride: 2, ..Options::default() })
     }
 
@@ -154,19 +154,19 @@ impl Conv3d {
         self.call(x, frames, Options::default())
     }
 
-    /// The sum and an addend, cut at zero.
+    /// The sum and an addend, then ReLU.
     pub(super) fn add_relu(&self, x: Tensor<4>, frames: usize, addend: Tensor<4>) -> Tensor<4> {
         let activation = Activation::Relu;
         self.call(x, frames, Options { addend: Some(addend), activation, ..Options::default() })
     }
 
-    /// The sum, cut at zero.
+    /// The sum, then ReLU.
     pub(super) fn relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         self.call(x, frames, Options { activation: Activation::Relu, ..Options::default() })
     }
 
-    /// The sum at every second row and column, cut at zero.
-    pub(super) fn halve_relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+    /// The sum at every second row and column, then ReLU.
+    pub(super) fn stride2_relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         let activation = Activation::Relu;
         self.call(x, frames, Options { stride: 2, activation, ..Options::default() })
     }

@@ -1,93 +1,75 @@
 //! The whole network: pre-denoiser, features, flow, fusion, U-Net.
 
-use super::error::ErrorHead;
-use super::evidence::Evidence;
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
 use super::layers::CORRECTION;
-use super::pre::PreDenoiser;
+use super::lucas_kanade::noise_variance;
+use super::normalized_input::NormalizedInput;
+use super::parameters::{init_parameters, initial_values};
+use super::predenoiser::PreDenoiser;
+use super::uncertainty::UncertaintyHead;
 use super::unet::UNet;
-use super::variance::mean_variance;
+use crate::conditioning::{AlignedTensors, Conditioning};
 use crate::config::{NetworkConfig, Part};
 use crate::diffusion::precondition::Preconditioned;
+use crate::diffusion::state::DiffusionState;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_core::Result;
 
-/// What was measured, `[bursts * frames, 1, height, width]`.
-#[derive(Clone, Debug)]
-pub struct Measured {
-    /// The linear estimate in image units.
-    pub u: Tensor<4>,
-    /// What classical methods make of it, `[bursts * frames, planes, height, width]`
-    /// ([`GuidePlanes`](crate::measurement::GuidePlanes)), with the network's number of neighbours.
-    pub guide: Tensor<4>,
-    /// Numbers of sensor and light, `[bursts, 11]`.
-    pub sensor: Tensor<2>,
-    /// Frames of a burst.
-    pub frames: usize,
-}
-
-/// The simulated measurement of the last estimate.
+/// The simulated measurement of the previous estimate.
+///
+/// # Shapes
+/// - y, u: `[bursts * frames, 1, height, width]`
 #[derive(Clone, Debug)]
 pub struct Simulated {
     /// Counts over full scale.
     pub y: Tensor<4>,
     /// Their linear estimate in image units.
     pub u: Tensor<4>,
-    /// For every burst, whether it has one; both are zero where not.
+    /// Whether each burst has one; both tensors are zero where not.
     pub exists: Vec<bool>,
 }
 
-/// Where the diffusion stands.
+/// A burst's conditioning as the network encodes it, the same in every reverse step.
 #[derive(Clone, Debug)]
-pub struct State {
-    /// The noisy image, `[bursts * frames, 1, height, width]`.
-    pub x_t: Tensor<4>,
-    /// The previous estimate of the clean image, in [-1, 1].
-    pub x0_prev: Tensor<4>,
-    /// For every burst, whether it has one.
-    pub known: Vec<bool>,
-    /// Diffusion time of every burst.
-    pub times: Vec<usize>,
-}
-
-/// What the network makes of a burst's measurement alone, the same in every step.
-#[derive(Clone, Debug)]
-pub struct Prepared {
+pub struct Encoded {
     pre: Tensor<4>,
     low: Tensor<4>,
     sensor: Tensor<2>,
     u: Tensor<4>,
-    evidence: Evidence,
+    input: NormalizedInput,
     /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`.
     variance: Tensor<4>,
     frames: usize,
-    /// The pre-denoised frames and their features, where no simulated measurement changes them ([`Qudi::denoise_once`]).
-    denoised: Option<(Tensor<4>, Tensor<4>)>,
+    /// The pre-denoised frames and their features, where simulated measurements do not change them
+    /// ([`Qudi::predenoise_once`]).
+    predenoised: Option<(Tensor<4>, Tensor<4>)>,
 }
 
-/// What the network says.
+/// The network's prediction.
+///
+/// # Shapes
+/// - x0, c_out, d: `[bursts * frames, 1, height, width]`
 #[derive(Clone, Debug)]
 pub struct Prediction {
     /// The clean image, about in [-1, 1].
     pub x0: Tensor<4>,
-    /// Deviation of what would be unknown of it if errors of the pre-denoised frames were white.
-    pub unit: Tensor<4>,
+    /// The unit of the correction in `x0`: sigma of what is unknown if the errors of the pre-denoised frames are white.
+    pub c_out: Tensor<4>,
     /// The pre-denoised frames, in image units.
     pub d: Tensor<4>,
     /// The flows that were used.
     pub flows: Flows,
 }
 
-/// See the module.
+/// The network of Quanta Diffusion.
 #[derive(Module, Debug)]
 pub struct Qudi {
-    /// Pre-denoisers of the rounds before the last: they make what the guide is found from, and learn no more.
-    drafts: Vec<PreDenoiser>,
+    /// Pre-denoisers of the refinement stages: their frames are what the window is aligned on. They learn no more.
+    stages: Vec<PreDenoiser>,
     pre: PreDenoiser,
-    error: Option<ErrorHead>,
+    uncertainty: Option<UncertaintyHead>,
     low: LowFeatures,
     high: HighFeatures,
     flow: Flow,
@@ -99,20 +81,20 @@ impl NetworkConfig {
     /// The network with initial weights of `seed`, the same on every device. The sizes must be
     /// [checked](Self::checked).
     pub fn init(&self, seed: u64, device: &Device) -> Qudi {
-        let initial = |name: &str, shape: &[usize]| super::weights::initial(seed, name, shape);
-        super::fill(self.shell(device), initial)
+        let initial = |name: &str, shape: &[usize]| initial_values(seed, name, shape);
+        init_parameters(self.uninitialized(device), initial)
     }
 
     /// The network without weights: it takes no memory yet.
-    pub fn shell(&self, device: &Device) -> Qudi {
-        let draft = |_| self.pre.of_drafts().init(self.fold, device);
+    pub fn uninitialized(&self, device: &Device) -> Qudi {
+        let stage = |_| self.pre.stage().init(self.fold, device);
         Qudi {
-            drafts: (1..self.pre.rounds).map(draft).collect(),
+            stages: (1..self.pre.stages).map(stage).collect(),
             pre: self.pre.init(self.fold, device),
-            error: self.pre.init_error(self.fold, device),
+            uncertainty: self.pre.init_uncertainty(self.fold, device),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
-            flow: self.flow.init(self.lacks(Part::Flow), device),
+            flow: self.flow.init(self.ablates(Part::Flow), device),
             fusion: self.fusion.init(&self.features, self.pre.width, self.fold, device),
             unet: self.unet.init(&self.fusion, self.fold, device),
         }
@@ -120,177 +102,157 @@ impl NetworkConfig {
 }
 
 impl Qudi {
-    /// Whether the picture depends on the noise that sampling starts from. It does not where only the pre-denoiser has
-    /// learnt: the U-Net's correction starts at zero.
-    ///
-    /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the device fails.
-    pub fn generates(&self) -> Result<bool> {
-        self.unet.corrects()
-    }
-
-    /// Computes what does not depend on the step.
-    pub fn prepare(&self, measured: &Measured) -> Prepared {
-        let u = measured.u.clone();
-        let evidence = Evidence::new(&measured.guide);
-        Prepared {
-            pre: self.pre.prepare(&evidence),
-            low: self.low.prepare(u.clone(), measured.frames),
-            sensor: self.unet.prepare(measured.sensor.clone()),
-            evidence,
-            variance: mean_variance(&measured.sensor, measured.frames),
-            u,
-            frames: measured.frames,
-            denoised: None,
+    /// Encodes what does not depend on the step.
+    pub fn encode(&self, conditioning: &Conditioning) -> Encoded {
+        let Conditioning { linear_estimate: u, aligned, sensor, frames } = conditioning;
+        let input = NormalizedInput::new(aligned);
+        Encoded {
+            pre: self.pre.encode(&input),
+            low: self.low.encode(u.clone(), *frames),
+            sensor: self.unet.encode(sensor.clone()),
+            input,
+            variance: noise_variance(sensor, *frames),
+            u: u.clone(),
+            frames: *frames,
+            predenoised: None,
         }
     }
 
-    /// Whether simulated measurements change the pre-denoised frames. They do not where the pre-denoiser has learnt before the
-    /// rest.
-    ///
-    /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the device fails.
-    pub fn denoises_anew(&self) -> Result<bool> {
-        self.pre.sees_simulated()
-    }
-
-    /// Denoises once for all steps; only where [`Self::denoises_anew`] is false.
+    /// Pre-denoises once for all steps: only for networks whose pre-denoiser does not see simulated measurements.
     #[must_use]
-    pub fn denoise_once(&self, prepared: Prepared) -> Prepared {
-        let Prepared { pre, evidence, frames, .. } = &prepared;
-        let denoised = self.pre_denoise(pre, evidence, *frames, None);
-        Prepared { denoised: Some(denoised), ..prepared }
+    pub fn predenoise_once(&self, encoded: Encoded) -> Encoded {
+        let predenoised = self.predenoise_with(&encoded, None);
+        Encoded { predenoised: Some(predenoised), ..encoded }
     }
 
     /// Predicts the clean frames. `flows` are those of an earlier step; estimated if there are none.
     pub fn forward(
         &self,
-        prepared: &Prepared,
+        encoded: &Encoded,
         simulated: Option<&Simulated>,
-        state: &State,
+        state: &DiffusionState,
         flows: Option<Flows>,
     ) -> Prediction {
-        self.forward_observed(prepared, simulated, state, flows, &mut |_| ())
+        self.forward_observed(encoded, simulated, state, flows, &mut |_| ())
     }
 
-    /// The pre-denoised frames alone, in image units, of frames and their guide ([`Measured`]), before any simulated
-    /// measurement: all there is where the U-Net does not correct them ([`Self::generates`]). With the deviation of their
-    /// errors, `[images, 1, height, width]`, where the network tells it ([`Self::tells_errors`]); no gradient goes from that
-    /// to anything but its own layers.
-    pub fn denoise(&self, guide: &Tensor<4>) -> (Tensor<4>, Option<Tensor<4>>) {
-        let evidence = Evidence::new(guide);
-        let (d, features) = self.pre.denoise_seen(&evidence);
-        (d, self.error.as_ref().map(|head| head.forward(features.detach(), &evidence)))
+    /// Pre-denoises frames alone, in image units, before any simulated measurement, with their predicted uncertainty
+    /// where the network has a head for it. No gradient goes from the uncertainty to anything but that head.
+    ///
+    /// # Shapes
+    /// - results: `[images, 1, height, width]`
+    pub fn predenoise(&self, aligned: &AlignedTensors) -> (Tensor<4>, Option<Tensor<4>>) {
+        let input = NormalizedInput::new(aligned);
+        let (d, features) = self.pre.predenoise_normalized(&input);
+        (d, self.uncertainty.as_ref().map(|head| head.forward(features.detach(), &input)))
     }
 
-    /// Whether the network tells how far its frames may be off.
-    pub fn tells_errors(&self) -> bool {
-        self.error.is_some()
+    /// Whether the network predicts the uncertainty of its pre-denoised frames.
+    pub fn predicts_uncertainty(&self) -> bool {
+        self.uncertainty.is_some()
     }
 
-    /// The network with the layers of another one of the same sizes that tell its errors.
+    /// The network with the uncertainty head of another one of the same sizes.
     #[must_use]
-    pub fn with_error_of(self, other: Self) -> Self {
-        Self { error: other.error, ..self }
+    pub fn with_uncertainty_head_of(self, other: Self) -> Self {
+        Self { uncertainty: other.uncertainty, ..self }
     }
 
-    /// What a burst's guide goes through before this network sees it, in their order.
-    pub fn drafts(&self) -> &[PreDenoiser] {
-        &self.drafts
+    /// The pre-denoisers of the refinement stages, in their order.
+    pub fn stages(&self) -> &[PreDenoiser] {
+        &self.stages
     }
 
-    /// The network with other drafts, as many as it has.
+    /// The network with other refinement stages, as many as it has.
     #[must_use]
-    pub fn with_drafts(self, drafts: Vec<PreDenoiser>) -> Self {
-        Self { drafts, ..self }
+    pub fn with_stages(self, stages: Vec<PreDenoiser>) -> Self {
+        Self { stages, ..self }
     }
 
-    /// The network for one round more, whose last pre-denoiser starts as a copy of what becomes a draft, and sees `more` frames laid
-    /// upon each besides, which have no say yet.
+    /// Adds a refinement stage: the pre-denoiser becomes that stage, and a copy of it that sees `more` aligned
+    /// neighbours, of zero weight at first, becomes the pre-denoiser.
     #[must_use]
-    pub fn with_round_more(mut self, more: usize) -> Self {
-        self.drafts.push(self.pre.clone());
-        self.pre = self.pre.seeing_more(more);
+    pub fn with_stage_added(mut self, more: usize) -> Self {
+        self.stages.push(self.pre.clone());
+        self.pre = self.pre.with_more_neighbours(more);
         self
     }
 
     /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.
     /// No gradient goes from the flows to the frames.
-    pub fn denoise_and_align(&self, prepared: &Prepared) -> (Tensor<4>, Flows) {
-        let Prepared { pre, evidence, frames, .. } = prepared;
-        let (d, _) = self.pre_denoise(pre, evidence, *frames, None);
-        let flows = self.estimate_flow(prepared, d.clone().detach());
+    pub fn predenoise_and_align(&self, encoded: &Encoded) -> (Tensor<4>, Flows) {
+        let (d, _) = self.predenoise_with(encoded, None);
+        let flows = self.estimate_flow(encoded, d.clone().detach());
         (d, flows)
     }
 
-    fn estimate_flow(&self, prepared: &Prepared, d: Tensor<4>) -> Flows {
-        let clean = prepared.evidence.clean.clone();
-        self.flow.forward(d, clean, prepared.variance.clone(), prepared.frames)
+    fn estimate_flow(&self, encoded: &Encoded, d: Tensor<4>) -> Flows {
+        let reference = encoded.input.reference.clone();
+        self.flow.forward(d, reference, encoded.variance.clone(), encoded.frames)
     }
 
-    /// Deviation of the pre-denoised frames' errors in image units: as told, else some tenths of the merged frames' noise.
-    fn errors(&self, features: &Tensor<4>, evidence: &Evidence) -> Tensor<4> {
-        match &self.error {
-            Some(head) => head.forward(features.clone().detach(), evidence).detach(),
-            None => evidence.deviation.clone() * CORRECTION,
+    /// Sigma of the pre-denoised frames' errors in image units: as predicted, else some tenths of the merged frames'
+    /// noise.
+    fn error_sigma(&self, features: &Tensor<4>, input: &NormalizedInput) -> Tensor<4> {
+        match &self.uncertainty {
+            Some(head) => head.forward(features.clone().detach(), input).detach(),
+            None => input.sigma.clone() * CORRECTION,
         }
     }
 
     /// The pre-denoised frames and their features.
-    fn pre_denoise(
+    fn predenoise_with(
         &self,
-        prepared: &Tensor<4>,
-        evidence: &Evidence,
-        frames: usize,
+        encoded: &Encoded,
         simulated: Option<&Simulated>,
     ) -> (Tensor<4>, Tensor<4>) {
-        let clean = &evidence.clean;
-        let bursts = clean.dims()[0] / frames;
+        let Encoded { pre, input, frames, .. } = encoded;
+        let reference = &input.reference;
+        let bursts = reference.dims()[0] / frames;
         let (y_sim, u_sim, flags) = match simulated {
             Some(simulated) => {
                 let flags = simulated.exists.iter().map(|&exists| f32::from(u8::from(exists)));
                 (simulated.y.clone(), simulated.u.clone(), flags.collect())
             }
-            None => (clean.zeros_like(), clean.zeros_like(), vec![0.0; bursts]),
+            None => (reference.zeros_like(), reference.zeros_like(), vec![0.0; bursts]),
         };
         let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
-        let flag = Tensor::<4>::from_data(flags, &clean.device()).repeat_dim(1, frames);
+        let flag = Tensor::<4>::from_data(flags, &reference.device()).repeat_dim(1, *frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim], 1);
-        self.pre.forward(prepared.clone(), evidence, both, flag)
+        self.pre.forward(pre.clone(), input, both, flag)
     }
 
-    /// [`Self::forward`], telling `done` the name of every block that is done.
+    /// [`Self::forward`], which calls `done` with the name of every block that is done.
     pub fn forward_observed(
         &self,
-        prepared: &Prepared,
+        encoded: &Encoded,
         simulated: Option<&Simulated>,
-        state: &State,
+        state: &DiffusionState,
         flows: Option<Flows>,
         done: &mut dyn FnMut(&'static str),
     ) -> Prediction {
-        let frames = prepared.frames;
-        let u = prepared.u.clone();
+        let frames = encoded.frames;
+        let u = encoded.u.clone();
         let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
-        let (d, features) = prepared.denoised.clone().unwrap_or_else(|| {
-            self.pre_denoise(&prepared.pre, &prepared.evidence, frames, simulated)
-        });
+        let (d, features) =
+            encoded.predenoised.clone().unwrap_or_else(|| self.predenoise_with(encoded, simulated));
         done("pre");
-        let low = self.low.forward(prepared.low.clone(), u_sim, d.clone(), frames);
+        let low = self.low.forward(encoded.low.clone(), u_sim, d.clone(), frames);
         done("low");
-        let evidence = &prepared.evidence;
-        // A deviation spans twice as much in [-1, 1].
-        let error = self.errors(&features, evidence) * 2.0;
-        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, error, state);
-        let high = self.high.forward(noisy.residual.clone(), noisy.earlier.clone(), frames);
+        let input = &encoded.input;
+        // A sigma spans twice as much in [-1, 1].
+        let sigma = self.error_sigma(&features, input) * 2.0;
+        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma, state);
+        let high = self.high.forward(noisy.residual.clone(), noisy.previous.clone(), frames);
         done("high");
-        let flows = flows.unwrap_or_else(|| self.estimate_flow(prepared, d.clone()));
+        let flows = flows.unwrap_or_else(|| self.estimate_flow(encoded, d.clone()));
         done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
-        let (unit, sensor) = (noisy.unknown.clone(), prepared.sensor.clone());
-        let x0 = self.unet.forward(noisy, evidence, fused, &state.times, sensor, frames);
+        let (c_out, sensor) = (noisy.c_out.clone(), encoded.sensor.clone());
+        let x0 = self.unet.forward(noisy, input, fused, &state.timesteps, sensor, frames);
         done("unet");
-        Prediction { x0, unit, d, flows }
+        Prediction { x0, c_out, d, flows }
     }
 }

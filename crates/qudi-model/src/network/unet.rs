@@ -1,23 +1,22 @@
 //! The U-Net that predicts the clean frames (Ho et al. 2020).
 
-use super::attention::Attention;
-use super::embedding::{SENSOR_NUMBERS, sinusoids};
-use super::evidence::Evidence;
 use super::features::Pyramid;
+use super::layers::attention::Attention;
+use super::layers::embedding::sinusoids;
+use super::layers::resample::{pixel_shuffle, pixel_unshuffle, repeat};
 use super::layers::{Bias, Conv2d, GroupNorm, Linear};
-use super::resample::{fold, repeat, unfold};
+use super::normalized_input::NormalizedInput;
+use crate::conditioning::SENSOR_NUMBERS;
 use crate::config::{FusionConfig, UNetConfig};
 use crate::diffusion::precondition::Preconditioned;
-use crate::tensor::read;
 use burn::module::Module;
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_core::Result;
 
 /// Images that the U-Net sees besides the fused features.
 const PLANES: usize = 6;
 
-/// Two convolutions with norms, steered by the embedding.
+/// Two convolutions with norms, modulated by the embedding (FiLM, Perez et al. 2018).
 #[derive(Module, Debug)]
 pub(super) struct ResidualBlock {
     norm1: GroupNorm,
@@ -49,11 +48,11 @@ impl ResidualBlock {
         let scale = film.clone().narrow(1, 0, outputs);
         let shift = film.narrow(1, outputs, outputs);
         let h = self.norm2.film_silu(h, scale, shift);
-        let kept = match &self.skip {
+        let shortcut = match &self.skip {
             Some(skip) => skip.linear(&[x]),
             None => x,
         };
-        self.conv2.add(&[h], kept)
+        self.conv2.add(&[h], shortcut)
     }
 }
 
@@ -94,7 +93,7 @@ struct Middle {
     second: ResidualBlock,
 }
 
-/// See the module.
+/// The U-Net.
 #[derive(Module, Debug)]
 pub struct UNet {
     time_in: Linear,
@@ -115,7 +114,7 @@ pub struct UNet {
 }
 
 impl UNetConfig {
-    /// The U-Net that takes fused features of these widths, weights zero.
+    /// The U-Net that takes fused features of these widths, all weights zero.
     pub fn init(&self, fusion: &FusionConfig, fold: usize, device: &Device) -> UNet {
         let channels: Vec<usize> = self.multipliers.iter().map(|m| m * self.width).collect();
         let levels = channels.len();
@@ -158,47 +157,40 @@ impl UNetConfig {
 }
 
 impl UNet {
-    /// Whether it changes anything: not before it has learnt.
-    pub(super) fn corrects(&self) -> Result<bool> {
-        let mut weights = read(self.out.weights())?;
-        weights.extend(read(self.out.biases())?);
-        Ok(weights.iter().any(|&weight| weight != 0.0))
-    }
-
-    /// The sensor's part of the embedding, `[bursts, M]`; does not depend on the step.
-    pub fn prepare(&self, sensor: Tensor<2>) -> Tensor<2> {
+    /// Encodes the sensor for the embedding, `[bursts, M]`; does not depend on the step.
+    pub fn encode(&self, sensor: Tensor<2>) -> Tensor<2> {
         self.sensor_out.forward(silu(self.sensor_in.forward(sensor)))
     }
 
-    /// The embedding of diffusion times, one for each burst, and of the sensor.
-    fn embed(&self, times: &[usize], sensor: Tensor<2>) -> Tensor<2> {
+    /// The embedding of timesteps, one for each burst, and of the sensor.
+    fn embed(&self, timesteps: &[usize], sensor: Tensor<2>) -> Tensor<2> {
         let [bursts, size] = sensor.dims();
-        let angles = TensorData::new(sinusoids(times, size), [bursts, size]);
+        let angles = TensorData::new(sinusoids(timesteps, size), [bursts, size]);
         let angles = Tensor::from_data(angles, &sensor.device());
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// The prediction, `[images, 1, H, W]` in [-1, 1]: the pre-denoised image, corrected by the noisy one and what the U-Net sees
-    /// in it; `times` one number for each burst; `sensor` as from [`Self::prepare`].
+    /// Predicts the clean image, `[images, 1, H, W]` in [-1, 1]: the pre-denoised image, corrected by the noisy one and
+    /// by what the U-Net sees in it. `timesteps` has one number for each burst; `sensor` is as from [`Self::encode`].
     pub(super) fn forward(
         &self,
         noisy: Preconditioned,
-        evidence: &Evidence,
+        input: &NormalizedInput,
         fused: Pyramid,
-        times: &[usize],
+        timesteps: &[usize],
         sensor: Tensor<2>,
         frames: usize,
     ) -> Tensor<4> {
-        let embedding = silu(self.embed(times, sensor));
-        let Preconditioned { base, residual, earlier, clarity, .. } = noisy.clone();
-        let (restored, difference) = (evidence.signed(), evidence.difference.clone());
-        let planes = vec![base, residual, earlier, restored, difference, clarity];
-        let mut x = self.inp.linear(&[fold(Tensor::cat(planes, 1), self.fold)]);
+        let embedding = silu(self.embed(timesteps, sensor));
+        let Preconditioned { mean, residual, previous, log_snr, .. } = noisy.clone();
+        let (reference, difference) = (input.signed(), input.difference.clone());
+        let planes = vec![mean, residual, previous, reference, difference, log_snr];
+        let mut x = self.inp.linear(&[pixel_unshuffle(Tensor::cat(planes, 1), self.fold)]);
         let mut skips = Vec::new();
         let mut fused = fused.into_iter();
         for (k, level) in self.encoder.iter().enumerate() {
             if k > 0 {
-                x = self.down[k - 1].halve(&[x]);
+                x = self.down[k - 1].stride2(&[x]);
             }
             if let (Some(merge), Some(fused)) = (self.merge.get(k), fused.next()) {
                 x = merge.linear(&[x, fused]);
@@ -223,6 +215,6 @@ impl UNet {
                 x = self.up[k - 1].linear(&[repeat(x)]);
             }
         }
-        noisy.prediction(unfold(self.out.linear(&[self.norm.silu(x)]), self.fold))
+        noisy.prediction(pixel_shuffle(self.out.linear(&[self.norm.silu(x)]), self.fold))
     }
 }

@@ -2,12 +2,12 @@
 
 use crate::dataset::Sample;
 use qudi_core::Size;
-use qudi_model::measurement::GuidePlanes;
+use qudi_model::conditioning::AlignedPlanes;
 
-/// Frames of a burst and what classical restoration makes of all of its frames.
+/// Frames of a burst with their reference estimate and aligned neighbours, made from all of its frames.
 #[derive(Clone, Debug)]
 pub(crate) struct ConditionedBurst {
     pub(crate) size: Size,
     pub(crate) sample: Sample,
-    pub(crate) guide: GuidePlanes,
+    pub(crate) aligned: AlignedPlanes,
 }

@@ -5,12 +5,12 @@ use crate::dataset::Dataset;
 use crate::recipe::Recipe;
 use burn::tensor::Device;
 use qudi_core::{Result, SimError};
-use qudi_model::draft::Draft;
 use qudi_model::network::Qudi;
+use qudi_model::refinement::RefinementStage;
 use qudi_model::restorer::TILE;
 use std::ops::ControlFlow;
 
-/// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the drafts of `network`, on `workers`
+/// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the refinement stages of `network`, on `workers`
 /// threads. `on` hears how many there are and how many there will be, and says whether to go on.
 ///
 /// # Errors
@@ -28,7 +28,7 @@ pub fn draw_bursts(
         return Err(SimError::request("no folder for bursts", "bursts", "name one"));
     };
     let dataset = Dataset::new(&recipe.data, files.pack)?;
-    let drafts = Draft::all(network, &recipe.network, TILE, device);
-    let bursts = BurstSampler::new(recipe, dataset, drafts).with_cache(folder, recipe)?;
+    let stages = RefinementStage::all(network, &recipe.network, TILE, device);
+    let bursts = BurstSampler::new(recipe, dataset, stages).with_cache(folder, recipe)?;
     bursts.draw_all(workers, on)
 }

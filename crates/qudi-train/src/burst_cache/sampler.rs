@@ -6,9 +6,9 @@ use crate::dataset::Dataset;
 use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Result, SimError, Size, USUAL_EXPOSURE};
+use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
 use qudi_model::config::Part;
-use qudi_model::draft::Draft;
-use qudi_model::measurement::{GuidePlanes, Laid, aligned};
+use qudi_model::refinement::{RefinementStage, align};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use std::ops::ControlFlow;
@@ -23,10 +23,10 @@ pub struct BurstSampler {
     dataset: Dataset,
     seed: u64,
     crop: usize,
-    laid: Laid,
-    exposure: bool,
+    neighbours: AlignedNeighbours,
+    mean_level: bool,
     crops: Option<(CropsConfig, Cached)>,
-    drafts: Vec<Draft>,
+    stages: Vec<RefinementStage>,
     cache: Option<Arc<BurstCache>>,
 }
 
@@ -34,8 +34,8 @@ pub struct BurstSampler {
 type Cached = Arc<Vec<OnceLock<CachedBurst>>>;
 
 impl BurstSampler {
-    /// The sampler of a recipe, with the drafts of the network that learns.
-    pub fn new(recipe: &Recipe, dataset: Dataset, drafts: Vec<Draft>) -> Self {
+    /// The sampler of a recipe, with the refinement stages of the network that learns.
+    pub fn new(recipe: &Recipe, dataset: Dataset, stages: Vec<RefinementStage>) -> Self {
         let cells = |crops: CropsConfig| {
             let cached = (0..crops.bursts).map(|_| OnceLock::new()).collect();
             (crops, Arc::new(cached))
@@ -44,10 +44,10 @@ impl BurstSampler {
             dataset,
             seed: recipe.train.seed,
             crop: recipe.data.crop,
-            laid: recipe.network.pre.laid(),
-            exposure: !recipe.network.lacks(Part::Exposure),
+            neighbours: recipe.network.pre.aligned_neighbours(),
+            mean_level: !recipe.network.ablates(Part::MeanLevel),
             crops: recipe.train.crops.map(cells),
-            drafts,
+            stages,
             cache: None,
         }
     }
@@ -57,7 +57,7 @@ impl BurstSampler {
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the recipe has no `train.crops`.
     pub fn with_cache(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
-        let cache = Some(Arc::new(BurstCache::new(folder, recipe, &self.drafts)?));
+        let cache = Some(Arc::new(BurstCache::new(folder, recipe, &self.stages)?));
         Ok(Self { cache, ..self })
     }
 
@@ -67,8 +67,8 @@ impl BurstSampler {
     /// [`SimError`](qudi_core::SimError) if the data cannot be opened again.
     pub fn try_clone(&self) -> Result<Self> {
         let (dataset, cache) = (self.dataset.try_clone()?, self.cache.clone());
-        let (drafts, crops) = (self.drafts.clone(), self.crops.clone());
-        Ok(Self { dataset, crops, drafts, cache, ..*self })
+        let (stages, crops) = (self.stages.clone(), self.crops.clone());
+        Ok(Self { dataset, crops, stages, cache, ..*self })
     }
 
     /// Sample `number`.
@@ -139,7 +139,7 @@ impl BurstSampler {
     fn draw(&mut self, number: u64, frames: Option<usize>) -> Result<ConditionedBurst> {
         let size = Size { height: self.crop, width: self.crop };
         let mut sample = self.dataset.sample(self.seed, number)?;
-        if !self.exposure {
+        if !self.mean_level {
             sample.acquisition.exposure = USUAL_EXPOSURE;
         }
         let all = sample.counts.len();
@@ -148,11 +148,11 @@ impl BurstSampler {
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let alignment = aligned(view, &sample.acquisition, &self.drafts)?;
-        let guide = GuidePlanes::of(&alignment, self.laid, range.clone());
+        let aligned = align(view, &sample.acquisition, &self.stages)?;
+        let aligned = AlignedPlanes::new(&aligned, self.neighbours, range.clone());
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
-        Ok(ConditionedBurst { size, sample, guide })
+        Ok(ConditionedBurst { size, sample, aligned })
     }
 }
 
@@ -184,7 +184,7 @@ mod tests {
     fn pixels(burst: &ConditionedBurst) -> Vec<(u32, u16, u32)> {
         let truth = burst.sample.truth.iter().flat_map(|frame| frame.data.clone());
         let counts = burst.sample.counts.iter().flatten();
-        let pixels = truth.zip(counts).zip(&burst.guide.0[0]);
+        let pixels = truth.zip(counts).zip(&burst.aligned.reference);
         let mut list: Vec<_> = pixels.map(|((t, &y), c)| (t.to_bits(), y, c.to_bits())).collect();
         list.sort_unstable();
         list
@@ -199,7 +199,7 @@ mod tests {
         for number in 0..16 {
             let crop = sample(&mut bursts, number);
             assert!(whole.contains(&pixels(&crop)), "sample {number}");
-            corners.insert(crop.guide.0[0][0].to_bits());
+            corners.insert(crop.aligned.reference[0].to_bits());
         }
         assert!(corners.len() > 4, "two bursts in eight positions, and {} corners", corners.len());
     }
@@ -213,9 +213,8 @@ mod tests {
         let pixels = whole.size.pixels();
         let first = whole.sample.truth.iter().position(|frame| *frame == cached.sample.truth[0]);
         let first = first.unwrap_or_else(|| panic!("no frame of the whole"));
-        for (all, some) in whole.guide.0.iter().zip(&cached.guide.0) {
-            assert!(all[first * pixels..][..2 * pixels] == some[..]);
-        }
+        let part = whole.aligned.map(|all| all[first * pixels..][..2 * pixels].to_vec());
+        assert!(part == cached.aligned);
     }
 
     #[test]
@@ -244,7 +243,7 @@ mod tests {
         };
         let same = |a: &ConditionedBurst, b: &ConditionedBurst| {
             let (one, other) = (&a.sample.acquisition, &b.sample.acquisition);
-            a.guide.0 == b.guide.0
+            a.aligned == b.aligned
                 && a.sample.truth == b.sample.truth
                 && a.sample.counts == b.sample.counts
                 && one.seed == other.seed
@@ -292,12 +291,12 @@ mod tests {
         }
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
-        let network = recipe.network.init(1, &device).with_round_more(0);
-        let drafts = Draft::all(&network, &recipe.network, TILE, &device);
-        let drafted = BurstSampler { drafts, ..of(&recipe) };
-        let mut drafted =
-            drafted.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
-        let error = (0..6).find_map(|number| drafted.sample(number).err());
+        let network = recipe.network.init(1, &device).with_stage_added(0);
+        let stages = RefinementStage::all(&network, &recipe.network, TILE, &device);
+        let refined = BurstSampler { stages, ..of(&recipe) };
+        let mut refined =
+            refined.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
+        let error = (0..6).find_map(|number| refined.sample(number).err());
         assert!(error.is_some_and(|e| e.to_string().contains("was drawn with other")));
 
         other.train.crops = None;

@@ -5,11 +5,12 @@ use super::timesteps::previous_timestep;
 use burn::module::Module;
 use burn::tensor::Tensor;
 use qudi_core::{Result, SimError, Size};
-use qudi_model::diffusion::physics::LoopSensor;
-use qudi_model::diffusion::sampler::TIMES;
+use qudi_model::conditioning::CountPlanes;
+use qudi_model::diffusion::forward_model::ForwardModel;
 use qudi_model::diffusion::schedule::NoiseSchedule;
-use qudi_model::measurement::Planes;
-use qudi_model::network::{Measured, Qudi, Simulated, State};
+use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
+use qudi_model::network::{Qudi, Simulated};
 use qudi_model::tensor::{read, to_tensor};
 
 /// Which results of the previous step the network is given.
@@ -45,25 +46,26 @@ pub(super) fn network_inputs(
     example: &Example<'_>,
     self_conditioning: SelfConditioning,
     options: LoopOptions,
-) -> Result<(State, Option<Simulated>)> {
+) -> Result<(DiffusionState, Option<Simulated>)> {
     let timesteps = example.timesteps;
-    let (x0_prev, known, simulated) = match self_conditioning {
+    let (x0_prev, has_previous, simulated) = match self_conditioning {
         // Where sampling begins, nothing comes before.
-        SelfConditioning::On(seed) if timesteps.iter().any(|&t| t < TIMES - 1) => {
+        SelfConditioning::On(seed) if timesteps.iter().any(|&t| t < NUM_TIMESTEPS - 1) => {
             let (x0_prev, simulated) = first_estimate(network, example, seed)?;
-            let known = simulated.exists.iter().map(|&exists| exists && options.self_conditioning);
-            (x0_prev, known.collect(), Some(simulated).filter(|_| options.forward_model))
+            let has_previous =
+                simulated.exists.iter().map(|&exists| exists && options.self_conditioning);
+            (x0_prev, has_previous.collect(), Some(simulated).filter(|_| options.forward_model))
         }
         _ => (example.truth.zeros_like(), vec![false; timesteps.len()], None),
     };
-    let state =
-        State { x_t: noisy_images(example, timesteps), x0_prev, known, times: timesteps.to_vec() };
+    let (x_t, timesteps) = (noisy_images(example, timesteps), timesteps.to_vec());
+    let state = DiffusionState { x_t, x0_prev, has_previous, timesteps };
     Ok((state, simulated))
 }
 
 /// The true images in [-1, 1] with the example's noise of these timesteps, one per burst.
 fn noisy_images(example: &Example<'_>, timesteps: &[usize]) -> Tensor<4> {
-    let schedule = NoiseSchedule::cosine(TIMES);
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let clean = example.truth.clone() * 2.0 - 1.0;
     let bursts = timesteps.len();
     let [images, _, height, width] = clean.dims();
@@ -86,18 +88,14 @@ fn first_estimate(
     seed: u64,
 ) -> Result<(Tensor<4>, Simulated)> {
     let device = example.truth.device();
-    let measured = Measured {
-        u: example.measured.u.clone().inner(),
-        guide: example.measured.guide.clone().inner(),
-        sensor: example.measured.sensor.clone().inner(),
-        frames: example.measured.frames,
-    };
+    let conditioning = example.conditioning.inner();
     let network = network.valid();
     let previous: Vec<usize> = example.timesteps.iter().map(|&t| previous_timestep(t)).collect();
     let x_t = noisy_images(example, &previous).inner();
-    let known = vec![false; previous.len()];
-    let state = State { x0_prev: x_t.zeros_like(), x_t, known, times: previous };
-    let prediction = network.forward(&network.prepare(&measured), None, &state, None);
+    let has_previous = vec![false; previous.len()];
+    let x0_prev = x_t.zeros_like();
+    let state = DiffusionState { x_t, x0_prev, has_previous, timesteps: previous };
+    let prediction = network.forward(&network.encode(&conditioning), None, &state, None);
     let [_, _, height, width] = example.truth.dims();
     let size = Size { height, width };
     let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;
@@ -108,9 +106,9 @@ fn first_estimate(
             "lower train.lr or train.clip, and resume from the checkpoint",
         ));
     }
-    let burst = measured.frames * size.pixels();
-    let mut planes = Planes { y: Vec::new(), u: Vec::new() };
-    let exists: Vec<bool> = example.timesteps.iter().map(|&t| t < TIMES - 1).collect();
+    let burst = conditioning.frames * size.pixels();
+    let mut planes = CountPlanes::default();
+    let exists: Vec<bool> = example.timesteps.iter().map(|&t| t < NUM_TIMESTEPS - 1).collect();
     for (number, (x0, acquisition)) in
         x0.chunks_exact_mut(burst).zip(example.acquisitions).enumerate()
     {
@@ -121,9 +119,9 @@ fn first_estimate(
             continue;
         }
         let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
-        let sensor = LoopSensor::at(acquisition, example.timesteps[number], TIMES);
-        let first = (number * measured.frames) as u64;
-        let more = sensor.measure(&images, size, first, seed)?;
+        let model = ForwardModel::new(acquisition, example.timesteps[number]);
+        let first = (number * conditioning.frames) as u64;
+        let more = model.measure(&images, size, first, seed)?;
         planes.y.extend(more.y);
         planes.u.extend(more.u);
     }

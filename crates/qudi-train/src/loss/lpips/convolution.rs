@@ -3,7 +3,7 @@
 use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::conv::{Activation, Options, conv_2d};
-use qudi_model::network::fold;
+use qudi_model::network::pixel_unshuffle;
 
 /// A convolution. Its weights are constants: no gradient is kept for them.
 #[derive(Clone, Debug)]
@@ -86,7 +86,7 @@ impl Convolution {
             (padding, whole.saturating_sub(size + padding))
         };
         let x = x.pad([(0, 0), (0, 0), pads(height), pads(width)], PadMode::Constant(0.0));
-        let y = conv_2d(&[fold(x, stride)], weight, bias, options);
+        let y = conv_2d(&[pixel_unshuffle(x, stride)], weight, bias, options);
         y.narrow(2, folded / 2, grid(height)).narrow(3, folded / 2, grid(width))
     }
 }

@@ -1,24 +1,25 @@
-//! How images lie before the network: mirrored at their edges up to what it wants, in tiles, and back.
+//! Images before and after the network: mirrored at their edges up to the size that it needs, and cut into tiles.
 
-use crate::measurement::GuidePlanes;
+use crate::conditioning::{AlignedPlanes, AlignedTensors};
 use crate::restorer::tiles::Tiles;
 use crate::tensor::read;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Frame, Result, Size};
 
-/// See the module.
+/// How images of one size are padded and cut into tiles.
 #[derive(Debug)]
-pub(crate) struct Layout {
-    /// Of the images.
+pub(crate) struct Tiling {
+    /// The size of the images.
     from: Size,
-    /// Of the images, padded.
+    /// The size of the padded images.
     pub(crate) size: Size,
-    /// Of the padded images.
+    /// The tiles of the padded images.
     pub(crate) tiles: Tiles,
 }
 
-impl Layout {
-    /// For images of size `from` and a network that wants multiples of `multiple`, in tiles of about `side` pixels.
+impl Tiling {
+    /// The tiling of images of size `from`, for a network that needs multiples of `multiple`, in tiles of about `side`
+    /// pixels.
     pub(crate) fn new(from: Size, multiple: usize, side: usize) -> Self {
         let size = Size {
             height: from.height.next_multiple_of(multiple),
@@ -29,7 +30,7 @@ impl Layout {
         Self { from, size, tiles: Tiles::new(size, side, overlap, multiple) }
     }
 
-    /// Images mirrored at their lower and right edges.
+    /// Mirrors images at their lower and right edges.
     pub(crate) fn padded(&self, images: &[f32]) -> Vec<f32> {
         let Self { from, size, .. } = self;
         // 0 1 2 3 2 1 0 1 2 ...: the edge itself is not repeated.
@@ -48,7 +49,7 @@ impl Layout {
         values
     }
 
-    /// Padded images as they were before.
+    /// Crops padded images to frames of the original size.
     pub(crate) fn frames(&self, images: &[f32]) -> Vec<Frame> {
         let cropped = |image: &[f32]| {
             let rows = image.chunks_exact(self.size.width).take(self.from.height);
@@ -58,19 +59,18 @@ impl Layout {
         images.chunks_exact(self.size.pixels()).map(cropped).collect()
     }
 
-    /// What `denoise` makes of a frame, in image units, from its padded guide: one image or several, cropped.
-    pub(crate) fn denoised(
+    /// Applies `predenoise` to the padded planes of a frame, tile by tile: one image or several, cropped.
+    pub(crate) fn predenoised(
         &self,
-        guide: &GuidePlanes,
+        planes: &AlignedPlanes,
         device: &Device,
-        denoise: impl Fn(&Tensor<4>) -> Vec<Tensor<4>>,
+        predenoise: impl Fn(&AlignedTensors) -> Vec<Tensor<4>>,
     ) -> Result<Vec<Frame>> {
         let tiles = &self.tiles;
         let mut images: Vec<Vec<f32>> = Vec::new();
         for number in 0..tiles.count() {
-            let guide = guide.map(|plane| tiles.crop(number, plane));
-            let guide = guide.into_tensor(tiles.tile, device);
-            let parts = denoise(&guide);
+            let planes = planes.map(|plane| tiles.crop(number, plane));
+            let parts = predenoise(&planes.into_tensors(tiles.tile, device));
             images.resize(parts.len(), vec![0.0; self.size.pixels()]);
             for (part, image) in parts.into_iter().zip(&mut images) {
                 tiles.blend(number, &read(part)?, image);

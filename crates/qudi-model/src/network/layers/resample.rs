@@ -1,17 +1,21 @@
-//! Grids: folding pixels into channels, flows from one scale to another.
+//! Resampling: pixels into channels, finer and coarser grids, flows from one scale to another.
 
 use burn::tensor::Tensor;
 use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::{AvgPoolOptions, PadMode};
 
 /// `[bursts * frames, c, h, w]` as `[bursts, frames, c, h, w]`.
-pub(super) fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
+pub(in crate::network) fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
     let [images, c, h, w] = x.dims();
     x.reshape([images / frames, frames, c, h, w])
 }
 
-/// Squares of `fold` pixels become channels: `[images, c, h * fold, w * fold]` to `[images, c * fold * fold, h, w]`.
-pub fn fold(x: Tensor<4>, fold: usize) -> Tensor<4> {
+/// Moves squares of `fold` x `fold` pixels into channels.
+///
+/// # Shapes
+/// - x: `[images, channels, height * fold, width * fold]`
+/// - result: `[images, channels * fold * fold, height, width]`
+pub fn pixel_unshuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
     }
@@ -25,8 +29,8 @@ pub fn fold(x: Tensor<4>, fold: usize) -> Tensor<4> {
     ])
 }
 
-/// The inverse of [`fold`].
-pub(super) fn unfold(x: Tensor<4>, fold: usize) -> Tensor<4> {
+/// The inverse of [`pixel_unshuffle`].
+pub(in crate::network) fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
     }
@@ -41,25 +45,29 @@ pub(super) fn unfold(x: Tensor<4>, fold: usize) -> Tensor<4> {
 }
 
 /// Means of 2 x 2 pixels.
-pub fn halve(x: Tensor<4>) -> Tensor<4> {
+///
+/// # Shapes
+/// - x: `[images, channels, height, width]`
+/// - result: `[images, channels, height / 2, width / 2]`
+pub fn avg_pool2(x: Tensor<4>) -> Tensor<4> {
     avg_pool2d(x, AvgPoolOptions::new([2, 2]))
 }
 
 /// Means of `scale` x `scale` pixels, `scale` a power of two.
-pub(super) fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
+pub(in crate::network) fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
     for _ in 0..scale.ilog2() {
-        x = halve(x);
+        x = avg_pool2(x);
     }
     x
 }
 
 /// Twice the size, bilinear with half-pixel centres, edges repeated. Composed: Burn's own has no gradient
 /// on GPUs.
-pub(super) fn double(x: Tensor<4>) -> Tensor<4> {
-    double_axis(double_axis(x, 2), 3)
+pub(in crate::network) fn upsample2(x: Tensor<4>) -> Tensor<4> {
+    upsample2_axis(upsample2_axis(x, 2), 3)
 }
 
-fn double_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
+fn upsample2_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
     let size = x.dims()[axis];
     let mut pads = [(0, 0); 4];
     pads[axis] = (1, 1);
@@ -73,7 +81,7 @@ fn double_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
 }
 
 /// Each pixel twice in both directions.
-pub(super) fn repeat(x: Tensor<4>) -> Tensor<4> {
+pub(in crate::network) fn repeat(x: Tensor<4>) -> Tensor<4> {
     let [images, channels, height, width] = x.dims();
     x.reshape([images, channels, height, 1, width, 1]).repeat(&[1, 1, 1, 2, 1, 2]).reshape([
         images,
@@ -84,21 +92,21 @@ pub(super) fn repeat(x: Tensor<4>) -> Tensor<4> {
 }
 
 /// A flow of one scale on another; both powers of two.
-pub(super) fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
+pub(in crate::network) fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
     let mut scale = from;
     while scale > to {
-        flow = double(flow) * 2.0;
+        flow = upsample2(flow) * 2.0;
         scale /= 2;
     }
     while scale < to {
-        flow = halve(flow) * 0.5;
+        flow = avg_pool2(flow) * 0.5;
         scale *= 2;
     }
     flow
 }
 
 /// Means over squares of `2 * radius + 1` pixels; edges repeated. `radius` is 2 or 4.
-pub(super) fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
+pub(in crate::network) fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
     mean_axis(mean_axis(x, 2, radius), 3, radius)
 }
 
@@ -121,7 +129,7 @@ fn mean_axis(x: Tensor<4>, axis: usize, radius: usize) -> Tensor<4> {
 }
 
 /// Half of what the pixel after has more than the one before, along rows and along columns; edges repeated.
-pub(super) fn differences(x: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
+pub(in crate::network) fn differences(x: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let along = |axis: usize| {
         let size = x.dims()[axis];
         let mut pads = [(0, 0); 4];

@@ -1,11 +1,10 @@
-//! The measurement inside the loop: exact distribution, same counts everywhere, and what the planes say.
+//! The forward model: exact distribution of counts, repeatable counts, unbiased linear estimates.
 #![allow(clippy::unwrap_used)]
 
 use qudi_core::Size;
-use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::{CountLaw, FullWell, Gain, Sensor};
-use qudi_model::diffusion::physics::LoopSensor;
-use qudi_model::measurement::Planes;
+use qudi_model::diffusion::forward_model::ForwardModel;
 
 const SIZE: Size = Size { height: 128, width: 256 };
 
@@ -15,11 +14,11 @@ fn acquisition(sensor: &str, ppp: f64, frames_summed: u32) -> Acquisition {
     Acquisition::new(sensor, ppp, 0.45).unwrap().with_seed(1)
 }
 
-/// Counts of a flat image of value 0.5 by level, measured at a diffusion time.
-fn histogram(acquisition: &Acquisition, time: usize, levels: usize) -> Vec<f64> {
-    let sensor = LoopSensor::at(acquisition, time, 1000);
+/// Counts of a flat image of value 0.5 by level, measured at a timestep.
+fn histogram(acquisition: &Acquisition, timestep: usize, levels: usize) -> Vec<f64> {
+    let model = ForwardModel::new(acquisition, timestep);
     let image = vec![0.5; SIZE.pixels()];
-    let planes = sensor.measure(&image, SIZE, 3, 77).unwrap();
+    let planes = model.measure(&image, SIZE, 3, 77).unwrap();
     let mut histogram = vec![0.0; levels];
     for y in planes.y {
         histogram[(y * (levels - 1) as f32).round() as usize] += 1.0;
@@ -45,21 +44,21 @@ fn check(observed: &[f64], probabilities: &[f64]) {
 }
 
 #[test]
-fn counts_follow_the_sensors_law_under_growing_light() {
+fn counts_follow_the_law_of_the_sensor_under_growing_light() {
     let acquisition = acquisition("qudi-paper", 3.25, 1);
-    for (time, factor) in [(900, 10f64.powf(0.1)), (500, 10f64.powf(0.5)), (0, 10.0)] {
+    for (timestep, factor) in [(900, 10f64.powf(0.1)), (500, 10f64.powf(0.5)), (0, 10.0)] {
         let mut sensor = acquisition.sensor.clone();
         let gain = acquisition.gain / factor;
         sensor.gain = Gain::Fixed(gain);
         sensor.full_well = FullWell::new(sensor.full_well.electrons() * factor);
         let detections = 0.8 * 3.25 * factor * 0.5 / 0.45 + 1.6;
         let law = CountLaw::new(&sensor, gain);
-        check(&histogram(&acquisition, time, 8), &law.probabilities(detections));
+        check(&histogram(&acquisition, timestep, 8), &law.probabilities(detections));
     }
 }
 
 #[test]
-fn sums_of_binary_frames_keep_their_light_and_get_longer() {
+fn sums_of_binary_frames_grow_in_length_at_equal_light() {
     let acquisition = acquisition("swissspad2", 2.0, 7);
     let sensor = Sensor { frames_summed: 22, ..acquisition.sensor.clone() }; // round(7 * sqrt(10))
     let dark = sensor.dark_per_frame().unwrap();
@@ -70,23 +69,23 @@ fn sums_of_binary_frames_keep_their_light_and_get_longer() {
 }
 
 #[test]
-fn the_same_estimate_gives_the_same_counts() {
+fn counts_are_repeatable_by_frame_number() {
     let acquisition = acquisition("qudi-paper", 9.75, 1);
     let image: Vec<f32> = (0..2 * SIZE.pixels()).map(|i| (i % 97) as f32 / 97.0).collect();
-    let sensor = LoopSensor::at(&acquisition, 300, 1000);
-    let measure = |first, seed| sensor.measure(&image, SIZE, first, seed).unwrap();
+    let model = ForwardModel::new(&acquisition, 300);
+    let measure = |first, seed| model.measure(&image, SIZE, first, seed).unwrap();
     let all = measure(5, 9);
     assert_eq!(all, measure(5, 9));
     assert_ne!(all.y, measure(5, 10).y);
     // Frames are drawn by their number in the capture: windows that overlap agree.
-    let second = sensor.measure(&image[SIZE.pixels()..], SIZE, 6, 9).unwrap();
+    let second = model.measure(&image[SIZE.pixels()..], SIZE, 6, 9).unwrap();
     assert_eq!(all.y[SIZE.pixels()..], second.y);
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     assert_eq!(all, one.install(|| measure(5, 9)));
 }
 
 #[test]
-fn the_linear_estimate_is_unbiased_in_image_units() {
+fn linear_estimate_is_unbiased() {
     // Without read noise and with light far from saturation the mean estimate is the image.
     let mut acquisition = acquisition("qudi-paper", 3.25, 1);
     acquisition.sensor.dark = qudi_core::sensor::DarkRate::PerFrame(0.0);
@@ -94,21 +93,7 @@ fn the_linear_estimate_is_unbiased_in_image_units() {
     acquisition.gain = 10.0;
     acquisition.sensor.gain = Gain::Fixed(10.0);
     let image = vec![0.45; SIZE.pixels()];
-    let planes = LoopSensor::at(&acquisition, 1000, 1000).measure(&image, SIZE, 0, 3).unwrap();
+    let planes = ForwardModel::new(&acquisition, 1000).measure(&image, SIZE, 0, 3).unwrap();
     let mean = planes.u.iter().map(|&u| f64::from(u)).sum::<f64>() / planes.u.len() as f64;
     assert!((mean - 0.45).abs() < 0.01, "mean estimate {mean}");
-}
-
-#[test]
-fn planes_hold_counts_over_full_scale_and_follow_a_dark_map() {
-    let mut acquisition = acquisition("qudi-paper", 3.25, 1);
-    let size = Size { height: 1, width: 4 };
-    let frames = [vec![0, 3, 7, 9]];
-    let planes = Planes::of(BurstView { size, frames: &frames }, &acquisition);
-    assert_eq!(planes.y, [0.0, 3.0 / 7.0, 1.0, 1.0]);
-    assert_eq!(planes.u[0], 0.0);
-    acquisition.dark = Some(vec![0.0, 3.0, 1.6, 1.6]);
-    let mapped = Planes::of(BurstView { size, frames: &frames }, &acquisition);
-    assert!(mapped.u[1] < planes.u[1]);
-    assert_eq!(mapped.u[2], planes.u[2]);
 }

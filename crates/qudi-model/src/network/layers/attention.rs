@@ -1,20 +1,21 @@
 //! Self-attention over the cells of a frame, or over the frames of a cell.
 
-use super::layers::{Bias, Conv2d, GroupNorm};
+use super::{Bias, Conv2d, GroupNorm};
 use burn::module::Module;
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::attention;
 
+/// Self-attention with a residual.
 #[derive(Module, Debug)]
-pub(super) struct Attention {
+pub(in crate::network) struct Attention {
     norm: GroupNorm,
     qkv: Conv2d,
     project: Conv2d,
 }
 
 impl Attention {
-    pub(super) fn zeros(channels: usize, device: &Device) -> Self {
+    pub(in crate::network) fn zeros(channels: usize, device: &Device) -> Self {
         Self {
             norm: GroupNorm::zeros(channels, device),
             qkv: Conv2d::zeros([channels, 3 * channels], 1, Bias::Yes, device),
@@ -23,13 +24,13 @@ impl Attention {
     }
 
     /// Every cell attends to the cells of its frame. `x`: `[images, channels, h, w]`.
-    pub(super) fn spatial(&self, x: Tensor<4>) -> Tensor<4> {
+    pub(in crate::network) fn spatial(&self, x: Tensor<4>) -> Tensor<4> {
         let qkv = self.qkv.linear(&[self.norm.plain(x.clone())]);
         self.project.add(&[attention(qkv)], x)
     }
 
     /// Every cell attends to the same cell of the other frames.
-    pub(super) fn temporal(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+    pub(in crate::network) fn temporal(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         let [images, channels, h, w] = x.dims();
         let bursts = images / frames;
         let qkv = self.qkv.linear(&[self.norm.plain(x.clone())]);

@@ -1,0 +1,118 @@
+//! The linear estimate of the image from single counts.
+
+use super::MAX_IMAGE;
+use super::sensor_numbers::dark_per_frame;
+use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::sensor::{CountLaw, Sensor};
+
+/// Counts as the network sees those of a simulated measurement, frame after frame, row-major.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CountPlanes {
+    /// Counts over full scale.
+    pub y: Vec<f32>,
+    /// The linear estimate in image units, in [0, 2].
+    pub u: Vec<f32>,
+}
+
+/// The linear estimates of a captured burst in image units, in [0, 2], frame after frame.
+pub fn linear_estimates(burst: BurstView<'_>, acquisition: &Acquisition) -> Vec<f32> {
+    let response = CountResponse::new(
+        &acquisition.sensor,
+        acquisition.photons_per_unit(),
+        acquisition.gain,
+        dark_per_frame(&acquisition.sensor),
+    );
+    let frame = |counts: &Vec<u16>| -> Vec<f32> {
+        match &acquisition.dark {
+            None => counts.iter().map(|&count| response.of(count).1).collect(),
+            Some(map) => {
+                let pixels = counts.iter().zip(map);
+                pixels.map(|(&count, &dark)| response.estimate(count, f64::from(dark))).collect()
+            }
+        }
+    };
+    burst.frames.iter().flat_map(frame).collect()
+}
+
+/// What a count of a sensor under a certain light means.
+#[derive(Clone, Debug)]
+pub struct CountResponse<'a> {
+    sensor: &'a Sensor,
+    photons_per_unit: f64,
+    gain: f64,
+    /// Count over full scale, and linear estimate of an ordinary pixel, by count.
+    table: Vec<(f32, f32)>,
+}
+
+impl<'a> CountResponse<'a> {
+    /// The response of pixels with `dark` electrons per output frame.
+    pub fn new(sensor: &'a Sensor, photons_per_unit: f64, gain: f64, dark: f64) -> Self {
+        let mut response = Self { sensor, photons_per_unit, gain, table: Vec::new() };
+        let full_scale = f32::from(sensor.max_count());
+        let entry = |count| (f32::from(count) / full_scale, response.estimate(count, dark));
+        response.table = (0..=sensor.max_count()).map(entry).collect();
+        response
+    }
+
+    /// The linear estimate from one count, in image units.
+    fn estimate(&self, count: u16, dark: f64) -> f32 {
+        let photons = self.sensor.estimate_flux(f64::from(count), 1, self.gain, dark);
+        (photons / self.photons_per_unit).min(MAX_IMAGE) as f32
+    }
+
+    /// Sigma of the linear estimate at `detections` expected per output frame, from the exact law of the counts.
+    pub(super) fn linear_sigma(&self, detections: f64) -> f64 {
+        let law = CountLaw::new(self.sensor, self.gain).probabilities(detections);
+        let values = || law.iter().zip(&self.table).map(|(p, &(_, u))| (p, f64::from(u)));
+        let mean: f64 = values().map(|(p, u)| p * u).sum();
+        values().map(|(p, u)| p * (u - mean).powi(2)).sum::<f64>().sqrt()
+    }
+
+    /// The entry of a count. Counts above full scale, which no such sensor gives, count as full scale.
+    fn of(&self, count: u16) -> (f32, f32) {
+        self.table[usize::from(count).min(self.table.len() - 1)]
+    }
+
+    /// Appends a frame to planes.
+    pub fn append(&self, counts: &[u16], planes: &mut CountPlanes) {
+        for &count in counts {
+            let (y, u) = self.of(count);
+            planes.y.push(y);
+            planes.u.push(u);
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use qudi_core::Size;
+
+    #[test]
+    fn planes_hold_counts_over_full_scale() {
+        let sensor = Sensor::load("qudi-paper").unwrap();
+        let gain = sensor.gain_at(3.25).unwrap();
+        let mut planes = CountPlanes::default();
+        CountResponse::new(&sensor, 7.0, gain, 1.6).append(&[0, 3, 7, 9], &mut planes);
+        assert_eq!(planes.y, [0.0, 3.0 / 7.0, 1.0, 1.0]);
+        assert_eq!(planes.u[2], planes.u[3]);
+    }
+
+    #[test]
+    fn linear_estimates_follow_a_dark_map() {
+        let sensor = Sensor::load("qudi-paper").unwrap();
+        let mut acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap();
+        let size = Size { height: 1, width: 4 };
+        let frames = [vec![0, 3, 7, 9]];
+        let estimates = |acquisition: &Acquisition| {
+            linear_estimates(BurstView { size, frames: &frames }, acquisition)
+        };
+        let flat = estimates(&acquisition);
+        assert_eq!(flat[0], 0.0);
+        acquisition.dark = Some(vec![0.0, 3.0, 1.6, 1.6]);
+        let mapped = estimates(&acquisition);
+        assert!(mapped[1] < flat[1]);
+        assert_eq!(mapped[2], flat[2]);
+    }
+}

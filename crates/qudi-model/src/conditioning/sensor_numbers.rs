@@ -1,0 +1,43 @@
+//! The sensor and its light as numbers that the network is given.
+
+use super::count_response::CountResponse;
+use qudi_core::restorer::Acquisition;
+use qudi_core::sensor::{Response, Sensor};
+
+/// How many numbers describe a sensor and its light.
+pub const SENSOR_NUMBERS: usize = 11;
+
+/// The place of log10 of the sigma of the linear estimate at the mean light.
+pub const MEAN_LIGHT_SIGMA: usize = 10;
+
+/// Dark electrons per output frame; none where the sensor does not say.
+pub(crate) fn dark_per_frame(sensor: &Sensor) -> f64 {
+    sensor.dark_per_frame().unwrap_or(0.0)
+}
+
+/// The sensor and its light in numbers (docs/network.md, "Inputs").
+pub fn sensor_numbers(acquisition: &Acquisition) -> [f32; SENSOR_NUMBERS] {
+    let sensor = &acquisition.sensor;
+    let binary = sensor.response == Response::Binary;
+    let light = acquisition.photons_per_unit();
+    let dark = dark_per_frame(sensor);
+    let response = CountResponse::new(sensor, light, acquisition.gain, dark);
+    let log_sigma = |image| {
+        let detections = sensor.quantum_efficiency * image * light + dark;
+        response.linear_sigma(detections).max(1e-4).log10()
+    };
+    [
+        acquisition.ppp.max(1e-6).log10(),
+        acquisition.exposure,
+        sensor.quantum_efficiency,
+        dark,
+        sensor.read_noise,
+        acquisition.gain.max(1e-6).log10(),
+        (f64::from(sensor.max_count()) + 1.0).log2() / 8.0,
+        f64::from(u8::from(binary)),
+        f64::from(sensor.frames_summed).log2() / 8.0,
+        log_sigma(0.0),
+        log_sigma(acquisition.exposure),
+    ]
+    .map(|number| number as f32)
+}

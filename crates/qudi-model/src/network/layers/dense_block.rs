@@ -1,0 +1,35 @@
+//! The residual dense block (Zhang et al. 2018, section 3.3).
+
+use super::{Bias, Conv2d};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+
+/// Dense layers of a block.
+const LAYERS: usize = 3;
+
+/// Layers that each see all layers before, and a residual.
+#[derive(Module, Debug)]
+pub(in crate::network) struct DenseBlock {
+    layers: Vec<Conv2d>,
+    fuse: Conv2d,
+}
+
+impl DenseBlock {
+    pub(in crate::network) fn zeros(width: usize, growth: usize, device: &Device) -> Self {
+        let layer = |l| Conv2d::zeros([width + l * growth, growth], 3, Bias::Yes, device);
+        let all = width + LAYERS * growth;
+        Self {
+            layers: (0..LAYERS).map(layer).collect(),
+            fuse: Conv2d::zeros([all, width], 1, Bias::Yes, device),
+        }
+    }
+
+    /// The result has the shape of `x`, `[images, width, h, w]`.
+    pub(in crate::network) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let mut parts = vec![x.clone()];
+        for layer in &self.layers {
+            parts.push(layer.relu(&parts));
+        }
+        self.fuse.add(&parts, x)
+    }
+}
