@@ -142,7 +142,7 @@ fn what_does_not_fit_is_refused_in_three_parts() {
     refused(
         &folder,
         "restore b.npy -o out --weights nan.safetensors --device cpu",
-        &["no numbers"],
+        &["not finite"],
     );
     qudi(&folder)
         .args("simulate scene:text --size 32x40 --frames 2 --ppp 9.75 -o two.npy -q".split(' '))

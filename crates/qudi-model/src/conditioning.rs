@@ -1,4 +1,5 @@
-//! What the network is given of a burst: named planes of counts and reference estimate, and the sensor in numbers.
+//! What the network is given of a burst: named planes of counts and reference estimate, and the sensor in
+//! numbers.
 
 mod aligned;
 mod count_response;

@@ -54,15 +54,15 @@ pub struct PreConfig {
     pub growth: usize,
     /// Neighbours that are aligned with each frame, the nearest ones.
     pub neighbours: usize,
-    /// Alignments of each neighbour: by the selected motion; with 2 also as matched frame by frame; with 3 also pixel by
-    /// pixel, but only on frames that a refinement stage has restored.
+    /// Alignments of each neighbour: by the selected motion; with 2 also as matched frame by frame; with 3
+    /// also pixel by pixel, but only on frames that a refinement stage has restored.
     #[serde(default = "one", alias = "motions", skip_serializing_if = "is_one")]
     pub alignments: usize,
     /// Channels of the layers that weight neighbours pixel by pixel; 0 for no such layers.
     #[serde(default, alias = "trust", skip_serializing_if = "is_zero")]
     pub weight_channels: usize,
-    /// Pre-denoisers, one after the other. All but the last are refinement stages: the window is aligned again on what
-    /// each of them restores.
+    /// Pre-denoisers, one after the other. All but the last are refinement stages: the window is aligned
+    /// again on what each of them restores.
     #[serde(default = "one", alias = "rounds", skip_serializing_if = "is_one")]
     pub stages: usize,
     /// Whether the last of them predicts the uncertainty of its frames.
@@ -71,7 +71,8 @@ pub struct PreConfig {
 }
 
 impl PreConfig {
-    /// The sizes of the pre-denoiser of a refinement stage, which sees what the only one of a network would see.
+    /// The sizes of the pre-denoiser of a refinement stage, which sees what the only one of a network would
+    /// see.
     #[must_use]
     pub fn stage(&self) -> Self {
         Self { stages: 1, ..self.clone() }

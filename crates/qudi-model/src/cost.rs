@@ -12,9 +12,9 @@ impl NetworkConfig {
         list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum()
     }
 
-    /// Bytes that restoring a window of `frames` frames of `size` takes on the processor at most, about: activations
-    /// of the finest level, `PLANES` times its widths at once. Just what `small` took at 256 x 256 where it was
-    /// measured, half as much again at 512 x 512.
+    /// Bytes that restoring a window of `frames` frames of `size` takes on the processor at most, about:
+    /// activations of the finest level, `PLANES` times its widths at once. Just what `small` took at 256 x
+    /// 256 where it was measured, half as much again at 512 x 512.
     pub fn memory(&self, size: Size, frames: usize) -> u64 {
         const PLANES: f64 = 6.5;
         let widths = self.unet.width + self.fusion.widths[0] + self.pre.width;
@@ -24,8 +24,9 @@ impl NetworkConfig {
         (4.0 * PLANES * widths as f64 * cells + others) as u64
     }
 
-    /// Multiplications of all convolutions in one reverse step that estimates the flow, over `frames` frames of
-    /// `size`; nothing is computed on `device`. Norms, attention scores and the embedding, a few hundredths of it, are left out.
+    /// Multiplications of all convolutions in one reverse step that estimates the flow, over `frames` frames
+    /// of `size`; nothing is computed on `device`. Norms, attention scores and the embedding, a few
+    /// hundredths of it, are left out.
     pub fn multiplications(&self, size: Size, frames: usize, device: &Device) -> usize {
         let pixels = size.pixels() as f64;
         let mut sum = 0.0;

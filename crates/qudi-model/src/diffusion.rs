@@ -1,4 +1,5 @@
-//! The diffusion process: schedule, timesteps, sampler, noise, preconditioning and the sensor's forward model.
+//! The diffusion process: schedule, timesteps, sampler, noise, preconditioning and the sensor's forward
+//! model.
 
 pub mod forward_model;
 pub mod noise;

@@ -1,7 +1,8 @@
-//! Refinement stages: a pre-denoiser restores all frames of a window, and the window is aligned again on them.
+//! Refinement stages: a pre-denoiser restores all frames of a window, and the window is aligned again on
+//! them.
 //!
-//! Better frames show where things are, which neighbours fit and what they look like. Each stage has a pre-denoiser
-//! of its own; the last pre-denoiser of a network is not a stage but what the U-Net starts from.
+//! Better frames show where things are, which neighbours fit and what they look like. Each stage has a
+//! pre-denoiser of its own; the last pre-denoiser of a network is not a stage but what the U-Net starts from.
 
 use crate::conditioning::{AlignedNeighbours, AlignedPlanes, AlignedTensors, MAX_IMAGE};
 use crate::config::NetworkConfig;
@@ -12,8 +13,8 @@ use qudi_burst::{AlignedBurst, ReferenceEstimate};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Frame, Result};
 
-/// Sigma of the errors that a pre-denoised frame does not share with the next one, in units of the sigma of the
-/// merged frame's noise.
+/// Sigma of the errors that a pre-denoised frame does not share with the next one, in units of the sigma of
+/// the merged frame's noise.
 const UNSHARED_SIGMA: f32 = 0.4;
 
 /// A refinement stage of a network.
@@ -27,8 +28,8 @@ pub struct RefinementStage {
 }
 
 impl RefinementStage {
-    /// The stages of a network of sizes `config` whose weights are on `device`, in their order. They see tiles of
-    /// `tile` pixels.
+    /// The stages of a network of sizes `config` whose weights are on `device`, in their order. They see
+    /// tiles of `tile` pixels.
     pub fn all(network: &Qudi, config: &NetworkConfig, tile: usize, device: &Device) -> Vec<Self> {
         let stage = |predenoiser: &PreDenoiser| Self {
             predenoiser: predenoiser.clone(),
@@ -86,7 +87,8 @@ pub(crate) struct PredenoisedFrames {
     pub(crate) noise_sigmas: Vec<Frame>,
 }
 
-/// Pre-denoises the frames of a window one by one. `predenoise` gives the frame, and its uncertainty if predicted.
+/// Pre-denoises the frames of a window one by one. `predenoise` gives the frame, and its uncertainty if
+/// predicted.
 pub(crate) fn predenoise_frames(
     burst: &AlignedBurst<'_>,
     neighbours: AlignedNeighbours,
@@ -106,8 +108,8 @@ pub(crate) fn predenoise_frames(
     Ok(all)
 }
 
-/// Filters frames that were pre-denoised each for itself over time, and clamps them to [0, `max`]. `noise_sigmas`
-/// are those of the merged frames.
+/// Filters frames that were pre-denoised each for itself over time, and clamps them to [0, `max`].
+/// `noise_sigmas` are those of the merged frames.
 pub(crate) fn filter_over_time(
     burst: &AlignedBurst<'_>,
     frames: Vec<Frame>,

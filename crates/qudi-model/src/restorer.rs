@@ -26,8 +26,8 @@ pub const TILE: usize = 512;
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleOptions {
-    /// Reverse steps. 0 restores by regression: the pre-denoised frames, filtered over time. 1 gives the mean of all
-    /// pictures that fit; more steps give sharper ones.
+    /// Reverse steps. 0 restores by regression: the pre-denoised frames, filtered over time. 1 gives the mean
+    /// of all pictures that fit; more steps give sharper ones.
     pub steps: usize,
     /// The spacing of their timesteps.
     pub spacing: TimestepSpacing,
@@ -74,8 +74,8 @@ pub enum QudiRestorer {
 }
 
 impl QudiRestorer {
-    /// The restorer of a model whose weights are on `device`. A model of [`ModelKind::Regression`] restores by
-    /// regression for any number of steps: its U-Net changes nothing.
+    /// The restorer of a model whose weights are on `device`. A model of [`ModelKind::Regression`] restores
+    /// by regression for any number of steps: its U-Net changes nothing.
     ///
     /// # Errors
     /// [`SimError::Request`] for options that make no sense.
@@ -149,7 +149,8 @@ mod tests {
     use qudi_core::Size;
     use qudi_core::sensor::Sensor;
 
-    /// The U-Net of initial weights changes nothing: one step of diffusion gives the pre-denoised frames, in tiles, too.
+    /// The U-Net of initial weights changes nothing: one step of diffusion gives the pre-denoised frames, in
+    /// tiles, too.
     #[test]
     fn diffusion_with_initial_weights_equals_regression() {
         let size = Size { height: 24, width: 48 };

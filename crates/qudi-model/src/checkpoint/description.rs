@@ -30,8 +30,8 @@ pub struct Description {
     /// Reverse diffusion steps unless the user says otherwise; 0 for regression. Older files do not say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default_steps: Option<usize>,
-    /// Which parts of the network have learnt. Writing sets it from the weights; reading an older file, which does not
-    /// say, too.
+    /// Which parts of the network have learnt. Writing sets it from the weights; reading an older file, which
+    /// does not say, too.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub kind: Option<ModelKind>,
 }

@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 pub enum ModelKind {
     /// The pre-denoiser alone: the U-Net changes nothing, and samples would not differ.
     Regression,
-    /// The U-Net, after the pre-denoiser, which learnt without simulated measurements: frames are pre-denoised once for
-    /// all steps.
+    /// The U-Net, after the pre-denoiser, which learnt without simulated measurements: frames are
+    /// pre-denoised once for all steps.
     DiffusionAfterRegression,
     /// All parts together: frames are pre-denoised again in every step.
     Diffusion,

@@ -1,4 +1,5 @@
-//! The planes of aligned frames: reference estimate, merged frame, noise, and standardized counts of all neighbours.
+//! The planes of aligned frames: reference estimate, merged frame, noise, and standardized counts of all
+//! neighbours.
 
 use super::MAX_IMAGE;
 use crate::tensor::to_tensor;
@@ -22,7 +23,8 @@ impl AlignedNeighbours {
         self.alignments.count() * self.neighbours
     }
 
-    /// The number of standardized planes: counts of the frame, then counts and expectations of `K` neighbours.
+    /// The number of standardized planes: counts of the frame, then counts and expectations of `K`
+    /// neighbours.
     pub fn standardized_planes(self) -> usize {
         2 * self.count() + 1
     }
@@ -33,8 +35,8 @@ impl AlignedNeighbours {
     }
 }
 
-/// The planes of aligned frames, frame after frame, row-major. Images are in image units, in [0, 2]; standardized
-/// planes in units of the sigma of the frame's noise ([`AlignedFrame`]).
+/// The planes of aligned frames, frame after frame, row-major. Images are in image units, in [0, 2];
+/// standardized planes in units of the sigma of the frame's noise ([`AlignedFrame`]).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AlignedPlanes {
     /// The reference estimate.

@@ -60,7 +60,8 @@ impl<'a> CountResponse<'a> {
         (photons / self.photons_per_unit).min(MAX_IMAGE) as f32
     }
 
-    /// Sigma of the linear estimate at `detections` expected per output frame, from the exact law of the counts.
+    /// Sigma of the linear estimate at `detections` expected per output frame, from the exact law of the
+    /// counts.
     pub(super) fn linear_sigma(&self, detections: f64) -> f64 {
         let law = CountLaw::new(self.sensor, self.gain).probabilities(detections);
         let values = || law.iter().zip(&self.table).map(|(p, &(_, u))| (p, f64::from(u)));

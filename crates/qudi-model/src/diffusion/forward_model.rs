@@ -1,5 +1,5 @@
-//! The sensor's forward model: every estimate is measured again, under light that grows as the estimate gets certain
-//! (docs/network.md, "Sampling").
+//! The sensor's forward model: every estimate is measured again, under light that grows as the estimate gets
+//! certain (docs/network.md, "Sampling").
 
 use crate::conditioning::{CountPlanes, CountResponse, dark_per_frame};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
@@ -20,8 +20,8 @@ pub struct ForwardModel {
 impl ForwardModel {
     /// The forward model at a timestep.
     ///
-    /// Light, and with it gain and full well, grow by `GROWTH^(1 - t / T)`, so that nothing saturates that did not in
-    /// the capture. Sums of binary frames keep their light and get more frames instead.
+    /// Light, and with it gain and full well, grow by `GROWTH^(1 - t / T)`, so that nothing saturates that
+    /// did not in the capture. Sums of binary frames keep their light and get more frames instead.
     pub fn new(acquisition: &Acquisition, timestep: usize) -> Self {
         let factor = GROWTH.powf(1.0 - timestep as f64 / NUM_TIMESTEPS as f64);
         let mut sensor = acquisition.sensor.clone();
@@ -44,8 +44,8 @@ impl ForwardModel {
         Self { sensor, light: Light { ppp, exposure: acquisition.exposure } }
     }
 
-    /// Measures `frames`, row-major images in [0, 1] of `size`. Frame `i` is number `first + i` of the capture; its
-    /// photons depend on that number and the seed alone.
+    /// Measures `frames`, row-major images in [0, 1] of `size`. Frame `i` is number `first + i` of the
+    /// capture; its photons depend on that number and the seed alone.
     ///
     /// # Errors
     /// [`SimError`](qudi_core::SimError) if the sensor or its light is impossible.

@@ -1,8 +1,8 @@
-//! Preconditioning around the pre-denoised image: inputs and output of unit variance at every timestep (Karras et al.
-//! 2022, section 5 and table 1, "EDM", around a known mean).
+//! Preconditioning around the pre-denoised image: inputs and output of unit variance at every timestep
+//! (Karras et al. 2022, section 5 and table 1, "EDM", around a known mean).
 //!
-//! Late in sampling, noise is as small as what the pre-denoiser has left wrong. A network that must find a few
-//! hundredths of difference between two images, and give them back, learns little else for a long time.
+//! Late in sampling, noise is as small as what the pre-denoiser has left wrong. A network that must find a
+//! few hundredths of difference between two images, and give them back, learns little else for a long time.
 
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::DiffusionState;
@@ -24,7 +24,8 @@ pub(crate) struct Preconditioned {
     pub(crate) mean: Tensor<4>,
     /// The noisy image's difference from the noisy mean, in its sigma.
     pub(crate) residual: Tensor<4>,
-    /// The previous estimate's difference from the mean in sigmas of the mean's errors; zero where there is none.
+    /// The previous estimate's difference from the mean in sigmas of the mean's errors; zero where there is
+    /// none.
     pub(crate) previous: Tensor<4>,
     /// Half the logarithm of the ratio of the mean's errors to the noise.
     pub(crate) log_snr: Tensor<4>,
@@ -66,7 +67,8 @@ impl Preconditioned {
         }
     }
 
-    /// The clean image in [-1, 1]: the posterior mean if the errors of the mean were white, and a `correction`.
+    /// The clean image in [-1, 1]: the posterior mean if the errors of the mean were white, and a
+    /// `correction`.
     pub(crate) fn prediction(self, correction: Tensor<4>) -> Tensor<4> {
         self.mean + self.residual * self.c_skip + correction * self.c_out
     }

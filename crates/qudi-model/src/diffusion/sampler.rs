@@ -32,8 +32,8 @@ pub struct Step {
 }
 
 impl Sampler {
-    /// The reverse steps, first to last: `count`, clamped to `1..=1000`, or fewer where their timesteps would be the
-    /// same. After the last one, `x` is the prediction.
+    /// The reverse steps, first to last: `count`, clamped to `1..=1000`, or fewer where their timesteps would
+    /// be the same. After the last one, `x` is the prediction.
     pub fn steps(
         self,
         schedule: &NoiseSchedule,
@@ -80,8 +80,8 @@ impl Step {
 
 /// Samples a clean image in [-1, 1] from the noise `x`.
 ///
-/// `predict` gives the clean image from a step, the noisy image and the previous prediction, which is zero at the first
-/// step. `noise` gives the fresh noise of a step.
+/// `predict` gives the clean image from a step, the noisy image and the previous prediction, which is zero at
+/// the first step. `noise` gives the fresh noise of a step.
 ///
 /// # Errors
 /// Those of `predict`.

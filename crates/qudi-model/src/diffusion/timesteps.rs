@@ -5,8 +5,8 @@ use super::schedule::NoiseSchedule;
 /// The number of timesteps in training.
 pub const NUM_TIMESTEPS: usize = 1000;
 
-/// Median noise of the log-logistic law: the sigma, in an image from -1 to 1, that hides half of what pre-denoisers
-/// usually leave wrong.
+/// Median noise of the log-logistic law: the sigma, in an image from -1 to 1, that hides half of what
+/// pre-denoisers usually leave wrong.
 const MEDIAN_NOISE: f64 = 0.08;
 
 /// Scale of the log-logistic law: how far the logarithm of the noise lies from its median.
@@ -17,23 +17,25 @@ const SCALE: f64 = 0.6;
 pub enum TimestepSpacing {
     /// Evenly, as in the paper: of ten timesteps one is low enough to show what a good start has left wrong.
     Linear,
-    /// By the quantiles of the log-logistic law of training ([`log_logistic_timestep`]), after the noisiest timestep.
+    /// By the quantiles of the log-logistic law of training ([`log_logistic_timestep`]), after the noisiest
+    /// timestep.
     #[default]
     LogLogistic,
 }
 
 /// The timestep at a quantile in (0, 1) of the log-logistic law by which training draws timesteps.
 ///
-/// Most lie where noise is about as large as what pre-denoisers leave wrong: much more noise hides all of that, much
-/// less hides nothing.
+/// Most lie where noise is about as large as what pre-denoisers leave wrong: much more noise hides all of
+/// that, much less hides nothing.
 pub fn log_logistic_timestep(schedule: &NoiseSchedule, quantile: f64) -> usize {
     schedule.timestep_with_noise(MEDIAN_NOISE * (quantile / (1.0 - quantile)).powf(SCALE))
 }
 
-/// The timesteps that a sampler of `steps` steps visits, noisiest first, each once, and `None` (clean) at the end.
+/// The timesteps that a sampler of `steps` steps visits, noisiest first, each once, and `None` (clean) at the
+/// end.
 ///
-/// These are the last timestep and quantiles of the log-logistic law, or `T s - 1` for `s` from 1 to 0, rounded half
-/// to even. `steps` is clamped to `1..=T`.
+/// These are the last timestep and quantiles of the log-logistic law, or `T s - 1` for `s` from 1 to 0,
+/// rounded half to even. `steps` is clamped to `1..=T`.
 pub fn sampling_timesteps(
     schedule: &NoiseSchedule,
     steps: usize,

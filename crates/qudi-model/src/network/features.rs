@@ -84,7 +84,8 @@ impl LowFeatures {
 }
 
 impl HighFeatures {
-    /// The features of the noisy image and of the previous estimate, both relative to the pre-denoised frames.
+    /// The features of the noisy image and of the previous estimate, both relative to the pre-denoised
+    /// frames.
     ///
     /// # Shapes
     /// - residual, previous: `[images, 1, height, width]`

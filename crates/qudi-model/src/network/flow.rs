@@ -1,5 +1,5 @@
-//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what steps of
-//! Lucas and Kanade find on every level.
+//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what
+//! steps of Lucas and Kanade find on every level.
 
 use super::layers::resample::{avg_pool2, by_burst, rescale_flow, shrink, upsample2};
 use super::layers::{Bias, Conv2d, FLOW_CORRECTION};
@@ -9,8 +9,8 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
 
-/// Flows of every frame to its neighbours, `[bursts * frames, 2, height / scale, width / scale]`, x before y, in
-/// cells of their grid; zero past the ends of a burst.
+/// Flows of every frame to its neighbours, `[bursts * frames, 2, height / scale, width / scale]`, x before y,
+/// in cells of their grid; zero past the ends of a burst.
 #[derive(Clone, Debug)]
 pub struct Flows {
     /// `warp(x[i + 1], to_next[i])` resembles `x[i]`.
@@ -56,8 +56,8 @@ impl FlowConfig {
 }
 
 impl Flow {
-    /// Estimates the flows between frames. Lucas and Kanade's steps register the `reference` estimate; the networks
-    /// see the pre-denoised frames `d`.
+    /// Estimates the flows between frames. Lucas and Kanade's steps register the `reference` estimate; the
+    /// networks see the pre-denoised frames `d`.
     ///
     /// # Shapes
     /// - d, reference: `[bursts * frames, 1, height, width]`
@@ -162,8 +162,8 @@ pub(super) fn shifted(x: Tensor<4>, frames: usize, next: bool) -> Tensor<4> {
     Tensor::cat(parts, 1).reshape([images, c, h, w])
 }
 
-/// References and neighbours: first every frame but the last with the next one, then every frame but the first
-/// with the one before.
+/// References and neighbours: first every frame but the last with the next one, then every frame but the
+/// first with the one before.
 fn both(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
     let [images, c, h, w] = x.dims();
     let pairs = images / frames * (frames - 1);

@@ -10,8 +10,8 @@ use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 
-/// The factor of a last layer's output that corrects a flow, in cells. Adam moves all weights by the same amount: the
-/// sum of a whole layer's would jump.
+/// The factor of a last layer's output that corrects a flow, in cells. Adam moves all weights by the same
+/// amount: the sum of a whole layer's would jump.
 pub(super) const FLOW_CORRECTION: f32 = 0.1;
 
 /// The factor of a last layer's output that corrects an image, in sigmas of the merged frame's noise.

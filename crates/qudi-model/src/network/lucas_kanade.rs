@@ -5,8 +5,8 @@ use crate::conditioning::MEAN_LIGHT_SIGMA;
 use burn::tensor::Tensor;
 use qudi_kernels::warp;
 
-/// Weight of the prior, in variances of a pixel's noise: where that hides what moves, a motion stays as it was. Found
-/// on the validation clips (docs/notes/network/start.md).
+/// Weight of the prior, in variances of a pixel's noise: where that hides what moves, a motion stays as it
+/// was. Found on the validation clips (docs/notes/network/start.md).
 const PRIOR: f32 = 0.005;
 
 /// Radius of the window that moves as one, in cells.
@@ -35,11 +35,12 @@ pub(super) fn noise_variance(sensor: &Tensor<2>, frames: usize) -> Tensor<4> {
     variance.repeat_dim(1, frames).reshape([bursts * frames, 1, 1, 1])
 }
 
-/// How much further than `start` to look into `neighbour` for what `reference` shows, in cells: `[pairs, 2, h, w]`.
+/// How much further than `start` to look into `neighbour` for what `reference` shows, in cells: `[pairs, 2,
+/// h, w]`.
 ///
-/// `reference` and `neighbour`: `[pairs, 1, h, w]`; `start`: `[pairs, 2, h, w]`; `variance` that of their pixels' noise,
-/// `[pairs, 1, 1, 1]`. Every cell's motion minimises squared differences over its window plus the prior, linearised
-/// around the last estimate. No gradient flows through it.
+/// `reference` and `neighbour`: `[pairs, 1, h, w]`; `start`: `[pairs, 2, h, w]`; `variance` that of their
+/// pixels' noise, `[pairs, 1, 1, 1]`. Every cell's motion minimises squared differences over its window plus
+/// the prior, linearised around the last estimate. No gradient flows through it.
 pub(super) fn lucas_kanade(
     reference: Tensor<4>,
     neighbour: Tensor<4>,

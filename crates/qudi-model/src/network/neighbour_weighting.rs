@@ -1,7 +1,7 @@
 //! Robustness weights: how much each aligned neighbour counts at every pixel.
 //!
-//! A layer that sees all neighbours at once can only add them up; whether one of them shows the same thing is a
-//! question to each of them.
+//! A layer that sees all neighbours at once can only add them up; whether one of them shows the same thing is
+//! a question to each of them.
 
 use super::layers::{Bias, Conv2d};
 use crate::config::PreConfig;
@@ -49,12 +49,12 @@ impl PreConfig {
 impl NeighbourWeighting {
     /// Merges the counts of a frame and of its neighbours by their weights.
     ///
-    /// The result has the merged counts in sigmas, the logarithm of how many frames they stand for, and features that
-    /// the neighbours have in common.
+    /// The result has the merged counts in sigmas, the logarithm of how many frames they stand for, and
+    /// features that the neighbours have in common.
     ///
     /// # Shapes
-    /// - planes: `[images, (5 + 2 K) * fold^2, h, w]`: those of the frame alone, its counts last, then the counts of
-    ///   `K` neighbours and what is expected of them
+    /// - planes: `[images, (5 + 2 K) * fold^2, h, w]`: those of the frame alone, its counts last, then the
+    ///   counts of `K` neighbours and what is expected of them
     /// - result: `[images, 2 fold^2 + width, h, w]`
     pub(super) fn forward(&self, planes: &Tensor<4>) -> Tensor<4> {
         let cells = self.fold * self.fold;

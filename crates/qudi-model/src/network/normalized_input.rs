@@ -21,7 +21,8 @@ const CONTRAST_RADIUS: usize = 4;
 pub(super) struct NormalizedInput {
     /// The reference estimate, in image units.
     pub(super) reference: Tensor<4>,
-    /// Sigma of the merged image's noise, in image units; errors of the reference estimate are some tenths of it.
+    /// Sigma of the merged image's noise, in image units; errors of the reference estimate are some tenths of
+    /// it.
     pub(super) sigma: Tensor<4>,
     /// The merged image's difference from the reference estimate.
     pub(super) difference: Tensor<4>,

@@ -89,8 +89,9 @@ const ZERO_AT_FIRST: [&str; 7] = [
     "layers.4.weight",
 ];
 
-/// Initial values: uniform with the variance that keeps the size of signals through a ReLU (He et al. 2015) or a plain
-/// layer. The last layer of every residual branch starts at zero: so a deep network starts as its shortcuts.
+/// Initial values: uniform with the variance that keeps the size of signals through a ReLU (He et al. 2015)
+/// or a plain layer. The last layer of every residual branch starts at zero: so a deep network starts as its
+/// shortcuts.
 pub(super) fn initial_values(seed: u64, name: &str, shape: &[usize]) -> Vec<f32> {
     let count: usize = shape.iter().product();
     if shape.len() == 1 {
@@ -103,8 +104,8 @@ pub(super) fn initial_values(seed: u64, name: &str, shape: &[usize]) -> Vec<f32>
     }
     let gain = if name.starts_with("unet.") { 3.0 } else { 6.0 };
     let bound = (gain / (count / shape[0]) as f32).sqrt();
-    // A stream of its own for every name: adding a layer leaves the others as they were. Former names keep former
-    // initial values.
+    // A stream of its own for every name: adding a layer leaves the others as they were. Former names keep
+    // former initial values.
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(former_name(name).bytes().fold(0xCBF2_9CE4_8422_2325, |hash: u64, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3) // FNV-1a

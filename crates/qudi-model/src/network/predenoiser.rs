@@ -1,4 +1,5 @@
-//! The pre-denoiser: a residual dense network (Zhang et al. 2018) that corrects the reference estimate frame by frame.
+//! The pre-denoiser: a residual dense network (Zhang et al. 2018) that corrects the reference estimate frame
+//! by frame.
 
 use super::layers::dense_block::DenseBlock;
 use super::layers::resample::{pixel_shuffle, pixel_unshuffle};
@@ -50,8 +51,8 @@ impl PreConfig {
 }
 
 impl PreDenoiser {
-    /// Adds inputs for `more` aligned neighbours after those that it has: of zero weight in the first layer, weighted
-    /// by [`NeighbourWeighting`] like the others.
+    /// Adds inputs for `more` aligned neighbours after those that it has: of zero weight in the first layer,
+    /// weighted by [`NeighbourWeighting`] like the others.
     pub(super) fn with_more_neighbours(self, more: usize) -> Self {
         let planes = self.fold * self.fold;
         let inputs = self.static_in.inputs();
@@ -93,8 +94,8 @@ impl PreDenoiser {
     }
 
     /// Corrects the reference estimate: the frames in image units, `[images, 1, H, W]`, and features
-    /// `[images, width, h, w]`. `encoded` is [`Self::encode`] of the same `input`; `simulated` are `y_sim` and
-    /// `u_sim`; `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
+    /// `[images, width, h, w]`. `encoded` is [`Self::encode`] of the same `input`; `simulated` are `y_sim`
+    /// and `u_sim`; `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
     pub(super) fn forward(
         &self,
         encoded: Tensor<4>,

@@ -55,7 +55,8 @@ pub struct Encoded {
 pub struct Prediction {
     /// The clean image, about in [-1, 1].
     pub x0: Tensor<4>,
-    /// The unit of the correction in `x0`: sigma of what is unknown if the errors of the pre-denoised frames are white.
+    /// The unit of the correction in `x0`: sigma of what is unknown if the errors of the pre-denoised frames
+    /// are white.
     pub c_out: Tensor<4>,
     /// The pre-denoised frames, in image units.
     pub d: Tensor<4>,
@@ -66,7 +67,8 @@ pub struct Prediction {
 /// The network of Quanta Diffusion.
 #[derive(Module, Debug)]
 pub struct Qudi {
-    /// Pre-denoisers of the refinement stages: their frames are what the window is aligned on. They learn no more.
+    /// Pre-denoisers of the refinement stages: their frames are what the window is aligned on. They learn no
+    /// more.
     stages: Vec<PreDenoiser>,
     pre: PreDenoiser,
     uncertainty: Option<UncertaintyHead>,
@@ -118,7 +120,8 @@ impl Qudi {
         }
     }
 
-    /// Pre-denoises once for all steps: only for networks whose pre-denoiser does not see simulated measurements.
+    /// Pre-denoises once for all steps: only for networks whose pre-denoiser does not see simulated
+    /// measurements.
     #[must_use]
     pub fn predenoise_once(&self, encoded: Encoded) -> Encoded {
         let predenoised = self.predenoise_with(&encoded, None);
@@ -136,8 +139,9 @@ impl Qudi {
         self.forward_observed(encoded, simulated, state, flows, &mut |_| ())
     }
 
-    /// Pre-denoises frames alone, in image units, before any simulated measurement, with their predicted uncertainty
-    /// where the network has a head for it. No gradient goes from the uncertainty to anything but that head.
+    /// Pre-denoises frames alone, in image units, before any simulated measurement, with their predicted
+    /// uncertainty where the network has a head for it. No gradient goes from the uncertainty to anything but
+    /// that head.
     ///
     /// # Shapes
     /// - results: `[images, 1, height, width]`
@@ -169,8 +173,8 @@ impl Qudi {
         Self { stages, ..self }
     }
 
-    /// Adds a refinement stage: the pre-denoiser becomes that stage, and a copy of it that sees `more` aligned
-    /// neighbours, of zero weight at first, becomes the pre-denoiser.
+    /// Adds a refinement stage: the pre-denoiser becomes that stage, and a copy of it that sees `more`
+    /// aligned neighbours, of zero weight at first, becomes the pre-denoiser.
     #[must_use]
     pub fn with_stage_added(mut self, more: usize) -> Self {
         self.stages.push(self.pre.clone());
@@ -178,8 +182,8 @@ impl Qudi {
         self
     }
 
-    /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is computed.
-    /// No gradient goes from the flows to the frames.
+    /// The pre-denoised frames before any simulated measurement, and the flows between them; nothing else is
+    /// computed. No gradient goes from the flows to the frames.
     pub fn predenoise_and_align(&self, encoded: &Encoded) -> (Tensor<4>, Flows) {
         let (d, _) = self.predenoise_with(encoded, None);
         let flows = self.estimate_flow(encoded, d.clone().detach());
@@ -191,8 +195,8 @@ impl Qudi {
         self.flow.forward(d, reference, encoded.variance.clone(), encoded.frames)
     }
 
-    /// Sigma of the pre-denoised frames' errors in image units: as predicted, else some tenths of the merged frames'
-    /// noise.
+    /// Sigma of the pre-denoised frames' errors in image units: as predicted, else some tenths of the merged
+    /// frames' noise.
     fn error_sigma(&self, features: &Tensor<4>, input: &NormalizedInput) -> Tensor<4> {
         match &self.uncertainty {
             Some(head) => head.forward(features.clone().detach(), input).detach(),

@@ -1,5 +1,5 @@
-//! The predicted uncertainty of the pre-denoised frames: sigma of a normal law that fits their errors pixel by pixel
-//! (Nix and Weigend 1994; Kendall and Gal 2017, section 2.2). It changes no frame.
+//! The predicted uncertainty of the pre-denoised frames: sigma of a normal law that fits their errors pixel
+//! by pixel (Nix and Weigend 1994; Kendall and Gal 2017, section 2.2). It changes no frame.
 
 use super::layers::resample::pixel_shuffle;
 use super::layers::{Bias, CORRECTION, Conv2d};

@@ -170,8 +170,9 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// Predicts the clean image, `[images, 1, H, W]` in [-1, 1]: the pre-denoised image, corrected by the noisy one and
-    /// by what the U-Net sees in it. `timesteps` has one number for each burst; `sensor` is as from [`Self::encode`].
+    /// Predicts the clean image, `[images, 1, H, W]` in [-1, 1]: the pre-denoised image, corrected by the
+    /// noisy one and by what the U-Net sees in it. `timesteps` has one number for each burst; `sensor` is as
+    /// from [`Self::encode`].
     pub(super) fn forward(
         &self,
         noisy: Preconditioned,

@@ -159,7 +159,8 @@ impl DiffusionRestorer {
         model.measure(&images, window.tiling.size, acquisition.first_frame, seed).map(Some)
     }
 
-    /// The network's clean image of tile `number`, in [-1, 1], from the noisy image and the previous estimate.
+    /// The network's clean image of tile `number`, in [-1, 1], from the noisy image and the previous
+    /// estimate.
     fn predict(
         &self,
         window: &Window<'_>,

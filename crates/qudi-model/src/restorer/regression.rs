@@ -15,10 +15,11 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored};
 /// The largest standard deviation that a value in [0, 1] can have (Popoviciu 1935).
 const MAX_UNCERTAINTY: f32 = 0.5;
 
-/// Restores windows with the pre-denoiser alone, without what the U-Net would take: most of the time and memory.
+/// Restores windows with the pre-denoiser alone, without what the U-Net would take: most of the time and
+/// memory.
 ///
-/// The pre-denoiser sees no simulated measurement. Each frame is pre-denoised for itself; the temporal filter joins
-/// them afterwards.
+/// The pre-denoiser sees no simulated measurement. Each frame is pre-denoised for itself; the temporal filter
+/// joins them afterwards.
 #[derive(Debug)]
 pub struct RegressionRestorer {
     network: Qudi,

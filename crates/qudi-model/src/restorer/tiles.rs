@@ -13,8 +13,8 @@ pub(crate) struct Tiles {
 }
 
 impl Tiles {
-    /// Tiles of `side` pixels (smaller where the frame is) that share at least `overlap`; frame, side and overlap are
-    /// multiples of `multiple`, and so are all positions.
+    /// Tiles of `side` pixels (smaller where the frame is) that share at least `overlap`; frame, side and
+    /// overlap are multiples of `multiple`, and so are all positions.
     pub(crate) fn new(frame: Size, side: usize, overlap: usize, multiple: usize) -> Self {
         let starts = |length: usize| {
             let side = side.min(length);
@@ -70,8 +70,8 @@ impl Tiles {
     }
 }
 
-/// Weight of every place of tile `number` along one axis: ramps over the overlaps, normalised by what the other
-/// tiles have there.
+/// Weight of every place of tile `number` along one axis: ramps over the overlaps, normalised by what the
+/// other tiles have there.
 fn shares(starts: &[usize], side: usize, number: usize) -> Vec<f32> {
     let weight = |n: usize, place: usize| -> f32 {
         let Some(i) = place.checked_sub(starts[n]).filter(|&i| i < side) else { return 0.0 };

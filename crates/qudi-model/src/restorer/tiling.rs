@@ -1,4 +1,5 @@
-//! Images before and after the network: mirrored at their edges up to the size that it needs, and cut into tiles.
+//! Images before and after the network: mirrored at their edges up to the size that it needs, and cut into
+//! tiles.
 
 use crate::conditioning::{AlignedPlanes, AlignedTensors};
 use crate::restorer::tiles::Tiles;
@@ -18,8 +19,8 @@ pub(crate) struct Tiling {
 }
 
 impl Tiling {
-    /// The tiling of images of size `from`, for a network that needs multiples of `multiple`, in tiles of about `side`
-    /// pixels.
+    /// The tiling of images of size `from`, for a network that needs multiples of `multiple`, in tiles of
+    /// about `side` pixels.
     pub(crate) fn new(from: Size, multiple: usize, side: usize) -> Self {
         let size = Size {
             height: from.height.next_multiple_of(multiple),
