@@ -106,6 +106,7 @@ fn unsuitable_inputs_and_outputs_are_refused() {
         (vec![scene, "-o", "out.npy", "--visionsim"], "visionsim"),
         (vec![scene, "-o", "-", "--json"], "standard output"),
         (vec![scene, "-o", "out.npy", "--frames", "0"], "too short"),
+        (vec![scene, "-o", "out.npy", "--frames", "9999999999999999"], "up to 1099511627776"),
         (vec![scene, "-o", "out.npy", "--instants", "0"], "0 instants"),
         (vec![scene, "-o", "out.npy", "--instants", "999999999999"], "instants"),
         (vec![scene, "-o", "out.npy", "--ppp", "-1"], "-1 photons"),

@@ -120,7 +120,7 @@ fn what_does_not_fit_is_refused_in_three_parts() {
     refused(&folder, &with("--steps 1001"), &["--steps"]);
     refused(&folder, &with("--samples 0"), &["--samples"]);
     refused(&folder, &with("--tile 8"), &["--tile"]);
-    refused(&folder, &with("--ppp 1e5"), &["weights know 3.25 to 26"]);
+    refused(&folder, &with("--ppp 1e5"), &["training range 3.25 to 26"]);
     refused(&folder, &with("--deviation d.npy"), &["--samples"]);
     refused(
         &folder,

@@ -112,11 +112,14 @@ fn runs_are_gone_on_with_and_never_lost() {
     let first = restored("run/weights.safetensors", "first.npy");
     assert!(restored("third/weights.safetensors", "third.npy") != first);
     // To tell errors is learnt beside what has been learnt.
-    let told =
+    let uncertain =
         "--set network.pre.uncertainty=true --set train.loss.pre=0 --set train.loss.prediction=0";
-    let told = format!("{told} --set train.loss.flow=0");
-    run(&folder, &format!("train tiny -o told --init run/weights.safetensors {told} {QUICK}"));
-    let [first, same] = ["run", "told"].map(|name| {
+    let uncertain = format!("{uncertain} --set train.loss.flow=0");
+    run(
+        &folder,
+        &format!("train tiny -o uncertain --init run/weights.safetensors {uncertain} {QUICK}"),
+    );
+    let [first, same] = ["run", "uncertain"].map(|name| {
         let weights = format!("{name}/weights.safetensors --steps 0");
         restored(&weights, &format!("{name}0.npy"))
     });
@@ -127,7 +130,7 @@ fn runs_are_gone_on_with_and_never_lost() {
     let pairs = values(&first).into_iter().zip(values(&same));
     // But for rounding in the mean of weights that stay.
     assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
-    let report = std::fs::read_to_string(folder.join("told/report.html")).unwrap();
+    let report = std::fs::read_to_string(folder.join("uncertain/report.html")).unwrap();
     assert!(report.contains("predicted uncertainty"));
 }
 

@@ -1,6 +1,6 @@
 //! The compute devices of this build and this machine.
 
-use crate::error::{Fault, Result};
+use crate::error::{CliError, Result};
 use burn::tensor::Device;
 #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
 use burn::tensor::DeviceType;
@@ -54,7 +54,7 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
     };
     let missing = || {
         let names: Vec<_> = list().into_iter().map(|device| device.name).collect();
-        Fault::new(
+        CliError::new(
             format!("there is no device `{name}`"),
             "--device",
             format!("this build and machine have {}; or use auto", names.join(", ")),
@@ -73,7 +73,7 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
     match opened {
         Ok(Some(device)) => Ok(Opened { name: name.clone(), device }),
         Ok(None) => Err(missing()),
-        Err(problem) => Err(Fault::new(
+        Err(problem) => Err(CliError::new(
             format!("the device cannot be used: {problem}"),
             &name,
             "check its driver with `qudi selftest`, or use --device cpu",
@@ -83,12 +83,12 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
 
 #[cfg(feature = "remote")]
 fn open_remote(name: String) -> Result<Opened> {
-    Ok(Opened { device: crate::remote::connect(&name)?, name })
+    Ok(Opened { device: crate::commands::serve::remote::connect(&name)?, name })
 }
 
 #[cfg(not(feature = "remote"))]
 fn open_remote(name: String) -> Result<Opened> {
-    Err(Fault::new(
+    Err(CliError::new(
         "this build knows no other machines' devices",
         name,
         "build it with `--features remote`",

@@ -1,16 +1,18 @@
 //! Errors of the command line: what happened, where, what to do.
 
-use crate::fields::{flags, flags_in_text};
+pub(crate) mod fields;
+
 use clap::error::{ContextKind, ErrorKind};
+use fields::{flags, flags_in_text};
 use qudi_core::SimError;
 use std::fmt::Display;
 use std::io;
 
-pub(crate) type Result<T, E = Fault> = std::result::Result<T, E>;
+pub(crate) type Result<T, E = CliError> = std::result::Result<T, E>;
 
 /// Anything that ends a command early.
 #[derive(Debug)]
-pub(crate) enum Fault {
+pub(crate) enum CliError {
     /// Three parts for the user.
     Error { what: String, place: Option<String>, help: Option<String> },
     /// It worked, but a bar that was set has been missed; the results are out already.
@@ -23,7 +25,7 @@ pub(crate) enum Fault {
     BrokenPipe,
 }
 
-impl Fault {
+impl CliError {
     pub(crate) fn new(what: impl Display, place: impl Display, help: impl Display) -> Self {
         Self::Error {
             what: what.to_string(),
@@ -33,7 +35,7 @@ impl Fault {
     }
 }
 
-impl Fault {
+impl CliError {
     /// A value that a flag cannot have, in the three parts of all errors.
     pub(crate) fn of_value(refusal: &clap::Error) -> Option<Self> {
         if refusal.kind() != ErrorKind::ValueValidation {
@@ -48,7 +50,7 @@ impl Fault {
     }
 }
 
-impl From<SimError> for Fault {
+impl From<SimError> for CliError {
     fn from(e: SimError) -> Self {
         match &e {
             SimError::Interrupted => Self::Interrupted,
@@ -64,17 +66,17 @@ impl From<SimError> for Fault {
     }
 }
 
-impl From<rayon::ThreadPoolBuildError> for Fault {
+impl From<rayon::ThreadPoolBuildError> for CliError {
     fn from(e: rayon::ThreadPoolBuildError) -> Self {
         Self::new(format!("cannot start threads: {e}"), "--threads", "ask for fewer threads")
     }
 }
 
 /// Errors of writing results to standard output.
-pub(crate) fn stdout_fault(e: io::Error) -> Fault {
+pub(crate) fn stdout_error(e: io::Error) -> CliError {
     match e.kind() {
-        io::ErrorKind::BrokenPipe => Fault::BrokenPipe,
-        _ => Fault::new(
+        io::ErrorKind::BrokenPipe => CliError::BrokenPipe,
+        _ => CliError::new(
             format!("cannot write the result: {e}"),
             "standard output",
             "check where it is redirected to",

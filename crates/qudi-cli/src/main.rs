@@ -1,22 +1,21 @@
 //! `qudi`: simulate, restore and measure video from single-photon cameras.
 
 mod args;
-mod cmd;
+mod capture;
+mod commands;
 mod device;
 mod error;
-mod fields;
 mod interrupt;
 mod memory;
+mod methods;
 mod places;
-#[cfg(feature = "remote")]
-mod remote;
 mod report;
 mod settings;
 mod weights;
 
 use args::{Args, Command};
 use clap::Parser;
-use error::Fault;
+use error::CliError;
 use std::process::ExitCode;
 
 /// See [`memory::keep_freed_pages`].
@@ -25,20 +24,20 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
     memory::keep_freed_pages();
-    if let Err(fault) = check_arguments() {
-        return report::Report::plain().fault(&fault);
+    if let Err(error) = check_arguments() {
+        return report::Report::plain().error(&error);
     }
     let args = match Args::try_parse() {
         Ok(args) => args,
-        Err(refusal) => match Fault::of_value(&refusal) {
-            Some(fault) => return report::Report::plain().fault(&fault),
+        Err(refusal) => match CliError::of_value(&refusal) {
+            Some(error) => return report::Report::plain().error(&error),
             None => refusal.exit(),
         },
     };
     let report = report::Report::new(&args.global);
     match run(&args, &report) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(fault) => report.fault(&fault),
+        Err(error) => report.error(&error),
     }
 }
 
@@ -46,7 +45,7 @@ fn main() -> ExitCode {
 fn check_arguments() -> error::Result<()> {
     match std::env::args_os().find(|argument| argument.to_str().is_none()) {
         None => Ok(()),
-        Some(argument) => Err(Fault::new(
+        Some(argument) => Err(CliError::new(
             "an argument is not UTF-8, so no record could name it",
             argument.display(),
             "rename the file or folder",
@@ -59,27 +58,31 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
     if let Some(threads) = args.global.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }
-    // Loaded for every command, so that none ignores what it was told.
+    // Loaded for every command, so that none ignores what is set.
     let settings = settings::Settings::load(&args.global, args.command.name())?;
     match &args.command {
-        Command::Simulate(simulate) => cmd::simulate::run(simulate, settings, &args.global, report),
-        Command::Restore(restore) => cmd::restore::run(restore, &settings, &args.global, report),
-        Command::Train(train) => cmd::train::run(train, &settings, &args.global, report),
-        Command::Publish(publish) => cmd::publish::run(publish, &args.global, report),
-        Command::Eval(eval) => cmd::eval::run(eval, &settings, &args.global, report),
-        Command::Bench(bench) => cmd::bench::run(bench, &args.global, report),
-        Command::Selftest(selftest) => cmd::selftest::run(selftest, report),
-        #[cfg(feature = "remote")]
-        Command::Serve(serve) => cmd::serve::run(serve, report),
-        Command::Convert(convert) => cmd::convert::run(convert, &args.global, report),
-        Command::Calibrate(calibrate) => {
-            cmd::calibrate::run(calibrate, &settings, &args.global, report)
+        Command::Simulate(simulate) => {
+            commands::simulate::run::run(simulate, settings, &args.global, report)
         }
-        Command::Demo(demo) => cmd::demo::run(demo, &settings, &args.global, report),
-        Command::Light(light) => cmd::light::run(light, &settings, report),
-        Command::Info(info) => cmd::info::run(info, &settings, &args.global, report),
-        Command::Config(config) => cmd::config::run(config, &settings, report),
-        Command::Completions(completions) => cmd::completions::run(completions),
-        Command::Man(man) => cmd::completions::man(man),
+        Command::Restore(restore) => {
+            commands::restore::run::run(restore, &settings, &args.global, report)
+        }
+        Command::Train(train) => commands::train::run::run(train, &settings, &args.global, report),
+        Command::Publish(publish) => commands::publish::run::run(publish, &args.global, report),
+        Command::Eval(eval) => commands::eval::run::run(eval, &settings, &args.global, report),
+        Command::Bench(bench) => commands::bench::run::run(bench, &args.global, report),
+        Command::Selftest(selftest) => commands::selftest::run::run(selftest, report),
+        #[cfg(feature = "remote")]
+        Command::Serve(serve) => commands::serve::run::run(serve, report),
+        Command::Convert(convert) => commands::convert::run::run(convert, &args.global, report),
+        Command::Calibrate(calibrate) => {
+            commands::calibrate::run::run(calibrate, &settings, &args.global, report)
+        }
+        Command::Demo(demo) => commands::demo::run::run(demo, &settings, &args.global, report),
+        Command::Light(light) => commands::light::run::run(light, &settings, report),
+        Command::Info(info) => commands::info::run::run(info, &settings, &args.global, report),
+        Command::Config(config) => commands::config::run::run(config, &settings, report),
+        Command::Completions(completions) => commands::completions::run::run(completions),
+        Command::Man(man) => commands::completions::run::man(man),
     }
 }

@@ -8,11 +8,11 @@ const KEEP: std::ffi::c_long = -1;
 
 /// Growth of the peak since a moment.
 #[derive(Debug)]
-pub(crate) struct Peak {
+pub(crate) struct PeakMemory {
     before: Option<f64>,
 }
 
-impl Peak {
+impl PeakMemory {
     /// Forgets the peak so far, and gives kept pages back first: they would hide what comes.
     #[allow(unsafe_code)]
     pub(crate) fn start() -> Self {
@@ -56,10 +56,11 @@ fn field(name: &str) -> Option<f64> {
     Some(kib / 1024.0)
 }
 
-/// Keeps freed pages for the next allocation. The network's tensors are large and short-lived; giving them back
-/// to the system and faulting them in again costs a tenth of the time.
+/// Keeps freed pages for the next allocation. The network's tensors are large and short-lived; giving them
+/// back to the system and faulting them in again costs a tenth of the time.
 #[allow(unsafe_code)]
 pub(crate) fn keep_freed_pages() {
-    // SAFETY: called at the start of `main`, before there are other threads; the value is in the option's range.
+    // SAFETY: called at the start of `main`, before there are other threads; the value is in the option's
+    // range.
     unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, KEEP) };
 }

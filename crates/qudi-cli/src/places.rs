@@ -1,6 +1,7 @@
-//! What a command reads and writes: no output is an input, and no two outputs are one, whatever `--force` says.
+//! What a command reads and writes: no output is an input, and no two outputs are one, whatever `--force`
+//! says.
 
-use crate::error::{Fault, Result};
+use crate::error::{CliError, Result};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
@@ -53,10 +54,11 @@ impl Places {
         self
     }
 
-    /// Refuses outputs that are, hold, or lie among inputs, outputs that are one, and places where no file can be.
+    /// Refuses outputs that are, hold, or lie among inputs, outputs that are one, and places where no file
+    /// can be.
     ///
     /// # Errors
-    /// A [`Fault`] that names the output and what it would destroy.
+    /// A [`CliError`] that names the output and what it would destroy.
     pub(crate) fn check(&self) -> Result<()> {
         let inputs: Vec<_> = self.inputs.iter().filter(|path| path.exists()).collect();
         for (n, output) in self.outputs.iter().enumerate() {
@@ -74,7 +76,7 @@ impl Places {
                 } else {
                     continue;
                 };
-                return Err(Fault::new(what, output.display(), "choose another name"));
+                return Err(CliError::new(what, output.display(), "choose another name"));
             }
             for other in &self.outputs[..n] {
                 let second = Identity::of(other);
@@ -85,7 +87,7 @@ impl Places {
                 } else {
                     continue;
                 };
-                return Err(Fault::new(what, output.display(), "give them names of their own"));
+                return Err(CliError::new(what, output.display(), "give them names of their own"));
             }
         }
         Ok(())
@@ -95,11 +97,11 @@ impl Places {
 /// Refuses devices, pipes and folders that do not exist, before the work and not after it.
 fn refuse_impossible(output: &Path) -> Result<()> {
     if std::fs::metadata(output).is_ok_and(|kind| !kind.is_file() && !kind.is_dir()) {
-        return Err(Fault::new("not a regular file", output.display(), "name a file to write"));
+        return Err(CliError::new("not a regular file", output.display(), "name a file to write"));
     }
     let parent = output.parent().filter(|parent| !parent.as_os_str().is_empty());
     match parent {
-        Some(parent) if !parent.is_dir() => Err(Fault::new(
+        Some(parent) if !parent.is_dir() => Err(CliError::new(
             format!("cannot create the output: {} is not a folder", parent.display()),
             output.display(),
             "make the folder first, or choose another",

@@ -1,6 +1,7 @@
 //! The report of a command: what is printed, and the tables, plots and pages that are written.
 //!
-//! Commands describe results as a [`Table`], a [`Plot`](svg::Plot) or the context of a page; every format has one exporter.
+//! Commands describe results as a [`Table`], a [`Plot`](svg::Plot) or the context of a page; every format has
+//! one exporter.
 
 mod console;
 pub(crate) mod csv;

@@ -1,7 +1,7 @@
 //! Settings in layers: defaults, file, environment, `--set`, flags; each value knows its origin.
 //!
-//! Every command loads them, and says by name which keys of `--set` it does not take. Files and the environment
-//! are shared between commands: known keys of other commands are no error there.
+//! Every command loads them, and says by name which keys of `--set` it does not take. Files and the
+//! environment are shared between commands: known keys of other commands are no error there.
 
 mod commands;
 mod flags;
@@ -12,7 +12,7 @@ pub(crate) use flags::KeyFlags;
 pub(crate) use keys::KEYS;
 
 use crate::args::Global;
-use crate::error::{Fault, Result};
+use crate::error::{CliError, Result};
 use keys::Kind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::nearest::nearest;
@@ -63,7 +63,7 @@ impl Settings {
         settings.add_environment()?;
         for assignment in &global.set {
             let Some((name, text)) = assignment.split_once('=') else {
-                return Err(Fault::new(
+                return Err(CliError::new(
                     format!("`{assignment}` sets nothing"),
                     "--set",
                     "write KEY=VALUE, as in --set simulate.ppp=9.75",
@@ -88,7 +88,7 @@ impl Settings {
         let help = "see `qudi config docs` for the keys and configs/ for examples";
         let text = read_text(path, TEXT_BYTES, "read the settings")?;
         let document: Value = toml::from_str(&text).map_err(|e| {
-            Fault::new(format!("not a TOML document: {}", e.message()), &place, help)
+            CliError::new(format!("not a TOML document: {}", e.message()), &place, help)
         })?;
         let mut leaves = Vec::new();
         flatten("", document, &mut leaves);
@@ -138,7 +138,7 @@ impl Settings {
         }
         // JSON has no NaN and no infinity: both arrive as null.
         if value.is_null() {
-            return Err(Fault::new(
+            return Err(CliError::new(
                 format!("`{name}` is not a finite number"),
                 origin.name(),
                 "leave it out to keep the default",
@@ -157,7 +157,7 @@ impl Settings {
         Ok(())
     }
 
-    fn not_taken(&self, key: &str, place: &str) -> Fault {
+    fn not_taken(&self, key: &str, place: &str) -> CliError {
         let command = self.command;
         let part = key.split('.').next().unwrap_or_default();
         let takers: Vec<_> = commands::takers(part);
@@ -168,7 +168,7 @@ impl Settings {
             parts => format!("it takes {parts}"),
         };
         let what = format!("`{key}` is not a setting of `qudi {command}`");
-        Fault::new(what, place, format!("{own}; {part}.* is for {}", takers.join(", ")))
+        CliError::new(what, place, format!("{own}; {part}.* is for {}", takers.join(", ")))
     }
 
     /// Refuses keys of `--set` that begin so, since this run has no use for them.
@@ -176,7 +176,7 @@ impl Settings {
         let meant = |name: &str| prefixes.iter().any(|prefix| name.starts_with(prefix));
         let given = self.iter().find(|(name, _, origin)| *origin == "--set" && meant(name));
         given.map_or(Ok(()), |(name, _, origin)| {
-            Err(Fault::new(format!("`{name}` is not used {why}"), origin, "leave it out"))
+            Err(CliError::new(format!("`{name}` is not used {why}"), origin, "leave it out"))
         })
     }
 
@@ -196,7 +196,7 @@ impl Settings {
     pub(crate) fn get<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
         let (value, origin) = self.find(name);
         serde_json::from_value(value.clone()).map_err(|e| {
-            Fault::new(
+            CliError::new(
                 format!("`{name}` cannot be {value}: {e}"),
                 origin,
                 "see `qudi config docs` for its meaning",
@@ -218,7 +218,7 @@ impl Settings {
         let (_, origin) = self.find(name);
         text.map(|text| {
             text.parse().map_err(|e: String| {
-                Fault::new(e, origin, format!("see `{name}` in `qudi config docs`"))
+                CliError::new(e, origin, format!("see `{name}` in `qudi config docs`"))
             })
         })
         .transpose()
@@ -275,9 +275,9 @@ fn variable(key: &str) -> String {
     format!("QUDI_{}", key.replace('.', "_").to_uppercase())
 }
 
-fn unknown_key(name: &str, names: &[&str], origin: &str) -> Fault {
+fn unknown_key(name: &str, names: &[&str], origin: &str) -> CliError {
     let hint = nearest(name, names).map_or(String::new(), |n| format!("did you mean `{n}`?  "));
-    Fault::new(
+    CliError::new(
         format!("unknown key `{name}`"),
         origin,
         format!("{hint}all keys: `qudi config docs`"),

@@ -1,6 +1,6 @@
 //! The network's weights: those of a file, or those that come along.
 
-use crate::error::{Fault, Result};
+use crate::error::{CliError, Result};
 use burn::tensor::Device;
 use qudi_core::SimError;
 use qudi_model::checkpoint::{Description, describe, describe_bytes, load, load_bytes};
@@ -77,7 +77,7 @@ fn verified() -> Result<&'static [u8]> {
     if found == SHA256.trim() {
         return Ok(BUILT_IN);
     }
-    Err(Fault::new(
+    Err(CliError::new(
         format!("the weights in this program are damaged: their SHA-256 is {found}"),
         "crates/qudi-cli/weights",
         "clone the repository again and build, or name other --weights",

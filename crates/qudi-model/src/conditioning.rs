@@ -6,14 +6,19 @@ mod count_response;
 mod sensor_numbers;
 
 use burn::tensor::Tensor;
+use qudi_core::sensor::Sensor;
 
 pub use aligned::{AlignedNeighbours, AlignedPlanes, AlignedTensors};
 pub use count_response::{CountPlanes, CountResponse, linear_estimates};
-pub(crate) use sensor_numbers::dark_per_frame;
 pub use sensor_numbers::{MEAN_LIGHT_SIGMA, SENSOR_NUMBERS, sensor_numbers};
 
 /// The brightest value of any plane in image units: twice white.
 pub(crate) const MAX_IMAGE: f64 = 2.0;
+
+/// Dark electrons per output frame; none where the sensor does not say.
+pub(crate) fn dark_per_frame(sensor: &Sensor) -> f64 {
+    sensor.dark_per_frame().unwrap_or(0.0)
+}
 
 /// The inputs of the network that come from the measurement, the same in every reverse step.
 ///

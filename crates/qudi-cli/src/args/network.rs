@@ -1,9 +1,11 @@
 //! Options of commands that may run the network.
 
 use super::number;
-use crate::error::{Fault, Result};
+use crate::methods::options::NetworkOptions;
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_model::diffusion::sampler::Sampler;
+use qudi_model::diffusion::timesteps::TimestepSpacing;
 use qudi_model::restorer::TILE;
 use std::path::PathBuf;
 
@@ -18,13 +20,13 @@ pub(crate) struct Network {
     /// draw sharper pictures, whose details are invented; the paper takes 10 [default: what the weights say of themselves]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
     steps: Option<usize>,
-    /// How the times of these steps lie [default: learnt]
+    /// Spacing of the timesteps of these steps [default: log-logistic]
     #[arg(long, value_name = "NAME")]
     spacing: Option<SpacingName>,
-    /// How noise leaves [default: ddim]
+    /// Sampler of these steps [default: ddim]
     #[arg(long, value_name = "NAME")]
     sampler: Option<SamplerName>,
-    /// Pictures drawn; the result is their mean, --uncertainty their spread [default: 1]
+    /// Samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
     #[arg(long, value_name = "K", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info --devices`)
@@ -36,118 +38,71 @@ pub(crate) struct Network {
     tile: Option<usize>,
 }
 
-/// The method that these options belong to.
-const METHOD: &str = "qudi";
-
 impl Network {
-    /// The weights that were asked for.
-    pub(crate) fn weights(&self) -> Weights {
-        Weights::of(self.weights.as_deref())
-    }
-
-    /// Reverse steps: those asked for, or those that the weights were made for.
-    pub(crate) fn steps(&self) -> Result<usize> {
-        match self.steps {
-            Some(steps) => Ok(steps),
-            None => Ok(self.weights().describe()?.reverse_steps()),
-        }
-    }
-
-    /// How the frames are made, in words.
-    pub(crate) fn mode(&self) -> Result<String> {
-        Ok(match self.steps()? {
-            0 => "regression".to_owned(),
-            1 => "diffusion in 1 step".to_owned(),
-            steps => format!("diffusion in {steps} steps"),
-        })
-    }
-
-    /// How the times of the steps lie.
-    pub(crate) fn spacing(&self) -> SpacingName {
-        self.spacing.unwrap_or(SpacingName::Learnt)
-    }
-
-    /// How noise leaves.
-    pub(crate) fn sampler(&self) -> SamplerName {
-        self.sampler.unwrap_or(SamplerName::Ddim)
-    }
-
-    /// Pictures drawn.
-    pub(crate) fn samples(&self) -> usize {
-        self.samples.unwrap_or(1)
-    }
-
-    /// The device to compute on.
-    pub(crate) fn device(&self) -> &str {
-        self.device.as_deref().unwrap_or("auto")
-    }
-
-    /// Side of the tiles in pixels.
-    pub(crate) fn tile(&self) -> usize {
-        self.tile.unwrap_or(TILE)
-    }
-
-    /// The first option given that changes what the network makes, so that it is the method that is meant.
-    pub(crate) fn meant(&self) -> Option<&'static str> {
-        let given = [
-            (self.weights.is_some(), "--weights"),
-            (self.steps.is_some(), "--steps"),
-            (self.spacing.is_some(), "--spacing"),
-            (self.sampler.is_some(), "--sampler"),
-            (self.samples.is_some(), "--samples"),
-            (self.tile.is_some(), "--tile"),
-        ];
-        given.into_iter().find(|(given, _)| *given).map(|(_, flag)| flag)
-    }
-
-    /// Refuses these options where none of the methods is the network.
-    pub(crate) fn check_methods<'a>(
-        &self,
-        mut methods: impl Iterator<Item = &'a str>,
-    ) -> Result<()> {
-        let given = self.meant().or(self.device.is_some().then_some("--device"));
-        match given {
-            Some(flag) if !methods.any(|method| method == METHOD) => Err(Fault::new(
-                format!("{flag} is for method {METHOD}"),
-                flag,
-                format!("leave it out, or use --method {METHOD}"),
-            )),
-            _ => Ok(()),
-        }
-    }
-
-    /// Refuses options that are about steps where there are none.
-    pub(crate) fn check_steps(&self) -> Result<()> {
-        let given = [
-            (self.spacing.is_some(), "--spacing"),
-            (self.sampler.is_some(), "--sampler"),
-            (self.samples.is_some_and(|samples| samples > 1), "--samples"),
-        ];
-        match given.into_iter().find(|(given, _)| *given) {
-            Some((_, flag)) if self.steps()? == 0 => Err(Fault::new(
-                format!("{flag} is for diffusion, and there are 0 steps"),
-                flag,
-                "leave it out, or ask for --steps above 0",
-            )),
-            _ => Ok(()),
+    /// The options with their defaults filled in.
+    pub(crate) fn options(&self) -> NetworkOptions {
+        let first = |given: &[(bool, &'static str)]| {
+            given.iter().find(|(given, _)| *given).map(|(_, flag)| *flag)
+        };
+        NetworkOptions {
+            weights: Weights::of(self.weights.as_deref()),
+            steps: self.steps,
+            spacing: self.spacing.map_or_else(TimestepSpacing::default, SpacingName::spacing),
+            sampler: self.sampler.map_or_else(Sampler::default, SamplerName::sampler),
+            samples: self.samples.unwrap_or(1),
+            device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),
+            tile: self.tile.unwrap_or(TILE),
+            result_flag: first(&[
+                (self.weights.is_some(), "--weights"),
+                (self.steps.is_some(), "--steps"),
+                (self.spacing.is_some(), "--spacing"),
+                (self.sampler.is_some(), "--sampler"),
+                (self.samples.is_some(), "--samples"),
+                (self.tile.is_some(), "--tile"),
+            ]),
+            device_flag: self.device.is_some().then_some("--device"),
+            diffusion_flag: first(&[
+                (self.spacing.is_some(), "--spacing"),
+                (self.sampler.is_some(), "--sampler"),
+                (self.samples.is_some_and(|samples| samples > 1), "--samples"),
+            ]),
         }
     }
 }
 
 /// Spacings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum SpacingName {
+enum SpacingName {
     /// Evenly, as in the paper
     Linear,
-    /// As densely as training drew them, by how much noise there is: sharper pictures in as many steps
-    Learnt,
+    /// As densely as training drew timesteps, by how much noise there is: sharper pictures in as many steps
+    #[value(alias = "learnt")]
+    LogLogistic,
+}
+
+impl SpacingName {
+    fn spacing(self) -> TimestepSpacing {
+        match self {
+            Self::Linear => TimestepSpacing::Linear,
+            Self::LogLogistic => TimestepSpacing::LogLogistic,
+        }
+    }
 }
 
 /// Samplers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum SamplerName {
+enum SamplerName {
     /// No fresh noise on the way (eta 0)
     Ddim,
     /// The noise of the posterior at every step
     Ancestral,
+}
+
+impl SamplerName {
+    fn sampler(self) -> Sampler {
+        match self {
+            Self::Ddim => Sampler::Ddim,
+            Self::Ancestral => Sampler::Ancestral,
+        }
+    }
 }

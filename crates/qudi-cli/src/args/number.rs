@@ -6,27 +6,27 @@ use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 /// The most threads that are started: several times the cores of large machines.
-pub(super) const MOST_THREADS: u64 = 256;
+pub(crate) const MOST_THREADS: u64 = 256;
 
 /// The most photons per pixel and frame: a million times what a picture needs.
-pub(super) const PPP: RangeInclusive<f64> = 1e-9..=1e9;
+pub(crate) const PPP: RangeInclusive<f64> = 1e-9..=1e9;
 
 /// Gains in DN per electron.
-pub(super) const GAIN: RangeInclusive<f64> = 1e-9..=1e9;
+pub(crate) const GAIN: RangeInclusive<f64> = 1e-9..=1e9;
 
 /// Mean image values.
-pub(super) const EXPOSURE: RangeInclusive<f64> = 1e-6..=1.0;
+pub(crate) const EXPOSURE: RangeInclusive<f64> = 1e-6..=1.0;
 
 /// Numbers of frames, or of bytes.
-pub(super) const COUNT: RangeInclusive<u64> = 1..=1 << 40;
+pub(crate) const COUNT: RangeInclusive<u64> = 1..=1 << 40;
 
 /// Reads a finite number in a range.
-pub(super) fn real(range: RangeInclusive<f64>) -> impl TypedValueParser<Value = f64> {
+pub(crate) fn real(range: RangeInclusive<f64>) -> impl TypedValueParser<Value = f64> {
     move |text: &str| in_range(text, &range)
 }
 
 /// Reads a whole number in a range.
-pub(super) fn whole<T>(range: RangeInclusive<u64>) -> impl TypedValueParser<Value = T>
+pub(crate) fn whole<T>(range: RangeInclusive<u64>) -> impl TypedValueParser<Value = T>
 where
     T: TryFrom<u64> + Clone + Send + Sync + 'static,
 {

@@ -2,7 +2,7 @@
 #![allow(clippy::print_stdout, clippy::print_stderr)]
 
 use crate::args::{Color, Global};
-use crate::error::{Fault, Result, stdout_fault};
+use crate::error::{CliError, Result, stdout_error};
 use crate::interrupt;
 use crate::report::json::document;
 use crate::report::printable;
@@ -83,8 +83,8 @@ impl Report {
         }
     }
 
-    /// Makes a progress bar, which is hidden off a terminal, under --json and under --quiet; with --verbose, log
-    /// lines take its place.
+    /// Makes a progress bar, which is hidden off a terminal, under --json and under --quiet; with --verbose,
+    /// log lines take its place.
     pub(crate) fn bar(&self) -> Bar {
         let shown = !self.json && self.volume == Volume::Normal && std::io::stderr().is_terminal();
         let target =
@@ -96,22 +96,22 @@ impl Report {
     }
 
     /// Prints an error and returns the exit code of the program.
-    pub(crate) fn fault(&self, fault: &Fault) -> ExitCode {
-        match fault {
-            Fault::BrokenPipe => ExitCode::SUCCESS,
-            Fault::Interrupted => {
+    pub(crate) fn error(&self, error: &CliError) -> ExitCode {
+        match error {
+            CliError::BrokenPipe => ExitCode::SUCCESS,
+            CliError::Interrupted => {
                 self.remark("interrupted: nothing was written");
                 ExitCode::from(interrupt::EXIT_CODE)
             }
-            Fault::Stopped(what) => {
+            CliError::Stopped(what) => {
                 self.remark(what);
                 ExitCode::from(interrupt::EXIT_CODE)
             }
-            Fault::Missed(what) => {
+            CliError::Missed(what) => {
                 self.remark(what);
                 ExitCode::from(1)
             }
-            Fault::Error { what, place, help } => {
+            CliError::Error { what, place, help } => {
                 let (red, bold, plain) =
                     if self.color { ("\x1b[1;31m", "\x1b[1m", "\x1b[0m") } else { ("", "", "") };
                 let mut text = format!("{red}error:{plain} {}\n", printable(what));
@@ -133,7 +133,7 @@ impl Report {
 pub(crate) fn print(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
     let end = if text.ends_with('\n') { "" } else { "\n" };
-    write!(out, "{text}{end}").and_then(|()| out.flush()).map_err(stdout_fault)
+    write!(out, "{text}{end}").and_then(|()| out.flush()).map_err(stdout_error)
 }
 
 /// Shows the progress of one command.

@@ -24,8 +24,8 @@ fn cell(cell: &Cell) -> String {
     }
 }
 
-/// Text in quotes. Spreadsheets take what starts with one of `= + - @` for a formula, and run it: an apostrophe
-/// before it makes it text (OWASP, CSV injection).
+/// Text in quotes. Spreadsheets take what starts with one of `= + - @` for a formula, and run it: an
+/// apostrophe before it makes it text (OWASP, CSV injection).
 fn quoted(text: &str) -> String {
     let apostrophe = if text.starts_with(['=', '+', '-', '@', '\t', '\r']) { "'" } else { "" };
     format!("\"{apostrophe}{}\"", text.replace('"', "\"\""))

@@ -1,7 +1,7 @@
 //! Pages: single files that fetch nothing, made of the templates in `templates/`.
 
 use super::{Table, printable};
-use crate::error::{Fault, Result};
+use crate::error::{CliError, Result};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::{ExtendedColorType, ImageEncoder};
@@ -31,7 +31,7 @@ pub(crate) fn render(template: &str, context: impl Serialize) -> Result<String> 
         environment.get_template(template)?.render(Serde(context))
     };
     fill().map_err(|e: minijinja::Error| {
-        Fault::new(format!("cannot make the page: {e}"), template, "report this as a bug")
+        CliError::new(format!("cannot make the page: {e}"), template, "report this as a bug")
     })
 }
 

@@ -7,8 +7,8 @@ use std::path::Path;
 
 /// A file that is opened before the work and written after it.
 ///
-/// A place that cannot be written is refused at once, and not after hours. Dropped without [`Output::write`], it
-/// leaves nothing behind.
+/// A place that cannot be written is refused at once, and not after hours. Dropped without [`Output::write`],
+/// it leaves nothing behind.
 #[derive(Debug)]
 pub(crate) struct Output(Option<PendingFile>);
 

@@ -5,8 +5,8 @@ use std::fmt::Write;
 
 /// Escapes control characters, so that a file name or a record cannot steer the terminal.
 ///
-/// Line feeds and tabs stay: they lay out our own text. Bidirectional overrides are escaped as well, since they
-/// show characters in another order than they have.
+/// Line feeds and tabs stay: they lay out our own text. Bidirectional overrides are escaped as well, since
+/// they show characters in another order than they have.
 pub(crate) fn printable(text: &str) -> Cow<'_, str> {
     if !text.chars().any(is_unprintable) {
         return Cow::Borrowed(text);

@@ -1,7 +1,6 @@
 //! The linear estimate of the image from single counts.
 
-use super::MAX_IMAGE;
-use super::sensor_numbers::dark_per_frame;
+use super::{MAX_IMAGE, dark_per_frame};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, Sensor};
 

@@ -1,19 +1,15 @@
 //! The sensor and its light as numbers that the network is given.
 
 use super::count_response::CountResponse;
+use super::dark_per_frame;
 use qudi_core::restorer::Acquisition;
-use qudi_core::sensor::{Response, Sensor};
+use qudi_core::sensor::Response;
 
 /// How many numbers describe a sensor and its light.
 pub const SENSOR_NUMBERS: usize = 11;
 
 /// The place of log10 of the sigma of the linear estimate at the mean light.
 pub const MEAN_LIGHT_SIGMA: usize = 10;
-
-/// Dark electrons per output frame; none where the sensor does not say.
-pub(crate) fn dark_per_frame(sensor: &Sensor) -> f64 {
-    sensor.dark_per_frame().unwrap_or(0.0)
-}
 
 /// The sensor and its light in numbers (docs/network.md, "Inputs").
 pub fn sensor_numbers(acquisition: &Acquisition) -> [f32; SENSOR_NUMBERS] {

@@ -1,0 +1,105 @@
+//! The acquisition of a capture: its light from overrides, the record, or the counts.
+
+use crate::error::{CliError, Result};
+use qudi_core::USUAL_EXPOSURE;
+use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::restorer::Acquisition;
+use qudi_core::sensor::Sensor;
+use qudi_core::windows::LONGEST_HALF;
+use qudi_io::capture::{Capture, Summary};
+
+/// What the user says about the light.
+#[derive(Debug)]
+pub(crate) struct LightOverrides {
+    /// Incident photons per pixel and output frame.
+    pub(crate) ppp: Option<f64>,
+    /// DN/e-.
+    pub(crate) gain: Option<f64>,
+    /// Image value that receives `ppp` photons, unless the capture is to tell.
+    pub(crate) exposure: Option<f64>,
+    pub(crate) seed: u64,
+}
+
+/// The acquisition of a capture, and where its light comes from.
+pub(crate) fn acquisition(
+    overrides: &LightOverrides,
+    capture: &mut Capture,
+    sensor: &Sensor,
+) -> Result<(Acquisition, &'static str)> {
+    checked_exposure(overrides.exposure)?;
+    let of_frames = capture.output_sensor(sensor)?;
+    let recorded = capture.info().ppp.map(|ppp| ppp * f64::from(capture.summed()));
+    let known_gain = overrides.gain.or(capture.info().gain);
+    let (ppp, source) = match (overrides.ppp, recorded) {
+        (Some(ppp), _) => (ppp, "given"),
+        (None, Some(ppp)) => (ppp, "from the record"),
+        (None, None) => {
+            let summary = Summary::measure(capture, Some(sensor), known_gain)?;
+            let ppp = summary.ppp.incident.ok_or_else(|| {
+                CliError::new(
+                    format!(
+                        "the light cannot be estimated: the gain of `{}` follows it",
+                        sensor.name
+                    ),
+                    "--ppp",
+                    "give the photons per pixel and frame, or the gain with --gain",
+                )
+            })?;
+            (ppp, "estimated")
+        }
+    };
+    if !(ppp.is_finite() && ppp > 0.0) {
+        return Err(CliError::new(
+            format!("{ppp} photons per pixel and frame"),
+            "--ppp",
+            "the capture is dark, or the sensor's dark rate too high: give the light, or another --sensor",
+        ));
+    }
+    let gain = match known_gain {
+        Some(gain) => gain,
+        None => of_frames.gain_at(ppp)?,
+    };
+    let summed = of_frames.frames_summed as f32;
+    let dark = capture.dark().map(|map| map.iter().map(|dark| dark * summed).collect());
+    let mut acquisition = Acquisition {
+        seed: overrides.seed,
+        first_frame: 0,
+        ppp,
+        exposure: USUAL_EXPOSURE,
+        sensor: of_frames,
+        gain,
+        dark,
+    };
+    acquisition.exposure = match overrides.exposure {
+        Some(exposure) => exposure,
+        None => exposure_of(capture, &acquisition)?,
+    };
+    Ok((acquisition, source))
+}
+
+/// What the user says of the exposure, if it can be.
+pub(crate) fn checked_exposure(exposure: Option<f64>) -> Result<()> {
+    match exposure {
+        Some(exposure) if !(exposure.is_finite() && exposure > 0.0) => Err(CliError::new(
+            format!("an exposure of {exposure}"),
+            "--exposure",
+            "give the mean image value, between 0 and 1",
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// What the capture says of it.
+fn exposure_of(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
+    let size = capture.size();
+    // Pipes have shown their first frames only.
+    let first = 2 * LONGEST_HALF as u64 + 1;
+    let frames =
+        if capture.forward_only() { capture.frames().min(first) } else { capture.frames() };
+    let read = |frame| {
+        let mut counts = vec![0; size.pixels()];
+        capture.read(frame, &mut counts)?;
+        Ok(counts)
+    };
+    Ok(fitting_exposure(size, frames, acquisition, read)?)
+}

@@ -1,0 +1,107 @@
+//! One folder a command: its options in `args`, what it does in `run`, the rest by its name.
+
+pub(crate) mod bench {
+    pub(crate) mod args;
+    mod burst;
+    mod network;
+    pub(crate) mod run;
+}
+
+pub(crate) mod calibrate {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod completions {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod config {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod convert {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod demo {
+    pub(crate) mod args;
+    mod html;
+    pub(crate) mod run;
+    mod shown;
+}
+
+pub(crate) mod eval {
+    pub(crate) mod args;
+    mod capture;
+    mod clip;
+    mod exposed_clip;
+    mod exposing;
+    mod html;
+    mod plan;
+    pub(crate) mod run;
+    mod score;
+    mod table;
+}
+
+pub(crate) mod info {
+    pub(crate) mod args;
+    mod capture;
+    mod record;
+    pub(crate) mod run;
+}
+
+pub(crate) mod light {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod publish {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod restore {
+    pub(crate) mod args;
+    mod chi_square_map;
+    mod output;
+    mod plan;
+    pub(crate) mod run;
+    mod uncertainty;
+    mod y4m;
+}
+
+pub(crate) mod selftest {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+#[cfg(feature = "remote")]
+pub(crate) mod serve {
+    pub(crate) mod args;
+    pub(crate) mod remote;
+    pub(crate) mod run;
+}
+
+pub(crate) mod simulate {
+    pub(crate) mod args;
+    mod outputs;
+    mod plan;
+    pub(crate) mod run;
+}
+
+pub(crate) mod train {
+    pub(crate) mod args;
+    mod data;
+    mod environment;
+    mod events;
+    mod pictures;
+    mod plan;
+    mod report;
+    mod resume;
+    pub(crate) mod run;
+    mod watch;
+}

@@ -1,0 +1,56 @@
+//! Options of `qudi bench`.
+
+use crate::args::{Network, number};
+use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_core::Size;
+use qudi_model::ComputePrecision;
+use std::path::PathBuf;
+
+/// Measure speed and memory of methods
+///
+/// Restores one window of a simulated burst over and over: one round to warm up, then medians. Keep the
+/// results with --json, and compare with them later.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Bench {
+    /// Methods to measure
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
+    pub(crate) method: Vec<String>,
+    /// Frame size, height first
+    #[arg(long, value_name = "HxW", default_value = "256x256")]
+    pub(crate) size: Size,
+    /// Frames of the window
+    #[arg(long, value_name = "N", default_value_t = 11, allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
+    pub(crate) frames: usize,
+    /// Measured rounds
+    #[arg(long, value_name = "N", default_value_t = 7, allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=10_000))]
+    pub(crate) rounds: usize,
+    /// Results of an earlier run (--json) to compare with
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) compare: Option<PathBuf>,
+    /// Instead of methods, measure networks of these sizes with random weights: tiny, small, base, paper
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
+    pub(crate) preset: Vec<String>,
+    /// Numbers that convolutions of these networks multiply, as with train.precision
+    #[arg(long, value_name = "NAME", default_value = "f32", requires = "preset")]
+    pub(crate) precision: PrecisionName,
+    #[command(flatten)]
+    pub(crate) network: Network,
+}
+
+/// Precisions of products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum PrecisionName {
+    /// 32 bits
+    F32,
+    /// 16 bits, 8 of them for the value
+    Bf16,
+}
+
+impl PrecisionName {
+    pub(crate) fn precision(self) -> ComputePrecision {
+        match self {
+            Self::F32 => ComputePrecision::F32,
+            Self::Bf16 => ComputePrecision::Bf16,
+        }
+    }
+}

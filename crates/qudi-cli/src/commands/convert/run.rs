@@ -1,0 +1,147 @@
+//! `qudi convert`: any capture into a format that everything reads.
+
+use super::args::Convert;
+use crate::args::Global;
+use crate::capture::remarks;
+use crate::error::{CliError, Result};
+use crate::interrupt;
+use crate::places::Places;
+use crate::report::{Bar, Report};
+use qudi_core::SimError;
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
+use qudi_io::writer::{BurstFormat, BurstWriter};
+use serde_json::Value;
+use std::path::Path;
+
+pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let options = args.reading.options(MaskChoice::None);
+    let format = BurstFormat::for_path(&args.output, 1, true);
+    let record = format.ok().map(|format| format.record_path(&args.output));
+    Places::default()
+        .reads_burst(&args.capture)
+        .reads(args.reading.files())
+        .writes([&args.output])
+        .writes(record.filter(|record| !record.starts_with(&args.output)))
+        .check()?;
+    refuse_taken(&args.output, overwrite)?;
+    let mut capture = Capture::open(&args.capture, &options, None)?;
+    let max_count = largest_count(&mut capture)?;
+    let format = BurstFormat::for_path(&args.output, max_count, !args.unpacked)?;
+    refuse_taken(&format.record_path(&args.output), overwrite)?;
+    let size = capture.size();
+    let mut writer = BurstWriter::create(&args.output, format, size, max_count, overwrite)?;
+    let mut counts = vec![0u16; size.pixels()];
+    let frames = capture.frames();
+    let mut bar = report.bar();
+    let mut frame = copy_packed(&mut capture, format, &mut writer, &mut bar)?;
+    while frame < frames {
+        if interrupt::check().is_break() {
+            return Err(CliError::Interrupted);
+        }
+        bar.update("converting", frame, Some(frames));
+        capture.read(frame, &mut counts)?;
+        let largest = counts.iter().copied().max().unwrap_or(0);
+        if largest > max_count {
+            return Err(SimError::data(
+                format!(
+                    "frame {frame} counts {largest}, beyond the {max_count} that its format allows"
+                ),
+                &args.capture,
+                "check --format and --levels",
+            )
+            .into());
+        }
+        writer.push(&counts)?;
+        frame += 1;
+    }
+    drop(bar);
+    let layout = BurstLayout::of_counts(format, frames, size, max_count, capture.fps());
+    let record = conversion(args, &options, &capture, layout)?;
+    let bytes = serde_json::to_vec_pretty(&record)
+        .map_err(|e| CliError::new(e, args.output.display(), "report this as a bug"))?;
+    writer.finish(&bytes, overwrite)?;
+    remarks(&capture, report);
+    let text = format!(
+        "{}   {frames} frames of {size}, {} bit, from {}",
+        args.output.display(),
+        record.burst.bits,
+        capture.info().title
+    );
+    report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
+}
+
+/// Frames copied without unpacking them: all, or none.
+fn copy_packed(
+    capture: &mut Capture,
+    format: BurstFormat,
+    writer: &mut BurstWriter,
+    bar: &mut Bar,
+) -> Result<u64> {
+    /// Bytes copied at once.
+    const PIECE: usize = 1 << 20;
+    if format != BurstFormat::NpyPacked {
+        return Ok(0);
+    }
+    let frame_bytes = capture.size().height * capture.size().width.div_ceil(8);
+    let at_once = (PIECE / frame_bytes).max(1) as u64;
+    let mut bytes = Vec::new();
+    let mut frame = 0;
+    while frame < capture.frames() {
+        if interrupt::check().is_break() {
+            return Err(CliError::Interrupted);
+        }
+        bar.update("converting", frame, Some(capture.frames()));
+        let n = at_once.min(capture.frames() - frame);
+        bytes.resize(n as usize * frame_bytes, 0);
+        if !capture.copy_packed(frame, &mut bytes)? {
+            return Ok(0);
+        }
+        writer.push_packed(&bytes)?;
+        frame += n;
+    }
+    Ok(frame)
+}
+
+fn conversion(
+    args: &Convert,
+    options: &ReadOptions,
+    capture: &Capture,
+    burst: BurstLayout,
+) -> Result<Conversion> {
+    let about = capture.info();
+    let absolute = |path: &Path| {
+        std::path::absolute(path).map_err(|e| SimError::io("find the capture", path, e))
+    };
+    Ok(Conversion {
+        version: VERSION,
+        program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
+        burst,
+        binary: about.binary,
+        preset: about.preset.map(str::to_owned),
+        capture: absolute(&args.capture)?,
+        format: about.format.to_owned(),
+        read: options.clone(),
+    })
+}
+
+/// The largest count that can appear: known, or that of the sample type needed for what is there.
+fn largest_count(capture: &mut Capture) -> Result<u16> {
+    if let Some(max) = capture.max_count() {
+        return Ok(max);
+    }
+    // Unknown depth: every frame decides.
+    let mut counts = vec![0u16; capture.size().pixels()];
+    let mut largest = 1;
+    for frame in 0..capture.frames() {
+        if interrupt::check().is_break() {
+            return Err(CliError::Interrupted);
+        }
+        capture.read(frame, &mut counts)?;
+        largest = largest.max(counts.iter().copied().max().unwrap_or(0));
+    }
+    let bits = 16 - largest.leading_zeros();
+    Ok(((1u32 << bits) - 1) as u16)
+}

@@ -1,0 +1,24 @@
+//! Options of `qudi demo`.
+
+use crate::args::{Network, number};
+use clap::{Args as ClapArgs, ValueHint};
+use std::path::PathBuf;
+
+/// See what the camera sees, and what every method makes of it: a built-in scene in one picture and one page
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Demo {
+    /// Picture to write [default: qudi-demo.png, overwritten]
+    #[arg(short, long, value_name = "PNG", value_hint = ValueHint::FilePath)]
+    pub(crate) output: Option<PathBuf>,
+    /// Sensor: a name or a .toml file
+    #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
+    pub(crate) sensor: String,
+    /// Photons per pixel and frame
+    #[arg(long, value_name = "PPP", allow_negative_numbers = true, default_value_t = 3.25, value_parser = number::real(number::PPP))]
+    pub(crate) ppp: f64,
+    /// Seed of photons and noise
+    #[arg(long, value_name = "N", default_value_t = 1, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
+    pub(crate) seed: u64,
+    #[command(flatten)]
+    pub(crate) network: Network,
+}

@@ -1,0 +1,153 @@
+//! One real capture, restored by every method without a truth: chi-square, cost, pictures.
+
+use super::clip::stem;
+use super::exposing::{FRAMES, SEED};
+use super::html::Pictures;
+use super::plan::Plan;
+use super::score::{FrameScore, Row, Score};
+use crate::capture::acquisition::{LightOverrides, acquisition};
+use crate::capture::{open_capture, remarks, unknown_sensor};
+use crate::error::Result;
+use crate::interrupt;
+use crate::memory::PeakMemory;
+use crate::methods::method;
+use crate::report::Report;
+use crate::settings::Settings;
+use qudi_core::Frame;
+use qudi_core::metrics::Consistency;
+use qudi_core::restorer::Acquisition;
+use qudi_core::windows::Windows;
+use qudi_io::capture::Capture;
+use qudi_io::restore::{RestoreSink, run as run_method};
+use serde_json::{Value, json};
+use std::path::Path;
+use std::time::Instant;
+
+/// The results of an evaluation.
+pub(crate) struct Evaluation {
+    pub(crate) rows: Vec<Row>,
+    pub(crate) pictures: Vec<Pictures>,
+    /// What the figures are, in a sentence.
+    pub(crate) about: String,
+    pub(crate) settings: Value,
+}
+
+/// Restores the first frames of the capture by every method.
+pub(crate) fn evaluate_capture(
+    plan: &Plan,
+    overrides: &Settings,
+    report: &Report,
+) -> Result<Evaluation> {
+    overrides.refuse(&["simulate."], "with --capture, whose photons are drawn already")?;
+    let seed = plan.seed.unwrap_or(SEED);
+    let path = Path::new(&plan.data);
+    let (mut capture, sensor) = open_capture(path, &plan.read, plan.sensor.as_deref(), overrides)?;
+    let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
+    let light = LightOverrides {
+        ppp: plan.ppp.first().copied(),
+        gain: plan.gain,
+        exposure: plan.exposure,
+        seed,
+    };
+    let (acquisition, source) = acquisition(&light, &mut capture, &sensor)?;
+    let frames = capture.frames().min(plan.frames.unwrap_or(FRAMES));
+    let mut counts = vec![0; capture.size().pixels()];
+    capture.read(frames / 2, &mut counts)?;
+    let full = f32::from(acquisition.sensor.max_count());
+    let data = counts.iter().map(|&count| f32::from(count) / full).collect();
+    let clip = stem(path);
+    let counts = Frame { size: capture.size(), data };
+    let mut pictures = Pictures::new(clip.clone(), acquisition.ppp, counts, None);
+    let mut rows = Vec::new();
+    let mut bar = report.bar();
+    for (n, name) in plan.methods.iter().enumerate() {
+        bar.update("evaluating", n as u64, Some(plan.methods.len() as u64));
+        let score = score(name, &clip, &mut capture, frames, &acquisition, plan)?;
+        pictures.add(name, &score);
+        rows.push(Row { method: name.clone(), ppp: acquisition.ppp, scores: vec![score] });
+    }
+    drop(bar);
+    remarks(&capture, report);
+    let about = format!(
+        "{frames} frames of {} of {}, sensor {}, {:.4} incident photons/pixel/frame ({source}); no truth: chi-square of the counts given the result, 1 where it explains them, below where it follows their noise, above where it blurs or invents",
+        capture.size(),
+        plan.data,
+        acquisition.sensor.name,
+        acquisition.ppp
+    );
+    let settings = json!({
+        "capture": plan.data,
+        "format": capture.info().format,
+        "frames": frames,
+        "ppp_from": source,
+        "gain": acquisition.gain,
+        "sensor": acquisition.sensor,
+        "seed": seed,
+        "exposure": acquisition.exposure,
+        "overlap": plan.overlap,
+    });
+    Ok(Evaluation { rows, pictures: vec![pictures], about, settings })
+}
+
+fn score(
+    name: &str,
+    clip: &str,
+    capture: &mut Capture,
+    frames: u64,
+    acquisition: &Acquisition,
+    plan: &Plan,
+) -> Result<Score> {
+    let mut sink = Watch {
+        consistency: Consistency::new(capture.size(), acquisition),
+        acquisition,
+        shown: frames / 2,
+        frames: Vec::new(),
+        picture: None,
+    };
+    let peak = PeakMemory::start();
+    let start = Instant::now();
+    let (mut restorer, how) = method(name, capture, acquisition, &plan.network)?;
+    let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
+    let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
+    run_method(
+        restorer.as_mut(),
+        capture,
+        &windows,
+        0..frames,
+        acquisition,
+        &mut sink,
+        &mut go_on,
+    )?;
+    let seconds = start.elapsed().as_secs_f64();
+    Ok(Score {
+        clip: clip.to_owned(),
+        chi_square: sink.consistency.chi_square(),
+        flicker: None,
+        flow: None,
+        seconds_per_frame: Some(seconds / frames as f64),
+        peak_mib: peak.grown_mib(),
+        frames: sink.frames,
+        picture: sink.picture.unwrap_or(Frame::filled(capture.size(), 0.0)),
+        how,
+    })
+}
+
+/// Measures frames as they come, and keeps the one that is shown.
+struct Watch<'a> {
+    consistency: Consistency,
+    acquisition: &'a Acquisition,
+    shown: u64,
+    frames: Vec<FrameScore>,
+    picture: Option<Frame>,
+}
+
+impl RestoreSink for Watch<'_> {
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
+        let chi_square = Some(self.consistency.add(restored, counts, self.acquisition)?);
+        self.frames.push(FrameScore { chi_square, ..FrameScore::default() });
+        if number == self.shown {
+            self.picture = Some(restored.clone());
+        }
+        Ok(())
+    }
+}

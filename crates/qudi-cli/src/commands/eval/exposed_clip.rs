@@ -1,0 +1,288 @@
+//! One clip, exposed at one light level, scored for every method.
+
+use super::args::External;
+use super::html::Pictures;
+use super::plan::Plan;
+use super::score::{Cost, FlowKind, FrameScore, Score};
+use crate::error::{CliError, Result};
+use crate::interrupt;
+use crate::memory::PeakMemory;
+use crate::methods::method;
+use qudi_burst::motion::warping_error;
+use qudi_core::flow::Flow;
+use qudi_core::metrics::{Consistency, best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim};
+use qudi_core::npy::read_clip;
+use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::windows::Windows;
+use qudi_core::{Camera, Frame, Light, Size};
+use qudi_io::capture::Capture;
+use qudi_io::restore::{RestoreSink, run as run_method};
+use qudi_sim::clip::{Input, Sampling};
+use qudi_sim::{Exposed, Sink, Start};
+use std::rc::Rc;
+use std::time::Instant;
+
+/// From each frame of the truth to the next.
+pub(super) enum Motion {
+    /// Known, since the scene is synthetic.
+    True(Vec<Flow>),
+    /// Found in the clean frames.
+    Estimated(Rc<Vec<Flow>>),
+}
+
+/// Name of a clip at a light level, as in `dog-ppp9_75`: no dot, so that a folder may have it.
+pub(super) fn burst_name(clip: &str, ppp: f64) -> String {
+    format!("{clip}-ppp{}", ppp.to_string().replace('.', "_"))
+}
+
+/// Photons and truth of a clip.
+#[derive(Default)]
+pub(super) struct Photons {
+    pub(super) counts: Vec<Vec<u16>>,
+    pub(super) truth: Vec<Frame>,
+    /// From each frame to the next, where the scene is synthetic.
+    pub(super) flow: Vec<Flow>,
+}
+
+impl Sink for Photons {
+    fn start(&mut self, _: Start) -> qudi_core::Result<()> {
+        Ok(())
+    }
+
+    fn frame(
+        &mut self,
+        exposed: Exposed<'_>,
+        flow: &dyn Fn() -> Option<Flow>,
+    ) -> qudi_core::Result<()> {
+        self.counts.push(exposed.counts.to_vec());
+        self.truth.push(exposed.truth.clone());
+        self.flow.extend(flow());
+        Ok(())
+    }
+}
+
+/// A clip exposed at one light level.
+pub(super) struct ExposedClip {
+    pub(super) name: String,
+    pub(super) size: Size,
+    pub(super) ppp: f64,
+    pub(super) seed: u64,
+    pub(super) photons: Photons,
+    pub(super) motion: Motion,
+    pub(super) acquisition: Acquisition,
+}
+
+impl ExposedClip {
+    pub(super) fn score_method(&self, name: &str, plan: &Plan) -> Result<Score> {
+        let sensor = &self.acquisition.sensor;
+        let mut capture =
+            Capture::in_memory(&self.name, self.size, self.photons.counts.clone(), sensor)?;
+        let peak = PeakMemory::start();
+        let start = Instant::now();
+        let (mut restorer, how) = method(name, &mut capture, &self.acquisition, &plan.network)?;
+        let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
+        let mut sink = Collected::default();
+        let all = 0..capture.frames();
+        run_method(
+            restorer.as_mut(),
+            &mut capture,
+            &windows,
+            all,
+            &self.acquisition,
+            &mut sink,
+            &mut |_, _| interrupt::check(),
+        )?;
+        let cost = Cost {
+            seconds_per_frame: start.elapsed().as_secs_f64() / sink.0.len() as f64,
+            peak_mib: peak.grown_mib(),
+        };
+        self.score(&sink.0, Some(cost), how)
+    }
+
+    /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
+    /// exposed anew with its own mean at `ppp`, and its middle frame judged.
+    pub(super) fn score_windows(&self, name: &str, plan: &Plan) -> Result<Score> {
+        const WINDOW: usize = 11;
+        let truth = &self.photons.truth;
+        if truth.len() < WINDOW {
+            return Err(CliError::new(
+                format!("{} frames, where a window has {WINDOW}", truth.len()),
+                &self.name,
+                "use longer clips, or --protocol strict",
+            ));
+        }
+        let sensor = &self.acquisition.sensor;
+        let (mut frames, mut middles) = (Vec::new(), Vec::new());
+        let (mut seconds, mut highest, mut how) = (0.0, None::<f64>, String::new());
+        let windows = truth.len() - WINDOW + 1;
+        for first in 0..windows {
+            if interrupt::check().is_break() {
+                return Err(CliError::Interrupted);
+            }
+            let scene = &truth[first..first + WINDOW];
+            let mean = scene.iter().map(Frame::mean).sum::<f64>() / WINDOW as f64;
+            let light = Light { ppp: self.acquisition.ppp, exposure: mean.max(1e-4) };
+            let seed = self.seed.wrapping_add(first as u64);
+            let mut camera = Camera::new(sensor, self.size, light, seed)?;
+            let mut counts = Vec::with_capacity(WINDOW);
+            for (t, frame) in scene.iter().enumerate() {
+                counts.push(camera.expose(t as u64, &[frame])?);
+            }
+            let acquisition = Acquisition { gain: camera.gain(), ..self.acquisition.clone() };
+            let peak = PeakMemory::start();
+            let start = Instant::now();
+            let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
+            let (mut restorer, chosen) = method(name, &mut capture, &acquisition, &plan.network)?;
+            how = chosen;
+            let burst = BurstView { size: self.size, frames: &counts };
+            let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
+            seconds += start.elapsed().as_secs_f64();
+            highest = [highest, peak.grown_mib()].into_iter().flatten().reduce(f64::max);
+            frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
+            middles.push(restored);
+        }
+        let middle = windows / 2;
+        let picture = aligned(&middles[middle], &truth[middle + WINDOW / 2]);
+        Ok(Score {
+            clip: self.name.clone(),
+            frames,
+            chi_square: None,
+            flicker: None,
+            flow: None,
+            seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
+            peak_mib: highest,
+            picture,
+            how,
+        })
+    }
+
+    fn score_frame(&self, image: &Frame, truth: &Frame) -> Result<FrameScore> {
+        let small = || {
+            CliError::new(
+                format!("frames of {} are smaller than SSIM's window of 11 x 11", self.size),
+                &self.name,
+                "use larger frames",
+            )
+        };
+        Ok(FrameScore {
+            psnr_a: Some(gain_aligned_psnr(image, truth)),
+            psnr: Some(psnr(image, truth)),
+            ssim: Some(ssim(image, truth).ok_or_else(small)?),
+            ssim_g: Some(gaussian_ssim(image, truth).ok_or_else(small)?),
+            chi_square: None,
+        })
+    }
+
+    /// Frames that another program made of the exported photons.
+    pub(super) fn score_external(&self, external: &External) -> Result<Score> {
+        let name = burst_name(&self.name, self.ppp);
+        let array = external.folder.join(format!("{name}.npy"));
+        let (place, frames) = if array.is_file() {
+            let frames = read_clip(&array, usize::MAX)?;
+            (array, frames)
+        } else {
+            let place = external.folder.join(name);
+            let input = Input::parse(&place.display().to_string(), None, None, 1, 0.0)?;
+            let mut source = input.open(&Sampling::default())?;
+            let mut frames = Vec::new();
+            while let Some(exposure) = source.next()? {
+                frames.push(exposure.truth().clone());
+            }
+            (place, frames)
+        };
+        let expected = self.photons.truth.len();
+        if frames.len() != expected || frames.iter().any(|frame| frame.size != self.size) {
+            return Err(CliError::new(
+                format!(
+                    "{} frames, where {expected} of {} are to be scored",
+                    frames.len(),
+                    self.size
+                ),
+                place.display(),
+                "restore every frame of the burst that --export-photons wrote",
+            ));
+        }
+        self.score(&frames, None, " (another program)".to_owned())
+    }
+
+    fn score(&self, restored: &[Frame], cost: Option<Cost>, how: String) -> Result<Score> {
+        let mut consistency = Consistency::new(self.size, &self.acquisition);
+        let mut frames = Vec::with_capacity(restored.len());
+        for ((image, truth), counts) in
+            restored.iter().zip(&self.photons.truth).zip(&self.photons.counts)
+        {
+            let chi_square = Some(consistency.add(image, counts, &self.acquisition)?);
+            frames.push(FrameScore { chi_square, ..self.score_frame(image, truth)? });
+        }
+        Ok(Score {
+            clip: self.name.clone(),
+            frames,
+            chi_square: consistency.chi_square(),
+            flicker: self.flicker(restored),
+            flow: match &self.motion {
+                _ if restored.len() < 2 => None,
+                Motion::True(_) => Some(FlowKind::True),
+                Motion::Estimated(_) => Some(FlowKind::Estimated),
+            },
+            seconds_per_frame: cost.map(|cost| cost.seconds_per_frame),
+            peak_mib: cost.and_then(|cost| cost.peak_mib),
+            picture: aligned(
+                &restored[restored.len() / 2],
+                &self.photons.truth[restored.len() / 2],
+            ),
+            how,
+        })
+    }
+}
+
+impl ExposedClip {
+    /// What the middle frame looks like, and what was seen of it.
+    pub(super) fn pictures(&self) -> Pictures {
+        let middle = self.photons.truth.len() / 2;
+        let full = f32::from(self.acquisition.sensor.max_count());
+        let counts = self.photons.counts[middle].iter().map(|&count| f32::from(count) / full);
+        let counts = Frame { size: self.size, data: counts.collect() };
+        let truth = self.photons.truth[middle].clone();
+        Pictures::new(self.name.clone(), self.ppp, counts, Some(truth))
+    }
+
+    fn flicker(&self, restored: &[Frame]) -> Option<f64> {
+        let mut excess = Vec::new();
+        let flow = match &self.motion {
+            Motion::True(flow) => flow,
+            Motion::Estimated(flow) => flow.as_ref(),
+        };
+        for (t, flow) in flow.iter().enumerate() {
+            let truth = &self.photons.truth;
+            // One gain for both frames: flicker of brightness counts.
+            let gain = best_gain(&restored[t], &truth[t]);
+            let own = warping_error(&truth[t], &truth[t + 1], flow)?;
+            excess.push(
+                warping_error(&scaled(&restored[t], gain), &scaled(&restored[t + 1], gain), flow)?
+                    - own,
+            );
+        }
+        let n = excess.len() as f64;
+        (n > 0.0).then(|| (excess.iter().sum::<f64>() / n).max(0.0).sqrt())
+    }
+}
+
+#[derive(Default)]
+struct Collected(Vec<Frame>);
+
+impl RestoreSink for Collected {
+    fn frame(&mut self, _: u64, restored: &Frame, _: &[u16]) -> qudi_core::Result<()> {
+        self.0.push(restored.clone());
+        Ok(())
+    }
+}
+
+/// A restored frame after the gain that brings it closest to the truth.
+fn aligned(image: &Frame, truth: &Frame) -> Frame {
+    scaled(image, best_gain(image, truth))
+}
+
+fn scaled(image: &Frame, gain: f64) -> Frame {
+    let data = image.data.iter().map(|v| (v * gain as f32).clamp(0.0, 1.0)).collect();
+    Frame { size: image.size, data }
+}

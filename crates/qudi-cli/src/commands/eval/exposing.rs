@@ -1,0 +1,82 @@
+//! How `qudi eval` exposes clips: the settings of `qudi simulate`, the flags of `eval` over them.
+
+use super::args::Protocol;
+use super::plan::Plan;
+use crate::error::Result;
+use crate::settings::Settings;
+use qudi_core::sensor::Sensor;
+use qudi_core::{PppDefinition, Size};
+use qudi_sim::Simulation;
+use qudi_sim::clip::{Input, Sampling};
+use qudi_sim::scene::StillMotion;
+
+/// Frames of a clip unless said otherwise.
+pub(crate) const FRAMES: u64 = 33;
+
+/// The seed unless said otherwise.
+pub(crate) const SEED: u64 = 1;
+
+/// Everything that decides the photons of a clip but the clip and its light.
+pub(crate) struct Exposing {
+    pub(crate) sensor: Sensor,
+    pub(crate) seed: u64,
+    sampling: Sampling,
+    ppp_def: PppDefinition,
+    exposure: Option<f64>,
+    motion: Option<StillMotion>,
+    size: Option<Size>,
+    scene_seed: u64,
+    speed: f64,
+}
+
+impl Exposing {
+    /// What flags and settings say.
+    pub(crate) fn new(plan: &Plan, settings: &Settings) -> Result<Self> {
+        if plan.protocol == Protocol::Quiver {
+            let unused = ["simulate.instants", "simulate.exposure"];
+            settings.refuse(&unused, "by --protocol quiver, which exposes windows anew")?;
+        }
+        let name = match &plan.sensor {
+            Some(name) => name.clone(),
+            None => settings.get("simulate.sensor")?,
+        };
+        let frames = match plan.frames {
+            Some(frames) => frames,
+            None => settings.given("simulate.frames")?.unwrap_or(FRAMES),
+        };
+        let seed = match plan.seed {
+            Some(seed) => seed,
+            None => settings.given("simulate.seed")?.unwrap_or(SEED),
+        };
+        Ok(Self {
+            sensor: settings.sensor(&name)?,
+            seed,
+            sampling: Sampling {
+                frames: Some(frames),
+                instants: settings.get("simulate.instants")?,
+                transfer: settings.get("simulate.transfer")?,
+                white: settings.get("simulate.white")?,
+            },
+            ppp_def: settings.get("simulate.ppp_def")?,
+            exposure: settings.get("simulate.exposure")?,
+            motion: settings.parse("simulate.motion")?,
+            size: settings.parse("simulate.size")?,
+            scene_seed: settings.get("simulate.scene_seed")?,
+            speed: settings.get("simulate.speed")?,
+        })
+    }
+
+    /// The simulation of the clip at `place`.
+    pub(crate) fn simulation(&self, place: &str, ppp: f64, seed: u64) -> Result<Simulation> {
+        let (motion, size) = (self.motion, self.size);
+        Ok(Simulation {
+            input: Input::parse(place, motion, size, self.scene_seed, self.speed)?,
+            sampling: self.sampling,
+            sensor: self.sensor.clone(),
+            ppp,
+            ppp_def: self.ppp_def,
+            exposure: self.exposure,
+            seed,
+        })
+    }
+}

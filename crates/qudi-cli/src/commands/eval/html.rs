@@ -1,0 +1,217 @@
+//! The page of `qudi eval`: table, plot, and pictures side by side.
+
+use super::score::{Row, Score};
+use super::table::summary;
+use crate::error::Result;
+use crate::report::html::{TableView, crop, crop_size, render};
+use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
+use qudi_core::Frame;
+use serde::Serialize;
+use std::fmt::Write;
+
+/// Largest side of the pictures: a crop from the middle.
+const CROP: usize = 224;
+
+/// Errors are shown this many times larger, zero at middle gray.
+const ERROR_GAIN: f32 = 2.0;
+
+/// The pictures of a clip at one light level.
+pub(crate) struct Pictures {
+    pub(crate) clip: String,
+    pub(crate) ppp: f64,
+    /// Counts of the middle frame, full scale for 1.
+    pub(crate) counts: Frame,
+    pub(crate) truth: Option<Frame>,
+    /// What methods made of it, and captions that say how.
+    restored: Vec<(String, Frame)>,
+    captions: Vec<String>,
+}
+
+/// The context of the template.
+#[derive(Serialize)]
+struct Page<'a> {
+    title: &'a str,
+    about: &'a str,
+    table: TableView,
+    plot: Option<Drawing>,
+    has_truth: bool,
+    clips: Vec<Clip>,
+}
+
+/// Pictures of a clip, two of them under a slider.
+#[derive(Serialize)]
+struct Clip {
+    name: String,
+    ppp: f64,
+    /// Size of the pictures.
+    width: usize,
+    height: usize,
+    /// Size of the frames.
+    size: String,
+    cropped: bool,
+    captions: Vec<String>,
+    pictures: Vec<Picture>,
+    /// Which pictures are shown at first.
+    left: usize,
+    right: usize,
+}
+
+#[derive(Serialize)]
+struct Picture {
+    name: String,
+    url: String,
+}
+
+impl Pictures {
+    pub(crate) fn new(clip: String, ppp: f64, counts: Frame, truth: Option<Frame>) -> Self {
+        Self { clip, ppp, counts, truth, restored: Vec::new(), captions: Vec::new() }
+    }
+
+    /// Adds what a method made of the clip.
+    pub(crate) fn add(&mut self, method: &str, score: &Score) {
+        let middle = score.frames.get(score.frames.len() / 2).copied().unwrap_or_default();
+        let mut caption = format!("{method}{}", score.how);
+        if let (Some(psnr_a), Some(ssim)) = (middle.psnr_a, middle.ssim) {
+            let _ = write!(caption, ": PSNR {psnr_a:.2} dB after the best gain, SSIM {ssim:.3}");
+        } else if let Some(chi_square) = middle.chi_square {
+            let _ = write!(caption, ": chi-square {chi_square:.3}");
+        }
+        self.captions.push(caption);
+        self.restored.push((method.to_owned(), score.picture.clone()));
+    }
+}
+
+/// The whole page.
+pub(crate) fn html(rows: &[Row], pictures: &[Pictures], about: &str) -> Result<String> {
+    render(
+        "eval.html",
+        Page {
+            title: "Evaluation of methods",
+            about,
+            table: TableView::from(&summary(rows)),
+            plot: quality(rows).draw(),
+            has_truth: pictures.iter().any(|clip| clip.truth.is_some()),
+            clips: pictures.iter().map(clip).collect(),
+        },
+    )
+}
+
+/// Gain-aligned PSNR against light.
+fn quality(rows: &[Row]) -> Plot {
+    let mut curves: Vec<Curve> = Vec::new();
+    for row in rows {
+        let Some(psnr_a) = row.over_clips(|f| f.psnr_a) else { continue };
+        let point = Point { x: row.ppp, y: psnr_a.mean, error: psnr_a.ci95.unwrap_or(0.0) };
+        match curves.iter_mut().find(|curve| curve.name == row.method) {
+            Some(curve) => curve.points.push(point),
+            None => curves.push(Curve { name: row.method.clone(), points: vec![point] }),
+        }
+    }
+    for curve in &mut curves {
+        curve.points.sort_by(|a, b| a.x.total_cmp(&b.x));
+    }
+    let mut levels: Vec<f64> = rows.iter().map(|row| row.ppp).collect();
+    levels.sort_by(f64::total_cmp);
+    levels.dedup();
+    Plot {
+        title: "PSNR against light".to_owned(),
+        caption: "PSNR after the best gain, all frames, mean over clips; bars show its 95 % confidence interval. \
+                  Higher is better."
+            .to_owned(),
+        x: Axis { ticks: levels, ..Axis::logarithmic("incident photons per pixel and frame") },
+        y: Axis::linear("dB"),
+        curves,
+    }
+}
+
+fn clip(clip: &Pictures) -> Clip {
+    let mut pictures = Vec::new();
+    let mut add =
+        |name: String, frame: &Frame| pictures.push(Picture { name, url: crop(frame, CROP) });
+    add("counts".to_owned(), &clip.counts);
+    for (method, frame) in &clip.restored {
+        add(method.clone(), frame);
+        if let Some(truth) = &clip.truth {
+            add(format!("{method}: error"), &error(frame, truth));
+        }
+    }
+    if let Some(truth) = &clip.truth {
+        add("truth".to_owned(), truth);
+    }
+    // The last method against the truth; without one, the counts against it.
+    let right = pictures.len() - 1;
+    let left = if clip.truth.is_some() { right.saturating_sub(2) } else { 0 };
+    let size = clip.counts.size;
+    let shown = crop_size(size, CROP);
+    Clip {
+        name: clip.clip.clone(),
+        // Four digits of an estimated level are plenty.
+        ppp: (clip.ppp * 1e4).round() / 1e4,
+        width: shown.width,
+        height: shown.height,
+        size: size.to_string(),
+        cropped: shown != size,
+        captions: clip.captions.clone(),
+        pictures,
+        left,
+        right,
+    }
+}
+
+/// Signed errors around middle gray.
+fn error(image: &Frame, truth: &Frame) -> Frame {
+    let pairs = image.data.iter().zip(&truth.data);
+    let data = pairs.map(|(image, truth)| 0.5 + ERROR_GAIN * 0.5 * (image - truth)).collect();
+    Frame { size: truth.size, data }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::commands::eval::score::FrameScore;
+    use qudi_core::Size;
+
+    fn score(clip: &str, size: Size, how: &str) -> Score {
+        let frame = FrameScore { psnr_a: Some(25.0), ssim: Some(0.9), ..FrameScore::default() };
+        Score {
+            clip: clip.to_owned(),
+            frames: vec![frame],
+            chi_square: None,
+            flicker: None,
+            flow: None,
+            seconds_per_frame: None,
+            peak_mib: None,
+            picture: Frame::filled(size, 0.5),
+            how: how.to_owned(),
+        }
+    }
+
+    fn pictures(clip: &str, size: Size) -> Pictures {
+        let frame = Frame::filled(size, 0.4);
+        Pictures::new(clip.to_owned(), 3.25, frame.clone(), Some(frame))
+    }
+
+    #[test]
+    fn draws_clips_of_two_sizes_under_one_name() {
+        let sizes = [Size { height: 24, width: 32 }, Size { height: 300, width: 40 }];
+        let mut clips = sizes.map(|size| pictures("run", size));
+        let scores = sizes.map(|size| score("run", size, ""));
+        for (clip, score) in clips.iter_mut().zip(&scores) {
+            clip.add("mle", score);
+        }
+        let rows = [Row { method: "mle".to_owned(), ppp: 3.25, scores: scores.to_vec() }];
+        let page = html(&rows, &clips, "about").unwrap_or_else(|e| panic!("{e:?}"));
+        assert!(page.contains("aspect-ratio:32/24") && page.contains("aspect-ratio:40/224"));
+        assert!(page.contains("the middle 40 x 224 pixels"));
+    }
+
+    #[test]
+    fn captions_say_how_pictures_were_made() {
+        let size = Size { height: 24, width: 32 };
+        let mut clip = pictures("<dog>", size);
+        clip.add("qudi", &score("<dog>", size, " (diffusion in 4 steps) on cpu"));
+        let page = html(&[], &[clip], "about").unwrap_or_else(|e| panic!("{e:?}"));
+        assert!(page.contains("qudi (diffusion in 4 steps) on cpu: PSNR 25.00 dB"), "{page}");
+        assert!(page.contains("<b>&lt;dog&gt;</b>"), "names are no markup");
+    }
+}

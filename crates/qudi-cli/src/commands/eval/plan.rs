@@ -1,0 +1,134 @@
+//! The plan of an evaluation: its arguments, checked once.
+
+use super::args::{Eval, External, Protocol};
+use crate::args::Shard;
+use crate::capture::acquisition::checked_exposure;
+use crate::error::{CliError, Result};
+use crate::methods::options::NetworkOptions;
+use crate::methods::{METHODS, is_method};
+use qudi_core::atomic_file::Overwrite;
+use qudi_io::capture::{MaskChoice, ReadOptions};
+use std::path::PathBuf;
+
+/// Everything that an evaluation is asked for.
+#[derive(Debug)]
+pub(super) struct Plan {
+    /// The clip, the folder of clips, or the capture.
+    pub(super) data: String,
+    pub(super) methods: Vec<String>,
+    pub(super) network: NetworkOptions,
+    /// Light levels; none for the usual ones of clips, or that of the capture.
+    pub(super) ppp: Vec<f64>,
+    pub(super) sensor: Option<String>,
+    /// The gain of a capture.
+    pub(super) gain: Option<f64>,
+    /// Frames of each clip, or of the capture, at most.
+    pub(super) frames: Option<u64>,
+    pub(super) protocol: Protocol,
+    pub(super) seed: Option<u64>,
+    /// The mean level that methods are given.
+    pub(super) exposure: Option<f64>,
+    /// Frames that neighbouring windows share.
+    pub(super) overlap: u64,
+    pub(super) export_photons: Option<PathBuf>,
+    pub(super) external: Vec<External>,
+    pub(super) shard: Option<Shard>,
+    /// Whether pictures are wanted.
+    pub(super) pictures: bool,
+    /// How a capture is read.
+    pub(super) read: ReadOptions,
+    pub(super) overwrite: Overwrite,
+}
+
+impl Plan {
+    /// Checks the arguments.
+    ///
+    /// # Errors
+    /// [`CliError`] for unknown methods and arguments that do not go together.
+    pub(super) fn new(args: &Eval, overwrite: Overwrite) -> Result<Self> {
+        checked_exposure(args.exposure)?;
+        if let Some(unknown) = args.method.iter().find(|name| !is_method(name)) {
+            return Err(CliError::new(
+                format!("no method named `{unknown}`"),
+                "--method",
+                format!("there are {}", METHODS.join(", ")),
+            ));
+        }
+        let network = args.network.options();
+        network.check_methods(args.method.iter().map(String::as_str))?;
+        let plan = Self {
+            data: args.data.clone(),
+            methods: args.method.clone(),
+            network,
+            ppp: args.ppp.clone(),
+            sensor: args.sensor.clone(),
+            gain: args.gain,
+            frames: args.frames,
+            protocol: args.protocol,
+            seed: args.seed,
+            exposure: args.exposure,
+            overlap: args.overlap,
+            export_photons: args.export_photons.clone(),
+            external: args.external.clone(),
+            shard: args.shard,
+            pictures: args.html.is_some(),
+            read: args.reading.options(MaskChoice::Auto),
+            overwrite,
+        };
+        if args.capture {
+            plan.check_capture(args.min_psnr.is_some())?;
+        } else {
+            plan.check_clips()?;
+        }
+        Ok(plan)
+    }
+
+    /// Refuses what needs a truth.
+    fn check_capture(&self, has_bar: bool) -> Result<()> {
+        let refused = [
+            (self.protocol == Protocol::Quiver, "--protocol"),
+            (self.export_photons.is_some(), "--export-photons"),
+            (!self.external.is_empty(), "--external"),
+            (has_bar, "--min-psnr"),
+        ];
+        if let Some((_, option)) = refused.iter().find(|(given, _)| *given) {
+            return Err(CliError::new(
+                "a capture has no truth, and its photons are drawn already",
+                option,
+                "leave it out, or evaluate on clips without --capture",
+            ));
+        }
+        if self.ppp.len() > 1 {
+            return Err(CliError::new(
+                format!("{} light levels for one capture", self.ppp.len()),
+                "--ppp",
+                "give the light of this capture, or leave it out",
+            ));
+        }
+        if self.frames == Some(0) {
+            return Err(CliError::new("no frames", "--frames", "ask for at least 1"));
+        }
+        Ok(())
+    }
+
+    /// Refuses what does not go with clips.
+    fn check_clips(&self) -> Result<()> {
+        if self.protocol == Protocol::Quiver
+            && (self.export_photons.is_some() || !self.external.is_empty())
+        {
+            return Err(CliError::new(
+                "the quiver protocol draws new photons for every window",
+                "--protocol",
+                "other programs are compared under the strict protocol",
+            ));
+        }
+        if self.read != ReadOptions::default() {
+            return Err(CliError::new(
+                "options for reading captures, and DATA is taken for clips",
+                &self.data,
+                "add --capture if it is a capture, or leave them out",
+            ));
+        }
+        Ok(())
+    }
+}

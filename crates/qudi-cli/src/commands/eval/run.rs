@@ -1,0 +1,192 @@
+//! `qudi eval`: methods against known truth on the same photons, or on a real capture without one.
+
+use super::args::{Eval, Protocol};
+use super::capture::{Evaluation, evaluate_capture};
+use super::clip::Clip;
+use super::exposing::Exposing;
+use super::html::html;
+use super::plan::Plan;
+use super::score::{Figure, FlowKind, Row};
+use super::table::{frames, summary};
+use crate::args::Global;
+use crate::error::{CliError, Result};
+use crate::interrupt;
+use crate::places::Places;
+use crate::report::{Output, Report, csv, markdown};
+use crate::settings::Settings;
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+/// Light levels of clips unless said otherwise: those of the paper's table.
+const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
+
+pub(crate) fn run(
+    args: &Eval,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let clips = if args.capture { Vec::new() } else { Clip::places(&args.data)? };
+    let outputs = [&args.csv, &args.markdown, &args.html, &args.export_photons];
+    let external = args.external.iter().map(|external| &external.folder);
+    Places::default()
+        .reads(args.capture.then_some(&args.data))
+        .reads(clips)
+        .reads(external)
+        .reads(args.sensor.as_deref())
+        .reads(&args.network.weights)
+        .writes(outputs.into_iter().flatten())
+        .check()?;
+    let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
+    let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
+    let html_file = output(&args.html)?;
+    if let Some(folder) = &args.export_photons {
+        refuse_taken(folder, overwrite)?;
+    }
+    let plan = Plan::new(args, overwrite)?;
+    let Evaluation { rows, pictures, about, settings } = if args.capture {
+        evaluate_capture(&plan, settings, report)?
+    } else {
+        evaluate_clips(&plan, settings, report)?
+    };
+    csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
+    html_file.write(|| html(&rows, &pictures, &about))?;
+    let table = summary(&rows);
+    markdown_file.write(|| Ok(markdown::table(&table)))?;
+    let text = format!("{}\n{about}\n", table.to_text());
+    report.result(&text, || document(settings, &rows))?;
+    let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
+    match args.min_psnr {
+        // What is no number passes no bar.
+        Some(bar) => match rows.iter().find(|row| psnr_a(row).is_nan() || psnr_a(row) < bar) {
+            Some(row) => Err(CliError::Missed(format!(
+                "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
+                row.method,
+                psnr_a(row),
+                row.ppp
+            ))),
+            None => Ok(()),
+        },
+        None => Ok(()),
+    }
+}
+
+/// Evaluates every method on every clip at every light level.
+fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<Evaluation> {
+    let exposing = Exposing::new(plan, settings)?;
+    let set = settings.given("simulate.ppp")?.map(|ppp: f64| vec![ppp]);
+    let levels = match &plan.ppp[..] {
+        [] => &set.unwrap_or(LEVELS.to_vec())[..],
+        given => given,
+    };
+    let mut clips = Clip::find(&plan.data)?;
+    if let Some(shard) = plan.shard {
+        let part = shard.range(clips.len() as u64);
+        clips = clips.drain(part.start as usize..part.end as usize).collect();
+        if clips.is_empty() {
+            let help = "ask for at most as many parts as there are clips";
+            return Err(CliError::new("this part holds no clip", "--shard", help));
+        }
+    }
+    if let Some(folder) = &plan.export_photons {
+        std::fs::create_dir_all(folder)
+            .map_err(|e| qudi_core::SimError::io("create the folder", folder, e))?;
+    }
+    let mut rows: Vec<Row> = Vec::new();
+    let names: Vec<&String> =
+        plan.methods.iter().chain(plan.external.iter().map(|external| &external.name)).collect();
+    for &ppp in levels {
+        rows.extend(names.iter().map(|&name| Row {
+            method: name.clone(),
+            ppp,
+            scores: Vec::new(),
+        }));
+    }
+    let mut pictures = Vec::new();
+    let mut bar = report.bar();
+    let number = clips.len();
+    let total = (number * levels.len()) as u64;
+    // By value: what was found out about a clip goes with it.
+    for (i, clip) in clips.into_iter().enumerate() {
+        for (j, &ppp) in levels.iter().enumerate() {
+            bar.update("evaluating", (i * levels.len() + j) as u64, Some(total));
+            if interrupt::check().is_break() {
+                return Err(CliError::Interrupted);
+            }
+            let exposed = clip.expose(plan, &exposing, ppp)?;
+            if plan.pictures {
+                pictures.push(exposed.pictures());
+            }
+            for (k, name) in names.iter().enumerate() {
+                let external = k.checked_sub(plan.methods.len()).map(|k| &plan.external[k]);
+                let score = match (external, plan.protocol) {
+                    (Some(external), _) => exposed.score_external(external)?,
+                    (None, Protocol::Strict) => exposed.score_method(name, plan)?,
+                    (None, Protocol::Quiver) => exposed.score_windows(name, plan)?,
+                };
+                if plan.pictures
+                    && let Some(pictures) = pictures.last_mut()
+                {
+                    pictures.add(name, &score);
+                }
+                rows[j * names.len() + k].scores.push(score);
+            }
+        }
+    }
+    drop(bar);
+    let flow = match rows.first().and_then(Row::flow) {
+        Some(FlowKind::True) => "; flicker: rms change along the true flow beyond the truth's",
+        Some(FlowKind::Estimated) => {
+            "; flicker: rms change along the estimated flow (on the truth, checked both ways) beyond the truth's"
+        }
+        None => "",
+    };
+    let protocol = plan.protocol.name();
+    let about = format!(
+        "{number} {}, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
+        if number == 1 { "clip" } else { "clips" },
+        exposing.sensor.name,
+        exposing.seed
+    );
+    let settings = json!({
+        "protocol": plan.protocol,
+        "data": plan.data,
+        "sensor": exposing.sensor,
+        "seed": exposing.seed,
+        "exposure": plan.exposure,
+        "overlap": plan.overlap,
+    });
+    Ok(Evaluation { rows, pictures, about, settings })
+}
+
+/// What is not known is left out.
+fn document(mut settings: Value, rows: &[Row]) -> Value {
+    let row = |row: &Row| {
+        let of = |figure: Figure| {
+            Some(
+                json!({"centre": row.centre(figure)?, "all": row.over_clips(figure)?, "frames": row.over_frames(figure)?}),
+            )
+        };
+        let figures = json!({
+            "method": row.method,
+            "ppp": row.ppp,
+            "psnr_a": of(|f| f.psnr_a),
+            "psnr": of(|f| f.psnr),
+            "ssim": of(|f| f.ssim),
+            "ssim_g": of(|f| f.ssim_g),
+            "chi_square": row.mean(|s| s.chi_square),
+            "flicker": row.mean(|s| s.flicker),
+            "flow": row.flow(),
+            "seconds_per_frame": row.mean(|s| s.seconds_per_frame),
+            "peak_mib": row.peak_mib(),
+            "clips": row.scores,
+        });
+        let Value::Object(mut figures) = figures else { return figures };
+        figures.retain(|_, figure| !figure.is_null());
+        Value::Object(figures)
+    };
+    settings["rows"] = rows.iter().map(row).collect();
+    settings
+}

@@ -1,0 +1,76 @@
+//! The tables of `qudi eval`: figures of methods, and of every frame.
+
+use super::score::{FlowKind, FrameScore, Row};
+use crate::report::{Cell, Column, Table};
+use qudi_core::metrics::Statistics;
+
+/// One row for every method and light level, without columns in which nothing is known.
+pub(crate) fn summary(rows: &[Row]) -> Table {
+    let flicker = match rows.first().and_then(Row::flow) {
+        Some(FlowKind::Estimated) => "flicker (estimated flow)",
+        Some(FlowKind::True) | None => "flicker",
+    };
+    let mut table = Table::new(vec![
+        Column::new("method", "method"),
+        Column::new("ppp", "PPP"),
+        Column::new("psnr_a_centre", "psnr-a centre"),
+        Column::new("psnr_a", "psnr-a all"),
+        Column::new("psnr_a_worst5", "worst 5 %"),
+        Column::new("psnr", "psnr all"),
+        Column::new("ssim", "ssim all"),
+        Column::new("ssim_g", "ssim-g all"),
+        Column::new("chi_square", "chi-square"),
+        Column::new("flicker", flicker),
+        Column::new("seconds_per_frame", "s/frame"),
+        Column::new("peak_mib", "peak").with_unit("MiB"),
+    ]);
+    table.rows = rows.iter().map(cells).collect();
+    table.without_unknown_columns()
+}
+
+fn cells(row: &Row) -> Vec<Cell> {
+    let mean = |statistics: Option<Statistics>, digits: usize| match statistics {
+        Some(Statistics { mean: value, ci95: Some(ci95), .. }) => {
+            Cell::Mean { value, ci95, digits }
+        }
+        other => Cell::number(other.map(|statistics| statistics.mean), digits),
+    };
+    vec![
+        Cell::text(&row.method),
+        // Estimated light levels have four significant decimals at most.
+        Cell::Exact((row.ppp * 1e4).round() / 1e4),
+        mean(row.centre(|f| f.psnr_a), 2),
+        mean(row.over_clips(|f| f.psnr_a), 2),
+        Cell::number(row.over_frames(|f| f.psnr_a).map(|s| s.worst5), 2),
+        mean(row.over_clips(|f| f.psnr), 2),
+        mean(row.over_clips(|f| f.ssim), 3),
+        mean(row.over_clips(|f| f.ssim_g), 3),
+        Cell::number(row.mean(|s| s.chi_square), 3),
+        Cell::number(row.mean(|s| s.flicker), 3),
+        Cell::number(row.mean(|s| s.seconds_per_frame), 4),
+        Cell::number(row.peak_mib(), 1),
+    ]
+}
+
+/// One row for every method, light level, clip and frame.
+pub(crate) fn frames(rows: &[Row]) -> Table {
+    let keys = ["method", "ppp", "clip", "frame", "psnr_a", "psnr", "ssim", "ssim_g", "chi_square"];
+    let mut table = Table::new(keys.map(|key| Column::new(key, key)).to_vec());
+    for row in rows {
+        for score in &row.scores {
+            for (n, &frame) in score.frames.iter().enumerate() {
+                let FrameScore { psnr_a, psnr, ssim, ssim_g, chi_square } = frame;
+                let mut cells = vec![
+                    Cell::text(&row.method),
+                    Cell::Exact(row.ppp),
+                    Cell::text(&score.clip),
+                    Cell::Exact(n as f64),
+                ];
+                let figures = [(psnr_a, 2), (psnr, 2), (ssim, 3), (ssim_g, 3), (chi_square, 3)];
+                cells.extend(figures.map(|(figure, digits)| Cell::number(figure, digits)));
+                table.rows.push(cells);
+            }
+        }
+    }
+    table
+}

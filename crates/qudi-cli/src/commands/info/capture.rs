@@ -1,0 +1,206 @@
+//! `qudi info CAPTURE`: what it is, how sure that is, and what is in it.
+
+use super::args::Info;
+use super::record::{origin, record_document};
+use crate::args::Global;
+use crate::capture::open_capture;
+use crate::error::fields::flags_in_text;
+use crate::error::{CliError, Result};
+use crate::places::Places;
+use crate::report::Report;
+use crate::settings::Settings;
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::sensor::Sensor;
+use qudi_core::{Frame, linear_to_srgb};
+use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
+use qudi_io::sidecar::Sidecar;
+use qudi_io::writer::Picture;
+use serde_json::{Value, json};
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// Columns of the histogram's bars.
+const BAR: usize = 40;
+
+/// Counts shown in the histogram; more are grouped.
+const BINS: usize = 8;
+
+/// `record` is the record beside it, and where that lies.
+pub(crate) fn run(
+    path: &Path,
+    record: Option<&(Sidecar, PathBuf)>,
+    info: &Info,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    Places::default()
+        .reads_burst(path)
+        .reads(info.reading.files())
+        .reads(info.sensor.as_deref())
+        .writes(&info.preview)
+        .check()?;
+    if let Some(preview) = &info.preview {
+        refuse_taken(preview, overwrite)?;
+    }
+    let options = info.reading.options(MaskChoice::Auto);
+    let (mut capture, sensor) = open_capture(path, &options, info.sensor.as_deref(), settings)?;
+    let gain = capture.info().gain;
+    let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
+    if let Some(preview) = &info.preview {
+        let mut picture = summary.picture(&capture, sensor.as_ref(), gain);
+        for value in &mut picture.data {
+            *value = linear_to_srgb(*value);
+        }
+        save(&picture, preview, overwrite)?;
+    }
+    let mut text = describe(&capture, &summary, sensor.as_ref());
+    if let Some((record, path)) = record {
+        text += &origin(record, path);
+    }
+    report.result(&text, || {
+        let mut document = document(&capture, &summary, sensor.as_ref());
+        document["record"] = record.map_or(Value::Null, |(record, _)| record_document(record));
+        document
+    })
+}
+
+fn save(picture: &Frame, path: &Path, overwrite: Overwrite) -> Result<()> {
+    if path.extension().is_none_or(|e| !e.eq_ignore_ascii_case("png")) {
+        return Err(CliError::new(
+            "previews are PNG",
+            path.display(),
+            "use a name that ends in .png",
+        ));
+    }
+    Ok(Picture::single(picture).save(path, overwrite)?)
+}
+
+fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> String {
+    let about = capture.info();
+    let mut text = String::new();
+    let mut line = |key: &str, value: String| {
+        let _ = writeln!(text, "{key:<11}{value}");
+    };
+    let evidence = flags_in_text(&about.reasons.join(", "));
+    line(
+        "format",
+        format!("{}: {} ({}: {evidence})", about.format, about.title, about.certainty.name()),
+    );
+    let depth = match capture.max_count() {
+        Some(max) => format!("{} bit, counts up to {max}", 16 - max.leading_zeros()),
+        None => "depth unknown".to_owned(),
+    };
+    let summed = match capture.summed() {
+        1 => String::new(),
+        n => format!(", sums of {n}"),
+    };
+    line("frames", format!("{} of {}, {depth}{summed}", capture.frames(), capture.size()));
+    if let Some(packing) = about.packing {
+        line("packing", describe_packing(packing, summary.bit_order));
+    }
+    if about.orient != qudi_io::capture::Orientation::Raw {
+        line("turned", about.orient.name().to_owned());
+    }
+    if let Some(fps) = capture.fps() {
+        line("rate", format!("{fps} frames per second"));
+    }
+    let sensor_fps = sensor.and_then(|s| s.fps).filter(|_| capture.fps().is_none());
+    if let (Some(sensor), Some(fps)) = (sensor, sensor_fps) {
+        line(
+            "rate",
+            format!("not in the file; `{}` takes up to {fps} frames per second", sensor.name),
+        );
+    }
+    line("looked at", format!("{} frames", summary.sampled));
+    let ppp = &summary.ppp;
+    let photons = |value: Option<f64>| value.map_or("unknown".to_owned(), |v| format!("{v:.4}"));
+    let by = sensor
+        .map_or("no sensor known: --sensor NAME".to_owned(), |s| format!("sensor {}", s.name));
+    line(
+        "light",
+        format!(
+            "dn {:.4}, detected {}, incident {} per pixel and frame ({by})",
+            ppp.dn,
+            photons(ppp.detected),
+            photons(ppp.incident)
+        ),
+    );
+    match summary.saturated {
+        Some(_) if capture.max_count() == Some(1) => {
+            line("ones", format!("{:.3} % of all bits", 100.0 * summary.mean));
+        }
+        Some(saturated) => line("saturated", format!("{:.3} % of samples", 100.0 * saturated)),
+        None => {
+            let largest = summary.histogram.len() - 1;
+            let bits = usize::BITS - largest.leading_zeros();
+            line("largest", format!("{largest}; if counts have {bits} bits, say --bits {bits}"));
+        }
+    }
+    line("pixels", capture.bad_pixels().describe(capture.size()));
+    histogram(&mut text, &summary.histogram);
+    for remark in &about.notes {
+        let _ = writeln!(text, "note       {}", flags_in_text(remark));
+    }
+    text
+}
+
+fn describe_packing(packing: Packing, check: Option<BitOrderCheck>) -> String {
+    let axis = match packing.axis {
+        qudi_io::capture::PackAxis::Height => "height",
+        _ => "width",
+    };
+    let order = packing.order;
+    let judged = match check {
+        Some(BitOrderCheck { seen: Some(seen), z_score }) if seen == order => {
+            format!("the picture agrees, {z_score:.0} standard errors")
+        }
+        Some(BitOrderCheck { seen: Some(seen), z_score }) => {
+            format!("but the picture says {seen}, {:.0} standard errors: see --bitorder", -z_score)
+        }
+        Some(BitOrderCheck { seen: None, z_score }) => {
+            format!("unsure from the picture, {z_score:.1} standard errors")
+        }
+        None => return format!("8 pixels per byte along the {axis}, {order}"),
+    };
+    format!("8 pixels per byte along the {axis}, {order} ({judged})")
+}
+
+fn histogram(text: &mut String, histogram: &[u64]) {
+    let total: u64 = histogram.iter().sum();
+    let width = histogram.len().div_ceil(BINS);
+    let bins: Vec<u64> = histogram.chunks(width).map(|bin| bin.iter().sum()).collect();
+    let most = bins.iter().copied().max().unwrap_or(1).max(1);
+    for (i, &bin) in bins.iter().enumerate() {
+        let (low, high) = (i * width, ((i + 1) * width - 1).min(histogram.len() - 1));
+        let label = if low == high { format!("{low}") } else { format!("{low}-{high}") };
+        let key = if i == 0 { "counts" } else { "" };
+        let bar = "#".repeat((bin as f64 / most as f64 * BAR as f64).round() as usize);
+        let percent = 100.0 * bin as f64 / total.max(1) as f64;
+        let _ = writeln!(text, "{key:<11}{label:>11} {percent:>7.3} % {bar}");
+    }
+}
+
+fn document(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> Value {
+    let bad = capture.bad_pixels();
+    json!({
+        "path": capture.path(),
+        "about": capture.info(),
+        "frames": capture.frames(),
+        "height": capture.size().height,
+        "width": capture.size().width,
+        "max_count": capture.max_count(),
+        "summed": capture.summed(),
+        "fps": capture.fps(),
+        "looked_at": summary.sampled,
+        "ppp": summary.ppp,
+        "sensor": sensor.map(|sensor| &sensor.name),
+        "mean": summary.mean,
+        "saturated": summary.saturated,
+        "histogram": summary.histogram,
+        "bit_order": summary.bit_order,
+        "hot": bad.hot.len(),
+        "dead": bad.dead.len(),
+    })
+}

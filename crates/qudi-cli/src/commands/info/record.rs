@@ -1,0 +1,40 @@
+//! Records of bursts: where a burst comes from, and how to make it again.
+
+use qudi_io::sidecar::Sidecar;
+use serde_json::{Value, json};
+use std::fmt::Write;
+use std::path::Path;
+
+/// The record as a JSON document.
+pub(crate) fn record_document(record: &Sidecar) -> Value {
+    match record {
+        Sidecar::Simulated(record) => json!(record),
+        Sidecar::Converted(conversion) => json!(conversion),
+    }
+}
+
+/// Where a burst comes from, and how to make it again.
+pub(crate) fn origin(record: &Sidecar, path: &Path) -> String {
+    let mut text = String::new();
+    let mut line = |key: &str, value: String| {
+        let _ = writeln!(text, "{key:<11}{value}");
+    };
+    match record {
+        Sidecar::Simulated(record) => {
+            let (simulation, light) = (&record.simulation, record.light);
+            let sensor = &simulation.sensor.name;
+            line("simulated", format!("sensor {sensor}, gain {:.4} DN/e-", record.gain));
+            let (ppp, exposure) = (light.ppp, light.exposure);
+            line("", format!("{ppp:.4} incident photons/pixel/frame, exposure {exposure:.4}"));
+            line("scene", simulation.input.place());
+            line("seed", simulation.seed.to_string());
+            line("made by", record.program.clone());
+            line("again", format!("qudi simulate --from {} -o OUT", path.display()));
+        }
+        Sidecar::Converted(conversion) => {
+            line("converted", format!("from {}", conversion.capture.display()));
+            line("made by", conversion.program.clone());
+        }
+    }
+    text
+}

@@ -1,0 +1,177 @@
+//! `qudi info`: captures, bursts, weights, sensors, devices.
+
+use super::args::Info;
+use super::capture;
+use super::record::{origin, record_document};
+use crate::args::Global;
+use crate::error::{CliError, Result};
+use crate::report::Report;
+use crate::settings::Settings;
+use crate::weights::Weights;
+use burn::tensor::Device;
+use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
+use qudi_io::codec::FORMATS;
+use qudi_io::sidecar::Sidecar;
+use qudi_model::checkpoint::ModelKind;
+use serde_json::json;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+pub(crate) fn run(
+    info: &Info,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    if info.sensors || info.formats || info.devices {
+        settings.refuse(&["sensor."], "by lists")?;
+    }
+    if info.sensors {
+        return sensors(report);
+    }
+    if info.formats {
+        return formats(report);
+    }
+    if info.devices {
+        return devices(report);
+    }
+    let subject = info.subject.as_deref().unwrap_or_default();
+    let path = Path::new(subject);
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let transforms = path.file_name().is_some_and(|name| name == "transforms.json");
+    match extension.as_deref() {
+        Some("toml") => sensor(subject, settings, report),
+        Some("safetensors") if path.is_file() => {
+            settings.refuse(&["sensor."], "for weights")?;
+            weights(&Weights::File(path.to_owned()), report)
+        }
+        Some("json") if path.is_file() && !transforms => {
+            settings.refuse(&["sensor."], "for records: name the burst")?;
+            burst(path, report)
+        }
+        _ if path.exists() => {
+            let beside = [PathBuf::from(format!("{subject}.json")), path.join("burst.json")];
+            // A record that cannot be read is remarked upon when the capture is opened.
+            let record = beside.into_iter().find(|record| record.is_file());
+            let record = record.and_then(|path| Some((Sidecar::load(&path).ok()?, path)));
+            capture::run(path, record.as_ref(), info, settings, global, report)
+        }
+        _ if preset(subject).is_some() => sensor(subject, settings, report),
+        _ if subject == "weights" => {
+            settings.refuse(&["sensor."], "for weights")?;
+            weights(&Weights::BuiltIn, report)
+        }
+        _ => Err(CliError::new(
+            format!("there is no file and no sensor named `{subject}`"),
+            subject,
+            "list sensors with `qudi info --sensors`",
+        )),
+    }
+}
+
+fn sensors(report: &Report) -> Result<()> {
+    let sensors =
+        PRESETS.iter().map(|p| Sensor::load(p.name)).collect::<qudi_core::Result<Vec<_>>>()?;
+    let mut text = format!(
+        "{:<15}{:<8}{:>4}{:>8}{:>9}{:>7}{:>8}  summary\n",
+        "name", "kind", "bits", "QE", "dark", "read", "fps"
+    );
+    for s in &sensors {
+        let mark = |key: &str, value: String| {
+            if s.unverified.iter().any(|u| u == key) { format!("{value}?") } else { value }
+        };
+        let _ = writeln!(
+            text,
+            "{:<15}{:<8}{:>4}{:>8}{:>9}{:>7}{:>8}  {}",
+            s.name,
+            if s.response == Response::Binary { "binary" } else { "linear" },
+            mark("bits", s.bits.to_string()),
+            mark("quantum_efficiency", format!("{:.3}", s.quantum_efficiency)),
+            mark("dark", s.dark.to_string()),
+            mark("read_noise", s.read_noise.to_string()),
+            s.fps.map_or("-".to_owned(), |fps| fps.to_string()),
+            s.summary
+        );
+    }
+    text += "\n?  no source confirms this number.  Sources: `qudi info NAME`.  dark: e- per frame, or per second (/s); read noise in e-.\n";
+    report.result(&text, || json!(sensors))
+}
+
+/// A weight file, as it describes itself.
+fn weights(weights: &Weights, report: &Report) -> Result<()> {
+    let d = weights.describe()?;
+    let mut text = String::new();
+    let mut line = |key: &str, value: String| {
+        let _ = writeln!(text, "{key:<12}{value}");
+    };
+    let sizes = d.network.parameters(&Device::flex());
+    line("network", format!("{}, {sizes} parameters", d.preset.as_deref().unwrap_or("own sizes")));
+    line("window", format!("{} frames", d.window));
+    line("sensors", d.sensors.join(", "));
+    line("light", format!("{} to {} photons per pixel and frame", d.ppp[0], d.ppp[1]));
+    line("trained", format!("{} steps on {}", d.steps, d.data.join(", ")));
+    line(
+        "made by",
+        d.program.clone() + &d.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}")),
+    );
+    let kind = match d.kind {
+        Some(ModelKind::Regression) => "regression",
+        _ => "diffusion, or regression with --steps 0",
+    };
+    line("restores by", format!("{kind}; {} steps by default", d.reverse_steps()));
+    line("licence", d.licence.clone());
+    line("sha-256", weights.sha256()?);
+    report.result(&text, || json!(weights.describe().ok()))
+}
+
+fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {
+    let sensor = settings.sensor(name)?;
+    // A preset as it was written, with the remarks on its numbers.
+    let text = match preset(name) {
+        Some(preset) if !settings.overrides_sensor() => preset.toml.to_owned(),
+        _ => {
+            toml::to_string(&sensor).map_err(|e| CliError::new(e, name, "report this as a bug"))?
+        }
+    };
+    report.result(&text, || json!(sensor))
+}
+
+/// A record, without its burst.
+fn burst(path: &Path, report: &Report) -> Result<()> {
+    let record = Sidecar::load(path)?;
+    let burst = match &record {
+        Sidecar::Simulated(record) => &record.burst,
+        Sidecar::Converted(conversion) => &conversion.burst,
+    };
+    let mut text = format!(
+        "{:<11}{} of {}, {} bit, counts up to {}\n",
+        "frames", burst.frames, burst.size, burst.bits, burst.max_count
+    );
+    if let Some(fps) = burst.fps {
+        let _ = writeln!(text, "{:<11}{fps} frames per second", "rate");
+    }
+    report.result(&(text + &origin(&record, path)), || record_document(&record))
+}
+
+/// The formats that captures are read from.
+fn formats(report: &Report) -> Result<()> {
+    let width = FORMATS.iter().map(|format| format.name.len()).max().unwrap_or(0) + 2;
+    let lines: Vec<String> =
+        FORMATS.iter().map(|f| format!("{:width$}{}\n", f.name, f.title)).collect();
+    let text =
+        format!("{}\nlayouts and how they are recognised: docs/formats.md\n", lines.concat());
+    report.result(&text, || {
+        FORMATS.iter().map(|f| json!({"name": f.name, "title": f.title})).collect()
+    })
+}
+
+fn devices(report: &Report) -> Result<()> {
+    let devices = crate::device::list();
+    let mut text = String::new();
+    for device in &devices {
+        let _ = writeln!(text, "{:<10}{}", device.name, device.description);
+    }
+    report.result(&text, || {
+        devices.iter().map(|d| json!({"device": d.name, "description": d.description})).collect()
+    })
+}

@@ -1,0 +1,15 @@
+//! Options of `qudi publish`.
+
+use clap::{Args as ClapArgs, ValueHint};
+use std::path::PathBuf;
+
+/// Write weights in half precision, half the size, with their SHA-256 beside them
+#[derive(Debug, ClapArgs)]
+pub(crate) struct Publish {
+    /// Weights that `qudi train` wrote
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub(crate) weights: PathBuf,
+    /// Where they go: .safetensors
+    #[arg(short, long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) output: PathBuf,
+}

@@ -1,0 +1,51 @@
+//! `qudi publish`: weights in half the space, with the hash that proves them.
+
+use super::args::Publish;
+use crate::args::Global;
+use crate::error::{CliError, Result};
+use crate::places::Places;
+use crate::report::Report;
+use crate::weights::{Weights, sha256};
+use burn::tensor::Device;
+use qudi_core::SimError;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_model::checkpoint::{Precision, save};
+use serde_json::json;
+
+pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()> {
+    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let path = &args.output;
+    if path.extension() != Some("safetensors".as_ref()) {
+        return Err(CliError::new(
+            "weights are .safetensors",
+            path.display(),
+            "name a .safetensors file",
+        ));
+    }
+    Places::default()
+        .reads([&args.weights])
+        .writes([path, &path.with_extension("sha256")])
+        .check()?;
+    let device = Device::flex();
+    let (network, mut description) = Weights::File(args.weights.clone()).load(&device)?;
+    // Said from now on, whatever later versions take for granted.
+    description.default_steps = Some(description.reverse_steps());
+    save(&network, &description, Precision::Half, path, overwrite)?;
+    let bytes = std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
+    let hash = sha256(&bytes);
+    PendingFile::write_whole(
+        &path.with_extension("sha256"),
+        format!("{hash}\n").as_bytes(),
+        overwrite,
+    )?;
+    let parameters = description.network.parameters(&device);
+    let text = format!(
+        "{}   {parameters} parameters in {} bytes\n  sha-256   {hash}\n",
+        path.display(),
+        bytes.len()
+    );
+    report.result(
+        &text,
+        || json!({"output": path, "parameters": parameters, "bytes": bytes.len(), "sha256": hash}),
+    )
+}

@@ -1,0 +1,93 @@
+//! Chi-square of the counts given the restored frames, and frames beside their counts.
+
+use crate::error::Result;
+use qudi_core::atomic_file::Overwrite;
+use qudi_core::metrics::Consistency;
+use qudi_core::restorer::Acquisition;
+use qudi_core::{Frame, SimError};
+use qudi_io::capture::Capture;
+use qudi_io::writer::{ArrayWriter, Picture};
+use std::path::Path;
+
+/// How well restored frames explain the photons: chi-square of all frames, and three of them beside their
+/// counts.
+pub(super) struct ChiSquareMap {
+    consistency: Consistency,
+    acquisition: Acquisition,
+    /// Frames to show; of a pipe that has not told its length, the first.
+    shown: Vec<u64>,
+    /// Frames that are shown: number, counts, restored.
+    pictures: Vec<(u64, [Frame; 2])>,
+    /// Whether the latest frame is kept, which may turn out to be the last.
+    keep_latest: bool,
+    /// Frames measured so far.
+    measured: u64,
+}
+
+impl ChiSquareMap {
+    pub(super) fn new(capture: &Capture, acquisition: &Acquisition) -> Self {
+        let length = capture.length();
+        let mut shown = vec![0];
+        shown.extend(length.into_iter().flat_map(|n| [(n - 1) / 2, n - 1]));
+        shown.dedup();
+        Self {
+            consistency: Consistency::new(capture.size(), acquisition),
+            acquisition: acquisition.clone(),
+            shown,
+            pictures: Vec::new(),
+            keep_latest: length.is_none(),
+            measured: 0,
+        }
+    }
+
+    pub(super) fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
+        if self.keep_latest || self.shown.contains(&self.measured) {
+            if self.keep_latest {
+                self.pictures.truncate(self.shown.len());
+            }
+            let full = f32::from(self.acquisition.sensor.max_count());
+            let data = counts.iter().map(|&count| f32::from(count) / full).collect();
+            let counts = Frame { size: restored.size, data };
+            self.pictures.push((self.measured, [counts, restored.clone()]));
+        }
+        self.measured += 1;
+        self.consistency.add(restored, counts, &self.acquisition).map(drop)
+    }
+
+    pub(super) fn chi_square(&self) -> Option<f64> {
+        self.consistency.chi_square()
+    }
+
+    /// Counts above, restored frames below: the first, the middle (not of a pipe without length) and
+    /// the last.
+    pub(super) fn side_by_side(&self) -> Option<Picture> {
+        let size = self.pictures.first()?.1[0].size;
+        let mut picture = Picture::new(size, 2, self.pictures.len(), 1);
+        for (column, (frame, pair)) in self.pictures.iter().enumerate() {
+            picture.place(0, column, &[&format!("COUNTS {frame}")], &pair[0]);
+            picture.place(1, column, &[&format!("RESTORED {frame}")], &pair[1]);
+        }
+        Some(picture)
+    }
+
+    /// Saves the chi-square of every pixel: values in `.npy`, or a picture in which 2 is white.
+    pub(super) fn save(&self, path: &Path, overwrite: Overwrite) -> Result<()> {
+        let mut map = self.consistency.map();
+        match path.extension().map(|e| e.to_string_lossy().to_lowercase()).as_deref() {
+            Some("npy") => {
+                let mut array = ArrayWriter::create(path, overwrite, "<f4", &[map.size.width])?;
+                for row in map.data.chunks(map.size.width) {
+                    array.push_f32(row.iter().copied())?;
+                }
+                Ok(array.finish()?)
+            }
+            Some("png") => {
+                for value in &mut map.data {
+                    *value *= 0.5;
+                }
+                Ok(Picture::single(&map).save(path, overwrite)?)
+            }
+            _ => Err(SimError::data("maps are .npy or .png", path, "choose one of the two").into()),
+        }
+    }
+}

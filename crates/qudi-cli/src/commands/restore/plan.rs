@@ -1,0 +1,154 @@
+//! The plan of a restoration: its arguments, checked once.
+
+use super::args::Restore;
+use crate::args::tiff_samples::tiff_samples;
+use crate::args::{Global, Shard};
+use crate::capture::acquisition::LightOverrides;
+use crate::error::{CliError, Result};
+use crate::methods::options::NetworkOptions;
+use crate::places::Places;
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_io::capture::{MaskChoice, ReadOptions};
+use qudi_io::writer::TiffSamples;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+
+/// Everything that a restoration is asked for.
+#[derive(Debug)]
+pub(super) struct Plan {
+    /// The capture; `-` for a pipe.
+    pub(super) capture: PathBuf,
+    /// Where the frames go; `-` for standard output.
+    pub(super) output: String,
+    /// The sensor by name, unless record or format say it.
+    pub(super) sensor: Option<String>,
+    pub(super) read: ReadOptions,
+    pub(super) light: LightOverrides,
+    /// `--seed`, if given.
+    pub(super) seed_flag: Option<&'static str>,
+    /// The method by name, unless the capture decides.
+    pub(super) method: Option<String>,
+    pub(super) network: NetworkOptions,
+    /// Frames that neighbouring windows share.
+    pub(super) overlap: u64,
+    pub(super) shard: Option<Shard>,
+    pub(super) tiff: TiffSamples,
+    pub(super) chi_square_map: Option<PathBuf>,
+    pub(super) side_by_side: Option<PathBuf>,
+    pub(super) uncertainty: Option<PathBuf>,
+    pub(super) overwrite: Overwrite,
+}
+
+impl Plan {
+    /// Checks the arguments; `json` says that a document goes to standard output.
+    ///
+    /// # Errors
+    /// [`CliError`] for arguments that do not go together, outputs that are inputs, and outputs that exist.
+    pub(super) fn new(args: &Restore, global: &Global, json: bool) -> Result<Self> {
+        if args.output == "-" && json {
+            return Err(CliError::new(
+                "--json and -o - both write to standard output",
+                "--json",
+                "write the frames to a file",
+            ));
+        }
+        let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+        let beside = [&args.chi_map, &args.side_by_side, &args.uncertainty];
+        Places::default()
+            .reads_burst(&args.capture)
+            .reads(args.reading.files())
+            .reads(args.sensor.as_deref())
+            .reads(&args.network.weights)
+            .reads(&global.config)
+            .writes([&args.output])
+            .writes(beside.into_iter().flatten())
+            .check()?;
+        for path in beside.into_iter().flatten() {
+            refuse_taken(path, overwrite)?;
+        }
+        if args.shard.is_some() && args.side_by_side.is_some() {
+            return Err(CliError::new(
+                "a part of the work has not all the frames to show",
+                "--side-by-side",
+                "ask for it when all parts are done: the same command without --shard",
+            ));
+        }
+        let mut network = args.network.options();
+        if let Some(method) = &args.method {
+            network.check_methods(std::iter::once(method.as_str()))?;
+        }
+        let seed_flag = args.seed.is_some().then_some("--seed");
+        network.diffusion_flag = network.diffusion_flag.or(seed_flag);
+        let plan = Self {
+            capture: args.capture.clone(),
+            output: args.output.clone(),
+            sensor: args.sensor.clone(),
+            read: args.reading.options(MaskChoice::Auto),
+            light: LightOverrides {
+                ppp: args.ppp,
+                gain: args.gain,
+                exposure: args.exposure,
+                seed: args.seed.unwrap_or(0),
+            },
+            seed_flag,
+            method: args.method.clone(),
+            network,
+            overlap: args.overlap,
+            shard: args.shard,
+            tiff: tiff_samples(args.float, Path::new(&args.output))?,
+            chi_square_map: args.chi_map.clone(),
+            side_by_side: args.side_by_side.clone(),
+            uncertainty: args.uncertainty.clone(),
+            overwrite,
+        };
+        plan.check_output()?;
+        if plan.reads_pipe() {
+            plan.check_pipe()?;
+        }
+        Ok(plan)
+    }
+
+    /// Whether the capture comes through standard input.
+    pub(super) fn reads_pipe(&self) -> bool {
+        self.capture.as_os_str() == "-"
+    }
+
+    /// Refuses a taken name before any work is done. Folders may be resumed.
+    fn check_output(&self) -> Result<()> {
+        let folder = Path::new(&self.output).extension().is_none() && self.output != "-";
+        if self.shard.is_some() && !folder {
+            return Err(CliError::new(
+                "parts of the work can only meet in a folder",
+                "--shard",
+                "give a name without extension",
+            ));
+        }
+        if !folder && self.output != "-" {
+            refuse_taken(Path::new(&self.output), self.overwrite)?;
+        }
+        Ok(())
+    }
+
+    /// Refuses what needs a capture that can be read again.
+    fn check_pipe(&self) -> Result<()> {
+        if std::io::stdin().is_terminal() {
+            return Err(CliError::new(
+                "standard input is a terminal, and a capture comes through a pipe",
+                "-",
+                "pipe one in, as in `cat burst.npy | qudi restore - -o out`, or name a file",
+            ));
+        }
+        if self.shard.is_some() {
+            return Err(CliError::new(
+                "a pipe comes once and whole",
+                "--shard",
+                "store the capture in a file to share the work",
+            ));
+        }
+        if self.output != "-" {
+            // Nobody knows whether the same frames come again, so that a folder is not resumed.
+            refuse_taken(Path::new(&self.output), self.overwrite)?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,61 @@
+//! The uncertainty of every pixel, written beside the frames: as the network predicts it, or over samples.
+
+use super::plan::Plan;
+use crate::error::{CliError, Result};
+use qudi_core::Frame;
+use qudi_io::capture::Capture;
+use qudi_io::writer::ArrayWriter;
+
+/// A `.npy` file of uncertainties, float32 `[frames, height, width]`, or none.
+#[derive(Debug)]
+pub(super) struct UncertaintyFile(Option<ArrayWriter>);
+
+impl UncertaintyFile {
+    /// Creates the file that the plan asks for. An earlier run that finished some frames wrote no uncertainty
+    /// of them.
+    pub(super) fn create(
+        plan: &Plan,
+        method: &str,
+        capture: &Capture,
+        finished: u64,
+    ) -> Result<Self> {
+        let Some(path) = &plan.uncertainty else { return Ok(Self(None)) };
+        if method != "qudi" {
+            let what = format!("{method} does not predict its uncertainty");
+            return Err(CliError::new(what, "--uncertainty", "use --method qudi"));
+        }
+        if plan.network.samples < 2 && !plan.network.predicts_uncertainty()? {
+            return Err(CliError::new(
+                "one sample has no uncertainty",
+                "--uncertainty",
+                "draw several with --samples K, or use --steps 0 with weights that predict it (`qudi info FILE`)",
+            ));
+        }
+        if path.extension() != Some("npy".as_ref()) {
+            return Err(CliError::new(
+                "uncertainties are .npy",
+                path.display(),
+                "name a .npy file",
+            ));
+        }
+        if finished > 0 {
+            return Err(CliError::new(
+                format!("{finished} frames were restored by an earlier run, without uncertainty"),
+                &plan.output,
+                "write into another folder",
+            ));
+        }
+        let size = capture.size();
+        let shape = [size.height, size.width];
+        Ok(Self(Some(ArrayWriter::create(path, plan.overwrite, "<f4", &shape)?)))
+    }
+
+    pub(super) fn push(&mut self, sigma: &Frame) -> qudi_core::Result<()> {
+        let values = sigma.data.iter().copied();
+        self.0.as_mut().map_or(Ok(()), |writer| writer.push_f32(values))
+    }
+
+    pub(super) fn finish(self) -> Result<()> {
+        Ok(self.0.map_or(Ok(()), ArrayWriter::finish)?)
+    }
+}

@@ -1,0 +1,212 @@
+//! The plan of a simulation: arguments and settings, checked once.
+
+use super::args::Simulate;
+use crate::args::Global;
+use crate::args::number::COUNT;
+use crate::args::tiff_samples::tiff_samples;
+use crate::error::{CliError, Result};
+use crate::places::Places;
+use crate::settings::Settings;
+use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_io::sidecar::Record;
+use qudi_io::writer::{BurstFormat, TiffSamples};
+use qudi_sim::Simulation;
+use qudi_sim::clip::{Input, Sampling};
+use std::hash::{BuildHasher, RandomState};
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+
+/// Everything that a simulation is asked for.
+#[derive(Debug)]
+pub(super) struct Plan {
+    pub(super) simulation: Simulation,
+    /// The checksum of the clip in the record that is simulated again, and that record.
+    pub(super) recorded: Option<(u32, PathBuf)>,
+    pub(super) outputs: OutputPlan,
+}
+
+/// The files that a simulation writes.
+#[derive(Debug)]
+pub(super) struct OutputPlan {
+    /// Where the burst goes; `-` for standard output.
+    pub(super) output: String,
+    pub(super) format: BurstFormat,
+    /// Full scale of the counts.
+    pub(super) max_count: u16,
+    pub(super) truth: Option<PathBuf>,
+    /// Samples of the truth's `.tif`.
+    pub(super) tiff: TiffSamples,
+    pub(super) flow: Option<PathBuf>,
+    pub(super) preview: Option<PathBuf>,
+    /// The file beside the burst that visionsim looks for.
+    pub(super) transforms: Option<PathBuf>,
+    pub(super) overwrite: Overwrite,
+}
+
+impl Plan {
+    /// Checks arguments and settings; `json` says that a document goes to standard output.
+    ///
+    /// # Errors
+    /// [`CliError`] for arguments that do not go together, outputs that are inputs, and outputs that exist.
+    pub(super) fn new(
+        args: &Simulate,
+        settings: Settings,
+        global: &Global,
+        json: bool,
+    ) -> Result<Self> {
+        if args.output == "-" && json {
+            return Err(CliError::new(
+                "--json and -o - both write to standard output",
+                "--json",
+                "write the burst to a file",
+            ));
+        }
+        let (simulation, recorded) = match &args.from {
+            Some(path) => {
+                reject_settings_beside_record(args, global)?;
+                let record = Record::load(path)?;
+                (record.simulation, Some((record.clip.crc32, path.clone())))
+            }
+            None => (simulation(args, &settings.with_flags(&args.keys)?)?, None),
+        };
+        if matches!(simulation.input, Input::Pipe { .. }) && std::io::stdin().is_terminal() {
+            return Err(CliError::new(
+                "nothing is piped in",
+                "standard input",
+                "pipe a clip in, as in `ffmpeg -i VIDEO -f yuv4mpegpipe - | qudi simulate - -o OUT`",
+            ));
+        }
+        let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+        if args.flow.is_some() && !simulation.input.is_synthetic() {
+            return Err(CliError::new(
+                "a recorded clip has no known flow",
+                "--flow",
+                "leave it out, or use a still in motion or a procedural scene",
+            ));
+        }
+        let transforms = Path::new(&args.output).with_file_name("transforms.json");
+        let transforms = args.visionsim.then_some(transforms);
+        check_places(args, &simulation, global, transforms.as_deref())?;
+        let max_count = simulation.sensor.max_count();
+        let outputs = OutputPlan {
+            output: args.output.clone(),
+            format: format(args, max_count)?,
+            max_count,
+            truth: args.truth.clone(),
+            tiff: match &args.truth {
+                Some(path) => tiff_samples(args.float, path)?,
+                None => TiffSamples::U16,
+            },
+            flow: args.flow.clone(),
+            preview: args.preview.clone(),
+            transforms,
+            overwrite,
+        };
+        outputs.check()?;
+        Ok(Self { simulation, recorded, outputs })
+    }
+}
+
+impl OutputPlan {
+    /// Refuses names that are taken, before the clip is read.
+    fn check(&self) -> Result<()> {
+        let path = PathBuf::from(&self.output);
+        let burst = (!self.to_stdout()).then(|| [path.clone(), self.format.record_path(&path)]);
+        let beside = [&self.truth, &self.flow, &self.preview, &self.transforms];
+        for path in burst.iter().flatten().chain(beside.into_iter().flatten()) {
+            refuse_taken(path, self.overwrite)?;
+        }
+        Ok(())
+    }
+
+    /// Whether the burst goes to standard output.
+    pub(super) fn to_stdout(&self) -> bool {
+        self.output == "-"
+    }
+}
+
+/// The format of the burst.
+fn format(args: &Simulate, max_count: u16) -> Result<BurstFormat> {
+    let packed = !args.unpacked;
+    let format = if args.output == "-" {
+        BurstFormat::npy(max_count, packed)
+    } else {
+        BurstFormat::for_path(Path::new(&args.output), max_count, packed)?
+    };
+    if args.visionsim && (format != BurstFormat::NpyPacked || args.output == "-") {
+        return Err(CliError::new(
+            "visionsim opens packed binary .npy files only",
+            "--visionsim",
+            "use a binary sensor (--sensor swissspad2), no --sum, and -o NAME.npy",
+        ));
+    }
+    Ok(format)
+}
+
+/// Refuses outputs that are inputs.
+fn check_places(
+    args: &Simulate,
+    simulation: &Simulation,
+    global: &Global,
+    transforms: Option<&Path>,
+) -> Result<()> {
+    let input = args.input.as_deref().filter(|input| !input.starts_with("scene:"));
+    let format = BurstFormat::for_path(Path::new(&args.output), 1, true);
+    let record = format.ok().map(|format| format.record_path(Path::new(&args.output)));
+    // The record of a folder lies in the folder.
+    let record = record.filter(|record| !record.starts_with(&args.output));
+    let beside = [&args.truth, &args.flow, &args.preview];
+    Places::default()
+        .reads(input)
+        .reads(&args.from)
+        .reads([simulation.input.place()])
+        .reads(&global.config)
+        .writes([&args.output])
+        .writes(record.filter(|_| args.output != "-"))
+        .writes(beside.into_iter().flatten())
+        .writes(transforms)
+        .check()
+}
+
+fn reject_settings_beside_record(args: &Simulate, global: &Global) -> Result<()> {
+    let given = args.keys.first();
+    let given = given.or((!global.set.is_empty()).then(|| "--set".to_owned()));
+    let given = given.or(global.config.is_some().then(|| "--config".to_owned()));
+    let Some(given) = given else { return Ok(()) };
+    Err(CliError::new(
+        format!("{given} beside --from: a record says everything about its burst"),
+        &given,
+        "leave it out, or give the input instead of the record",
+    ))
+}
+
+fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
+    let input = Input::parse(
+        args.input.as_deref().unwrap_or_default(),
+        settings.parse("simulate.motion")?,
+        settings.parse("simulate.size")?,
+        settings.get("simulate.scene_seed")?,
+        settings.get("simulate.speed")?,
+    )?;
+    let frames: Option<u64> = settings.get("simulate.frames")?;
+    if let Some(frames) = frames.filter(|frames| frames > COUNT.end()) {
+        let help = format!("give a number up to {}", COUNT.end());
+        return Err(CliError::new(format!("{frames} frames"), "--frames", help));
+    }
+    // Drawn seeds stay short enough to be read out and typed.
+    let drawn = || RandomState::new().hash_one(0) % 1_000_000;
+    Ok(Simulation {
+        input,
+        sampling: Sampling {
+            frames,
+            instants: settings.get("simulate.instants")?,
+            transfer: settings.get("simulate.transfer")?,
+            white: settings.get("simulate.white")?,
+        },
+        sensor: settings.sensor(&settings.get::<String>("simulate.sensor")?)?,
+        ppp: settings.get("simulate.ppp")?,
+        ppp_def: settings.get("simulate.ppp_def")?,
+        exposure: settings.get("simulate.exposure")?,
+        seed: settings.get::<Option<u64>>("simulate.seed")?.unwrap_or_else(drawn),
+    })
+}

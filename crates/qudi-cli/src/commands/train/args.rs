@@ -1,0 +1,53 @@
+//! Options of `qudi train`.
+
+use crate::args::number;
+use clap::{Args as ClapArgs, ValueHint};
+use std::path::PathBuf;
+
+/// Learn a network from videos, stills and procedural scenes
+///
+/// A recipe says everything that decides the result; --set KEY=VALUE changes it, as in --set train.steps=1000. The run's
+/// folder gets the recipe, metrics, pictures, weights.safetensors for `qudi restore --weights`, and the state that
+/// --resume goes on from, exactly.
+#[derive(Debug, ClapArgs)]
+#[expect(clippy::struct_excessive_bools, reason = "switches of a command line")]
+pub(crate) struct Train {
+    /// The recipe: tiny, small, base, paper, or a .toml file [default with --resume: the run's own]
+    pub(crate) recipe: Option<String>,
+    /// Folder of the run
+    #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present_any = ["cache_only", "draw_only"])]
+    pub(crate) output: Option<PathBuf>,
+    /// Folder that the recipe's files lie in
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
+    pub(crate) data: Option<PathBuf>,
+    /// Decoded data in one file; made from --data if it is not there [default: pack.zip in the run's folder]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) pack: Option<PathBuf>,
+    /// Folder for the bursts of recipes with train.crops, with their reference estimates: those there are not drawn again
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
+    pub(crate) bursts: Option<PathBuf>,
+    /// Make the pack, and stop
+    #[arg(long, requires = "pack")]
+    pub(crate) cache_only: bool,
+    /// Draw all bursts of a recipe with train.crops into --bursts, and stop
+    #[arg(long, requires = "bursts", conflicts_with_all = ["cache_only", "output"])]
+    pub(crate) draw_only: bool,
+    /// Go on from the run's last state
+    #[arg(long, conflicts_with_all = ["cache_only", "draw_only", "init"])]
+    pub(crate) resume: bool,
+    /// Start from these weights instead of random ones: of the same network, or of one with one refinement stage less
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) init: Option<PathBuf>,
+    /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
+    pub(crate) device: Vec<String>,
+    /// Threads that draw samples
+    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MOST_THREADS))]
+    pub(crate) workers: usize,
+    /// Download the weights of the recipe's LPIPS term into --backbones first, with curl
+    #[arg(long, requires = "backbones")]
+    pub(crate) fetch: bool,
+    /// Folder with the weights of the LPIPS backbone and heads [default: where Burn keeps them]
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
+    pub(crate) backbones: Option<PathBuf>,
+}

@@ -1,0 +1,84 @@
+//! What a run learns from: decoded files, cached bursts, initial weights.
+
+use super::plan::Plan;
+use crate::device::Opened;
+use crate::error::{CliError, Result};
+use crate::interrupt;
+use crate::report::Report;
+use qudi_core::atomic_file::Overwrite;
+use qudi_model::checkpoint::{Description, load};
+use qudi_model::network::Qudi;
+use qudi_train::dataset::{Pack, write_pack};
+use qudi_train::{Files, Recipe};
+use std::path::Path;
+
+/// The files that the recipe learns from, made first if they are not there.
+pub(super) fn files(plan: &Plan, report: &Report) -> Result<Files> {
+    if let Some(folder) = &plan.bursts {
+        make_folder(folder, "the folder of bursts", "choose another with --bursts")?;
+    }
+    let pack = pack(plan, report)?;
+    Ok(Files { pack, bursts: plan.bursts.clone() })
+}
+
+pub(super) fn make_folder(folder: &Path, what: &str, help: &str) -> Result<()> {
+    std::fs::create_dir_all(folder)
+        .map_err(|e| CliError::new(format!("cannot make {what}: {e}"), folder.display(), help))
+}
+
+/// The recipe's files, decoded; made first if they are not there.
+fn pack(plan: &Plan, report: &Report) -> Result<Option<Pack>> {
+    if !plan.recipe.data.needs_files() && plan.recipe.validation_data().is_none() {
+        return Ok(None);
+    }
+    if !plan.pack.exists() {
+        make_pack(plan, Overwrite::No, report)?;
+    }
+    Ok(Some(Pack::open(&plan.pack)?))
+}
+
+/// Decodes the recipe's files into a pack.
+pub(super) fn make_pack(plan: &Plan, overwrite: Overwrite, report: &Report) -> Result<()> {
+    let Some(data) = &plan.data else {
+        return Err(CliError::new(
+            "the recipe reads files",
+            "--data",
+            "name the folder that they lie in, or a pack with --pack",
+        ));
+    };
+    let validation = plan.recipe.validation_data();
+    let mut configs = vec![&plan.recipe.data];
+    configs.extend(&validation);
+    let mut bar = report.bar();
+    write_pack(&configs, data, &plan.pack, overwrite, &mut |progress| {
+        let [done, total] = progress.done;
+        bar.update("decoding", done as u64, Some(total as u64));
+        interrupt::check()
+    })?;
+    Ok(())
+}
+
+/// The network that training starts from, out of a weight file.
+pub(super) fn initial(path: &Path, recipe: &Recipe, device: &Opened) -> Result<Box<Qudi>> {
+    let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
+    let before = sizes.pre.aligned_neighbours();
+    // A pre-denoiser that sees more than a refinement stage does cannot become one.
+    let is_stage = before == sizes.pre.stage().aligned_neighbours();
+    if sizes.pre.stages + 1 == recipe.network.pre.stages && is_stage {
+        sizes.pre.stages += 1;
+        network = network.with_stage_added(sizes.pre.aligned_neighbours().count() - before.count());
+    }
+    if recipe.network.pre.uncertainty && !sizes.pre.uncertainty {
+        let fresh = recipe.network.init(recipe.train.seed, &device.device);
+        network = network.with_uncertainty_head_of(fresh);
+        sizes.pre.uncertainty = true;
+    }
+    if sizes != recipe.network {
+        return Err(CliError::new(
+            "these weights are for a network of other sizes than the recipe's",
+            path.display(),
+            "choose the recipe that they were trained with, its [network] table, or that with one more refinement stage or with an uncertainty head",
+        ));
+    }
+    Ok(Box::new(network))
+}

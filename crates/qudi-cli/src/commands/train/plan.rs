@@ -1,0 +1,96 @@
+//! The plan of a training run: arguments and settings, checked once.
+
+use super::args::Train;
+use crate::args::Global;
+use crate::error::{CliError, Result};
+use crate::settings::{Settings, toml_text};
+use qudi_core::atomic_file::Overwrite;
+use qudi_train::{RECIPE, Recipe};
+use std::path::PathBuf;
+
+/// What is to be done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Action {
+    /// Decode the recipe's files into a pack.
+    MakePack,
+    /// Draw all bursts of the recipe.
+    DrawBursts,
+    /// Train from initial weights.
+    Start,
+    /// Train from the last state.
+    Resume,
+}
+
+/// Everything that a training run is asked for.
+#[derive(Debug)]
+pub(super) struct Plan {
+    pub(super) action: Action,
+    pub(super) recipe: Recipe,
+    /// The folder of the run, or of the bursts that are drawn.
+    pub(super) folder: PathBuf,
+    /// The folder of the recipe's files.
+    pub(super) data: Option<PathBuf>,
+    /// The decoded files.
+    pub(super) pack: PathBuf,
+    /// The folder of cached bursts.
+    pub(super) bursts: Option<PathBuf>,
+    /// Weights to start from.
+    pub(super) init: Option<PathBuf>,
+    pub(super) devices: Vec<String>,
+    /// Threads that draw samples.
+    pub(super) workers: usize,
+    /// Whether LPIPS weights are downloaded first.
+    pub(super) fetch: bool,
+    pub(super) backbones: Option<PathBuf>,
+    pub(super) overwrite: Overwrite,
+}
+
+impl Plan {
+    /// Checks arguments and settings.
+    ///
+    /// # Errors
+    /// [`CliError`] if there is no recipe, or a key of it is wrong.
+    pub(super) fn new(args: &Train, settings: &Settings, global: &Global) -> Result<Self> {
+        let action = match (args.cache_only, args.draw_only, args.resume) {
+            (true, ..) => Action::MakePack,
+            (_, true, _) => Action::DrawBursts,
+            (.., true) => Action::Resume,
+            _ => Action::Start,
+        };
+        let folder = if action == Action::DrawBursts { &args.bursts } else { &args.output };
+        let folder = folder.clone().unwrap_or_default();
+        let pack = if action == Action::MakePack { PathBuf::new() } else { folder.clone() };
+        Ok(Self {
+            action,
+            recipe: recipe(args, settings)?,
+            pack: args.pack.clone().unwrap_or_else(|| pack.join("pack.zip")),
+            folder,
+            data: args.data.clone(),
+            bursts: args.bursts.clone(),
+            init: args.init.clone(),
+            devices: args.device.clone(),
+            workers: args.workers,
+            fetch: args.fetch,
+            backbones: args.backbones.clone(),
+            overwrite: if global.force { Overwrite::Yes } else { Overwrite::No },
+        })
+    }
+}
+
+fn recipe(args: &Train, settings: &Settings) -> Result<Recipe> {
+    let changes = settings.recipe_changes().iter();
+    let changes: Vec<_> = changes.map(|(key, value, _)| (key.clone(), toml_text(value))).collect();
+    let own = args.output.as_ref().map(|folder| folder.join(RECIPE));
+    let name = match (&args.recipe, own) {
+        (Some(name), _) => name.clone(),
+        (None, Some(own)) if args.resume => own.display().to_string(),
+        _ => {
+            return Err(CliError::new(
+                "no recipe",
+                "RECIPE",
+                "name one: tiny, small, base, paper, or a .toml file",
+            ));
+        }
+    };
+    Ok(Recipe::load(&name, &changes)?)
+}

@@ -1,0 +1,168 @@
+//! `qudi train`: a recipe and data in, weights out.
+
+use super::args::Train;
+use super::data::{files, initial, make_folder, make_pack};
+use super::environment::{ENVIRONMENT, environment};
+use super::plan::{Action, Plan};
+use super::resume::{check_pack, check_recipe};
+use super::watch::{Watch, quality_text, write, write_report};
+use crate::args::Global;
+use crate::device;
+use crate::error::{CliError, Result};
+use crate::interrupt;
+use crate::report::Report;
+use crate::settings::Settings;
+use qudi_core::atomic_file::Overwrite;
+use qudi_train::dataset::Pack;
+use qudi_train::loss::lpips::fetch;
+use qudi_train::{From, METRICS, RECIPE, Run, Validation, WEIGHTS, draw_bursts};
+use serde_json::json;
+
+pub(crate) fn run(
+    args: &Train,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    let plan = Plan::new(args, settings, global)?;
+    match plan.action {
+        Action::MakePack => pack(&plan, report),
+        Action::DrawBursts => draw(&plan, report),
+        Action::Start | Action::Resume => train(&plan, report),
+    }
+}
+
+/// Makes the pack of a recipe.
+fn pack(plan: &Plan, report: &Report) -> Result<()> {
+    make_pack(plan, plan.overwrite, report)?;
+    let path = &plan.pack;
+    let pack = Pack::open(path)?;
+    let frames: usize = pack.clips().iter().map(|clip| clip.frames).sum();
+    let clips = pack.clips().len();
+    let text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
+    report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}))
+}
+
+/// Trains to the end of the recipe.
+fn train(plan: &Plan, report: &Report) -> Result<()> {
+    let (folder, recipe) = (&plan.folder, &plan.recipe);
+    check_folder(plan)?;
+    if plan.action == Action::Resume {
+        check_recipe(folder, recipe)?;
+        check_pack(folder, &plan.pack)?;
+    }
+    let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
+    make_folder(folder, "the run's folder", "choose another with -o")?;
+    if let (true, Some(backbones)) = (plan.fetch, &plan.backbones) {
+        for path in fetch(recipe.train.loss.term, backbones)? {
+            report.remark(&format!("{} is there", path.display()));
+        }
+    }
+    let files = files(plan, report)?;
+    let from = if plan.action == Action::Resume {
+        From::State
+    } else {
+        let init = plan.init.as_deref().map(|path| initial(path, recipe, &devices[0]));
+        From::Start(init.transpose()?)
+    };
+    let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
+    let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
+    let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
+    write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
+    let mut watch = Watch::new(recipe, folder, report)?;
+    let learnt =
+        device::guarded("training", || run.learn(plan.workers, &mut |event| watch.event(&event)));
+    let [step, steps] = run.progress();
+    let last = watch.finish()?;
+    match learnt {
+        Ok(Ok(())) => {}
+        Ok(Err(qudi_core::SimError::Interrupted)) => {
+            let text = format!("stopped after step {step} of {steps}: --resume goes on");
+            return Err(CliError::Stopped(text));
+        }
+        Ok(Err(error)) => return Err(error.into()),
+        Err(problem) => {
+            return Err(CliError::new(
+                format!("the device failed in step {}: {problem}", step + 1),
+                "--device",
+                "lower train.batch or data.crop and raise train.accumulate; --resume goes on from the last state",
+            ));
+        }
+    }
+    write_report(folder)?;
+    let weights = folder.join(WEIGHTS);
+    let means = last.as_ref().map(Validation::means).unwrap_or_default();
+    let quality: Vec<_> = means
+        .iter()
+        .map(|(ppp, [psnr_a, psnr, ssim])| {
+            json!({"ppp": ppp, "psnr_a": psnr_a, "psnr": psnr, "ssim": ssim})
+        })
+        .collect();
+    let text = format!("{} after {steps} steps\n{}", weights.display(), quality_text(&means));
+    report.result(&text, || json!({"weights": weights, "steps": steps, "validation": quality}))
+}
+
+/// Draws all bursts of a recipe, for other programs, or before anything learns from them.
+fn draw(plan: &Plan, report: &Report) -> Result<()> {
+    let opened = device::open(plan.devices.first().map_or("auto", String::as_str))?;
+    let (folder, recipe) = (&plan.folder, &plan.recipe);
+    let files = files(plan, report)?;
+    let network = match &plan.init {
+        Some(path) => *initial(path, recipe, &opened)?,
+        None => recipe.network.init(recipe.train.seed, &opened.device),
+    };
+    let mut bar = report.bar();
+    let mut bursts = 0;
+    let drawn = device::guarded("drawing", || {
+        let workers = plan.workers;
+        draw_bursts(recipe, &network, files, &opened.device, workers, &mut |[done, all]| {
+            bursts = all;
+            bar.update("drawing", done, Some(all));
+            interrupt::check()
+        })
+    });
+    match drawn {
+        Ok(Err(qudi_core::SimError::Interrupted)) => {
+            let text = format!("stopped: the same command goes on in {}", folder.display());
+            return Err(CliError::Stopped(text));
+        }
+        Ok(drawn) => drawn?,
+        Err(problem) => {
+            let what = format!("the device failed: {problem}");
+            return Err(CliError::new(what, "--device", "lower data.crop, or take cpu"));
+        }
+    }
+    let text = format!("{}: {bursts} bursts", folder.display());
+    report.result(&text, || json!({"folder": folder, "bursts": bursts}))
+}
+
+/// Refuses a folder without a state to resume from, or with a run that would be lost.
+fn check_folder(plan: &Plan) -> Result<()> {
+    let folder = &plan.folder;
+    let exists = Run::exists(folder);
+    let resume = plan.action == Action::Resume;
+    if resume && !exists {
+        return Err(CliError::new(
+            "there is no state to go on from",
+            folder.display(),
+            "start without --resume, or name the run's folder with -o",
+        ));
+    }
+    let own = [WEIGHTS, RECIPE, METRICS, ENVIRONMENT, "report.html"];
+    let taken = exists || own.iter().any(|name| folder.join(name).exists());
+    if !resume && taken && plan.overwrite == Overwrite::No {
+        return Err(CliError::new(
+            "the folder holds a run already",
+            folder.display(),
+            "go on with --resume, choose another folder, or start anew with --force",
+        ));
+    }
+    if !resume && taken {
+        // A new run must not be taken for the old one's continuation.
+        for name in ["state", "state.old", "state.new"] {
+            let _ = std::fs::remove_dir_all(folder.join(name));
+        }
+        let _ = std::fs::remove_file(folder.join(METRICS));
+    }
+    Ok(())
+}

@@ -1,0 +1,147 @@
+//! Watching a run: progress, pictures, event file, report.
+
+use super::environment::ENVIRONMENT;
+use super::events::EventFile;
+use super::pictures::strip;
+use super::report::{Source, page};
+use crate::error::{CliError, Result};
+use crate::interrupt;
+use crate::report::{Bar, Report};
+use qudi_core::SimError;
+use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_train::{Event, METRICS, RECIPE, Recipe, StepReport, Validation};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Folder of pictures in a run's folder.
+const SAMPLES: &str = "samples";
+
+/// Quality at every light, in words.
+pub(crate) fn quality_text(means: &[(f64, [f64; 3])]) -> String {
+    let one = |(ppp, [psnr_a, _, ssim]): &(f64, [f64; 3])| {
+        format!("{ppp} PPP: psnr-a {psnr_a:.2} dB, ssim {ssim:.3}")
+    };
+    means.iter().map(one).collect::<Vec<_>>().join("; ")
+}
+
+/// Shows a run's progress and writes its pictures.
+pub(crate) struct Watch<'a> {
+    report: &'a Report,
+    folder: &'a Path,
+    steps: u64,
+    samples: f64,
+    bar: Bar,
+    events: EventFile,
+    start: Instant,
+    taken: u64,
+    /// Of the last step; averaged, single ones jump.
+    loss: Option<f64>,
+    last: Option<Validation>,
+    error: Option<CliError>,
+}
+
+impl<'a> Watch<'a> {
+    pub(crate) fn new(recipe: &Recipe, folder: &'a Path, report: &'a Report) -> Result<Self> {
+        Ok(Self {
+            events: EventFile::create(folder)?,
+            report,
+            folder,
+            steps: recipe.train.steps,
+            samples: (recipe.train.batch * recipe.train.accumulate) as f64,
+            bar: report.bar(),
+            start: Instant::now(),
+            taken: 0,
+            loss: None,
+            last: None,
+            error: None,
+        })
+    }
+
+    pub(crate) fn event(&mut self, event: &Event<'_>) -> ControlFlow<()> {
+        let shown = match event {
+            Event::Step(step) => self.step(step),
+            Event::Validation(validation) => self.validation(validation),
+            Event::Saved(_) => Ok(()),
+        };
+        if let Err(error) = shown {
+            self.error = Some(error);
+        }
+        if self.error.is_some() { ControlFlow::Break(()) } else { interrupt::check() }
+    }
+
+    fn step(&mut self, step: &StepReport) -> Result<()> {
+        self.taken += 1;
+        let loss = self.loss.map_or(step.loss.total, |loss| 0.98 * loss + 0.02 * step.loss.total);
+        self.loss = Some(loss);
+        let rate = self.samples * self.taken as f64 / self.start.elapsed().as_secs_f64();
+        let text = format!("loss {loss:.5} rate {:.1e} {rate:.2} samples/s", step.lr);
+        self.bar.learning(text, step.step, self.steps);
+        let scalars = [
+            ("loss/total", step.loss.total),
+            ("loss/prediction", step.loss.prediction),
+            ("loss/pre", step.loss.pre),
+            ("loss/perceptual", step.loss.perceptual),
+            ("loss/flow", step.loss.flow),
+            ("loss/error", step.loss.uncertainty),
+            ("train/rate", step.lr),
+            ("train/norm", step.norm),
+        ];
+        self.events.scalars(step.step, &scalars.map(|(tag, value)| (tag.to_owned(), value)))
+    }
+
+    /// The last validation, or what went wrong while watching.
+    pub(crate) fn finish(self) -> Result<Option<Validation>> {
+        match self.error {
+            Some(error) => Err(error),
+            None => Ok(self.last),
+        }
+    }
+
+    fn validation(&mut self, validation: &Validation) -> Result<()> {
+        let loss = self.loss.unwrap_or(f64::NAN);
+        let minutes = self.start.elapsed().as_secs_f64() / 60.0;
+        let text = format!(
+            "step {} of {}, {minutes:.1} min: loss {loss:.5}; {}",
+            validation.step,
+            self.steps,
+            quality_text(&validation.means())
+        );
+        self.bar.above(&text, self.report);
+        self.last = Some(validation.clone());
+        let scalars = validation.means().into_iter().flat_map(|(ppp, [psnr_a, psnr, ssim])| {
+            let named = [("psnr-a", psnr_a), ("psnr", psnr), ("ssim", ssim)];
+            named.map(|(name, value)| (format!("validation/{name} at {ppp} PPP"), value))
+        });
+        self.events.scalars(validation.step, &scalars.collect::<Vec<_>>())?;
+        let folder = self.folder.join(SAMPLES);
+        let made = std::fs::create_dir_all(&folder);
+        made.map_err(|e| SimError::io("make the folder of pictures", &folder, e))?;
+        let name = format!("step-{:07}.png", validation.step);
+        strip(&validation.clips).save(&folder.join(name), Overwrite::Yes)?;
+        write_report(self.folder)
+    }
+}
+
+/// Writes a file of the run.
+pub(crate) fn write(folder: &Path, name: &str, bytes: &[u8]) -> Result<()> {
+    Ok(PendingFile::write_whole(&folder.join(name), bytes, Overwrite::Yes)?)
+}
+
+/// Writes the report of a run's folder.
+pub(crate) fn write_report(folder: &Path) -> Result<()> {
+    let read = |name: &str| {
+        let path = folder.join(name);
+        std::fs::read_to_string(&path).map_err(|e| SimError::io("read the run", &path, e))
+    };
+    let pictures = std::fs::read_dir(folder.join(SAMPLES)).into_iter().flatten().flatten();
+    let last: Option<PathBuf> = pictures.map(|entry| entry.path()).max();
+    let picture = last.and_then(|path| std::fs::read(path).ok());
+    let text = page(&Source {
+        metrics: &read(METRICS)?,
+        recipe: &read(RECIPE)?,
+        environment: &read(ENVIRONMENT)?,
+        picture: picture.as_deref(),
+    })?;
+    write(folder, "report.html", text.as_bytes())
+}

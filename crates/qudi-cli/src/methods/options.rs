@@ -1,0 +1,106 @@
+//! What the method `qudi` is asked for, defaults filled in.
+
+use crate::error::{CliError, Result};
+use crate::weights::Weights;
+use qudi_model::diffusion::sampler::Sampler;
+use qudi_model::diffusion::timesteps::TimestepSpacing;
+
+/// The method that these options belong to.
+const METHOD: &str = "qudi";
+
+/// Options of the network.
+#[derive(Clone, Debug)]
+pub(crate) struct NetworkOptions {
+    /// The weights.
+    pub(crate) weights: Weights,
+    /// Reverse steps; none for those that the weights were made for.
+    pub(crate) steps: Option<usize>,
+    /// The spacing of their timesteps.
+    pub(crate) spacing: TimestepSpacing,
+    /// The sampler.
+    pub(crate) sampler: Sampler,
+    /// The number of samples.
+    pub(crate) samples: usize,
+    /// The device to compute on.
+    pub(crate) device: String,
+    /// Side of the tiles in pixels.
+    pub(crate) tile: usize,
+    /// The first flag given that changes the result.
+    pub(crate) result_flag: Option<&'static str>,
+    /// `--device`, if given.
+    pub(crate) device_flag: Option<&'static str>,
+    /// The first flag given that is about diffusion steps.
+    pub(crate) diffusion_flag: Option<&'static str>,
+}
+
+impl NetworkOptions {
+    /// Reverse steps: those asked for, or those that the weights were made for.
+    pub(crate) fn steps(&self) -> Result<usize> {
+        match self.steps {
+            Some(steps) => Ok(steps),
+            None => Ok(self.weights.describe()?.reverse_steps()),
+        }
+    }
+
+    /// How the frames are made, in words.
+    pub(crate) fn mode(&self) -> Result<String> {
+        Ok(match self.steps()? {
+            0 => "regression".to_owned(),
+            1 => "diffusion in 1 step".to_owned(),
+            steps => format!("diffusion in {steps} steps"),
+        })
+    }
+
+    /// The name of the spacing on the command line.
+    pub(crate) fn spacing_name(&self) -> &'static str {
+        match self.spacing {
+            TimestepSpacing::Linear => "linear",
+            TimestepSpacing::LogLogistic => "log-logistic",
+        }
+    }
+
+    /// The name of the sampler on the command line.
+    pub(crate) fn sampler_name(&self) -> &'static str {
+        match self.sampler {
+            Sampler::Ddim => "ddim",
+            Sampler::Ancestral => "ancestral",
+        }
+    }
+
+    /// Whether the network, asked so, predicts its uncertainty without samples.
+    pub(crate) fn predicts_uncertainty(&self) -> Result<bool> {
+        Ok(self.steps()? == 0 && self.weights.describe()?.network.pre.uncertainty)
+    }
+
+    /// Refuses these options where none of the methods is the network.
+    pub(crate) fn check_methods<'a>(
+        &self,
+        mut methods: impl Iterator<Item = &'a str>,
+    ) -> Result<()> {
+        match self.result_flag.or(self.device_flag) {
+            Some(flag) if !methods.any(|method| method == METHOD) => Err(other_method(flag)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses options that are about diffusion steps where there are none.
+    pub(crate) fn check_steps(&self) -> Result<()> {
+        match self.diffusion_flag {
+            Some(flag) if self.steps()? == 0 => Err(CliError::new(
+                format!("{flag} is for diffusion, and there are 0 steps"),
+                flag,
+                "leave it out, or ask for --steps above 0",
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// A flag of the network beside another method.
+pub(crate) fn other_method(flag: &str) -> CliError {
+    CliError::new(
+        format!("{flag} is for method {METHOD}"),
+        flag,
+        format!("leave it out, or use --method {METHOD}"),
+    )
+}
