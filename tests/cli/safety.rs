@@ -140,6 +140,8 @@ fn flags_of_another_method_are_refused() {
         refused(&folder, &format!("bench --size 16x16 --method average {flag}"), &expected);
     }
     refused(&folder, "restore b.npy -o o --device cpu --samples 2", &["0 steps"]);
+    refused(&folder, "restore b.npy -o o --method mle --seed 3", &["--seed is for method qudi"]);
+    refused(&folder, "restore b.npy -o o --device cpu --seed 3", &["--seed is for diffusion"]);
 }
 
 #[test]
