@@ -49,7 +49,7 @@ fn console_blocks_run_as_documented() {
 }
 
 #[test]
-fn the_settings_reference_is_up_to_date() {
+fn settings_reference_is_up_to_date() {
     let output = std::process::Command::new(env!("CARGO_BIN_EXE_qudi"))
         .args(["config", "docs"])
         .output()
@@ -59,7 +59,7 @@ fn the_settings_reference_is_up_to_date() {
 }
 
 #[test]
-fn the_example_settings_are_accepted() {
+fn accepts_the_example_settings() {
     let folder = outputs::scratch("example-settings");
     let settings = root().join("configs/simulate.toml");
     outputs::qudi(&folder)

@@ -18,7 +18,7 @@ fn refused(folder: &Path, args: &[&str]) -> String {
 }
 
 #[test]
-fn damaged_files_are_refused() {
+fn rejects_damaged_files() {
     let folder = scratch("damaged");
     let ones = |n: usize, v: f32| -> Vec<u8> { (0..n).flat_map(|_| v.to_le_bytes()).collect() };
     let png = {
@@ -74,7 +74,7 @@ fn damaged_files_are_refused() {
 }
 
 #[test]
-fn unsuitable_inputs_and_outputs_are_refused() {
+fn rejects_unsuitable_inputs_and_outputs() {
     let folder = scratch("unsuitable");
     std::fs::create_dir(folder.join("nothing")).unwrap();
     std::fs::create_dir(folder.join("mixed")).unwrap();
@@ -127,7 +127,7 @@ fn unsuitable_inputs_and_outputs_are_refused() {
 }
 
 #[test]
-fn impossible_sensors_are_refused() {
+fn rejects_impossible_sensors() {
     let folder = scratch("sensors");
     for (name, toml, reason) in [
         ("noise.toml", "base = \"ideal\"\nread_noise = -1", "read_noise is -1"),
@@ -175,7 +175,7 @@ fn impossible_sensors_are_refused() {
 }
 
 #[test]
-fn unknown_settings_are_refused_wherever_they_stand() {
+fn rejects_unknown_settings_from_every_layer() {
     let folder = scratch("settings");
     std::fs::write(folder.join("a.toml"), "[simulate]\npp = 3\n").unwrap();
     std::fs::write(folder.join("b.toml"), "not toml at all [").unwrap();
@@ -197,7 +197,7 @@ fn unknown_settings_are_refused_wherever_they_stand() {
 }
 
 #[test]
-fn a_record_that_lies_is_refused() {
+fn rejects_record_that_contradicts_its_file() {
     let folder = scratch("records");
     qudi(&folder)
         .args("simulate scene:text --size 16x16 --seed 1 -o a.npy".split(' '))
@@ -232,7 +232,7 @@ fn a_record_that_lies_is_refused() {
 }
 
 #[test]
-fn videos_without_ffmpeg_are_explained() {
+fn explains_videos_without_ffmpeg() {
     let folder = scratch("ffmpeg");
     std::fs::write(folder.join("clip.mp4"), "not a video").unwrap();
     let output = qudi(&folder)
@@ -252,7 +252,7 @@ fn videos_without_ffmpeg_are_explained() {
 
 #[cfg(unix)]
 #[test]
-fn names_that_are_no_text_are_refused() {
+fn rejects_names_that_are_not_utf8() {
     use std::os::unix::ffi::OsStrExt;
     let folder = scratch("names");
     let name = std::ffi::OsStr::from_bytes(b"clip\xff.npy");
@@ -268,7 +268,7 @@ fn names_that_are_no_text_are_refused() {
 /// Ctrl-C in the middle: exit code 130 and no file, finished or temporary.
 #[cfg(unix)]
 #[test]
-fn an_interrupt_leaves_nothing_behind() {
+fn interrupt_leaves_no_file_behind() {
     let folder = scratch("interrupt");
     let mut child = std::process::Command::new(env!("CARGO_BIN_EXE_qudi"))
         .args("simulate scene:gratings --size 64x64 --frames 3000 -o out.npy --truth truth --preview p.gif".split(' '))

@@ -88,7 +88,7 @@ fn more_light_is_better_and_bars_are_kept() {
 }
 
 #[test]
-fn the_classical_methods_beat_a_mean_where_things_move() {
+fn classical_methods_beat_the_average_under_motion() {
     let folder = scratch("eval-classical");
     let methods = "mle,transform-denoise,bm3d,qbp,qbp-bm3d";
     let clip = "--size 80x96 --frames 11 --ppp 3 --seed 1 --truth clip.npy -o burst.npy -q";
@@ -107,7 +107,7 @@ fn the_classical_methods_beat_a_mean_where_things_move() {
 }
 
 #[test]
-fn the_report_is_one_file_that_fetches_nothing() {
+fn report_is_one_self_contained_file() {
     let folder = scratch("eval-html");
     eval(&folder, "scene:dead-leaves --ppp 3.25,26 --frames 11 --html report.html");
     let page = std::fs::read_to_string(folder.join("report.html")).unwrap();
@@ -124,7 +124,7 @@ fn the_report_is_one_file_that_fetches_nothing() {
 }
 
 #[test]
-fn the_quiver_protocol_judges_the_middle_of_every_window() {
+fn quiver_protocol_scores_the_middle_of_every_window() {
     let folder = scratch("eval-quiver");
     let quiver = |seed: u32| {
         eval(&folder, &format!("scene:text --ppp 9.75 --frames 14 --protocol quiver --seed {seed}"))
@@ -167,7 +167,7 @@ fn recorded_clips_flicker_along_an_estimated_flow() {
 }
 
 #[test]
-fn a_capture_is_judged_without_truth() {
+fn evaluates_a_capture_without_truth() {
     let folder = scratch("eval-capture");
     qudi(&folder)
         .args("simulate scene:dead-leaves --size 48x64 --frames 40 --seed 2 -o c.npy -q".split(' '))

@@ -55,7 +55,7 @@ pub(crate) fn refused(folder: &Path, args: &str, words: &[&str]) {
 }
 
 #[test]
-fn a_burst_is_restored_and_gone_on_with() {
+fn restores_a_burst_and_resumes() {
     let folder = prepared("network-restore");
     let run = |args: &str| qudi(&folder).args(args.split_whitespace()).assert().success();
     let common = "restore b.npy --weights w.safetensors --device cpu --steps 2 --overlap 5";
@@ -82,7 +82,7 @@ fn a_burst_is_restored_and_gone_on_with() {
 
 /// The built-in weights tell how far their frames may be off; the frames are the same.
 #[test]
-fn errors_are_told_beside_the_frames() {
+fn writes_predicted_uncertainty_beside_frames() {
     let folder = prepared("network-errors");
     let run = |args: &str| qudi(&folder).args(args.split_whitespace()).assert().success();
     run("restore b.npy -o s.npy --uncertainty d.npy -q");
@@ -100,7 +100,7 @@ fn errors_are_told_beside_the_frames() {
 
 /// These weights' U-Net is silent, and their pre-denoiser has seen no simulated measurement.
 #[test]
-fn more_steps_change_nothing_where_nothing_is_generated() {
+fn regression_weights_ignore_the_number_of_steps() {
     let folder = prepared("network-steps");
     let restored = |steps: u32| {
         let args = format!("restore b.npy --weights w.safetensors --steps {steps} -o {steps}.npy");
@@ -112,7 +112,7 @@ fn more_steps_change_nothing_where_nothing_is_generated() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused_in_three_parts() {
+fn rejects_unfit_weights_and_options_in_three_parts() {
     let folder = prepared("network-refuse");
     let with =
         |rest: &str| format!("restore b.npy -o out --weights w.safetensors --device cpu {rest}");
@@ -159,7 +159,7 @@ fn what_does_not_fit_is_refused_in_three_parts() {
 /// Without a word about methods or weights: the network that comes along where it knows the sensor and the light, else
 /// the best method that needs no training.
 #[test]
-fn the_usual_method_follows_the_capture() {
+fn default_method_follows_the_capture() {
     let folder = scratch("network-usual");
     let run = |args: &str| {
         let output = qudi(&folder).args(args.split_whitespace()).output().unwrap();
@@ -212,7 +212,7 @@ fn published_weights_restore_what_trained_ones_do() {
 }
 
 #[test]
-fn the_processor_passes_its_own_test() {
+fn processor_passes_selftest() {
     let folder = scratch("network-selftest");
     let only = "selftest --device cpu --only arithmetic,warp,network";
     let output = qudi(&folder).args(only.split(' ')).output().unwrap();
@@ -223,7 +223,7 @@ fn the_processor_passes_its_own_test() {
 
 /// Where there is a graphics card, or a driver that imitates one: what such a driver does in seconds.
 #[test]
-fn a_graphics_card_computes_what_the_processor_does() {
+fn graphics_card_matches_the_processor() {
     let folder = scratch("network-gpu");
     let devices = qudi(&folder).args(["info", "--devices"]).output().unwrap();
     if !String::from_utf8_lossy(&devices.stdout).contains("wgpu:0") {

@@ -53,7 +53,7 @@ fn simulate(folder: &Path, args: &str) {
 }
 
 #[test]
-fn binary_bursts_are_packed_along_the_width_first_pixel_highest() {
+fn packs_binary_bursts_along_the_width_first_pixel_highest() {
     let folder = scratch("packed");
     simulate(
         &folder,
@@ -117,7 +117,7 @@ fn every_format_holds_the_same_counts() {
 }
 
 #[test]
-fn force_replaces_files_and_folders_of_our_own() {
+fn force_replaces_own_files_and_folders() {
     let folder = scratch("force");
     for output in ["a.npy", "a"] {
         simulate(&folder, &format!("scene:text --size 16x16 --frames 5 --seed 1 -o {output}"));
@@ -132,7 +132,7 @@ fn force_replaces_files_and_folders_of_our_own() {
 }
 
 #[test]
-fn a_record_makes_its_burst_again_from_anywhere() {
+fn record_reproduces_its_burst_from_any_folder() {
     let folder = scratch("record");
     simulate(
         &folder,
@@ -241,7 +241,7 @@ fn every_input_format_shows_the_same_scene() {
 }
 
 #[test]
-fn a_still_moves_as_told() {
+fn still_moves_as_specified() {
     let folder = scratch("still");
     simulate(&folder, "scene:chart --size 48x64 --frames 1 --seed 1 -o c.npy --truth still");
     simulate(
@@ -261,7 +261,7 @@ fn a_still_moves_as_told() {
 }
 
 #[test]
-fn a_dark_map_beside_the_sensor_file_is_used() {
+fn uses_dark_map_beside_the_sensor_file() {
     let folder = scratch("dark-map");
     std::fs::create_dir(folder.join("lab")).unwrap();
     // Three dark electrons in the left half, none in the right.
@@ -298,7 +298,7 @@ fn a_dark_map_beside_the_sensor_file_is_used() {
 /// A stand-in for ffmpeg on PATH delivers frames, or fails half-way.
 #[cfg(unix)]
 #[test]
-fn videos_come_through_ffmpeg() {
+fn reads_videos_through_ffmpeg() {
     let folder = scratch("video");
     let mut frames = Vec::new();
     for t in 0..3u8 {
@@ -387,7 +387,7 @@ fn settings_come_in_layers() {
 }
 
 #[test]
-fn completions_and_manual_are_made() {
+fn writes_completions_and_manual() {
     let folder = scratch("man");
     for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
         let script = qudi(&folder).args(["completions", shell]).output().unwrap();

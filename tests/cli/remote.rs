@@ -71,7 +71,7 @@ fn machines_share_batches_without_changing_the_result() {
 }
 
 #[test]
-fn a_server_asks_for_the_token() {
+fn server_requires_the_token() {
     let folder = scratch("remote-token");
     let server = serve("cpu", "lamp");
     let device = ["selftest", "--only", "arithmetic", "--device", &server.name];

@@ -54,7 +54,7 @@ fn clips_of_two_formats_keep_their_extensions() {
 }
 
 #[test]
-fn page_says_how_pictures_were_made() {
+fn page_names_regression_or_diffusion() {
     let folder = scratch("report-how");
     qudi(&folder)
         .args(
@@ -69,7 +69,7 @@ fn page_says_how_pictures_were_made() {
 }
 
 #[test]
-fn impossible_outputs_are_refused_before_the_work() {
+fn rejects_impossible_outputs_before_the_work() {
     let folder = scratch("report-impossible");
     for option in ["--csv", "--html", "--markdown"] {
         // The clip does not exist either: the output is checked first.
@@ -84,7 +84,7 @@ fn impossible_outputs_are_refused_before_the_work() {
 }
 
 #[test]
-fn csv_does_not_hold_formulas() {
+fn csv_cells_cannot_become_formulas() {
     let folder = scratch("report-formula");
     std::fs::create_dir(folder.join("clips")).unwrap();
     write_clip(&folder.join("clips/=1+1.npy"), 32, 32);
@@ -97,7 +97,7 @@ fn csv_does_not_hold_formulas() {
 }
 
 #[test]
-fn control_characters_of_names_are_printed_escaped() {
+fn prints_control_characters_of_names_escaped() {
     let folder = scratch("report-control");
     let name = "a\u{1b}[31mb\u{9b}2J.npy";
     let error = qudi(&folder).args(["info", name]).assert().code(2);

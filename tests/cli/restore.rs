@@ -81,7 +81,7 @@ fn every_output_holds_the_same_frames() {
 }
 
 #[test]
-fn a_run_killed_ten_times_ends_like_an_undisturbed_one() {
+fn run_killed_ten_times_equals_undisturbed_run() {
     let folder = burst("restore-kill", 600);
     restore(&folder, "b.npy -o whole --chi-map whole.npy --side-by-side whole.png");
     let finished = || {
@@ -166,7 +166,7 @@ fn piped(folder: &Path, args: &str, input: &[u8]) -> std::process::Output {
 }
 
 #[test]
-fn a_pipe_restores_to_the_frames_of_a_file() {
+fn pipe_restores_the_same_frames_as_a_file() {
     let folder = burst("restore-pipe", 43);
     restore(&folder, &format!("b.npy -o file.npy --method average {KNOWN}"));
     let expected = std::fs::read(folder.join("file.npy")).unwrap();
@@ -192,7 +192,7 @@ fn a_pipe_restores_to_the_frames_of_a_file() {
 
 /// Frames come out while the pipe still runs: a camera does not end.
 #[test]
-fn a_running_pipe_is_restored_as_it_comes() {
+fn restores_a_running_pipe_frame_by_frame() {
     use std::io::{Read, Write};
     let folder = burst("restore-live", 27);
     let array = std::fs::read(folder.join("b.npy")).unwrap();
@@ -232,7 +232,7 @@ fn a_running_pipe_is_restored_as_it_comes() {
 }
 
 #[test]
-fn broken_pipes_are_refused_with_a_way_out() {
+fn rejects_broken_pipes_with_help() {
     let folder = burst("restore-broken", 30);
     let array = std::fs::read(folder.join("b.npy")).unwrap();
     let raw = "--format raw-u8 --size 64x80";

@@ -24,7 +24,7 @@ fn prepared(name: &str) -> PathBuf {
 }
 
 #[test]
-fn outputs_that_are_inputs_are_refused_whatever_force_says() {
+fn rejects_outputs_that_are_inputs_despite_force() {
     let folder = prepared("safety-inputs");
     run(&folder, "convert b.npy -o d.npy -q");
     std::fs::hard_link(folder.join("b.npy"), folder.join("hard.npy")).unwrap();
@@ -67,7 +67,7 @@ fn outputs_that_are_inputs_are_refused_whatever_force_says() {
 }
 
 #[test]
-fn force_deletes_no_file_of_others() {
+fn force_deletes_no_foreign_file() {
     let folder = prepared("safety-force");
     let foreign = |name: &str, files: &[(&str, &str)]| {
         std::fs::create_dir(folder.join(name)).unwrap();
@@ -90,7 +90,7 @@ fn force_deletes_no_file_of_others() {
 }
 
 #[test]
-fn frames_of_another_capture_are_not_gone_on_with() {
+fn refuses_to_resume_frames_of_another_capture() {
     let folder = prepared("safety-resume");
     std::fs::write(folder.join("mask.npy"), npy_bytes("|u1", "(32, 40)", &[0; 32 * 40])).unwrap();
     let restore = "restore b.npy --method average -o out --mask mask.npy";
@@ -107,7 +107,7 @@ fn frames_of_another_capture_are_not_gone_on_with() {
 }
 
 #[test]
-fn a_bar_is_not_passed_by_what_is_no_number() {
+fn nan_does_not_pass_a_minimum_psnr() {
     let folder = scratch("safety-nan");
     let args = "eval scene:gratings --frames 11 --ppp 1e6 --method average --min-psnr 99";
     refused(&folder, args, &["NaN"]);
@@ -130,7 +130,7 @@ fn clips_of_one_stem_keep_names_of_their_own() {
 }
 
 #[test]
-fn flags_of_another_method_are_refused() {
+fn rejects_flags_of_another_method() {
     let folder = prepared("safety-flags");
     for flag in ["--steps 3", "--tile 64", "--samples 2", "--device cpu", "--spacing linear"] {
         let name = flag.split(' ').next().unwrap();
@@ -145,7 +145,7 @@ fn flags_of_another_method_are_refused() {
 }
 
 #[test]
-fn weights_restore_the_same_frames_by_name_and_by_path() {
+fn weights_restore_equal_frames_by_name_and_path() {
     let folder = prepared("safety-weights");
     run(&folder, "publish w.safetensors -o p.safetensors -q");
     let frames = |weights: &str, to: &str| {
@@ -164,7 +164,7 @@ fn weights_restore_the_same_frames_by_name_and_by_path() {
 
 /// Each of these used to eat memory, to abort, or to be believed.
 #[test]
-fn numbers_out_of_range_are_refused_with_the_range() {
+fn rejects_numbers_out_of_range_with_the_range() {
     let folder = prepared("safety-numbers");
     for flag in [
         "--ppp 1e300",

@@ -49,7 +49,7 @@ fn said(folder: &Path, command: &str, rest: &[&str]) -> String {
 }
 
 #[test]
-fn every_command_applies_a_key_of_set_or_refuses_it_by_name() {
+fn every_command_applies_or_rejects_set_keys_by_name() {
     let folder = prepared("settings-set");
     for (command, takes) in COMMANDS {
         let verb = command.split(' ').next().unwrap();
@@ -89,7 +89,7 @@ fn files_and_the_environment_are_shared_between_commands() {
 
 /// What a command accepts changes what it does.
 #[test]
-fn keys_that_are_taken_are_applied() {
+fn applies_keys_that_a_command_takes() {
     let folder = prepared("settings-applied");
     let json = |args: &str| -> serde_json::Value {
         let args = format!("{args} --json");

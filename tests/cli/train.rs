@@ -15,7 +15,7 @@ fn run(folder: &Path, args: &str) {
 
 /// The shipped recipe as it is: it learns, in less than two minutes on two cores.
 #[test]
-fn the_tiny_recipe_learns_without_a_file() {
+fn tiny_recipe_trains_without_files() {
     let folder = scratch("train-tiny");
     run(&folder, "train tiny -o run --device cpu -q");
     let run_folder = folder.join("run");
@@ -79,7 +79,7 @@ fn packs_train_without_the_files() {
 }
 
 #[test]
-fn runs_are_gone_on_with_and_never_lost() {
+fn runs_resume_and_are_never_lost() {
     let folder = scratch("train-resume");
     run(&folder, &format!("train tiny -o run {QUICK}"));
     refused(&folder, &format!("train tiny -o run {QUICK}"), &["--resume", "--force"]);
@@ -135,7 +135,7 @@ fn runs_are_gone_on_with_and_never_lost() {
 }
 
 #[test]
-fn all_bursts_can_be_drawn_before_learning() {
+fn draws_all_bursts_before_training() {
     let folder = scratch("train-draw");
     let parts = format!("{QUICK} --set train.crops={{bursts=5,cached_frames=3,frames=3,side=16}}");
     run(&folder, &format!("train tiny --bursts kept --draw-only --workers 2 {parts}"));
@@ -157,7 +157,7 @@ fn all_bursts_can_be_drawn_before_learning() {
 }
 
 #[test]
-fn impossible_trainings_are_refused() {
+fn rejects_impossible_recipes_and_folders() {
     let folder = scratch("train-refused");
     for (args, words) in [
         ("train -o run", ["no recipe"].as_slice()),

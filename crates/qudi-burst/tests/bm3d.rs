@@ -22,7 +22,7 @@ fn noisy(truth: &Frame, noise: &Frame, sigma: f32) -> Frame {
 }
 
 #[test]
-fn it_reaches_the_reference_package() {
+fn bm3d_reaches_the_reference_package() {
     let text = std::fs::read_to_string(golden().join("figures.json")).unwrap();
     let figures: serde_json::Value = serde_json::from_str(&text).unwrap();
     let mut shortfall = Vec::new();
@@ -43,7 +43,7 @@ fn it_reaches_the_reference_package() {
 }
 
 #[test]
-fn threads_do_not_change_a_bit() {
+fn result_does_not_depend_on_threads() {
     let truth = read_image(&golden().join("waves-truth.npy")).unwrap();
     let noise = read_image(&golden().join("waves-noise.npy")).unwrap();
     let image = noisy(&truth, &noise, 0.1);
@@ -56,7 +56,7 @@ fn threads_do_not_change_a_bit() {
 }
 
 #[test]
-fn any_size_works_and_flat_images_stay_flat() {
+fn bm3d_keeps_flat_images_of_any_size() {
     for (height, width) in [(1, 1), (3, 40), (8, 8), (9, 17), (64, 7)] {
         let size = Size { height, width };
         let flat = bm3d(&Frame::filled(size, 0.3), 0.1);

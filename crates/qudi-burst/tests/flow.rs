@@ -100,7 +100,7 @@ fn turning_is_found_to_half_a_pixel() {
 /// Leaves that move each on its own, most smaller than a patch: few patches have one motion, and the
 /// bound is only that finding it is better than finding nothing.
 #[test]
-fn small_leaves_each_on_its_own() {
+fn occluders_stay_distinct_at_small_scale() {
     for speed in [2.0, 8.0] {
         let found = mean(&errors(&leaves(1, speed), 9.75, 5, &[4, 6]));
         println!("leaves up to {speed} px/frame, each on its own: next frame {found:.3} px");

@@ -65,7 +65,7 @@ fn every_method_beats_the_average_of_a_moving_scene() {
 }
 
 #[test]
-fn the_second_round_beats_the_first() {
+fn second_pass_beats_the_first() {
     let size = Size { height: 96, width: 112 };
     // Single binary frames of so little light show the second round no more than the first.
     let cases = [("qudi-paper", 3.25, 0.1), ("qudi-paper", 26.0, 1.0), ("swissspad2", 0.5, -0.1)];
@@ -104,7 +104,7 @@ fn the_second_round_beats_the_first() {
 /// Counts of a scene at rest, less what the guide expects of them, are noise of deviation one, the frame's own as much as
 /// its neighbours'; what is expected of these hardly differs. Past the ends of the window there is nothing.
 #[test]
-fn neighbours_are_seen_in_deviations() {
+fn neighbours_are_standardized() {
     let size = Size { height: 48, width: 64 };
     let sensor = Sensor::load("qudi-paper").unwrap();
     let still =
@@ -162,7 +162,7 @@ fn neighbours_are_seen_in_deviations() {
 }
 
 #[test]
-fn threads_do_not_change_a_bit() {
+fn result_does_not_depend_on_threads() {
     let size = Size { height: 48, width: 64 };
     let sensor = Sensor::load("qudi-paper").unwrap();
     let (counts, _) = exposed(size, &sensor, 9.75, 5);
@@ -179,7 +179,7 @@ fn threads_do_not_change_a_bit() {
 
 /// One frame, tiny frames, none or all of the light: every pixel of every frame is a number.
 #[test]
-fn odd_input_gives_pictures() {
+fn odd_values_give_valid_pictures() {
     for name in ["qudi-paper", "swissspad2", "qis4-gj"] {
         let sensor = Sensor::load(name).unwrap();
         let most = sensor.max_count();

@@ -15,7 +15,7 @@ fn golden(key: &str) -> Vec<serde_json::Value> {
 }
 
 #[test]
-fn the_binomial_transform_is_scipys() {
+fn binomial_transform_matches_scipy() {
     for figure in golden("binomial") {
         let value = |key: &str| figure[key].as_f64().unwrap();
         let mut sensor = Sensor::load("spad512s").unwrap();
@@ -36,7 +36,7 @@ fn the_binomial_transform_is_scipys() {
 }
 
 #[test]
-fn the_generalized_transform_is_scipys() {
+fn generalized_transform_matches_scipy() {
     for figure in golden("generalized") {
         let value = |key: &str| figure[key].as_f64().unwrap();
         let mut sensor = Sensor::load("ideal").unwrap();
@@ -112,7 +112,7 @@ fn inverses_are_unbiased_on_simulated_counts() {
 
 /// The integral keeps its variance where Anscombe's collapses: near saturation.
 #[test]
-fn the_integral_follows_counts_into_saturation() {
+fn integral_transform_follows_counts_into_saturation() {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let gain = sensor.gain_at(3.25).unwrap();
     let of = |transform| VarianceStabilizer::new(transform, &sensor, gain, 1);
@@ -124,7 +124,7 @@ fn the_integral_follows_counts_into_saturation() {
 }
 
 #[test]
-fn the_ends_are_finite_and_in_order() {
+fn light_range_ends_are_finite_and_ordered() {
     for name in ["qudi-paper", "ideal", "swissspad2", "qis4-gj"] {
         let sensor = Sensor::load(name).unwrap();
         for transform in [Transform::Identity, Transform::Anscombe, Transform::Integral] {

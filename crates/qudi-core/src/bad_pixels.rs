@@ -173,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clusters_are_repaired_from_outside() {
+    fn repairs_clusters_from_their_surroundings() {
         let size = Size { height: 5, width: 5 };
         let mut mask = vec![false; 25];
         for i in [6, 7, 8, 11, 12, 13, 16, 17, 18] {
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fully_bad_array_is_left_alone() {
+    fn leaves_a_fully_bad_array_unrepaired() {
         let size = Size { height: 2, width: 2 };
         assert_eq!(Repair::new(&[true; 4], size).count(), 0);
     }

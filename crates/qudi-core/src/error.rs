@@ -1,5 +1,7 @@
 //! What can go wrong, in three parts: what happened, where, and what to do about it.
 
+pub mod nearest;
+
 use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};

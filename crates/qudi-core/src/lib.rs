@@ -17,29 +17,26 @@
 //! ```
 #![warn(missing_docs)]
 
-pub mod atomic_file;
-pub mod auto_exposure;
 pub mod bad_pixels;
 mod camera;
 pub mod error;
+mod files;
 pub mod flow;
 mod frame;
 mod light;
 pub mod limits;
 pub mod metrics;
-pub mod natural_order;
-pub mod nearest;
-pub mod npy;
 pub mod random;
-pub mod regular_file;
 pub mod restorer;
 pub mod sensor;
 mod transfer;
 pub mod windows;
 
 pub use camera::Camera;
-pub use error::{Result, SimError};
+pub use error::{Result, SimError, nearest};
+pub use files::{atomic_file, natural_order, npy, regular_file};
 pub use frame::{Frame, Size};
+pub use light::mean_level::fitting_exposure;
 pub use light::{
     Checksum, ClipStatistics, Light, PppDefinition, Spectrum, USUAL_EXPOSURE, ppp_from_lux,
     resolve_light, sensor_lux,

@@ -1,5 +1,7 @@
 //! How much light there is: photons per pixel (PPP) in its three meanings, and lux.
 
+pub(crate) mod mean_level;
+
 use crate::error::{Result, SimError};
 use crate::sensor::{CountLaw, Gain, Response, Sensor};
 use serde::{Deserialize, Serialize};
@@ -247,7 +249,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_lux_is_the_published_number_of_photons() {
+    fn one_lux_gives_the_published_photon_flux() {
         let green = Spectrum::wavelength(555.0);
         assert!((green.photons_per_lux_second_um2() - 4091.0).abs() < 1.0);
         assert!((ppp_from_lux(1.0, 1.0 / 2000.0, 1.1, green) - 2.475).abs() < 5e-4);
@@ -260,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn the_three_meanings_agree_on_a_clip() {
+    fn three_light_definitions_agree_on_a_clip() {
         let clip = clip_of(&[0.1, 0.5, 0.9, 0.2]);
         let mut sensor = Sensor::load("swissspad2").unwrap();
         sensor.frames_summed = 7;
@@ -279,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn impossible_light_is_refused() {
+    fn rejects_impossible_light() {
         let clip = clip_of(&[0.5]);
         let sensor = Sensor::load("qudi-paper").unwrap();
         let ask = |definition, value, clip: &ClipStatistics| {

@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn gray_of_gray_is_itself() {
+    fn gray_of_a_gray_image_is_unchanged() {
         for transfer in [Transfer::AsIs, Transfer::Srgb] {
             assert!((transfer.gray([0.4; 3]) - transfer.decode(0.4)).abs() < 1e-6);
         }

@@ -7,7 +7,7 @@ use qudi_core::npy::read_image;
 use std::path::Path;
 
 #[test]
-fn figures_are_those_of_scikit_image() {
+fn metrics_match_scikit_image() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/metrics");
     let text = std::fs::read_to_string(folder.join("figures.json")).unwrap();
     let figures: serde_json::Value = serde_json::from_str(&text).unwrap();

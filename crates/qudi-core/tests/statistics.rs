@@ -244,7 +244,7 @@ fn pixel_maps_have_the_asked_for_statistics() {
 }
 
 #[test]
-fn hot_and_dead_pixels_read_as_such() {
+fn hot_and_dead_pixels_read_their_values() {
     let mut sensor = binary(1);
     sensor.dark = DarkRate::PerFrame(0.0);
     sensor.defects.hot_fraction = 0.01;

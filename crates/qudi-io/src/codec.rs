@@ -1,4 +1,6 @@
 //! Every format that captures come in: one file and one line each.
+//!
+//! Writers lie in [`writer`](crate::writer): they share the atomic file and the record beside it, and write few formats.
 
 mod array;
 #[cfg(feature = "hdf5")]
@@ -10,7 +12,6 @@ mod npz;
 mod piped;
 mod qvga;
 mod raw;
-
 mod spad512s;
 mod sparse;
 mod swissspad2;
@@ -58,7 +59,7 @@ impl Recognition {
     }
 }
 
-/// All formats. To add one: a file in `formats/`, a line here, a row in `docs/formats.md`.
+/// All formats. To add one: a file in `codec/`, a line here, a row in `docs/formats.md`.
 pub const FORMATS: &[Format] = &[
     npy::FORMAT,
     npy::COMPRESSED,

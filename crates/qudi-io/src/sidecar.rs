@@ -12,15 +12,10 @@ use qudi_sim::Simulation;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
+pub use crate::writer::beside;
+
 /// Version of this layout.
 pub const VERSION: u32 = 1;
-
-/// Where the record of the file at `path` lies: `NAME.npy.json` beside `NAME.npy`.
-pub fn beside(path: &Path) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".json");
-    name.into()
-}
 
 /// The record of a simulated burst, `NAME.npy.json`.
 #[derive(Debug, Serialize, Deserialize)]

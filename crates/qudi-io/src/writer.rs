@@ -10,7 +10,7 @@ mod picture;
 mod tiff_stack;
 
 pub use array::ArrayWriter;
-pub use burst::{BurstFormat, BurstWriter, pack_row, unpack_row, write_npy_stream};
+pub use burst::{BurstFormat, BurstWriter, beside, pack_row, unpack_row, write_npy_stream};
 pub use clip::ClipWriter;
 pub(crate) use clip::save_png16;
 pub(crate) use frame_name::{frame_name, is_frame_name};

@@ -30,7 +30,7 @@ mod tests {
     use super::exp;
 
     #[test]
-    fn exp_is_that_of_the_library() {
+    fn exp_matches_the_library() {
         for i in -86_999..=87_999 {
             let x = i as f32 * 1e-3;
             let expected = f64::from(x).exp();

@@ -40,7 +40,7 @@ fn check<const D: usize, const E: usize>(
 }
 
 #[test]
-fn convolutions() {
+fn convolutions_match_pytorch() {
     let file = File::open("conv");
     for device in devices() {
         for case in file.cases() {
@@ -77,7 +77,7 @@ fn convolutions() {
 }
 
 #[test]
-fn an_addend_is_added_and_gets_its_gradient() {
+fn addend_is_added_and_receives_its_gradient() {
     for device in devices() {
         let random = |name: &str, shape: [usize; 4]| -> Tensor<4> {
             let values = cases::uniform(name, shape.iter().product());
@@ -107,7 +107,7 @@ fn an_addend_is_added_and_gets_its_gradient() {
 }
 
 #[test]
-fn group_normalisation() {
+fn group_norm_matches_pytorch() {
     let file = File::open("group_norm");
     for device in devices() {
         for case in file.cases() {
@@ -138,7 +138,7 @@ fn group_normalisation() {
 }
 
 #[test]
-fn warps() {
+fn warps_match_pytorch() {
     let file = File::open("warp");
     for device in devices() {
         for case in file.cases() {

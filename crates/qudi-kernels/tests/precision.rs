@@ -62,7 +62,7 @@ fn run(
 /// Products are of rounded numbers, summed in 32 bits and rounded once; bias and addend keep all their bits. On the way back
 /// the same holds of gradients.
 #[test]
-fn products_have_fewer_bits_and_all_else_has_32() {
+fn bf16_rounds_products_only() {
     let device = Device::flex().autodiff();
     for (kernel, stride) in [([1, 3, 3], 1), ([1, 3, 3], 2), ([1, 1, 1], 1), ([3, 5, 5], 1)] {
         let [frames, rows, columns] = kernel;
@@ -102,7 +102,7 @@ fn products_have_fewer_bits_and_all_else_has_32() {
 
 /// What is rounded here is what a backend with such numbers computes, but for the order of sums; flex sums weights' gradients in 16 bits.
 #[test]
-fn rounding_is_what_numbers_of_16_bits_do() {
+fn bf16_rounding_matches_the_definition() {
     let device = Device::flex().autodiff();
     let images = || [IMAGES, IMAGES, IMAGES].map(|shape| tensor(shape, 6, &device));
     let weight = || tensor([IMAGES[1], IMAGES[1], 1, 3, 3], 7, &device);
@@ -126,7 +126,7 @@ fn rounding_is_what_numbers_of_16_bits_do() {
 
 /// The switch holds for what runs inside of it, and ends with it.
 #[test]
-fn single_precision_comes_back() {
+fn single_precision_reads_back() {
     let device = Device::flex().autodiff();
     let x = tensor(IMAGES, 9, &device);
     let weight = tensor([2, IMAGES[1], 3, 3], 10, &device);

@@ -65,7 +65,7 @@ fn run(shape: Shape, relu: bool, device: &Device) -> Vec<Vec<f32>> {
 }
 
 #[test]
-fn every_shape_is_that_of_burn() {
+fn output_shapes_match_burn() {
     #[allow(deprecated)] // asked for by name
     let burns = Device::ndarray().autodiff();
     let ours = Device::flex().autodiff();

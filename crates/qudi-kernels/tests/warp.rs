@@ -29,7 +29,7 @@ fn values(tensor: Tensor<4>) -> Vec<f32> {
 }
 
 #[test]
-fn a_translation_is_a_shift_and_borders_repeat() {
+fn warp_by_a_translation_shifts_and_repeats_borders() {
     for device in devices() {
         // A plane is what bilinear interpolation reproduces exactly.
         let x = image(|x, y| 3.0 * x - 2.0 * y, &device);

@@ -19,7 +19,7 @@ pub fn read<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>> {
         SimError::request(
             format!("the device failed: {problem}"),
             device.clone(),
-            "try smaller tiles (--tile), `qudi selftest`, or --device cpu",
+            "try a smaller `tile`, `qudi selftest`, or the device cpu",
         )
     };
     let data = tensor.try_into_data().map_err(|e| failed(e.to_string()))?;

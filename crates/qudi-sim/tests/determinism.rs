@@ -34,7 +34,7 @@ fn sensors() -> Vec<Sensor> {
 }
 
 #[test]
-fn one_and_eight_threads_see_the_same_photons() {
+fn photons_do_not_depend_on_threads() {
     let size = Size { height: 67, width: 91 };
     for sensor in sensors() {
         let alone = expose(&sensor, size, 7, 1, 3);
@@ -69,7 +69,7 @@ const PINNED: [u32; 6] =
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     #[test]
-    fn any_size_and_seed_is_reproducible(
+    fn simulation_is_reproducible_for_any_size_and_seed(
         height in 1usize..40, width in 1usize..70, seed: u64, threads in 1usize..9, which in 0usize..6,
     ) {
         let size = Size { height, width };

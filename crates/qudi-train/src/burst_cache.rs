@@ -345,7 +345,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_are_finer_than_noise() {
+    fn cached_bytes_are_finer_than_noise() {
         for i in -800..=800 {
             let z = i as f32 * 0.01;
             let error = (expanded(compressed(z)) - z).abs();

@@ -3,7 +3,7 @@
 use super::recipe::{Recipe, VALIDATION, ValidationConfig};
 use crate::dataset::Pack;
 use burn::tensor::Device;
-use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::fitting_exposure;
 use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;

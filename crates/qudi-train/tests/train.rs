@@ -241,7 +241,7 @@ fn first_stage_trains_the_pre_denoiser_on_crops() {
 
 /// Weights of earlier stages stay as they were, bit for bit, in the average, too; a resumed run has the same bursts.
 #[test]
-fn earlier_stages_keep_their_weights() {
+fn refinement_stages_keep_their_weights() {
     let recipe = recipe(&[("network.pre.stages", "2")]);
     let start = recipe.network.init(1, &Device::flex());
     let start = init_parameters(start, |_, shape| {
@@ -366,7 +366,7 @@ fn reads_recipes_with_former_key_names() {
 }
 
 #[test]
-fn recipes_with_removed_terms_are_refused_with_the_reason() {
+fn rejects_recipes_with_removed_terms() {
     for name in ["ms-ssim", "oriented", "lpips-squeeze"] {
         let changes = [("train.loss.term", name), ("train.loss.perceptual", "0.1")];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));

@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_the_definition_and_has_an_inverse() {
+    fn dft_matches_its_definition_and_inverts() {
         let patch: Patch =
             std::array::from_fn(|y| std::array::from_fn(|x| ((x * 5 + y * y * 3) % 17) as f32));
         let spectrum = forward(&patch);

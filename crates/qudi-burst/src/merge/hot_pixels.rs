@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_hot_pixel_becomes_like_its_neighbours() {
+    fn repairs_hot_pixel_from_its_neighbours() {
         let size = qudi_core::Size { height: 12, width: 14 };
         let mut frame = vec![1u16; size.pixels()];
         frame[5 * 14 + 6] = 7;

@@ -205,7 +205,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_goes_somewhere_came_from_there() {
+    fn backward_warp_is_the_adjoint_of_forward() {
         let map = Affine([[3.0, 1.02, -0.03], [-2.0, 0.05, 0.97]]);
         for place in [[0.0, 0.0], [40.0, -25.0], [-17.5, 60.0]] {
             let back = map.inverse_of(map.of(place));
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn systems_are_solved() {
+    fn solves_linear_systems() {
         let row =
             |p: usize| std::array::from_fn(|q| if p == q { 4.0 } else { 1.0 / (p + q) as f64 });
         let matrix: [[f64; NUMBERS]; NUMBERS] = std::array::from_fn(row);

@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_moves_where_nothing_is_seen_and_small_frames_do_not_panic() {
+    fn flow_is_zero_without_texture_and_small_frames_do_not_panic() {
         for (height, width) in [(1, 1), (3, 40), (64, 64), (65, 33)] {
             let flat = Frame::filled(Size { height, width }, 0.4);
             let flow = estimate_flow(&flat, &flat);
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_covered_or_leaves_is_not_compared() {
+    fn flicker_skips_occluded_and_leaving_pixels() {
         let size = Size { height: 96, width: 128 };
         let now = texture(size, 0.0, 0.0);
         let mut next = now.clone();
@@ -328,7 +328,7 @@ mod tests {
     /// On scenes whose flow is known, the truth changes along the estimated flow about as little as
     /// along the true one.
     #[test]
-    fn the_truth_hardly_changes_along_it() {
+    fn truth_hardly_changes_along_its_flow() {
         let size = Size { height: 128, width: 160 };
         for &kind in PROCEDURAL {
             let scene = Procedural { kind, size, seed: 3, speed: 3.0 }.scene();

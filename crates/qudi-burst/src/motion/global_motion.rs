@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn most_of_the_image_decides_and_uneven_motion_is_found() {
+    fn majority_decides_and_uneven_motion_is_detected() {
         let moments = moments();
         let camera = GlobalMotion::find(&frames(&moments), &moments, 1.0).unwrap();
         let [cx, cy] = centre(SIZE);
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nothing_is_seen_nothing_moves() {
+    fn motion_is_zero_without_texture() {
         let moments = moments();
         let flat = vec![Frame::filled(SIZE, 1.0); 5];
         let camera = GlobalMotion::find(&flat, &moments, 1.0).unwrap();

@@ -374,7 +374,7 @@ mod tests {
 
     /// With light and good reference frames matching is right.
     #[test]
-    fn accelerated_motion_stays_as_it_was_matched() {
+    fn keeps_matched_motion_where_it_accelerates() {
         let moved = |t: f32| [0.25 * (t - 5.0) * (t - 5.0), 0.0];
         let (burst, frames) = burst(100.0, moved);
         let references = ReferenceFrames::new(&burst, frames, 0.1);

@@ -273,7 +273,7 @@ mod tests {
 
     /// A texture too faint for two frames, moving evenly: the true velocity is that of nearly every patch.
     #[test]
-    fn faint_even_motion_is_found() {
+    fn finds_faint_constant_motion() {
         let size = Size { height: 96, width: 112 };
         let velocity = [1.7, -0.9];
         let texture = |x: f32, y: f32| {
@@ -317,7 +317,7 @@ mod tests {
 
     /// What one patch does not know its neighbours tell; what it knows better it keeps.
     #[test]
-    fn neighbours_help_but_do_not_overrule() {
+    fn neighbouring_hypotheses_help_but_do_not_overrule() {
         let certain =
             |label: usize| (0..VELOCITIES).map(|l| if l == label { 0.0 } else { 40.0 }).collect();
         let (one, other) = (100, 900);

@@ -24,7 +24,7 @@ mod tests {
     use qudi_core::Size;
 
     #[test]
-    fn a_shift_along_its_flow_does_not_flicker() {
+    fn shift_along_its_flow_has_no_flicker() {
         let size = Size { height: 6, width: 12 };
         let scene = |shift: usize| Frame::from_fn(size, |x, y| ((x + 12 - shift) * (y + 3)) as f32);
         let visible = (0..size.pixels()).map(|i| i % 12 < 9).collect();

@@ -2,7 +2,7 @@
 
 use crate::error::{CliError, Result};
 use qudi_core::USUAL_EXPOSURE;
-use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::fitting_exposure;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::LONGEST_HALF;

@@ -85,6 +85,7 @@ const IN_TEXT: &[&str] = &[
     "start",
     "steps",
     "sum",
+    "tile",
     "trailer",
 ];
 

@@ -37,7 +37,7 @@ mod tests {
     use crate::frame::Size;
 
     #[test]
-    fn a_known_error_has_a_known_psnr() {
+    fn psnr_of_known_error_is_exact() {
         let size = Size { height: 4, width: 5 };
         let truth = Frame::filled(size, 0.5);
         assert!((psnr(&Frame::filled(size, 0.6), &truth) - 20.0).abs() < 1e-5);

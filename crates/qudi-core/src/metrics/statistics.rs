@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn intervals_are_students() {
+    fn confidence_intervals_follow_student() {
         // scipy.stats.t.interval(0.95, 3, 2.5, sem([1, 2, 3, 4])) is (0.4457, 4.5543).
         let of = Statistics::of(&[1.0, 2.0, 3.0, 4.0]).unwrap();
         assert_eq!((of.n, of.mean, of.worst5), (4, 2.5, 1.0));

@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn without_noise_and_clipping_it_is_the_poisson_law() {
+    fn law_without_noise_and_clipping_is_poisson() {
         let p = law(8, 1.0, 0.0).probabilities(4.2);
         // scipy.stats.poisson.pmf([0, 1, 5, 20], 4.2)
         for (k, expected) in [
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_response_is_inverted() {
+    fn inverts_the_mean_response() {
         for law in [law(3, 1.077, 0.2), law(12, 0.5, 0.3)] {
             for detections in [0.5, 2.0, 4.2] {
                 let back = law.detections_for_mean(law.mean(detections));
@@ -274,7 +274,7 @@ mod tests {
 
     /// A full well that the output cannot fill saturates all the same.
     #[test]
-    fn a_full_well_bounds_the_inverse() {
+    fn full_well_bounds_the_inverse_response() {
         for (gain, most) in [(0.02, 4.0), (0.002, 0.5), (1.0, 7.0)] {
             let mut law = law(3, gain, 0.2);
             law.full_well = 200.0;
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn round_half_even_is_numpys() {
+    fn round_half_even_matches_numpy() {
         // gain 0.5 sends 1, 3, 5 electrons to 0.5, 1.5, 2.5, which round to 0, 2, 2.
         let law = law(3, 0.5, 0.0);
         for (k, y) in [(1.0, 0), (2.0, 1), (3.0, 2), (4.0, 2), (5.0, 2), (6.0, 3)] {

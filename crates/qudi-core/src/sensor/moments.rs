@@ -74,7 +74,7 @@ mod tests {
     use crate::sensor::Sensor;
 
     #[test]
-    fn tables_agree_with_the_law() {
+    fn count_tables_match_the_law() {
         for (name, gain) in [("qudi-paper", 1.077), ("swissspad2", 1.0), ("qis4-gj", 1.0)] {
             let law = CountLaw::new(&Sensor::load(name).unwrap(), gain);
             let moments = CountMoments::new(&law);

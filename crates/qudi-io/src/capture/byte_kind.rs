@@ -55,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn bits_and_counts_are_told_apart() {
+    fn distinguishes_bits_from_counts() {
         for rate in [0.01, 0.1, 0.5, 0.9] {
             let packed = bytes(|u| (0..8).fold(0, |b, i| b | u8::from(u() < rate) << i));
             assert_eq!(ByteKind::of(&packed), ByteKind::Packed, "{rate}");

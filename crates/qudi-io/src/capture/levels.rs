@@ -43,7 +43,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_and_pictures_stay_what_they_are() {
+    fn distinguishes_counts_from_pictures() {
         assert_eq!(infer_levels(&[0], 255), None);
         assert_eq!(infer_levels(&[0, 1], 255), None);
         assert_eq!(infer_levels(&[0, 1, 2, 3, 4, 5, 6, 7], 255), None);

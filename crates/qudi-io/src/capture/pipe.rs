@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_kept_until_released_and_no_longer() {
+    fn pipe_keeps_frames_until_released() {
         let mut pipe = pipe(b"aaabbbcccdddeee", None, TAIL);
         let mut notes = Vec::new();
         assert_eq!((pipe.wait_for(2, &mut notes).unwrap(), pipe.length()), (2, None));
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_inside_frames_are_refused_or_said() {
+    fn rejects_or_reports_ends_inside_frames() {
         let all = |mut pipe: Pipe| {
             let mut notes = Vec::new();
             pipe.wait_for(9, &mut notes).map(|n| (n, notes.len()))
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn camera_trailers_are_no_frames() {
+    fn skips_trailers_of_cameras() {
         let mut four = Pipe::new(Box::new(&b"aaaaabbbbbDONE"[..]), 5, None, TAIL);
         let mut notes = Vec::new();
         assert_eq!(four.wait_for(9, &mut notes).unwrap(), 2);

@@ -1,6 +1,6 @@
 //! A first look at a path, shared by all formats that try to recognise it.
 
-use super::raw_sample::RawSample;
+use super::raw_sample::{RawSample, stem};
 use qudi_core::limits::FOLDER_FILES;
 use qudi_core::natural_order::natural_order;
 use qudi_core::{Result, SimError};
@@ -30,8 +30,8 @@ pub(crate) struct Probe {
     /// The first bytes of a file.
     pub(crate) head: Vec<u8>,
     files: OnceCell<Listing>,
-    /// Filled by [`RawSample::at`], which several formats ask.
-    pub(crate) raw_sample: OnceCell<Option<RawSample>>,
+    /// Filled by [`Probe::raw_sample`], which several formats ask.
+    raw_sample: OnceCell<Option<RawSample>>,
 }
 
 impl Probe {
@@ -69,6 +69,17 @@ impl Probe {
     /// File name without its extension.
     pub(crate) fn stem(&self) -> String {
         stem(&self.path)
+    }
+
+    /// What the `.bin` file, or the first one of the folder, looks like; none if there is none.
+    pub(crate) fn raw_sample(&self) -> Result<Option<RawSample>> {
+        if let Some(sample) = self.raw_sample.get() {
+            return Ok(*sample);
+        }
+        let is_raw = self.is_folder || self.has_extension(&["bin", "raw"]);
+        let first = if is_raw { self.files(&["bin"])?.into_iter().next() } else { None };
+        let sample = first.map(|path| RawSample::read(&path)).transpose()?;
+        Ok(*self.raw_sample.get_or_init(|| sample))
     }
 
     /// Whether it is a file with one of these extensions.
@@ -124,10 +135,6 @@ impl Probe {
         file.take(SAMPLE).read_to_end(&mut bytes).map_err(io)?;
         Ok(bytes)
     }
-}
-
-pub(crate) fn stem(path: &Path) -> String {
-    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 /// What lies in a folder and in those below it.

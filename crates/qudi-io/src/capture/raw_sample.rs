@@ -3,7 +3,6 @@
 use super::bit_order::{SURE, bit_order_z_score, standard_errors};
 use super::byte_kind::ByteKind;
 use super::options::BitOrder;
-use super::probe::{Probe, stem};
 use crate::frames::bit_sums::{MOST_FRAMES, add_packed};
 use qudi_core::Size;
 use qudi_core::{Result, SimError};
@@ -41,30 +40,23 @@ pub(crate) struct RawSample {
 }
 
 impl RawSample {
-    /// Looks at the first `.bin` file of `probe`, if there is one.
-    pub(crate) fn at(probe: &Probe) -> Result<Option<Self>> {
-        if let Some(sample) = probe.raw_sample.get() {
-            return Ok(*sample);
-        }
-        let sample = Self::new(probe)?;
-        Ok(*probe.raw_sample.get_or_init(|| sample))
-    }
-
-    fn new(probe: &Probe) -> Result<Option<Self>> {
-        if !(probe.is_folder || probe.has_extension(&["bin", "raw"])) {
-            return Ok(None);
-        }
-        let Some(path) = probe.files(&["bin"])?.into_iter().next() else { return Ok(None) };
-        let io = |e| SimError::io("read", &path, e);
-        let file = File::open(&path).map_err(io)?;
+    /// Looks at a `.bin` file.
+    pub(crate) fn read(path: &Path) -> Result<Self> {
+        let io = |e| SimError::io("read", path, e);
+        let file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         let mut bytes = Vec::new();
         file.take(SWISSSPAD_FILE).read_to_end(&mut bytes).map_err(io)?;
         bytes.truncate(bytes.len() / FRAME * FRAME);
         let (order, full_array) = pictures(&bytes);
         let kind = ByteKind::of(&bytes[..bytes.len().min(1 << 20)]);
-        Ok(Some(Self { convention: convention(&path), length, kind, order, full_array }))
+        Ok(Self { convention: convention(path), length, kind, order, full_array })
     }
+}
+
+/// The name of a file without its extension.
+pub(crate) fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
 fn convention(path: &Path) -> Convention {

@@ -85,7 +85,7 @@ mod tests {
 
     /// numpy: rot90([[a,b,c],[d,e,f]]) is [[c,f],[b,e],[a,d]].
     #[test]
-    fn quarter_turns_are_numpys() {
+    fn quarter_turns_match_numpy() {
         assert_eq!(turn(Orientation::Raw, None), [b"abc", b"def"]);
         assert_eq!(turn(Orientation::Rot90, None), [b"cf", b"be", b"ad"]);
         assert_eq!(turn(Orientation::Vendor, None), [b"cf", b"be", b"ad"]);
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn crops_apply_to_the_turned_frame() {
+    fn crops_the_turned_frame() {
         assert_eq!(turn(Orientation::Rot90, Some("1:3,0:1")), [b"b", b"a"]);
         assert_eq!(turn(Orientation::Raw, Some("0:2,1:3")), [b"bc", b"ef"]);
         let stored = Size { height: 2, width: 3 };

@@ -8,7 +8,7 @@ use crate::capture::format_options::FormatOption;
 use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, Orientation, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
-use crate::capture::raw_sample::{Convention, FRAME, RawSample};
+use crate::capture::raw_sample::{Convention, FRAME};
 use crate::codec::raw::files::{ends_in_trailer, frame_files};
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
@@ -51,7 +51,7 @@ pub(crate) const WORDS: Format = Format {
 };
 
 fn recognise(probe: &Probe, kind: ByteKind, frame: u64) -> Result<Option<Recognition>> {
-    let Some(sample) = RawSample::at(probe)? else { return Ok(None) };
+    let Some(sample) = probe.raw_sample()? else { return Ok(None) };
     let binary = kind == ByteKind::Packed;
     let fits = match sample.kind {
         // A dark capture could be of any depth; the common one is meant.

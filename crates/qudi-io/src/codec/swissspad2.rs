@@ -9,7 +9,7 @@ use crate::capture::byte_kind::ByteKind;
 use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
-use crate::capture::raw_sample::{Convention, RawSample, SWISSSPAD_FILE};
+use crate::capture::raw_sample::{Convention, SWISSSPAD_FILE};
 use crate::codec::raw::files::frame_files;
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement};
@@ -41,7 +41,7 @@ pub(crate) const FULL: Format = Format {
 const HALF_FRAME: u64 = 16_384;
 
 fn recognise(probe: &Probe, full: bool) -> Result<Option<Recognition>> {
-    let Some(sample) = RawSample::at(probe)? else { return Ok(None) };
+    let Some(sample) = probe.raw_sample()? else { return Ok(None) };
     let frame = if full { 2 * HALF_FRAME } else { HALF_FRAME };
     if !sample.length.is_multiple_of(frame) || sample.kind == ByteKind::Counts {
         return Ok(None);

@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn full_counters_do_not_overflow() {
+    fn bit_sums_do_not_overflow() {
         let frames = vec![0xff; 255 * 130];
         let mut sums = vec![1; 130 * 8];
         add_packed(&frames, 130, BitOrder::Msb, &mut sums);

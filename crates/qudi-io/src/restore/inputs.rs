@@ -176,7 +176,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn copies_agree_and_other_content_of_equal_length_does_not() {
+    fn fingerprints_agree_for_copies_only() {
         let scratch = tempfile::tempdir().unwrap();
         let path = |name: &str| scratch.path().join(name);
         std::fs::write(path("a"), [1, 2, 3]).unwrap();

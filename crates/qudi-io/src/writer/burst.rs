@@ -15,6 +15,13 @@ use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// The path of the record of the file at `path`: `NAME.npy.json` beside `NAME.npy`.
+pub fn beside(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".json");
+    name.into()
+}
+
 /// How counts lie on disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -65,7 +72,7 @@ impl BurstFormat {
         if self == Self::Png {
             return path.join(PngFolder::RECORD);
         }
-        crate::sidecar::beside(path)
+        beside(path)
     }
 
     /// NumPy type and shape of one frame.

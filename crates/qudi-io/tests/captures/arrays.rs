@@ -6,7 +6,7 @@ use qudi_io::capture::{Axes, BitOrder, Orientation, PackAxis, ReadOptions};
 use std::io::Write;
 
 #[test]
-fn the_first_pixel_is_the_highest_bit_and_padding_needs_the_width() {
+fn first_pixel_is_the_highest_bit_and_padding_needs_the_width() {
     let folder = scratch();
     // One frame of 2 x 10 pixels: 0x01 sets pixel 7, 0x80 in the second byte pixel 8.
     let data = [0x01, 0x80, 0xff, 0x40];
@@ -93,7 +93,7 @@ fn every_sample_type_holds_the_same_counts() {
 }
 
 #[test]
-fn what_is_no_count_is_refused() {
+fn rejects_values_that_are_not_counts() {
     let folder = scratch();
     for value in [-1.0f32, 0.5, f32::NAN, 70_000.0] {
         let path =
@@ -113,7 +113,7 @@ fn what_is_no_count_is_refused() {
 }
 
 #[test]
-fn axes_in_any_order_and_fortran_order_are_the_same_frames() {
+fn reads_axes_in_any_order_and_fortran_order() {
     let folder = scratch();
     let (t, h, w) = (5usize, 3usize, 4usize);
     let value = |f: usize, y: usize, x: usize| (100 * f + 10 * y + x) as u16;
@@ -157,7 +157,7 @@ fn axes_in_any_order_and_fortran_order_are_the_same_frames() {
 }
 
 #[test]
-fn colour_is_refused_and_one_channel_can_be_read() {
+fn rejects_colour_and_reads_one_channel() {
     let folder = scratch();
     let data: Vec<u8> = (0..2 * 2 * 2 * 3).collect();
     let path = write(folder.path(), "a.npy", &npy("|u1", "False", "(2, 2, 2, 3)", &data));
@@ -173,7 +173,7 @@ fn colour_is_refused_and_one_channel_can_be_read() {
 }
 
 #[test]
-fn compressed_arrays_go_forward_and_back() {
+fn reads_compressed_arrays_forwards_and_backwards() {
     let folder = scratch();
     let frames = scene(30, 16, 24, 3);
     let data: Vec<u8> = frames.iter().flat_map(|f| pack(f, 24, false)).collect();
@@ -202,7 +202,7 @@ fn compressed_arrays_go_forward_and_back() {
 }
 
 #[test]
-fn truncated_arrays_are_refused_or_trimmed() {
+fn rejects_or_trims_truncated_arrays() {
     let folder = scratch();
     let bytes = npy("<u2", "False", "(3, 2, 2)", &[5, 0, 6, 0, 7, 0, 8, 0, 1, 0, 2, 0, 3, 0]);
     let path = write(folder.path(), "a.npy", &bytes);
@@ -218,7 +218,7 @@ fn truncated_arrays_are_refused_or_trimmed() {
 }
 
 #[test]
-fn headers_that_lie_allocate_nothing() {
+fn lying_headers_allocate_nothing() {
     let folder = scratch();
     for shape in [
         "(1000000, 100000, 100000)",
@@ -280,7 +280,7 @@ fn frames_are_chosen_cropped_turned_and_summed() {
 proptest! {
     /// What is packed comes back, on any size, either axis, either order; totals agree with frames.
     #[test]
-    fn packing_is_undone(
+    fn packed_rows_unpack_to_the_same_bits(
         t in 1usize..40, h in 1usize..20, w in 1usize..40, seed: u64, lsb: bool, along_height: bool,
     ) {
         let folder = scratch();

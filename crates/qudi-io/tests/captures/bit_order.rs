@@ -38,7 +38,7 @@ fn reversed(sums: &[u32]) -> Vec<u32> {
 }
 
 #[test]
-fn bursts_of_16_to_1024_frames_are_right_or_unsure() {
+fn bit_order_of_16_to_1024_frames_is_right_or_unsure() {
     let size = Size { height: 128, width: 256 };
     let lengths = [16, 32, 64, 128, 256, 512, 1024];
     let (mut sure, mut all) = (0, 0);
@@ -66,7 +66,7 @@ fn bursts_of_16_to_1024_frames_are_right_or_unsure() {
 }
 
 #[test]
-fn noise_and_nothing_leave_it_open() {
+fn noise_and_darkness_leave_the_bit_order_open() {
     let size = Size { height: 64, width: 64 };
     assert_eq!(bit_order_z_score(&vec![0; 64 * 64], size), 0.0);
     for seed in 0..20 {

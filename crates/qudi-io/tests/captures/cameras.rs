@@ -93,7 +93,7 @@ fn spad512s_frames_come_with_and_without_trailer_and_turned() {
 }
 
 #[test]
-fn the_server_s_error_is_reported_and_a_torn_frame_refused() {
+fn reports_server_errors_and_rejects_torn_frames() {
     let folder = scratch();
     let frames = scene(20, 512, 512, 6);
     let mut bytes: Vec<u8> = frames.iter().flat_map(|f| pack(f, 512, false)).collect();
@@ -201,7 +201,7 @@ fn qvga_files_have_a_header_or_none() {
 }
 
 #[test]
-fn a_length_alone_decides_nothing() {
+fn file_length_alone_recognises_no_format() {
     let folder = scratch();
     // 8 MiB: a SwissSPAD2 file, or 256 frames of a SPAD512S. The picture tells; noise does not.
     let frames = scene(256, 512, 512, 10);
@@ -229,7 +229,7 @@ fn a_length_alone_decides_nothing() {
 }
 
 #[test]
-fn any_other_camera_is_described_by_hand() {
+fn reads_raw_files_of_any_camera_with_options() {
     let folder = scratch();
     let frames = scene(6, 10, 12, 11);
     let mut bytes = vec![7u8; 5];

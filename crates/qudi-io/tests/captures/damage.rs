@@ -235,7 +235,7 @@ fn masks_in_fortran_order_are_read() {
 }
 
 #[test]
-fn folders_are_overwritten_only_if_all_files_are_ours() {
+fn overwrites_folders_of_own_files_only() {
     use qudi_core::atomic_file::Overwrite;
     use qudi_io::writer::{ClipWriter, TiffSamples};
     let scratch = scratch();

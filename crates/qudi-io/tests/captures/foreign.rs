@@ -60,7 +60,7 @@ fn every_file_holds_the_same_frames() {
 
 #[cfg(feature = "hdf5")]
 #[test]
-fn hdf5_holds_them_too() {
+fn reads_hdf5_captures() {
     let three_bit = expected("counts.npy");
     for name in ["chunked.h5", "contiguous.h5", "matlab73.mat", "mono.ubi.h5"] {
         assert_eq!(frames(name, &plain()), three_bit, "{name}");
@@ -74,12 +74,12 @@ fn hdf5_holds_them_too() {
 
 #[cfg(not(feature = "hdf5"))]
 #[test]
-fn without_the_feature_hdf5_says_so() {
+fn explains_builds_without_hdf5() {
     assert!(refusal(open(&golden("chunked.h5"), &plain())).contains("--features hdf5"));
 }
 
 #[test]
-fn what_is_known_is_said() {
+fn info_says_what_is_known() {
     let info = |name: &str| open(&golden(name), &plain()).unwrap().info().clone();
     for name in ["counts.npy", "stored.npz", "plain.mat", "pages.tif", "visionsim1", "parts"] {
         assert_eq!(info(name).certainty, Certainty::Certain, "{name}");
@@ -92,7 +92,7 @@ fn what_is_known_is_said() {
 }
 
 #[test]
-fn what_is_open_is_asked() {
+fn asks_for_what_the_file_leaves_open() {
     let words = refusal(open(&golden("two.npz"), &plain()));
     assert!(words.contains("left") && words.contains("`array`"), "{words}");
     let left = ReadOptions { array: Some("left".into()), ..plain() };
@@ -125,7 +125,7 @@ fn matlab_s_dark_map_names_hot_pixels() {
 
 /// Cut anywhere, a file is an error or fewer frames, never a panic.
 #[test]
-fn files_cut_anywhere_do_not_panic() {
+fn truncated_files_do_not_panic() {
     let folder = crate::scratch();
     for name in [
         "counts.npy",
@@ -158,7 +158,7 @@ fn files_cut_anywhere_do_not_panic() {
 /// A named pipe among the files would keep a reader waiting for ever.
 #[cfg(unix)]
 #[test]
-fn pipes_in_a_folder_are_left_alone() {
+fn skips_pipes_in_a_folder() {
     let folder = crate::scratch();
     let made =
         std::process::Command::new("mkfifo").arg(folder.path().join("filename0.bin")).status();

@@ -71,7 +71,7 @@ fn file(format: &str, folder: &Path) -> Option<PathBuf> {
 }
 
 #[test]
-fn options_that_a_format_does_not_take_are_refused_by_name() {
+fn rejects_options_that_a_format_does_not_take_by_name() {
     let folder = scratch();
     for format in FORMATS {
         // Refused before anything is read, so that any file will do.
@@ -100,7 +100,7 @@ fn outcome(path: &Path, options: &ReadOptions) -> String {
 }
 
 #[test]
-fn options_that_a_format_takes_are_not_ignored() {
+fn applies_options_that_a_format_takes() {
     let folder = scratch();
     for format in FORMATS {
         let Some(path) = file(format.name, folder.path()) else { continue };

@@ -27,7 +27,7 @@ fn raw(size: &str) -> ReadOptions {
 proptest! {
     /// Headers, lengths and options of any kind: frames or an error, never a panic.
     #[test]
-    fn no_piped_array_panics(
+    fn hostile_piped_arrays_never_panic(
         shape in prop::collection::vec(0usize..7, 0..5),
         descr in prop::sample::select(vec!["|u1", "|b1", "<u2", ">i4", "<f4"]),
         fortran in prop::sample::select(vec!["True", "False"]),
@@ -84,7 +84,7 @@ fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, SimError> {
 
 /// Every length around one, two and three windows, of which the last is moved.
 #[test]
-fn a_pipe_restores_to_the_frames_of_a_file() {
+fn pipe_restores_the_same_frames_as_a_file() {
     let folder = scratch();
     for frames in 1..40 {
         let data: Vec<u8> =
@@ -124,7 +124,7 @@ fn packed_frames_parts_and_sums_are_those_of_a_file() {
 }
 
 #[test]
-fn released_frames_are_gone_and_the_end_is_said() {
+fn released_frames_are_gone_and_the_end_is_known() {
     let data: Vec<u8> = scene(30, 4, 5, 1).iter().flatten().map(|&c| c as u8).collect();
     let mut pipe = piped(&data, &ReadOptions { end: Some(50), ..raw("4x5") }).unwrap();
     assert_eq!(pipe.length(), None);
@@ -140,7 +140,7 @@ fn released_frames_are_gone_and_the_end_is_said() {
 }
 
 #[test]
-fn what_cannot_come_through_a_pipe_is_refused() {
+fn rejects_formats_that_cannot_be_piped() {
     let says = |bytes: &[u8], options: &ReadOptions| refusal(piped(bytes, options));
     assert!(says(b"", &plain()).contains("nothing came"));
     assert!(says(b"YUV4MPEG2 W8 H8", &plain()).contains("pictures, not photon counts"));

@@ -48,7 +48,7 @@ dead_fraction = 0.002
 "#;
 
 #[test]
-fn hot_and_dead_pixels_of_a_real_scene_are_found_and_few_others() {
+fn finds_hot_and_dead_pixels_of_a_textured_scene() {
     let folder = scratch();
     let size = Size { height: 128, width: 160 };
     let sensor = sensor(DEFECTIVE);
@@ -73,7 +73,7 @@ fn hot_and_dead_pixels_of_a_real_scene_are_found_and_few_others() {
 }
 
 #[test]
-fn a_clean_capture_has_no_bad_pixels() {
+fn finds_no_bad_pixels_in_a_clean_capture() {
     let size = Size { height: 96, width: 96 };
     for (seed, rate) in [(1, 3u32), (2, 40)] {
         let frames = crate::scene(60, 96, 96, seed);

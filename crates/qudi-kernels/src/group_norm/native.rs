@@ -285,7 +285,7 @@ mod tests {
     use super::sigmoid;
 
     #[test]
-    fn sigmoid_is_that_of_the_library() {
+    fn sigmoid_matches_the_library() {
         for i in -100_000..=100_000 {
             let v = i as f32 * 1e-3;
             let expected = 1.0 / (1.0 + (-f64::from(v)).exp());

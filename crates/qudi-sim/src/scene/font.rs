@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn glyphs_are_sorted_so_that_the_search_finds_them() {
+    fn glyphs_are_sorted_for_binary_search() {
         assert!(GLYPHS.windows(2).all(|pair| pair[0].0 < pair[1].0));
         assert!(dot('t', 2, 6) && !dot('t', 0, 6) && !dot('~', 2, 2));
     }

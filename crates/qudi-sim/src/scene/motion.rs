@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_two_directions_are_inverse() {
+    fn warp_and_its_adjoint_are_consistent() {
         let motion = Motion {
             velocity: [1.5, -2.0],
             rotation: 0.1,

@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn far_views_are_averaged_not_aliased() {
+    fn averages_far_views_without_aliasing() {
         let size = Size { height: 32, width: 32 };
         let paint = Paint::image(Frame::from_fn(size, |x, y| ((x + y) % 2) as f32));
         assert!((paint.value([10.0, 10.0], 0.25) - 0.5).abs() < 0.01);

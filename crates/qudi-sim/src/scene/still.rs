@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn without_motion_it_is_the_image() {
+    fn still_without_motion_equals_the_image() {
         let still = still_scene(image(), StillMotion::default(), image().size, 1).render(3.0);
         for (a, b) in still.data.iter().zip(&image().data) {
             assert!((a - b).abs() < 1e-6);
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pan_is_a_shift_with_that_flow() {
+    fn pan_shifts_the_image_along_its_flow() {
         let motion: StillMotion = "pan:3,-2".parse().unwrap();
         let scene = still_scene(image(), motion, image().size, 1);
         let moved = scene.render(1.0);
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn motions_are_checked() {
+    fn rejects_invalid_motions() {
         for bad in ["spin:1", "pan:1", "zoom:0", "rotate:x", "pan:nan,0"] {
             assert!(bad.parse::<StillMotion>().is_err(), "{bad}");
         }

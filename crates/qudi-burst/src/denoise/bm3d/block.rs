@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn inverses_invert() {
+    fn unbiased_inverse_inverts_the_transform() {
         for transform in [Transform::Bior, Transform::Dct] {
             let mut block = some_block();
             transform.forward(&mut block);
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn constants_have_no_detail() {
+    fn constant_images_have_zero_distance() {
         let mut flat: Block = [f32x8::splat(3.0); 8];
         Transform::Bior.forward(&mut flat);
         assert!((flat[0].to_array()[0] - 24.0).abs() < 1e-5);

@@ -166,7 +166,7 @@ mod tests {
 
     /// Against the definition, block by block, at every border and with a full group.
     #[test]
-    fn groups_are_those_of_an_exhaustive_search() {
+    fn block_matching_equals_exhaustive_search() {
         let size = Size { height: 23, width: 30 };
         let image: Vec<f32> =
             (0..size.pixels()).map(|i| ((i * i * 31 + i * 7) % 101) as f32).collect();

@@ -6,7 +6,7 @@ use super::plan::Plan;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use qudi_burst::motion::estimate_flow;
-use qudi_core::auto_exposure::fitting_exposure;
+use qudi_core::fitting_exposure;
 use qudi_core::flow::Flow;
 use qudi_core::restorer::Acquisition;
 use qudi_core::{SimError, USUAL_EXPOSURE};

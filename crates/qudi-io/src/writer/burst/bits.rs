@@ -20,7 +20,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn the_first_pixel_is_the_highest_bit() {
+    fn first_pixel_is_the_highest_bit() {
         let mut bytes = [0u8; 2];
         pack_row(&[0, 0, 0, 0, 0, 0, 0, 1, 1, 1], &mut bytes);
         assert_eq!(bytes, [0x01, 0xc0]);
@@ -28,7 +28,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn unpacking_undoes_packing(row in prop::collection::vec(0u16..2, 1..200)) {
+        fn unpacking_inverts_packing(row in prop::collection::vec(0u16..2, 1..200)) {
             let mut bytes = vec![0u8; row.len().div_ceil(8)];
             pack_row(&row, &mut bytes);
             let mut back = vec![0u16; row.len()];

@@ -108,7 +108,7 @@ mod tests {
 
     /// The file calls a function in the place of a tensor: nothing is called, and there is no tensor.
     #[test]
-    fn executes_nothing() {
+    fn executes_no_code_of_a_pickle() {
         let file =
             StateDict::open(&golden("code.pth")).and_then(|file| file.read("a.weight", &[2, 3]));
         assert!(file.is_err());

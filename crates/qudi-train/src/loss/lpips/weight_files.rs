@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_are_found_by_either_name_and_missing_ones_are_named() {
+    fn finds_files_by_either_name_and_names_missing_ones() {
         let [given, cached] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let folders = [given.path().to_owned(), cached.path().to_owned()];
         let files = files(Net::Alex);

@@ -338,7 +338,7 @@ mod tests {
     proptest! {
         /// Headers come from strangers: anything but a panic.
         #[test]
-        fn no_header_panics(mut bytes in prop::collection::vec(any::<u8>(), 0..300), magic: bool) {
+        fn hostile_npy_headers_never_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..300), magic: bool) {
             if magic && bytes.len() > 8 {
                 bytes[..8].copy_from_slice(b"\x93NUMPY\x01\x00");
             }
@@ -346,7 +346,7 @@ mod tests {
         }
 
         #[test]
-        fn no_dictionary_panics(text in "\\{('descr'|'shape'|'fortran_order'|[ ,:()'<f4u1|0-9]|True|False){0,20}") {
+        fn hostile_npy_dictionaries_never_panic(text in "\\{('descr'|'shape'|'fortran_order'|[ ,:()'<f4u1|0-9]|True|False){0,20}") {
             let _ = parse_dictionary(&text);
         }
     }
@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn headers_are_aligned_and_come_back() {
+    fn npy_headers_are_aligned_and_read_back() {
         for shape in [vec![5], vec![3, 4], vec![100_000, 256, 64]] {
             let bytes = header_bytes("<u2", &shape);
             assert_eq!(bytes.len() % 64, 0);
@@ -370,14 +370,14 @@ mod tests {
     }
 
     #[test]
-    fn numpys_own_header_is_read() {
+    fn reads_headers_that_numpy_wrote() {
         let text = b"\x93NUMPY\x01\x00v\x00{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3, 4), }                                                          \n";
         let header = Header::read(&mut text.as_slice(), Path::new("x.npy")).unwrap();
         assert_eq!((header.sample, header.shape), (Sample::U8, vec![2, 3, 4]));
     }
 
     #[test]
-    fn hostile_headers_are_errors() {
+    fn rejects_hostile_npy_headers() {
         let path = Path::new("x.npy");
         for bytes in [
             b"".to_vec(),
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn both_byte_orders_decode() {
+    fn decodes_both_byte_orders() {
         assert_eq!(Sample::U16 { big_endian: true }.decode(&[1, 2]), 258.0);
         assert_eq!(Sample::U16 { big_endian: false }.decode(&[2, 1]), 258.0);
         assert_eq!(Sample::F32 { big_endian: true }.decode(&1.5f32.to_be_bytes()), 1.5);

@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_sort_as_numbers() {
+    fn natural_order_sorts_numbers_by_value() {
         let mut names = ["f10.png", "f9.png", "f1.png", "f01.png", "e100.png", "f.png"];
         names.sort_by(|a, b| natural_order(a, b));
         assert_eq!(names, ["e100.png", "f.png", "f1.png", "f01.png", "f9.png", "f10.png"]);
