@@ -156,8 +156,8 @@ fn rejects_unfit_weights_and_options_in_three_parts() {
     assert!(!folder.join("none").join("000000.png").exists(), "no partial output");
 }
 
-/// Without a word about methods or weights: the network that comes along where it knows the sensor and the light, else
-/// the best method that needs no training.
+/// Without a word about methods or weights: the network that comes along where it knows the sensor and the
+/// light, else the best method that needs no training.
 #[test]
 fn default_method_follows_the_capture() {
     let folder = scratch("network-usual");
@@ -223,10 +223,12 @@ fn processor_passes_selftest() {
 
 /// Where there is a graphics card, or a driver that imitates one: what such a driver does in seconds.
 #[test]
+#[expect(clippy::print_stderr, reason = "says that it is skipped")]
 fn graphics_card_matches_the_processor() {
     let folder = scratch("network-gpu");
     let devices = qudi(&folder).args(["info", "--devices"]).output().unwrap();
     if !String::from_utf8_lossy(&devices.stdout).contains("wgpu:0") {
+        eprintln!("skipped: needs a graphics card, or a driver that imitates one");
         return;
     }
     let only =

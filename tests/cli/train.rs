@@ -45,7 +45,8 @@ fn tiny_recipe_trains_without_files() {
     run(&folder, "simulate scene:text --size 64x64 --frames 11 --seed 3 -o b.npy -q");
     run(&folder, "restore b.npy --weights run/weights.safetensors --steps 1 --device cpu -o r -q");
     assert_eq!(listing(&folder.join("r")).len(), 12); // frames and manifest
-    // Untrained, the guide alone reaches 19.09 and 18.89 dB. So few steps help dead leaves; text they must not harm.
+    // Untrained, the guide alone reaches 19.09 and 18.89 dB. So few steps help dead leaves; text they must
+    // not harm.
     let quality = |clip: usize| lines.last().unwrap()["clips"][clip]["psnr_a"].as_f64().unwrap();
     assert!(quality(0) > 19.1 && quality(1) > 18.86, "{} and {} dB", quality(0), quality(1));
 }

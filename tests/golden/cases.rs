@@ -1,4 +1,5 @@
-//! Reads the golden files that tests/golden/generate/network_goldens.py writes; its docstring gives the format.
+//! Reads the golden files that tests/golden/generate/network_goldens.py writes; its docstring gives the
+//! format.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::struct_field_names)]
 
 use burn::tensor::{Device, Tensor, TensorData};

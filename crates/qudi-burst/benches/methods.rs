@@ -15,13 +15,13 @@ fn methods(c: &mut Criterion) {
     let scene =
         Procedural { kind: ProceduralScene::DeadLeaves, size: SIZE, seed: 1, speed: 2.0 }.scene();
     let sensor = Sensor::load("qudi-paper").expect("a preset");
-    let light = Light { ppp: 9.75, exposure: 0.45 };
+    let light = Light { ppp: 9.75, mean_level: 0.45 };
     let mut camera = Camera::new(&sensor, SIZE, light, 1).expect("a camera");
     let counts: Vec<Vec<u16>> = (0..11)
         .map(|t| camera.expose(t, &[&scene.render(t as f64)]).expect("an exposure"))
         .collect();
     let acquisition =
-        Acquisition::new(sensor, light.ppp, light.exposure).expect("a gain").with_seed(1);
+        Acquisition::new(sensor, light.ppp, light.mean_level).expect("a gain").with_seed(1);
     let burst = BurstView { size: SIZE, frames: &counts };
     let image = scene.render(0.0);
 

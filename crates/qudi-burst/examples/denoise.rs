@@ -6,7 +6,7 @@
 #![allow(clippy::print_stdout)]
 
 use qudi_burst::bm3d;
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_core::npy::{read_image, write_header};
 use std::path::Path;
 use std::time::Instant;
@@ -14,11 +14,7 @@ use std::time::Instant;
 fn main() -> qudi_core::Result<()> {
     let args: Vec<String> = std::env::args().collect();
     let [_, noisy, sigma, out] = args.as_slice() else {
-        return Err(SimError::request(
-            "three arguments",
-            "command line",
-            "NOISY.npy SIGMA OUT.npy",
-        ));
+        return Err(Error::request("three arguments", "command line", "NOISY.npy SIGMA OUT.npy"));
     };
     let image = read_image(Path::new(noisy))?;
     let sigma = sigma.parse().unwrap_or(0.0);
@@ -31,7 +27,7 @@ fn main() -> qudi_core::Result<()> {
     }
     println!("{fastest:.4}");
     let mut bytes = Vec::new();
-    let write = |e| SimError::io("write", Path::new(out), e);
+    let write = |e| Error::io("write", Path::new(out), e);
     write_header(&mut bytes, "<f4", &[image.size.height, image.size.width]).map_err(write)?;
     bytes.extend(denoised.data.iter().flat_map(|v| v.to_le_bytes()));
     std::fs::write(out, bytes).map_err(write)

@@ -11,7 +11,7 @@ use qudi_burst::{PostFilter, Qbp, QbpSettings, Transform, TransformDenoise};
 use qudi_core::metrics::gain_aligned_psnr;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Frame, Light, Result, SimError, Size};
+use qudi_core::{Camera, Error, Frame, Light, Result, Size};
 use qudi_sim::clip::{Input, Sampling};
 use std::path::Path;
 
@@ -25,12 +25,12 @@ struct Exposed {
 fn main() -> Result<()> {
     let args: Vec<String> = std::env::args().collect();
     let [_, folder, frames, side] = args.as_slice() else {
-        return Err(SimError::request("three arguments", "command line", "FOLDER FRAMES SIDE"));
+        return Err(Error::request("three arguments", "command line", "FOLDER FRAMES SIDE"));
     };
     let (frames, side) = (frames.parse().unwrap_or(11), side.parse().unwrap_or(256));
     let mut clips = Vec::new();
     let path = Path::new(folder);
-    let io = |e| SimError::io("list the folder", path, e);
+    let io = |e| Error::io("list the folder", path, e);
     let mut places = Vec::new();
     for entry in std::fs::read_dir(path).map_err(io)? {
         places.push(entry.map_err(io)?.path());
@@ -123,8 +123,8 @@ fn read(place: &str, frames: u64, side: usize) -> Result<Vec<Frame>> {
     let sampling = Sampling { frames: Some(frames), ..Sampling::default() };
     let mut source = input.open(&sampling)?;
     let mut clip = Vec::new();
-    while let Some(exposure) = source.next()? {
-        let whole = exposure.truth();
+    while let Some(mean_level) = source.next()? {
+        let whole = mean_level.truth();
         let size = Size { height: side.min(whole.size.height), width: side.min(whole.size.width) };
         let (top, left) =
             ((whole.size.height - size.height) / 2, (whole.size.width - size.width) / 2);
@@ -136,14 +136,11 @@ fn read(place: &str, frames: u64, side: usize) -> Result<Vec<Frame>> {
 fn expose(truth: &[Frame], ppp: f64, seed: u64) -> Result<Exposed> {
     let sensor = Sensor::load("qudi-paper")?;
     let mean = truth.iter().map(Frame::mean).sum::<f64>() / truth.len() as f64;
-    let mut camera = Camera::new(&sensor, truth[0].size, Light { ppp, exposure: mean }, seed)?;
+    let mut camera = Camera::new(&sensor, truth[0].size, Light { ppp, mean_level: mean }, seed)?;
     let mut counts = Vec::new();
     for (i, frame) in truth.iter().enumerate() {
         counts.push(camera.expose(i as u64, &[frame])?);
     }
-    let gain = camera.gain();
-    let exposure = 0.45;
-    let acquisition =
-        Acquisition { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None };
+    let acquisition = Acquisition::new(sensor, ppp, 0.45)?;
     Ok(Exposed { truth: truth.to_vec(), counts, acquisition })
 }

@@ -15,7 +15,7 @@ use qudi_burst::{PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_core::{Frame, SimError, Size};
+use qudi_core::{Error, Frame, Size};
 use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
 use qudi_io::writer::ArrayWriter;
 use rand::rngs::ChaCha8Rng;
@@ -29,12 +29,12 @@ const EXPOSURE: f64 = 0.45;
 fn main() -> qudi_core::Result<()> {
     let args: Vec<String> = std::env::args().collect();
     let [_, folder, levels, seed, rest @ ..] = args.as_slice() else {
-        return Err(SimError::request("three arguments", "command line", "FOLDER LEVELS SEED"));
+        return Err(Error::request("three arguments", "command line", "FOLDER LEVELS SEED"));
     };
     let other = match rest {
         [] => None,
         [word, path] if ["write", "score"].contains(&word.as_str()) => Some((word.as_str(), path)),
-        _ => return Err(SimError::request(rest.join(" "), "command line", "write or score PATH")),
+        _ => return Err(Error::request(rest.join(" "), "command line", "write or score PATH")),
     };
     let number = |text: &str| text.parse::<u64>().unwrap_or(0);
     let levels = number(levels) as u16;
@@ -83,15 +83,7 @@ fn main() -> qudi_core::Result<()> {
     document["quantum_efficiency"] = 1.0.into();
     document["frames_summed"] = SUM.into();
     let sensor = Sensor::from_document(document, "swissspad2")?;
-    let acquisition = Acquisition {
-        seed: 0,
-        first_frame: 0,
-        ppp: mean * f64::from(SUM),
-        exposure: EXPOSURE,
-        sensor,
-        gain: 1.0,
-        dark: None,
-    };
+    let acquisition = Acquisition::new(sensor, mean * f64::from(SUM), EXPOSURE)?;
     println!(
         "{size}, {:.4} detections per frame of {SUM}, reference of {rest} frames",
         acquisition.ppp
@@ -144,17 +136,17 @@ fn write(path: &str, burst: BurstView<'_>, sensor: &Sensor) -> qudi_core::Result
     }
     array.finish()?;
     let text = toml::to_string(sensor)
-        .map_err(|e| SimError::request(e.to_string(), "the sensor", "report this"))?;
+        .map_err(|e| Error::request(e.to_string(), "the sensor", "report this"))?;
     PendingFile::write_whole(Path::new(&format!("{path}.toml")), text.as_bytes(), Overwrite::Yes)
 }
 
 /// The middle one of 11 frames of float32 in a .npy file of ours.
 fn middle(path: &str, size: Size) -> qudi_core::Result<Frame> {
-    let bytes = std::fs::read(path).map_err(|e| SimError::io("read", Path::new(path), e))?;
+    let bytes = std::fs::read(path).map_err(|e| Error::io("read", Path::new(path), e))?;
     let frame = 4 * size.pixels();
     let Some(values) = bytes.len().checked_sub(FRAMES * frame).map(|header| &bytes[header..])
     else {
-        return Err(SimError::request("too few frames", path, "restore all of the burst"));
+        return Err(Error::request("too few frames", path, "restore all of the burst"));
     };
     let words = values[FRAMES / 2 * frame..][..frame].chunks_exact(4);
     let data = words.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();

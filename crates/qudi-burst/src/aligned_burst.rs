@@ -1,5 +1,5 @@
-//! All frames of a window aligned with each of them, before anybody decides which to trust. A robust merge decides by a
-//! formula; a network that sees them all can learn to.
+//! All frames of a window aligned with each of them, before anybody decides which to trust. A robust merge
+//! decides by a formula; a network that sees them all can learn to.
 
 use crate::denoise::stabilized::{image, units};
 use crate::denoise::vst::VarianceStabilizer;
@@ -20,7 +20,8 @@ use std::sync::OnceLock;
 /// Variance of the errors of the reference estimate, in units of the counts' variance, about.
 const REFERENCE_ERROR: f32 = 0.1;
 
-/// Least variance of a count: what certainly counts nothing, or full scale, still differs from it by something.
+/// Least variance of a count: what certainly counts nothing, or full scale, still differs from it by
+/// something.
 const LEAST_VARIANCE: f64 = 1e-4;
 
 /// A window aligned on its reference estimate.
@@ -54,7 +55,8 @@ struct FrameMotion {
 pub enum Alignments {
     /// The selected motion of its patches.
     Selected,
-    /// The selected motion, and the motion as matched frame by frame: freer, and fitting the noise of what it was matched on.
+    /// The selected motion, and the motion as matched frame by frame: freer, and fitting the noise of what it
+    /// was matched on.
     WithMatched,
     /// Both, and pixel by pixel whichever of the motions around fits best: freer still.
     WithPerPixel,
@@ -71,8 +73,8 @@ impl Alignments {
     }
 }
 
-/// What is known of a frame from all frames of its window. A standardized count is the count less what the reference
-/// estimate expects of the frame, in units of the sigma of its noise.
+/// What is known of a frame from all frames of its window. A standardized count is the count less what the
+/// reference estimate expects of the frame, in units of the sigma of its noise.
 #[derive(Clone, Debug)]
 pub struct AlignedFrame {
     /// The reference estimate, in image units.
@@ -81,8 +83,8 @@ pub struct AlignedFrame {
     pub merged: Frame,
     /// Sigma of the merged frame's noise at each pixel, in image units.
     pub noise_sigma: Frame,
-    /// Standardized counts of the frame itself, then of its aligned neighbours, nearest first, for each of the
-    /// [`Alignments`]. Zero past the ends of the window and of the image.
+    /// Standardized counts of the frame itself, then of its aligned neighbours, nearest first, for each of
+    /// the [`Alignments`]. Zero past the ends of the window and of the image.
     pub counts: Vec<Frame>,
     /// What the reference estimate expects of the aligned neighbours, standardized likewise.
     pub expected: Vec<Frame>,
@@ -183,8 +185,9 @@ impl<'a> AlignedBurst<'a> {
         }
     }
 
-    /// Merges restored frames of this window, in image units, each with its neighbours along their motion. Each was denoised
-    /// on its own and errs in its own way. `error_variances` are those of the errors that the frames do not share, about.
+    /// Merges restored frames of this window, in image units, each with its neighbours along their motion.
+    /// Each was denoised on its own and errs in its own way. `error_variances` are those of the errors that
+    /// the frames do not share, about.
     pub fn temporal_filter(&self, frames: &[Frame], error_variances: &[Frame]) -> Vec<Frame> {
         let motions: Vec<&PatchMotion> =
             (0..frames.len()).map(|frame| &self.motion(frame).selected).collect();
@@ -216,8 +219,8 @@ impl<'a> AlignedBurst<'a> {
         variance.max(LEAST_VARIANCE).sqrt() as f32
     }
 
-    /// Sigma in image units of merged counts whose mean is `means`: half of what separates the images one sigma above and
-    /// below, through the inverse of the transform; black is no bound.
+    /// Sigma in image units of merged counts whose mean is `means`: half of what separates the images one
+    /// sigma above and below, through the inverse of the transform; black is no bound.
     fn noise_sigma(&self, means: &Frame, noise: &Frame) -> Frame {
         let n = self.burst.frames.len() as f64;
         let units = units(self.acquisition);

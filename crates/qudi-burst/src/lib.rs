@@ -1,9 +1,9 @@
-//! Classical restoration of single-photon bursts: the methods of the field, written from their papers, and the reference
-//! estimate that a network goes on from.
+//! Classical restoration of single-photon bursts: the methods of the field, written from their papers, and
+//! the reference estimate that a network goes on from.
 //!
-//! All methods are [`Restorer`](qudi_core::restorer::Restorer)s: a window of counts `[frames][height][width]` in, all its
-//! frames out, in image units. Constants were chosen on training clips, those of the [`ReferenceEstimate`] on validation
-//! clips.
+//! All methods are [`Restorer`](qudi_core::restorer::Restorer)s: a window of counts `[frames][height][width]`
+//! in, all its frames out, in image units. Constants were chosen on training clips, those of the
+//! [`ReferenceEstimate`] on validation clips.
 #![warn(missing_docs)]
 
 mod aligned_burst;

@@ -4,8 +4,8 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, CountMoments};
 use qudi_core::windows::LONGEST_HALF;
 
-/// Calls `f` for every frame with the sum of the frames within `radius` of it and how many those are; the window's ends
-/// have fewer.
+/// Calls `f` for every frame with the sum of the frames within `radius` of it and how many those are; the
+/// window's ends have fewer.
 pub fn moving_sums(burst: BurstView<'_>, radius: usize, mut f: impl FnMut(&[u32], u32)) {
     let n = burst.frames.len();
     let mut sums = vec![0u32; burst.size.pixels()];
@@ -28,8 +28,8 @@ pub fn moving_sums(burst: BurstView<'_>, radius: usize, mut f: impl FnMut(&[u32]
     }
 }
 
-/// Chooses the radius of moving means by Stein's unbiased risk estimate (SURE) on windows of the clip, if what follows
-/// leaves `noise_left` of the variance of a mean (1 if nothing follows).
+/// Chooses the radius of moving means by Stein's unbiased risk estimate (SURE) on windows of the clip, if
+/// what follows leaves `noise_left` of the variance of a mean (1 if nothing follows).
 ///
 /// With `y` a frame's counts and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y`
 /// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise; the
@@ -91,13 +91,13 @@ mod tests {
     fn chooses_long_windows_for_static_scenes() {
         let size = Size { height: 48, width: 64 };
         let scene = Frame::from_fn(size, |x, y| 0.2 + 0.01 * ((x + 2 * y) % 50) as f32);
-        let light = Light { ppp: 1.0, exposure: 0.45 };
+        let light = Light { ppp: 1.0, mean_level: 0.45 };
         for name in ["qudi-paper", "spad512s"] {
             let sensor = Sensor::load(name).unwrap();
             let mut camera = qudi_core::Camera::new(&sensor, size, light, 1).unwrap();
             let frames: Vec<Vec<u16>> =
                 (0..11).map(|t| camera.expose(t, &[&scene]).unwrap()).collect();
-            let acquisition = Acquisition::new(sensor, light.ppp, light.exposure).unwrap();
+            let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level).unwrap();
             for noise_left in [1.0, 0.1] {
                 let radius = sure_window_radius(
                     &[BurstView { size, frames: &frames }],

@@ -22,7 +22,8 @@ pub(crate) fn padded_size(size: Size) -> Size {
     Size { height: size.height.max(SIDE), width: size.width.max(SIDE) }
 }
 
-/// Finds the samples of a patch that starts at `start` which lie in an image of `length` pixels, along one axis.
+/// Finds the samples of a patch that starts at `start` which lie in an image of `length` pixels, along one
+/// axis.
 pub(crate) fn inside(start: f32, length: usize) -> Range<usize> {
     let first = (-0.5 - start).ceil().clamp(0.0, SIDE as f32);
     let end = ((length as f32 - 0.5 - start).floor() + 1.0).clamp(first, SIDE as f32);

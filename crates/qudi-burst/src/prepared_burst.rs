@@ -47,8 +47,8 @@ impl PreparedBurst {
         Frame::from_fn(self.size, |x, y| frame.row(y)[x])
     }
 
-    /// Variance of the difference of two matched pixels of images whose errors are `error_variance` times the variance
-    /// of the counts of frame `reference`; above zero also for images without noise.
+    /// Variance of the difference of two matched pixels of images whose errors are `error_variance` times the
+    /// variance of the counts of frame `reference`; above zero also for images without noise.
     pub(crate) fn matching_variance(&self, reference: usize, error_variance: f32) -> f32 {
         let single = self.moments.variance_at_mean(self.frames[reference].mean()) as f32;
         (2.0 * (error_variance * single)).max(1e-6)
@@ -62,7 +62,8 @@ impl PreparedBurst {
     }
 }
 
-/// Lists up to `count` of `frames` frames, the nearest to `reference` first: itself, and of two as near the later one.
+/// Lists up to `count` of `frames` frames, the nearest to `reference` first: itself, and of two as near the
+/// later one.
 pub(crate) fn nearest(frames: usize, reference: usize, count: usize) -> Vec<usize> {
     let mut list: Vec<usize> = (0..frames).collect();
     list.sort_by_key(|&frame| (frame.abs_diff(reference), frame < reference));

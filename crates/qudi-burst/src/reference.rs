@@ -1,6 +1,7 @@
-//! The reference estimate of a window, in two passes of aligning and merging. The first is quanta burst photography with
-//! BM3D. What it restores shows the second where things are and which frames fit, far better than noisy frames can. Basic
-//! estimates for a second pass are BM3D's idea (Dabov et al. 2007, section III-B), here applied to the whole method.
+//! The reference estimate of a window, in two passes of aligning and merging. The first is quanta burst
+//! photography with BM3D. What it restores shows the second where things are and which frames fit, far better
+//! than noisy frames can. Basic estimates for a second pass are BM3D's idea (Dabov et al. 2007, section
+//! III-B), here applied to the whole method.
 
 use crate::denoise::bm3d::SearchSettings;
 use crate::denoise::stabilized::{denoise, image};
@@ -49,7 +50,7 @@ impl ReferenceEstimate {
     /// Restores the window in two passes.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown.
+    /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.
     pub fn compute(view: BurstView<'_>, acquisition: &Acquisition) -> Result<Self> {
         let Acquisition { sensor, gain, .. } = acquisition;
         let ordinary_dark = sensor.dark_per_frame()?;

@@ -1,6 +1,6 @@
-//! Temporal filter of restored frames: each was denoised on its own and errs in its own way, and a merge with its
-//! neighbours flickers less. The frames take the place of the counts in the robust merge (Hasinoff et al. 2016,
-//! section 5), their errors that of the noise.
+//! Temporal filter of restored frames: each was denoised on its own and errs in its own way, and a merge with
+//! its neighbours flickers less. The frames take the place of the counts in the robust merge (Hasinoff et al.
+//! 2016, section 5), their errors that of the noise.
 
 use crate::merge::cubic::cubic_within;
 use crate::merge::wiener::{AlignedPatch, merge};
@@ -13,16 +13,16 @@ use rayon::prelude::*;
 /// Frames that each is merged with. Those farther away have moved too far to fit.
 const NEAREST: usize = 6;
 
-/// Constant of the Wiener filter: the squared difference, in units of that which errors make, at which a frame gets half
-/// its weight.
+/// Constant of the Wiener filter: the squared difference, in units of that which errors make, at which a
+/// frame gets half its weight.
 const WIENER_C: f32 = 2.0;
 
 /// Least variance of errors: what has none must not divide by zero.
 const LEAST: f32 = 1e-8;
 
-/// Merges each of the restored `frames` of a window with its neighbours along `motions`, those of the patches of each frame
-/// to all frames. `error_variances` are those of the errors that the frames do not share, about; one frame of the same size
-/// for each.
+/// Merges each of the restored `frames` of a window with its neighbours along `motions`, those of the patches
+/// of each frame to all frames. `error_variances` are those of the errors that the frames do not share,
+/// about; one frame of the same size for each.
 pub(crate) fn temporal_filter(
     frames: &[Frame],
     error_variances: &[Frame],

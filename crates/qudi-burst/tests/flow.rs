@@ -13,13 +13,11 @@ const SIZE: Size = Size { height: 192, width: 192 };
 
 fn exposed(scene: &Scene, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Acquisition) {
     let sensor = Sensor::load("qudi-paper").unwrap();
-    let light = Light { ppp, exposure: scene.render(0.0).mean() };
+    let light = Light { ppp, mean_level: scene.render(0.0).mean() };
     let mut camera = Camera::new(&sensor, scene.size, light, 3).unwrap();
     let expose = |t: usize| camera.expose(t as u64, &[&scene.render(t as f64)]).unwrap();
     let counts = (0..frames).map(expose).collect();
-    let gain = camera.gain();
-    let exposure = light.exposure;
-    (counts, Acquisition { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None })
+    (counts, Acquisition::new(sensor, ppp, light.mean_level).unwrap())
 }
 
 /// End-point errors of all patches that stay inside, from `reference` to `other`.

@@ -30,7 +30,7 @@ fn acquisition(sensor: Sensor, ppp: f64) -> Acquisition {
 /// A window of a scene in motion, and its truth.
 fn exposed(size: Size, sensor: &Sensor, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>) {
     let scene = Procedural { kind: ProceduralScene::Text, size, seed: 2, speed: 2.0 }.scene();
-    let mut camera = Camera::new(sensor, size, Light { ppp, exposure: 0.45 }, 5).unwrap();
+    let mut camera = Camera::new(sensor, size, Light { ppp, mean_level: 0.45 }, 5).unwrap();
     let truth: Vec<Frame> = (0..frames).map(|t| scene.render(t as f64)).collect();
     let counts =
         truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
@@ -101,18 +101,19 @@ fn second_pass_beats_the_first() {
     }
 }
 
-/// Counts of a scene at rest, less what the guide expects of them, are noise of deviation one, the frame's own as much as
-/// its neighbours'; what is expected of these hardly differs. Past the ends of the window there is nothing.
+/// Counts of a scene at rest, less what the guide expects of them, are noise of deviation one, the frame's
+/// own as much as its neighbours'; what is expected of these hardly differs. Past the ends of the window
+/// there is nothing.
 #[test]
 fn neighbours_are_standardized() {
     let size = Size { height: 48, width: 64 };
     let sensor = Sensor::load("qudi-paper").unwrap();
     let still =
         Frame::from_fn(size, |x, y| 0.25 + 0.4 * (x as f32 / 64.0) + 0.2 * (y as f32 / 48.0));
-    let light = Light { ppp: 3.25, exposure: still.mean() };
+    let light = Light { ppp: 3.25, mean_level: still.mean() };
     let mut camera = Camera::new(&sensor, size, light, 9).unwrap();
     let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
-    let acquisition = Acquisition { exposure: still.mean(), ..acquisition(sensor, 3.25) };
+    let acquisition = Acquisition { mean_level: still.mean(), ..acquisition(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
     let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
     let aligned = AlignedBurst::new(guide, &acquisition).frame(2, 8, Alignments::Selected);

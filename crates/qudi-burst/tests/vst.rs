@@ -72,7 +72,7 @@ fn inverses_are_unbiased_on_simulated_counts() {
         let dark = sensor.dark_per_frame().unwrap();
         for frames in [1u32, 5] {
             for image in [0.1, 0.45, 0.8] {
-                let light = Light { ppp, exposure: 0.45 };
+                let light = Light { ppp, mean_level: 0.45 };
                 let mut camera = Camera::new(&sensor, size, light, 11).unwrap();
                 let scene = Frame::filled(size, image);
                 let mut sums = vec![0.0; size.pixels()];

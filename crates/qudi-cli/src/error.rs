@@ -4,7 +4,7 @@ pub(crate) mod fields;
 
 use clap::error::{ContextKind, ErrorKind};
 use fields::{flags, flags_in_text};
-use qudi_core::SimError;
+use qudi_core::Error;
 use std::fmt::Display;
 use std::io;
 
@@ -50,11 +50,11 @@ impl CliError {
     }
 }
 
-impl From<SimError> for CliError {
-    fn from(e: SimError) -> Self {
+impl From<Error> for CliError {
+    fn from(e: Error) -> Self {
         match &e {
-            SimError::Interrupted => Self::Interrupted,
-            SimError::Io { source, .. } if source.kind() == io::ErrorKind::BrokenPipe => {
+            Error::Interrupted => Self::Interrupted,
+            Error::Io { source, .. } if source.kind() == io::ErrorKind::BrokenPipe => {
                 Self::BrokenPipe
             }
             _ => Self::Error {

@@ -2,7 +2,7 @@
 
 use crate::error::{CliError, Result};
 use burn::tensor::Device;
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_model::checkpoint::{Description, describe, describe_bytes, load, load_bytes};
 use qudi_model::network::Qudi;
 use sha2::{Digest, Sha256};
@@ -55,7 +55,7 @@ impl Weights {
             Self::BuiltIn => Ok(SHA256.trim().to_owned()),
             Self::File(path) => {
                 let bytes =
-                    std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
+                    std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;
                 Ok(sha256(&bytes))
             }
         }

@@ -32,7 +32,7 @@ fn camera(c: &mut Criterion) {
         }),
         ("12-bit qis16-gj", Sensor::load("qis16-gj").expect("a preset")),
     ] {
-        let light = Light { ppp: 3.25, exposure: 0.45 };
+        let light = Light { ppp: 3.25, mean_level: 0.45 };
         let mut camera = Camera::new(&sensor, SIZE, light, 1).expect("a camera");
         let scene = scene();
         let mut t = 0;

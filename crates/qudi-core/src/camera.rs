@@ -2,7 +2,7 @@
 //!
 //! Exposed frames depend on the seed, the frame's number and the scene alone, never on threads.
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::frame::{Frame, Size};
 use crate::light::Light;
 use crate::random::{Domain, Streams, uniform};
@@ -45,7 +45,7 @@ impl Camera {
     /// A camera with frames of `size` under `light`.
     ///
     /// # Errors
-    /// [`SimError`] for an impossible sensor, an unreadable dark map, or light beyond all bounds.
+    /// [`Error`] for an impossible sensor, an unreadable dark map, or light beyond all bounds.
     pub fn new(sensor: &Sensor, size: Size, light: Light, seed: u64) -> Result<Self> {
         Self::with_maps(sensor, PixelMaps::draw(sensor, size)?, size, light, seed)
     }
@@ -60,10 +60,10 @@ impl Camera {
     ) -> Result<Self> {
         sensor.validate()?;
         let gain = sensor.gain_at(light.ppp)?;
-        let electrons_per_value = sensor.quantum_efficiency * light.ppp / light.exposure;
+        let electrons_per_value = sensor.quantum_efficiency * light.ppp / light.mean_level;
         let dark = sensor.dark_per_frame()? / f64::from(sensor.frames_summed);
         if !electrons_per_value.is_finite() || electrons_per_value > MAX_DETECTIONS {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("{electrons_per_value:e} electrons in a white pixel"),
                 "ppp, exposure",
                 "lower the light or raise the exposure value",
@@ -71,7 +71,7 @@ impl Camera {
         }
         let law = CountLaw::new(sensor, gain);
         if law.dead_time() > 0.0 && electrons_per_value > MAX_ARRIVALS {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("{electrons_per_value:e} arrivals in a white pixel with a dead time"),
                 "ppp, defects.dead_time_ns",
                 format!(
@@ -119,7 +119,7 @@ impl Camera {
     /// during it). Returns `height * width` counts.
     ///
     /// # Errors
-    /// [`SimError::Request`] if an instant has another size or values that are no light.
+    /// [`Error::Request`] if an instant has another size or values that are no light.
     pub fn expose(&mut self, index: u64, instants: &[&Frame]) -> Result<Vec<u16>> {
         self.check(instants)?;
         let defects = &self.sensor.defects;
@@ -158,7 +158,7 @@ impl Camera {
 
     fn check(&self, instants: &[&Frame]) -> Result<()> {
         let fault = |what: String| {
-            Err(SimError::request(
+            Err(Error::request(
                 what,
                 "the scene",
                 "frames have one size and values between 0 and 1000000",

@@ -7,12 +7,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// Shorthand for results of this crate.
-pub type Result<T, E = SimError> = std::result::Result<T, E>;
+pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Every error of this crate. [`SimError::place`] says where, [`SimError::help`] what to do.
+/// Every error of this crate. [`Error::place`] says where, [`Error::help`] what to do.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum SimError {
+pub enum Error {
     /// The operating system refused.
     #[error("cannot {action}: {source}")]
     Io {
@@ -58,7 +58,7 @@ pub enum SimError {
     Interrupted,
 }
 
-impl SimError {
+impl Error {
     /// An operating-system error with the action in words.
     pub fn io(action: impl Into<String>, path: &Path, source: io::Error) -> Self {
         Self::Io { action: action.into(), path: path.to_owned(), source }

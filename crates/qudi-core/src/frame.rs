@@ -1,6 +1,6 @@
 //! One gray image, `[height][width]`, in the unit of the scene (0 is black, 1 is white).
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::limits::FRAME_PIXELS;
 
 /// Width and height of an image in pixels.
@@ -16,11 +16,11 @@ impl Size {
     /// A size whose pixel count is positive and below 2^29.
     ///
     /// # Errors
-    /// [`SimError::Request`] naming `place` otherwise.
+    /// [`Error::Request`] naming `place` otherwise.
     pub fn new(height: usize, width: usize, place: &str) -> Result<Self> {
         match height.checked_mul(width) {
             Some(1..=FRAME_PIXELS) => Ok(Self { height, width }),
-            _ => Err(SimError::request(
+            _ => Err(Error::request(
                 format!("a frame of {height} x {width} pixels is not possible"),
                 place,
                 format!("frames hold between 1 and {FRAME_PIXELS} pixels"),

@@ -1,7 +1,9 @@
-//! The photon and the image: frames, sensors, light, cameras, metrics, and what every method of restoration gets.
+//! The photon and the image: frames, sensors, light, cameras, metrics, and what every method of restoration
+//! gets.
 //!
-//! A [`Camera`], which is a [`sensor::Sensor`] under a certain [`Light`], turns [`Frame`]s in [0, 1] into photon
-//! counts. A [`restorer::Restorer`] turns counts into frames, and [`metrics`] compare them with the truth.
+//! A [`Camera`], which is a [`sensor::Sensor`] under a certain [`Light`], turns [`Frame`]s in [0, 1] into
+//! photon counts. A [`restorer::Restorer`] turns counts into frames, and [`metrics`] compare them with the
+//! truth.
 //!
 //! ```
 //! use qudi_core::{Camera, Frame, Light, Size, sensor::Sensor};
@@ -13,7 +15,7 @@
 //! let mut camera = Camera::new(&sensor, size, light, 7)?;
 //! let counts = camera.expose(0, &[&scene])?;
 //! assert!(counts.iter().all(|&count| count <= sensor.max_count()));
-//! # Ok::<(), qudi_core::SimError>(())
+//! # Ok::<(), qudi_core::Error>(())
 //! ```
 #![warn(missing_docs)]
 
@@ -33,12 +35,12 @@ mod transfer;
 pub mod windows;
 
 pub use camera::Camera;
-pub use error::{Result, SimError, nearest};
+pub use error::{Error, Result, nearest};
 pub use files::{atomic_file, natural_order, npy, regular_file};
 pub use frame::{Frame, Size};
-pub use light::mean_level::fitting_exposure;
+pub use light::mean_level::fitting_mean_level;
 pub use light::{
-    Checksum, ClipStatistics, Light, PppDefinition, Spectrum, USUAL_EXPOSURE, ppp_from_lux,
+    Checksum, ClipStatistics, Light, PppDefinition, Spectrum, USUAL_MEAN_LEVEL, ppp_from_lux,
     resolve_light, sensor_lux,
 };
 pub use transfer::{Transfer, linear_to_srgb, srgb_to_linear};

@@ -2,12 +2,12 @@
 
 pub(crate) mod mean_level;
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::sensor::{CountLaw, Gain, Response, Sensor};
 use serde::{Deserialize, Serialize};
 
 /// The mean value of usual scenes, assumed where the true one is unknown.
-pub const USUAL_EXPOSURE: f64 = 0.45;
+pub const USUAL_MEAN_LEVEL: f64 = 0.45;
 
 /// What a number of "photons per pixel" counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,13 +22,14 @@ pub enum PppDefinition {
     Dn,
 }
 
-/// The light of a clip: `theta = image * ppp / exposure` photons per pixel and output frame.
+/// The light of a clip: `theta = image * ppp / mean_level` photons per pixel and output frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Light {
     /// Mean incident photons per pixel and output frame.
     pub ppp: f64,
     /// The image value that receives `ppp` photons: the mean of the image over the whole clip.
-    pub exposure: f64,
+    #[serde(rename = "exposure")]
+    pub mean_level: f64,
 }
 
 /// CRC-32 of a clip's values, little-endian, in order.
@@ -100,26 +101,28 @@ impl ClipStatistics {
 /// `dark` is the array's mean dark electrons per output frame.
 ///
 /// # Errors
-/// [`SimError::Request`] if no light does, or if the clip is black and no exposure is given.
+/// [`Error::Request`] if no light does, or if the clip is black and no exposure is given.
 pub fn resolve_light(
     sensor: &Sensor,
     definition: PppDefinition,
     value: f64,
-    exposure: Option<f64>,
+    mean_level: Option<f64>,
     clip: &ClipStatistics,
     dark: f64,
 ) -> Result<Light> {
     if !(value.is_finite() && (0.0..=1e6).contains(&value)) {
-        return Err(SimError::request(
+        return Err(Error::request(
             format!("{value} photons per pixel"),
             "ppp",
             "give a number between 0 (darkness) and 1000000",
         ));
     }
-    let exposure = exposure.unwrap_or_else(|| clip.mean());
-    if !(exposure.is_finite() && exposure > 0.0 && exposure <= 1e6) {
-        return Err(SimError::request(
-            format!("an exposure of {exposure}: the clip has no light to distribute photons over"),
+    let mean_level = mean_level.unwrap_or_else(|| clip.mean());
+    if !(mean_level.is_finite() && mean_level > 0.0 && mean_level <= 1e6) {
+        return Err(Error::request(
+            format!(
+                "an exposure of {mean_level}: the clip has no light to distribute photons over"
+            ),
             "exposure",
             "give the image value that receives PPP photons, such as 0.45",
         ));
@@ -129,7 +132,7 @@ pub fn resolve_light(
         PppDefinition::Incident => value,
         PppDefinition::Detected if value >= dark => (value - dark) / qe,
         PppDefinition::Detected => {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("{value} detections per pixel, but dark counts alone are {dark:.4}"),
                 "ppp",
                 "raise `ppp`, or lower the sensor's `dark`",
@@ -138,7 +141,7 @@ pub fn resolve_light(
         PppDefinition::Dn => {
             let gain_follows_light = matches!(sensor.gain, Gain::Quiver | Gain::Auto);
             if sensor.response == Response::Linear && gain_follows_light {
-                return Err(SimError::request(
+                return Err(Error::request(
                     format!(
                         "the gain rule `{}` follows the light, so a mean output value does not fix it",
                         sensor.gain
@@ -148,17 +151,17 @@ pub fn resolve_light(
                 ));
             }
             let law = CountLaw::new(sensor, sensor.gain_at(1.0)?);
-            let mean_dn = |ppp: f64| clip.mean_of(|v| law.mean(qe * ppp * v / exposure + dark));
+            let mean_dn = |ppp: f64| clip.mean_of(|v| law.mean(qe * ppp * v / mean_level + dark));
             light_for_mean_value(mean_dn, value)?
         }
     };
-    Ok(Light { ppp, exposure })
+    Ok(Light { ppp, mean_level })
 }
 
 /// Inverts the rising function `mean_dn` by bisection.
 fn light_for_mean_value(mean_dn: impl Fn(f64) -> f64, value: f64) -> Result<f64> {
     let unreachable = |low: f64, high: f64| {
-        SimError::request(
+        Error::request(
             format!(
                 "a mean output value of {value} is out of reach: this sensor gives {low:.4} to {high:.4} here"
             ),

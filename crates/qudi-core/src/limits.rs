@@ -15,11 +15,12 @@ pub const VIDEO_FRAME_BYTES: usize = 1 << 30;
 /// The most instants of one exposure: finer steps than any motion needs.
 pub const EXPOSURE_INSTANTS: usize = 4096;
 
-/// The most bytes of a file that a person writes, as sensors, settings and recipes: they are a few pages long.
+/// The most bytes of a file that a person writes, as sensors, settings and recipes: they are a few pages
+/// long.
 pub const TEXT_BYTES: u64 = 1 << 20;
 
-/// The most bytes of a file that this program wrote beside data, as records, manifests and results of `bench`:
-/// one line a frame at most.
+/// The most bytes of a file that this program wrote beside data, as records, manifests and results of
+/// `bench`: one line a frame at most.
 pub const RECORD_BYTES: u64 = 1 << 24;
 
 /// The most bytes of a weight file: the paper's network has 0.2 GiB.

@@ -20,10 +20,10 @@ pub struct Acquisition {
     pub seed: u64,
     /// The number of the window's first frame in the capture.
     pub first_frame: u64,
-    /// Incident photons per pixel and frame, where the image is `exposure`.
+    /// Incident photons per pixel and frame, where the image is `mean_level`.
     pub ppp: f64,
     /// Image value that receives `ppp` photons.
-    pub exposure: f64,
+    pub mean_level: f64,
     /// The sensor of these frames, `frames_summed` included.
     pub sensor: Sensor,
     /// The gain in DN/e-.
@@ -52,19 +52,20 @@ pub trait Restorer {
     /// Restores every frame of `burst`.
     ///
     /// # Errors
-    /// [`SimError`](crate::SimError) if the method cannot work with this burst.
+    /// [`Error`](crate::Error) if the method cannot work with this burst.
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored>;
 }
 
 impl Acquisition {
-    /// The acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons per pixel
-    /// and frame, where the image has the mean level `exposure`; seed 0, from the first frame on, no dark map.
+    /// The acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons per
+    /// pixel and frame, where the image has the mean level `mean_level`; seed 0, from the first frame on, no
+    /// dark map.
     ///
     /// # Errors
-    /// [`SimError`](crate::SimError) if the sensor has no gain at this light.
-    pub fn new(sensor: Sensor, ppp: f64, exposure: f64) -> Result<Self> {
+    /// [`Error`](crate::Error) if the sensor has no gain at this light.
+    pub fn new(sensor: Sensor, ppp: f64, mean_level: f64) -> Result<Self> {
         let gain = sensor.gain_at(ppp)?;
-        Ok(Self { seed: 0, first_frame: 0, ppp, exposure, sensor, gain, dark: None })
+        Ok(Self { seed: 0, first_frame: 0, ppp, mean_level, sensor, gain, dark: None })
     }
 
     /// The same acquisition with another seed of random draws.
@@ -81,7 +82,7 @@ impl Acquisition {
 
     /// Incident photons per unit of image value.
     pub fn photons_per_unit(&self) -> f64 {
-        self.ppp / self.exposure
+        self.ppp / self.mean_level
     }
 
     /// Dark electrons per frame of pixel `i`; `typical` where no map is known.

@@ -25,7 +25,7 @@ pub use moments::CountMoments;
 pub use presets::{PRESETS, Preset, preset};
 pub use units::{DarkRate, FullWell, Gain};
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
 /// How a pixel answers to light.
@@ -111,7 +111,7 @@ impl Sensor {
     /// Dark electrons of an ordinary pixel per *output* frame (the median, where pixels differ).
     ///
     /// # Errors
-    /// [`SimError::Sensor`] if the rate is per second and the frame rate is unknown.
+    /// [`Error::Sensor`] if the rate is per second and the frame rate is unknown.
     pub fn dark_per_frame(&self) -> Result<f64> {
         Ok(self.per_native_frame(self.dark, "dark")? * f64::from(self.frames_summed))
     }
@@ -131,7 +131,7 @@ impl Sensor {
     /// Gain in DN/e- at `ppp` incident photons per pixel and output frame.
     ///
     /// # Errors
-    /// [`SimError::Sensor`] if the rule has no finite answer at this light.
+    /// [`Error::Sensor`] if the rule has no finite answer at this light.
     pub fn gain_at(&self, ppp: f64) -> Result<f64> {
         if self.response == Response::Binary {
             return Ok(1.0);
@@ -183,7 +183,7 @@ impl Sensor {
     /// Checks every parameter against what a sensor can be.
     ///
     /// # Errors
-    /// [`SimError::Sensor`] for the first impossible value.
+    /// [`Error::Sensor`] for the first impossible value.
     pub fn validate(&self) -> Result<()> {
         let positive = 0.0..=f64::MAX;
         self.within("quantum_efficiency", self.quantum_efficiency, 0.0..=1.0)?;
@@ -261,7 +261,7 @@ impl Sensor {
         Err(self.fault(format!("{key} is {value}"), &help))
     }
 
-    pub(crate) fn fault(&self, what: String, help: &str) -> SimError {
-        SimError::Sensor { what, place: format!("sensor `{}`", self.name), help: help.to_owned() }
+    pub(crate) fn fault(&self, what: String, help: &str) -> Error {
+        Error::Sensor { what, place: format!("sensor `{}`", self.name), help: help.to_owned() }
     }
 }

@@ -1,6 +1,6 @@
 //! A long capture as overlapping windows, and their results as one clip.
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::frame::Frame;
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -20,10 +20,10 @@ impl Windows {
     /// Windows of `length` frames, each sharing `overlap` with the one before.
     ///
     /// # Errors
-    /// [`SimError::Request`] if the overlap is no shorter than the window.
+    /// [`Error::Request`] if the overlap is no shorter than the window.
     pub fn new(frames: u64, length: u64, overlap: u64) -> Result<Self> {
         if length == 0 || overlap >= length {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("windows of {length} frames that share {overlap}"),
                 "window, overlap",
                 "windows are longer than their overlap",

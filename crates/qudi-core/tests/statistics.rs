@@ -11,7 +11,7 @@ const SIZE: Size = Size { height: 512, width: 512 };
 fn expose_flat(sensor: &Sensor, detections: f64, frames: u64) -> Vec<Vec<u16>> {
     let dark = sensor.dark_per_frame().unwrap();
     let ppp = (detections - dark) / sensor.quantum_efficiency;
-    let light = Light { ppp: ppp.max(0.0), exposure: 0.5 };
+    let light = Light { ppp: ppp.max(0.0), mean_level: 0.5 };
     let mut camera = Camera::new(sensor, SIZE, light, 20).unwrap();
     let scene = Frame::filled(SIZE, 0.5);
     (0..frames).map(|t| camera.expose(t, &[&scene]).unwrap()).collect()
@@ -146,7 +146,7 @@ fn motion_inside_an_exposure_adds_up_instant_by_instant() {
     let levels = [0.1f32, 0.2, 0.4, 0.8, 0.6, 0.5, 0.9];
     let scenes: Vec<Frame> = levels.iter().map(|&v| Frame::filled(SIZE, v)).collect();
     let instants: Vec<&Frame> = scenes.iter().collect();
-    let light = Light { ppp: 6.0, exposure: 0.5 };
+    let light = Light { ppp: 6.0, mean_level: 0.5 };
 
     let mut camera = Camera::new(&binary(7), SIZE, light, 1).unwrap();
     let counts = vec![camera.expose(0, &instants).unwrap()];
@@ -230,7 +230,7 @@ fn pixel_maps_have_the_asked_for_statistics() {
     sensor.defects.hot_fraction = 0.02;
     sensor.defects.hot_dark = DarkRate::PerSecond(5000.0);
     sensor.defects.dead_fraction = 0.01;
-    let camera = Camera::new(&sensor, SIZE, Light { ppp: 1.0, exposure: 0.5 }, 3).unwrap();
+    let camera = Camera::new(&sensor, SIZE, Light { ppp: 1.0, mean_level: 0.5 }, 3).unwrap();
     let maps = camera.maps();
     let n = 262_144.0;
     assert!((maps.hot.len() as f64 / n - 0.02).abs() < 6.0 * (0.02f64 / n).sqrt());
@@ -250,7 +250,7 @@ fn hot_and_dead_pixels_read_their_values() {
     sensor.defects.hot_fraction = 0.01;
     sensor.defects.hot_dark = DarkRate::PerFrame(0.7);
     sensor.defects.dead_fraction = 0.01;
-    let mut camera = Camera::new(&sensor, SIZE, Light { ppp: 0.0, exposure: 0.5 }, 3).unwrap();
+    let mut camera = Camera::new(&sensor, SIZE, Light { ppp: 0.0, mean_level: 0.5 }, 3).unwrap();
     let scene = Frame::filled(SIZE, 0.5);
     let frames: Vec<_> = (0..20).map(|t| camera.expose(t, &[&scene]).unwrap()).collect();
     let hot = camera.maps().hot.clone();
@@ -261,7 +261,7 @@ fn hot_and_dead_pixels_read_their_values() {
     // In the dark nothing else fires.
     assert_eq!(fired, frames.iter().flatten().filter(|&&c| c > 0).count());
 
-    let mut camera = Camera::new(&sensor, SIZE, Light { ppp: 50.0, exposure: 0.5 }, 3).unwrap();
+    let mut camera = Camera::new(&sensor, SIZE, Light { ppp: 50.0, mean_level: 0.5 }, 3).unwrap();
     let bright = camera.expose(0, &[&scene]).unwrap();
     assert!(camera.maps().dead.iter().all(|&i| bright[i] == 0));
     assert!(bright.iter().filter(|&&c| c == 0).count() == camera.maps().dead.len());

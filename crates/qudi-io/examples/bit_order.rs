@@ -13,10 +13,10 @@ fn main() -> qudi_core::Result<()> {
     for scene in ["scene:dead-leaves", "scene:text", "scene:chart", "scene:gratings"] {
         for detected in [0.02, 0.06, 0.5] {
             let input = Input::parse(scene, None, Some(size), 1, 0.02)?;
-            let Some(exposure) = input.open(&Sampling::default())?.next()? else { continue };
-            let light = Light { ppp: detected / sensor.quantum_efficiency, exposure: 0.4 };
+            let Some(mean_level) = input.open(&Sampling::default())?.next()? else { continue };
+            let light = Light { ppp: detected / sensor.quantum_efficiency, mean_level: 0.4 };
             let mut camera = Camera::new(&sensor, size, light, 1)?;
-            let instants: Vec<_> = exposure.instants.iter().collect();
+            let instants: Vec<_> = mean_level.instants.iter().collect();
             let mut sums = vec![0u32; size.pixels()];
             let mut line = format!("{scene:<20}{detected:>10}         ");
             for frame in 0..1024u64 {

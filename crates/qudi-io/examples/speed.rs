@@ -3,7 +3,7 @@
 #![allow(clippy::print_stdout)]
 
 use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Frame, Light, Result, SimError, Size};
+use qudi_core::{Camera, Error, Frame, Light, Result, Size};
 use std::time::Instant;
 
 const SIZE: Size = Size { height: 512, width: 512 };
@@ -16,8 +16,8 @@ fn main() -> Result<()> {
     let mut threads = 1;
     while threads <= cores {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-        let pool = pool.map_err(|e| SimError::request(e.to_string(), "threads", "use fewer"))?;
-        let mut camera = Camera::new(&sensor, SIZE, Light { ppp: 3.25, exposure: 0.45 }, 1)?;
+        let pool = pool.map_err(|e| Error::request(e.to_string(), "threads", "use fewer"))?;
+        let mut camera = Camera::new(&sensor, SIZE, Light { ppp: 3.25, mean_level: 0.45 }, 1)?;
         let mut times = Vec::new();
         for t in 0..FRAMES {
             let start = Instant::now();

@@ -33,7 +33,7 @@ use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::{Response, Sensor};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -72,11 +72,11 @@ impl std::fmt::Debug for Capture {
 /// What the user says of the depth, unless the file knows better.
 fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     if !(1..=16).contains(&bits) {
-        return Err(SimError::request(format!("{bits} bits"), "bits", "counts have 1 to 16 bits"));
+        return Err(Error::request(format!("{bits} bits"), "bits", "counts have 1 to 16 bits"));
     }
     let max = ((1u32 << bits) - 1) as u16;
     match info.max_count {
-        Some(known) if known != max => Err(SimError::request(
+        Some(known) if known != max => Err(Error::request(
             format!("{bits} bits, where the file has counts up to {known}"),
             "bits",
             "leave it out: the file knows its depth",
@@ -106,7 +106,7 @@ impl Capture {
     /// `options` name none.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read, is of no known format, or an option does not fit.
+    /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
         let (native, info) = codec::open(path, options)?;
         Self::assemble(path, native, info, options, sensor)
@@ -154,21 +154,21 @@ impl Capture {
         let range = start..options.end.unwrap_or(frames).min(there);
         if range.start >= range.end || options.end.is_some_and(|end| end > frames) {
             let range = start..options.end.unwrap_or(frames);
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("frames {} to {} of {frames}", range.start, range.end),
                 "start, end",
                 format!("frames count from 0; `end` is one past the last, at most {frames}"),
             ));
         }
         if sum == 0 || u64::from(sum) > range.end - range.start {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("{sum} frames summed into one, of {}", range.end - range.start),
                 "sum",
                 "sum between 1 and all frames",
             ));
         }
         if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("sums of {sum} frames do not fit into 16 bits"),
                 "sum",
                 "counts go up to 65535: sum fewer frames",
@@ -197,7 +197,7 @@ impl Capture {
     /// Output frames of `sensor` that are in memory already, `[frames][height * width]`.
     ///
     /// # Errors
-    /// [`SimError::Request`] if there are none, or one has another size.
+    /// [`Error::Request`] if there are none, or one has another size.
     pub fn in_memory(
         name: &str,
         size: Size,
@@ -206,7 +206,7 @@ impl Capture {
     ) -> Result<Self> {
         let place = Path::new(name);
         if frames.is_empty() || frames.iter().any(|frame| frame.len() != size.pixels()) {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("{} frames, not all of {size}", frames.len()),
                 place.display(),
                 "give at least one frame, all of one size",
@@ -253,7 +253,7 @@ impl Capture {
         self.native_frames() / u64::from(self.sum)
     }
 
-    /// Output frames in all; `None` as long as a pipe has not told.
+    /// Output frames in all; `None` as long as that of a pipe is unknown.
     pub fn length(&self) -> Option<u64> {
         let end = match (self.native.length(), self.end) {
             (Some(length), Some(end)) => length.min(end),
@@ -266,7 +266,7 @@ impl Capture {
     /// A file has all its frames from the start; a pipe blocks until they come.
     ///
     /// # Errors
-    /// [`SimError`] if a pipe fails, or ends inside a frame.
+    /// [`Error`] if a pipe fails, or ends inside a frame.
     pub fn wait_for(&mut self, frames: u64) -> Result<u64> {
         if !self.complete {
             let native = frames.saturating_mul(self.sum.into()).saturating_add(self.range.start);
@@ -321,25 +321,25 @@ impl Capture {
     /// count does here.
     ///
     /// # Errors
-    /// [`SimError::Request`] if the depth is unknown or is not that sensor's, or if frames of a
+    /// [`Error::Request`] if the depth is unknown or is not that sensor's, or if frames of a
     /// linear sensor are summed, which no sensor does.
     pub fn output_sensor(&self, sensor: &Sensor) -> Result<Sensor> {
         let place = self.path.display();
         let linear = sensor.response == Response::Linear;
         if linear && self.sum > 1 {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("sums of {} frames of `{}`, a linear sensor", self.sum, sensor.name),
                 "sum",
                 "only binary frames are summed: leave it out",
             ));
         }
         match self.max_count() {
-            _ if linear && self.info.binary => Err(SimError::request(
+            _ if linear && self.info.binary => Err(Error::request(
                 format!("binary frames, and `{}` is a linear sensor", sensor.name),
                 place,
                 "name the sensor that took them, as in `sensor swissspad2`",
             )),
-            Some(max) if linear && max != sensor.max_count() => Err(SimError::request(
+            Some(max) if linear && max != sensor.max_count() => Err(Error::request(
                 format!(
                     "counts up to {max}, and those of `{}` reach {}",
                     sensor.name,
@@ -349,7 +349,7 @@ impl Capture {
                 "name the sensor that took them, or the depth with `bits N`",
             )),
             Some(max) if !linear => Ok(Sensor { frames_summed: u32::from(max), ..sensor.clone() }),
-            None if !linear => Err(SimError::request(
+            None if !linear => Err(Error::request(
                 "how many binary frames a count sums is not known",
                 place,
                 "say the depth of counts with `bits 3` (for sums of 7), or `levels` for scaled means",
@@ -381,7 +381,7 @@ impl Capture {
     /// Reads output frame `frame`, bad pixels repaired.
     ///
     /// # Errors
-    /// [`SimError`] if the file cannot be read, or a sum does not fit into 16 bits.
+    /// [`Error`] if the file cannot be read, or a sum does not fit into 16 bits.
     pub fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
         self.check(frame..frame + 1)?;
         if self.sum == 1 {
@@ -392,7 +392,7 @@ impl Capture {
             self.stored_total(frame..frame + 1, &mut sums)?;
             for (count, sum) in counts.iter_mut().zip(sums) {
                 *count = u16::try_from(sum).map_err(|_| {
-                    SimError::request(
+                    Error::request(
                         format!("frame {frame} sums to {sum}, which does not fit into 16 bits"),
                         "sum",
                         "sum fewer frames",
@@ -409,7 +409,7 @@ impl Capture {
     /// otherwise.
     ///
     /// # Errors
-    /// [`SimError`] if the file cannot be read.
+    /// [`Error`] if the file cannot be read.
     pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
         let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.count() == 0;
         if !untouched || self.info.packing.is_none() {
@@ -423,7 +423,7 @@ impl Capture {
     /// Sums output frames, bad pixels repaired.
     ///
     /// # Errors
-    /// [`SimError`] if the file cannot be read.
+    /// [`Error`] if the file cannot be read.
     pub fn total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.stored_total(frames, sums)?;
         self.repair.sums(sums);
@@ -446,7 +446,7 @@ impl Capture {
         if frames.start <= frames.end && frames.end <= self.frames() {
             return Ok(());
         }
-        Err(SimError::request(
+        Err(Error::request(
             format!("frames {} to {} of {}", frames.start, frames.end, self.frames()),
             self.path.display(),
             "ask for frames of the capture",

@@ -1,6 +1,7 @@
 //! Every format that captures come in: one file and one line each.
 //!
-//! Writers lie in [`writer`](crate::writer): they share the atomic file and the record beside it, and write few formats.
+//! Writers lie in [`writer`](crate::writer): they share the atomic file and the record beside it, and write
+//! few formats.
 
 mod array;
 #[cfg(feature = "hdf5")]
@@ -26,7 +27,7 @@ use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::Path;
 
 /// Why a format is sure where a record of ours lies beside the file.
@@ -173,7 +174,7 @@ fn by_name(name: &str) -> Result<&'static Format> {
         let names: Vec<_> = FORMATS.iter().map(|format| format.name).collect();
         let hint = qudi_core::nearest::nearest(name, &names)
             .map_or(String::new(), |n| format!("did you mean `{n}`?  "));
-        SimError::request(
+        Error::request(
             format!("no format named `{name}`"),
             "format",
             format!("{hint}there are {}", names.join(", ")),
@@ -181,11 +182,11 @@ fn by_name(name: &str) -> Result<&'static Format> {
     })
 }
 
-fn unknown(probe: &Probe) -> SimError {
+fn unknown(probe: &Probe) -> Error {
     let hdf5 = probe.head.starts_with(b"\x89HDF\r\n\x1a\n")
         || probe.head.get(512..520).is_some_and(|magic| magic == b"\x89HDF\r\n\x1a\n");
     if hdf5 {
-        return SimError::data(
+        return Error::data(
             "an HDF5 file (or MATLAB 7.3), and this build reads none",
             &probe.path,
             "build with --features hdf5, or save it in Python: numpy.save('capture.npy', h5py.File(NAME)[DATASET])",
@@ -197,9 +198,9 @@ fn unknown(probe: &Probe) -> SimError {
         "no known format"
     };
     if let Some(inside) = inside(probe) {
-        return SimError::data(what, &probe.path, format!("name one capture, as {inside}"));
+        return Error::data(what, &probe.path, format!("name one capture, as {inside}"));
     }
-    SimError::data(
+    Error::data(
         what,
         &probe.path,
         "`qudi info --formats` lists what is read; a file without header is read with `format raw-bits`, raw-u8 or raw-u16 and `size HxW`",
@@ -215,7 +216,7 @@ fn inside(probe: &Probe) -> Option<String> {
     Some(path.display().to_string())
 }
 
-fn ambiguous(probe: &Probe, found: &[(&Format, Recognition)]) -> SimError {
+fn ambiguous(probe: &Probe, found: &[(&Format, Recognition)]) -> Error {
     let candidates: Vec<String> = found
         .iter()
         .map(|(format, fit)| {
@@ -224,7 +225,7 @@ fn ambiguous(probe: &Probe, found: &[(&Format, Recognition)]) -> SimError {
             format!("{}{why}", format.name)
         })
         .collect();
-    SimError::data(
+    Error::data(
         format!("the format is ambiguous: {}", candidates.join("; ")),
         &probe.path,
         format!("say which it is, as in `format {}`", found[0].0.name),
@@ -242,7 +243,7 @@ pub(crate) fn read_mat_map(path: &Path, name: &str) -> Result<qudi_core::Frame> 
         });
     match found {
         Some(array) => mat::file::read_map(array, path),
-        None => Err(SimError::data(
+        None => Err(Error::data(
             format!("no variable `{name}` in it"),
             path,
             "save the map as a matrix of height x width",

@@ -7,7 +7,7 @@ use qudi_core::Size;
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
 use qudi_core::sensor::Sensor;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::Simulation;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -133,14 +133,14 @@ impl Sidecar {
     /// Reads a record of either kind.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read or is no record.
+    /// [`Error`] if it cannot be read or is no record.
     pub fn load(path: &Path) -> Result<Self> {
         let document: serde_json::Value = parse(&read_file(path)?, path)?;
         if document.get("capture").is_none() {
             return Ok(Self::Simulated(Box::new(Record::load(path)?)));
         }
         let conversion: Conversion = serde_json::from_value(document).map_err(|e| {
-            SimError::data(
+            Error::data(
                 format!("not the record of a converted capture: {e}"),
                 path,
                 "convert the capture again",
@@ -155,7 +155,7 @@ impl Record {
     /// Reads a record.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read, is no record, or describes an impossible sensor.
+    /// [`Error`] if it cannot be read, is no record, or describes an impossible sensor.
     pub fn load(path: &Path) -> Result<Self> {
         let record: Self = parse(&read_file(path)?, path)?;
         check_version(record.version, path)?;
@@ -165,8 +165,8 @@ impl Record {
 }
 
 /// The error of a record that says one thing about the file at `path`, which holds another.
-pub(crate) fn contradiction(recorded: &str, found: &str, path: &Path) -> SimError {
-    SimError::data(
+pub(crate) fn contradiction(recorded: &str, found: &str, path: &Path) -> Error {
+    Error::data(
         format!("the record beside it describes {recorded}, and {found}"),
         path,
         format!("remove {} if it belongs to another burst", beside(path).display()),
@@ -179,7 +179,7 @@ fn read_file(path: &Path) -> Result<Vec<u8>> {
 
 fn parse<T: serde::de::DeserializeOwned>(bytes: &[u8], path: &Path) -> Result<T> {
     serde_json::from_slice(bytes).map_err(|e| {
-        SimError::data(
+        Error::data(
             format!("not the record of a burst: {e}"),
             path,
             "name the .json that `qudi simulate` wrote beside a burst",
@@ -191,7 +191,7 @@ fn check_version(version: u32, path: &Path) -> Result<()> {
     if version == VERSION {
         return Ok(());
     }
-    Err(SimError::data(
+    Err(Error::data(
         format!("a record of version {version}, this program reads {VERSION}"),
         path,
         "use the version of qudi that wrote it",

@@ -18,7 +18,7 @@ mod pipes;
 #[path = "captures/pixels.rs"]
 mod pixels;
 
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
 use std::path::{Path, PathBuf};
 
@@ -39,7 +39,7 @@ pub(crate) fn plain() -> ReadOptions {
     ReadOptions { mask: MaskChoice::None, ..ReadOptions::default() }
 }
 
-pub(crate) fn open(path: &Path, options: &ReadOptions) -> Result<Capture, SimError> {
+pub(crate) fn open(path: &Path, options: &ReadOptions) -> Result<Capture, Error> {
     Capture::open(path, options, None)
 }
 
@@ -56,7 +56,7 @@ pub(crate) fn counts(capture: &mut Capture) -> Vec<Vec<u16>> {
 }
 
 /// The message of an expected error: what, and its help.
-pub(crate) fn refusal(result: Result<Capture, SimError>) -> String {
+pub(crate) fn refusal(result: Result<Capture, Error>) -> String {
     let error = result.expect_err("to be refused");
     format!("{error}; {}", error.help().unwrap_or_default())
 }

@@ -14,8 +14,8 @@ use extension::AttentionBackend;
 /// `softmax(q k^T / sqrt(C)) v` for every image, over its cells.
 ///
 /// # Shapes
-/// `qkv`: `[images, 3 C, height, width]`, queries, keys and values joined by channel; result `[images, C, height,
-/// width]`.
+/// `qkv`: `[images, 3 C, height, width]`, queries, keys and values joined by channel; result `[images, C,
+/// height, width]`.
 pub fn attention(qkv: Tensor<4>) -> Tensor<4> {
     let [images, channels, height, width] = qkv.dims();
     assert_eq!(channels % 3, 0, "queries, keys and values of the same size");

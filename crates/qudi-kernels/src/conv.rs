@@ -90,9 +90,9 @@ pub fn conv_2d(
 /// Convolves `inputs`, joined by channel, over the frames of every burst.
 ///
 /// # Shapes
-/// `inputs`: `[bursts * frames, channels, height, width]` each; `weight`: `[outputs, channels,
-/// frames, rows, columns]`, odd kernel; `bias`: `[outputs]`. Result: `[bursts * frames, outputs, ceil(height /
-/// stride), ceil(width / stride)]`: padding is half the kernel, zeros past the ends of the burst.
+/// `inputs`: `[bursts * frames, channels, height, width]` each; `weight`: `[outputs, channels, frames, rows,
+/// columns]`, odd kernel; `bias`: `[outputs]`. Result: `[bursts * frames, outputs, ceil(height / stride),
+/// ceil(width / stride)]`: padding is half the kernel, zeros past the ends of the burst.
 pub fn conv_3d(
     inputs: &[Tensor<4>],
     weight: Tensor<5>,

@@ -3,13 +3,13 @@
 /// 1.5 * 2^23.
 const ROUNDING: f32 = 12_582_912.0;
 
-/// `exp(x)` to 2e-7 for x from -87 to 88, cut there: a polynomial of degree six after reduction to half a power of
-/// two (Cephes, expf).
+/// `exp(x)` to 2e-7 for x from -87 to 88, cut there: a polynomial of degree six after reduction to half a
+/// power of two (Cephes, expf).
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
-    // Adding this number rounds to a whole one and leaves it in the lowest bits; a cast would check for numbers
-    // that do not fit and has no vector form.
+    // Adding this number rounds to a whole one and leaves it in the lowest bits; a cast would check for
+    // numbers that do not fit and has no vector form.
     let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUNDING);
     let n = shifted - ROUNDING;
     let r = n.mul_add(-0.693_359_4, x);

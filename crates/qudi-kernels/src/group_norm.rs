@@ -36,8 +36,8 @@ pub enum Activation {
 /// `(x - mean) / sqrt(variance + EPSILON) * weight + bias` by group of channels, then the activation.
 ///
 /// # Shapes
-/// `x` and result: `[images, channels, height, width]`; `weight`, `bias`: `[rows, channels]`, row `image * rows /
-/// images` for every image: one row for all, or one per burst or image.
+/// `x` and result: `[images, channels, height, width]`; `weight`, `bias`: `[rows, channels]`, row `image *
+/// rows / images` for every image: one row for all, or one per burst or image.
 pub fn group_norm(x: Tensor<4>, weight: Tensor<2>, bias: Tensor<2>, norm: Norm) -> Tensor<4> {
     let [images, channels, height, width] = x.dims();
     let rows = weight.dims()[0];

@@ -1,9 +1,9 @@
-//! Numbers that convolutions multiply (Micikevicius et al. 2018, section 3): of 16 bits, graphics cards multiply
-//! several times as many, and what is kept for the gradient is half as large. Weights, sums and all between convolutions
-//! have 32 bits.
+//! Numbers that convolutions multiply (Micikevicius et al. 2018, section 3): of 16 bits, graphics cards
+//! multiply several times as many, and what is kept for the gradient is half as large. Weights, sums and all
+//! between convolutions have 32 bits.
 //!
-//! Of the two kinds of 16 bits only that with the range of 32 will do: nothing holds the U-Net's residual sums below what the
-//! other one can hold (docs/notes/training/sixteen-bits.md).
+//! Of the two kinds of 16 bits only that with the range of 32 will do: nothing holds the U-Net's residual
+//! sums below what the other one can hold (docs/notes/training/sixteen-bits.md).
 
 use crate::backend::{Switch, is_native};
 use burn::tensor::{DType, Device, FloatDType, Tensor};
@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use std::cell::Cell;
 use std::fmt;
 
-/// See the module.
+/// The numbers that convolutions multiply.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ComputePrecision {
@@ -33,8 +33,8 @@ pub fn with_precision<T>(precision: ComputePrecision, run: impl FnOnce() -> T) -
 }
 
 impl ComputePrecision {
-    /// Whether a device computes with such numbers. The flex backend does not, but rounds to them: results are those of a
-    /// card that does, at no better speed.
+    /// Whether a device computes with such numbers. The flex backend does not, but rounds to them: results
+    /// are those of a card that does, at no better speed.
     pub fn is_supported(self, device: &Device) -> bool {
         device.supports_dtype(self.dtype())
     }

@@ -59,8 +59,8 @@ fn run(
     ]
 }
 
-/// Products are of rounded numbers, summed in 32 bits and rounded once; bias and addend keep all their bits. On the way back
-/// the same holds of gradients.
+/// Products are of rounded numbers, summed in 32 bits and rounded once; bias and addend keep all their bits.
+/// On the way back the same holds of gradients.
 #[test]
 fn bf16_rounds_products_only() {
     let device = Device::flex().autodiff();
@@ -100,7 +100,8 @@ fn bf16_rounds_products_only() {
     }
 }
 
-/// What is rounded here is what a backend with such numbers computes, but for the order of sums; flex sums weights' gradients in 16 bits.
+/// What is rounded here is what a backend with such numbers computes, but for the order of sums; flex sums
+/// weights' gradients in 16 bits.
 #[test]
 fn bf16_rounding_matches_the_definition() {
     let device = Device::flex().autodiff();

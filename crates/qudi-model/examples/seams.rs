@@ -21,11 +21,11 @@ fn burst(size: Size, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>, Acquisition) 
     let scene = Procedural { kind, size, seed, speed: 1.5 }.scene();
     let truth: Vec<Frame> = (0..frames).map(|t| scene.render(t as f64)).collect();
     let sensor = Sensor::load("qudi-paper").unwrap();
-    let exposure = truth.iter().map(Frame::mean).sum::<f64>() / frames as f64;
-    let light = Light { ppp: 9.75, exposure };
+    let mean_level = truth.iter().map(Frame::mean).sum::<f64>() / frames as f64;
+    let light = Light { ppp: 9.75, mean_level };
     let mut camera = Camera::new(&sensor, size, light, seed).unwrap();
     let counts = (0..).zip(&truth).map(|(t, f)| camera.expose(t, &[f]).unwrap()).collect();
-    (counts, truth, Acquisition::new(sensor, light.ppp, exposure).unwrap().with_seed(1))
+    (counts, truth, Acquisition::new(sensor, light.ppp, mean_level).unwrap().with_seed(1))
 }
 
 fn main() {

@@ -9,7 +9,7 @@ use burn::tensor::{Device, Tensor, f16};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::limits::WEIGHT_BYTES;
 use qudi_core::regular_file::read_limited;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::path::Path;
@@ -32,7 +32,7 @@ pub enum Precision {
 /// Writes the network's weights, whole or not at all.
 ///
 /// # Errors
-/// [`SimError`] if the file cannot be written or the device cannot be read.
+/// [`Error`] if the file cannot be written or the device cannot be read.
 pub fn save(
     network: &Qudi,
     description: &Description,
@@ -47,7 +47,7 @@ pub fn save(
         return Err(error);
     }
     if let Some(name) = values.broken {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("`{name}` holds values beyond {:e}", precision.largest()),
             path,
             "the training that wrote it had failed: use an earlier checkpoint",
@@ -63,7 +63,7 @@ pub fn save(
         (name, view.expect("as many bytes as the shape says"))
     });
     let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| {
-        SimError::data(format!("cannot lay out the weights: {e}"), path, "report this")
+        Error::data(format!("cannot lay out the weights: {e}"), path, "report this")
     })?;
     PendingFile::write_whole(path, &bytes, overwrite)
 }
@@ -71,7 +71,7 @@ pub fn save(
 /// Reads the description of a weight file alone.
 ///
 /// # Errors
-/// [`SimError::Data`] if it is not a weight file of this program.
+/// [`Error::Data`] if it is not a weight file of this program.
 pub fn describe(path: &Path) -> Result<Description> {
     Ok(File::open(path)?.description)
 }
@@ -79,7 +79,7 @@ pub fn describe(path: &Path) -> Result<Description> {
 /// The description of a weight file that is in memory; `place` names it in errors.
 ///
 /// # Errors
-/// [`SimError::Data`] if it is not a weight file of this program.
+/// [`Error::Data`] if it is not a weight file of this program.
 pub fn describe_bytes(bytes: &[u8], place: &Path) -> Result<Description> {
     description(bytes, place)
 }
@@ -95,7 +95,7 @@ pub fn load_bytes(bytes: &[u8], place: &Path, device: &Device) -> Result<(Qudi, 
 /// Reads a network onto `device`. Nothing is allocated that the file does not hold.
 ///
 /// # Errors
-/// [`SimError::Data`] if the file does not fit its own description, or holds values that are no numbers.
+/// [`Error::Data`] if the file does not fit its own description, or holds values that are no numbers.
 pub fn load(path: &Path, device: &Device) -> Result<(Qudi, Description)> {
     let File { bytes, description } = File::open(path)?;
     network(&bytes, description, path, device)
@@ -141,7 +141,7 @@ fn network(
         values
     });
     match broken {
-        Some(name) => Err(SimError::data(
+        Some(name) => Err(Error::data(
             format!("`{name}` holds values that are not finite"),
             path,
             "the training that wrote it had failed: use an earlier checkpoint",
@@ -168,7 +168,7 @@ fn description(bytes: &[u8], path: &Path) -> Result<Description> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(path, e))?;
     let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
     let Some(text) = text else {
-        return Err(SimError::data(
+        return Err(Error::data(
             "a SafeTensors file of another program",
             path,
             "weights of this program say so in their metadata; name a file that `qudi train` wrote",
@@ -200,16 +200,12 @@ fn is_float(tensor: &TensorView<'_>) -> bool {
     matches!(tensor.dtype(), Dtype::F32 | Dtype::F16)
 }
 
-fn damaged(path: &Path, error: impl std::fmt::Display) -> SimError {
-    SimError::data(
-        format!("not a whole SafeTensors file: {error}"),
-        path,
-        "copy or download it again",
-    )
+fn damaged(path: &Path, error: impl std::fmt::Display) -> Error {
+    Error::data(format!("not a whole SafeTensors file: {error}"), path, "copy or download it again")
 }
 
-fn mismatch(path: &Path, what: impl Into<String>) -> SimError {
-    SimError::data(what, path, "the file is damaged, or of another version of the program")
+fn mismatch(path: &Path, what: impl Into<String>) -> Error {
+    Error::data(what, path, "the file is damaged, or of another version of the program")
 }
 
 /// The values of a tensor of F32 or F16.
@@ -258,7 +254,7 @@ struct Values {
     list: Vec<(String, Vec<usize>, Vec<u8>)>,
     /// The first parameter with values that cannot be written.
     broken: Option<String>,
-    error: Option<SimError>,
+    error: Option<Error>,
 }
 
 impl Values {

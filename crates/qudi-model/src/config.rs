@@ -2,7 +2,7 @@
 
 use crate::conditioning::AlignedNeighbours;
 use qudi_burst::Alignments;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 
 /// Sizes of the whole network (docs/network.md).
@@ -183,15 +183,15 @@ impl NetworkConfig {
     /// A preset by name.
     ///
     /// # Errors
-    /// [`SimError::Request`] if there is none of that name.
+    /// [`Error::Request`] if there is none of that name.
     pub fn preset(name: &str) -> Result<Self> {
         let Some((_, text)) = PRESETS.iter().find(|preset| preset.0 == name) else {
             let names: Vec<_> = PRESETS.iter().map(|preset| preset.0).collect();
             let help = format!("there are {}", names.join(", "));
-            return Err(SimError::request(format!("no preset named `{name}`"), "preset", help));
+            return Err(Error::request(format!("no preset named `{name}`"), "preset", help));
         };
         let document: Document = toml::from_str(text)
-            .map_err(|e| SimError::request(e.message(), name, "correct the preset's file"))?;
+            .map_err(|e| Error::request(e.message(), name, "correct the preset's file"))?;
         document.network.checked()
     }
 
@@ -209,7 +209,7 @@ impl NetworkConfig {
     /// The sizes, if a network can be built from them.
     ///
     /// # Errors
-    /// [`SimError::Request`] with the key that is wrong. Sizes come from weight files, too: nothing may be
+    /// [`Error::Request`] with the key that is wrong. Sizes come from weight files, too: nothing may be
     /// allocated from them before this.
     pub fn checked(self) -> Result<Self> {
         let levels = self.unet.multipliers.len();
@@ -253,7 +253,7 @@ impl NetworkConfig {
         for (key, good, problem) in rules {
             if !good {
                 let key = format!("network.{key}");
-                return Err(SimError::request(
+                return Err(Error::request(
                     format!("{key} {problem}"),
                     &key,
                     "see docs/network.md",

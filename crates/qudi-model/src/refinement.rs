@@ -49,7 +49,7 @@ impl RefinementStage {
     /// Restores the frames of a window, filtered over time, in image units.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the device fails.
+    /// [`Error`](qudi_core::Error) if the device fails.
     pub fn restore(&self, burst: &AlignedBurst<'_>) -> Result<Vec<Frame>> {
         let tiling = Tiling::new(burst.size(), self.fold, self.tile);
         let predenoise = |aligned: &AlignedTensors| vec![self.predenoiser.predenoise(aligned)];
@@ -62,7 +62,7 @@ impl RefinementStage {
 /// Aligns the frames of a captured burst: on the reference estimate, then on what each stage restores.
 ///
 /// # Errors
-/// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown, or a device fails.
+/// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown, or a device fails.
 pub fn align<'a>(
     burst: BurstView<'_>,
     acquisition: &'a Acquisition,

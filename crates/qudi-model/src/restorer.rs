@@ -12,7 +12,7 @@ use crate::diffusion::timesteps::{NUM_TIMESTEPS, TimestepSpacing};
 use crate::network::Qudi;
 use burn::tensor::Device;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 
 pub use diffusion::DiffusionRestorer;
 pub use regression::RegressionRestorer;
@@ -78,18 +78,18 @@ impl QudiRestorer {
     /// by regression for any number of steps: its U-Net changes nothing.
     ///
     /// # Errors
-    /// [`SimError::Request`] for options that make no sense.
+    /// [`Error::Request`] for options that make no sense.
     pub fn new(model: Model, options: SampleOptions, device: &Device) -> Result<Self> {
         if options.steps > NUM_TIMESTEPS {
             let what = format!("{} reverse steps", options.steps);
-            return Err(SimError::request(what, "steps", format!("use 0 to {NUM_TIMESTEPS}")));
+            return Err(Error::request(what, "steps", format!("use 0 to {NUM_TIMESTEPS}")));
         }
         if options.samples == 0 {
-            return Err(SimError::request("no samples at all", "samples", "draw at least 1"));
+            return Err(Error::request("no samples at all", "samples", "draw at least 1"));
         }
         let diffuses = model.kind != ModelKind::Regression;
         if options.samples > 1 && !diffuses {
-            return Err(SimError::request(
+            return Err(Error::request(
                 "these weights make the same picture of any noise: samples would not differ",
                 "samples",
                 "leave it out, or use weights that learnt with train.loss.prediction above 0 (docs/training.md)",
@@ -97,13 +97,13 @@ impl QudiRestorer {
         }
         if options.samples > 1 && options.steps == 0 {
             let what = "samples do not differ where nothing is diffused";
-            return Err(SimError::request(what, "samples", "take some steps, such as `steps 10`"));
+            return Err(Error::request(what, "samples", "take some steps, such as `steps 10`"));
         }
         let smallest = 4 * model.config.multiple();
         if options.tile < smallest {
             let what = format!("tiles of {} pixels", options.tile);
             let help = format!("this network needs at least {smallest}");
-            return Err(SimError::request(what, "tile", help));
+            return Err(Error::request(what, "tile", help));
         }
         Ok(if diffuses && options.steps > 0 {
             Self::Diffusion(Box::new(DiffusionRestorer::new(model, options, device)))
@@ -128,7 +128,7 @@ impl Restorer for QudiRestorer {
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
         let frames = burst.frames.len();
         if frames < MIN_FRAMES {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("a burst of {frames} frames"),
                 "method",
                 format!("it needs at least {MIN_FRAMES}, better {}", self.window()),

@@ -1,7 +1,7 @@
 //! The only bridge between images in memory and tensors.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_core::{Result, SimError, Size};
+use qudi_core::{Error, Result, Size};
 
 /// Images as a tensor, `[images, 1, height, width]`. `values` holds whole images, row-major.
 pub fn to_tensor(values: Vec<f32>, size: Size, device: &Device) -> Tensor<4> {
@@ -12,11 +12,11 @@ pub fn to_tensor(values: Vec<f32>, size: Size, device: &Device) -> Tensor<4> {
 /// The values of a tensor, row-major.
 ///
 /// # Errors
-/// [`SimError::Request`] if the device fails; kernels report their errors only here.
+/// [`Error::Request`] if the device fails; kernels report their errors only here.
 pub fn read<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>> {
     let device = format!("{:?}", tensor.device());
     let failed = |problem: String| {
-        SimError::request(
+        Error::request(
             format!("the device failed: {problem}"),
             device.clone(),
             "try a smaller `tile`, `qudi selftest`, or the device cpu",

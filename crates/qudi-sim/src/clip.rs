@@ -70,6 +70,6 @@ pub trait FrameReader {
     /// The next frame; none at the end.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if it cannot be read.
+    /// [`Error`](qudi_core::Error) if it cannot be read.
     fn next(&mut self) -> Result<Option<Frame>>;
 }

@@ -8,8 +8,8 @@ use qudi_core::Checksum;
 use qudi_core::flow::Flow;
 use qudi_core::sensor::{PixelMaps, Sensor};
 use qudi_core::{ClipStatistics, Light, PppDefinition, resolve_light};
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
 
@@ -27,7 +27,8 @@ pub struct Simulation {
     /// What `ppp` counts.
     pub ppp_def: PppDefinition,
     /// Image value that receives `ppp` photons; the clip's mean if absent.
-    pub exposure: Option<f64>,
+    #[serde(rename = "exposure")]
+    pub mean_level: Option<f64>,
     /// Seed of photons and noise.
     pub seed: u64,
 }
@@ -108,7 +109,7 @@ pub struct Summary {
 /// Runs a simulation. `on` hears of every frame and may end it.
 ///
 /// # Errors
-/// [`SimError`] of the input, the sensor, the light or the sink; [`SimError::Interrupted`] if `on`
+/// [`Error`] of the input, the sensor, the light or the sink; [`Error::Interrupted`] if `on`
 /// breaks.
 pub fn simulate(
     simulation: &Simulation,
@@ -117,7 +118,7 @@ pub fn simulate(
 ) -> Result<Summary> {
     let mut progress = |stage, done, total| match on(Progress { stage, done, total }) {
         ControlFlow::Continue(()) => Ok(()),
-        ControlFlow::Break(()) => Err(SimError::Interrupted),
+        ControlFlow::Break(()) => Err(Error::Interrupted),
     };
     let Simulation { input, sampling, sensor, .. } = simulation;
     sensor.validate()?;
@@ -132,7 +133,7 @@ pub fn simulate(
         progress(Stage::Measuring, frames, info.frames)?;
     }
     if frames == 0 {
-        return Err(SimError::request(
+        return Err(Error::request(
             format!("the clip is too short for one exposure of {} frames", sampling.instants),
             input.place(),
             "lower `instants`, or check `frames`",
@@ -145,7 +146,7 @@ pub fn simulate(
         sensor,
         simulation.ppp_def,
         simulation.ppp,
-        simulation.exposure,
+        simulation.mean_level,
         &clip,
         mean_dark,
     )?;
@@ -185,8 +186,8 @@ pub fn simulate(
     })
 }
 
-fn changed(input: &Input) -> SimError {
-    SimError::request(
+fn changed(input: &Input) -> Error {
+    Error::request(
         "the clip changed between the measuring and the exposing pass",
         input.place(),
         "let nothing write to the input, then run again",

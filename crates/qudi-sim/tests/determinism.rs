@@ -8,7 +8,7 @@ use qudi_core::{Camera, Frame, Light, Size};
 fn expose(sensor: &Sensor, size: Size, seed: u64, threads: usize, frames: u64) -> Vec<Vec<u16>> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| {
-        let light = Light { ppp: 3.25, exposure: 0.45 };
+        let light = Light { ppp: 3.25, mean_level: 0.45 };
         let mut camera = Camera::new(sensor, size, light, seed).unwrap();
         let scene = Frame::from_fn(size, |x, y| ((x * 7 + y * 13) % 100) as f32 / 100.0);
         (0..frames).map(|t| camera.expose(t, &[&scene]).unwrap()).collect()

@@ -35,7 +35,7 @@ impl Batch {
     /// Draws batch `number` of a recipe.
     ///
     /// # Errors
-    /// [`qudi_core::SimError`] if the data cannot be read.
+    /// [`qudi_core::Error`] if the data cannot be read.
     pub fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Self> {
         let count = recipe.train.batch;
         let (frames, side) = recipe.sample_size();

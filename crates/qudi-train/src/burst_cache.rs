@@ -1,4 +1,5 @@
-//! Cached bursts, small in memory, and on disk: a reference estimate takes ten times as long as a training step.
+//! Cached bursts, small in memory, and on disk: a reference estimate takes ten times as long as a training
+//! step.
 
 pub(crate) mod burst;
 mod draw;
@@ -11,7 +12,7 @@ use burst::ConditionedBurst;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
-use qudi_core::{Frame, Result, SimError, Size};
+use qudi_core::{Error, Frame, Result, Size};
 use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
 use qudi_model::config::Part;
 use qudi_model::refinement::RefinementStage;
@@ -176,7 +177,8 @@ fn sha256(stage: &RefinementStage) -> Result<String> {
 struct Label {
     drawn: String,
     ppp: f64,
-    exposure: f64,
+    #[serde(rename = "exposure")]
+    mean_level: f64,
     gain: f64,
     sensor: Sensor,
 }
@@ -191,7 +193,7 @@ impl BurstCache {
     pub(super) fn new(folder: &Path, recipe: &Recipe, stages: &[RefinementStage]) -> Result<Self> {
         let Some(crops) = recipe.train.crops else {
             let what = "the recipe draws every sample anew";
-            return Err(SimError::request(
+            return Err(Error::request(
                 what,
                 "train.crops",
                 "add train.crops, or leave the folder of bursts out",
@@ -236,11 +238,10 @@ impl BurstCache {
     /// Writes burst `number`.
     pub(super) fn write(&self, number: u64, burst: &CachedBurst) -> Result<()> {
         let path = self.path(number);
-        let report = |e: &dyn std::fmt::Display| {
-            SimError::data(format!("no burst: {e}"), &path, "report this")
-        };
-        let Acquisition { ppp, exposure, gain, ref sensor, .. } = burst.sample.acquisition;
-        let label = Label { drawn: self.key.text(), ppp, exposure, gain, sensor: sensor.clone() };
+        let report =
+            |e: &dyn std::fmt::Display| Error::data(format!("no burst: {e}"), &path, "report this");
+        let Acquisition { ppp, mean_level, gain, ref sensor, .. } = burst.sample.acquisition;
+        let label = Label { drawn: self.key.text(), ppp, mean_level, gain, sensor: sensor.clone() };
         // TOML: its numbers come back bit for bit.
         let label = toml::to_string(&label).map_err(|e| report(&e))?;
         let words =
@@ -265,17 +266,17 @@ impl BurstCache {
     /// Burst `number`, if it is there.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read, is damaged, or was drawn for something else.
+    /// [`Error`] if it cannot be read, is damaged, or was drawn for something else.
     pub(super) fn read(&self, number: u64) -> Result<Option<CachedBurst>> {
         let path = self.path(number);
-        let io = |e| SimError::io("read the burst", &path, e);
+        let io = |e| Error::io("read the burst", &path, e);
         let length = match std::fs::metadata(&path) {
             Ok(about) => about.len(),
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(e) => return Err(io(e)),
         };
         let damaged =
-            |what: String| SimError::data(what, &path, "remove the file: it will be drawn again");
+            |what: String| Error::data(what, &path, "remove the file: it will be drawn again");
         let pixels: usize = self.shape.iter().product();
         let bytes = |kind: Dtype| pixels * kind.bitsize() / 8;
         let whole = self.tensors().iter().map(|(_, kind)| bytes(*kind)).sum::<usize>();
@@ -292,14 +293,14 @@ impl BurstCache {
         if key.is_none() || key != CacheKey::from_text(&self.key.text()) {
             let help =
                 "keep the bursts of another recipe, or of another version, in another folder";
-            return Err(SimError::data(
+            return Err(Error::data(
                 "the burst was drawn with other data, sensors or weights",
                 &path,
                 help,
             ));
         }
         label.sensor.validate()?;
-        if ![label.ppp, label.exposure, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {
+        if ![label.ppp, label.mean_level, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {
             return Err(damaged("light and gain are no numbers above 0".to_owned()));
         }
         let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(e.to_string()))?;
@@ -326,7 +327,7 @@ impl BurstCache {
             seed: 0,
             first_frame: 0,
             ppp: label.ppp,
-            exposure: label.exposure,
+            mean_level: label.mean_level,
             gain: label.gain,
             sensor: label.sensor,
             dark: None,

@@ -1,8 +1,8 @@
 //! The loss that training minimises, as a weighted sum of terms.
 //!
-//! The prediction's squared error counts in units of what is unknown of every pixel (Karras et al. 2022, table 1,
-//! "EDM": their weight `1 / c_out^2`), that of the pre-denoised frames relative to the error of the reference
-//! estimate. docs/network.md has the formulas.
+//! The prediction's squared error counts in units of what is unknown of every pixel (Karras et al. 2022,
+//! table 1, "EDM": their weight `1 / c_out^2`), that of the pre-denoised frames relative to the error of the
+//! reference estimate. docs/network.md has the formulas.
 
 mod gaussian_nll;
 pub mod lpips;
@@ -29,7 +29,8 @@ pub use timesteps::training_timestep;
 /// The least unit that a pixel's error is counted in, in [-1, 1]: half a step of 8 bits.
 const LEAST_UNIT: f32 = 0.004;
 
-/// The weight of each term of the loss. That of the predicted uncertainty is 1, for nothing else learns from it.
+/// The weight of each term of the loss. That of the predicted uncertainty is 1, for nothing else learns from
+/// it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossWeights {
     /// The weight of the prediction.
@@ -71,8 +72,8 @@ pub struct Example<'a> {
 pub struct LossTerms {
     /// The weighted sum.
     pub total: Tensor<1>,
-    /// The squared error of the prediction; about 1 where it knows no more than the predicted uncertainty of every
-    /// pixel.
+    /// The squared error of the prediction; about 1 where it knows no more than the predicted uncertainty of
+    /// every pixel.
     pub prediction: Tensor<1>,
     /// The error of the pre-denoised frames; 1 where it is that of the reference estimate.
     pub pre: Tensor<1>,
@@ -104,7 +105,7 @@ impl LossTerms {
 /// Computes the loss of `network`, which is on an autodiff device, on an example on the same device.
 ///
 /// # Errors
-/// [`SimError`](qudi_core::SimError) if the device fails or a sensor is impossible.
+/// [`Error`](qudi_core::Error) if the device fails or a sensor is impossible.
 pub fn loss_terms(
     network: &Qudi,
     example: &Example<'_>,
@@ -137,8 +138,9 @@ pub fn loss_terms(
     Ok(LossTerms { total, prediction, pre, perceptual, flow, uncertainty }.weighted(weights))
 }
 
-/// Computes the terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no weight: a first
-/// stage, at a fifth of the cost or less, for what must work before the rest can learn from it.
+/// Computes the terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no
+/// weight: a first stage, at a fifth of the cost or less, for what must work before the rest can learn from
+/// it.
 fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights) -> LossTerms {
     let Example { conditioning, truth, .. } = example;
     let (d, sigma, flows) = if weights.flow > 0.0 {

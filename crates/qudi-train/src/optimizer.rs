@@ -1,7 +1,7 @@
 //! The Adam optimizer (Kingma and Ba 2015) on lists of values, whose state is two more such lists.
 //!
-//! Burn's own keeps its state under numbers that change from run to run, and reads it back onto the default device,
-//! which a machine without a graphics card does not have; training must go on exactly, anywhere.
+//! Burn's own keeps its state under numbers that change from run to run, and reads it back onto the default
+//! device, which a machine without a graphics card does not have; training must go on exactly, anywhere.
 
 mod learning_rate;
 

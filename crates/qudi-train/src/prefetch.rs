@@ -3,7 +3,7 @@
 use super::batch::Batch;
 use super::burst_cache::BurstSampler;
 use super::recipe::Recipe;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::sync::mpsc::{Receiver, sync_channel};
 
 /// The number of batches that a thread keeps ready.
@@ -20,7 +20,7 @@ impl Prefetcher {
     /// Starts `workers` threads that draw batches from number `first` on.
     ///
     /// # Errors
-    /// [`SimError`] if the data cannot be opened.
+    /// [`Error`] if the data cannot be opened.
     pub fn new(recipe: &Recipe, bursts: &BurstSampler, first: u64, workers: usize) -> Result<Self> {
         let count = workers.max(1) as u64;
         let start = |worker: u64| {
@@ -34,13 +34,7 @@ impl Prefetcher {
                 }
             };
             std::thread::Builder::new().name(format!("prefetch-{worker}")).spawn(work).map_err(
-                |e| {
-                    SimError::request(
-                        format!("no thread for the data: {e}"),
-                        "workers",
-                        "use fewer",
-                    )
-                },
+                |e| Error::request(format!("no thread for the data: {e}"), "workers", "use fewer"),
             )?;
             Ok(receiver)
         };
@@ -51,12 +45,12 @@ impl Prefetcher {
     /// Waits for the next batch.
     ///
     /// # Errors
-    /// [`SimError`] if it could not be drawn.
+    /// [`Error`] if it could not be drawn.
     pub fn next_batch(&mut self) -> Result<Batch> {
         let at = (self.next % self.workers.len() as u64) as usize;
         self.next += 1;
         self.workers[at].recv().unwrap_or_else(|_| {
-            Err(SimError::request("a data thread has stopped", "the data", "report this"))
+            Err(Error::request("a data thread has stopped", "the data", "report this"))
         })
     }
 }

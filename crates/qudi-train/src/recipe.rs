@@ -4,7 +4,7 @@ use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind
 use crate::loss::lpips::PerceptualKind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_kernels::ComputePrecision;
 use qudi_model::config::{NetworkConfig, PRESETS};
 use serde::{Deserialize, Serialize};
@@ -66,7 +66,8 @@ pub struct TrainConfig {
     pub licence: String,
 }
 
-/// What samples are cut from: reference estimates of whole bursts, which take long to compute and see no borders.
+/// What samples are cut from: reference estimates of whole bursts, which take long to compute and see no
+/// borders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CropsConfig {
@@ -85,15 +86,16 @@ pub struct CropsConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossConfig {
-    /// Of the prediction.
+    /// The weight of the prediction.
     pub prediction: f32,
-    /// Of the pre-denoised frames.
+    /// The weight of the pre-denoised frames.
     pub pre: f32,
-    /// Of the perceptual term.
+    /// The weight of the perceptual term.
     pub perceptual: f32,
-    /// Which perceptual term.
+    /// The kind of the perceptual term.
     pub term: PerceptualKind,
-    /// Of the misfit of true neighbours warped along the flows: flow learns from it long before fusion can teach it.
+    /// The weight of the warping error of true neighbours along the flows: flow learns from it long before fusion can
+    /// teach it.
     #[serde(default)]
     pub flow: f32,
 }
@@ -125,7 +127,7 @@ impl Recipe {
     /// A preset's recipe, or that of a file, with keys changed: `("train.steps", "100")`.
     ///
     /// # Errors
-    /// [`SimError`] if there is none, or a key is unknown or wrong.
+    /// [`Error`] if there is none, or a key is unknown or wrong.
     pub fn load(name: &str, changes: &[(String, String)]) -> Result<Self> {
         let preset = PRESETS.iter().find(|preset| preset.0 == name);
         let text = match preset {
@@ -141,7 +143,7 @@ impl Recipe {
     /// As [`Self::load`].
     pub fn parse(text: &str, place: &str, changes: &[(String, String)]) -> Result<Self> {
         let help = "compare with configs/small.toml and docs/training.md";
-        let fault = |what: String| SimError::request(what, place, help);
+        let fault = |what: String| Error::request(what, place, help);
         let mut document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
         modernize(&mut document, "");
@@ -237,7 +239,7 @@ impl Recipe {
         for (key, good, problem) in rules {
             if !good {
                 let what = format!("{key} {problem}");
-                return Err(SimError::request(what, key, "correct the recipe"));
+                return Err(Error::request(what, key, "correct the recipe"));
             }
         }
         if let Some(validation) = &self.validation {
@@ -248,7 +250,7 @@ impl Recipe {
                 && validation.every > 0
                 && !validation.from.is_empty();
             if !good {
-                return Err(SimError::request(
+                return Err(Error::request(
                     "the validation cannot be done: it wants clips, 3 frames, 16 pixels, light",
                     "validation",
                     "correct the recipe",
@@ -292,13 +294,9 @@ fn read(name: &str) -> Result<String> {
         std::io::ErrorKind::NotFound => {
             let names: Vec<_> = PRESETS.iter().map(|preset| preset.0).collect();
             let what = format!("`{name}` is no recipe");
-            SimError::request(
-                what,
-                name,
-                format!("name a .toml file, or one of {}", names.join(", ")),
-            )
+            Error::request(what, name, format!("name a .toml file, or one of {}", names.join(", ")))
         }
-        _ => SimError::io("read the recipe", path, e),
+        _ => Error::io("read the recipe", path, e),
     };
     std::fs::metadata(path).map_err(failed)?;
     read_text(path, TEXT_BYTES, "read the recipe")
@@ -362,7 +360,7 @@ fn modern_key(key: &str) -> String {
 fn set(document: &mut toml::Table, key: &str, text: &str) -> Result<()> {
     let unknown = || {
         let help = "name keys of the recipe, as in train.steps or data.source.0.weight";
-        SimError::request(format!("`{key}` is no key of the recipe"), key, help)
+        Error::request(format!("`{key}` is no key of the recipe"), key, help)
     };
     let value = format!("v = {text}").parse::<toml::Table>().ok();
     let value = value.and_then(|mut table| table.remove("v"));

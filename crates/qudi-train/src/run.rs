@@ -9,7 +9,7 @@ use super::validate::{Validation, Validator};
 use crate::dataset::Dataset;
 use burn::tensor::Device;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_model::checkpoint::{Description, Precision, save};
 use qudi_model::config::{NetworkConfig, PRESETS};
 use qudi_model::network::Qudi;
@@ -72,7 +72,7 @@ impl Run {
     /// Opens a run in `folder`, which exists.
     ///
     /// # Errors
-    /// [`SimError`] if the data, the state or the folder cannot be used.
+    /// [`Error`] if the data, the state or the folder cannot be used.
     pub fn open(
         folder: &Path,
         recipe: &Recipe,
@@ -119,11 +119,11 @@ impl Run {
         [self.trainer.step_number(), self.recipe.train.steps]
     }
 
-    /// Learns to the end of the recipe, with data drawn on `workers` threads. `on` hears of every step and says whether
-    /// to go on; if not, the state is written and the run stops.
+    /// Learns to the end of the recipe, with data drawn on `workers` threads. `on` hears of every step and
+    /// says whether to go on; if not, the state is written and the run stops.
     ///
     /// # Errors
-    /// [`SimError`] if data, device or disk fail, or the loss is not finite; [`SimError::Interrupted`] if told
+    /// [`Error`] if data, device or disk fail, or the loss is not finite; [`Error::Interrupted`] if asked
     /// to stop.
     pub fn learn(
         &mut self,
@@ -160,7 +160,7 @@ impl Run {
                 }
             }
             if go_on.is_break() && !last {
-                return Err(SimError::Interrupted);
+                return Err(Error::Interrupted);
             }
         }
         Ok(())
@@ -228,7 +228,7 @@ impl Run {
         self.write(METRICS, kept.as_bytes())
     }
 
-    fn failed(&self, name: &str, e: std::io::Error) -> SimError {
-        SimError::io("write the run", &self.folder.join(name), e)
+    fn failed(&self, name: &str, e: std::io::Error) -> Error {
+        Error::io("write the run", &self.folder.join(name), e)
     }
 }

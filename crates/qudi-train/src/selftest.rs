@@ -1,4 +1,5 @@
-//! What a device must get right: every operation of the network with its gradients, and a small network whole.
+//! What a device must get right: every operation of the network with its gradients, and a small network
+//! whole.
 
 use crate::loss::reconstruction;
 use burn::tensor::activation::softmax;
@@ -77,11 +78,11 @@ impl Check {
         }
     }
 
-    /// Largest difference between the device's results and those of Burn's stock operations on `reference`, in
-    /// terms of the largest value.
+    /// Largest difference between the device's results and those of Burn's stock operations on `reference`,
+    /// in terms of the largest value.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if a device fails.
+    /// [`Error`](qudi_core::Error) if a device fails.
     pub fn error(&self, device: &Device, reference: &Device) -> Result<f32> {
         let got = with_precision(self.precision, || (self.run)(device))?;
         let expected = with_stock_operations(|| (self.run)(reference))?;

@@ -1,12 +1,12 @@
-//! The state that a run resumes from: a folder of weights, their average, the optimizer's moments and counters, which
-//! is replaced whole or not at all.
+//! The state that a run resumes from: a folder of weights, their average, the optimizer's moments and
+//! counters, which is replaced whole or not at all.
 
 use super::optimizer::Adam;
 use super::parameters::with_parameters;
 use super::recipe::Recipe;
 use super::trainer::Trainer;
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_model::network::{former_name, parameter_shapes};
 use qudi_model::tensor::read;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -36,12 +36,12 @@ impl Trainer {
     /// Writes the state into the run's folder. At any moment one whole state lies there.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be written; the state before is intact then.
+    /// [`Error`] if it cannot be written; the state before is intact then.
     pub fn save_state(&self, run: &Path) -> Result<()> {
         let [state, new, old] = names(run);
         let failed = |path: &Path| {
             let path = path.to_owned();
-            move |e| SimError::io("write the training state", &path, e)
+            move |e| Error::io("write the training state", &path, e)
         };
         // What an interrupted call left.
         if new.exists() {
@@ -64,7 +64,7 @@ impl Trainer {
             (name, view.expect("as many bytes as the shape says"))
         });
         let bytes = safetensors::serialize(views, None).map_err(|e| {
-            SimError::data(format!("cannot lay out the state: {e}"), &new, "report this")
+            Error::data(format!("cannot lay out the state: {e}"), &new, "report this")
         })?;
         let counters =
             serde_json::to_vec(&Counters { step: self.step_number() }).expect("plain data");
@@ -99,7 +99,7 @@ impl Trainer {
     /// Resumes from the state in a run's folder.
     ///
     /// # Errors
-    /// [`SimError`] if there is none, or it is damaged or of another recipe.
+    /// [`Error`] if there is none, or it is damaged or of another recipe.
     pub fn resume(
         run: &Path,
         recipe: &Recipe,
@@ -110,7 +110,7 @@ impl Trainer {
         // Killed between two renames: the old state is the whole one.
         let folder = if state.exists() { state } else { old };
         let damaged = |what: String| {
-            SimError::data(
+            Error::data(
                 format!("the training state cannot be used: {what}"),
                 &folder,
                 "start a new run in another folder from this run's weights.safetensors",
@@ -118,7 +118,7 @@ impl Trainer {
         };
         let open = |name: &str| {
             let path = folder.join(name);
-            std::fs::read(&path).map_err(|e| SimError::io("read the training state", &path, e))
+            std::fs::read(&path).map_err(|e| Error::io("read the training state", &path, e))
         };
         let counters: Counters =
             serde_json::from_slice(&open(COUNTERS)?).map_err(|e| damaged(e.to_string()))?;

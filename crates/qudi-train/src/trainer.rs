@@ -10,7 +10,7 @@ use crate::loss::lpips::Lpips;
 use crate::loss::{LoopOptions, LossWeights, SelfConditioning, loss_terms};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use qudi_core::{Result, SimError, Size};
+use qudi_core::{Error, Result, Size};
 use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::config::Part;
 use qudi_model::network::Qudi;
@@ -83,11 +83,11 @@ struct Pass {
 }
 
 impl Trainer {
-    /// Starts from `network`, or from the recipe's initial weights. `devices` are without autodiff; batches go to
-    /// them in turn. `backbones` is the folder of the perceptual term's weights.
+    /// Starts from `network`, or from the recipe's initial weights. `devices` are without autodiff; batches
+    /// go to them in turn. `backbones` is the folder of the perceptual term's weights.
     ///
     /// # Errors
-    /// [`SimError`] if the perceptual term cannot be loaded, or a device lacks the numbers of `train.precision`.
+    /// [`Error`] if the perceptual term cannot be loaded, or a device lacks the numbers of `train.precision`.
     pub fn new(
         recipe: &Recipe,
         network: Option<Qudi>,
@@ -96,7 +96,7 @@ impl Trainer {
     ) -> Result<Self> {
         let devices: Vec<Device> = devices.iter().map(|device| device.clone().autodiff()).collect();
         let Some(main) = devices.first() else {
-            return Err(SimError::request("no device", "devices", "name at least one"));
+            return Err(Error::request("no device", "devices", "name at least one"));
         };
         let precision = recipe.train.precision;
         if let Some(device) = devices.iter().find(|device| !precision.is_supported(device)) {
@@ -146,7 +146,7 @@ impl Trainer {
     /// Takes one step.
     ///
     /// # Errors
-    /// [`SimError`] if the data or the device fails, or the loss is not finite.
+    /// [`Error`] if the data or the device fails, or the loss is not finite.
     pub fn step(&mut self, prefetcher: &mut Prefetcher) -> Result<StepReport> {
         let start = Instant::now();
         let count = self.recipe.train.accumulate;
@@ -212,7 +212,7 @@ impl Trainer {
             let handles: Vec<_> =
                 (0..self.devices.len()).map(|number| scope.spawn(work(number))).collect();
             let failed =
-                || Err(SimError::request("a device's thread failed", "devices", "report this"));
+                || Err(Error::request("a device's thread failed", "devices", "report this"));
             let lists =
                 handles.into_iter().map(|handle| handle.join().unwrap_or_else(|_| failed()));
             lists.collect::<Result<Vec<_>>>()
@@ -282,7 +282,7 @@ impl Trainer {
         if value.is_finite() {
             return Ok(());
         }
-        Err(SimError::request(
+        Err(Error::request(
             format!(
                 "{what} is {value} at step {}: training stopped, the last checkpoint is good",
                 self.step_number() + 1
@@ -304,8 +304,8 @@ impl LossValues {
     }
 }
 
-fn unsupported(precision: ComputePrecision, device: &Device) -> SimError {
-    SimError::request(
+fn unsupported(precision: ComputePrecision, device: &Device) -> Error {
+    Error::request(
         format!("{device:?} cannot compute with {precision} numbers"),
         "train.precision",
         "set it to \"f32\", which all devices have",

@@ -3,11 +3,11 @@
 use super::recipe::{Recipe, VALIDATION, ValidationConfig};
 use crate::dataset::Pack;
 use burn::tensor::Device;
-use qudi_core::fitting_exposure;
+use qudi_core::fitting_mean_level;
 use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Frame, Light, Result, SimError, Size, USUAL_EXPOSURE};
+use qudi_core::{Camera, Error, Frame, Light, Result, Size, USUAL_MEAN_LEVEL};
 use qudi_model::checkpoint::ModelKind;
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::Qudi;
@@ -60,7 +60,7 @@ impl Validator {
     /// Reads the clips of a recipe from its pack; none if the recipe measures nothing.
     ///
     /// # Errors
-    /// [`SimError`] if the pack lacks them or they are too small.
+    /// [`Error`] if the pack lacks them or they are too small.
     pub fn new(recipe: &Recipe, pack: Option<&Pack>) -> Result<Option<Self>> {
         let Some(config) = recipe.validation.clone() else { return Ok(None) };
         let side = Size { height: config.crop, width: config.crop };
@@ -68,7 +68,7 @@ impl Validator {
         for name in config.from.iter().filter_map(|from| from.strip_prefix("scene:")) {
             let Some(kind) = ProceduralScene::by_name(name) else {
                 let what = format!("no procedural scene named `{name}`");
-                return Err(SimError::request(what, "validation.from", "correct the recipe"));
+                return Err(Error::request(what, "validation.from", "correct the recipe"));
             };
             let scene = Procedural { kind, size: side, seed: SEED, speed: SPEED }.scene();
             let frames = (0..config.frames).map(|t| scene.render(t as f64)).collect();
@@ -78,7 +78,7 @@ impl Validator {
             let Some(pack) = pack else {
                 let help = "give the data folder, or a pack";
                 let what = "the validation clips need files";
-                return Err(SimError::request(what, "validation.from", help));
+                return Err(Error::request(what, "validation.from", help));
             };
             let mut pack = pack.try_clone()?;
             for number in 0..pack.clips().len() {
@@ -90,7 +90,7 @@ impl Validator {
                 if height.min(width) < config.crop || clip.frames < config.frames {
                     let what =
                         format!("`{}` is smaller than the validation's crop or frames", clip.name);
-                    return Err(SimError::data(
+                    return Err(Error::data(
                         what,
                         pack.path(),
                         "lower validation.crop or validation.frames",
@@ -107,7 +107,7 @@ impl Validator {
         }
         if clips.is_empty() {
             let what = "the pack holds no validation clips";
-            return Err(SimError::request(
+            return Err(Error::request(
                 what,
                 "validation.from",
                 "make the pack again from this recipe",
@@ -125,7 +125,7 @@ impl Validator {
     /// Restores every clip at every light with `network`, which is on `device`.
     ///
     /// # Errors
-    /// [`SimError`] if the device fails.
+    /// [`Error`] if the device fails.
     pub fn measure(
         &self,
         network: &Qudi,
@@ -146,15 +146,15 @@ impl Validator {
             for (number, (name, truth)) in self.clips.iter().enumerate() {
                 let size = truth[0].size;
                 let mean = truth.iter().map(Frame::mean).sum::<f64>() / truth.len() as f64;
-                let light = Light { ppp, exposure: mean.max(1e-3) };
+                let light = Light { ppp, mean_level: mean.max(1e-3) };
                 let mut camera = Camera::new(&self.sensor, size, light, SEED + number as u64)?;
                 let counts = (0..).zip(truth).map(|(t, frame)| camera.expose(t, &[frame]));
                 let counts: Vec<Vec<u16>> = counts.collect::<Result<_>>()?;
                 let mut acquisition =
-                    Acquisition::new(self.sensor.clone(), ppp, USUAL_EXPOSURE)?.with_seed(SEED);
+                    Acquisition::new(self.sensor.clone(), ppp, USUAL_MEAN_LEVEL)?.with_seed(SEED);
                 let read = |frame: u64| Ok(counts[frame as usize].clone());
-                acquisition.exposure =
-                    fitting_exposure(size, counts.len() as u64, &acquisition, read)?;
+                acquisition.mean_level =
+                    fitting_mean_level(size, counts.len() as u64, &acquisition, read)?;
                 let restored =
                     restorer.restore(BurstView { size, frames: &counts }, &acquisition)?.frames;
                 let mean = |of: fn(&Frame, &Frame) -> f64| {

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use image::{GrayImage, Luma};
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_core::atomic_file::Overwrite;
 use qudi_train::dataset::{
     DataConfig, Dataset, LightRange, Pack, Sample, SensorMix, SourceConfig, SourceKind, write_pack,
@@ -66,7 +66,7 @@ fn all_sources() -> DataConfig {
 }
 
 /// The files' pack, for `config`.
-fn pack(config: &DataConfig, folder: &Path) -> Result<PathBuf, SimError> {
+fn pack(config: &DataConfig, folder: &Path) -> Result<PathBuf, Error> {
     let path = folder.join("pack.zip");
     write_pack(&[config], folder, &path, Overwrite::Yes, &mut |_| ControlFlow::Continue(()))?;
     Ok(path)
@@ -138,11 +138,11 @@ fn mean_level_is_that_of_the_whole_clip() {
             for &v in &frame.data {
                 assert!((0.0..=1.0).contains(&v));
                 // Every pixel is a whole number of the file's steps.
-                let level = f64::from(v) / sample.acquisition.exposure * mean;
+                let level = f64::from(v) / sample.acquisition.mean_level * mean;
                 assert!((level - level.round()).abs() < 1e-3 && level >= 20.0, "{level}");
             }
         }
-        factors.push(sample.acquisition.exposure * 255.0 / mean);
+        factors.push(sample.acquisition.mean_level * 255.0 / mean);
     }
     let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
     let least = factors.iter().fold(9.0f64, |a, &b| a.min(b));
@@ -163,11 +163,12 @@ fn clips_are_downscaled_up_to_max_downscale() {
         let sample = dataset.sample(3, k).unwrap();
         let frame = &sample.truth[0];
         assert_eq!(frame.size.pixels(), 256);
-        // From one corner to the other the file's values rise by 1 + 2 for every step of both, or one against the other.
+        // From one corner to the other the file's values rise by 1 + 2 for every step of both, or one against
+        // the other.
         let at = |x: usize, y: usize| f64::from(frame.data[16 * y + x]);
         let (across, down) = (at(15, 0) - at(0, 0), at(0, 15) - at(0, 0));
         let level = 255.0 * (across.abs() + down.abs()) / 15.0;
-        let brightness = sample.acquisition.exposure / clip_mean(1);
+        let brightness = sample.acquisition.mean_level / clip_mean(1);
         factors.push(level / 3.0 / brightness);
     }
     let most = factors.iter().fold(0.0f64, |a, &b| a.max(b));
@@ -253,14 +254,14 @@ fn rejects_data_that_cannot_be_sampled() {
         assert!(error.to_string().contains(key), "{error}");
     }
     let missing = super_config("no-such-folder");
-    assert!(matches!(pack_in(&missing, folder.path()), Err(SimError::Io { .. })));
+    assert!(matches!(pack_in(&missing, folder.path()), Err(Error::Io { .. })));
 }
 
 fn super_config(from: &str) -> DataConfig {
     config(vec![source("clips", SourceKind::Clips, &[from])])
 }
 
-fn pack_in(config: &DataConfig, folder: &Path) -> Result<PathBuf, SimError> {
+fn pack_in(config: &DataConfig, folder: &Path) -> Result<PathBuf, Error> {
     let path = folder.join("other.zip");
     let result =
         write_pack(&[config], folder, &path, Overwrite::No, &mut |_| ControlFlow::Continue(()));

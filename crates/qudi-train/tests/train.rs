@@ -1,8 +1,9 @@
-//! Training is reproducible: results depend neither on workers nor devices, and a resumed run equals an undisturbed one.
+//! Training is reproducible: results depend neither on workers nor devices, and a resumed run equals an
+//! undisturbed one.
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::{Device, Tensor};
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_model::checkpoint::load;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
@@ -43,11 +44,11 @@ fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Ve
     (weights(&trainer.averaged()), steps)
 }
 
-fn open(folder: &Path, recipe: &Recipe, from: From) -> Result<Run, SimError> {
+fn open(folder: &Path, recipe: &Recipe, from: From) -> Result<Run, Error> {
     Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
 }
 
-fn learn(run: &mut Run, stop_after: u64) -> Result<(), SimError> {
+fn learn(run: &mut Run, stop_after: u64) -> Result<(), Error> {
     run.learn(1, &mut |event| match event {
         Event::Step(report) if report.step == stop_after => ControlFlow::Break(()),
         _ => ControlFlow::Continue(()),
@@ -132,7 +133,7 @@ fn resumed_run_equals_undisturbed_run() {
     for stop in [1, 4] {
         let from = if stop == 1 { From::Start(None) } else { From::State };
         let mut run = open(folders[1].path(), &recipe, from).unwrap();
-        assert!(matches!(learn(&mut run, stop), Err(SimError::Interrupted)));
+        assert!(matches!(learn(&mut run, stop), Err(Error::Interrupted)));
         assert_eq!(run.progress(), [stop, 6]);
     }
     let mut run = open(folders[1].path(), &recipe, From::State).unwrap();
@@ -239,7 +240,8 @@ fn first_stage_trains_the_pre_denoiser_on_crops() {
     }
 }
 
-/// Weights of earlier stages stay as they were, bit for bit, in the average, too; a resumed run has the same bursts.
+/// Weights of earlier stages stay as they were, bit for bit, in the average, too; a resumed run has the same
+/// bursts.
 #[test]
 fn refinement_stages_keep_their_weights() {
     let recipe = recipe(&[("network.pre.stages", "2")]);

@@ -49,7 +49,7 @@ fn tiny() -> NetworkConfig {
 
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let sensor = Sensor::load("qudi-paper").unwrap();
-    let light = Light { ppp: 3.25, exposure: 0.45 };
+    let light = Light { ppp: 3.25, mean_level: 0.45 };
     let mut camera = Camera::new(&sensor, size, light, 4).unwrap();
     let scene = |t: usize| {
         Frame::from_fn(size, |x, y| {
@@ -60,7 +60,7 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let truth: Vec<Frame> = (0..frames).map(scene).collect();
     let counts: Vec<Vec<u16>> =
         truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
-    let acquisition = Acquisition::new(sensor, light.ppp, light.exposure).unwrap();
+    let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level).unwrap();
     let view = BurstView { size, frames: &counts };
     let aligned = align(view, &acquisition, &[]).unwrap();
     let neighbours = tiny().pre.aligned_neighbours();
@@ -92,7 +92,8 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
         .unwrap()
 }
 
-/// The first stage computes the same terms of pre-denoiser and flow as the whole network, and nothing else learns.
+/// The first stage computes the same terms of pre-denoiser and flow as the whole network, and nothing else
+/// learns.
 #[test]
 fn first_stage_terms_equal_those_of_the_whole_network() {
     let device = Device::flex().autodiff();

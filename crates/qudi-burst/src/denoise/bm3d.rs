@@ -28,8 +28,8 @@ pub(crate) struct SearchSettings {
 }
 
 impl SearchSettings {
-    /// Windows of 39 x 39 (table I, "normal profile"). The second pass looks for a block every 2 pixels instead
-    /// of 3: 0.02 dB for half as much time again (docs/notes/burst/bm3d.md).
+    /// Windows of 39 x 39 (table I, "normal profile"). The second pass looks for a block every 2 pixels
+    /// instead of 3: 0.02 dB for half as much time again (docs/notes/burst/bm3d.md).
     pub(crate) const NORMAL: Self = Self { radius: 19, step: [3, 2] };
 }
 

@@ -13,8 +13,8 @@ pub(crate) struct Blocks {
 }
 
 impl Blocks {
-    /// Divides `frames` frames into blocks of `length` frames (odd), one of them around `reference`; those at the ends
-    /// may be shorter.
+    /// Divides `frames` frames into blocks of `length` frames (odd), one of them around `reference`; those at
+    /// the ends may be shorter.
     pub(crate) fn around(reference: usize, frames: usize, length: usize) -> Self {
         let half = length / 2;
         let own = reference.saturating_sub(half)..(reference + half + 1).min(frames);
@@ -44,8 +44,8 @@ impl Blocks {
         std::iter::once(self.reference).chain(others).map(|k| &self.ranges[k])
     }
 
-    /// Interpolates the motion of every patch to every frame, `[frame][patch]`: linear between the middles of blocks,
-    /// and beyond them. The reference block's motion is zero at `reference`.
+    /// Interpolates the motion of every patch to every frame, `[frame][patch]`: linear between the middles of
+    /// blocks, and beyond them. The reference block's motion is zero at `reference`.
     pub(crate) fn interpolate(&self, flows: &PatchMotion, reference: usize) -> PatchMotion {
         let middle = |k: usize| {
             let range = &self.ranges[k];

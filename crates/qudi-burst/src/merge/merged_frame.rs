@@ -54,8 +54,8 @@ impl MergedFrame {
         })
     }
 
-    /// Merges frame `reference` with all others along the motion of its patches. What fits is decided on the reference
-    /// frames, and patches are sampled with cubic convolution.
+    /// Merges frame `reference` with all others along the motion of its patches. What fits is decided on the
+    /// reference frames, and patches are sampled with cubic convolution.
     pub(crate) fn on_reference_frames(
         burst: &PreparedBurst,
         references: &ReferenceFrames,
@@ -95,7 +95,8 @@ impl MergedFrame {
     }
 }
 
-/// What sampling between pixels, `d` away, leaves of the variance of white noise along each axis; `along` says it of one.
+/// What sampling between pixels, `d` away, leaves of the variance of white noise along each axis; `along`
+/// says it of one.
 fn left_of_noise(d: [f32; 2], along: impl Fn(f32) -> f32) -> [f32; 2] {
     d.map(|d| along(d - d.floor()))
 }

@@ -1,5 +1,6 @@
-//! Robust merge of aligned patches: a Wiener filter over time in the frequency domain, which gives coefficients that do
-//! not fit the reference little weight (Hasinoff et al. 2016, section 5; Ma et al. 2020, section 5.2).
+//! Robust merge of aligned patches: a Wiener filter over time in the frequency domain, which gives
+//! coefficients that do not fit the reference little weight (Hasinoff et al. 2016, section 5; Ma et al. 2020,
+//! section 5.2).
 
 use super::dft16::{Spectrum, forward, inverse};
 use crate::patch::{Patch, SIDE};
@@ -15,15 +16,16 @@ pub(crate) struct AlignedPatch {
     pub(crate) noise: f32,
 }
 
-/// Merges `patches`, the reference first, of frames whose counts have the given `variance`. `wiener_c` is the squared
-/// difference, in units of that which noise makes, at which a coefficient gets half its weight. Returns the patch and
-/// the variance of its noise, in units of the variance of one frame's counts.
+/// Merges `patches`, the reference first, of frames whose counts have the given `variance`. `wiener_c` is the
+/// squared difference, in units of that which noise makes, at which a coefficient gets half its weight.
+/// Returns the patch and the variance of its noise, in units of the variance of one frame's counts.
 pub(crate) fn merge(patches: &[AlignedPatch], variance: f32, wiener_c: f32) -> (Patch, f32) {
     let spectra: Vec<Spectrum> = patches.iter().map(|aligned| forward(&aligned.patch)).collect();
     merge_spectra(patches, &spectra, &spectra, variance, wiener_c)
 }
 
-/// Merges `patches` like [`merge`], but decides on `shown`, estimates of what the patches show, which coefficients fit.
+/// Merges `patches` like [`merge`], but decides on `shown`, estimates of what the patches show, which
+/// coefficients fit.
 pub(crate) fn merge_by_reference(
     patches: &[AlignedPatch],
     shown: &[Patch],
@@ -35,8 +37,8 @@ pub(crate) fn merge_by_reference(
     merge_spectra(patches, &spectra, &shown, variance, wiener_c)
 }
 
-/// Merges the `spectra` of `patches`. The robustness weight of each coefficient follows from how far `criterion` differs
-/// from that of the reference.
+/// Merges the `spectra` of `patches`. The robustness weight of each coefficient follows from how far
+/// `criterion` differs from that of the reference.
 fn merge_spectra(
     patches: &[AlignedPatch],
     spectra: &[Spectrum],

@@ -27,8 +27,8 @@ impl Restorer for Average {
         let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
         let detections = acquisition.sensor.quantum_efficiency * acquisition.ppp
             + acquisition.sensor.dark_per_frame()?;
-        // The count that an image value of `exposure` gives on average.
-        let per_unit = law.mean(detections) / acquisition.exposure;
+        // The count that an image value of `mean_level` gives on average.
+        let per_unit = law.mean(detections) / acquisition.mean_level;
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, WINDOW / 2, |sums, n| {
             let scale = 1.0 / (per_unit * f64::from(n));

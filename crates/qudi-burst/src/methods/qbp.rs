@@ -29,16 +29,16 @@ pub enum PostFilter {
 pub struct QbpSettings {
     /// Blocks hold as many frames as it takes for this many detections per pixel, at most 5.
     pub detections_per_block: f64,
-    /// The constant of the Wiener filter: the squared difference, in units of that which noise makes, at which a
-    /// block gets half its weight.
+    /// The constant of the Wiener filter: the squared difference, in units of that which noise makes, at
+    /// which a block gets half its weight.
     pub wiener_c: f32,
     /// The noise sigma that BM3D assumes, in units of the merge's own.
     pub bm3d_sigma_factor: f64,
 }
 
 impl QbpSettings {
-    /// The default settings before `post_filter`. Where BM3D follows, it pays to merge less: noise can still be removed,
-    /// ghosts cannot.
+    /// The default settings before `post_filter`. Where BM3D follows, it pays to merge less: noise can still
+    /// be removed, ghosts cannot.
     pub fn new(post_filter: PostFilter) -> Self {
         let wiener_c = match post_filter {
             PostFilter::None => 64.0,
@@ -129,7 +129,7 @@ impl PatchFlow {
     /// Finds the motion that [`Qbp`] goes by for frame `reference`, to measure it.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the sensor's dark rate is unknown.
+    /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.
     pub fn find(burst: BurstView<'_>, acquisition: &Acquisition, reference: usize) -> Result<Self> {
         let block_length = Qbp::new(PostFilter::None).block_length(acquisition)?;
         let counts = PreparedBurst::new(burst, acquisition);

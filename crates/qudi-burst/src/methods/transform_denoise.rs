@@ -10,7 +10,8 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
 
-/// What BM3D leaves of the variance of the noise, about (chosen on training clips, docs/notes/burst/stabilization-and-length.md).
+/// What BM3D leaves of the variance of the noise, about (chosen on training clips,
+/// docs/notes/burst/stabilization-and-length.md).
 const NOISE_LEFT: f64 = 0.05;
 
 /// BM3D on moving sums of frames.

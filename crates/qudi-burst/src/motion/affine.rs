@@ -1,8 +1,9 @@
-//! Affine maps between frames, and steps towards the one that lays a frame upon another.
+//! Affine maps between frames, and steps towards the one that aligns a frame with another.
 
 use qudi_core::{Frame, Size};
 
-/// Mean squared residual around a pixel, in the noise's variance, at which it counts a quarter; and how far that is taken from.
+/// Mean squared residual around a pixel, in the noise's variance, at which it counts a quarter; and how far
+/// that is taken from.
 const TRUST: f32 = 1.4;
 const RADIUS: usize = 2;
 
@@ -30,7 +31,8 @@ pub(crate) enum Freedom {
 /// Numbers of an affine map.
 const NUMBERS: usize = 6;
 
-/// For each coordinate its constant and its slopes along x and y; places in pixels from the centre of the image.
+/// For each coordinate its constant and its slopes along x and y; places in pixels from the centre of the
+/// image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Affine([[f32; 3]; 2]);
 
@@ -60,8 +62,9 @@ impl Affine {
         self
     }
 
-    /// `frame` laid upon the image that this maps from, bilinear between pixels; no number where it does not reach.
-    pub(crate) fn laid(self, frame: &Frame) -> Vec<f32> {
+    /// `frame` aligned with the image that this maps from, bilinear between pixels; NaN where it does not
+    /// reach.
+    pub(crate) fn aligned(self, frame: &Frame) -> Vec<f32> {
         let size = frame.size;
         let centre = centre(size);
         let value = |i: usize| {
@@ -72,9 +75,9 @@ impl Affine {
         (0..size.pixels()).map(value).collect()
     }
 
-    /// A step of Gauss and Newton (Lucas and Kanade 1981) towards the map that lays a frame upon `template`, robustly: what
-    /// moves otherwise hardly counts, however strong its contrast. `values` are the frame laid upon it by this map, both of size
-    /// `size`; nothing if they have too little in common.
+    /// A step of Gauss and Newton (Lucas and Kanade 1981) towards the map that aligns a frame with `template`,
+    /// robustly: what moves otherwise hardly counts, however strong its contrast. `values` are the frame aligned
+    /// upon it by this map, both of size `size`; nothing if they have too little in common.
     pub(crate) fn stepped(
         self,
         values: &[f32],

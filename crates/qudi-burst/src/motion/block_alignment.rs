@@ -25,7 +25,8 @@ impl BlockAligner {
         Self { block_length, pyramids: frames.par_iter().map(Pyramid::new).collect() }
     }
 
-    /// Divides the window into blocks around frame `reference`, and finds the motion of every patch to every frame.
+    /// Divides the window into blocks around frame `reference`, and finds the motion of every patch to every
+    /// frame.
     pub(crate) fn align(&self, burst: &PreparedBurst, reference: usize) -> (Blocks, PatchMotion) {
         let blocks = Blocks::around(reference, burst.frames.len(), self.block_length);
         let variance = burst.matching_variance(reference, 1.0);
@@ -51,8 +52,8 @@ impl BlockAligner {
     }
 }
 
-/// Matches the `patches` patches of the reference block in all other blocks, and interpolates their motion to all frames.
-/// `variance` is that of the difference of two matched pixels of single frames.
+/// Matches the `patches` patches of the reference block in all other blocks, and interpolates their motion to
+/// all frames. `variance` is that of the difference of two matched pixels of single frames.
 pub(crate) fn align_blocks<'a>(
     blocks: &Blocks,
     reference: usize,

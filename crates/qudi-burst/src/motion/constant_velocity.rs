@@ -50,7 +50,8 @@ impl ConstantVelocity {
     }
 }
 
-/// The velocity of patch `i` from those of the patches `time` frames later: that of the patch which it has moved to.
+/// The velocity of patch `i` from those of the patches `time` frames later: that of the patch which it has
+/// moved to.
 fn carried(grid: &Grid, velocities: &[[f32; 2]], i: usize, time: f32) -> [f32; 2] {
     let centre = grid.corner(i).map(|corner| (corner + grid.side / 2) as f32);
     let mut v = velocities[i];

@@ -1,8 +1,8 @@
 //! The camera's own motion: what most of the image does together, however unevenly.
 //!
-//! A patch of a few photons says little of its motion, the whole image a lot. Squares of the image vote on the shift from each
-//! frame to the next; then affine maps are found that lay all frames upon the mean of the others, which is far less noisy than
-//! any of them.
+//! A patch of a few photons says little of its motion, the whole image a lot. Squares of the image vote on
+//! the shift from each frame to the next; then affine maps are found that lay all frames upon the mean of the
+//! others, which is far less noisy than any of them.
 
 use super::affine::{Affine, Freedom, centre};
 use super::pyramid::{shrink, smooth};
@@ -14,8 +14,8 @@ use rayon::prelude::*;
 /// Pixels of the frames along a side of a pixel where squares vote.
 const VOTES: usize = 4;
 
-/// The same where frames are registered, coarse to fine, and what is found there. The first is coarser than that of the votes,
-/// which are wrong by some pixels where something else has more contrast.
+/// The same where frames are registered, coarse to fine, and what is found there. The first is coarser than
+/// that of the votes, which are wrong by some pixels where something else has more contrast.
 const LEVELS: [(usize, Freedom); 3] =
     [(8, Freedom::Shift), (4, Freedom::Shift), (2, Freedom::Affine)];
 
@@ -34,7 +34,7 @@ const MOST: f32 = 8.0;
 const ROUNDS: usize = 3;
 const STEPS: usize = 2;
 
-/// See the module.
+/// The motion of a whole window: one affine map from the middle frame to each frame.
 #[derive(Clone, Debug)]
 pub(crate) struct GlobalMotion {
     centre: [f32; 2],
@@ -43,8 +43,8 @@ pub(crate) struct GlobalMotion {
 }
 
 impl GlobalMotion {
-    /// Of a window's frames of mean counts, whose errors are `error` times the variance of counts; nothing if frames are too
-    /// few or too small to tell.
+    /// Of a window's frames of mean counts, whose errors are `error` times the variance of counts; nothing if
+    /// frames are too few or too small to tell.
     pub(crate) fn find(frames: &[Frame], moments: &CountMoments, error: f32) -> Option<Self> {
         let whole = frames.first()?.size;
         let size = Size { height: whole.height / VOTES, width: whole.width / VOTES };
@@ -84,7 +84,8 @@ impl GlobalMotion {
         Some(Self { centre: centre(whole), maps })
     }
 
-    /// By how much what is at `place` of frame `reference` is displaced in frame `k`, in pixels, right and down.
+    /// By how much what is at `place` of frame `reference` is displaced in frame `k`, in pixels, right and
+    /// down.
     pub(crate) fn displacement(&self, place: [f32; 2], reference: usize, k: usize) -> [f32; 2] {
         let from = [place[0] - self.centre[0], place[1] - self.centre[1]];
         let to = self.maps[k].of(self.maps[reference].inverse_of(from));
@@ -92,8 +93,8 @@ impl GlobalMotion {
     }
 }
 
-/// The shift that most of the image agrees on, to a part of a pixel. Squares vote, each by the likelihood of its counts, but
-/// within limits: what has much contrast and moves otherwise must not outvote the rest.
+/// The shift that most of the image agrees on, to a part of a pixel. Squares vote, each by the likelihood of
+/// its counts, but within limits: what has much contrast and moves otherwise must not outvote the rest.
 fn shift(here: &Frame, there: &Frame, variance: &Frame) -> [f32; 2] {
     let shifts: Vec<[isize; 2]> = (0..ACROSS * ACROSS)
         .map(|label| [label % ACROSS - FARTHEST, label / ACROSS - FARTHEST])
@@ -150,23 +151,26 @@ fn cost([here, there, variance]: [&Frame; 3], [dx, dy]: [isize; 2]) -> f32 {
 /// IJCV 56(3), 2004, but with a template that all frames make).
 fn registered(frames: &[Frame], maps: &[Affine], freedom: Freedom) -> Vec<Affine> {
     let size = frames[0].size;
-    let laid: Vec<Vec<f32>> = frames.par_iter().zip(maps).map(|(f, map)| map.laid(f)).collect();
+    let aligned: Vec<Vec<f32>> =
+        frames.par_iter().zip(maps).map(|(f, map)| map.aligned(f)).collect();
     let mut sums = vec![[0.0f32; 2]; size.pixels()];
-    for frame in &laid {
+    for frame in &aligned {
         for (sum, value) in sums.iter_mut().zip(frame).filter(|(_, value)| value.is_finite()) {
             *sum = [sum[0] + value, sum[1] + 1.0];
         }
     }
     let moved = |(k, (frame, map)): (usize, (&Frame, &Affine))| {
-        let others = sums.iter().zip(&laid[k]).map(|([sum, count], value)| {
+        let others = sums.iter().zip(&aligned[k]).map(|([sum, count], value)| {
             let own = if value.is_finite() { [*value, 1.0] } else { [0.0; 2] };
             let count = count - own[1];
             if count > 0.5 { (sum - own[0]) / count } else { f32::NAN }
         });
         let others: Vec<f32> = others.collect();
-        let Some(mut map) = map.stepped(&laid[k], &others, size, freedom) else { return *map };
+        let Some(mut map) = map.stepped(&aligned[k], &others, size, freedom) else { return *map };
         for _ in 1..STEPS {
-            let Some(next) = map.stepped(&map.laid(frame), &others, size, freedom) else { break };
+            let Some(next) = map.stepped(&map.aligned(frame), &others, size, freedom) else {
+                break;
+            };
             map = next;
         }
         map
@@ -210,7 +214,8 @@ mod tests {
         [26.0, 3.5, 1.02],
     ];
 
-    /// Frames whose counts vary as photons do, about; a dark square of a tenth of the image stays where it is.
+    /// Frames whose counts vary as photons do, about; a dark square of a tenth of the image stays where it
+    /// is.
     fn frames(moments: &CountMoments) -> Vec<Frame> {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let [cx, cy] = centre(SIZE);

@@ -21,7 +21,8 @@ impl Grid {
         Self { side, xs: corners(size.width), ys: corners(size.height) }
     }
 
-    /// Lays out the patches of alignment and merging: each overlaps the next by half (Ma et al. 2020, section 5.1).
+    /// Lays out the patches of alignment and merging: each overlaps the next by half (Ma et al. 2020, section
+    /// 5.1).
     pub(crate) fn half_overlapping(size: Size) -> Self {
         Self::new(size, SIDE, SIDE / 2)
     }
@@ -36,8 +37,8 @@ impl Grid {
         [self.xs[i % self.xs.len()], self.ys[i / self.xs.len()]]
     }
 
-    /// The upper left part, of size `to`, of a frame of size `from` that overlapping patches make, each of which fades out
-    /// towards its borders.
+    /// The upper left part, of size `to`, of a frame of size `from` that overlapping patches make, each of
+    /// which fades out towards its borders.
     pub(crate) fn blended(&self, from: Size, to: Size, patch: impl Fn(usize) -> Patch) -> Frame {
         let mut sum = Frame::filled(from, 0.0);
         let mut weights = sum.clone();

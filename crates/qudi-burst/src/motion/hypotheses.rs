@@ -1,9 +1,10 @@
-//! Selection of motion hypotheses: every patch moves as it was matched frame by frame, with constant velocity, or with
-//! most of the image, whichever the counts of all frames make most likely.
+//! Selection of motion hypotheses: every patch moves as it was matched frame by frame, with constant
+//! velocity, or with most of the image, whichever the counts of all frames make most likely.
 //!
-//! Matching reference frames repeats their errors: what they lost cannot be matched, and what they made up moves as it
-//! was merged. Counts are independent from frame to frame. A hypothesis is judged by the likelihood of all frames'
-//! counts: the patch is what the reference estimate shows plus something unknown, the same in all frames, plus noise.
+//! Matching reference frames repeats their errors: what they lost cannot be matched, and what they made up
+//! moves as it was merged. Counts are independent from frame to frame. A hypothesis is judged by the
+//! likelihood of all frames' counts: the patch is what the reference estimate shows plus something unknown,
+//! the same in all frames, plus noise.
 
 use super::constant_velocity::ConstantVelocity;
 use super::global_motion::GlobalMotion;
@@ -15,14 +16,15 @@ use crate::prepared_burst::PreparedBurst;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
-/// By how much a frame may fit worse on a selected hypothesis, in units of the noise's variance. Beyond it, something
-/// came in between, and the frame's own match is kept.
+/// By how much a frame may fit worse on a selected hypothesis, in units of the noise's variance. Beyond it,
+/// something came in between, and the frame's own match is kept.
 const WORSE: f32 = 100.0;
 
 /// Settings of the selection, which depend on what the reference's patch is known from.
 #[derive(Clone, Copy)]
 struct Settings {
-    /// Variance of one frame's noise in units of that of the reference's errors, both smoothed; 0 where nothing is known.
+    /// Variance of one frame's noise in units of that of the reference's errors, both smoothed; 0 where
+    /// nothing is known.
     known: f32,
     /// Penalty of each pixel that leaves the image, in units of the noise's variance.
     outside: f32,
@@ -37,9 +39,9 @@ impl Settings {
     const ESTIMATE: Self = Self { known: 6.0, outside: 0.1, window: 1 };
 }
 
-/// Penalties of hypotheses on reference frames, in units of the noise's variance. Reference frames hold the noise of the
-/// counts that judge hypotheses found in them, and the more freely one was found, the more of that noise it fits: then
-/// noise is merged with itself.
+/// Penalties of hypotheses on reference frames, in units of the noise's variance. Reference frames hold the
+/// noise of the counts that judge hypotheses found in them, and the more freely one was found, the more of
+/// that noise it fits: then noise is merged with itself.
 mod penalty {
     pub(crate) const MATCHED: f32 = 200.0;
     pub(crate) const CONSTANT: f32 = 200.0;
@@ -56,8 +58,8 @@ const CORRELATION: f32 = 0.8;
 /// The motion that a hypothesis gives every patch, and its penalty.
 type Hypothesis = (f32, PatchMotion);
 
-/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and global motion, by
-/// the counts alone. Without velocities the matched motion stays.
+/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and
+/// global motion, by the counts alone. Without velocities the matched motion stays.
 pub(crate) fn select_on_counts(
     burst: &PreparedBurst,
     velocity: Option<&ConstantVelocity>,
@@ -79,8 +81,9 @@ pub(crate) fn select_on_counts(
     selector.select_all(reference, &hypotheses)
 }
 
-/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and global motion, both
-/// as they are and refined on the reference frames, and rest. Without velocities the matched motion stays.
+/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and
+/// global motion, both as they are and refined on the reference frames, and rest. Without velocities the
+/// matched motion stays.
 pub(crate) fn select_on_estimates(
     burst: &PreparedBurst,
     velocity: Option<&ConstantVelocity>,
@@ -316,7 +319,7 @@ mod tests {
     /// A window of a texture that moves, and the mean counts of its frames.
     fn burst(ppp: f64, moved: impl Fn(f32) -> [f32; 2]) -> (PreparedBurst, Vec<Frame>) {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
-        let light = Light { ppp, exposure: 0.45 };
+        let light = Light { ppp, mean_level: 0.45 };
         let mut camera = Camera::new(&sensor, SIZE, light, 5).unwrap_or_else(|e| panic!("{e}"));
         let mut counts = Vec::new();
         let mut frames = Vec::new();
@@ -386,8 +389,8 @@ mod tests {
         assert!(before < 0.3 && after < before + 0.05, "{before} before, {after} px after");
     }
 
-    /// Reference frames of a scene at rest that hold a fifth of their frames' counts, smoothed: matching follows the
-    /// noise of these, which judges hypotheses, too.
+    /// Reference frames of a scene at rest that hold a fifth of their frames' counts, smoothed: matching
+    /// follows the noise of these, which judges hypotheses, too.
     #[test]
     fn noise_in_reference_frames_does_not_move_patches() {
         let moved = |_: f32| [0.0, 0.0];

@@ -1,5 +1,5 @@
-//! Refinement of patch displacements below a pixel by Lucas and Kanade's steps ("An iterative image registration
-//! technique", IJCAI 1981), and their regularization: flat patches move with their surroundings.
+//! Refinement of patch displacements below a pixel by Lucas and Kanade's steps ("An iterative image
+//! registration technique", IJCAI 1981), and their regularization: flat patches move with their surroundings.
 
 use super::grid::Grid;
 use crate::patch::{SIDE, bilinear};
@@ -20,8 +20,8 @@ const ITERATIONS: usize = 4;
 /// The farthest that refinement may move a patch in all, in pixels.
 const LONGEST: f32 = 1.0;
 
-/// Refines the displacements `starts` of all patches of the first image in the second. `variance` is that of the noise
-/// of any two pixels' difference.
+/// Refines the displacements `starts` of all patches of the first image in the second. `variance` is that of
+/// the noise of any two pixels' difference.
 pub(crate) fn refine(
     [image, there]: [&Frame; 2],
     grid: &Grid,
@@ -42,7 +42,8 @@ struct Refined {
     slopes: [f32; 3],
 }
 
-/// Takes Gauss-Newton steps towards the displacement of least squared difference, with the gradients of `image`.
+/// Takes Gauss-Newton steps towards the displacement of least squared difference, with the gradients of
+/// `image`.
 fn refine_patch(
     image: &Frame,
     there: &Frame,
@@ -87,7 +88,8 @@ fn refine_patch(
     Refined { flow: d, slopes: [xx, xy, yy] }
 }
 
-/// Draws every patch towards the median motion of its neighbourhood, as far as its own gradients leave its motion open.
+/// Draws every patch towards the median motion of its neighbourhood, as far as its own gradients leave its
+/// motion open.
 fn regularize(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> {
     let mut flow: Vec<[f32; 2]> = refined.iter().map(|patch| patch.flow).collect();
     let ridge = variance / (NEIGHBOUR_SIGMA * NEIGHBOUR_SIGMA);

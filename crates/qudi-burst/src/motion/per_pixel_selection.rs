@@ -1,5 +1,6 @@
-//! Per-pixel selection of motion: one patch has one motion, but where things move past each other it holds two. What
-//! reference frames show of a pixel's surroundings selects among the motions of the patches around it.
+//! Per-pixel selection of motion: one patch has one motion, but where things move past each other it holds
+//! two. What reference frames show of a pixel's surroundings selects among the motions of the patches around
+//! it.
 
 use super::reference_frames::ReferenceFrames;
 use crate::patch::{Patch, PatchMotion, SIDE, inside};
@@ -13,15 +14,16 @@ const RADIUS: usize = 2;
 /// Motions less than so many pixels apart in both components are one.
 const SAME: f32 = 0.4;
 
-/// By how much any other motion must fit better than the patch's own, in the variance of the noise of two pixels' difference: where all
-/// fit, noise would choose.
+/// By how much any other motion must fit better than the patch's own, in the variance of the noise of two
+/// pixels' difference: where all fit, noise would choose.
 const RELUCTANCE: f32 = 0.1;
 
 /// Pixels of a square.
 const AREA: f32 = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as f32;
 
-/// Warps the counts of frame `k`, and its estimate, onto the reference pixel by pixel along whichever motion in `motions`,
-/// of the patch or of those around it, makes the estimates the most alike. The first motion is kept where all fit.
+/// Warps the counts of frame `k`, and its estimate, onto the reference pixel by pixel along whichever motion
+/// in `motions`, of the patch or of those around it, makes the estimates the most alike. The first motion is
+/// kept where all fit.
 pub(crate) fn per_pixel_selection(
     burst: &PreparedBurst,
     references: &ReferenceFrames,
@@ -135,7 +137,8 @@ mod tests {
 
     const SIZE: Size = Size { height: 64, width: 80 };
 
-    /// Mean counts of two textures: the right one rests, the left one comes before it, three pixels per frame.
+    /// Mean counts of two textures: the right one rests, the left one comes before it, three pixels per
+    /// frame.
     fn scene(t: usize) -> Frame {
         Frame::from_fn(SIZE, |x, y| {
             let (x, y) = (x as f32, y as f32);
@@ -146,7 +149,8 @@ mod tests {
         })
     }
 
-    /// Errors of frame 1 warped onto frame 4 by patches and by pixels, if patches left of `border` move with the front.
+    /// Errors of frame 1 warped onto frame 4 by patches and by pixels, if patches left of `border` move with
+    /// the front.
     fn errors(border: usize) -> [f32; 2] {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
@@ -174,7 +178,8 @@ mod tests {
         })
     }
 
-    /// In frame 4 the border lies at 32; patches up to half a patch beyond are said to move with the front, too.
+    /// In frame 4 the border lies at 32; patches up to half a patch beyond are said to move with the front,
+    /// too.
     #[test]
     fn pixels_at_a_motion_border_move_on_their_own() {
         for border in [32, 40] {

@@ -1,5 +1,5 @@
-//! Estimates of all frames of a window, on which motion is found once more: they show far better than noisy counts where
-//! things are, and what does not fit.
+//! Estimates of all frames of a window, on which motion is found once more: they show far better than noisy
+//! counts where things are, and what does not fit.
 
 use super::block_alignment::align_blocks;
 use super::global_motion::GlobalMotion;
@@ -12,8 +12,8 @@ use qudi_core::Frame;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Variance of the frames' errors when global motion is found, in units of the counts' variance. It is small because
-/// global motion goes by squares of many pixels.
+/// Variance of the frames' errors when global motion is found, in units of the counts' variance. It is small
+/// because global motion goes by squares of many pixels.
 const GLOBAL_MOTION_ERROR: f32 = 0.05;
 
 /// Estimates of the mean counts of all frames of a window.
@@ -30,7 +30,8 @@ pub(crate) struct ReferenceFrames {
 }
 
 impl ReferenceFrames {
-    /// Prepares estimates of the mean counts of `burst`, whose errors are `error_variance` times the counts' variance.
+    /// Prepares estimates of the mean counts of `burst`, whose errors are `error_variance` times the counts'
+    /// variance.
     pub(crate) fn new(burst: &PreparedBurst, frames: Vec<Frame>, error_variance: f32) -> Self {
         let pyramids = frames.par_iter().map(Pyramid::new).collect();
         let global_motion = GlobalMotion::find(&frames, &burst.moments, GLOBAL_MOTION_ERROR);
@@ -45,8 +46,8 @@ impl ReferenceFrames {
         align_blocks(&blocks, reference, variance, burst.grid.len(), pyramid)
     }
 
-    /// Samples patch `i` of `image`, displaced by `d`, with cubic convolution. Where it has left the image, it shows the
-    /// estimate of frame `reference`.
+    /// Samples patch `i` of `image`, displaced by `d`, with cubic convolution. Where it has left the image,
+    /// it shows the estimate of frame `reference`.
     pub(crate) fn sample(
         &self,
         burst: &PreparedBurst,

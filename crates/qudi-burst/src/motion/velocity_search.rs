@@ -1,10 +1,11 @@
 //! Search for the constant velocity that the counts of all frames agree on.
 //!
-//! Two frames of a few photons say little of how a faint texture moves from one to the other. Along the right path, though,
-//! all frames of a window show the same, and differ by noise alone. Of all velocities on a lattice every patch takes the
-//! one along which the frames vary least, and neighbours help each other: semi-global matching (Hirschmüller, "Stereo
-//! processing by semiglobal matching and mutual information", IEEE TPAMI 30(2), 2008, eq. 13) with velocities for
-//! disparities. What is found is exhaustive and knows no start, unlike a search from coarse to fine.
+//! Two frames of a few photons say little of how a faint texture moves from one to the other. Along the right
+//! path, though, all frames of a window show the same, and differ by noise alone. Of all velocities on a
+//! lattice every patch takes the one along which the frames vary least, and neighbours help each other:
+//! semi-global matching (Hirschmüller, "Stereo processing by semiglobal matching and mutual information",
+//! IEEE TPAMI 30(2), 2008, eq. 13) with velocities for disparities. What is found is exhaustive and knows no
+//! start, unlike a search from coarse to fine.
 
 use super::grid::Grid;
 use super::pyramid::shrink;
@@ -24,14 +25,17 @@ const VELOCITIES: usize = ACROSS * ACROSS;
 /// Pixels here around a patch's centre, to either side, that decide for it.
 const RADIUS: usize = 2;
 
-/// Nats of a mean excess of one variance over those pixels: half of them for each that noise leaves independent.
+/// Nats of a mean excess of one variance over those pixels: half of them for each that noise leaves
+/// independent.
 const NATS: f32 = 1.0 / 3.0;
 
-/// Price in nats of the next velocity of the lattice, and of any other, from one patch to its neighbour (`P1` and `P2` there).
+/// Price in nats of the next velocity of the lattice, and of any other, from one patch to its neighbour (`P1`
+/// and `P2` there).
 const NEXT: f32 = 1.0;
 const ANY: f32 = 6.0;
 
-/// Variance that the filter 1 2 1 leaves of white noise along a side, and the correlation of neighbours after it.
+/// Variance that the filter 1 2 1 leaves of white noise along a side, and the correlation of neighbours after
+/// it.
 const LEFT: f32 = 0.375;
 const CORRELATION: f32 = 2.0 / 3.0;
 
@@ -61,7 +65,8 @@ impl VelocitySearch {
         Self { frames, variance, size }
     }
 
-    /// The velocity of every patch of frame `reference`, in the pixels of the frames per frame, right and down.
+    /// The velocity of every patch of frame `reference`, in the pixels of the frames per frame, right and
+    /// down.
     pub(crate) fn velocities(&self, grid: &Grid, reference: usize) -> Vec<[f32; 2]> {
         let places: Vec<[usize; 2]> = (0..grid.len())
             .map(|i| grid.corner(i).map(|corner| (corner + grid.side / 2) / SHRINK))
@@ -176,7 +181,8 @@ impl Shift {
     }
 }
 
-/// What every velocity costs every patch, `[patch][label]`, when neighbours have their say, from left, right, above and below.
+/// What every velocity costs every patch, `[patch][label]`, when neighbours have their say, from left, right,
+/// above and below.
 fn matched(cost: &[Vec<f32>], columns: usize) -> Vec<Vec<f32>> {
     let rows = cost.len() / columns;
     let across = |y: usize| (0..columns).map(move |x| y * columns + x).collect::<Vec<_>>();
@@ -281,7 +287,7 @@ mod tests {
             0.45 + 0.04 * wave + 0.03 * (0.41 * (x - y)).cos()
         };
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
-        let light = Light { ppp: 3.25, exposure: 0.45 };
+        let light = Light { ppp: 3.25, mean_level: 0.45 };
         let mut camera = Camera::new(&sensor, size, light, 5).unwrap_or_else(|e| panic!("{e}"));
         let frames: Vec<Frame> = (0..11u8)
             .map(|k| {

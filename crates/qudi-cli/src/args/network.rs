@@ -16,8 +16,9 @@ pub(crate) struct Network {
     /// Weights that `qudi train` wrote [default: those that come along]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) weights: Option<PathBuf>,
-    /// Reverse diffusion steps. With 0 the frames are a regression: fastest, and closest to the truth on average. More steps
-    /// draw sharper pictures, whose details are invented; the paper takes 10 [default: what the weights say of themselves]
+    /// Reverse diffusion steps. With 0 the frames are a regression: fastest, and closest to the truth on
+    /// average. More steps draw sharper pictures, whose details are invented; the paper takes 10 [default:
+    /// what the weights say of themselves]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
     steps: Option<usize>,
     /// Spacing of the timesteps of these steps [default: log-logistic]
@@ -29,11 +30,12 @@ pub(crate) struct Network {
     /// Samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
     #[arg(long, value_name = "K", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
-    /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info --devices`)
-    /// [default: auto]
+    /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info
+    /// --devices`) [default: auto]
     #[arg(long, value_name = "NAME")]
     device: Option<String>,
-    /// Side of the tiles that the network sees at once, in pixels: memory grows with its square [default: 512]
+    /// Side of the tiles that the network sees at once, in pixels: memory grows with its square [default:
+    /// 512]
     #[arg(long, value_name = "PIXELS", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1 << 16))]
     tile: Option<usize>,
 }

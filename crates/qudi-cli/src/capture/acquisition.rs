@@ -1,8 +1,8 @@
 //! The acquisition of a capture: its light from overrides, the record, or the counts.
 
 use crate::error::{CliError, Result};
-use qudi_core::USUAL_EXPOSURE;
-use qudi_core::fitting_exposure;
+use qudi_core::USUAL_MEAN_LEVEL;
+use qudi_core::fitting_mean_level;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::LONGEST_HALF;
@@ -16,7 +16,7 @@ pub(crate) struct LightOverrides {
     /// DN/e-.
     pub(crate) gain: Option<f64>,
     /// Image value that receives `ppp` photons, unless the capture is to tell.
-    pub(crate) exposure: Option<f64>,
+    pub(crate) mean_level: Option<f64>,
     pub(crate) seed: u64,
 }
 
@@ -26,7 +26,7 @@ pub(crate) fn acquisition(
     capture: &mut Capture,
     sensor: &Sensor,
 ) -> Result<(Acquisition, &'static str)> {
-    checked_exposure(overrides.exposure)?;
+    checked_mean_level(overrides.mean_level)?;
     let of_frames = capture.output_sensor(sensor)?;
     let recorded = capture.info().ppp.map(|ppp| ppp * f64::from(capture.summed()));
     let known_gain = overrides.gain.or(capture.info().gain);
@@ -65,23 +65,23 @@ pub(crate) fn acquisition(
         seed: overrides.seed,
         first_frame: 0,
         ppp,
-        exposure: USUAL_EXPOSURE,
+        mean_level: USUAL_MEAN_LEVEL,
         sensor: of_frames,
         gain,
         dark,
     };
-    acquisition.exposure = match overrides.exposure {
-        Some(exposure) => exposure,
-        None => exposure_of(capture, &acquisition)?,
+    acquisition.mean_level = match overrides.mean_level {
+        Some(mean_level) => mean_level,
+        None => mean_level_of(capture, &acquisition)?,
     };
     Ok((acquisition, source))
 }
 
 /// What the user says of the exposure, if it can be.
-pub(crate) fn checked_exposure(exposure: Option<f64>) -> Result<()> {
-    match exposure {
-        Some(exposure) if !(exposure.is_finite() && exposure > 0.0) => Err(CliError::new(
-            format!("an exposure of {exposure}"),
+pub(crate) fn checked_mean_level(mean_level: Option<f64>) -> Result<()> {
+    match mean_level {
+        Some(mean_level) if !(mean_level.is_finite() && mean_level > 0.0) => Err(CliError::new(
+            format!("an exposure of {mean_level}"),
             "--exposure",
             "give the mean image value, between 0 and 1",
         )),
@@ -90,7 +90,7 @@ pub(crate) fn checked_exposure(exposure: Option<f64>) -> Result<()> {
 }
 
 /// What the capture says of it.
-fn exposure_of(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
+fn mean_level_of(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
     let size = capture.size();
     // Pipes have shown their first frames only.
     let first = 2 * LONGEST_HALF as u64 + 1;
@@ -101,5 +101,5 @@ fn exposure_of(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> 
         capture.read(frame, &mut counts)?;
         Ok(counts)
     };
-    Ok(fitting_exposure(size, frames, acquisition, read)?)
+    Ok(fitting_mean_level(size, frames, acquisition, read)?)
 }

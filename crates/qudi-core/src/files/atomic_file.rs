@@ -1,6 +1,6 @@
 //! Unfinished files and folders; dropped before `finish`, they leave nothing behind.
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -31,10 +31,10 @@ fn parent(path: &Path) -> &Path {
 /// Refuses a name that is taken, before any work is done for it.
 ///
 /// # Errors
-/// [`SimError::Data`] if it exists and may not be overwritten.
+/// [`Error::Data`] if it exists and may not be overwritten.
 pub fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
     if overwrite == Overwrite::No && path.symlink_metadata().is_ok() {
-        return Err(SimError::data(
+        return Err(Error::data(
             "the output exists already",
             path,
             "choose another name, or overwrite it with `force`",
@@ -47,11 +47,11 @@ impl PendingFile {
     /// Starts a file beside where it will be.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken or the folder cannot be written.
+    /// [`Error`] if the name is taken or the folder cannot be written.
     pub fn create(path: &Path, overwrite: Overwrite) -> Result<Self> {
         refuse_taken(path, overwrite)?;
         if path.is_dir() {
-            return Err(SimError::data("the output is a folder", path, "name a file"));
+            return Err(Error::data("the output is a folder", path, "name a file"));
         }
         let mut builder = tempfile::Builder::new();
         builder.prefix(".qudi-").suffix(".tmp");
@@ -60,7 +60,7 @@ impl PendingFile {
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
         let file = builder
             .tempfile_in(parent(path))
-            .map_err(|e| SimError::io("create the output", path, e))?;
+            .map_err(|e| Error::io("create the output", path, e))?;
         Ok(Self {
             writer: BufWriter::with_capacity(1 << 18, file),
             path: path.to_owned(),
@@ -71,7 +71,7 @@ impl PendingFile {
     /// Writes a file whose bytes are all there.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken, or the file cannot be written.
+    /// [`Error`] if the name is taken, or the file cannot be written.
     pub fn write_whole(path: &Path, bytes: &[u8], overwrite: Overwrite) -> Result<()> {
         let mut file = Self::create(path, overwrite)?;
         file.write_all(bytes).map_err(|e| file.fault(e))?;
@@ -84,8 +84,8 @@ impl PendingFile {
     }
 
     /// Wraps an error of writing into this file.
-    pub fn fault(&self, e: std::io::Error) -> SimError {
-        SimError::io("write", &self.path, e)
+    pub fn fault(&self, e: std::io::Error) -> Error {
+        Error::io("write", &self.path, e)
     }
 
     /// The open file, everything written so far flushed to it.
@@ -100,10 +100,10 @@ impl PendingFile {
     /// Flushes to disk and gives the file its name.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full or the folder is gone.
+    /// [`Error::Io`] if the disk is full or the folder is gone.
     pub fn finish(self) -> Result<()> {
         let path = self.path;
-        let fault = |e: std::io::Error| SimError::io("write", &path, e);
+        let fault = |e: std::io::Error| Error::io("write", &path, e);
         let file = self.writer.into_inner().map_err(|e| fault(e.into_error()))?;
         file.as_file().sync_all().map_err(fault)?;
         // Whoever took the name since the start keeps it.
@@ -144,12 +144,12 @@ impl OwnFolder {
     /// Refuses a folder at `path` that holds anything else. An empty one is fine.
     ///
     /// # Errors
-    /// [`SimError`] that names a foreign file.
+    /// [`Error`] that names a foreign file.
     fn check(&self, path: &Path) -> Result<()> {
-        let list = |e| SimError::io("list the output", path, e);
+        let list = |e| Error::io("list the output", path, e);
         let help = "choose another name, or remove it yourself";
         if !path.is_dir() {
-            return Err(SimError::data("the output exists and is not a folder", path, help));
+            return Err(Error::data("the output exists and is not a folder", path, help));
         }
         let mut marked = false;
         let mut entries = 0;
@@ -158,7 +158,7 @@ impl OwnFolder {
             let name = entry.file_name().to_string_lossy().into_owned();
             let is_file = entry.file_type().map_err(list)?.is_file();
             if !is_file || !(name == self.marker || (self.is_own_file)(&name)) {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!("the output holds `{name}`, which this program did not write"),
                     path,
                     "choose another name, or move that file away",
@@ -171,7 +171,7 @@ impl OwnFolder {
             return Ok(());
         }
         let marker = self.marker;
-        Err(SimError::data(
+        Err(Error::data(
             format!("the output exists and was not made by this program (no {marker} in it)"),
             path,
             help,
@@ -189,11 +189,11 @@ pub struct PendingFolder {
 }
 
 impl PendingFolder {
-    /// Starts a folder beside where it will be. A folder is overwritten only if all its files are of `own`, or if it
-    /// is empty.
+    /// Starts a folder beside where it will be. A folder is overwritten only if all its files are of `own`,
+    /// or if it is empty.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken or the parent folder cannot be written.
+    /// [`Error`] if the name is taken or the parent folder cannot be written.
     pub fn create(path: &Path, overwrite: Overwrite, own: OwnFolder) -> Result<Self> {
         refuse_taken(path, overwrite)?;
         if path.symlink_metadata().is_ok() {
@@ -205,7 +205,7 @@ impl PendingFolder {
         builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
         let folder = builder
             .tempdir_in(parent(path))
-            .map_err(|e| SimError::io("create the output", path, e))?;
+            .map_err(|e| Error::io("create the output", path, e))?;
         Ok(Self { folder, path: path.to_owned(), overwrite, own })
     }
 
@@ -222,9 +222,9 @@ impl PendingFolder {
     /// Gives the folder its name.
     ///
     /// # Errors
-    /// [`SimError::Io`] if that fails.
+    /// [`Error::Io`] if that fails.
     pub fn finish(self) -> Result<()> {
-        let fault = |e| SimError::io("rename the finished folder to", &self.path, e);
+        let fault = |e| Error::io("rename the finished folder to", &self.path, e);
         if self.overwrite == Overwrite::Yes && self.path.is_dir() {
             // Something else may have been put there since the start.
             self.own.check(&self.path)?;

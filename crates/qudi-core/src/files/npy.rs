@@ -2,7 +2,7 @@
 //!
 //! Nothing is allocated from a header before the sizes it claims are checked against the file.
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::frame::{Frame, Size};
 use crate::limits::ARRAY_HEADER_BYTES;
 use crate::regular_file::open_regular;
@@ -133,10 +133,10 @@ impl Header {
     /// Reads a header from `reader`; `path` is for messages.
     ///
     /// # Errors
-    /// [`SimError::Data`] if it is no `.npy` of a supported type.
+    /// [`Error::Data`] if it is no `.npy` of a supported type.
     pub fn read(reader: &mut impl Read, path: &Path) -> Result<Self> {
         let fault = |what: &str| {
-            SimError::data(
+            Error::data(
                 what,
                 path,
                 "write it with numpy.save, as booleans, integers, float32 or float64",
@@ -144,7 +144,7 @@ impl Header {
         };
         let ended = |e: std::io::Error| match e.kind() {
             std::io::ErrorKind::UnexpectedEof => fault("the file ends inside its .npy header"),
-            _ => SimError::io("read the .npy header", path, e),
+            _ => Error::io("read the .npy header", path, e),
         };
         let mut start = [0u8; 10];
         reader.read_exact(&mut start).map_err(ended)?;
@@ -177,12 +177,12 @@ impl Header {
     /// Refuses arrays whose first axis is the fastest.
     ///
     /// # Errors
-    /// [`SimError::Data`] naming `path`.
+    /// [`Error::Data`] naming `path`.
     pub fn require_c_order(&self, path: &Path) -> Result<()> {
         if !self.fortran {
             return Ok(());
         }
-        Err(SimError::data(
+        Err(Error::data(
             "the array is in Fortran order",
             path,
             "save it as numpy.save(NAME, numpy.ascontiguousarray(array))",
@@ -198,9 +198,9 @@ impl Header {
     /// Opens a file and checks that it holds all the data its header promises.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read, is malformed, or is too short.
+    /// [`Error`] if it cannot be read, is malformed, or is too short.
     pub fn open(path: &Path) -> Result<(Self, BufReader<File>)> {
-        let io = |e| SimError::io("open the file", path, e);
+        let io = |e| Error::io("open the file", path, e);
         let file = open_regular(path, "open the file")?;
         let length = file.metadata().map_err(io)?.len();
         let mut reader = BufReader::with_capacity(1 << 16, file);
@@ -208,14 +208,14 @@ impl Header {
         let there = length - header.data_start.min(length);
         match header.data_bytes() {
             Some(promised) if promised <= there => Ok((header, reader)),
-            Some(promised) => Err(SimError::data(
+            Some(promised) => Err(Error::data(
                 format!(
                     "the file is truncated: its header promises {promised} bytes of data, it holds {there}"
                 ),
                 path,
                 "copy or export it again",
             )),
-            None => Err(SimError::data(
+            None => Err(Error::data(
                 format!("its header claims an impossible shape, {:?}", header.shape),
                 path,
                 "the file is damaged: export it again",
@@ -270,11 +270,11 @@ pub fn write_header(out: &mut impl Write, descr: &str, shape: &[usize]) -> std::
 /// Reads a two-dimensional `.npy` in C or Fortran order, values as they are.
 ///
 /// # Errors
-/// [`SimError`] if it cannot be read or has another number of dimensions.
+/// [`Error`] if it cannot be read or has another number of dimensions.
 pub fn read_image(path: &Path) -> Result<Frame> {
     let (header, mut reader) = Header::open(path)?;
     let &[height, width] = header.shape.as_slice() else {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("an array of shape {:?} where one image is expected", header.shape),
             path,
             "save an array of shape (height, width)",
@@ -282,7 +282,7 @@ pub fn read_image(path: &Path) -> Result<Frame> {
     };
     let size = Size::new(height, width, &path.display().to_string())?;
     let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
-    reader.read_exact(&mut bytes).map_err(|e| SimError::io("read the data", path, e))?;
+    reader.read_exact(&mut bytes).map_err(|e| Error::io("read the data", path, e))?;
     let length = header.sample.bytes();
     let value = |at: usize| header.sample.decode(&bytes[at * length..][..length]);
     // In Fortran order columns come one after the other.
@@ -295,14 +295,14 @@ pub fn read_image(path: &Path) -> Result<Frame> {
 /// outside [0, 1]; bytes and words relative to full scale.
 ///
 /// # Errors
-/// [`SimError`] if it cannot be read, has other axes, or holds values that are not finite.
+/// [`Error`] if it cannot be read, has other axes, or holds values that are not finite.
 pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
     let (header, mut reader) = Header::open(path)?;
     header.require_c_order(path)?;
     let (&[frames, height, width], Some(full)) =
         (header.shape.as_slice(), header.sample.full_scale())
     else {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!(
                 "an array of shape {:?}, or of wide integers, where a clip is expected",
                 header.shape
@@ -315,15 +315,11 @@ pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
     let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
     let mut clip = Vec::new();
     for _ in 0..frames.min(most) {
-        reader.read_exact(&mut bytes).map_err(|e| SimError::io("read a frame", path, e))?;
+        reader.read_exact(&mut bytes).map_err(|e| Error::io("read a frame", path, e))?;
         let samples = bytes.chunks_exact(header.sample.bytes());
         let data: Vec<f32> = samples.map(|b| header.sample.decode(b) / full).collect();
         if let Some(bad) = data.iter().find(|v| !v.is_finite()) {
-            return Err(SimError::data(
-                format!("a value of {bad}"),
-                path,
-                "replace missing values",
-            ));
+            return Err(Error::data(format!("a value of {bad}"), path, "replace missing values"));
         }
         clip.push(Frame { size, data });
     }

@@ -1,6 +1,6 @@
 //! Files that end: devices and pipes in their place would be read for ever, or waited for.
 
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -8,14 +8,14 @@ use std::path::Path;
 /// Refuses anything that is no regular file, without opening it: opening a named pipe waits for a writer.
 ///
 /// # Errors
-/// [`SimError`] if there is nothing, or a folder, a device, a pipe or a socket.
+/// [`Error`] if there is nothing, or a folder, a device, a pipe or a socket.
 pub fn require_regular(path: &Path, action: &str) -> Result<u64> {
-    let about = std::fs::metadata(path).map_err(|e| SimError::io(action, path, e))?;
+    let about = std::fs::metadata(path).map_err(|e| Error::io(action, path, e))?;
     if about.is_dir() {
-        return Err(SimError::io(action, path, std::io::ErrorKind::IsADirectory.into()));
+        return Err(Error::io(action, path, std::io::ErrorKind::IsADirectory.into()));
     }
     if !about.is_file() {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("cannot {action}: not a regular file"),
             path,
             "copy its contents into a file first",
@@ -27,20 +27,20 @@ pub fn require_regular(path: &Path, action: &str) -> Result<u64> {
 /// Opens a regular file; `action` says what for, as in "open the GIF".
 ///
 /// # Errors
-/// [`SimError`] if it is no regular file or cannot be opened.
+/// [`Error`] if it is no regular file or cannot be opened.
 pub fn open_regular(path: &Path, action: &str) -> Result<File> {
     require_regular(path, action)?;
-    File::open(path).map_err(|e| SimError::io(action, path, e))
+    File::open(path).map_err(|e| Error::io(action, path, e))
 }
 
 /// Reads a regular file of at most `limit` bytes.
 ///
 /// # Errors
-/// [`SimError`] if it is no regular file, is larger, or cannot be read.
+/// [`Error`] if it is no regular file, is larger, or cannot be read.
 pub fn read_limited(path: &Path, limit: u64, action: &str) -> Result<Vec<u8>> {
     let length = require_regular(path, action)?;
     let too_large = |length: u64| {
-        SimError::data(
+        Error::data(
             format!("cannot {action}: {length} bytes are over the limit of {limit}"),
             path,
             "check that it is the right file",
@@ -49,7 +49,7 @@ pub fn read_limited(path: &Path, limit: u64, action: &str) -> Result<Vec<u8>> {
     if length > limit {
         return Err(too_large(length));
     }
-    let io = |e| SimError::io(action, path, e);
+    let io = |e| Error::io(action, path, e);
     let mut bytes = Vec::with_capacity(length as usize);
     let file = File::open(path).map_err(io)?;
     // Files of /proc claim no length, and others grow while they are read.
@@ -63,14 +63,10 @@ pub fn read_limited(path: &Path, limit: u64, action: &str) -> Result<Vec<u8>> {
 /// Reads a regular text file of at most `limit` bytes.
 ///
 /// # Errors
-/// [`SimError`] as [`read_limited`], or if it is not UTF-8.
+/// [`Error`] as [`read_limited`], or if it is not UTF-8.
 pub fn read_text(path: &Path, limit: u64, action: &str) -> Result<String> {
     String::from_utf8(read_limited(path, limit, action)?).map_err(|_| {
-        SimError::data(
-            format!("cannot {action}: not a text file"),
-            path,
-            "save it as text in UTF-8",
-        )
+        Error::data(format!("cannot {action}: not a text file"), path, "save it as text in UTF-8")
     })
 }
 

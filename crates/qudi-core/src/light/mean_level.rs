@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::frame::Size;
-use crate::light::USUAL_EXPOSURE;
+use crate::light::USUAL_MEAN_LEVEL;
 use crate::restorer::{Acquisition, BurstView};
 use crate::sensor::{CountLaw, Response};
 use crate::windows::LONGEST_HALF;
@@ -20,15 +20,15 @@ const BRIGHTER: usize = 1000;
 /// The image value of the brightest square that counts: details smaller than a square are brighter still.
 const BRIGHT: f64 = 0.75;
 
-/// The image value that should receive `acquisition.ppp` photons: [`USUAL_EXPOSURE`], or less where parts of the
-/// scene would be brighter than white.
+/// The image value that should receive `acquisition.ppp` photons: [`USUAL_MEAN_LEVEL`], or less where parts
+/// of the scene would be brighter than white.
 ///
-/// `acquisition.exposure` is not used. `read` is asked for the first, the middle and the last 11 of `frames`
-/// frames, in this order.
+/// `acquisition.mean_level` is not used. `read` is asked for the first, the middle and the last 11 of
+/// `frames` frames, in this order.
 ///
 /// # Errors
-/// [`SimError`](crate::SimError) if the sensor's dark rate is unknown, and what `read` returns.
-pub fn fitting_exposure(
+/// [`Error`](crate::Error) if the sensor's dark rate is unknown, and what `read` returns.
+pub fn fitting_mean_level(
     size: Size,
     frames: u64,
     acquisition: &Acquisition,
@@ -37,13 +37,13 @@ pub fn fitting_exposure(
     let length = frames.min(2 * LONGEST_HALF as u64 + 1);
     let mut starts = vec![0, (frames - length) / 2, frames - length];
     starts.dedup();
-    let mut exposure = USUAL_EXPOSURE;
+    let mut mean_level = USUAL_MEAN_LEVEL;
     for start in starts {
         let frames = (start..start + length).map(&mut read).collect::<Result<Vec<_>>>()?;
         let bright = brightest(BurstView { size, frames: &frames }, acquisition)?;
-        exposure = exposure.min(BRIGHT * acquisition.ppp / bright.max(f64::MIN_POSITIVE));
+        mean_level = mean_level.min(BRIGHT * acquisition.ppp / bright.max(f64::MIN_POSITIVE));
     }
-    Ok(exposure)
+    Ok(mean_level)
 }
 
 /// Photons per pixel and frame that a thousandth of the squares exceed.
@@ -78,7 +78,8 @@ fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
     if acquisition.sensor.response == Response::Binary {
         return Ok(flux);
     }
-    // Full scale cuts off bright counts. The law corrects that, but takes seconds for all squares of deep counts.
+    // Full scale cuts off bright counts. The law corrects that, but takes seconds for all squares of deep
+    // counts.
     let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
     Ok((law.detections_for_mean(mean) - dark) / acquisition.sensor.quantum_efficiency)
 }
@@ -97,10 +98,10 @@ mod tests {
     /// The exposure found for a scene whose mean gets `ppp` photons, every `hot`-th pixel at full scale.
     fn estimated(scene: &Frame, sensor: &str, ppp: f64, hot: usize) -> f64 {
         let sensor = Sensor::load(sensor).unwrap();
-        let light = Light { ppp, exposure: scene.mean() };
+        let light = Light { ppp, mean_level: scene.mean() };
         let mut camera = Camera::new(&sensor, SIZE, light, 5).unwrap();
         let acquisition = Acquisition::new(sensor, ppp, f64::NAN).unwrap();
-        fitting_exposure(SIZE, 30, &acquisition, |t| {
+        fitting_mean_level(SIZE, 30, &acquisition, |t| {
             let mut counts = camera.expose(t, &[scene])?;
             counts
                 .iter_mut()
@@ -119,20 +120,23 @@ mod tests {
     #[test]
     fn chooses_the_usual_exposure_where_the_scene_fits() {
         let even = Frame::from_fn(SIZE, |x, _| 0.5 + 0.004 * x as f32);
-        assert_eq!(estimated(&even, "qudi-paper", 3.25, usize::MAX), USUAL_EXPOSURE);
-        assert_eq!(estimated(&even, "spad512s", 0.3, usize::MAX), USUAL_EXPOSURE);
+        assert_eq!(estimated(&even, "qudi-paper", 3.25, usize::MAX), USUAL_MEAN_LEVEL);
+        assert_eq!(estimated(&even, "spad512s", 0.3, usize::MAX), USUAL_MEAN_LEVEL);
         // Hot pixels are not the scene's.
-        assert_eq!(estimated(&even, "spad512s", 0.05, 131), USUAL_EXPOSURE);
+        assert_eq!(estimated(&even, "spad512s", 0.05, 131), USUAL_MEAN_LEVEL);
     }
 
     #[test]
     fn keeps_the_brightest_squares_below_white() {
         for (sensor, ppp) in [("qudi-paper", 2.0), ("qudi-paper", 26.0), ("spad512s", 2.0)] {
-            // The scene's mean is 0.467 where its brightest is 1; the exposure does not depend on the scale, and
-            // is 0.35 but for the noise of the brightest square.
+            // The scene's mean is 0.467 where its brightest is 1; the exposure does not depend on the scale,
+            // and is 0.35 but for the noise of the brightest square.
             for brightest in [1.0, 0.2] {
-                let exposure = estimated(&lamp(brightest), sensor, ppp, usize::MAX);
-                assert!((0.29..0.37).contains(&exposure), "{sensor} {ppp} {brightest}: {exposure}");
+                let mean_level = estimated(&lamp(brightest), sensor, ppp, usize::MAX);
+                assert!(
+                    (0.29..0.37).contains(&mean_level),
+                    "{sensor} {ppp} {brightest}: {mean_level}"
+                );
             }
         }
     }

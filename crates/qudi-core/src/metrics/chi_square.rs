@@ -30,7 +30,7 @@ impl Consistency {
     /// Compares one frame with its counts, and gives its own mean.
     ///
     /// # Errors
-    /// [`SimError`](crate::SimError) if the sensor's dark rate is unknown.
+    /// [`Error`](crate::Error) if the sensor's dark rate is unknown.
     pub fn add(
         &mut self,
         restored: &Frame,

@@ -3,7 +3,7 @@
 //! The pattern belongs to the camera, not to the capture: it is drawn from its own `seed`.
 
 use super::{DarkRate, Response, Sensor};
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::frame::Size;
 use crate::random::{Domain, Streams, uniform};
 use rand_distr::{Distribution, StandardNormal};
@@ -98,7 +98,7 @@ impl PixelMaps {
     /// Mean dark electrons per pixel and output frame over the array.
     ///
     /// # Errors
-    /// [`SimError::Sensor`] if the sensor's rate is per second and its frame rate unknown.
+    /// [`Error::Sensor`] if the sensor's rate is per second and its frame rate unknown.
     pub fn mean_dark(&self, sensor: &Sensor) -> Result<f64> {
         let Some(map) = &self.dark else { return sensor.dark_per_frame() };
         let sum: f64 = map.iter().map(|&d| f64::from(d)).sum();
@@ -108,7 +108,7 @@ impl PixelMaps {
     /// Draws the pattern of `sensor` for an array of `size`.
     ///
     /// # Errors
-    /// [`SimError`] if the sensor's dark map cannot be read or has another size.
+    /// [`Error`] if the sensor's dark map cannot be read or has another size.
     pub fn draw(sensor: &Sensor, size: Size) -> Result<Self> {
         let defects = &sensor.defects;
         let median = sensor.per_native_frame(sensor.dark, "dark")?;
@@ -148,14 +148,14 @@ fn read_dark_map(file: &str, size: Size) -> Result<Vec<f32>> {
     let path = std::path::Path::new(file);
     let map = crate::npy::read_image(path)?;
     if map.size != size {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("a dark map of {} for frames of {size}", map.size),
             path,
             "use a map of the same array, or crop it to the frames",
         ));
     }
     if let Some(bad) = map.data.iter().find(|v| !(v.is_finite() && **v >= 0.0)) {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("a dark rate of {bad}"),
             path,
             "dark rates are finite and not negative, in electrons per pixel and frame",

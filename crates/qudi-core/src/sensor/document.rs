@@ -1,7 +1,7 @@
 //! Sensor files: TOML, alone or on top of a preset (`base = "swissspad2"`).
 
 use super::{PRESETS, Sensor, preset};
-use crate::error::{Result, SimError};
+use crate::error::{Error, Result};
 use crate::limits::TEXT_BYTES;
 use crate::regular_file::read_text;
 use serde_json::Value;
@@ -11,7 +11,7 @@ impl Sensor {
     /// A preset by name, or a TOML file by path.
     ///
     /// # Errors
-    /// [`SimError`] if there is no such preset or file, or if it describes no possible sensor.
+    /// [`Error`] if there is no such preset or file, or if it describes no possible sensor.
     pub fn load(name_or_path: &str) -> Result<Self> {
         Self::from_document(load_document(name_or_path)?, name_or_path)
     }
@@ -19,9 +19,9 @@ impl Sensor {
     /// A sensor from its document, checked.
     ///
     /// # Errors
-    /// [`SimError::Sensor`] for unknown keys, missing keys, wrong types and impossible values.
+    /// [`Error::Sensor`] for unknown keys, missing keys, wrong types and impossible values.
     pub fn from_document(document: Value, place: &str) -> Result<Self> {
-        let sensor: Self = serde_json::from_value(document).map_err(|e| SimError::Sensor {
+        let sensor: Self = serde_json::from_value(document).map_err(|e| Error::Sensor {
             what: e.to_string(),
             place: place.to_owned(),
             help: "`qudi info SENSOR` shows every key; `base = \"qudi-paper\"` fills in the rest"
@@ -35,7 +35,7 @@ impl Sensor {
 /// The document of a preset or a TOML file, its `base` filled in, ready for overrides.
 ///
 /// # Errors
-/// [`SimError`] if it cannot be found, read or parsed.
+/// [`Error`] if it cannot be found, read or parsed.
 pub fn load_document(name_or_path: &str) -> Result<Value> {
     if let Some(preset) = preset(name_or_path) {
         return parse(preset.toml, name_or_path);
@@ -45,7 +45,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         let names = preset_names();
         let nearest = crate::nearest::nearest(name_or_path, &names);
         let hint = nearest.map_or(String::new(), |n| format!("did you mean `{n}`?  "));
-        return Err(SimError::request(
+        return Err(Error::request(
             format!("no sensor named `{name_or_path}`"),
             "sensor",
             format!("{hint}list them with `qudi info --sensors`, or pass a .toml file"),
@@ -56,7 +56,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
     if let Some(base) = document.as_object_mut().and_then(|d| d.shift_remove("base")) {
         let base = base.as_str().map(str::to_owned).unwrap_or_default();
         let Some(preset) = preset(&base) else {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("no preset named `{base}` to start from"),
                 path,
                 format!("there are {}", preset_names().join(", ")),
@@ -73,7 +73,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
             && let Some(folder) = path.parent()
         {
             let map_path = std::path::absolute(folder.join(name))
-                .map_err(|e| SimError::io("find the map", Path::new(name), e))?;
+                .map_err(|e| Error::io("find the map", Path::new(name), e))?;
             *map = Value::String(map_path.to_string_lossy().into_owned());
         }
     }
@@ -86,7 +86,7 @@ fn preset_names() -> Vec<&'static str> {
 }
 
 fn parse(text: &str, place: &str) -> Result<Value> {
-    let fault = |what: String, place: String| SimError::Sensor {
+    let fault = |what: String, place: String| Error::Sensor {
         what,
         place,
         help: "see configs/sensors for examples".to_owned(),

@@ -100,8 +100,8 @@ impl CountLaw {
     }
 
     /// Expected detections per output frame whose mean output value is `mean`: the inverse of
-    /// [`CountLaw::mean`], kept between 0 and where half a count is left to saturation, of the output or of the
-    /// full well.
+    /// [`CountLaw::mean`], kept between 0 and where half a count is left to saturation, of the output or of
+    /// the full well.
     pub fn detections_for_mean(&self, mean: f64) -> f64 {
         let largest = self.largest_mean();
         let target = mean.min(largest - 0.5f64.min(0.5 * largest));

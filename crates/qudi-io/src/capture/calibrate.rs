@@ -4,7 +4,7 @@ use super::Capture;
 use qudi_core::Size;
 use qudi_core::bad_pixels::BadPixels;
 use qudi_core::sensor::{CountLaw, Response, Sensor};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 
 /// A hot pixel is this many times darker than the array's bulk, unless a threshold is given.
 const HOT_FACTOR: f64 = 10.0;
@@ -41,7 +41,7 @@ pub struct Calibration {
 /// sensors; `hot` is a threshold in dark electrons per native frame.
 ///
 /// # Errors
-/// [`SimError`] if the capture cannot be read, is no dark one, or the gain is unknown.
+/// [`Error`] if the capture cannot be read, is no dark one, or the gain is unknown.
 pub fn calibrate(
     capture: &mut Capture,
     sensor: &Sensor,
@@ -54,7 +54,7 @@ pub fn calibrate(
     let native = u64::from(capture.summed())
         * u64::from(if binary { capture.info.max_count.unwrap_or(1) } else { 1 });
     if !binary && capture.summed() > 1 {
-        return Err(SimError::request(
+        return Err(Error::request(
             "a sum of frames cannot tell read noise from dark counts",
             "sum",
             "leave it out",
@@ -65,7 +65,7 @@ pub fn calibrate(
     let frames = capture.frames();
     for first in (0..frames).step_by(CHUNK as usize) {
         if on(first, frames).is_break() {
-            return Err(SimError::Interrupted);
+            return Err(Error::Interrupted);
         }
         capture.total(first..(first + CHUNK).min(frames), &mut piece)?;
         for (sum, &piece) in sums.iter_mut().zip(&piece) {
@@ -79,7 +79,7 @@ pub fn calibrate(
         return finish(capture, size, frames, &rates, trials, hot, None);
     }
     let gain = gain.ok_or_else(|| {
-        SimError::request(
+        Error::request(
             format!("the gain of `{}` follows the light, and a dark capture has none", sensor.name),
             "gain",
             "give the gain of this capture in DN per electron",
@@ -126,7 +126,7 @@ fn finish(
     let bulk = if median > 0.0 { median } else { trimmed };
     let ninth = sorted[(sorted.len() - 1) * 9 / 10];
     if ninth > 0.5 && read_noise.is_none() {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("a tenth of the pixels count more than {ninth:.2} dark electrons per frame"),
             capture.path(),
             "calibrate from a capture with the shutter closed",
@@ -165,7 +165,7 @@ fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f6
         capture.read(frame, &mut counts)?;
         for &i in &chosen {
             let Some(bin) = histogram.get_mut(usize::from(counts[i])) else {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!(
                         "a count of {}, where `{}` reaches {}",
                         counts[i],

@@ -1,7 +1,7 @@
 //! Which options apply to which format: an option that a format does not take is refused by name.
 
 use super::options::{PackAxis, ReadOptions};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 
 /// An option that only some formats take. Turning, cropping, summing and repairing apply to all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,7 +105,7 @@ pub(crate) fn refuse_packing(options: &ReadOptions, title: &str) -> Result<()> {
     Err(not_applicable(option, title, help.to_owned()))
 }
 
-fn not_applicable(option: FormatOption, title: &str, help: String) -> SimError {
+fn not_applicable(option: FormatOption, title: &str, help: String) -> Error {
     let name = option.name();
-    SimError::request(format!("`{name}` does not apply to {title}"), name, help)
+    Error::request(format!("`{name}` does not apply to {title}"), name, help)
 }

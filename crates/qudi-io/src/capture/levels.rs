@@ -1,6 +1,6 @@
 //! Pictures of counts: pixel values that are means of N binary frames, scaled to full scale.
 
-/// More levels than this cannot be told from an ordinary picture.
+/// More levels than this look like an ordinary picture.
 const MOST: u16 = 64;
 
 /// N, if the distinct `values` (rising) are multiples of `full / N`, rounded or cut off.

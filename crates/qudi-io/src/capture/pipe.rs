@@ -1,7 +1,7 @@
 //! Frames that come through a pipe: each one once, in order, how many only its end tells. What has
 //! come is kept until it is released, so that the first window can be looked at more than once.
 
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::collections::VecDeque;
 use std::io::Read;
 use std::path::Path;
@@ -81,7 +81,7 @@ impl Pipe {
             (&mut self.reader)
                 .take(self.frame_bytes as u64)
                 .read_to_end(&mut frame)
-                .map_err(|e| SimError::io("read", Path::new(STDIN), e))?;
+                .map_err(|e| Error::io("read", Path::new(STDIN), e))?;
             if frame.len() < self.frame_bytes {
                 self.end(&frame, notes)?;
                 break;
@@ -120,7 +120,7 @@ impl Pipe {
             notes.push(what);
             return Ok(());
         }
-        Err(SimError::data(
+        Err(Error::data(
             what,
             Path::new(STDIN),
             "look for what went wrong before the pipe, check `size` and `format`, or keep the whole frames with `lenient`",
@@ -141,7 +141,7 @@ impl Pipe {
         for (frame, out) in (first..).zip(bytes.chunks_exact_mut(self.frame_bytes)) {
             let kept = frame.checked_sub(oldest).and_then(|at| self.kept.get(at as usize));
             let kept = kept.ok_or_else(|| {
-                SimError::request(
+                Error::request(
                     format!("frame {frame} of a pipe, which holds {oldest} to {}", self.arrived),
                     STDIN,
                     "a pipe goes by once: store the capture in a file to go back in it",

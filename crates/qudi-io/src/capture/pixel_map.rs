@@ -10,7 +10,7 @@ use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::npy::read_image;
 use qudi_core::regular_file::require_regular;
 use qudi_core::sensor::Sensor;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::clip::read_still;
 use std::path::Path;
 
@@ -62,7 +62,7 @@ pub(crate) fn plan(
     let size = capture.size();
     capture.repair = Repair::new(&capture.bad.mask(size), size);
     if capture.repair.count() < capture.bad.len() {
-        return Err(SimError::request(
+        return Err(Error::request(
             "every pixel is bad",
             "mask",
             "a mask is nonzero at bad pixels only; use `mask none` to repair none",
@@ -105,7 +105,7 @@ fn load(capture: &Capture, path: &Path) -> Result<Frame> {
         capture.view.apply(&map.data, &mut turned.data);
         return Ok(turned);
     }
-    Err(SimError::data(
+    Err(Error::data(
         format!("a map of {} for frames of {size}, stored as {stored}", map.size),
         path,
         "use a map of the same camera and the same part of the array",
@@ -119,7 +119,7 @@ fn read(path: &Path) -> Result<Frame> {
         "npy" => read_image(path),
         "mat" => read_mat_map(path, "dcr"),
         "png" | "tif" | "tiff" => read_still(path, Transfer::AsIs),
-        _ => Err(SimError::data(
+        _ => Err(Error::data(
             "not a map of pixels",
             path,
             "maps are .npy, .mat (variable `dcr`), .png or .tif; a sensor file ends in .toml",

@@ -3,7 +3,7 @@
 use super::raw_sample::{RawSample, stem};
 use qudi_core::limits::FOLDER_FILES;
 use qudi_core::natural_order::natural_order;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::cell::OnceCell;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -38,18 +38,18 @@ impl Probe {
     /// Looks at `path`.
     ///
     /// # Errors
-    /// [`SimError::Io`] if it cannot be read.
+    /// [`Error::Io`] if it cannot be read.
     pub(crate) fn new(path: &Path) -> Result<Self> {
-        let io = |e| SimError::io("open the capture", path, e);
+        let io = |e| Error::io("open the capture", path, e);
         let found = std::fs::metadata(path).map_err(io)?;
         let mut head = Vec::new();
         if found.is_file() {
             File::open(path).map_err(io)?.take(HEAD).read_to_end(&mut head).map_err(io)?;
             if head.is_empty() {
-                return Err(SimError::data("the file is empty", path, "copy or export it again"));
+                return Err(Error::data("the file is empty", path, "copy or export it again"));
             }
         } else if !found.is_dir() {
-            return Err(SimError::data(
+            return Err(Error::data(
                 "not a regular file or folder",
                 path,
                 "store the capture in a file first, or pipe it into `qudi restore -`",
@@ -126,7 +126,7 @@ impl Probe {
         } else {
             self.path.clone()
         };
-        let io = |e| SimError::io("read", &path, e);
+        let io = |e| Error::io("read", &path, e);
         let mut file = File::open(&path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         let from = (length / 2).saturating_sub(SAMPLE / 2) / align * align;
@@ -146,7 +146,7 @@ struct Listing {
 }
 
 fn list(folder: &Path, depth: usize, listing: &mut Listing) -> Result<()> {
-    let io = |e| SimError::io("list the folder", folder, e);
+    let io = |e| Error::io("list the folder", folder, e);
     for entry in std::fs::read_dir(folder).map_err(io)? {
         let path = entry.map_err(io)?.path();
         let hidden = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
@@ -166,7 +166,7 @@ fn list(folder: &Path, depth: usize, listing: &mut Listing) -> Result<()> {
             listing.skipped.push(path);
         }
         if listing.files.len() > FOLDER_FILES {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("more than {FOLDER_FILES} files"),
                 folder,
                 "name the folder of one capture",

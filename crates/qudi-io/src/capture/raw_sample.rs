@@ -5,7 +5,7 @@ use super::byte_kind::ByteKind;
 use super::options::BitOrder;
 use crate::frames::bit_sums::{MOST_FRAMES, add_packed};
 use qudi_core::Size;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -42,7 +42,7 @@ pub(crate) struct RawSample {
 impl RawSample {
     /// Looks at a `.bin` file.
     pub(crate) fn read(path: &Path) -> Result<Self> {
-        let io = |e| SimError::io("read", path, e);
+        let io = |e| Error::io("read", path, e);
         let file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         let mut bytes = Vec::new();

@@ -65,7 +65,7 @@ impl Summary {
     /// sensors whose own rule follows the light.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the file cannot be read.
+    /// [`Error`](qudi_core::Error) if the file cannot be read.
     pub fn measure(
         capture: &mut Capture,
         sensor: Option<&Sensor>,

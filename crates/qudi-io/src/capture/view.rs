@@ -2,7 +2,7 @@
 
 use super::options::{Crop, Orientation};
 use qudi_core::Size;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 
 /// A turned and cropped frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,7 +28,7 @@ impl View {
         let crop =
             crop.unwrap_or(Crop { top: 0, bottom: turned.height, left: 0, right: turned.width });
         if crop.bottom > turned.height || crop.right > turned.width {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("rows and columns {crop} of a frame of {turned}"),
                 "crop",
                 "the crop applies to the turned frame, and ends inside it",

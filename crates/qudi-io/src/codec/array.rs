@@ -13,7 +13,7 @@ use crate::sidecar::{self, BurstLayout};
 use crate::writer::BurstFormat;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::PathBuf;
@@ -118,7 +118,7 @@ impl Array {
         info.packing = packing;
         if let Some(packing) = packing {
             if options.levels.is_some() {
-                return Err(SimError::request(
+                return Err(Error::request(
                     "`levels` does not apply to packed bits",
                     "levels",
                     "leave it out: single bits are no means",
@@ -143,8 +143,8 @@ impl Array {
         Ok(Box::new(frames))
     }
 
-    fn fault(&self, what: impl Into<String>, help: impl Into<String>) -> SimError {
-        SimError::data(what, &self.path, help)
+    fn fault(&self, what: impl Into<String>, help: impl Into<String>) -> Error {
+        Error::data(what, &self.path, help)
     }
 
     /// Three extents, and the channels of a fourth axis.
@@ -166,7 +166,7 @@ impl Array {
         if channels == 1 {
             return match options.channel {
                 None | Some(0) => Ok(MONO),
-                Some(index) => Err(SimError::request(
+                Some(index) => Err(Error::request(
                     format!("channel {index} of a gray capture, shape {:?}", self.shape),
                     "channel",
                     "leave it out: there is no colour to choose from",
@@ -221,7 +221,7 @@ impl Array {
                         ByteKind::Packed => Some(Packing { axis: PackAxis::Width, order }),
                         ByteKind::Counts | ByteKind::WideCounts => None,
                         ByteKind::Unclear => return Err(self.fault(
-                            "the array is nearly empty, so that packed bits cannot be told from counts",
+                            "the array is nearly empty, so that packed bits look like counts",
                             "say what its bytes are: `pack_axis width` (8 pixels each), height, or none (one count each)",
                         )),
                     }
@@ -339,7 +339,7 @@ impl Array {
         frame_bytes: usize,
         info: &mut CaptureInfo,
     ) -> Result<Vec<u8>> {
-        let io = |e| SimError::io("read", &self.path, e);
+        let io = |e| Error::io("read", &self.path, e);
         let mut bytes = Vec::new();
         match &mut self.place {
             Place::File { start, available, .. } => {

@@ -12,7 +12,7 @@ use crate::codec::hdf5::guard::{Checked, Hdf5};
 use crate::frames::CountFrames;
 use hdf5_pure::{Datatype, DatatypeByteOrder};
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::Path;
 
 pub(crate) const FORMAT: Format = Format {
@@ -113,8 +113,8 @@ fn open(
     array.open(options, &Hints::default(), info)
 }
 
-fn damaged(e: &str, path: &Path) -> SimError {
-    SimError::data(
+fn damaged(e: &str, path: &Path) -> Error {
+    Error::data(
         format!("not a readable HDF5 file: {e}"),
         path,
         "if h5py opens it, save the frames in Python: numpy.save('capture.npy', file[DATASET])",
@@ -161,7 +161,7 @@ fn metadata(
     if let Some(pattern) = metadata["cfa_pattern"].as_str() {
         let mono = ["", "none", "mono", "monochrome"].contains(&pattern.to_lowercase().as_str());
         if !mono && options.channel.is_none() {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("a capture behind a colour filter array ({pattern})"),
                 path,
                 "colour is not supported yet; read the mosaic as if it were gray with `channel 0`",
@@ -187,7 +187,7 @@ fn choose(found: &[&Candidate], options: &ReadOptions, path: &Path) -> Result<us
         let wanted = wanted.trim_start_matches('/');
         return found.iter().position(|c| c.path.trim_start_matches('/') == wanted).ok_or_else(
             || {
-                SimError::data(
+                Error::data(
                     format!("no dataset `{wanted}` in it"),
                     path,
                     format!("there are {}", listed()),
@@ -198,12 +198,12 @@ fn choose(found: &[&Candidate], options: &ReadOptions, path: &Path) -> Result<us
     let mut captures = found.iter().enumerate().filter(|(_, c)| c.shape.len() >= 3);
     match (captures.next(), captures.next()) {
         (Some((at, _)), None) => Ok(at),
-        (None, _) => Err(SimError::data(
+        (None, _) => Err(Error::data(
             format!("no dataset of frames in it; there are {}", listed()),
             path,
             "a capture has the axes frames, height, width",
         )),
-        (Some(_), Some(_)) => Err(SimError::data(
+        (Some(_), Some(_)) => Err(Error::data(
             format!("several datasets could be the capture: {}", listed()),
             path,
             "name one with `array`",

@@ -11,7 +11,7 @@ use crate::frames::samples::{Scale, no_count};
 use image::DynamicImage;
 use qudi_core::Size;
 use qudi_core::regular_file::require_regular;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::clip::decode_image;
 use std::fs::File;
 use std::io::Read;
@@ -60,7 +60,7 @@ fn open(
     let frames = open_files(files, &probe.path, recorded.is_some(), options, info)?;
     match recorded {
         Some(layout) if (layout.frames, layout.size) != (frames.frames(), frames.size()) => {
-            Err(SimError::data(
+            Err(Error::data(
                 format!(
                     "burst.json in it describes {} frames of {}, and it holds {} of {}",
                     layout.frames,
@@ -85,7 +85,7 @@ pub(crate) fn open_files(
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let Some(first) = files.first() else {
-        return Err(SimError::data(
+        return Err(Error::data(
             "the folder holds no images",
             place,
             "put frames into it as PNG or TIFF",
@@ -134,7 +134,7 @@ impl Images {
             && let Some(levels) = ladders[0].filter(|&n| n > 1)
             && ladders.iter().all(Option::is_some)
         {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!(
                     "images of different scale: {full}/{levels} in the first, another step in others"
                 ),
@@ -172,7 +172,7 @@ fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
         DynamicImage::ImageRgb16(i) => (i.into_raw(), 65535),
         DynamicImage::ImageRgba16(i) => (i.into_raw(), 65535),
         DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_) => {
-            return Err(SimError::data(
+            return Err(Error::data(
                 "a floating-point colour image",
                 path,
                 "save counts as 8- or 16-bit gray",
@@ -183,7 +183,7 @@ fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
     let colours = channels - usize::from(alpha);
     let coloured = samples.chunks_exact(channels).any(|p| p[..colours].iter().any(|&v| v != p[0]));
     if coloured {
-        return Err(SimError::data(
+        return Err(Error::data(
             "a colour image",
             path,
             "colour is not supported yet; frames of counts are gray",
@@ -205,7 +205,7 @@ impl CountFrames for Images {
         let path = &self.files[frame as usize];
         let (size, samples, _) = gray(path)?;
         if size != self.size {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("an image of {size} among images of {}", self.size),
                 path,
                 "frames of one capture have one size",

@@ -13,7 +13,7 @@ use crate::frames::CountFrames;
 use crate::frames::chain::Chain;
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
 pub(crate) const FORMAT: Format = Format {
@@ -59,7 +59,7 @@ fn open(
     for path in &files {
         let part = frames(path, choose(path, options)?, options, info)?;
         if *size.get_or_insert(part.size()) != part.size() {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("a part of {} among parts of another size", part.size()),
                 path,
                 "parts of one capture have one size",
@@ -68,7 +68,7 @@ fn open(
         lengths.push(part.frames());
     }
     let Some(size) = size else {
-        return Err(SimError::data("no part_<N>.mat in it", &probe.path, "name one .mat file"));
+        return Err(Error::data("no part_<N>.mat in it", &probe.path, "name one .mat file"));
     };
     info.notes.dedup();
     check_info(&probe.path.join("info.json"), files.len(), lengths.iter().sum(), options, info)?;
@@ -95,7 +95,7 @@ fn check_info(
     let promised = noted["no_parts"].as_u64();
     let missing = promised.is_some_and(|promised| promised != parts as u64);
     if missing && !options.lenient {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("{parts} parts, where info.json notes {}", promised.unwrap_or(0)),
             path,
             "copy the missing parts, or read those that are there with `lenient`",
@@ -116,12 +116,14 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
         if names.is_empty() { "it holds no numeric arrays".to_owned() } else { names.join(", ") }
     };
     if let Some(wanted) = &options.array {
-        return found.iter().find(|a| a.name == *wanted).cloned().ok_or_else(|| {
-            SimError::data(format!("no variable `{wanted}` in it"), path, listed())
-        });
+        return found
+            .iter()
+            .find(|a| a.name == *wanted)
+            .cloned()
+            .ok_or_else(|| Error::data(format!("no variable `{wanted}` in it"), path, listed()));
     }
     if found.iter().any(|a| a.name == "imbs") {
-        return Err(SimError::data(
+        return Err(Error::data(
             "a simulated colour-filter capture (`imbs`)",
             path,
             "colour is not supported yet; read the mosaic as if it were gray with `array imbs`",
@@ -132,12 +134,12 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
     match (customary, captures.as_slice()) {
         (Some(array), _) => Ok(array.clone()),
         (None, [one]) => Ok((*one).clone()),
-        (None, []) => Err(SimError::data(
+        (None, []) => Err(Error::data(
             format!("no array of frames in it; there are: {}", listed()),
             path,
             "a capture is an array of height x width x frames; dark maps go to `dcr`",
         )),
-        (None, _) => Err(SimError::data(
+        (None, _) => Err(Error::data(
             format!("several arrays could be the capture: {}", listed()),
             path,
             "name one with `array`",

@@ -14,7 +14,7 @@ use qudi_core::limits::DEFLATE_RATIO;
 use qudi_core::npy::Header;
 use qudi_core::regular_file::open_regular;
 use qudi_core::sensor::{Response, preset};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
@@ -50,7 +50,7 @@ pub(crate) const COMPRESSED: Format = Format {
 /// A `.npy` file as an array; sizes are checked by [`Array::open`].
 pub(crate) fn open_array(path: &Path) -> Result<Array> {
     let file = open_regular(path, "open the file")?;
-    let length = file.metadata().map_err(|e| SimError::io("open", path, e))?.len();
+    let length = file.metadata().map_err(|e| Error::io("open", path, e))?.len();
     let header = Header::read(&mut BufReader::new(file), path)?;
     let place = Place::File {
         start: header.data_start,
@@ -78,7 +78,7 @@ fn open_gzip(
 ) -> Result<Box<dyn CountFrames>> {
     let path = probe.path.clone();
     let unpacked = move || -> Result<MultiGzDecoder<BufReader<File>>> {
-        let file = File::open(&path).map_err(|e| SimError::io("open", &path, e))?;
+        let file = File::open(&path).map_err(|e| Error::io("open", &path, e))?;
         Ok(MultiGzDecoder::new(BufReader::with_capacity(1 << 16, file)))
     };
     let header = Header::read(&mut unpacked()?, &probe.path)?;
@@ -88,7 +88,7 @@ fn open_gzip(
     let opener: Opener = Box::new(move || {
         let mut stream = unpacked()?;
         std::io::copy(&mut stream.by_ref().take(start), &mut std::io::sink())
-            .map_err(|e| SimError::io("decompress", &path, e))?;
+            .map_err(|e| Error::io("decompress", &path, e))?;
         Ok(Box::new(stream))
     });
     array(&probe.path, header, Place::Stream(opener)).open(options, &Hints::default(), info)
@@ -99,7 +99,7 @@ pub(crate) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Resu
     let most = compressed.saturating_mul(DEFLATE_RATIO);
     match header.data_bytes() {
         Some(bytes) if bytes <= most => Ok(()),
-        _ => Err(SimError::data(
+        _ => Err(Error::data(
             format!(
                 "its header promises an array of shape {:?}, more than {compressed} compressed bytes can hold",
                 header.shape

@@ -11,7 +11,7 @@ use crate::frames::checksum::CrcReader;
 use crate::frames::frame_bytes::{Checksum, Opener};
 use flate2::read::DeflateDecoder;
 use qudi_core::npy::Header;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -55,7 +55,7 @@ fn open(
         let opener: Opener = Box::new(move || {
             let mut stream = entry.stream(&path)?;
             std::io::copy(&mut stream.by_ref().take(data_start), &mut std::io::sink())
-                .map_err(|e| SimError::io("decompress", &path, e))?;
+                .map_err(|e| Error::io("decompress", &path, e))?;
             Ok(stream)
         });
         Place::Stream(opener)
@@ -85,7 +85,7 @@ fn stream(
     compressed: u64,
     deflated: bool,
 ) -> Result<Box<dyn Read + Send>> {
-    let io = |e| SimError::io("open", path, e);
+    let io = |e| Error::io("open", path, e);
     let mut file = File::open(path).map_err(io)?;
     file.seek(SeekFrom::Start(start)).map_err(io)?;
     let stored = BufReader::with_capacity(1 << 16, file.take(compressed));
@@ -95,13 +95,13 @@ fn stream(
 /// The arrays of the archive whose samples could be counts.
 fn entries(path: &Path) -> Result<Vec<Entry>> {
     let damaged = |e: zip::result::ZipError| {
-        SimError::data(
+        Error::data(
             format!("not a readable .npz: {e}"),
             path,
             "write it with numpy.savez or numpy.savez_compressed",
         )
     };
-    let io = |e| SimError::io("open", path, e);
+    let io = |e| Error::io("open", path, e);
     let file = File::open(path).map_err(io)?;
     let length = file.metadata().map_err(io)?.len();
     let mut archive = ZipArchive::new(BufReader::new(file)).map_err(damaged)?;
@@ -111,7 +111,7 @@ fn entries(path: &Path) -> Result<Vec<Entry>> {
         let name = file.name().map_err(damaged)?;
         let Some(name) = name.strip_suffix(".npy").map(str::to_owned) else { continue };
         if file.encrypted() {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("array `{name}` is encrypted"),
                 path,
                 "unpack it with its password, and write it again with numpy.savez",
@@ -126,7 +126,7 @@ fn entries(path: &Path) -> Result<Vec<Entry>> {
         let Some(start) = file.data_start() else { continue };
         let compressed = file.compressed_size();
         if start.checked_add(compressed).is_none_or(|end| end > length) {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("array `{name}` reaches beyond the end of the file"),
                 path,
                 "the file is truncated or damaged: copy or export it again",
@@ -149,7 +149,7 @@ fn choose<'a>(entries: &'a [Entry], options: &ReadOptions, path: &Path) -> Resul
     };
     if let Some(wanted) = &options.array {
         return entries.iter().find(|e| e.name == *wanted).ok_or_else(|| {
-            SimError::data(
+            Error::data(
                 format!("no array `{wanted}` in it"),
                 path,
                 format!("there are {}", listed()),
@@ -159,12 +159,12 @@ fn choose<'a>(entries: &'a [Entry], options: &ReadOptions, path: &Path) -> Resul
     let mut captures = entries.iter().filter(|e| e.header.shape.len() >= 3);
     match (captures.next(), captures.next()) {
         (Some(one), None) => Ok(one),
-        (None, _) => Err(SimError::data(
+        (None, _) => Err(Error::data(
             format!("no array of frames in it; there are {}", listed()),
             path,
             "save one array of shape (frames, height, width)",
         )),
-        (Some(_), Some(_)) => Err(SimError::data(
+        (Some(_), Some(_)) => Err(Error::data(
             format!("several arrays could be the capture: {}", listed()),
             path,
             "name one with `array`",

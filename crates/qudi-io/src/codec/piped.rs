@@ -9,7 +9,7 @@ use crate::capture::options::ReadOptions;
 use crate::capture::pipe::{Pipe, STDIN, Tail};
 use crate::frames::CountFrames;
 use qudi_core::npy::Header;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::io::{Cursor, Read};
 use std::path::Path;
 
@@ -38,7 +38,7 @@ pub(crate) fn open_pipe(
 ) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
     let place = Path::new(STDIN);
     if options.frames_per_file.is_some() {
-        return Err(SimError::request(
+        return Err(Error::request(
             "a pipe has no files to count frames in",
             "frames_per_file",
             "leave it out, or end with `end`",
@@ -46,7 +46,7 @@ pub(crate) fn open_pipe(
     }
     if let Some(name) = options.format.as_deref().filter(|&name| name != "npy") {
         return piped_raw(name, reader, options).unwrap_or_else(|| {
-            Err(SimError::request(
+            Err(Error::request(
                 format!("`{name}` cannot be read from a pipe"),
                 "format",
                 "pipes carry npy, raw-bits, raw-u8 and raw-u16: name the file itself, or `qudi convert` it",
@@ -55,12 +55,9 @@ pub(crate) fn open_pipe(
     }
     refuse_others(options, super::ARRAY, "npy")?;
     let mut start = Vec::new();
-    (&mut reader)
-        .take(MAGIC)
-        .read_to_end(&mut start)
-        .map_err(|e| SimError::io("read", place, e))?;
+    (&mut reader).take(MAGIC).read_to_end(&mut start).map_err(|e| Error::io("read", place, e))?;
     if start.is_empty() {
-        return Err(SimError::data(
+        return Err(Error::data(
             "nothing came through the pipe",
             place,
             "check the command before it",
@@ -75,7 +72,7 @@ pub(crate) fn open_pipe(
             ),
             |&(_, what, help)| (what, help),
         );
-        return Err(SimError::data(what, place, help));
+        return Err(Error::data(what, place, help));
     }
     let mut reader: Box<dyn Read + Send> = Box::new(Cursor::new(start).chain(reader));
     let header = Header::read(&mut reader, place)?;

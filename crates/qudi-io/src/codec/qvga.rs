@@ -12,7 +12,7 @@ use crate::codec::raw::files::frame_files;
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement};
 use qudi_core::Size;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 
 pub(crate) const FORMAT: Format = Format {
     name: "qvga",
@@ -38,11 +38,11 @@ struct Header {
 
 impl Header {
     fn parse(head: &[u8]) -> Option<Self> {
-        let &[exposure, yrange, global, ..] = head else { return None };
+        let &[mean_level, yrange, global, ..] = head else { return None };
         if !(8..=HEIGHT as u8).contains(&yrange) || global > 1 {
             return None;
         }
-        let skipped = if global == 0 && exposure == 1 { u64::from(yrange) * 80 } else { 0 };
+        let skipped = if global == 0 && mean_level == 1 { u64::from(yrange) * 80 } else { 0 };
         Some(Self { yrange: usize::from(yrange), start: 3 + skipped, rolling: global == 0 })
     }
 
@@ -84,7 +84,7 @@ fn open(
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     if probe.is_folder {
-        return Err(SimError::data("a folder", &probe.path, "name one spc_data<N>.bin"));
+        return Err(Error::data("a folder", &probe.path, "name one spc_data<N>.bin"));
     }
     let header = match options.header {
         Some(_) => None,
@@ -93,7 +93,7 @@ fn open(
     let rows = header.as_ref().map_or(HEIGHT, |header| header.yrange);
     let size = options.size.unwrap_or(Size { height: rows, width: WIDTH });
     if !size.width.is_multiple_of(8) {
-        return Err(SimError::request(
+        return Err(Error::request(
             format!("rows of {} bits are not whole bytes", size.width),
             "size",
             "this sensor has 320 columns",

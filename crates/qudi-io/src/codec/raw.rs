@@ -1,5 +1,5 @@
-//! Files without header of any camera, as the options `size`, `bitorder`, `header` and `trailer` describe them.
-//! Never guessed.
+//! Files without header of any camera, as the options `size`, `bitorder`, `header` and `trailer` describe
+//! them. Never guessed.
 
 pub(super) mod files;
 
@@ -16,7 +16,7 @@ use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::io::Read;
 use std::path::Path;
 
@@ -71,7 +71,7 @@ const WORD: Sample = Sample::U16 { big_endian: false };
 
 fn size(options: &ReadOptions) -> Result<Size> {
     options.size.ok_or_else(|| {
-        SimError::request(
+        Error::request(
             "files without header do not say how large a frame is",
             "size",
             "give height and width, as in `size 256x512`",
@@ -83,7 +83,7 @@ fn size(options: &ReadOptions) -> Result<Size> {
 fn files(probe: &Probe) -> Result<Vec<std::path::PathBuf>> {
     let files = probe.files(&["bin", "raw", "dat", ""])?;
     if files.is_empty() {
-        return Err(SimError::data(
+        return Err(Error::data(
             "the folder holds no .bin, .raw or .dat files",
             &probe.path,
             "name the file itself",
@@ -120,7 +120,7 @@ pub(crate) fn piped(
         let mut reader = reader.take().unwrap_or_else(|| Box::new(std::io::empty()));
         let header = options.header.unwrap_or(0);
         std::io::copy(&mut (&mut reader).take(header), &mut std::io::sink())
-            .map_err(|e| SimError::io("read", Path::new(STDIN), e))?;
+            .map_err(|e| Error::io("read", Path::new(STDIN), e))?;
         let trailer = options.trailer.unwrap_or(0);
         let tail = Tail { trailer, known: &TRAILERS, lenient: options.lenient };
         Ok(FrameBytes::Pipe(Pipe::new(reader, frame_bytes, None, tail)))
@@ -140,7 +140,7 @@ fn transposed(options: &ReadOptions) -> Result<bool> {
     if axes.frame_position() == 0 {
         return Ok(axes.transposed());
     }
-    Err(SimError::request(
+    Err(Error::request(
         "frames of files without header come one after the other",
         "axes",
         "use thw or twh; another order is read from .npy",
@@ -157,7 +157,7 @@ fn bits(
         Some(axis @ (PackAxis::Width | PackAxis::Height)) => axis,
         None => PackAxis::Width,
         Some(PackAxis::None) => {
-            return Err(SimError::request(
+            return Err(Error::request(
                 "raw-bits holds packed bits",
                 "pack_axis",
                 "name the axis, width or height, or read one byte per count as raw-u8",

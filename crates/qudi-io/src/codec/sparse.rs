@@ -7,7 +7,7 @@ use crate::capture::options::{Orientation, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use qudi_core::Size;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -55,10 +55,10 @@ fn open(
 ) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     if probe.is_folder {
-        return Err(SimError::data("a folder", path, "name one file of the sparse stream"));
+        return Err(Error::data("a folder", path, "name one file of the sparse stream"));
     }
     let size = options.size.unwrap_or(ARRAY);
-    let io = |e| SimError::io("read", path, e);
+    let io = |e| Error::io("read", path, e);
     let mut file = File::open(path).map_err(io)?;
     let starts = index(&mut file, size, path, options, info)?;
     info.preset = Some("spad512s");
@@ -81,7 +81,7 @@ fn index(
     let mut starts = vec![0];
     let (mut at, mut piece, mut held) = (0u64, vec![0u8; 1 << 20], 0);
     loop {
-        let n = reader.read(&mut piece[held..]).map_err(|e| SimError::io("read", path, e))?;
+        let n = reader.read(&mut piece[held..]).map_err(|e| Error::io("read", path, e))?;
         held += n;
         for bytes in piece[..held].chunks_exact(4) {
             let word = word(bytes);
@@ -89,7 +89,7 @@ fn index(
             if word == delimiter {
                 starts.push(at);
             } else if word > delimiter {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!("word {} is {word}, beyond the last pixel of {size}", at - 1),
                     path,
                     "not a sparse stream of this array: check `format` and `size`",
@@ -107,7 +107,7 @@ fn index(
     if held > 0 || open_words > 0 {
         let what = format!("the last frame has no delimiter after its {open_words} photons");
         if !options.lenient {
-            return Err(SimError::data(
+            return Err(Error::data(
                 what,
                 path,
                 "the stream was cut off: copy it again, or drop the last frame with `lenient`",
@@ -116,7 +116,7 @@ fn index(
         info.notes.push(format!("{what}: dropped"));
     }
     if starts.len() < 2 {
-        return Err(SimError::data("no whole frame", path, "check `format` and `size`"));
+        return Err(Error::data("no whole frame", path, "check `format` and `size`"));
     }
     Ok(starts)
 }
@@ -134,7 +134,7 @@ impl CountFrames for SparseFrames {
         counts.fill(0);
         let (from, to) = (self.starts[frame as usize], self.starts[frame as usize + 1] - 1);
         self.words.resize((to - from) as usize * 4, 0);
-        let io = |e| SimError::io(format!("read frame {frame} of"), &self.path, e);
+        let io = |e| Error::io(format!("read frame {frame} of"), &self.path, e);
         self.file.seek(SeekFrom::Start(from * 4)).map_err(io)?;
         self.file.read_exact(&mut self.words).map_err(io)?;
         for index in self.words.chunks_exact(4).map(word) {

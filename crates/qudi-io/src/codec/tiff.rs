@@ -15,7 +15,7 @@ use crate::sidecar::{self, BurstLayout};
 use pages::{TiffPages, bits_reversed, decoder, fault};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::Path;
 use tiff::ColorType;
 use tiff::tags::{ByteOrder, Tag};
@@ -47,7 +47,7 @@ fn open(
 ) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
     if probe.is_folder {
-        return Err(SimError::data("a folder", path, "use `format images`, or name one file"));
+        return Err(Error::data("a folder", path, "use `format images`, or name one file"));
     }
     let recorded = described(&sidecar::beside(path), info);
     let Some(block) = block(probe)? else {
@@ -60,7 +60,7 @@ fn open(
     let whole = (probe.length.saturating_sub(block.start) / frame_bytes).min(block.frames);
     if whole < block.frames {
         if !options.lenient || whole == 0 {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!(
                     "the stack is truncated: {} frames promised, {whole} whole ones there",
                     block.frames

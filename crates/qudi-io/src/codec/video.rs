@@ -9,7 +9,7 @@ use crate::frames::frame_bytes::{FrameBytes, Segment};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
 use qudi_core::Transfer;
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::clip::{FrameReader, Video};
 use std::io::{BufWriter, Write};
 
@@ -33,7 +33,7 @@ fn open(
     let path = &probe.path;
     let mut video = Video::open(path, Transfer::AsIs)?;
     let size = video.size();
-    let spool = |e| SimError::io("store the decoded frames of", path, e);
+    let spool = |e| Error::io("store the decoded frames of", path, e);
     let mut file = BufWriter::with_capacity(1 << 18, tempfile::tempfile().map_err(spool)?);
     let mut frames = 0;
     while let Some(frame) = video.next()? {

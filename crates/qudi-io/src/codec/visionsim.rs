@@ -12,7 +12,7 @@ use crate::frames::CountFrames;
 use qudi_core::Size;
 use qudi_core::limits::INDEX_BYTES;
 use qudi_core::regular_file::read_limited;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use serde::Deserialize;
 use std::path::{Component, Path, PathBuf};
 
@@ -58,11 +58,7 @@ fn open(
 ) -> Result<Box<dyn CountFrames>> {
     let path = document(probe);
     let fault = |what: String| {
-        SimError::data(
-            what,
-            &path,
-            "write the data set again with visionsim, or name the .npy itself",
-        )
+        Error::data(what, &path, "write the data set again with visionsim, or name the .npy itself")
     };
     let bytes = read_limited(&path, INDEX_BYTES, "read the list of frames")?;
     let transforms: Transforms = serde_json::from_slice(&bytes)
@@ -70,7 +66,7 @@ fn open(
     let folder = path.parent().unwrap_or(Path::new("."));
     info.fps = transforms.fps;
     if transforms.c.is_some_and(|c| c > 1) && options.channel.is_none() {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("a colour capture of {} channels", transforms.c.unwrap_or(0)),
             &path,
             "colour is not supported yet; read one channel of unpacked frames with `channel`",
@@ -102,7 +98,7 @@ impl Transforms {
             (_, None | Some(2)) => PackAxis::Width,
             (_, Some(1)) => PackAxis::Height,
             (_, Some(dim)) => {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!("bits packed along axis {dim}"),
                     path,
                     "frames are packed along axis 1 (height) or 2 (width)",

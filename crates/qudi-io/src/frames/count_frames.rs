@@ -9,7 +9,7 @@ pub trait CountFrames: Send {
     /// Number of frames; of a pipe, those that have arrived.
     fn frames(&self) -> u64;
 
-    /// Number of frames in all; `None` as long as a pipe has not told.
+    /// Number of frames in all; `None` as long as that of a pipe is unknown.
     fn length(&self) -> Option<u64> {
         Some(self.frames())
     }
@@ -18,7 +18,7 @@ pub trait CountFrames: Send {
     /// user should know of the end goes to `notes`.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the pipe ends inside a frame.
+    /// [`Error`](qudi_core::Error) if the pipe ends inside a frame.
     fn wait_for(&mut self, _frames: u64, _remarks: &mut Vec<String>) -> Result<u64> {
         Ok(self.frames())
     }
@@ -32,7 +32,7 @@ pub trait CountFrames: Send {
     /// Reads frame `frame` into `counts`, row-major.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the file cannot be read or holds no counts.
+    /// [`Error`](qudi_core::Error) if the file cannot be read or holds no counts.
     fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()>;
 
     /// Adds the counts of `frames` to `sums`.
@@ -54,7 +54,7 @@ pub trait CountFrames: Send {
     /// the highest bit; `false` if frames are not stored so nearly like that that copying is all.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the file cannot be read.
+    /// [`Error`](qudi_core::Error) if the file cannot be read.
     fn copy_packed(&mut self, _first: u64, _bytes: &mut [u8]) -> Result<bool> {
         Ok(false)
     }

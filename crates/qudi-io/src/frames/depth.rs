@@ -1,7 +1,7 @@
 //! Frames whose counts are checked against the depth that is known of them.
 
 use super::count_frames::CountFrames;
-use qudi_core::{Result, SimError, Size};
+use qudi_core::{Error, Result, Size};
 use std::path::{Path, PathBuf};
 
 /// Frames in which no count may exceed `max_count`.
@@ -41,7 +41,7 @@ impl CountFrames for DepthChecked {
             return Ok(());
         };
         let (max, bits) = (self.max_count, 16 - self.max_count.leading_zeros());
-        Err(SimError::data(
+        Err(Error::data(
             format!(
                 "frame {frame} holds a count of {largest}, beyond the {max} ({bits} bit) that {} allows",
                 self.source

@@ -2,7 +2,7 @@
 //! frame axis is not the slowest. Memory is bounded by a few frames.
 
 use crate::capture::pipe::Pipe;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
@@ -236,13 +236,13 @@ impl Files {
             let here = wanted.min(frames - within);
             let (piece, rest) = bytes.split_at_mut(here as usize * self.frame_bytes);
             if self.open.as_ref().is_none_or(|(open, _)| *open != at) {
-                let file = File::open(path).map_err(|e| SimError::io("open", path, e))?;
+                let file = File::open(path).map_err(|e| Error::io("open", path, e))?;
                 self.open = Some((at, file));
             }
             let (_, file) = self.open.as_mut().expect("opened above");
             file.seek(SeekFrom::Start(start + within * self.frame_bytes as u64))
                 .and_then(|_| file.read_exact(piece))
-                .map_err(|e| SimError::io(format!("read frame {first} of"), path, e))?;
+                .map_err(|e| Error::io(format!("read frame {first} of"), path, e))?;
             if let Some(checksum) = &mut self.checksum {
                 let segment = &self.segments[at];
                 checksum.add(first, piece, self.frame_bytes, segment, file).map_err(|e| {
@@ -250,7 +250,7 @@ impl Files {
                     if ends || e.kind() == std::io::ErrorKind::InvalidData {
                         return damaged(&e, path);
                     }
-                    SimError::io("check", path, e)
+                    Error::io("check", path, e)
                 })?;
             }
             bytes = rest;
@@ -270,12 +270,8 @@ pub(crate) enum StreamEnd {
 }
 
 /// The error of data that differ from their checksum.
-fn damaged(e: &std::io::Error, path: &Path) -> SimError {
-    SimError::data(
-        format!("the stored data are damaged: {e}"),
-        path,
-        "copy or export the file again",
-    )
+fn damaged(e: &std::io::Error, path: &Path) -> Error {
+    Error::data(format!("the stored data are damaged: {e}"), path, "copy or export the file again")
 }
 
 pub(crate) struct Stream {
@@ -296,17 +292,17 @@ impl Stream {
         }
         let reader = self.reader.as_mut().expect("opened above");
         let fault = |frame: u64, path: &Path, e: std::io::Error| match e.kind() {
-            std::io::ErrorKind::UnexpectedEof => SimError::data(
+            std::io::ErrorKind::UnexpectedEof => Error::data(
                 format!("the compressed data end before frame {frame} is complete"),
                 path,
                 "the file is truncated or damaged: copy or export it again",
             ),
-            std::io::ErrorKind::InvalidInput | std::io::ErrorKind::InvalidData => SimError::data(
+            std::io::ErrorKind::InvalidInput | std::io::ErrorKind::InvalidData => Error::data(
                 format!("the compressed data are damaged before frame {frame}: {e}"),
                 path,
                 "copy or export the file again",
             ),
-            _ => SimError::io(format!("read frame {frame} of"), path, e),
+            _ => Error::io(format!("read frame {frame} of"), path, e),
         };
         let skip = (first - self.at) * self.frame_bytes as u64;
         let skipped = std::io::copy(&mut reader.by_ref().take(skip), &mut std::io::sink());
@@ -372,7 +368,7 @@ pub(crate) fn strewn(
     let run = inner * element;
     let (path, mut open) = (path.to_owned(), None);
     let fetch = move |first: u64, count: u64| {
-        let io = |e| SimError::io("read", &path, e);
+        let io = |e| Error::io("read", &path, e);
         if open.is_none() {
             open = Some(File::open(&path).map_err(io)?);
         }

@@ -6,7 +6,7 @@ use crate::capture::info::CaptureInfo;
 use crate::capture::levels::infer_levels;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// How stored values become counts.
@@ -147,8 +147,8 @@ impl CountFrames for SampleFrames {
 }
 
 /// A value that no photon counter gives.
-pub(crate) fn no_count(value: f32, frame: u64, path: &Path) -> SimError {
-    SimError::data(
+pub(crate) fn no_count(value: f32, frame: u64, path: &Path) -> Error {
+    Error::data(
         format!("frame {frame} holds {value}, and photon counts are whole numbers from 0 to 65535"),
         path,
         "means of N binary frames are read with `levels N`; an image without photon counts is not a capture",

@@ -8,8 +8,8 @@ use qudi_core::Transfer;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use qudi_sim::clip::read_still;
 use serde_json::{Value, json};
 use std::io::Write;
@@ -40,13 +40,13 @@ pub struct FrameFolder {
 }
 
 impl FrameFolder {
-    /// Opens `path` for the frames of `size` of `run`: a new folder, or one of an interrupted run with the same
-    /// settings, inputs and version of the program. It stays locked until it is dropped.
+    /// Opens `path` for the frames of `size` of `run`: a new folder, or one of an interrupted run with the
+    /// same settings, inputs and version of the program. It stays locked until it is dropped.
     ///
     /// # Errors
-    /// [`SimError`] if the folder holds something else or frames of another run, or if a run is writing into it.
+    /// [`Error`] if the folder holds something else or frames of another run, or if a run is writing into it.
     pub fn open(path: &Path, size: Size, run: FolderRun, overwrite: Overwrite) -> Result<Self> {
-        let io = |e| SimError::io("create the output", path, e);
+        let io = |e| Error::io("create the output", path, e);
         if !path.exists() {
             std::fs::create_dir(path).map_err(io)?;
         }
@@ -57,7 +57,7 @@ impl FrameFolder {
                 (!name.starts_with('.')).then_some(name)
             });
             if let Some(name) = foreign {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!(
                         "the output exists and was not made by this program (no {MANIFEST} beside `{name}` in it)"
                     ),
@@ -75,7 +75,7 @@ impl FrameFolder {
         let found = read_manifest(&manifest)?;
         if overwrite == Overwrite::Yes {
             if folder.run.share != Share::Whole {
-                return Err(SimError::data(
+                return Err(Error::data(
                     "starting over with one part would remove the frames of the others",
                     path,
                     "start over without parts, or remove the folder yourself",
@@ -92,7 +92,7 @@ impl FrameFolder {
     /// Refuses to go on with the frames of another run, with what differs.
     fn check(&self, found: &Value) -> Result<()> {
         let refuse = |what: String| {
-            Err(SimError::data(
+            Err(Error::data(
                 what,
                 &self.path,
                 "choose another name, go on with the old settings, or start over with `force`",
@@ -135,14 +135,14 @@ impl FrameFolder {
     /// Writes a frame, and gives back what a reader of the file will see.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn push(&self, frame: u64, image: &Frame) -> Result<Frame> {
         let path = self.file(frame);
         // The last run may have been killed between writing and renaming.
         let unfinished = self.path.join(format!(".frame_{frame:06}.png"));
         save_png16(image, &unfinished)
             .and_then(|()| std::fs::rename(&unfinished, &path))
-            .map_err(|e| SimError::io("write", &path, e))?;
+            .map_err(|e| Error::io("write", &path, e))?;
         let seen = |v: &f32| (v.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
         Ok(Frame { size: self.size, data: image.data.iter().map(seen).collect() })
     }
@@ -150,12 +150,12 @@ impl FrameFolder {
     /// Reads a finished frame.
     ///
     /// # Errors
-    /// [`SimError`] if it is damaged or has another size.
+    /// [`Error`] if it is damaged or has another size.
     pub fn read(&self, frame: u64) -> Result<Frame> {
         let path = self.file(frame);
         let image = read_still(&path, Transfer::AsIs)?;
         if image.size != self.size {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("a frame of {} among frames of {}", image.size, self.size),
                 &path,
                 "it is not of this run: start over with `force`",
@@ -167,7 +167,7 @@ impl FrameFolder {
     /// Notes in the manifest that all is done, with `results`.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn finish(&self, results: &Value) -> Result<()> {
         self.write_manifest(true, results)
     }
@@ -189,7 +189,7 @@ impl FrameFolder {
 
     /// Removes our own files, and nothing else.
     fn clear(&self) -> Result<()> {
-        let io = |e| SimError::io("clear the output", &self.path, e);
+        let io = |e| Error::io("clear the output", &self.path, e);
         for entry in std::fs::read_dir(&self.path).map_err(io)? {
             let path = entry.map_err(io)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -204,7 +204,7 @@ impl FrameFolder {
 
 fn read_manifest(path: &Path) -> Result<Value> {
     let fault =
-        |what: String| SimError::data(what, path, "choose another output, or remove it yourself");
+        |what: String| Error::data(what, path, "choose another output, or remove it yourself");
     let text = read_limited(path, RECORD_BYTES, "read the manifest")?;
     let manifest: Value =
         serde_json::from_slice(&text).map_err(|e| fault(format!("not a manifest: {e}")))?;
@@ -213,7 +213,7 @@ fn read_manifest(path: &Path) -> Result<Value> {
     if ours {
         return Ok(manifest);
     }
-    Err(SimError::data(
+    Err(Error::data(
         format!("the output exists, and its {MANIFEST} was not written by this program"),
         path,
         "choose another name, or remove it yourself",

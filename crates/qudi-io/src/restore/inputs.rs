@@ -2,7 +2,7 @@
 
 use crc32fast::Hasher;
 use qudi_core::natural_order::natural_order;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -39,7 +39,7 @@ impl Fingerprint {
     /// Reads the fingerprint of the file or folder at `path`.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read, or is neither a regular file nor a folder.
+    /// [`Error`] if it cannot be read, or is neither a regular file nor a folder.
     pub fn of(path: &Path) -> Result<Self> {
         if !path.is_dir() {
             qudi_core::regular_file::require_regular(path, "read the input")?;
@@ -52,7 +52,7 @@ impl Fingerprint {
         let mut modified = None;
         let mut lengths = Vec::with_capacity(files.len());
         for file in &files {
-            let found = file.metadata().map_err(|e| SimError::io("read", file, e))?;
+            let found = file.metadata().map_err(|e| Error::io("read", file, e))?;
             let time = found.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok());
             modified = modified.max(time.map(|t| t.as_secs()));
             bytes = bytes.saturating_add(found.len());
@@ -72,7 +72,7 @@ impl Fingerprint {
             } else {
                 hash_some(file, length, blocks, &mut hasher)
             };
-            hashed.map_err(|e| SimError::io("read", file, e))?;
+            hashed.map_err(|e| Error::io("read", file, e))?;
         }
         Ok(Self { bytes, modified, crc32: hasher.finalize(), whole })
     }
@@ -100,7 +100,7 @@ fn list(path: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
         files.push(path.to_owned());
         return Ok(());
     }
-    let io = |e| SimError::io("list the folder", path, e);
+    let io = |e| Error::io("list the folder", path, e);
     for entry in std::fs::read_dir(path).map_err(io)? {
         let path = entry.map_err(io)?.path();
         if path.is_file() || (depth > 1 && path.is_dir()) {

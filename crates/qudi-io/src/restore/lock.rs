@@ -1,6 +1,7 @@
-//! Locks that keep two runs from writing the same frames. The system drops them when a process ends, however it ends.
+//! Locks that keep two runs from writing the same frames. The system drops them when a process ends, however
+//! it ends.
 
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
@@ -30,7 +31,7 @@ impl FolderLock {
     /// Locks the folder at `path`: alone for a whole run, beside other parts for a part.
     ///
     /// # Errors
-    /// [`SimError::Data`] if another run holds it.
+    /// [`Error::Data`] if another run holds it.
     pub(super) fn take(path: &Path, share: Share) -> Result<Self> {
         let folder = handle(path);
         let held = match share {
@@ -43,7 +44,7 @@ impl FolderLock {
         };
         let file = path.join(format!(".part-{number}-of-{of}.lock"));
         let part = OpenOptions::new().create(true).append(true).open(&file);
-        let part = part.map_err(|e| SimError::io("create the lock", &file, e))?;
+        let part = part.map_err(|e| Error::io("create the lock", &file, e))?;
         let what = format!("another run is at work on part {number} of {of} of this folder");
         check(Some(part.try_lock()), path, &what)?;
         Ok(Self { _folder: folder, part: Some((part, file)) })
@@ -75,7 +76,7 @@ fn check(
 ) -> Result<()> {
     match held {
         Some(Err(TryLockError::WouldBlock)) => {
-            Err(SimError::data(what, path, "wait until it is done, or choose another folder"))
+            Err(Error::data(what, path, "wait until it is done, or choose another folder"))
         }
         _ => Ok(()),
     }

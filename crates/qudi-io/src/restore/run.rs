@@ -4,7 +4,7 @@ use crate::capture::Capture;
 use qudi_core::Frame;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::windows::{CrossFade, Windows};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::collections::VecDeque;
 use std::ops::{ControlFlow, Range};
 use std::path::Path;
@@ -17,8 +17,8 @@ pub trait RestoreSink {
     /// The sink's own; the run ends with it.
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()>;
 
-    /// Takes the uncertainty of frame `number`, right after the frame: the standard deviation over the samples of
-    /// a method that draws several. Other methods have none.
+    /// Takes the uncertainty of frame `number`, right after the frame: the standard deviation over the
+    /// samples of a method that draws several. Other methods have none.
     ///
     /// # Errors
     /// The sink's own; the run ends with it.
@@ -33,7 +33,7 @@ fn refuse_not_finite(first: u64, frames: &[Frame], path: &Path) -> Result<()> {
     for (number, frame) in (first..).zip(frames) {
         if let Some(at) = frame.data.iter().position(|value| !value.is_finite()) {
             let (row, column) = (at / frame.size.width, at % frame.size.width);
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!(
                     "restored frame {number} holds {} at row {row}, column {column}",
                     frame.data[at]
@@ -51,8 +51,8 @@ fn refuse_not_finite(first: u64, frames: &[Frame], path: &Path) -> Result<()> {
 /// whether it came from a file or a pipe. Memory holds two windows at most.
 ///
 /// # Errors
-/// [`SimError`] if the capture cannot be read or the method or the sink fails;
-/// [`SimError::Interrupted`] if `on`, told how many wanted frames are done of how many (if that is
+/// [`Error`] if the capture cannot be read or the method or the sink fails;
+/// [`Error::Interrupted`] if `on`, which hears how many wanted frames are done of how many (if that is
 /// known), says so.
 pub fn run(
     restorer: &mut dyn Restorer,
@@ -78,7 +78,7 @@ pub fn run(
         let range = windows.range(number);
         let total = capture.length().map(|length| wanted.end.min(length) - wanted.start);
         if on(range.start.saturating_sub(wanted.start), total).is_break() {
-            return Err(SimError::Interrupted);
+            return Err(Error::Interrupted);
         }
         if counts.is_empty() {
             first_held = range.start;

@@ -18,7 +18,7 @@ impl ArrayWriter {
     /// Starts an array of items of shape `item`, samples of NumPy type `descr`.
     ///
     /// # Errors
-    /// [`qudi_core::SimError`] if the name is taken or the folder cannot be written.
+    /// [`qudi_core::Error`] if the name is taken or the folder cannot be written.
     pub fn create(
         path: &Path,
         overwrite: Overwrite,
@@ -35,7 +35,7 @@ impl ArrayWriter {
     /// Adds one item, given as little-endian bytes.
     ///
     /// # Errors
-    /// [`qudi_core::SimError::Io`] if the disk is full.
+    /// [`qudi_core::Error::Io`] if the disk is full.
     pub fn push(&mut self, bytes: &[u8]) -> Result<()> {
         self.shape[0] += 1;
         self.file.write_all(bytes).map_err(|e| self.file.fault(e))
@@ -44,7 +44,7 @@ impl ArrayWriter {
     /// Adds one item of f32 samples.
     ///
     /// # Errors
-    /// [`qudi_core::SimError::Io`] if the disk is full.
+    /// [`qudi_core::Error::Io`] if the disk is full.
     pub fn push_f32(&mut self, values: impl Iterator<Item = f32>) -> Result<()> {
         let bytes: Vec<u8> = values.flat_map(f32::to_le_bytes).collect();
         self.push(&bytes)
@@ -53,7 +53,7 @@ impl ArrayWriter {
     /// Writes the true length into the header and gives the file its name.
     ///
     /// # Errors
-    /// [`qudi_core::SimError::Io`] if the disk is full.
+    /// [`qudi_core::Error::Io`] if the disk is full.
     pub fn finish(mut self) -> Result<()> {
         let mut header = Vec::new();
         let rewritten = write_header(&mut header, self.descr, &self.shape)

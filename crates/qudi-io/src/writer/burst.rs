@@ -10,7 +10,7 @@ use png_folder::PngFolder;
 use qudi_core::Size;
 use qudi_core::atomic_file::Overwrite;
 use qudi_core::npy::write_header;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -43,14 +43,14 @@ impl BurstFormat {
     /// are packed if `packed`.
     ///
     /// # Errors
-    /// [`SimError`] for other extensions.
+    /// [`Error`] for other extensions.
     pub fn for_path(path: &Path, max_count: u16, packed: bool) -> Result<Self> {
         let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
         match extension.as_deref() {
             Some("npy") => Ok(Self::npy(max_count, packed)),
             Some("tif" | "tiff") => Ok(Self::Tiff),
             None => Ok(Self::Png),
-            Some(other) => Err(SimError::data(
+            Some(other) => Err(Error::data(
                 format!("bursts are not written as .{other}"),
                 path,
                 "use .npy, .tif, or a name without extension for a folder of PNG",
@@ -135,7 +135,7 @@ impl BurstWriter {
     /// Starts a burst of frames of `size`, counts up to `max_count`.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken or the folder cannot be written.
+    /// [`Error`] if the name is taken or the folder cannot be written.
     pub fn create(
         path: &Path,
         format: BurstFormat,
@@ -160,7 +160,7 @@ impl BurstWriter {
     /// Adds one frame.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn push(&mut self, counts: &[u16]) -> Result<()> {
         match &mut self.target {
             Target::Array(array) => array.push(&self.format.encode(self.size, counts)),
@@ -176,7 +176,7 @@ impl BurstWriter {
     /// Adds packed frames as they are; `false` if the format is not packed `.npy`.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn push_packed(&mut self, frames: &[u8]) -> Result<bool> {
         match &mut self.target {
             Target::Array(array) if self.format == BurstFormat::NpyPacked => {
@@ -191,7 +191,7 @@ impl BurstWriter {
     /// Gives the burst its name, and its record beside or inside it.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn finish(self, record: &[u8], overwrite: Overwrite) -> Result<()> {
         let record_path = self.format.record_path(&self.path);
         if let Target::Png(folder) = self.target {

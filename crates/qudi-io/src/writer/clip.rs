@@ -7,8 +7,8 @@ use super::tiff_stack::{TiffSamples, TiffStack};
 use super::{frame_name, is_frame_name};
 use image::{ImageBuffer, Luma};
 use qudi_core::atomic_file::{Overwrite, OwnFolder, PendingFolder};
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::path::Path;
 
 /// A folder of frames and nothing else, which begins with the first.
@@ -51,7 +51,7 @@ impl ClipWriter {
     /// extension. `tiff` says what the samples of a `.tif` are.
     ///
     /// # Errors
-    /// [`SimError`] for other extensions, or if the name is taken or the folder cannot be written.
+    /// [`Error`] for other extensions, or if the name is taken or the folder cannot be written.
     pub fn create(
         path: &Path,
         size: Size,
@@ -71,7 +71,7 @@ impl ClipWriter {
                 let folder = PendingFolder::create(path, overwrite, FRAMES)?;
                 Ok(Self::Folder { folder, frames: 0 })
             }
-            Some(other) => Err(SimError::data(
+            Some(other) => Err(Error::data(
                 format!("frames are not written as .{other}"),
                 path,
                 "use .npy, .tif, .gif, .mp4, or a name without extension for a folder of 16-bit PNG",
@@ -82,7 +82,7 @@ impl ClipWriter {
     /// Adds one frame.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn push(&mut self, frame: &Frame) -> Result<()> {
         match self {
             Self::Array(array) => array.push_f32(frame.data.iter().copied()),
@@ -98,7 +98,7 @@ impl ClipWriter {
                 let file = folder.file(&frame_name(*frames));
                 *frames += 1;
                 save_png16(frame, &file)
-                    .map_err(|e| SimError::io("write a frame into", folder.path(), e))
+                    .map_err(|e| Error::io("write a frame into", folder.path(), e))
             }
         }
     }
@@ -106,7 +106,7 @@ impl ClipWriter {
     /// Gives the clip its name.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn finish(self) -> Result<()> {
         match self {
             Self::Array(array) => array.finish(),

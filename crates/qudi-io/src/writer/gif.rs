@@ -2,7 +2,7 @@
 
 use qudi_core::Size;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::Path;
 
 /// A growing GIF.
@@ -29,11 +29,11 @@ impl GifWriter {
     /// Starts a preview of frames whose brightest value is `full_scale`.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken, the folder cannot be written, or frames are too large.
+    /// [`Error`] if the name is taken, the folder cannot be written, or frames are too large.
     pub fn create(path: &Path, overwrite: Overwrite, size: Size, full_scale: u16) -> Result<Self> {
         let (Ok(width), Ok(height)) = (u16::try_from(size.width), u16::try_from(size.height))
         else {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("frames of {size} do not fit into a GIF"),
                 path,
                 "GIF ends at 65535 pixels: leave out `preview`",
@@ -50,7 +50,7 @@ impl GifWriter {
     /// Adds a frame of counts; those after the 200th are left out.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn push(&mut self, counts: &[u16]) -> Result<()> {
         if self.frames == MAX_FRAMES {
             return Ok(());
@@ -72,7 +72,7 @@ impl GifWriter {
     /// Gives the file its name.
     ///
     /// # Errors
-    /// [`SimError::Io`] if the disk is full.
+    /// [`Error::Io`] if the disk is full.
     pub fn finish(self) -> Result<()> {
         let path = self.encoder.get_ref().path().to_owned();
         let file = self.encoder.into_inner().map_err(|e| fault(&path, e))?;
@@ -80,9 +80,9 @@ impl GifWriter {
     }
 }
 
-fn fault(path: &Path, e: gif::EncodingError) -> SimError {
+fn fault(path: &Path, e: gif::EncodingError) -> Error {
     match e {
-        gif::EncodingError::Io(e) => SimError::io("write", path, e),
-        other => SimError::io("write", path, std::io::Error::other(other)),
+        gif::EncodingError::Io(e) => Error::io("write", path, e),
+        other => Error::io("write", path, std::io::Error::other(other)),
     }
 }

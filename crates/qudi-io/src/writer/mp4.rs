@@ -1,8 +1,8 @@
 //! MP4 through the `ffmpeg` program on PATH, for looking at: 8 bits, compressed.
 
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -27,10 +27,10 @@ impl Mp4Writer {
     /// Starts a film of frames of `size`.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken or there is no ffmpeg.
+    /// [`Error`] if the name is taken or there is no ffmpeg.
     pub fn create(path: &Path, size: Size, overwrite: Overwrite) -> Result<Self> {
         refuse_taken(path, overwrite)?;
-        let io = |e| SimError::io("create the output", path, e);
+        let io = |e| Error::io("create the output", path, e);
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let mut builder = tempfile::Builder::new();
         builder.prefix(".qudi-").suffix(".mp4");
@@ -54,12 +54,12 @@ impl Mp4Writer {
             .stderr(words.try_clone().map_err(io)?)
             .spawn();
         let child = spawned.map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => SimError::data(
+            std::io::ErrorKind::NotFound => Error::data(
                 "films are made by ffmpeg, and there is no `ffmpeg` on PATH",
                 path,
                 "install ffmpeg (https://ffmpeg.org), or write .gif, .npy or a folder",
             ),
-            _ => SimError::io("start ffmpeg for", path, e),
+            _ => Error::io("start ffmpeg for", path, e),
         })?;
         Ok(Self { child, words, unfinished, path: path.to_owned(), overwrite })
     }
@@ -67,7 +67,7 @@ impl Mp4Writer {
     /// Adds a frame.
     ///
     /// # Errors
-    /// [`SimError`] with ffmpeg's words if it has given up.
+    /// [`Error`] with ffmpeg's words if it has given up.
     pub fn push(&mut self, frame: &Frame) -> Result<()> {
         let bytes: Vec<u8> =
             frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
@@ -81,21 +81,21 @@ impl Mp4Writer {
     /// Waits for ffmpeg and gives the film its name.
     ///
     /// # Errors
-    /// [`SimError`] if ffmpeg failed or the disk is full.
+    /// [`Error`] if ffmpeg failed or the disk is full.
     pub fn finish(mut self) -> Result<()> {
         drop(self.child.stdin.take());
         let status =
-            self.child.wait().map_err(|e| SimError::io("wait for ffmpeg at", &self.path, e))?;
+            self.child.wait().map_err(|e| Error::io("wait for ffmpeg at", &self.path, e))?;
         if !status.success() {
             return Err(self.failed());
         }
         // Whoever took the name since the start keeps it.
         refuse_taken(&self.path, self.overwrite)?;
         std::fs::rename(self.unfinished.path(), &self.path)
-            .map_err(|e| SimError::io("write", &self.path, e))
+            .map_err(|e| Error::io("write", &self.path, e))
     }
 
-    fn failed(&mut self) -> SimError {
+    fn failed(&mut self) -> Error {
         let _ = self.child.kill();
         let _ = self.child.wait();
         let mut text = Vec::new();
@@ -103,7 +103,7 @@ impl Mp4Writer {
         let _ = (&mut self.words).take(4096).read_to_end(&mut text);
         let text = String::from_utf8_lossy(&text);
         let reason = text.lines().next().unwrap_or("it gave no reason").trim().to_owned();
-        SimError::data(
+        Error::data(
             format!("ffmpeg cannot write the film: {reason}"),
             &self.path,
             "an ffmpeg with libx264 is needed; or write .gif, .npy or a folder",

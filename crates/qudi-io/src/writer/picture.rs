@@ -2,8 +2,8 @@
 
 use image::{ExtendedColorType, ImageEncoder};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use qudi_sim::scene::{GLYPH_HEIGHT, draw_text};
 use std::path::Path;
 
@@ -52,7 +52,7 @@ impl Picture {
     /// Writes it as an 8-bit gray PNG.
     ///
     /// # Errors
-    /// [`SimError`] if the name is taken or the folder cannot be written.
+    /// [`Error`] if the name is taken or the folder cannot be written.
     pub fn save(&self, path: &Path, overwrite: Overwrite) -> Result<()> {
         let mut file = PendingFile::create(path, overwrite)?;
         let bytes: Vec<u8> =
@@ -60,7 +60,7 @@ impl Picture {
         let Size { height, width } = self.canvas.size;
         image::codecs::png::PngEncoder::new(&mut file)
             .write_image(&bytes, width as u32, height as u32, ExtendedColorType::L8)
-            .map_err(|e| SimError::io("write", path, std::io::Error::other(e)))?;
+            .map_err(|e| Error::io("write", path, std::io::Error::other(e)))?;
         file.finish()
     }
 }

@@ -3,7 +3,7 @@
 
 use qudi_core::Size;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::cell::RefCell;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -79,7 +79,7 @@ impl TiffStack {
     {
         self.bytes += (size_of_val(samples) + DIRECTORY) as u64;
         if self.bytes > CLASSIC_LIMIT {
-            return Err(SimError::data(
+            return Err(Error::data(
                 "the stack outgrows the 4 GiB of a TIFF file",
                 &self.path,
                 "write it as .npy, or fewer frames at a time",
@@ -96,9 +96,9 @@ impl TiffStack {
     }
 }
 
-fn fault(path: &Path, e: tiff::TiffError) -> SimError {
+fn fault(path: &Path, e: tiff::TiffError) -> Error {
     match e {
-        tiff::TiffError::IoError(e) => SimError::io("write", path, e),
-        other => SimError::io("write", path, std::io::Error::other(other)),
+        tiff::TiffError::IoError(e) => Error::io("write", path, e),
+        other => Error::io("write", path, std::io::Error::other(other)),
     }
 }

@@ -13,7 +13,7 @@ fn sums(scene: &str, seed: u64, ppp: f64, lengths: &[u64]) -> Vec<(u64, Vec<u32>
     let longest = *lengths.last().unwrap();
     let sampling = Sampling { frames: Some(longest), ..Sampling::default() };
     let mut source = input.open(&sampling).unwrap();
-    let light = Light { ppp: ppp / sensor.quantum_efficiency, exposure: 0.4 };
+    let light = Light { ppp: ppp / sensor.quantum_efficiency, mean_level: 0.4 };
     let mut camera = Camera::new(&sensor, size, light, seed).unwrap();
     let mut total = vec![0u32; size.pixels()];
     let mut found = Vec::new();

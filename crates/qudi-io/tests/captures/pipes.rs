@@ -6,12 +6,12 @@ use qudi_burst::Average;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
-use qudi_core::{Frame, SimError};
+use qudi_core::{Error, Frame};
 use qudi_io::capture::{Axes, Capture, PackAxis, ReadOptions};
 use qudi_io::restore::{RestoreSink, run};
 use std::ops::ControlFlow;
 
-fn piped(bytes: &[u8], options: &ReadOptions) -> Result<Capture, SimError> {
+fn piped(bytes: &[u8], options: &ReadOptions) -> Result<Capture, Error> {
     Capture::from_pipe(std::io::Cursor::new(bytes.to_vec()), options, None)
 }
 
@@ -72,7 +72,7 @@ impl RestoreSink for Collected {
     }
 }
 
-fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, SimError> {
+fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, Error> {
     let acquisition =
         Acquisition::new(Sensor::load("ideal").unwrap(), 1.0, 0.45).unwrap().with_seed(1);
     let windows = Windows::new(capture.frames(), 11, 3)?;

@@ -21,7 +21,7 @@ fn simulate(
     ppp: f64,
     frames: u64,
 ) -> std::path::PathBuf {
-    let light = Light { ppp, exposure: 0.4 };
+    let light = Light { ppp, mean_level: 0.4 };
     let mut camera = Camera::new(sensor, scene.size, light, 5).unwrap();
     let mut data = Vec::new();
     for frame in 0..frames {

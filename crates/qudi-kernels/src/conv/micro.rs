@@ -8,8 +8,8 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Channels and vectors of the kinds of blocks: 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512, NEON).
-/// Best first: the more channels, the fewer loads.
+/// Channels and vectors of the kinds of blocks: 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512,
+/// NEON). Best first: the more channels, the fewer loads.
 pub(super) const KINDS: [(usize, usize); 4] = [(12, 2), (8, 3), (6, 2), (4, 3)];
 
 /// Channels of the kind of block that wastes least on results of `outputs` channels and `columns` pixels.

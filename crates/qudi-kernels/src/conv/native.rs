@@ -38,8 +38,8 @@ pub(crate) fn forward(
     output
 }
 
-/// Gradients for the inputs, one for each, the addend excepted; `output` is what [`forward`] gave, where it cut
-/// at zero.
+/// Gradients for the inputs, one for each, the addend excepted; `output` is what [`forward`] gave, where it
+/// cut at zero.
 pub(super) fn input_gradients(
     geometry: &Geometry,
     weight: &[f32],

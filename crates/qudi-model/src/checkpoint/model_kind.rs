@@ -4,7 +4,7 @@ use crate::network::Qudi;
 use crate::tensor::read;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::Tensor;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 
 /// Which parts of a network have learnt.
@@ -39,7 +39,7 @@ impl ModelKind {
     /// The kind of a network in memory.
     ///
     /// # Errors
-    /// [`SimError`] if the device fails.
+    /// [`Error`] if the device fails.
     pub fn of(network: &Qudi) -> Result<Self> {
         let mut zeros = Zeros { path: Vec::new(), names: Vec::new(), error: None };
         network.visit(&mut zeros);
@@ -54,7 +54,7 @@ impl ModelKind {
 struct Zeros {
     path: Vec<String>,
     names: Vec<String>,
-    error: Option<SimError>,
+    error: Option<Error>,
 }
 
 impl ModuleVisitor for Zeros {

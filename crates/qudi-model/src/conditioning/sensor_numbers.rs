@@ -24,7 +24,7 @@ pub fn sensor_numbers(acquisition: &Acquisition) -> [f32; SENSOR_NUMBERS] {
     };
     [
         acquisition.ppp.max(1e-6).log10(),
-        acquisition.exposure,
+        acquisition.mean_level,
         sensor.quantum_efficiency,
         dark,
         sensor.read_noise,
@@ -33,7 +33,7 @@ pub fn sensor_numbers(acquisition: &Acquisition) -> [f32; SENSOR_NUMBERS] {
         f64::from(u8::from(binary)),
         f64::from(sensor.frames_summed).log2() / 8.0,
         log_sigma(0.0),
-        log_sigma(acquisition.exposure),
+        log_sigma(acquisition.mean_level),
     ]
     .map(|number| number as f32)
 }

@@ -41,14 +41,14 @@ impl ForwardModel {
                 ppp *= after / before;
             }
         }
-        Self { sensor, light: Light { ppp, exposure: acquisition.exposure } }
+        Self { sensor, light: Light { ppp, mean_level: acquisition.mean_level } }
     }
 
     /// Measures `frames`, row-major images in [0, 1] of `size`. Frame `i` is number `first + i` of the
     /// capture; its photons depend on that number and the seed alone.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the sensor or its light is impossible.
+    /// [`Error`](qudi_core::Error) if the sensor or its light is impossible.
     pub fn measure(
         &self,
         frames: &[f32],
@@ -57,7 +57,7 @@ impl ForwardModel {
         seed: u64,
     ) -> Result<CountPlanes> {
         let mut camera = Camera::new(&self.sensor, size, self.light, seed)?;
-        let photons_per_unit = self.light.ppp / self.light.exposure;
+        let photons_per_unit = self.light.ppp / self.light.mean_level;
         let dark = dark_per_frame(&self.sensor);
         let response = CountResponse::new(&self.sensor, photons_per_unit, camera.gain(), dark);
         let mut planes = CountPlanes {

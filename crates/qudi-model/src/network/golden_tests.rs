@@ -480,7 +480,7 @@ fn ten_sampling_steps_match_pytorch() {
             flows = Some(result.flows);
             let x0 = read(result.x0.clamp(-1.0, 1.0))?;
             close("x0", &x0, &expected_x0, k);
-            Ok::<_, qudi_core::SimError>(x0)
+            Ok::<_, qudi_core::Error>(x0)
         };
         let noise = |k: usize| cases::gaussian(&format!("noise.{k}"), count);
         let steps = sampler.steps(&schedule, 10, TimestepSpacing::Linear);

@@ -5,8 +5,8 @@ use image::codecs::gif::GifDecoder;
 use image::{AnimationDecoder, ImageDecoder};
 use qudi_core::Transfer;
 use qudi_core::regular_file::open_regular;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
@@ -27,12 +27,8 @@ impl Gif {
     }
 }
 
-fn damaged(path: &Path, e: &image::ImageError) -> SimError {
-    SimError::data(
-        format!("not a readable GIF: {e}"),
-        path,
-        "export it again, or as a folder of PNG",
-    )
+fn damaged(path: &Path, e: &image::ImageError) -> Error {
+    Error::data(format!("not a readable GIF: {e}"), path, "export it again, or as a folder of PNG")
 }
 
 impl FrameReader for Gif {

@@ -4,8 +4,8 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits};
 use qudi_core::Transfer;
 use qudi_core::limits::IMAGE_PIXELS;
 use qudi_core::regular_file::open_regular;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::io::BufReader;
 use std::path::Path;
 
@@ -21,7 +21,7 @@ pub fn is_image(path: &Path) -> bool {
 /// Reads one image as gray values in [0, 1]; an alpha channel is ignored.
 ///
 /// # Errors
-/// [`SimError`] if it cannot be read, is damaged, or is too large.
+/// [`Error`] if it cannot be read, is damaged, or is too large.
 pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
     to_gray(decode_image(path)?, path, transfer)
 }
@@ -29,16 +29,16 @@ pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
 /// Decodes one image as it is stored.
 ///
 /// # Errors
-/// [`SimError`] if it cannot be read, is damaged, or is too large.
+/// [`Error`] if it cannot be read, is damaged, or is too large.
 pub fn decode_image(path: &Path) -> Result<DynamicImage> {
     let file = BufReader::new(open_regular(path, "open the image")?);
     let guessed = ImageReader::new(file).with_guessed_format();
-    let reader = guessed.map_err(|e| SimError::io("open the image", path, e))?;
+    let reader = guessed.map_err(|e| Error::io("open the image", path, e))?;
     // A few kilobytes can stand for gigabytes of pixels: the header is asked before anything is decoded.
     let decoder = reader.into_decoder().map_err(|e| unreadable(e, path))?;
     let (width, height) = decoder.dimensions();
     if u64::from(width) * u64::from(height) > IMAGE_PIXELS {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!(
                 "an image of {height} x {width} pixels is over the limit of {IMAGE_PIXELS} pixels"
             ),
@@ -48,7 +48,7 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
     }
     let most = Limits::default().max_alloc.unwrap_or(u64::MAX);
     if decoder.total_bytes() > most {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("an image of {} bytes is over the limit of {most}", decoder.total_bytes()),
             path,
             "cut it into smaller images, or save it with fewer channels",
@@ -58,12 +58,12 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
 }
 
 /// Says why an image cannot be decoded.
-fn unreadable(e: ImageError, path: &Path) -> SimError {
+fn unreadable(e: ImageError, path: &Path) -> Error {
     match e {
         ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
-            SimError::io("read the image", path, e)
+            Error::io("read the image", path, e)
         }
-        other => SimError::data(
+        other => Error::data(
             format!("not a readable image: {other}"),
             path,
             "open it in a viewer to see whether it is damaged, and save it again as PNG",
@@ -99,7 +99,7 @@ fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame
         DynamicImage::ImageRgb32F(i) => i.into_raw(),
         DynamicImage::ImageRgba32F(i) => i.into_raw(),
         other => {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("an image of unsupported type {:?}", other.color()),
                 path,
                 "save it as 8- or 16-bit gray or RGB",
@@ -114,7 +114,7 @@ fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame
 /// Floating-point files may hold anything; scenes hold values in [0, 1].
 pub(super) fn check_values(data: &[f32], path: &Path) -> Result<()> {
     let Some(bad) = data.iter().find(|v| !(0.0..=1.0).contains(*v)) else { return Ok(()) };
-    Err(SimError::data(
+    Err(Error::data(
         format!("a value of {bad}, where scenes lie between 0 (black) and 1 (white)"),
         path,
         "replace missing values; for other scales give the value of white, such as 255",

@@ -4,8 +4,8 @@ use super::FrameReader;
 use super::image_file::{EXTENSIONS, is_image, read_still};
 use qudi_core::Transfer;
 use qudi_core::natural_order::natural_order;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::path::{Path, PathBuf};
 
 pub(super) struct ImageFolder {
@@ -18,7 +18,7 @@ pub(super) struct ImageFolder {
 
 impl ImageFolder {
     pub(super) fn open(folder: &Path, transfer: Transfer) -> Result<Self> {
-        let read = |e| SimError::io("list the folder", folder, e);
+        let read = |e| Error::io("list the folder", folder, e);
         let mut files = Vec::new();
         for entry in std::fs::read_dir(folder).map_err(read)? {
             let path = entry.map_err(read)?.path();
@@ -29,7 +29,7 @@ impl ImageFolder {
         }
         files.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
         let Some(name) = files.first() else {
-            return Err(SimError::data(
+            return Err(Error::data(
                 "the folder holds no images",
                 folder,
                 format!("put frames into it as {}", EXTENSIONS.join(", ")),
@@ -60,7 +60,7 @@ impl FrameReader for ImageFolder {
         let Some(path) = self.files.next() else { return Ok(None) };
         let frame = read_still(&path, self.transfer)?;
         if frame.size != self.size {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("an image of {} among images of {}", frame.size, self.size),
                 &path,
                 "frames of one clip have one size: resize it, or move it to another folder",

@@ -14,7 +14,7 @@ use qudi_core::Size;
 use qudi_core::Transfer;
 use qudi_core::limits::EXPOSURE_INSTANTS;
 use qudi_core::regular_file::open_regular;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom, Write};
@@ -98,7 +98,7 @@ impl Input {
     /// `motion`, `size`, `seed` and `speed` are for the synthetic kinds.
     ///
     /// # Errors
-    /// [`SimError`] if there is no such file or scene, or an option does not go with it.
+    /// [`Error`] if there is no such file or scene, or an option does not go with it.
     pub fn parse(
         text: &str,
         motion: Option<StillMotion>,
@@ -109,7 +109,7 @@ impl Input {
         if let Some(name) = text.strip_prefix("scene:") {
             let Some(kind) = ProceduralScene::by_name(name) else {
                 let names: Vec<_> = PROCEDURAL.iter().map(|kind| kind.name()).collect();
-                return Err(SimError::request(
+                return Err(Error::request(
                     format!("no procedural scene named `{name}`"),
                     text,
                     format!("there are {}", names.join(", ")),
@@ -123,9 +123,8 @@ impl Input {
         }
         // Absolute, so that a record works from any folder.
         let path = std::path::absolute(text)
-            .map_err(|e| SimError::io("find the input", Path::new(text), e))?;
-        let about =
-            std::fs::metadata(&path).map_err(|e| SimError::io("find the input", &path, e))?;
+            .map_err(|e| Error::io("find the input", Path::new(text), e))?;
+        let about = std::fs::metadata(&path).map_err(|e| Error::io("find the input", &path, e))?;
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         let input = match extension.as_str() {
             _ if about.is_dir() => Self::Images { path },
@@ -139,7 +138,7 @@ impl Input {
             _ => Self::Video { path },
         };
         if motion.is_some() || size.is_some() {
-            return Err(SimError::request(
+            return Err(Error::request(
                 "`motion` and `size` shape synthetic scenes, and this is a recorded clip",
                 text,
                 "leave them out, or give a single image",
@@ -151,7 +150,7 @@ impl Input {
     /// A recorded clip: a folder of frames or a file.
     ///
     /// # Errors
-    /// [`SimError`] if there is none.
+    /// [`Error`] if there is none.
     pub fn clip(path: &Path) -> Result<Self> {
         Self::parse(&path.to_string_lossy(), None, None, 0, 0.0)
     }
@@ -166,7 +165,7 @@ impl Input {
     /// Does nothing for other kinds. `on` is asked between pieces whether to go on.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read or stored; [`SimError::Interrupted`] if `on` breaks.
+    /// [`Error`] if it cannot be read or stored; [`Error::Interrupted`] if `on` breaks.
     pub fn spool(
         &mut self,
         from: &mut impl Read,
@@ -175,17 +174,17 @@ impl Input {
         let Self::Pipe { spool } = self else { return Ok(()) };
         let stdin = Path::new("standard input");
         let mut file = tempfile::tempfile()
-            .map_err(|e| SimError::io("make a temporary file for the pipe", stdin, e))?;
+            .map_err(|e| Error::io("make a temporary file for the pipe", stdin, e))?;
         let mut piece = vec![0u8; 1 << 18];
         loop {
-            let n = from.read(&mut piece).map_err(|e| SimError::io("read the pipe", stdin, e))?;
+            let n = from.read(&mut piece).map_err(|e| Error::io("read the pipe", stdin, e))?;
             if n == 0 {
                 break;
             }
             file.write_all(&piece[..n])
-                .map_err(|e| SimError::io("store the pipe's data", stdin, e))?;
+                .map_err(|e| Error::io("store the pipe's data", stdin, e))?;
             if on().is_break() {
-                return Err(SimError::Interrupted);
+                return Err(Error::Interrupted);
             }
         }
         *spool = Some(file);
@@ -195,10 +194,10 @@ impl Input {
     /// Opens the clip at its beginning.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read or the sampling does not fit.
+    /// [`Error`] if it cannot be read or the sampling does not fit.
     pub fn open(&self, sampling: &Sampling) -> Result<Box<dyn ExposureSource>> {
         if !(1..=EXPOSURE_INSTANTS).contains(&sampling.instants) {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("{} instants per exposure", sampling.instants),
                 "instants",
                 format!("between 1 (no motion during an exposure) and {EXPOSURE_INSTANTS}"),
@@ -207,7 +206,7 @@ impl Input {
         if let Some(white) = sampling.white
             && !(white.is_finite() && white > 0.0)
         {
-            return Err(SimError::request(
+            return Err(Error::request(
                 format!("white at {white}"),
                 "white",
                 "give a number above 0",
@@ -227,13 +226,13 @@ impl Input {
             Self::Pipe { spool } => {
                 let stdin = Path::new("standard input");
                 let Some(spool) = spool else {
-                    return Err(SimError::request(
+                    return Err(Error::request(
                         "the pipe is gone",
                         "standard input",
                         "pipe the clip in again",
                     ));
                 };
-                let again = |e| SimError::io("reread the pipe's data", stdin, e);
+                let again = |e| Error::io("reread the pipe's data", stdin, e);
                 let mut file = spool.try_clone().map_err(again)?;
                 file.seek(SeekFrom::Start(0)).map_err(again)?;
                 Box::new(Y4m::open(BufReader::with_capacity(1 << 18, file), stdin, transfer)?)
@@ -248,7 +247,7 @@ impl Input {
                 let size = procedural.size;
                 Size::new(size.height, size.width, "size")?;
                 if !(procedural.speed.is_finite() && procedural.speed >= 0.0) {
-                    return Err(SimError::request(
+                    return Err(Error::request(
                         format!("a speed of {}", procedural.speed),
                         "speed",
                         "give pixels per frame, 0 or more",

@@ -4,8 +4,8 @@ use super::FrameReader;
 use super::image_file::check_values;
 use qudi_core::Transfer;
 use qudi_core::npy::{Header, Sample};
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ impl NpyFrames {
         let (header, reader) = Header::open(path)?;
         header.require_c_order(path)?;
         let Some(white) = white.or(header.sample.full_scale()) else {
-            return Err(SimError::data(
+            return Err(Error::data(
                 "an array of wide integers, whose value of white is unknown",
                 path,
                 "give the value of white, such as 255",
@@ -38,7 +38,7 @@ impl NpyFrames {
             [t, h, w] => (t, h, w, 1),
             [t, h, w, c @ (1 | 3)] => (t, h, w, c),
             _ => {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!("an array of shape {:?} is no clip", header.shape),
                     path,
                     "save an array of shape (frames, height, width) or (frames, height, width, 3)",
@@ -46,11 +46,7 @@ impl NpyFrames {
             }
         };
         if frames == 0 {
-            return Err(SimError::data(
-                "the array holds no frames",
-                path,
-                "save at least one frame",
-            ));
+            return Err(Error::data("the array holds no frames", path, "save at least one frame"));
         }
         Ok(Self {
             reader,
@@ -82,9 +78,7 @@ impl FrameReader for NpyFrames {
         self.left -= 1;
         let bytes = self.sample.bytes();
         let mut raw = vec![0u8; self.size.pixels() * self.channels * bytes];
-        self.reader
-            .read_exact(&mut raw)
-            .map_err(|e| SimError::io("read a frame", &self.path, e))?;
+        self.reader.read_exact(&mut raw).map_err(|e| Error::io("read a frame", &self.path, e))?;
         let value = |b: &[u8]| self.sample.decode(b) / self.white;
         let data: Vec<f32> = if self.channels == 1 {
             raw.chunks_exact(bytes).map(|b| self.transfer.decode(value(b))).collect()

@@ -3,7 +3,7 @@
 use super::FrameReader;
 use image::codecs::pnm::PnmDecoder;
 use image::{ColorType, ImageDecoder};
-use qudi_core::{Frame, Result, SimError, Size, Transfer};
+use qudi_core::{Error, Frame, Result, Size, Transfer};
 use std::io::BufRead;
 use std::path::{Path, PathBuf};
 
@@ -26,8 +26,8 @@ impl<R: BufRead> PpmStream<R> {
     }
 }
 
-fn damaged(path: &Path, what: &str) -> SimError {
-    SimError::data(
+fn damaged(path: &Path, what: &str) -> Error {
+    Error::data(
         format!("the decoded video is broken: {what}"),
         path,
         "check the file with `ffmpeg -i FILE -f null -`",
@@ -36,7 +36,7 @@ fn damaged(path: &Path, what: &str) -> SimError {
 
 /// Decodes one image; none at the end of the stream.
 fn read_frame(reader: &mut impl BufRead, path: &Path, transfer: Transfer) -> Result<Option<Frame>> {
-    let rest = reader.fill_buf().map_err(|e| SimError::io("read the decoded video", path, e))?;
+    let rest = reader.fill_buf().map_err(|e| Error::io("read the decoded video", path, e))?;
     if rest.is_empty() {
         return Ok(None);
     }

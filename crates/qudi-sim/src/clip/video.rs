@@ -4,8 +4,8 @@ use super::FrameReader;
 use super::ppm::PpmStream;
 use qudi_core::Transfer;
 use qudi_core::regular_file::open_regular;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -30,11 +30,11 @@ impl Video {
     /// Starts `ffmpeg` on the file at `path`.
     ///
     /// # Errors
-    /// [`SimError`] if `ffmpeg` is missing or cannot decode it.
+    /// [`Error`] if `ffmpeg` is missing or cannot decode it.
     pub fn open(path: &Path, transfer: Transfer) -> Result<Self> {
         // Opened here first, so that ffmpeg neither reports a missing file nor waits for a pipe.
         open_regular(path, "open the video")?;
-        let scratch = |e| SimError::io("make a temporary file for ffmpeg's messages", path, e);
+        let scratch = |e| Error::io("make a temporary file for ffmpeg's messages", path, e);
         let mut words = tempfile::tempfile().map_err(scratch)?;
         // `file:` keeps ffmpeg from taking the name for a URL or an option.
         let mut url = std::ffi::OsString::from("file:");
@@ -60,12 +60,12 @@ impl Video {
             .stderr(words.try_clone().map_err(scratch)?)
             .spawn();
         let mut child = spawned.map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => SimError::data(
+            std::io::ErrorKind::NotFound => Error::data(
                 "videos are decoded by ffmpeg, and there is no `ffmpeg` on PATH",
                 path,
                 "install ffmpeg (https://ffmpeg.org), or give a folder of PNG frames, a GIF or a Y4M file",
             ),
-            _ => SimError::io("start ffmpeg for the video", path, e),
+            _ => Error::io("start ffmpeg for the video", path, e),
         })?;
         let stdout = child.stdout.take().expect("stdout is piped");
         match PpmStream::open(BufReader::with_capacity(1 << 16, stdout), path, transfer) {
@@ -76,7 +76,7 @@ impl Video {
 }
 
 /// ffmpeg's own words about what went wrong.
-fn failed(child: &mut Child, words: &mut File, path: &Path) -> SimError {
+fn failed(child: &mut Child, words: &mut File, path: &Path) -> Error {
     let _ = child.kill();
     let _ = child.wait();
     let mut text = Vec::new();
@@ -86,7 +86,7 @@ fn failed(child: &mut Child, words: &mut File, path: &Path) -> SimError {
     let _ = words.take(4096).read_to_end(&mut text);
     let text = String::from_utf8_lossy(&text);
     let reason = text.lines().next_back().unwrap_or("no video frames in it").trim().to_owned();
-    SimError::data(
+    Error::data(
         format!("ffmpeg cannot decode the file: {reason}"),
         path,
         "check that it is a video; `ffmpeg -i FILE` tells what ffmpeg sees in it",
@@ -106,7 +106,7 @@ impl FrameReader for Video {
         let frame = self.frames.next()?;
         if frame.is_none() {
             let status =
-                self.child.wait().map_err(|e| SimError::io("wait for ffmpeg", &self.path, e))?;
+                self.child.wait().map_err(|e| Error::io("wait for ffmpeg", &self.path, e))?;
             if !status.success() {
                 return Err(failed(&mut self.child, &mut self.words, &self.path));
             }

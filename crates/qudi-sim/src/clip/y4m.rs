@@ -3,8 +3,8 @@
 use super::FrameReader;
 use qudi_core::Transfer;
 use qudi_core::limits::VIDEO_FRAME_BYTES;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use std::cell::Cell;
 use std::io::{Chain, Cursor, Read};
 use std::path::{Path, PathBuf};
@@ -41,7 +41,7 @@ pub(super) struct Y4m<R: Read> {
 
 impl<R: Read> Y4m<R> {
     pub(super) fn open(mut reader: R, path: &Path, transfer: Transfer) -> Result<Self> {
-        let line = first_line(&mut reader).map_err(|e| SimError::io("read the stream", path, e))?;
+        let line = first_line(&mut reader).map_err(|e| Error::io("read the stream", path, e))?;
         let (line, bits) = with_known_layout(&line, path)?;
         let bytes = Rc::new(Cell::new(0));
         let inner = Cursor::new(line).chain(reader);
@@ -91,7 +91,7 @@ fn with_known_layout(line: &[u8], path: &Path) -> Result<(Vec<u8>, u32)> {
             return Ok((known.into_bytes(), bits));
         }
     }
-    Err(SimError::data(
+    Err(Error::data(
         format!("a Y4M stream in the colour space `{name}`, which is not supported"),
         path,
         "convert it with `ffmpeg -i VIDEO -pix_fmt yuv444p -f yuv4mpegpipe -`",
@@ -102,14 +102,14 @@ fn contains(text: &[u8], word: &[u8]) -> bool {
     text.windows(word.len()).any(|part| part == word)
 }
 
-fn damaged(path: &Path, e: &y4m::Error) -> SimError {
+fn damaged(path: &Path, e: &y4m::Error) -> Error {
     let what = match e {
         y4m::Error::EOF => "the stream is empty or ends inside a frame".to_owned(),
         y4m::Error::OutOfMemory => format!("a frame of more than {VIDEO_FRAME_BYTES} bytes"),
         y4m::Error::IoError(e) => format!("cannot read the stream: {e}"),
         other => format!("not a readable Y4M stream: {other}"),
     };
-    SimError::data(what, path, "make one with `ffmpeg -i VIDEO -f yuv4mpegpipe -`")
+    Error::data(what, path, "make one with `ffmpeg -i VIDEO -f yuv4mpegpipe -`")
 }
 
 impl<R: Read> FrameReader for Y4m<R> {

@@ -4,18 +4,19 @@ use super::{BurstSampler, Files};
 use crate::dataset::Dataset;
 use crate::recipe::Recipe;
 use burn::tensor::Device;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_model::network::Qudi;
 use qudi_model::refinement::RefinementStage;
 use qudi_model::restorer::TILE;
 use std::ops::ControlFlow;
 
-/// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the refinement stages of `network`, on `workers`
-/// threads. `on` hears how many there are and how many there will be, and says whether to go on.
+/// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the refinement stages of
+/// `network`, on `workers` threads. `on` hears how many there are and how many there will be, and says
+/// whether to go on.
 ///
 /// # Errors
-/// [`SimError`] if `files` name no folder for bursts, the data or the disk fail, or bursts of something else lie in the
-/// folder; [`SimError::Interrupted`] if told to stop.
+/// [`Error`] if `files` name no folder for bursts, the data or the disk fail, or bursts of something else lie
+/// in the folder; [`Error::Interrupted`] if asked to stop.
 pub fn draw_bursts(
     recipe: &Recipe,
     network: &Qudi,
@@ -25,7 +26,7 @@ pub fn draw_bursts(
     on: &mut dyn FnMut([u64; 2]) -> ControlFlow<()>,
 ) -> Result<()> {
     let Some(folder) = &files.bursts else {
-        return Err(SimError::request("no folder for bursts", "bursts", "name one"));
+        return Err(Error::request("no folder for bursts", "bursts", "name one"));
     };
     let dataset = Dataset::new(&recipe.data, files.pack)?;
     let stages = RefinementStage::all(network, &recipe.network, TILE, device);

@@ -5,7 +5,7 @@ use super::{BurstCache, CachedBurst};
 use crate::dataset::Dataset;
 use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
-use qudi_core::{Result, SimError, Size, USUAL_EXPOSURE};
+use qudi_core::{Error, Result, Size, USUAL_MEAN_LEVEL};
 use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
 use qudi_model::config::Part;
 use qudi_model::refinement::{RefinementStage, align};
@@ -55,7 +55,7 @@ impl BurstSampler {
     /// Writes drawn bursts into `folder`, which exists, and reads those that are there.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the recipe has no `train.crops`.
+    /// [`Error`](qudi_core::Error) if the recipe has no `train.crops`.
     pub fn with_cache(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
         let cache = Some(Arc::new(BurstCache::new(folder, recipe, &self.stages)?));
         Ok(Self { cache, ..self })
@@ -64,7 +64,7 @@ impl BurstSampler {
     /// Makes the same sampler for another thread.
     ///
     /// # Errors
-    /// [`SimError`](qudi_core::SimError) if the data cannot be opened again.
+    /// [`Error`](qudi_core::Error) if the data cannot be opened again.
     pub fn try_clone(&self) -> Result<Self> {
         let (dataset, cache) = (self.dataset.try_clone()?, self.cache.clone());
         let (stages, crops) = (self.stages.clone(), self.crops.clone());
@@ -128,7 +128,7 @@ impl BurstSampler {
             for (done, drawn) in (1..).zip(receiver) {
                 drawn?;
                 if on([done, all]).is_break() {
-                    return Err(SimError::Interrupted);
+                    return Err(Error::Interrupted);
                 }
             }
             Ok(())
@@ -140,7 +140,7 @@ impl BurstSampler {
         let size = Size { height: self.crop, width: self.crop };
         let mut sample = self.dataset.sample(self.seed, number)?;
         if !self.mean_level {
-            sample.acquisition.exposure = USUAL_EXPOSURE;
+            sample.acquisition.mean_level = USUAL_MEAN_LEVEL;
         }
         let all = sample.counts.len();
         let frames = frames.unwrap_or(all).min(all);
@@ -247,8 +247,8 @@ mod tests {
                 && a.sample.truth == b.sample.truth
                 && a.sample.counts == b.sample.counts
                 && one.seed == other.seed
-                && (one.ppp.to_bits(), one.exposure.to_bits(), one.gain.to_bits())
-                    == (other.ppp.to_bits(), other.exposure.to_bits(), other.gain.to_bits())
+                && (one.ppp.to_bits(), one.mean_level.to_bits(), one.gain.to_bits())
+                    == (other.ppp.to_bits(), other.mean_level.to_bits(), other.gain.to_bits())
                 && one.sensor == other.sensor
         };
         let (mut drawn, mut first, mut second) = (of(&recipe), cached(&recipe), cached(&recipe));

@@ -2,7 +2,7 @@
 
 use qudi_core::random::uniform;
 use qudi_core::sensor::Sensor;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::scene::{PROCEDURAL, ProceduralScene};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -68,7 +68,8 @@ pub struct SourceConfig {
     /// Longest step through a clip, in its frames: 2 also makes motion twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
-    /// The largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from 1 to it.
+    /// The largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from
+    /// 1 to it.
     #[serde(default = "one", alias = "shrink")]
     pub max_downscale: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
@@ -134,7 +135,7 @@ impl SensorMix {
     /// The sensor, as it is used.
     ///
     /// # Errors
-    /// [`SimError`] if there is none of that name, or it cannot exist.
+    /// [`Error`] if there is none of that name, or it cannot exist.
     pub fn load(&self) -> Result<Sensor> {
         let mut sensor = Sensor::load(&self.name)?;
         if let Some(frames) = self.frames_summed {
@@ -149,10 +150,10 @@ impl DataConfig {
     /// The configuration, if samples can be drawn from it.
     ///
     /// # Errors
-    /// [`SimError::Request`] with the key that is wrong.
+    /// [`Error::Request`] with the key that is wrong.
     pub fn checked(self) -> Result<Self> {
         let fault = |key: &str, what: String, help: &str| {
-            Err(SimError::request(format!("{key} {what}"), key, help))
+            Err(Error::request(format!("{key} {what}"), key, help))
         };
         if !(3..=1000).contains(&self.frames) {
             return fault(

@@ -2,7 +2,7 @@
 
 use super::config::{SourceConfig, SourceKind};
 use qudi_core::natural_order::natural_order;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::clip::is_image;
 use std::path::{Path, PathBuf};
 
@@ -25,7 +25,7 @@ pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content
     for from in &source.from {
         let path = data.join(from);
         let about = std::fs::metadata(&path)
-            .map_err(|e| SimError::io(format!("find the source `{}`", source.name), &path, e))?;
+            .map_err(|e| Error::io(format!("find the source `{}`", source.name), &path, e))?;
         if about.is_dir() {
             gather(source.kind, &path, DEEPEST, &mut list)?;
         } else {
@@ -33,7 +33,7 @@ pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content
         }
     }
     if list.is_empty() {
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("source `{}` holds nothing", source.name),
             data,
             "name videos, folders of frames, or images",
@@ -50,7 +50,7 @@ pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content
 
 /// What lies in a folder: for clips a folder of images is one clip and other files are videos.
 fn gather(kind: SourceKind, folder: &Path, depth: usize, list: &mut Vec<PathBuf>) -> Result<()> {
-    let read = |e| SimError::io("list the folder", folder, e);
+    let read = |e| Error::io("list the folder", folder, e);
     let mut paths = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(read)? {
         let path = entry.map_err(read)?.path();

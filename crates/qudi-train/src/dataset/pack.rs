@@ -1,9 +1,10 @@
-//! Decoded training data in one file: a ZIP archive of gray 8-bit PNG images with an index, which any tool opens.
+//! Decoded training data in one file: a ZIP archive of gray 8-bit PNG images with an index, which any tool
+//! opens.
 
 use image::{ImageFormat, ImageReader, Limits};
 use qudi_core::limits::PACK_ENTRY_BYTES;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -55,9 +56,9 @@ impl Pack {
     /// Opens a pack and reads its index.
     ///
     /// # Errors
-    /// [`SimError`] if it cannot be read or is no pack.
+    /// [`Error`] if it cannot be read or is no pack.
     pub fn open(path: &Path) -> Result<Self> {
-        let file = File::open(path).map_err(|e| SimError::io("open the pack", path, e))?;
+        let file = File::open(path).map_err(|e| Error::io("open the pack", path, e))?;
         let mut archive =
             ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e.to_string()))?;
         let text = entry(&mut archive, INDEX, path)?;
@@ -66,7 +67,7 @@ impl Pack {
         if index.version != VERSION {
             let what =
                 format!("the pack's layout is {}, this program reads {VERSION}", index.version);
-            return Err(SimError::data(what, path, "make the pack again from its recipe"));
+            return Err(Error::data(what, path, "make the pack again from its recipe"));
         }
         for clip in &index.clips {
             let size = Size::new(clip.size.height, clip.size.width, &clip.name);
@@ -98,7 +99,7 @@ impl Pack {
     /// A frame of clip `number`.
     ///
     /// # Errors
-    /// [`SimError`] if the file is damaged there.
+    /// [`Error`] if the file is damaged there.
     pub fn frame(&mut self, number: usize, frame: usize) -> Result<Frame> {
         let clip = &self.clips[number];
         let name = clip.entry(frame);
@@ -128,7 +129,7 @@ fn entry(archive: &mut ZipArchive<BufReader<File>>, name: &str, path: &Path) -> 
     Ok(bytes)
 }
 
-fn damaged(path: &Path, what: impl Into<String>) -> SimError {
+fn damaged(path: &Path, what: impl Into<String>) -> Error {
     let what = format!("not a whole training pack: {}", what.into());
-    SimError::data(what, path, "make the pack again from its recipe")
+    Error::data(what, path, "make the pack again from its recipe")
 }

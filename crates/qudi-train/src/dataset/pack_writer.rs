@@ -7,7 +7,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use qudi_core::Frame;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use qudi_sim::clip::{Input, Sampling};
 use rayon::prelude::*;
 use std::io::Write;
@@ -28,11 +28,11 @@ pub struct PackProgress {
     pub done: [usize; 2],
 }
 
-/// Decodes every clip and still that `configs` name, below the folder `data`, into one pack. `most` frames of a clip
-/// are taken at most. `on` hears of every clip and says whether to go on.
+/// Decodes every clip and still that `configs` name, below the folder `data`, into one pack. `most` frames of
+/// a clip are taken at most. `on` hears of every clip and says whether to go on.
 ///
 /// # Errors
-/// [`SimError`] if something cannot be read or written; [`SimError::Interrupted`] if told to stop.
+/// [`Error`] if something cannot be read or written; [`Error::Interrupted`] if asked to stop.
 pub fn write_pack(
     configs: &[&DataConfig],
     data: &Path,
@@ -66,7 +66,7 @@ pub fn write_pack(
             mean: 0.0,
         };
         if clips.iter().any(|other| other.source == clip.source && other.name == clip.name) {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("source `{}` holds `{}` twice", clip.source, clip.name),
                 &content.path,
                 "name every file once",
@@ -75,8 +75,8 @@ pub fn write_pack(
         loop {
             let mut batch = Vec::with_capacity(BATCH);
             while batch.len() < BATCH {
-                let Some(exposure) = reader.next()? else { break };
-                batch.push(exposure.truth().clone());
+                let Some(mean_level) = reader.next()? else { break };
+                batch.push(mean_level.truth().clone());
             }
             if batch.is_empty() {
                 break;
@@ -91,7 +91,7 @@ pub fn write_pack(
         clip.mean /= clip.frames.max(1) as f64;
         clips.push(clip.clone());
         if on(&PackProgress { clip, done: [clips.len(), total] }).is_break() {
-            return Err(SimError::Interrupted);
+            return Err(Error::Interrupted);
         }
     }
     let index = serde_json::to_vec_pretty(&Index { version: VERSION, clips }).expect("plain data");
@@ -108,7 +108,7 @@ fn png(frame: &Frame) -> Result<Vec<u8>> {
     let (width, height) = (frame.size.width as u32, frame.size.height as u32);
     let done = encoder.write_image(&bytes, width, height, ExtendedColorType::L8);
     done.map_err(|e| {
-        SimError::request(format!("a frame cannot be encoded: {e}"), frame.size, "report this")
+        Error::request(format!("a frame cannot be encoded: {e}"), frame.size, "report this")
     })?;
     Ok(image)
 }
@@ -124,12 +124,12 @@ fn store<W: Write>(
         .compression_method(CompressionMethod::Stored)
         .last_modified_time(zip::DateTime::default());
     zip.start_file(name, options).map_err(|e| failed(path, e))?;
-    zip.write_all(bytes).map_err(|e| SimError::io("write the pack", path, e))
+    zip.write_all(bytes).map_err(|e| Error::io("write the pack", path, e))
 }
 
-fn failed(path: &Path, error: zip::result::ZipError) -> SimError {
+fn failed(path: &Path, error: zip::result::ZipError) -> Error {
     match error {
-        zip::result::ZipError::Io(e) => SimError::io("write the pack", path, e),
-        other => SimError::data(format!("cannot write the pack: {other}"), path, "report this"),
+        zip::result::ZipError::Io(e) => Error::io("write the pack", path, e),
+        other => Error::data(format!("cannot write the pack: {other}"), path, "report this"),
     }
 }

@@ -8,8 +8,8 @@ use qudi_core::Light;
 use qudi_core::random::{Domain, Streams, uniform};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
+use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use qudi_core::{Result, SimError};
 use qudi_sim::scene::{Procedural, ProceduralScene, StillMotion, still_scene};
 use rand::Rng;
 use std::f64::consts::TAU;
@@ -17,7 +17,8 @@ use std::f64::consts::TAU;
 /// Exposures outside make no picture: all black, or burnt out.
 const EXPOSURES: [f64; 2] = [0.02, 0.95];
 
-/// Least and most that a scene is made darker or brighter, photons unchanged: users do not know the true exposure.
+/// Least and most that a scene is made darker or brighter, photons unchanged: users do not know the true
+/// exposure.
 const RESCALING: [f64; 2] = [0.6, 1.5];
 
 /// One burst to learn from.
@@ -45,7 +46,7 @@ impl Dataset {
     /// Samples of `config` from `pack`, which sources with files need.
     ///
     /// # Errors
-    /// [`SimError`] if a sensor is unknown, or the pack lacks a source or holds clips that are too small.
+    /// [`Error`] if a sensor is unknown, or the pack lacks a source or holds clips that are too small.
     pub fn new(config: &DataConfig, pack: Option<Pack>) -> Result<Self> {
         let sensors = config.sensor.iter().map(super::SensorMix::load).collect::<Result<_>>()?;
         let clips = config.source.iter().map(|source| clips_of(config, source, pack.as_ref()));
@@ -65,26 +66,26 @@ impl Dataset {
     /// Sample `number` of `seed`.
     ///
     /// # Errors
-    /// [`SimError`] if the pack is damaged.
+    /// [`Error`] if the pack is damaged.
     pub fn sample(&mut self, seed: u64, number: u64) -> Result<Sample> {
         let mut rng = Streams::new(seed).row(Domain::Training, number, 0);
         let weights: Vec<f64> = self.config.source.iter().map(|source| source.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
-        let (truth, exposure) = match self.config.source[at].kind {
+        let (truth, mean_level) = match self.config.source[at].kind {
             SourceKind::Clips => self.clip(at, &mut rng)?,
             SourceKind::Stills => self.still(at, &mut rng)?,
             SourceKind::Scenes => self.scene(at, &mut rng),
         };
-        let (truth, exposure) = rescaled(truth, exposure, uniform(&mut rng));
+        let (truth, mean_level) = rescaled(truth, mean_level, uniform(&mut rng));
         let weights: Vec<f64> = self.config.sensor.iter().map(|mix| mix.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
         let sensor = self.sensors[at].clone();
-        let light = Light { ppp: self.config.sensor[at].ppp.at(uniform(&mut rng)), exposure };
+        let light = Light { ppp: self.config.sensor[at].ppp.at(uniform(&mut rng)), mean_level };
         let seed = rng.next_u64();
         let mut camera = Camera::new(&sensor, truth[0].size, light, seed)?;
         let counts = (0..).zip(&truth).map(|(t, frame)| camera.expose(t, &[frame]));
         let counts = counts.collect::<Result<_>>()?;
-        let acquisition = Acquisition::new(sensor, light.ppp, exposure)?.with_seed(seed);
+        let acquisition = Acquisition::new(sensor, light.ppp, mean_level)?.with_seed(seed);
         Ok(Sample { truth, counts, acquisition })
     }
 
@@ -172,21 +173,21 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
     }
     let Some(pack) = pack else {
         let what = format!("source `{}` needs files", source.name);
-        return Err(SimError::request(what, "data.source", "give the data folder, or a pack"));
+        return Err(Error::request(what, "data.source", "give the data folder, or a pack"));
     };
     let mine = pack.clips().iter().enumerate().filter(|(_, clip)| clip.source == source.name);
     let list: Vec<usize> = mine.map(|(number, _)| number).collect();
     if list.is_empty() {
         let what = format!("the pack holds nothing of source `{}`", source.name);
         let help = "make the pack again from this recipe";
-        return Err(SimError::data(what, pack.path(), help));
+        return Err(Error::data(what, pack.path(), help));
     }
     let frames = if source.kind == SourceKind::Clips { config.frames } else { 1 };
     for &number in &list {
         let clip = &pack.clips()[number];
         let small = clip.size.height.min(clip.size.width) < config.crop;
         if small || clip.frames < frames {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!(
                     "`{}` has {} frames of {}, samples have {frames} of {} x {}",
                     clip.name, clip.frames, clip.size, config.crop, config.crop
@@ -200,16 +201,16 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
 }
 
 /// The frames and their exposure times the same factor, drawn with `u`, which takes no value beyond white.
-fn rescaled(mut truth: Vec<Frame>, exposure: f64, u: f64) -> (Vec<Frame>, f64) {
-    let exposure = exposure.clamp(EXPOSURES[0], EXPOSURES[1]);
+fn rescaled(mut truth: Vec<Frame>, mean_level: f64, u: f64) -> (Vec<Frame>, f64) {
+    let mean_level = mean_level.clamp(EXPOSURES[0], EXPOSURES[1]);
     let values = truth.iter().flat_map(|frame| &frame.data);
     let brightest = f64::from(values.fold(1e-3f32, |most, &value| most.max(value)));
-    let most = RESCALING[1].min(1.0 / brightest).min(EXPOSURES[1] / exposure);
+    let most = RESCALING[1].min(1.0 / brightest).min(EXPOSURES[1] / mean_level);
     let factor = RESCALING[0] * (most / RESCALING[0]).powf(u);
     for value in truth.iter_mut().flat_map(|frame| &mut frame.data) {
         *value *= factor as f32;
     }
-    (truth, exposure * factor)
+    (truth, mean_level * factor)
 }
 
 /// Frames around time 0.

@@ -2,8 +2,8 @@
 
 use burn::tensor::Tensor;
 
-/// The mean negative log-likelihood of errors under a normal law of standard deviation `sigma`, without its constant
-/// (Kendall and Gal 2017, eq. 5). It is least where `sigma` is the size of the errors.
+/// The mean negative log-likelihood of errors under a normal law of standard deviation `sigma`, without its
+/// constant (Kendall and Gal 2017, eq. 5). It is least where `sigma` is the size of the errors.
 ///
 /// # Shapes
 /// - error, sigma: `[images, 1, height, width]`
@@ -13,8 +13,8 @@ pub fn gaussian_nll(error: Tensor<4>, sigma: Tensor<4>) -> Tensor<1> {
     (square * 0.5 + sigma.log()).mean()
 }
 
-/// The [`gaussian_nll`] of pre-denoised frames, if the network predicts their uncertainty. No gradient flows into the
-/// frames.
+/// The [`gaussian_nll`] of pre-denoised frames, if the network predicts their uncertainty. No gradient flows
+/// into the frames.
 ///
 /// # Shapes
 /// - frames, truth, sigma: `[bursts * frames, 1, height, width]` in [0, 1]

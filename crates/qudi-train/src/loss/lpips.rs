@@ -1,8 +1,8 @@
 //! LPIPS, a distance between images that follows human judgement (Zhang et al. 2018, "The Unreasonable
 //! Effectiveness of Deep Features as a Perceptual Metric", version 0.1; docs/training.md).
 //!
-//! It compares the features of an image classifier, whose weights come from files. They are constants: gradients
-//! flow to the images alone.
+//! It compares the features of an image classifier, whose weights come from files. They are constants:
+//! gradients flow to the images alone.
 
 mod backbone;
 mod convolution;
@@ -16,7 +16,7 @@ mod weight_files;
 use backbone::{Backbone, Weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::nearest::nearest;
-use qudi_core::{Result, SimError, Size};
+use qudi_core::{Error, Result, Size};
 use serde::{Deserialize, Serialize};
 use state_dict::StateDict;
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ impl PerceptualKind {
     /// The kind of this name.
     ///
     /// # Errors
-    /// [`SimError::Request`] that lists the names, or says why a former term was removed.
+    /// [`Error::Request`] that lists the names, or says why a former term was removed.
     pub fn by_name(name: &str) -> Result<Self> {
         if let Some(kind) = PERCEPTUAL_KINDS.iter().find(|kind| kind.name() == name) {
             return Ok(*kind);
@@ -69,12 +69,12 @@ impl PerceptualKind {
         let list = format!("use one of {}", names.join(", "));
         if let Some((_, why)) = REMOVED.iter().find(|(removed, _)| *removed == name) {
             let what = format!("the perceptual term `{name}` was removed: {why}");
-            return Err(SimError::request(what, "train.loss.term", list));
+            return Err(Error::request(what, "train.loss.term", list));
         }
         let hint =
             nearest(name, &names).map_or(String::new(), |name| format!("did you mean `{name}`?  "));
         let (what, help) = (format!("no perceptual term named `{name}`"), format!("{hint}{list}"));
-        Err(SimError::request(what, "train.loss.term", help))
+        Err(Error::request(what, "train.loss.term", help))
     }
 
     fn net(self) -> Option<Net> {
@@ -117,11 +117,11 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Reads the weights of `kind` onto `device`: from `folder`, if one is given, or else from [`cache_folder`].
-    /// Gives nothing for [`PerceptualKind::None`].
+    /// Reads the weights of `kind` onto `device`: from `folder`, if one is given, or else from
+    /// [`cache_folder`]. Gives nothing for [`PerceptualKind::None`].
     ///
     /// # Errors
-    /// [`SimError`] if weights are missing (it says which and where to get them), or do not fit.
+    /// [`Error`] if weights are missing (it says which and where to get them), or do not fit.
     pub fn load(
         kind: PerceptualKind,
         folder: Option<&Path>,
@@ -153,13 +153,13 @@ impl Lpips {
     /// Checks that images of this size can be compared.
     ///
     /// # Errors
-    /// [`SimError::Request`] with both sizes if they are too small.
+    /// [`Error::Request`] with both sizes if they are too small.
     pub fn check(&self, size: Size) -> Result<()> {
         let smallest = self.net.smallest_side();
         if size.height.min(size.width) >= smallest {
             return Ok(());
         }
-        Err(SimError::request(
+        Err(Error::request(
             format!(
                 "LPIPS needs images of at least {smallest} x {smallest} pixels, these are {size}"
             ),
@@ -206,11 +206,11 @@ fn unit(x: Tensor<4>) -> Tensor<4> {
     x / length
 }
 
-/// Downloads the weights of a kind into `folder` with the `curl` program, and checks their hashes. Files that are
-/// there already are checked and kept. Gives the paths: none for [`PerceptualKind::None`].
+/// Downloads the weights of a kind into `folder` with the `curl` program, and checks their hashes. Files that
+/// are there already are checked and kept. Gives the paths: none for [`PerceptualKind::None`].
 ///
 /// # Errors
-/// [`SimError`] if curl is missing or fails, or a file is not the published one.
+/// [`Error`] if curl is missing or fails, or a file is not the published one.
 pub fn fetch(kind: PerceptualKind, folder: &Path) -> Result<Vec<PathBuf>> {
     let files = kind.net().map(weight_files::files);
     let files = files.iter().flatten();

@@ -8,8 +8,8 @@ const TOTAL_VARIATION: f32 = 0.01;
 /// The least mean squared error that a reference estimate counts with: better ones leave nothing to learn.
 const LEAST_ERROR: f32 = 1e-4;
 
-/// Computes `mean e^2 + 0.01 (mean |dx e| + mean |dy e|)` of the error `e = p - q`, where `dx` and `dy` are the
-/// differences of neighbours along rows and columns.
+/// Computes `mean e^2 + 0.01 (mean |dx e| + mean |dy e|)` of the error `e = p - q`, where `dx` and `dy` are
+/// the differences of neighbours along rows and columns.
 ///
 /// # Shapes
 /// - p, q: `[images, 1, height, width]` in [0, 1]
@@ -25,8 +25,9 @@ pub fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
     error.powi_scalar(2).mean() + variation * TOTAL_VARIATION
 }
 
-/// Computes [`reconstruction`] with errors in units of the root of the reference estimate's mean squared error over
-/// each burst. Otherwise a few dark bursts, whose errors are thirty times those of bright ones, would decide.
+/// Computes [`reconstruction`] with errors in units of the root of the reference estimate's mean squared
+/// error over each burst. Otherwise a few dark bursts, whose errors are thirty times those of bright ones,
+/// would decide.
 ///
 /// # Shapes
 /// - estimate, truth, reference: `[bursts * frames, 1, height, width]` in [0, 1]

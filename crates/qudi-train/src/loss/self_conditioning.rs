@@ -4,7 +4,7 @@ use super::Example;
 use super::timesteps::previous_timestep;
 use burn::module::Module;
 use burn::tensor::Tensor;
-use qudi_core::{Result, SimError, Size};
+use qudi_core::{Error, Result, Size};
 use qudi_model::conditioning::CountPlanes;
 use qudi_model::diffusion::forward_model::ForwardModel;
 use qudi_model::diffusion::schedule::NoiseSchedule;
@@ -29,14 +29,14 @@ impl LoopOptions {
     pub const NONE: Self = Self { forward_model: false, self_conditioning: false };
 }
 
-/// Whether a first pass makes the estimate that the network is given, as after the first step of sampling (Chen et
-/// al. 2023, "Analog Bits", section 3.2).
+/// Whether a first pass makes the estimate that the network is given, as after the first step of sampling
+/// (Chen et al. 2023, "Analog Bits", section 3.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SelfConditioning {
     /// The network starts from nothing.
     Off,
-    /// The network is given its own estimate from a noisier image, and that estimate measured again with photons
-    /// of this seed.
+    /// The network is given its own estimate from a noisier image, and that estimate measured again with
+    /// photons of this seed.
     On(u64),
 }
 
@@ -80,8 +80,8 @@ fn noisy_images(example: &Example<'_>, timesteps: &[usize]) -> Tensor<4> {
     clean * signal + example.noise.clone() * noise
 }
 
-/// The network's own estimate at the timesteps before the example's, without gradient, and its simulated measurement.
-/// Bursts at the noisiest timestep have neither: there sampling starts.
+/// The network's own estimate at the timesteps before the example's, without gradient, and its simulated
+/// measurement. Bursts at the noisiest timestep have neither: there sampling starts.
 fn first_estimate(
     network: &Qudi,
     example: &Example<'_>,
@@ -100,7 +100,7 @@ fn first_estimate(
     let size = Size { height, width };
     let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;
     if !x0.iter().all(|value| value.is_finite()) {
-        return Err(SimError::request(
+        return Err(Error::request(
             "the network's first estimate is not finite: the last checkpoint is good",
             "self-conditioning",
             "lower train.lr or train.clip, and resume from the checkpoint",

@@ -12,7 +12,8 @@ pub fn training_timestep(kind: f64, place: f64, noise_start_fraction: f64) -> us
     log_logistic_timestep(&NoiseSchedule::cosine(NUM_TIMESTEPS), place)
 }
 
-/// The timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale of their roots.
+/// The timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale of their
+/// roots.
 pub(super) fn previous_timestep(timestep: usize) -> usize {
     let all = NUM_TIMESTEPS as f64;
     let share = ((timestep + 1) as f64 / all).sqrt() + 0.1;

@@ -19,7 +19,7 @@ pub(super) fn median(mut times: Vec<f64>) -> f64 {
 /// A simulated burst to restore.
 pub(super) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Acquisition)> {
     let sensor = Sensor::load("qudi-paper")?;
-    let light = Light { ppp: 3.25, exposure: EXPOSURE };
+    let light = Light { ppp: 3.25, mean_level: EXPOSURE };
     let scene =
         Procedural { kind: ProceduralScene::DeadLeaves, size: args.size, seed: 1, speed: 2.0 };
     let scene = scene.scene();
@@ -28,6 +28,6 @@ pub(super) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Acquisition)> {
     for t in 0..args.frames {
         counts.push(camera.expose(t as u64, &[&scene.render(t as f64)])?);
     }
-    let acquisition = Acquisition::new(sensor, light.ppp, light.exposure)?.with_seed(1);
+    let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level)?.with_seed(1);
     Ok((counts, acquisition))
 }

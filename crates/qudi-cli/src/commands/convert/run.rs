@@ -7,7 +7,7 @@ use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::places::Places;
 use crate::report::{Bar, Report};
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
         capture.read(frame, &mut counts)?;
         let largest = counts.iter().copied().max().unwrap_or(0);
         if largest > max_count {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!(
                     "frame {frame} counts {largest}, beyond the {max_count} that its format allows"
                 ),
@@ -112,9 +112,8 @@ fn conversion(
     burst: BurstLayout,
 ) -> Result<Conversion> {
     let about = capture.info();
-    let absolute = |path: &Path| {
-        std::path::absolute(path).map_err(|e| SimError::io("find the capture", path, e))
-    };
+    let absolute =
+        |path: &Path| std::path::absolute(path).map_err(|e| Error::io("find the capture", path, e));
     Ok(Conversion {
         version: VERSION,
         program: format!("qudi {}", env!("CARGO_PKG_VERSION")),

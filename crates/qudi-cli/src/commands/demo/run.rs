@@ -18,7 +18,7 @@ use qudi_core::metrics::{best_gain, gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{
-    Camera, ClipStatistics, Frame, Light, PppDefinition, SimError, Size, USUAL_EXPOSURE,
+    Camera, ClipStatistics, Error, Frame, Light, PppDefinition, Size, USUAL_MEAN_LEVEL,
     resolve_light,
 };
 use qudi_io::writer::Picture;
@@ -75,15 +75,8 @@ pub(crate) fn run(
     for (t, frame) in (0..).zip(&truths) {
         burst.push(camera.expose(t, &[frame])?);
     }
-    let acquisition = Acquisition {
-        seed: demo.seed,
-        first_frame: 0,
-        ppp: light.ppp,
-        exposure: USUAL_EXPOSURE,
-        gain: camera.gain(),
-        sensor: sensor.clone(),
-        dark: None,
-    };
+    let acquisition = Acquisition::new(sensor.clone(), light.ppp, USUAL_MEAN_LEVEL)?;
+    let acquisition = acquisition.with_seed(demo.seed);
     let truth = &truths[CENTRE];
     let how = |how: &str| how.to_owned();
     let mut methods: Vec<(&str, Box<dyn Restorer>, String)> = vec![
@@ -144,7 +137,7 @@ pub(crate) fn run(
         "{} at {} photons/pixel/frame, seed {}; psnr in dB, -a after the best gain",
         sensor.name, demo.ppp, demo.seed
     );
-    let png = std::fs::read(&path).map_err(|e| SimError::io("read", &path, e))?;
+    let png = std::fs::read(&path).map_err(|e| Error::io("read", &path, e))?;
     page_file.write(|| html(&png, &shown, &table, explained, &foot))?;
     let text = format!("{text}\n{}   {foot}\n{}\n", path.display(), page.display());
     report.result(
@@ -187,7 +180,7 @@ fn redrawn(
     acquisition: &Acquisition,
     bar: &mut Bar,
 ) -> Result<Frame> {
-    let light = Light { ppp: acquisition.ppp, exposure: acquisition.exposure };
+    let light = Light { ppp: acquisition.ppp, mean_level: acquisition.mean_level };
     let mut sums = vec![[0.0f32; 2]; SIZE.pixels()];
     for draw in 1..=REDRAWN {
         let mut camera = Camera::new(&acquisition.sensor, SIZE, light, acquisition.seed)?;
@@ -210,7 +203,7 @@ fn redrawn(
 
 fn stop_if_asked() -> Result<()> {
     if interrupt::check().is_break() {
-        return Err(SimError::Interrupted.into());
+        return Err(Error::Interrupted.into());
     }
     Ok(())
 }

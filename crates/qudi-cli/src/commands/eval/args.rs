@@ -25,7 +25,8 @@ pub(crate) struct Eval {
     /// Methods to compare
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
     pub(crate) method: Vec<String>,
-    /// Incident photons per pixel and frame [default: 3.25,9.75,26; of a capture: from its record, or estimated]
+    /// Incident photons per pixel and frame [default: 3.25,9.75,26; of a capture: from its record, or
+    /// estimated]
     #[arg(long, value_name = "PPP,...", value_delimiter = ',', allow_negative_numbers = true, value_parser = number::real(number::PPP))]
     pub(crate) ppp: Vec<f64>,
     /// Sensor: a name or a .toml file [default: qudi-paper; of a capture: known from record or format]
@@ -45,8 +46,8 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: Option<u64>,
     /// Mean image value that methods are given [default: as `qudi restore` finds it in each capture]
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
-    pub(crate) exposure: Option<f64>,
+    #[arg(long = "exposure", value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
+    pub(crate) mean_level: Option<f64>,
     /// Frames that neighbouring windows share, blended
     #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1000))]
     pub(crate) overlap: u64,
@@ -56,7 +57,8 @@ pub(crate) struct Eval {
     /// Score frames that another program made of them: DIR/dog-ppp9_75.npy, or a folder of that name
     #[arg(long, value_name = "NAME=DIR")]
     pub(crate) external: Vec<External>,
-    /// Do part I of N (from 1) of the clips: parts give the same figures as the whole, and their --csv files join
+    /// Do part I of N (from 1) of the clips: parts give the same figures as the whole, and their --csv files
+    /// join
     #[arg(long, value_name = "I/N", conflicts_with = "capture")]
     pub(crate) shard: Option<Shard>,
     /// Write every figure of every frame

@@ -46,7 +46,7 @@ pub(crate) fn evaluate_capture(
     let light = LightOverrides {
         ppp: plan.ppp.first().copied(),
         gain: plan.gain,
-        exposure: plan.exposure,
+        mean_level: plan.mean_level,
         seed,
     };
     let (acquisition, source) = acquisition(&light, &mut capture, &sensor)?;
@@ -83,7 +83,7 @@ pub(crate) fn evaluate_capture(
         "gain": acquisition.gain,
         "sensor": acquisition.sensor,
         "seed": seed,
-        "exposure": acquisition.exposure,
+        "exposure": acquisition.mean_level,
         "overlap": plan.overlap,
     });
     Ok(Evaluation { rows, pictures: vec![pictures], about, settings })

@@ -6,10 +6,10 @@ use super::plan::Plan;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use qudi_burst::motion::estimate_flow;
-use qudi_core::fitting_exposure;
+use qudi_core::fitting_mean_level;
 use qudi_core::flow::Flow;
 use qudi_core::restorer::Acquisition;
-use qudi_core::{SimError, USUAL_EXPOSURE};
+use qudi_core::{Error, USUAL_MEAN_LEVEL};
 use qudi_io::sidecar::{BurstLayout, ClipDigest, Record, VERSION, beside};
 use qudi_io::writer::{BurstFormat, BurstWriter};
 use qudi_sim::simulate;
@@ -43,7 +43,7 @@ impl Clip {
             }
             return Ok(vec![Self::new(name, data.to_owned())]);
         }
-        let io = |e| SimError::io("list the folder", path, e);
+        let io = |e| Error::io("list the folder", path, e);
         let mut inside = Vec::new();
         for entry in std::fs::read_dir(path).map_err(io)? {
             inside.push(entry.map_err(io)?.path());
@@ -98,14 +98,14 @@ impl Clip {
                 .map_err(|e| CliError::new(e, path.display(), "report this as a bug"))?;
             writer.finish(&bytes, plan.overwrite)?;
         }
-        let acquisition = Acquisition::new(sensor.clone(), summary.light.ppp, USUAL_EXPOSURE)?;
+        let acquisition = Acquisition::new(sensor.clone(), summary.light.ppp, USUAL_MEAN_LEVEL)?;
         let mut acquisition = acquisition.with_seed(exposing.seed);
         acquisition.gain = summary.gain;
-        acquisition.exposure = if let Some(exposure) = plan.exposure {
-            exposure
+        acquisition.mean_level = if let Some(mean_level) = plan.mean_level {
+            mean_level
         } else {
             let read = |frame: u64| Ok(photons.counts[frame as usize].clone());
-            fitting_exposure(size, photons.counts.len() as u64, &acquisition, read)?
+            fitting_mean_level(size, photons.counts.len() as u64, &acquisition, read)?
         };
         let motion = if photons.flow.is_empty() {
             let estimate = || {

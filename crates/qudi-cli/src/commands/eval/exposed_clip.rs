@@ -121,7 +121,7 @@ impl ExposedClip {
             }
             let scene = &truth[first..first + WINDOW];
             let mean = scene.iter().map(Frame::mean).sum::<f64>() / WINDOW as f64;
-            let light = Light { ppp: self.acquisition.ppp, exposure: mean.max(1e-4) };
+            let light = Light { ppp: self.acquisition.ppp, mean_level: mean.max(1e-4) };
             let seed = self.seed.wrapping_add(first as u64);
             let mut camera = Camera::new(sensor, self.size, light, seed)?;
             let mut counts = Vec::with_capacity(WINDOW);

@@ -22,7 +22,7 @@ pub(crate) struct Exposing {
     pub(crate) seed: u64,
     sampling: Sampling,
     ppp_def: PppDefinition,
-    exposure: Option<f64>,
+    mean_level: Option<f64>,
     motion: Option<StillMotion>,
     size: Option<Size>,
     scene_seed: u64,
@@ -58,7 +58,7 @@ impl Exposing {
                 white: settings.get("simulate.white")?,
             },
             ppp_def: settings.get("simulate.ppp_def")?,
-            exposure: settings.get("simulate.exposure")?,
+            mean_level: settings.get("simulate.exposure")?,
             motion: settings.parse("simulate.motion")?,
             size: settings.parse("simulate.size")?,
             scene_seed: settings.get("simulate.scene_seed")?,
@@ -75,7 +75,7 @@ impl Exposing {
             sensor: self.sensor.clone(),
             ppp,
             ppp_def: self.ppp_def,
-            exposure: self.exposure,
+            mean_level: self.mean_level,
             seed,
         })
     }

@@ -2,7 +2,7 @@
 
 use super::args::{Eval, External, Protocol};
 use crate::args::Shard;
-use crate::capture::acquisition::checked_exposure;
+use crate::capture::acquisition::checked_mean_level;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{METHODS, is_method};
@@ -27,7 +27,7 @@ pub(super) struct Plan {
     pub(super) protocol: Protocol,
     pub(super) seed: Option<u64>,
     /// The mean level that methods are given.
-    pub(super) exposure: Option<f64>,
+    pub(super) mean_level: Option<f64>,
     /// Frames that neighbouring windows share.
     pub(super) overlap: u64,
     pub(super) export_photons: Option<PathBuf>,
@@ -46,7 +46,7 @@ impl Plan {
     /// # Errors
     /// [`CliError`] for unknown methods and arguments that do not go together.
     pub(super) fn new(args: &Eval, overwrite: Overwrite) -> Result<Self> {
-        checked_exposure(args.exposure)?;
+        checked_mean_level(args.mean_level)?;
         if let Some(unknown) = args.method.iter().find(|name| !is_method(name)) {
             return Err(CliError::new(
                 format!("no method named `{unknown}`"),
@@ -66,7 +66,7 @@ impl Plan {
             frames: args.frames,
             protocol: args.protocol,
             seed: args.seed,
-            exposure: args.exposure,
+            mean_level: args.mean_level,
             overlap: args.overlap,
             export_photons: args.export_photons.clone(),
             external: args.external.clone(),

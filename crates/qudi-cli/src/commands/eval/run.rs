@@ -92,7 +92,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     }
     if let Some(folder) = &plan.export_photons {
         std::fs::create_dir_all(folder)
-            .map_err(|e| qudi_core::SimError::io("create the folder", folder, e))?;
+            .map_err(|e| qudi_core::Error::io("create the folder", folder, e))?;
     }
     let mut rows: Vec<Row> = Vec::new();
     let names: Vec<&String> =
@@ -155,7 +155,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         "data": plan.data,
         "sensor": exposing.sensor,
         "seed": exposing.seed,
-        "exposure": plan.exposure,
+        "exposure": plan.mean_level,
         "overlap": plan.overlap,
     });
     Ok(Evaluation { rows, pictures, about, settings })

@@ -24,8 +24,8 @@ pub(crate) fn origin(record: &Sidecar, path: &Path) -> String {
             let (simulation, light) = (&record.simulation, record.light);
             let sensor = &simulation.sensor.name;
             line("simulated", format!("sensor {sensor}, gain {:.4} DN/e-", record.gain));
-            let (ppp, exposure) = (light.ppp, light.exposure);
-            line("", format!("{ppp:.4} incident photons/pixel/frame, exposure {exposure:.4}"));
+            let (ppp, mean_level) = (light.ppp, light.mean_level);
+            line("", format!("{ppp:.4} incident photons/pixel/frame, exposure {mean_level:.4}"));
             line("scene", simulation.input.place());
             line("seed", simulation.seed.to_string());
             line("made by", record.program.clone());

@@ -7,7 +7,7 @@ use crate::places::Places;
 use crate::report::Report;
 use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_model::checkpoint::{Precision, save};
 use serde_json::json;
@@ -31,7 +31,7 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
     // Said from now on, whatever later versions take for granted.
     description.default_steps = Some(description.reverse_steps());
     save(&network, &description, Precision::Half, path, overwrite)?;
-    let bytes = std::fs::read(path).map_err(|e| SimError::io("read the weights", path, e))?;
+    let bytes = std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;
     let hash = sha256(&bytes);
     PendingFile::write_whole(
         &path.with_extension("sha256"),

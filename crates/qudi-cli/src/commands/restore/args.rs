@@ -6,20 +6,22 @@ use std::path::PathBuf;
 
 /// Restore video from a capture
 ///
-/// OUT is a folder (no extension) of 16-bit PNG with manifest.json: killed, it goes on where it
-/// stopped. Or one file: .npy (float32), .tif (16 bit, or --float), .gif, .mp4 (through ffmpeg), or - for Y4M on standard
+/// OUT is a folder (no extension) of 16-bit PNG with manifest.json: killed, it goes on where it stopped. Or
+/// one file: .npy (float32), .tif (16 bit, or --float), .gif, .mp4 (through ffmpeg), or - for Y4M on standard
 /// output. White is 1 = full scale; the scene's mean lands at --exposure.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Restore {
-    /// The capture: a file or a folder in any format, or - for a pipe of .npy or raw frames (--format raw-u8 --size HxW)
+    /// The capture: a file or a folder in any format, or - for a pipe of .npy or raw frames (--format raw-u8
+    /// --size HxW)
     #[arg(value_hint = ValueHint::AnyPath)]
     pub(crate) capture: PathBuf,
     /// Where the frames go
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
-    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen), transform-denoise, bm3d, qbp,
-    /// qbp-bm3d, qbp-refined (in two passes), or qudi (the network) [default: qudi; qbp-refined for sensors and light that
-    /// the built-in weights do not know, and mle where the dark rate is unknown, too]
+    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen),
+    /// transform-denoise, bm3d, qbp, qbp-bm3d, qbp-refined (in two passes), or qudi (the network) [default:
+    /// qudi; qbp-refined for sensors and light that the built-in weights do not know, and mle where the dark
+    /// rate is unknown, too]
     #[arg(long, value_name = "NAME")]
     pub(crate) method: Option<String>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
@@ -31,10 +33,10 @@ pub(crate) struct Restore {
     /// Gain in DN per electron, for sensors whose gain follows the light [default: from the record]
     #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, value_parser = number::real(number::GAIN))]
     pub(crate) gain: Option<f64>,
-    /// Image value that PPP photons become: counts do not fix the brightness of a picture [default: 0.45, or less where parts
-    /// of the scene would be brighter than white]
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
-    pub(crate) exposure: Option<f64>,
+    /// Image value that PPP photons become: counts do not fix the brightness of a picture [default: 0.45, or
+    /// less where parts of the scene would be brighter than white]
+    #[arg(long = "exposure", value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
+    pub(crate) mean_level: Option<f64>,
     /// Seed of the diffusion [default: 0]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: Option<u64>,
@@ -53,7 +55,8 @@ pub(crate) struct Restore {
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
-    /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over --samples K
+    /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over
+    /// --samples K
     #[arg(long, alias = "deviation", value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) uncertainty: Option<PathBuf>,
     #[command(flatten)]

@@ -4,7 +4,7 @@ use crate::error::Result;
 use qudi_core::atomic_file::Overwrite;
 use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
-use qudi_core::{Frame, SimError};
+use qudi_core::{Error, Frame};
 use qudi_io::capture::Capture;
 use qudi_io::writer::{ArrayWriter, Picture};
 use std::path::Path;
@@ -14,7 +14,7 @@ use std::path::Path;
 pub(super) struct ChiSquareMap {
     consistency: Consistency,
     acquisition: Acquisition,
-    /// Frames to show; of a pipe that has not told its length, the first.
+    /// Frames to show; of a pipe of unknown length, the first.
     shown: Vec<u64>,
     /// Frames that are shown: number, counts, restored.
     pictures: Vec<(u64, [Frame; 2])>,
@@ -87,7 +87,7 @@ impl ChiSquareMap {
                 }
                 Ok(Picture::single(&map).save(path, overwrite)?)
             }
-            _ => Err(SimError::data("maps are .npy or .png", path, "choose one of the two").into()),
+            _ => Err(Error::data("maps are .npy or .png", path, "choose one of the two").into()),
         }
     }
 }

@@ -5,7 +5,7 @@ use super::uncertainty::UncertaintyFile;
 use super::y4m;
 use crate::error::Result;
 use qudi_core::atomic_file::Overwrite;
-use qudi_core::{Frame, SimError};
+use qudi_core::{Error, Frame};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink};
 use qudi_io::writer::{ClipWriter, TiffSamples};
@@ -108,7 +108,7 @@ impl RestoreSink for Sink<'_> {
             }
             Output::Pipe => {
                 y4m::write_frame(restored)
-                    .map_err(|e| SimError::io("write to", Path::new("standard output"), e))?;
+                    .map_err(|e| Error::io("write to", Path::new("standard output"), e))?;
                 None
             }
         };

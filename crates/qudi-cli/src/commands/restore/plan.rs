@@ -87,7 +87,7 @@ impl Plan {
             light: LightOverrides {
                 ppp: args.ppp,
                 gain: args.gain,
-                exposure: args.exposure,
+                mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
             },
             seed_flag,

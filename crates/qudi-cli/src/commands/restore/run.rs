@@ -147,7 +147,7 @@ impl Job {
             "seed": plan.light.seed,
             "network": network_settings(restorer.name(), &plan.network)?,
             "ppp": acquisition.ppp,
-            "exposure": acquisition.exposure,
+            "exposure": acquisition.mean_level,
             "gain": acquisition.gain,
             "sensor": acquisition.sensor,
             "repaired_pixels": capture.bad_pixels().len(),
@@ -241,11 +241,11 @@ fn describe(
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
-    let (ppp, exposure) = (acquisition.ppp, acquisition.exposure);
+    let (ppp, mean_level) = (acquisition.ppp, acquisition.mean_level);
     let source = job.source;
     line(
         "light",
-        format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {exposure:.4}"),
+        format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {mean_level:.4}"),
     );
     line("sensor", format!("{}, gain {:.4} DN/e-", acquisition.sensor.name, acquisition.gain));
     if resumed > 0 {

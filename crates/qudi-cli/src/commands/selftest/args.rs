@@ -2,8 +2,8 @@
 
 use clap::Args as ClapArgs;
 
-/// Check that a device computes what Burn's stock operations do on the processor: every operation of the network, and a
-/// small network whole
+/// Check that a device computes what Burn's stock operations do on the processor: every operation of the
+/// network, and a small network whole
 ///
 /// Exits with 1 if a result is off. GPU drivers and backends have had wrong kernels; run this once on yours.
 #[derive(Debug, ClapArgs)]

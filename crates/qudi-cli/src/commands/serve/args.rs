@@ -4,8 +4,9 @@ use clap::Args as ClapArgs;
 
 /// Let other machines compute on this one's devices, with --device ws://HOST:PORT there, until Ctrl-C
 ///
-/// Operations and tensors cross the network unencrypted, so serve within a network that you trust. Where others can reach it, server
-/// and clients need the same word in QUDI_TOKEN. Both must be of the same version.
+/// Operations and tensors cross the network unencrypted, so serve within a network that you trust. Where
+/// others can reach it, server and clients need the same word in QUDI_TOKEN. Both must be of the same
+/// version.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Serve {
     /// Devices to serve, as for train

@@ -2,7 +2,7 @@
 
 use super::plan::OutputPlan;
 use crate::error::{CliError, Result};
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_core::atomic_file::PendingFile;
 use qudi_core::flow::Flow;
 use qudi_io::sidecar::Record;
@@ -76,8 +76,7 @@ impl Sink for Outputs<'_> {
                 start.frames as usize,
                 start.size,
             );
-            let stream =
-                stream.map_err(|e| SimError::io("write", Path::new("standard output"), e))?;
+            let stream = stream.map_err(|e| Error::io("write", Path::new("standard output"), e))?;
             self.stream = Some(Box::new(stream));
         } else {
             let path = Path::new(&plan.output);
@@ -110,7 +109,7 @@ impl Sink for Outputs<'_> {
         }
         if let Some(encode) = &self.stream {
             let written = stdout().lock().write_all(&encode(exposed.counts));
-            written.map_err(|e| SimError::io("write", Path::new("standard output"), e))?;
+            written.map_err(|e| Error::io("write", Path::new("standard output"), e))?;
         }
         if let Some(truth) = &mut self.truth {
             truth.push(exposed.truth)?;

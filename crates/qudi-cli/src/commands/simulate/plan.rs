@@ -206,7 +206,7 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
         sensor: settings.sensor(&settings.get::<String>("simulate.sensor")?)?,
         ppp: settings.get("simulate.ppp")?,
         ppp_def: settings.get("simulate.ppp_def")?,
-        exposure: settings.get("simulate.exposure")?,
+        mean_level: settings.get("simulate.exposure")?,
         seed: settings.get::<Option<u64>>("simulate.seed")?.unwrap_or_else(drawn),
     })
 }

@@ -94,7 +94,7 @@ fn describe(record: &Record, summary: &Summary, written: &[PathBuf], output: &st
     let _ = writeln!(
         text,
         "  light   {} photons/pixel/frame ({meaning}) · {:.4} incident · exposure {:.4}",
-        record.simulation.ppp, record.light.ppp, record.light.exposure
+        record.simulation.ppp, record.light.ppp, record.light.mean_level
     );
     let _ = writeln!(
         text,

@@ -6,9 +6,9 @@ use std::path::PathBuf;
 
 /// Learn a network from videos, stills and procedural scenes
 ///
-/// A recipe says everything that decides the result; --set KEY=VALUE changes it, as in --set train.steps=1000. The run's
-/// folder gets the recipe, metrics, pictures, weights.safetensors for `qudi restore --weights`, and the state that
-/// --resume goes on from, exactly.
+/// A recipe says everything that decides the result; --set KEY=VALUE changes it, as in --set
+/// train.steps=1000. The run's folder gets the recipe, metrics, pictures, weights.safetensors for `qudi
+/// restore --weights`, and the state that --resume goes on from, exactly.
 #[derive(Debug, ClapArgs)]
 #[expect(clippy::struct_excessive_bools, reason = "switches of a command line")]
 pub(crate) struct Train {
@@ -23,7 +23,8 @@ pub(crate) struct Train {
     /// Decoded data in one file; made from --data if it is not there [default: pack.zip in the run's folder]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) pack: Option<PathBuf>,
-    /// Folder for the bursts of recipes with train.crops, with their reference estimates: those there are not drawn again
+    /// Folder for the bursts of recipes with train.crops, with their reference estimates: those there are not
+    /// drawn again
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
     pub(crate) bursts: Option<PathBuf>,
     /// Make the pack, and stop
@@ -35,7 +36,8 @@ pub(crate) struct Train {
     /// Go on from the run's last state
     #[arg(long, conflicts_with_all = ["cache_only", "draw_only", "init"])]
     pub(crate) resume: bool,
-    /// Start from these weights instead of random ones: of the same network, or of one with one refinement stage less
+    /// Start from these weights instead of random ones: of the same network, or of one with one refinement
+    /// stage less
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) init: Option<PathBuf>,
     /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1

@@ -76,7 +76,7 @@ fn train(plan: &Plan, report: &Report) -> Result<()> {
     let last = watch.finish()?;
     match learnt {
         Ok(Ok(())) => {}
-        Ok(Err(qudi_core::SimError::Interrupted)) => {
+        Ok(Err(qudi_core::Error::Interrupted)) => {
             let text = format!("stopped after step {step} of {steps}: --resume goes on");
             return Err(CliError::Stopped(text));
         }
@@ -122,7 +122,7 @@ fn draw(plan: &Plan, report: &Report) -> Result<()> {
         })
     });
     match drawn {
-        Ok(Err(qudi_core::SimError::Interrupted)) => {
+        Ok(Err(qudi_core::Error::Interrupted)) => {
             let text = format!("stopped: the same command goes on in {}", folder.display());
             return Err(CliError::Stopped(text));
         }

@@ -7,7 +7,7 @@ use super::report::{Source, page};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::{Bar, Report};
-use qudi_core::SimError;
+use qudi_core::Error;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_train::{Event, METRICS, RECIPE, Recipe, StepReport, Validation};
 use std::ops::ControlFlow;
@@ -116,7 +116,7 @@ impl<'a> Watch<'a> {
         self.events.scalars(validation.step, &scalars.collect::<Vec<_>>())?;
         let folder = self.folder.join(SAMPLES);
         let made = std::fs::create_dir_all(&folder);
-        made.map_err(|e| SimError::io("make the folder of pictures", &folder, e))?;
+        made.map_err(|e| Error::io("make the folder of pictures", &folder, e))?;
         let name = format!("step-{:07}.png", validation.step);
         strip(&validation.clips).save(&folder.join(name), Overwrite::Yes)?;
         write_report(self.folder)
@@ -132,7 +132,7 @@ pub(crate) fn write(folder: &Path, name: &str, bytes: &[u8]) -> Result<()> {
 pub(crate) fn write_report(folder: &Path) -> Result<()> {
     let read = |name: &str| {
         let path = folder.join(name);
-        std::fs::read_to_string(&path).map_err(|e| SimError::io("read the run", &path, e))
+        std::fs::read_to_string(&path).map_err(|e| Error::io("read the run", &path, e))
     };
     let pictures = std::fs::read_dir(folder.join(SAMPLES)).into_iter().flatten().flatten();
     let last: Option<PathBuf> = pictures.map(|entry| entry.path()).max();

@@ -8,7 +8,7 @@ use crate::frames::frame_bytes::Opener;
 use flate2::read::ZlibDecoder;
 use qudi_core::limits::{ARRAY_HEADER_BYTES, DEFLATE_RATIO, MAT_VARIABLES};
 use qudi_core::npy::Sample;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -65,15 +65,15 @@ fn stream(
     (start, length): (u64, u64),
     compressed: bool,
 ) -> Result<Box<dyn Read + Send>> {
-    let io = |e| SimError::io("open", path, e);
+    let io = |e| Error::io("open", path, e);
     let mut file = File::open(path).map_err(io)?;
     file.seek(SeekFrom::Start(start)).map_err(io)?;
     let stored = BufReader::with_capacity(1 << 16, file.take(length));
     Ok(if compressed { Box::new(ZlibDecoder::new(stored)) } else { Box::new(stored) })
 }
 
-fn damaged(what: impl Into<String>, path: &Path) -> SimError {
-    SimError::data(what, path, "save it again from MATLAB with `save -v7`")
+fn damaged(what: impl Into<String>, path: &Path) -> Error {
+    Error::data(what, path, "save it again from MATLAB with `save -v7`")
 }
 
 fn skip(stream: &mut impl Read, bytes: u64, path: &Path) -> Result<()> {
@@ -89,7 +89,7 @@ pub(crate) fn is_level_5(head: &[u8]) -> bool {
 
 /// The numeric arrays of a file.
 pub(crate) fn arrays(path: &Path) -> Result<Vec<MatArray>> {
-    let io = |e| SimError::io("read", path, e);
+    let io = |e| Error::io("read", path, e);
     let mut file = File::open(path).map_err(io)?;
     let length = file.metadata().map_err(io)?.len();
     let mut head = [0u8; 128];

@@ -3,7 +3,7 @@
 use crate::capture::info::CaptureInfo;
 use crate::capture::options::ReadOptions;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ pub(crate) fn frame_files(
             if segment.frames > per_file {
                 segment.frames = per_file;
             } else if segment.frames < per_file && !last {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!("the file holds {} frames instead of {per_file}", segment.frames),
                     path,
                     "only the last file may be shorter; leave `frames_per_file` out, or copy the file again",
@@ -48,7 +48,7 @@ pub(crate) fn frame_files(
     }
     if segments.is_empty() {
         let place = files.first().map_or(Path::new("the folder"), PathBuf::as_path);
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("no whole frame of {frame_bytes} bytes"),
             place,
             "check `format` and `size`",
@@ -64,12 +64,12 @@ fn segment(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Segment> {
-    let io = |e| SimError::io("open", path, e);
+    let io = |e| Error::io("open", path, e);
     let mut file = File::open(path).map_err(io)?;
     let length = file.metadata().map_err(io)?.len();
     let header = options.header.unwrap_or(header);
     let too_short = || {
-        SimError::data(
+        Error::data(
             format!("{length} bytes, shorter than its header and trailer"),
             path,
             "check `header` and `trailer`, or copy the file again",
@@ -84,7 +84,7 @@ fn segment(
     let rest = body % frame_bytes;
     if rest != 0 {
         if !options.lenient {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!(
                     "{length} bytes are {} frames of {frame_bytes} bytes and {rest} bytes more",
                     body / frame_bytes
@@ -107,7 +107,7 @@ fn trailer(file: &mut File, rest: u64, path: &Path, info: &mut CaptureInfo) -> R
         return Ok(0);
     };
     let mut end = vec![0u8; known.len()];
-    let io = |e| SimError::io("read the end of", path, e);
+    let io = |e| Error::io("read the end of", path, e);
     file.seek(SeekFrom::End(-(known.len() as i64))).map_err(io)?;
     file.read_exact(&mut end).map_err(io)?;
     if end != *known {

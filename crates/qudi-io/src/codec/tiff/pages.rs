@@ -5,7 +5,7 @@ use crate::capture::options::ReadOptions;
 use crate::frames::CountFrames;
 use crate::frames::samples::{Scale, no_count};
 use qudi_core::Size;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
@@ -27,12 +27,12 @@ pub(crate) struct TiffPages {
     reversed: bool,
 }
 
-pub(crate) fn fault(path: &Path, e: tiff::TiffError) -> SimError {
+pub(crate) fn fault(path: &Path, e: tiff::TiffError) -> Error {
     match e {
         tiff::TiffError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
-            SimError::io("read", path, e)
+            Error::io("read", path, e)
         }
-        other => SimError::data(
+        other => Error::data(
             format!("not a readable TIFF: {other}"),
             path,
             "open it in ImageJ to see whether it is damaged, and save it again as 8- or 16-bit gray",
@@ -41,12 +41,12 @@ pub(crate) fn fault(path: &Path, e: tiff::TiffError) -> SimError {
 }
 
 pub(crate) fn decoder(path: &Path) -> Result<TiffDecoder> {
-    let file = File::open(path).map_err(|e| SimError::io("open", path, e))?;
+    let file = File::open(path).map_err(|e| Error::io("open", path, e))?;
     Decoder::new(BufReader::with_capacity(1 << 16, file)).map_err(|e| fault(path, e))
 }
 
-/// Whether the bits of each byte of the current page are stored lowest first (FillOrder 2, TIFF 6.0 section 8).
-/// The decoder does not honour it, so that only uncompressed bytes can be turned round.
+/// Whether the bits of each byte of the current page are stored lowest first (FillOrder 2, TIFF 6.0 section
+/// 8). The decoder does not honour it, so that only uncompressed bytes can be turned round.
 pub(super) fn bits_reversed(decoder: &mut TiffDecoder, path: &Path) -> Result<bool> {
     let mut tag = |tag| -> Result<Option<u16>> {
         let value = decoder.find_tag(tag).map_err(|e| fault(path, e))?;
@@ -60,7 +60,7 @@ pub(super) fn bits_reversed(decoder: &mut TiffDecoder, path: &Path) -> Result<bo
     if compression == 1 && depth <= 8 {
         return Ok(true);
     }
-    Err(SimError::data(
+    Err(Error::data(
         format!(
             "bits stored lowest first (FillOrder 2) in samples of {depth} bits, compression {compression}"
         ),
@@ -79,7 +79,7 @@ impl TiffPages {
         let mut decoder = decoder(path)?;
         let color = decoder.colortype().map_err(|e| fault(path, e))?;
         let ColorType::Gray(bits) = color else {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("images of type {color:?}"),
                 path,
                 "colour is not supported yet; save the stack as 8- or 16-bit gray",
@@ -154,21 +154,21 @@ impl TiffPages {
         self.decoder.seek_to_image(frame as usize).map_err(fault)?;
         let (width, height) = self.decoder.dimensions().map_err(fault)?;
         if (height as usize, width as usize) != (self.size.height, self.size.width) {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("frame {frame} is {height} x {width} among frames of {}", self.size),
                 &self.path,
                 "frames of one capture have one size",
             ));
         }
         if !matches!(self.decoder.colortype().map_err(fault)?, ColorType::Gray(_)) {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("frame {frame} is no gray image"),
                 &self.path,
                 "colour is not supported yet; save the stack as 8- or 16-bit gray",
             ));
         }
         if bits_reversed(&mut self.decoder, &self.path)? != self.reversed {
-            return Err(SimError::data(
+            return Err(Error::data(
                 format!("frame {frame} has another order of bits (FillOrder) than the first"),
                 &self.path,
                 "save the stack again as 8- or 16-bit gray",
@@ -183,8 +183,8 @@ impl TiffPages {
         Ok(image)
     }
 
-    fn wrong_length(&self, frame: u64, length: usize) -> SimError {
-        SimError::data(
+    fn wrong_length(&self, frame: u64, length: usize) -> Error {
+        Error::data(
             format!("frame {frame} holds {length} samples instead of {}", self.size.pixels()),
             &self.path,
             "save the stack again as 8- or 16-bit gray",
@@ -226,7 +226,7 @@ impl CountFrames for TiffPages {
             DecodingResult::F32(v) => v,
             DecodingResult::F64(v) => v.into_iter().map(|v| v as f32).collect(),
             _ => {
-                return Err(SimError::data(
+                return Err(Error::data(
                     format!("frame {frame} has samples of an unusual type"),
                     &self.path,
                     "save the stack again as 8- or 16-bit gray",

@@ -4,7 +4,7 @@ use crate::writer::{frame_name, is_frame_name};
 use image::{ImageBuffer, Luma};
 use qudi_core::Size;
 use qudi_core::atomic_file::{Overwrite, OwnFolder, PendingFolder};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::Path;
 
 pub(crate) struct PngFolder {
@@ -43,13 +43,13 @@ impl PngFolder {
             image.expect("the camera's size").save(&file)
         };
         saved.map_err(|e| {
-            SimError::io("write a frame into", self.folder.path(), std::io::Error::other(e))
+            Error::io("write a frame into", self.folder.path(), std::io::Error::other(e))
         })
     }
 
     pub(crate) fn finish(self, record: &[u8]) -> Result<()> {
         std::fs::write(self.folder.file(Self::RECORD), record)
-            .map_err(|e| SimError::io("write the record of", self.folder.path(), e))?;
+            .map_err(|e| Error::io("write the record of", self.folder.path(), e))?;
         self.folder.finish()
     }
 }

@@ -1,5 +1,5 @@
-//! The image classifiers whose features LPIPS compares, up to the last layer that it uses, as torchvision builds
-//! them.
+//! The image classifiers whose features LPIPS compares, up to the last layer that it uses, as torchvision
+//! builds them.
 
 use super::convolution::Convolution;
 use burn::tensor::module::max_pool2d;
@@ -36,7 +36,8 @@ impl Net {
 pub(super) enum Layer {
     /// A convolution and a ReLU.
     Convolution { index: usize, outputs: usize, kernel: usize, stride: usize, padding: usize },
-    /// The maximum over squares of `side` pixels, at every second pixel; squares that are cut off are dropped.
+    /// The maximum over squares of `side` pixels, at every second pixel; squares that are cut off are
+    /// dropped.
     Pool { side: usize },
     /// A tap: the output of the layer before is compared.
     Tap,

@@ -19,18 +19,19 @@ pub(super) struct Convolution {
 /// channels, and the kernel likewise, filled up with zeros.
 #[derive(Clone, Copy, Debug)]
 struct Strided {
-    /// Of the original.
+    /// The kernel of the original.
     kernel: usize,
-    /// Of the original.
+    /// The stride of the original.
     stride: usize,
-    /// Of the original.
+    /// The padding of the original.
     padding: usize,
     /// Side of the folded kernel, odd.
     folded: usize,
 }
 
 impl Convolution {
-    /// Makes a convolution of stride 1 and padding of half the kernel. `sizes` are outputs, inputs and the odd side of the kernel.
+    /// Makes a convolution of stride 1 and padding of half the kernel. `sizes` are outputs, inputs and the
+    /// odd side of the kernel.
     pub(super) fn new(
         weight: Vec<f32>,
         bias: Vec<f32>,

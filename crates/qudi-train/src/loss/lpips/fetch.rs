@@ -1,9 +1,9 @@
-//! Downloads by the `curl` program on PATH: it brings the certificates of the system, and this program needs no
-//! network code.
+//! Downloads by the `curl` program on PATH: it brings the certificates of the system, and this program needs
+//! no network code.
 
 use super::weight_files::WeightFile;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use sha2::{Digest, Sha256};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -15,17 +15,17 @@ const LONGEST: &str = "700000000";
 /// Brings `file` from `base` into `folder` unless it is there, whole and with the right hash or not at all.
 ///
 /// # Errors
-/// [`SimError`] if there is no curl, if it fails, or if what it brings, or what is there, has another hash.
+/// [`Error`] if there is no curl, if it fails, or if what it brings, or what is there, has another hash.
 pub(super) fn fetch(file: &WeightFile, base: &str, folder: &Path) -> Result<PathBuf> {
     let path = folder.join(file.names[0]);
     if path.exists() {
         let mut present =
-            std::fs::File::open(&path).map_err(|e| SimError::io("read the weights", &path, e))?;
+            std::fs::File::open(&path).map_err(|e| Error::io("read the weights", &path, e))?;
         let sum = copy(&mut present, &mut std::io::sink(), &path)?;
         check(file, &sum, &path, "remove it and fetch it again")?;
         return Ok(path);
     }
-    std::fs::create_dir_all(folder).map_err(|e| SimError::io("create the folder", folder, e))?;
+    std::fs::create_dir_all(folder).map_err(|e| Error::io("create the folder", folder, e))?;
     let mut pending = PendingFile::create(&path, Overwrite::No)?;
     let url = format!("{base}/{}", file.remote);
     let mut curl = Running(start(&url, &path)?);
@@ -36,10 +36,10 @@ pub(super) fn fetch(file: &WeightFile, base: &str, folder: &Path) -> Result<Path
         // Without its words the status still says that it failed.
         let _ = stderr.take(4096).read_to_string(&mut words);
     }
-    let status = curl.0.wait().map_err(|e| SimError::io("wait for curl at", &path, e))?;
+    let status = curl.0.wait().map_err(|e| Error::io("wait for curl at", &path, e))?;
     if !status.success() {
         let reason = words.lines().next().unwrap_or("it gave no reason").trim();
-        return Err(SimError::data(
+        return Err(Error::data(
             format!("curl cannot fetch {url}: {reason}"),
             &path,
             "check the network; or download the address by other means to this place",
@@ -72,18 +72,18 @@ fn start(url: &str, path: &Path) -> Result<Child> {
         .stderr(Stdio::piped())
         .spawn();
     spawned.map_err(|e| match e.kind() {
-        std::io::ErrorKind::NotFound => SimError::data(
+        std::io::ErrorKind::NotFound => Error::data(
             "files are fetched by curl, and there is no `curl` on PATH",
             path,
             format!("install curl (https://curl.se), or download {url} to this place"),
         ),
-        _ => SimError::io("start curl for", path, e),
+        _ => Error::io("start curl for", path, e),
     })
 }
 
 /// Copies everything and gives the SHA-256 of it, in hexadecimal.
 fn copy(from: &mut impl Read, to: &mut impl Write, path: &Path) -> Result<String> {
-    let failed = |e| SimError::io("fetch", path, e);
+    let failed = |e| Error::io("fetch", path, e);
     let (mut hash, mut part) = (Sha256::new(), vec![0; 1 << 16]);
     loop {
         let count = match from.read(&mut part) {
@@ -103,7 +103,7 @@ fn check(file: &WeightFile, sum: &str, path: &Path, help: &str) -> Result<()> {
         return Ok(());
     }
     let digits = &sum[..file.sha256.len().min(sum.len())];
-    Err(SimError::data(format!("the SHA-256 is {digits}, expected {}", file.sha256), path, help))
+    Err(Error::data(format!("the SHA-256 is {digits}, expected {}", file.sha256), path, help))
 }
 
 #[cfg(test)]

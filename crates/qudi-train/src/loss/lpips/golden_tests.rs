@@ -158,8 +158,8 @@ fn gradients_of_flat_images_are_finite() {
     }
 }
 
-/// Along its gradient the distance changes as the gradient says. In other directions the kinks of the networks'
-/// ReLUs hide small slopes.
+/// Along its gradient the distance changes as the gradient says. In other directions the kinks of the
+/// networks' ReLUs hide small slopes.
 #[test]
 fn gradient_is_the_slope_of_the_distance() {
     let golden = Golden::open();

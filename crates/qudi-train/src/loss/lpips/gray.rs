@@ -1,9 +1,9 @@
 //! Gray images for networks of coloured ones.
 //!
-//! LPIPS maps an image `p` in [0, 1] to `x = 2 p - 1`, and channel `c` to `(x - shift_c) / scale_c`; the first layer
-//! then sums over three channels with weights `w_c`, beyond the borders of which there are zeros. For gray
-//! images that is the sum of `p` times `sum_c 2 w_c / scale_c` and of a plane of ones times
-//! `-sum_c w_c (1 + shift_c) / scale_c`, beyond the borders of which there are zeros, too. So two planes do for
+//! LPIPS maps an image `p` in [0, 1] to `x = 2 p - 1`, and channel `c` to `(x - shift_c) / scale_c`; the
+//! first layer then sums over three channels with weights `w_c`, beyond the borders of which there are zeros.
+//! For gray images that is the sum of `p` times `sum_c 2 w_c / scale_c` and of a plane of ones times `-sum_c
+//! w_c (1 + shift_c) / scale_c`, beyond the borders of which there are zeros, too. So two planes do for
 //! three, exactly, and nothing is computed on the image itself.
 
 use burn::tensor::Tensor;

@@ -1,10 +1,10 @@
 //! Named tensors of the `.pth` files that PyTorch writes.
 //!
-//! Files come from elsewhere. The reader executes nothing, bounds what it builds, and reads a tensor's bytes only
-//! after its type and shape are known to be those of the network.
+//! Files come from elsewhere. The reader executes nothing, bounds what it builds, and reads a tensor's bytes
+//! only after its type and shape are known to be those of the network.
 
 use pytorch_reader::{DType, PytorchReader};
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// An open file of weights.
@@ -17,14 +17,14 @@ impl StateDict {
     /// Reads the names; the values follow when asked for.
     ///
     /// # Errors
-    /// [`SimError`] if the file cannot be read, or is no dictionary of tensors.
+    /// [`Error`] if the file cannot be read, or is no dictionary of tensors.
     pub(super) fn open(path: &Path) -> Result<Self> {
         // The reader names no file where one is missing.
-        std::fs::metadata(path).map_err(|e| SimError::io("read the weights", path, e))?;
+        std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
         let reader = PytorchReader::new(path).map_err(|e| {
             let help =
                 "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
-            SimError::data(format!("not a readable file of weights: {e}"), path, help)
+            Error::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
         Ok(Self { path: path.to_owned(), reader })
     }
@@ -32,11 +32,11 @@ impl StateDict {
     /// The values of one tensor, row-major.
     ///
     /// # Errors
-    /// [`SimError::Data`] if there is no such tensor of finite 32-bit floats of this shape.
+    /// [`Error::Data`] if there is no such tensor of finite 32-bit floats of this shape.
     pub(super) fn read(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         let wrong = |what: String| {
             let help = "these are weights of another network, or the file is damaged";
-            SimError::data(what, &self.path, help)
+            Error::data(what, &self.path, help)
         };
         let tensor = self.reader.get(name).ok_or_else(|| wrong(format!("`{name}` is missing")))?;
         if tensor.shape() != shape {

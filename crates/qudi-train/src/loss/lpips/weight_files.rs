@@ -1,7 +1,7 @@
 //! The published files of weights of LPIPS, and where they are looked for.
 
 use super::backbone::Net;
-use qudi_core::{Result, SimError};
+use qudi_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// A published file of weights.
@@ -24,7 +24,8 @@ const BACKBONES: &str = "https://download.pytorch.org/models";
 const HEADS: &str =
     "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1";
 
-/// The files of backbone and heads. Their second names are those of the framework's own LPIPS, and of the authors.
+/// The files of backbone and heads. Their second names are those of the framework's own LPIPS, and of the
+/// authors.
 pub(super) fn files(net: Net) -> [WeightFile; 2] {
     let backbone = |name, cached, sha256| WeightFile {
         names: [name, cached],
@@ -57,7 +58,7 @@ pub(super) fn files(net: Net) -> [WeightFile; 2] {
 /// The paths of backbone and heads: in `folder`, if one is given, or else where Burn keeps them.
 ///
 /// # Errors
-/// [`SimError::Request`] that names the missing files, where they were looked for, and how to get them.
+/// [`Error::Request`] that names the missing files, where they were looked for, and how to get them.
 pub(super) fn find(net: Net, folder: Option<&Path>) -> Result<[PathBuf; 2]> {
     let folders: Vec<PathBuf> =
         folder.map(Path::to_owned).into_iter().chain(cache_folder()).collect();
@@ -81,7 +82,7 @@ fn locate(files: &[WeightFile; 2], folders: &[PathBuf]) -> Result<[PathBuf; 2]> 
         .iter()
         .map(|file| format!("{}/{} as {}", file.base, file.remote, file.names[0]))
         .collect();
-    Err(SimError::request(
+    Err(Error::request(
         format!("LPIPS needs {}, not found", names.join(" and ")),
         if places.is_empty() { "no folder given".into() } else { places.join(", ") },
         format!(
@@ -91,8 +92,8 @@ fn locate(files: &[WeightFile; 2], folders: &[PathBuf]) -> Result<[PathBuf; 2]> 
     ))
 }
 
-/// The folder where weights are looked for if none is given: where Burn's own LPIPS keeps its downloads. None if the
-/// system names no home.
+/// The folder where weights are looked for if none is given: where Burn's own LPIPS keeps its downloads. None
+/// if the system names no home.
 pub fn cache_folder() -> Option<PathBuf> {
     let variable =
         |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
