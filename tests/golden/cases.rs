@@ -22,7 +22,7 @@ pub struct Case<'a> {
 
 impl File {
     pub fn open(name: &str) -> Self {
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/network");
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden");
         let bytes = std::fs::read(format!("{folder}/{name}.safetensors")).unwrap();
         let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
         let cases = &header.metadata().as_ref().unwrap()["cases"];

@@ -41,7 +41,7 @@ fn check<const D: usize, const E: usize>(
 
 #[test]
 fn convolutions_match_pytorch() {
-    let file = File::open("conv");
+    let file = File::open("kernels/conv");
     for device in devices() {
         for case in file.cases() {
             let x: Tensor<4> = case.input("x", &device).require_grad();
@@ -108,7 +108,7 @@ fn addend_is_added_and_receives_its_gradient() {
 
 #[test]
 fn group_norm_matches_pytorch() {
-    let file = File::open("group_norm");
+    let file = File::open("kernels/group_norm");
     for device in devices() {
         for case in file.cases() {
             let x: Tensor<4> = case.input("x", &device).require_grad();
@@ -139,7 +139,7 @@ fn group_norm_matches_pytorch() {
 
 #[test]
 fn warps_match_pytorch() {
-    let file = File::open("warp");
+    let file = File::open("kernels/warp");
     for device in devices() {
         for case in file.cases() {
             let x: Tensor<4> = case.input("x", &device).require_grad();

@@ -18,7 +18,8 @@ import tifffile
 from PIL import Image
 
 out = Path(sys.argv[1])
-out.mkdir(parents=True, exist_ok=True)
+for folder in ("tiff", "mat", "hdf5"):
+    (out / folder).mkdir(parents=True, exist_ok=True)
 rng = np.random.default_rng(20)
 light = np.linspace(0.1, 0.8, 20) * np.linspace(0.4, 1, 12)[:, None]
 counts = rng.binomial(7, light, (6, 12, 20)).astype(np.uint8)
@@ -37,10 +38,10 @@ np.save(out / "wide.npy", counts.astype(np.int64))
 
 # MATLAB: height x width x frames.
 stack = np.ascontiguousarray(counts.transpose(1, 2, 0))
-scipy.io.savemat(out / "plain.mat", {"OUTPUT": stack, "note": "text"}, do_compression=False)
-scipy.io.savemat(out / "compressed.mat", {"OUTPUT": stack, "x": 1.0}, do_compression=True)
-scipy.io.savemat(out / "dcr.mat", {"dcr": np.where(light > 0.75, 500.0, 7.5)}, do_compression=True)
-scipy.io.savemat(out / "bayer.mat", {"imbs": stack, "dataParam": 1.0}, do_compression=True)
+scipy.io.savemat(out / "mat/plain.mat", {"OUTPUT": stack, "note": "text"}, do_compression=False)
+scipy.io.savemat(out / "mat/compressed.mat", {"OUTPUT": stack, "x": 1.0}, do_compression=True)
+scipy.io.savemat(out / "mat/dcr.mat", {"dcr": np.where(light > 0.75, 500.0, 7.5)}, do_compression=True)
+scipy.io.savemat(out / "mat/bayer.mat", {"imbs": stack, "dataParam": 1.0}, do_compression=True)
 parts = out / "parts"
 parts.mkdir(exist_ok=True)
 for k, part in enumerate(np.split(bits.transpose(1, 2, 0).astype(bool), [2, 4], axis=2), 1):
@@ -48,13 +49,13 @@ for k, part in enumerate(np.split(bits.transpose(1, 2, 0).astype(bool), [2, 4], 
 (parts / "info.json").write_text(json.dumps({"no_parts": 3, "no_frames": 2}))
 
 # TIFF: pages, ImageJ's block, compressed pages, means scaled to full range.
-tifffile.imwrite(out / "pages.tif", counts, photometric="minisblack")
-tifffile.imwrite(out / "imagej.tif", counts.astype(np.uint16), imagej=True)
-tifffile.imwrite(out / "deflate.tif", counts.astype(np.uint16), compression="zlib", photometric="minisblack")
-tifffile.imwrite(out / "float.tif", counts.astype(np.float32), photometric="minisblack")
-tifffile.imwrite(out / "means.tif", np.round(counts * (255 / 7)).astype(np.uint8), photometric="minisblack")
-tifffile.imwrite(out / "bilevel.tif", bits.astype(bool), photometric="minisblack")
-tifffile.imwrite(out / "rgb.tif", np.repeat(counts[..., None], 3, axis=-1), photometric="rgb")
+tifffile.imwrite(out / "tiff/pages.tif", counts, photometric="minisblack")
+tifffile.imwrite(out / "tiff/imagej.tif", counts.astype(np.uint16), imagej=True)
+tifffile.imwrite(out / "tiff/deflate.tif", counts.astype(np.uint16), compression="zlib", photometric="minisblack")
+tifffile.imwrite(out / "tiff/float.tif", counts.astype(np.float32), photometric="minisblack")
+tifffile.imwrite(out / "tiff/means.tif", np.round(counts * (255 / 7)).astype(np.uint8), photometric="minisblack")
+tifffile.imwrite(out / "tiff/bilevel.tif", bits.astype(bool), photometric="minisblack")
+tifffile.imwrite(out / "tiff/rgb.tif", np.repeat(counts[..., None], 3, axis=-1), photometric="rgb")
 
 # Images: 0/255, out of alphabetical order.
 images = out / "images"
@@ -77,20 +78,20 @@ transforms |= {"c": 3, "frames": []}
 (folder / "transforms.json").write_text(json.dumps(transforms))
 
 # HDF5: plain, chunked, MATLAB 7.3 (frames x width x height), frames as numbered datasets.
-with h5py.File(out / "chunked.h5", "w") as f:
+with h5py.File(out / "hdf5/chunked.h5", "w") as f:
     f.create_dataset("run/counts", data=counts, chunks=(4, 5, 7), compression="gzip", shuffle=True)
     f.create_dataset("label", data=3)
-with h5py.File(out / "contiguous.h5", "w") as f:
+with h5py.File(out / "hdf5/contiguous.h5", "w") as f:
     f.create_dataset("counts", data=counts.astype(">u2"))
-with h5py.File(out / "packed.h5", "w") as f:
+with h5py.File(out / "hdf5/packed.h5", "w") as f:
     f.create_dataset("frames", data=np.packbits(np.tile(bits, (40, 1, 1)), axis=2), chunks=(16, 12, 3), compression="gzip")
-with h5py.File(out / "matlab73.mat", "w", userblock_size=512) as f:
+with h5py.File(out / "mat/matlab73.mat", "w", userblock_size=512) as f:
     d = f.create_dataset("OUTPUT", data=np.ascontiguousarray(counts.transpose(0, 2, 1)), chunks=(2, 20, 12), compression="gzip")
     d.attrs["MATLAB_class"] = np.bytes_(b"uint8")
-with open(out / "matlab73.mat", "r+b") as f:
+with open(out / "mat/matlab73.mat", "r+b") as f:
     f.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
 for name, pattern in (("mono", None), ("cfa", "RGGB")):
-    with h5py.File(out / f"{name}.ubi.h5", "w") as f:
+    with h5py.File(out / f"hdf5/{name}.ubi.h5", "w") as f:
         group = f.create_group("capture_integrated/raw_hdf5")
         schedule = {"schedule": {"base_schedule": {"binary_frame_rate_fps": 70000.0}}}
         group.attrs["metadata"] = json.dumps({

@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Golden values of the network for the Rust tests, in tests/golden/network/*.safetensors.
+"""Golden values of the network for the Rust tests, in tests/golden/network and, for single operations, tests/golden/kernels.
 
     python tests/golden/generate/network_goldens.py [FILE ...]
 
@@ -58,7 +58,8 @@ from schedule import alpha_bar
 from torch import Tensor, nn
 from uniform import affine, gaussian, parameter, uniform
 
-OUT = network.ROOT / "tests/golden/network"
+OUT = network.ROOT / "tests/golden"
+KERNELS = {"conv", "group_norm", "warp"}
 Tensors = dict[str, Tensor]
 
 
@@ -193,8 +194,9 @@ class File:
         self.tensors[name] = value.float().contiguous().clone()
 
     def save(self) -> None:
-        OUT.mkdir(parents=True, exist_ok=True)
-        path = OUT / f"{self.name}.safetensors"
+        folder = OUT / ("kernels" if self.name in KERNELS else "network")
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.name}.safetensors"
         save_file(dict(sorted(self.tensors.items())), path, {"cases": json.dumps(self.cases)})
         errors = ", ".join(f"{kind} {e:.1e} ({where})" for kind, (e, where) in self.worst.items())
         path.chmod(0o644)

@@ -6,7 +6,14 @@ use qudi_io::capture::{Certainty, MaskChoice, PackAxis, ReadOptions};
 use std::path::{Path, PathBuf};
 
 fn golden(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/captures").join(name)
+    let folder = match name.rsplit('.').next() {
+        Some("tif") => "tiff",
+        Some("mat") => "mat",
+        Some("h5") => "hdf5",
+        _ => "",
+    };
+    let captures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/captures");
+    captures.join(folder).join(name)
 }
 
 fn frames(name: &str, options: &ReadOptions) -> Vec<Vec<u16>> {

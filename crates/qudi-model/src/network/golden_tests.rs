@@ -129,7 +129,7 @@ fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
 
 #[test]
 fn resampling_matches_pytorch() {
-    let file = File::open("resample");
+    let file = File::open("network/resample");
     for device in devices() {
         for case in file.cases() {
             let x: Tensor<4> = case.input("x", &device).require_grad();
@@ -152,7 +152,7 @@ fn resampling_matches_pytorch() {
 
 #[test]
 fn small_blocks_match_pytorch() {
-    let file = File::open("blocks");
+    let file = File::open("network/blocks");
     for device in devices() {
         let input = |case: &Case<'_>| -> Tensor<4> { case.input("x", &device).require_grad() };
         let case = file.case("dense");
@@ -189,12 +189,12 @@ fn small_blocks_match_pytorch() {
 
 #[test]
 fn pre_denoiser_matches_pytorch() {
-    check_pre_denoiser("pre");
+    check_pre_denoiser("network/pre");
 }
 
 #[test]
 fn pre_denoiser_with_neighbour_weighting_matches_pytorch() {
-    check_pre_denoiser("pre_trust");
+    check_pre_denoiser("network/pre_trust");
 }
 
 fn check_pre_denoiser(file: &str) {
@@ -223,7 +223,7 @@ fn check_pre_denoiser(file: &str) {
 
 #[test]
 fn uncertainty_head_matches_pytorch() {
-    let file = File::open("error");
+    let file = File::open("network/error");
     for device in devices() {
         let case = file.case("error");
         let config = config(&case);
@@ -246,7 +246,7 @@ fn named(list: &[(String, Tensor<4>)]) -> Vec<(&str, Tensor<4>)> {
 
 #[test]
 fn features_match_pytorch() {
-    let file = File::open("features");
+    let file = File::open("network/features");
     for device in devices() {
         let input =
             |case: &Case<'_>, name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
@@ -270,7 +270,7 @@ fn features_match_pytorch() {
 
 #[test]
 fn flow_matches_pytorch() {
-    let file = File::open("flow");
+    let file = File::open("network/flow");
     for device in devices() {
         for case in file.cases() {
             let flow = weighted(config(&case).flow.init(false, &device), "flow");
@@ -286,7 +286,7 @@ fn flow_matches_pytorch() {
 
 #[test]
 fn fusion_matches_pytorch() {
-    let file = File::open("fusion");
+    let file = File::open("network/fusion");
     for device in devices() {
         for case in file.cases() {
             let sizes = config(&case);
@@ -319,7 +319,7 @@ fn fusion_matches_pytorch() {
 
 #[test]
 fn u_net_matches_pytorch() {
-    let file = File::open("unet");
+    let file = File::open("network/unet");
     for device in [flex()] {
         for case in file.cases() {
             let sizes = config(&case);
@@ -357,7 +357,7 @@ fn u_net_matches_pytorch() {
 
 #[test]
 fn whole_network_matches_pytorch() {
-    let file = File::open("network");
+    let file = File::open("network/network");
     for device in [flex()] {
         let case = file.case("tiny");
         let network = init_parameters(config(&case).init(0, &device), reference_parameter);
@@ -404,7 +404,7 @@ fn whole_network_matches_pytorch() {
 
 #[test]
 fn sampler_weights_match_numpy() {
-    let file = File::open("steps");
+    let file = File::open("network/steps");
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     for (name, sampler) in [("ddim", Sampler::Ddim), ("ancestral", Sampler::Ancestral)] {
         let expected = file.f64s(name);
@@ -425,7 +425,7 @@ fn ten_sampling_steps_match_pytorch() {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let size = Size { height: 32, width: 32 };
     for (name, sampler) in [("ddim", Sampler::Ddim), ("ancestral", Sampler::Ancestral)] {
-        let file = File::open(&format!("sample_{name}"));
+        let file = File::open(&format!("network/sample_{name}"));
         let case = file.case("sample");
         let device = Device::flex();
         let config = config(&case);

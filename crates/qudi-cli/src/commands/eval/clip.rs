@@ -17,7 +17,7 @@ use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-/// A clip by name, and what to give [`Input::parse`].
+/// A clip by name, and what to give [`Input::parse`](qudi_sim::clip::Input::parse).
 pub(crate) struct Clip {
     name: String,
     place: String,
