@@ -22,6 +22,8 @@ mod restore;
 mod safety;
 #[path = "cli/settings.rs"]
 mod settings;
+#[path = "cli/support.rs"]
+mod support;
 #[path = "cli/train.rs"]
 mod train;
 
@@ -60,12 +62,12 @@ fn settings_reference_is_up_to_date() {
 
 #[test]
 fn accepts_the_example_settings() {
-    let folder = outputs::scratch("example-settings");
+    let folder = support::scratch("example-settings");
     let settings = root().join("configs/simulate.toml");
-    outputs::qudi(&folder)
+    support::qudi(&folder)
         .args("simulate scene:text --size 32x32 --frames 3 -o out.npy --config".split(' '))
         .arg(settings)
         .assert()
         .success();
-    assert_eq!(outputs::listing(&folder), ["out.npy", "out.npy.json"]);
+    assert_eq!(support::listing(&folder), ["out.npy", "out.npy.json"]);
 }

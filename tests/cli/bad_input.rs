@@ -1,6 +1,6 @@
 //! Bad input: a three-part error, exit code 2, nothing half-written, no panic.
 
-use super::outputs::{listing, npy_bytes, qudi, scratch};
+use super::support::{listing, npy_bytes, qudi, scratch};
 use std::path::Path;
 
 /// Runs `qudi` and checks the manners of its refusal; returns what it said.

@@ -1,6 +1,6 @@
 //! `qudi eval`: the same photons for everyone, bars, exports.
 
-use crate::outputs::{listing, qudi, scratch};
+use crate::support::{listing, qudi, scratch};
 use serde_json::Value;
 use std::path::Path;
 
@@ -229,5 +229,5 @@ fn parts_of_the_clips_give_the_figures_of_the_whole() {
     assert_eq!(parts.concat(), scores(""));
     assert_eq!(parts.map(|part| part.len()), [1, 2]);
     let none = "eval clips --method average --shard 1/9";
-    crate::network::refused(&folder, none, &["--shard"]);
+    crate::support::refused(&folder, none, &["--shard"]);
 }

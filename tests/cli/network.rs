@@ -1,6 +1,6 @@
 //! The method `qudi` on the command line: weights, devices, options, and what is refused.
 
-use crate::outputs::{listing, qudi, scratch};
+use crate::support::{listing, qudi, refused, scratch};
 use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, Precision, save};
@@ -43,15 +43,6 @@ fn weights(path: &Path, value: f32) {
         module = init_parameters(module, |_, shape| vec![value; shape.iter().product()]);
     }
     save(&module, &description, Precision::Single, path, Overwrite::Yes).unwrap();
-}
-
-pub(crate) fn refused(folder: &Path, args: &str, words: &[&str]) {
-    let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2), "{args}: {text}");
-    for part in ["error: ", "where: ", "help: "].iter().chain(words) {
-        assert!(text.contains(part), "{args}: no `{part}` in\n{text}");
-    }
 }
 
 #[test]

@@ -1,31 +1,8 @@
 //! What `qudi simulate` writes: formats, records, truth, flow, reproducibility.
 
+use crate::support::{listing, npy_bytes, qudi, scratch};
 use assert_cmd::Command;
-use std::path::{Path, PathBuf};
-
-pub(crate) fn qudi(folder: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_qudi"));
-    command.current_dir(folder).env("NO_COLOR", "1");
-    command
-}
-
-/// An empty folder of this name.
-pub(crate) fn scratch(name: &str) -> PathBuf {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).unwrap();
-    folder
-}
-
-/// Names in a folder, sorted.
-pub(crate) fn listing(folder: &Path) -> Vec<String> {
-    let mut names: Vec<_> = std::fs::read_dir(folder)
-        .unwrap()
-        .map(|e| e.unwrap().file_name().to_string_lossy().into_owned())
-        .collect();
-    names.sort();
-    names
-}
+use std::path::Path;
 
 /// Header text and data of a `.npy` file.
 fn npy(path: &Path) -> (String, Vec<u8>) {
@@ -33,19 +10,6 @@ fn npy(path: &Path) -> (String, Vec<u8>) {
     assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
     let start = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
     (String::from_utf8(bytes[10..start].to_vec()).unwrap(), bytes[start..].to_vec())
-}
-
-/// A `.npy` file as NumPy would write it.
-pub(crate) fn npy_bytes(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
-    let text = format!(
-        "{:<117}\n",
-        format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}")
-    );
-    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-    bytes.extend((text.len() as u16).to_le_bytes());
-    bytes.extend(text.as_bytes());
-    bytes.extend(data);
-    bytes
 }
 
 fn simulate(folder: &Path, args: &str) {

@@ -1,7 +1,6 @@
 //! `qudi serve` and devices of other machines, here all on this one.
 
-use crate::network::refused;
-use crate::outputs::{qudi, scratch};
+use crate::support::{qudi, refused, scratch};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};

@@ -1,6 +1,6 @@
 //! Reports: pages, tables, and text that a terminal must not obey.
 
-use crate::outputs::{listing, npy_bytes, qudi, scratch};
+use crate::support::{listing, npy_bytes, qudi, scratch};
 
 /// A gray clip of eleven frames.
 fn write_clip(path: &std::path::Path, height: usize, width: usize) {

@@ -1,6 +1,6 @@
 //! `qudi restore`: outputs agree, interrupted runs go on, parts meet, settings do not mix.
 
-use crate::outputs::{listing, qudi, scratch};
+use crate::support::{listing, qudi, scratch};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;

@@ -1,15 +1,7 @@
 //! What must not be lost or believed: inputs, files of others, bars on no number, results of another capture.
 
-use crate::network::refused;
-use crate::outputs::{listing, npy_bytes, qudi, scratch};
-use std::path::{Path, PathBuf};
-
-fn run(folder: &Path, args: &str) -> String {
-    let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success(), "{args}: {text}");
-    String::from_utf8_lossy(&output.stdout).into_owned()
-}
+use crate::support::{listing, npy_bytes, qudi, refused, run, scratch};
+use std::path::PathBuf;
 
 /// A folder with a burst `b.npy`, its truth as a folder `fr`, and weights.
 fn prepared(name: &str) -> PathBuf {

@@ -1,6 +1,6 @@
 //! Settings: every command applies a key or refuses it by name, wherever the key comes from.
 
-use crate::outputs::{qudi, scratch};
+use crate::support::{qudi, scratch};
 use std::path::Path;
 
 /// A run of every command that is quick, with the parts of the settings that it takes.

@@ -1,17 +1,11 @@
 //! `qudi train` from recipe to restored frames, and what is refused.
 
-use crate::network::refused;
-use crate::outputs::{listing, qudi, scratch};
+use crate::support::{listing, refused, run, scratch};
 use image::{GrayImage, Luma};
-use std::path::Path;
 
 /// Settings that make `tiny` a matter of seconds.
 const QUICK: &str = "--device cpu -q --set train.steps=4 --set train.checkpoint=2 --set data.crop=32 \
     --set data.frames=3 --set validation.crop=32 --set validation.frames=3 --set validation.every=2";
-
-fn run(folder: &Path, args: &str) {
-    qudi(folder).args(args.split_whitespace()).assert().success();
-}
 
 /// The shipped recipe as it is: it learns, in less than two minutes on two cores.
 #[test]

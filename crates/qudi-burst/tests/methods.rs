@@ -75,8 +75,8 @@ fn second_pass_beats_the_first() {
         let acquisition = acquisition(sensor, ppp);
         let burst = BurstView { size, frames: &counts };
         let first = Qbp::new(PostFilter::Bm3d).restore(burst, &acquisition).unwrap().frames;
-        let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
-        let alignment = AlignedBurst::new(guide, &acquisition);
+        let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
+        let alignment = AlignedBurst::new(reference, &acquisition);
         let aligned: Vec<AlignedFrame> = (0..truth.len())
             .map(|frame| alignment.frame(frame, 10, Alignments::Selected))
             .collect();
@@ -101,7 +101,7 @@ fn second_pass_beats_the_first() {
     }
 }
 
-/// Counts of a scene at rest, less what the guide expects of them, are noise of deviation one, the frame's
+/// Counts of a scene at rest, less what the reference estimate expects of them, are noise of sigma one, the frame's
 /// own as much as its neighbours'; what is expected of these hardly differs. Past the ends of the window
 /// there is nothing.
 #[test]
@@ -115,8 +115,8 @@ fn neighbours_are_standardized() {
     let counts: Vec<_> = (0..7).map(|i| camera.expose(i, &[&still]).unwrap()).collect();
     let acquisition = Acquisition { mean_level: still.mean(), ..acquisition(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
-    let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
-    let aligned = AlignedBurst::new(guide, &acquisition).frame(2, 8, Alignments::Selected);
+    let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
+    let aligned = AlignedBurst::new(reference, &acquisition).frame(2, 8, Alignments::Selected);
     assert_eq!((aligned.counts.len(), aligned.expected.len()), (9, 8));
     let deviation = |frame: &Frame| {
         let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
@@ -131,9 +131,9 @@ fn neighbours_are_standardized() {
     }
     assert!(aligned.counts[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
 
-    // The truth in the guide's place shows it as well: what it expects is what the camera counts.
-    let guide = ReferenceEstimate::compute(burst, &acquisition).unwrap();
-    let aligned = AlignedBurst::new(guide, &acquisition).realign(vec![still.clone(); 7]).frame(
+    // The truth in place of the reference estimate shows it as well: what it expects is what the camera counts.
+    let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
+    let aligned = AlignedBurst::new(reference, &acquisition).realign(vec![still.clone(); 7]).frame(
         2,
         8,
         Alignments::Selected,

@@ -11,7 +11,7 @@
 //! let size = Size::new(32, 48, "example")?;
 //! let scene = Frame::filled(size, 0.45);
 //! let sensor = Sensor::load("qudi-paper")?;
-//! let light = Light { ppp: 3.25, exposure: 0.45 };
+//! let light = Light { ppp: 3.25, mean_level: 0.45 };
 //! let mut camera = Camera::new(&sensor, size, light, 7)?;
 //! let counts = camera.expose(0, &[&scene])?;
 //! assert!(counts.iter().all(|&count| count <= sensor.max_count()));

@@ -39,7 +39,7 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     pub(crate) frames: Option<u64>,
     /// How photons are drawn: strict (once per clip) or quiver (anew for every window of 11, light
-    /// normalised by the window, middle frames judged)
+    /// normalised by the window, middle frames scored)
     #[arg(long, value_name = "NAME", default_value = "strict")]
     pub(crate) protocol: Protocol,
     /// Seed; each clip gets one made from it and its name [default: 1]
@@ -83,7 +83,7 @@ pub(crate) struct Eval {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Protocol {
-    /// One noise realisation per clip, light normalised by the clip, every frame judged
+    /// One noise realisation per clip, light normalised by the clip, every frame scored
     Strict,
     /// The public code of QUIVER, seeded: overlapping windows share no photon
     Quiver,

@@ -100,7 +100,7 @@ impl ExposedClip {
     }
 
     /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
-    /// exposed anew with its own mean at `ppp`, and its middle frame judged.
+    /// exposed anew with its own mean at `ppp`, and its middle frame scored.
     pub(super) fn score_windows(&self, name: &str, plan: &Plan) -> Result<Score> {
         const WINDOW: usize = 11;
         let truth = &self.photons.truth;
