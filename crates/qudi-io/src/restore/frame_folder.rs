@@ -225,6 +225,10 @@ fn program() -> String {
     format!("qudi {}", env!("CARGO_PKG_VERSION"))
 }
 
+/// Values of settings that have another name by now: the key, the former value, the value.
+const RENAMED: &[(&str, &str, &str)] =
+    &[("method", "guide", "qbp-refined"), ("spacing", "learnt", "log-logistic")];
+
 /// The first key whose value differs, with both values.
 fn difference(was: &Value, is: &Value) -> Option<(String, String, String)> {
     match (was, is) {
@@ -233,6 +237,12 @@ fn difference(was: &Value, is: &Value) -> Option<(String, String, String)> {
             keys.into_iter().find_map(|key| {
                 let (was, is) = (was.get(key), is.get(key));
                 let (was, is) = (was.unwrap_or(&Value::Null), is.unwrap_or(&Value::Null));
+                if RENAMED
+                    .iter()
+                    .any(|(name, former, now)| key == name && was == former && is == now)
+                {
+                    return None;
+                }
                 let (below, was, is) = difference(was, is)?;
                 let name = if below.is_empty() { key.clone() } else { format!("{key}.{below}") };
                 Some((name, was, is))
@@ -282,6 +292,19 @@ mod tests {
         let fresh = open(&other, Overwrite::Yes).unwrap();
         assert_eq!(fresh.finished(0..5), 0);
         assert!(path.join("notes.txt").is_file(), "only our own files are removed");
+    }
+
+    #[test]
+    fn resumes_manifests_with_former_values() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("out");
+        let open = |settings: Value| {
+            FrameFolder::open(&path, SIZE, run(settings), Overwrite::No).map(drop)
+        };
+        open(json!({"method": "guide", "network": {"spacing": "learnt"}})).unwrap();
+        open(json!({"method": "qbp-refined", "network": {"spacing": "log-logistic"}})).unwrap();
+        assert!(open(json!({"method": "mle", "network": {"spacing": "log-logistic"}})).is_err());
+        assert!(open(json!({"method": "qbp-refined", "network": {"spacing": "linear"}})).is_err());
     }
 
     #[test]
