@@ -27,6 +27,7 @@ use crate::commands::serve::args::Serve;
 use crate::commands::simulate::args::Simulate;
 use crate::commands::train::args::Train;
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
+use qudi_core::atomic_file::Overwrite;
 use std::path::PathBuf;
 
 const EXIT_CODES: &str = "Exit codes:
@@ -79,6 +80,13 @@ pub(crate) struct Global {
     /// Overwrite existing outputs
     #[arg(short, long, global = true)]
     pub(crate) force: bool,
+}
+
+impl Global {
+    /// Whether existing outputs are overwritten.
+    pub(crate) fn overwrite(&self) -> Overwrite {
+        if self.force { Overwrite::Yes } else { Overwrite::No }
+    }
 }
 
 /// When to colour messages.

@@ -16,7 +16,7 @@ use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::network::{Qudi, Simulated};
-use qudi_model::restorer::{Model, QudiRestorer};
+use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 use qudi_model::with_precision;
 use qudi_train::loss::reconstruction;
 use serde::Serialize;
@@ -56,19 +56,21 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         let help = "ask for at least 1 round of 3 frames";
         return Err(CliError::new("nothing to measure", "--rounds, --frames", help));
     }
-    let device = device::open(&args.network.options().device)?;
+    let options = args.network.options();
+    let device = device::open(&options.device)?;
     let precision = args.precision.precision();
     if !precision.is_supported(&device.device) {
         let what = format!("{} cannot compute with {precision} numbers", device.name);
         return Err(CliError::new(what, "--precision", "ask for another, or another --device"));
     }
-    let steps = args.network.options().steps()?;
+    let (steps, sampling) = (options.steps()?, sample_options(&options)?);
     let mut bar = report.bar();
     let mut all = Vec::new();
     for preset in &args.preset {
         let config = NetworkConfig::preset(preset)?;
-        let figures =
-            with_precision(precision, || measure(preset, config, args, &device, &mut bar))?;
+        let figures = with_precision(precision, || {
+            measure(preset, config, args, sampling, &device, &mut bar)
+        })?;
         all.push(figures);
     }
     drop(bar);
@@ -92,6 +94,7 @@ fn measure(
     preset: &str,
     config: NetworkConfig,
     args: &Bench,
+    sampling: SampleOptions,
     device: &Opened,
     bar: &mut Bar,
 ) -> Result<Figures> {
@@ -130,11 +133,10 @@ fn measure(
     }
     drop((differentiable, of_step));
     let (counts, acquisition) = burst(args)?;
-    let options = sample_options(&args.network.options())?;
     // Initial weights change nothing in the U-Net; its time is measured all the same.
     let kind = ModelKind::Diffusion;
     let model = Model { network, config: config.clone(), kind, window: args.frames };
-    let mut restorer = QudiRestorer::new(model, options, &device.device)?;
+    let mut restorer = QudiRestorer::new(model, sampling, &device.device)?;
     let peak = PeakMemory::start();
     let start = Instant::now();
     restorer.restore(BurstView { size: args.size, frames: &counts }, &acquisition)?;

@@ -23,7 +23,7 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
-    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let overwrite = global.overwrite();
     if args.output.extension().is_none_or(|e| e != "toml") {
         return Err(CliError::new(
             "sensor files end in .toml",

@@ -8,7 +8,7 @@ use crate::interrupt;
 use crate::places::Places;
 use crate::report::{Bar, Report};
 use qudi_core::Error;
-use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::atomic_file::refuse_taken;
 use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
 use qudi_io::writer::{BurstFormat, BurstWriter};
@@ -16,7 +16,7 @@ use serde_json::Value;
 use std::path::Path;
 
 pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
-    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let overwrite = global.overwrite();
     let options = args.reading.options(MaskChoice::None);
     let format = BurstFormat::for_path(&args.output, 1, true);
     let record = format.ok().map(|format| format.record_path(&args.output));

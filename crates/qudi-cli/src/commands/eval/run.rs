@@ -14,7 +14,7 @@ use crate::interrupt;
 use crate::places::Places;
 use crate::report::{Output, Report, csv, markdown};
 use crate::settings::Settings;
-use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::atomic_file::refuse_taken;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -27,7 +27,7 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
-    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let overwrite = global.overwrite();
     let clips = if args.capture { Vec::new() } else { Clip::places(&args.data)? };
     let outputs = [&args.csv, &args.markdown, &args.html, &args.export_photons];
     let external = args.external.iter().map(|external| &external.folder);

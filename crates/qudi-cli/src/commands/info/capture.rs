@@ -34,7 +34,7 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
-    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let overwrite = global.overwrite();
     Places::default()
         .reads_burst(path)
         .reads(info.reading.files())

@@ -8,12 +8,12 @@ use crate::report::Report;
 use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
 use qudi_core::Error;
-use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::atomic_file::PendingFile;
 use qudi_model::checkpoint::{Precision, save};
 use serde_json::json;
 
 pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()> {
-    let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+    let overwrite = global.overwrite();
     let path = &args.output;
     if path.extension() != Some("safetensors".as_ref()) {
         return Err(CliError::new(

@@ -52,7 +52,7 @@ impl Plan {
                 "write the frames to a file",
             ));
         }
-        let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+        let overwrite = global.overwrite();
         let beside = [&args.chi_map, &args.side_by_side, &args.uncertainty];
         Places::default()
             .reads_burst(&args.capture)

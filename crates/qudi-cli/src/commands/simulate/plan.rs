@@ -76,7 +76,7 @@ impl Plan {
                 "pipe a clip in, as in `ffmpeg -i VIDEO -f yuv4mpegpipe - | qudi simulate - -o OUT`",
             ));
         }
-        let overwrite = if global.force { Overwrite::Yes } else { Overwrite::No };
+        let overwrite = global.overwrite();
         if args.flow.is_some() && !simulation.input.is_synthetic() {
             return Err(CliError::new(
                 "a recorded clip has no known flow",

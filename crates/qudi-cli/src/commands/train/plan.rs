@@ -72,7 +72,7 @@ impl Plan {
             workers: args.workers,
             fetch: args.fetch,
             backbones: args.backbones.clone(),
-            overwrite: if global.force { Overwrite::Yes } else { Overwrite::No },
+            overwrite: global.overwrite(),
         })
     }
 }
