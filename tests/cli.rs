@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 mod bad_input;
 #[path = "cli/eval.rs"]
 mod eval;
+#[path = "cli/field.rs"]
+mod field;
 #[path = "cli/network.rs"]
 mod network;
 #[path = "cli/outputs.rs"]

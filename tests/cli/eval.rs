@@ -45,7 +45,7 @@ fn other_programs_are_scored_on_the_same_photons() {
                 "-o",
                 &format!("theirs/{name}.npy"),
             ])
-            .args("--mask none -q".split(' '))
+            .args("--mask none --ppp 9.75 -q".split(' '))
             .assert()
             .success();
     }

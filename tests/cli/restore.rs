@@ -73,7 +73,7 @@ fn every_output_holds_the_same_frames() {
     qudi(&folder).args("restore b.npy --method mle -o g.npy --float".split(' ')).assert().code(2);
     let piped =
         qudi(&folder).args("restore b.npy --method mle -o -".split(' ')).output().unwrap().stdout;
-    assert!(piped.starts_with(b"YUV4MPEG2 W80 H64 F2000:1"));
+    assert!(piped.starts_with(b"YUV4MPEG2 W80 H64 F25:1"));
     assert_eq!(
         piped.iter().position(|&b| b == b'\n').unwrap() + 1 + 14 * (6 + 64 * 80),
         piped.len()

@@ -4,11 +4,13 @@ mod network;
 pub(crate) mod number;
 mod reading;
 mod shard;
+mod sum;
 pub(crate) mod tiff_samples;
 
 pub(crate) use network::Network;
-pub(crate) use reading::Reading;
+pub(crate) use reading::{AutoSum, Reading};
 pub(crate) use shard::Shard;
+pub(crate) use sum::Sum;
 
 use crate::commands::bench::args::Bench;
 use crate::commands::calibrate::args::Calibrate;
@@ -19,6 +21,7 @@ use crate::commands::demo::args::Demo;
 use crate::commands::eval::args::Eval;
 use crate::commands::info::args::Info;
 use crate::commands::light::args::Light;
+use crate::commands::look::args::Look;
 use crate::commands::publish::args::Publish;
 use crate::commands::restore::args::Restore;
 use crate::commands::selftest::args::Selftest;
@@ -116,6 +119,7 @@ pub(crate) enum Command {
     Demo(Demo),
     Light(Light),
     Info(Box<Info>),
+    Look(Box<Look>),
     Config(Config),
     Completions(Completions),
     #[command(hide = true)]
@@ -140,6 +144,7 @@ impl Command {
             Self::Demo(_) => "demo",
             Self::Light(_) => "light",
             Self::Info(_) => "info",
+            Self::Look(_) => "look",
             Self::Config(_) => "config",
             Self::Completions(_) => "completions",
             Self::Man(_) => "man",

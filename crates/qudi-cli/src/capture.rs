@@ -1,13 +1,15 @@
 //! Captures as commands open them: with the sensor that is named or known, and with remarks for the user.
 
 pub(crate) mod acquisition;
+pub(crate) mod warnings;
 
+use crate::args::AutoSum;
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::sensor::Sensor;
-use qudi_io::capture::{Capture, ReadOptions};
+use qudi_io::capture::{Capture, ReadOptions, SumChoice, choose_sum};
 use std::path::Path;
 
 /// The sensor that a record names, or the camera that the format belongs to.
@@ -61,9 +63,81 @@ pub(crate) fn open_capture(
     }
 }
 
+/// A capture with its sensor, and how many frames are summed by themselves.
+pub(crate) struct OpenedCapture {
+    pub(crate) capture: Capture,
+    pub(crate) sensor: Option<Sensor>,
+    /// Why so many frames are summed, where nobody said so.
+    pub(crate) sum: Option<SumChoice>,
+}
+
+/// Opens a capture as [`open_capture`] does; frames are summed as `auto` says. `None` opens standard input.
+pub(crate) fn open_summed(
+    path: Option<&Path>,
+    options: &ReadOptions,
+    auto: AutoSum,
+    sensor: Option<&str>,
+    settings: &Settings,
+) -> Result<OpenedCapture> {
+    let (mut capture, sensor) = if let Some(path) = path {
+        open_capture(path, options, sensor, settings)?
+    } else {
+        let named = sensor.map(|name| settings.sensor(name)).transpose()?;
+        let mut capture = Capture::from_pipe(std::io::stdin(), options, named.as_ref())?;
+        // Frames that are restored as they come are not held back unasked.
+        if auto == AutoSum::Asked {
+            capture.wait_for(PIPED)?;
+        }
+        let known = named.or(known_sensor(&capture)?);
+        (capture, known.map(|sensor| settings.adjusted(sensor)).transpose()?)
+    };
+    let settled = capture.info().sensor.is_some();
+    let open = auto == AutoSum::Open && !settled && path.is_some();
+    let wanted = auto == AutoSum::Asked || open;
+    let sum = if wanted { choose_sum(&mut capture)? } else { None };
+    if auto == AutoSum::Asked && sum.is_none() {
+        return Err(CliError::new(
+            "sums are chosen for binary frames whose light is known",
+            "--sum",
+            "leave it out; say the depth with --bits 1 if these are binary frames",
+        ));
+    }
+    let sum = sum.filter(|choice| choice.frames > 1);
+    if let Some(choice) = &sum {
+        let of_sensor = sensor.as_ref();
+        capture = capture.summed_by(choice.frames, options, of_sensor)?;
+    }
+    Ok(OpenedCapture { capture, sensor, sum })
+}
+
+/// Frames of a pipe that are waited for before it is said how many are summed.
+const PIPED: u64 = 256;
+
+/// Says how many frames are summed, and why.
+pub(crate) fn describe_sum(
+    choice: &SumChoice,
+    capture: &Capture,
+    sensor: Option<&Sensor>,
+) -> String {
+    let native = capture.info().fps.or(sensor.and_then(|sensor| sensor.fps));
+    let rate = native.map_or(String::new(), |fps| {
+        format!(", which makes {:.4} frames per second", fps / f64::from(choice.frames))
+    });
+    format!(
+        "{} frames are summed into one{rate}: {}; --sum N sums another number",
+        choice.frames,
+        choice.reason()
+    )
+}
+
 /// Says on standard error what the user should know about a capture.
 pub(crate) fn remarks(capture: &Capture, report: &Report) {
+    let mut said: Vec<&String> = Vec::new();
     for remark in &capture.info().notes {
+        if said.contains(&remark) {
+            continue;
+        }
+        said.push(remark);
         report.remark(&format!("note: {}", flags_in_text(remark)));
     }
 }

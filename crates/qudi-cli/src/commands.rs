@@ -49,12 +49,17 @@ pub(crate) mod eval {
 
 pub(crate) mod info {
     pub(crate) mod args;
-    mod capture;
+    pub(crate) mod capture;
     mod record;
     pub(crate) mod run;
 }
 
 pub(crate) mod light {
+    pub(crate) mod args;
+    pub(crate) mod run;
+}
+
+pub(crate) mod look {
     pub(crate) mod args;
     pub(crate) mod run;
 }

@@ -81,6 +81,7 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Demo(demo) => commands::demo::run::run(demo, &settings, &args.global, report),
         Command::Light(light) => commands::light::run::run(light, &settings, report),
         Command::Info(info) => commands::info::run::run(info, &settings, &args.global, report),
+        Command::Look(look) => commands::look::run::run(look, &settings, &args.global, report),
         Command::Config(config) => commands::config::run::run(config, &settings, report),
         Command::Completions(completions) => commands::completions::run::run(completions),
         Command::Man(man) => commands::completions::run::man(man),

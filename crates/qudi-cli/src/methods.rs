@@ -56,22 +56,35 @@ pub(crate) fn method(
     }
 }
 
+/// The method of those who name none.
+pub(crate) struct UsualMethod {
+    pub(crate) name: &'static str,
+    /// Why it is not the network.
+    pub(crate) reason: Option<String>,
+}
+
 /// The method of those who name none: the best that knows what to do with this capture.
 pub(crate) fn usual_method(
     options: &NetworkOptions,
     capture: &Capture,
     acquisition: &Acquisition,
-) -> Result<&'static str> {
+) -> Result<UsualMethod> {
     let long_enough = capture.length().is_none_or(|frames| frames >= MIN_FRAMES as u64);
-    Ok(if options.result_flag.is_some() {
-        "qudi"
-    } else if acquisition.sensor.dark_per_frame().is_err() {
-        "mle"
-    } else if long_enough && network::built_in_knows(acquisition)? {
-        "qudi"
-    } else {
-        "qbp-refined"
-    })
+    let other = |name, reason| Ok(UsualMethod { name, reason: Some(reason) });
+    if options.result_flag.is_some() {
+        return Ok(UsualMethod { name: "qudi", reason: None });
+    }
+    if acquisition.sensor.dark_per_frame().is_err() {
+        let sensor = &acquisition.sensor.name;
+        return other("mle", format!("the dark rate of `{sensor}` is unknown"));
+    }
+    if !long_enough {
+        return other("qbp-refined", format!("fewer than {MIN_FRAMES} frames"));
+    }
+    match network::unknown_to_built_in(acquisition)? {
+        Some(reason) => other("qbp-refined", reason),
+        None => Ok(UsualMethod { name: "qudi", reason: None }),
+    }
 }
 
 fn over(frames: usize) -> String {

@@ -23,6 +23,8 @@ pub struct BadPixels {
     pub hot: Vec<usize>,
     /// Pixels that never fire.
     pub dead: Vec<usize>,
+    /// Pixels of bright clumps: hot ones, or small bright things. They are not repaired.
+    pub doubtful: usize,
 }
 
 impl BadPixels {
@@ -61,6 +63,7 @@ impl BadPixels {
             }
             around.clear();
         }
+        bad.doubtful = doubtful(&detections, size, &bad);
         bad
     }
 
@@ -90,8 +93,51 @@ impl BadPixels {
         let (hot, dead) = (self.hot.len(), self.dead.len());
         let _ =
             write!(text, "{hot} hot ({:.3} %), {dead} dead ({:.3} %)", percent(hot), percent(dead));
+        if self.doubtful > 0 {
+            let _ = write!(text, ", {} in bright clumps are doubtful", self.doubtful);
+        }
         text
     }
+}
+
+/// Reach of the surroundings of a clump: 9 x 9 pixels.
+const WIDE: isize = 4;
+
+/// A clump outshines the pixels around it by this factor: optics leave a rim around bright things.
+const CLUMP_FACTOR: f64 = 4.0;
+
+/// Counts pixels that are no isolated defects, but far brighter than most pixels around them.
+fn doubtful(detections: &[f64], size: Size, bad: &BadPixels) -> usize {
+    let known = bad.mask(size);
+    let mut around = Vec::with_capacity(80);
+    let mut count = 0;
+    for i in 0..size.pixels() {
+        if known[i] {
+            continue;
+        }
+        // Most pixels are darker than their surroundings and need no second look.
+        let mut mean = 0.0;
+        let mut n = 0.0;
+        neighbours(i, size, REACH, |j| {
+            mean += detections[j];
+            n += 1.0;
+        });
+        if n == 0.0 || detections[i] < 1.2 * mean / n {
+            continue;
+        }
+        around.clear();
+        neighbours(i, size, WIDE, |j| around.push(detections[j]));
+        let upper = around.len() * 3 / 4;
+        if around.len() < 24 {
+            continue;
+        }
+        let (_, &mut usual, _) = around.select_nth_unstable_by(upper, f64::total_cmp);
+        let noise = HOT_SIGMAS * (usual + 1.0).sqrt();
+        if detections[i] > CLUMP_FACTOR * usual && detections[i] > usual + noise {
+            count += 1;
+        }
+    }
+    count
 }
 
 /// Calls `f` with the pixels within `reach` of pixel `i`, itself left out.

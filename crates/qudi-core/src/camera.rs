@@ -153,7 +153,19 @@ impl Camera {
         for &pixel in &self.maps.dead {
             counts[pixel] = 0;
         }
+        self.add_pedestal(&mut counts);
         Ok(counts)
+    }
+
+    /// The pedestal of a linear sensor, dead pixels included.
+    fn add_pedestal(&self, counts: &mut [u16]) {
+        if self.sensor.offset > 0.0 && self.sensor.response == Response::Linear {
+            let offset = self.sensor.offset.round() as u16;
+            let most = self.sensor.max_count();
+            for count in counts {
+                *count = count.saturating_add(offset).min(most);
+            }
+        }
     }
 
     fn check(&self, instants: &[&Frame]) -> Result<()> {

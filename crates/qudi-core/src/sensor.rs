@@ -61,6 +61,13 @@ pub struct Sensor {
     /// Full-well capacity in e-.
     #[serde(default)]
     pub full_well: FullWell,
+    /// Pedestal in DN that the camera adds to every sample of a linear sensor; subtracted on reading.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub offset: f64,
+    /// Photon counting with an analogue camera: a sample more than this many DN above the pedestal is one
+    /// detection. Binary sensors only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub threshold: Option<f64>,
     /// Gain in DN per e-, or the rule that sets it from the light.
     #[serde(default)]
     pub gain: Gain,
@@ -92,6 +99,11 @@ pub struct Sensor {
 
 fn one() -> u32 {
     1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)] // serde passes a reference
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
 }
 
 impl Sensor {
@@ -195,6 +207,16 @@ impl Sensor {
         }
         self.within("dark", self.dark.value(), 0.0..=1e9)?;
         self.within("read_noise", self.read_noise, 0.0..=1e6)?;
+        self.within("offset", self.offset, 0.0..=65_535.0)?;
+        if let Some(threshold) = self.threshold {
+            self.within("threshold", threshold, 0.0..=65_535.0)?;
+            if self.response == Response::Linear {
+                return Err(self.fault(
+                    "a threshold on a linear sensor".into(),
+                    "counting photons above a threshold makes binary frames: `response = \"binary\"`, `bits = 1`, `read_noise = 0`",
+                ));
+            }
+        }
         if self.full_well.electrons().is_nan() || self.full_well.electrons() < 1.0 {
             return Err(self.fault(
                 format!("full_well is {} e-", self.full_well.electrons()),

@@ -4,12 +4,14 @@
 //! ([`CountFrames`]); a [`Capture`] turns and crops them, sums them, and repairs bad pixels, so that
 //! nothing downstream sees a raw file. Memory holds a few frames, however long the capture is.
 
+mod auto_sum;
 pub(crate) mod bit_order;
 pub(crate) mod byte_kind;
 mod calibrate;
 pub(crate) mod format_options;
 pub(crate) mod info;
 pub(crate) mod levels;
+pub(crate) mod mosaic;
 pub(crate) mod options;
 pub(crate) mod pipe;
 mod pixel_map;
@@ -18,16 +20,19 @@ pub(crate) mod raw_sample;
 mod summary;
 mod view;
 
+pub use auto_sum::{SumChoice, SumLimit, choose_sum};
 pub use bit_order::{SURE, bit_order_z_score};
 pub use calibrate::{Calibration, calibrate};
 pub use format_options::FormatOption;
 pub use info::{CaptureInfo, Certainty, Packing};
+pub use mosaic::Mosaic;
 pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 pub use summary::{BitOrderCheck, Summary};
 
 use crate::codec;
 use crate::frames::depth::DepthChecked;
 use crate::frames::{CountFrames, memory};
+use mosaic::MosaicPlane;
 use pipe::{FIRST_WINDOW, STDIN};
 use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
@@ -69,6 +74,19 @@ impl std::fmt::Debug for Capture {
     }
 }
 
+/// The options, with the pedestal and the threshold of the sensor where they say nothing of either.
+fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
+    let mut options = options.clone();
+    if options.offset.is_none()
+        && options.threshold.is_none()
+        && let Some(sensor) = sensor
+    {
+        options.offset = (sensor.offset > 0.0).then_some(sensor.offset);
+        options.threshold = sensor.threshold;
+    }
+    options
+}
+
 /// What the user says of the depth, unless the file knows better.
 fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     if !(1..=16).contains(&bits) {
@@ -86,6 +104,63 @@ fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
             Ok(())
         }
     }
+}
+
+/// The pixels of a mosaic that are read; `None` where there is none.
+fn mosaic_plane(
+    info: &mut CaptureInfo,
+    options: &ReadOptions,
+    path: &Path,
+) -> Result<Option<MosaicPlane>> {
+    let Some(mosaic) = options.cfa.clone().or(info.cfa.take()) else { return Ok(None) };
+    info.cfa = Some(mosaic.clone());
+    let letters = mosaic.pattern();
+    let index = match options.channel {
+        Some(index) => index,
+        None if options.cfa.is_some() => {
+            let first = letters.chars().next().unwrap_or_default();
+            info.notes.push(format!(
+                "one colour of the mosaic {mosaic} is read, the first ({first}); all are {}",
+                mosaic.choices()
+            ));
+            0
+        }
+        None => {
+            return Err(Error::data(
+                format!("a capture behind a colour filter array ({})", letters.to_uppercase()),
+                path,
+                format!("read one of its colours as gray: {}", mosaic.choices()),
+            ));
+        }
+    };
+    let plane = mosaic.plane(index);
+    if plane.is_none() {
+        return Err(Error::request(
+            format!("channel {index} of the mosaic {mosaic}"),
+            "channel",
+            format!("it has {}", mosaic.choices()),
+        ));
+    }
+    Ok(plane)
+}
+
+/// Refuses sums of no frames, of more than there are, and those that 16 bits do not hold.
+fn check_sum(sum: u32, frames: u64, info: &CaptureInfo) -> Result<()> {
+    if sum == 0 || u64::from(sum) > frames {
+        return Err(Error::request(
+            format!("{sum} frames summed into one, of {frames}"),
+            "sum",
+            "sum between 1 and all frames",
+        ));
+    }
+    if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
+        return Err(Error::request(
+            format!("sums of {sum} frames do not fit into 16 bits"),
+            "sum",
+            "counts go up to 65535: sum fewer frames",
+        ));
+    }
+    Ok(())
 }
 
 /// Who says how deep the counts of a capture are.
@@ -108,7 +183,13 @@ impl Capture {
     /// # Errors
     /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
-        let (native, info) = codec::open(path, options)?;
+        let options = &with_pedestal(options, sensor);
+        let (mut native, mut info) = codec::open(path, options)?;
+        let known = with_pedestal(options, info.sensor.as_ref());
+        let options = if known == *options { options } else { &known };
+        if info.sensor.as_ref().is_some_and(|sensor| sensor.offset > 0.0) {
+            (native, info) = codec::open(path, options)?;
+        }
         Self::assemble(path, native, info, options, sensor)
     }
 
@@ -122,6 +203,7 @@ impl Capture {
         options: &ReadOptions,
         sensor: Option<&Sensor>,
     ) -> Result<Self> {
+        let options = &with_pedestal(options, sensor);
         let (native, info) = codec::open_pipe(Box::new(reader), options)?;
         Self::assemble(Path::new(STDIN), native, info, options, sensor)
     }
@@ -144,7 +226,8 @@ impl Capture {
             info.orient = orient;
         }
         let stored = native.size();
-        let view = View::new(stored, info.orient, info.vendor, options.crop)?;
+        let plane = mosaic_plane(&mut info, options, path)?;
+        let view = View::new(stored, plane, info.orient, info.vendor, options.crop)?;
         let sum = options.sum.unwrap_or(1);
         let start = options.start.unwrap_or(0);
         native.discard_before(start);
@@ -160,20 +243,7 @@ impl Capture {
                 format!("frames count from 0; `end` is one past the last, at most {frames}"),
             ));
         }
-        if sum == 0 || u64::from(sum) > range.end - range.start {
-            return Err(Error::request(
-                format!("{sum} frames summed into one, of {}", range.end - range.start),
-                "sum",
-                "sum between 1 and all frames",
-            ));
-        }
-        if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
-            return Err(Error::request(
-                format!("sums of {sum} frames do not fit into 16 bits"),
-                "sum",
-                "counts go up to 65535: sum fewer frames",
-            ));
-        }
+        check_sum(sum, range.end - range.start, &info)?;
         let mut capture = Self {
             path: path.to_owned(),
             info,
@@ -192,6 +262,26 @@ impl Capture {
         capture.note_end();
         pixel_map::plan(&mut capture, options, sensor)?;
         Ok(capture)
+    }
+
+    /// The same capture with `sum` native frames summed into each output frame. `options` and `sensor` are
+    /// those that it was opened with: they say which pixels are repaired.
+    ///
+    /// # Errors
+    /// [`Error`] if so many frames do not fit, or the capture cannot be read.
+    pub fn summed_by(
+        mut self,
+        sum: u32,
+        options: &ReadOptions,
+        sensor: Option<&Sensor>,
+    ) -> Result<Self> {
+        check_sum(sum, self.native_frames(), &self.info)?;
+        self.sum = sum;
+        let window = FIRST_WINDOW.saturating_mul(sum.into());
+        self.complete = false;
+        self.wait_for(window / u64::from(sum))?;
+        pixel_map::plan(&mut self, options, sensor)?;
+        Ok(self)
     }
 
     /// Output frames of `sensor` that are in memory already, `[frames][height * width]`.
@@ -384,12 +474,30 @@ impl Capture {
     /// [`Error`] if the file cannot be read, or a sum does not fit into 16 bits.
     pub fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
         self.check(frame..frame + 1)?;
+        self.read_from(frame * u64::from(self.sum), counts)
+    }
+
+    /// Reads the output frame that begins with native frame `native`, counted from the first in use; sums may
+    /// begin anywhere. Bad pixels are repaired.
+    ///
+    /// # Errors
+    /// As [`Capture::read`].
+    pub fn read_from(&mut self, native: u64, counts: &mut [u16]) -> Result<()> {
+        let frame = native / u64::from(self.sum);
+        let end = native.saturating_add(self.sum.into());
+        if end > self.native_frames() {
+            return Err(Error::request(
+                format!("frames {native} to {end} of {}", self.native_frames()),
+                self.path.display(),
+                "ask for frames of the capture",
+            ));
+        }
         if self.sum == 1 {
-            self.native.read(self.range.start + frame, &mut self.stored)?;
+            self.native.read(self.range.start + native, &mut self.stored)?;
             self.view.apply(&self.stored, counts);
         } else {
             let mut sums = vec![0; self.size().pixels()];
-            self.stored_total(frame..frame + 1, &mut sums)?;
+            self.stored_sum(self.range.start + native..self.range.start + end, &mut sums)?;
             for (count, sum) in counts.iter_mut().zip(sums) {
                 *count = u16::try_from(sum).map_err(|_| {
                     Error::request(
@@ -434,7 +542,11 @@ impl Capture {
     fn stored_total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.check(frames.clone())?;
         let native = |frame: u64| self.range.start + frame * u64::from(self.sum);
-        let range = native(frames.start)..native(frames.end);
+        self.stored_sum(native(frames.start)..native(frames.end), sums)
+    }
+
+    /// Sums stored frames `range`, turned and cropped only.
+    fn stored_sum(&mut self, range: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.stored_sums.clear();
         self.stored_sums.resize(self.stored.len(), 0);
         self.native.add(range, &mut self.stored_sums)?;

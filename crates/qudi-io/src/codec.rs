@@ -89,7 +89,7 @@ pub(crate) fn open(
     path: &Path,
     options: &ReadOptions,
 ) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
-    let probe = Probe::new(path)?;
+    let probe = Probe::new(path, options.size)?;
     if let Some(name) = &options.format {
         let format = by_name(name)?;
         let mut info = CaptureInfo::new(format.name, format.title);
@@ -122,8 +122,13 @@ fn open_as(
     options: &ReadOptions,
     mut info: CaptureInfo,
 ) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
-    refuse_others(options, format.options, format.name)?;
-    let frames = (format.open)(probe, options, &mut info)?;
+    // The channel of a mosaic is one of its planes, whatever the container.
+    let mut container = options.clone();
+    if options.cfa.is_some() {
+        container.channel = None;
+    }
+    refuse_others(&container, format.options, format.name)?;
+    let frames = (format.open)(probe, &container, &mut info)?;
     info.notes.extend(probe.note_on_skipped());
     Ok((frames, info))
 }
@@ -136,6 +141,8 @@ const ARRAY: &[FormatOption] = &[
     FormatOption::PackAxis,
     FormatOption::Size,
     FormatOption::Levels,
+    FormatOption::Offset,
+    FormatOption::Threshold,
 ];
 
 /// Options of files that hold several arrays.
@@ -147,10 +154,18 @@ const ARRAYS: &[FormatOption] = &[
     FormatOption::PackAxis,
     FormatOption::Size,
     FormatOption::Levels,
+    FormatOption::Offset,
+    FormatOption::Threshold,
 ];
 
 /// Options of pictures.
-const PICTURES: &[FormatOption] = &[FormatOption::Levels];
+const PICTURES: &[FormatOption] = &[
+    FormatOption::Axes,
+    FormatOption::Channel,
+    FormatOption::Levels,
+    FormatOption::Offset,
+    FormatOption::Threshold,
+];
 
 /// Options of headerless files of packed bits, whose frame size the format knows.
 const BIT_FILES: &[FormatOption] = &[
@@ -182,7 +197,71 @@ fn by_name(name: &str) -> Result<&'static Format> {
     })
 }
 
+/// Formats of other programs, by magic number or extension: their name, and what converts them.
+const FOREIGN: &[(&[u8], &[&str], &str, &str)] = &[
+    (
+        b"PQTTTR",
+        &["ptu", "pt3", "ht3", "phu"],
+        "a PicoQuant file of photon arrival times",
+        "bin its photons into frames first, as with `ptufile` or `phconvert` in Python, and save them with numpy.save",
+    ),
+    (
+        b"",
+        &["spc", "sdt"],
+        "a Becker & Hickl file of photon arrival times",
+        "bin its photons into frames first, as with `sdtfile` or `phconvert` in Python, and save them with numpy.save",
+    ),
+    (
+        b"SIMPLE  =",
+        &["fits", "fit", "fts"],
+        "a FITS file",
+        "save its cube in Python: numpy.save('capture.npy', astropy.io.fits.getdata(NAME))",
+    ),
+    (
+        b"ZISRAWFILE",
+        &["czi", "nd2", "lif", "oib", "oif", "lsm", "ims"],
+        "a microscope's own format",
+        "export it from ImageJ (Bio-Formats) as a TIFF stack of 8 or 16 bits",
+    ),
+    (
+        b"% evt",
+        &["aedat4", "aedat", "evt", "dat2"],
+        "a file of an event camera, which counts no photons",
+        "captures are frames of photon counts",
+    ),
+    (b"SQLite format 3", &["db", "sqlite"], "a database", "export its frames with numpy.save"),
+    (
+        b"\x1f\x8b",
+        &["tgz"],
+        "a compressed file",
+        "unpack it, or name it NAME.npy.gz if it is a NumPy array",
+    ),
+    (b"PK\x03\x04", &["zip"], "a zip archive", "unpack it, and name one capture in it"),
+    (
+        b"7z\xbc\xaf\x27\x1c",
+        &["7z", "rar", "tar", "bz2", "xz", "zst"],
+        "an archive",
+        "unpack it, and name one capture in it",
+    ),
+];
+
+/// What a file of another program's format is, and what to do about it.
+fn foreign(probe: &Probe) -> Option<Error> {
+    if probe.is_folder {
+        return None;
+    }
+    let by_magic =
+        FOREIGN.iter().find(|(magic, ..)| !magic.is_empty() && probe.head.starts_with(magic));
+    let by_name =
+        || FOREIGN.iter().find(|(_, extensions, ..)| extensions.contains(&&*probe.extension));
+    let (_, _, what, help) = by_magic.or_else(by_name)?;
+    Some(Error::data(*what, &probe.path, *help))
+}
+
 fn unknown(probe: &Probe) -> Error {
+    if let Some(error) = foreign(probe) {
+        return error;
+    }
     let hdf5 = probe.head.starts_with(b"\x89HDF\r\n\x1a\n")
         || probe.head.get(512..520).is_some_and(|magic| magic == b"\x89HDF\r\n\x1a\n");
     if hdf5 {

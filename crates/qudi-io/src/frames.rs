@@ -2,12 +2,14 @@
 
 pub(crate) mod bit_sums;
 pub(crate) mod chain;
+pub(crate) mod channel_pages;
 pub(crate) mod checksum;
 mod count_frames;
 pub(crate) mod depth;
 pub(crate) mod frame_bytes;
 pub(crate) mod memory;
 pub(crate) mod packed;
+pub(crate) mod reordered;
 pub(crate) mod samples;
 
 pub use count_frames::CountFrames;

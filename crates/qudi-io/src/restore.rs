@@ -2,10 +2,12 @@
 
 mod frame_folder;
 mod inputs;
+mod instants;
 mod lock;
 mod run;
 
 pub use frame_folder::{FolderRun, FrameFolder, MANIFEST};
 pub use inputs::{Fingerprint, Inputs};
+pub use instants::{Instants, Schedule};
 pub use lock::Share;
 pub use run::{RestoreSink, run};

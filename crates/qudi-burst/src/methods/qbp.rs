@@ -11,9 +11,10 @@ use crate::merge::merged_frame::MergedFrame;
 use crate::motion::block_alignment::BlockAligner;
 use crate::patch::PatchMotion;
 use crate::prepared_burst::PreparedBurst;
-use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
+use qudi_core::{Frame, Result};
+use std::ops::Range;
 
 /// The filter that follows the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -66,6 +67,52 @@ impl Qbp {
         Self { post_filter, settings }
     }
 
+    /// Restores frame `reference` of a window only.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.
+    pub fn restore_one(
+        &self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        reference: usize,
+    ) -> Result<Frame> {
+        let mut one = self.restore_frames(burst, acquisition, reference..reference + 1)?;
+        Ok(one.swap_remove(0))
+    }
+
+    /// Restores the frames `references`, each from the whole window.
+    fn restore_frames(
+        &self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        references: Range<usize>,
+    ) -> Result<Vec<Frame>> {
+        let sensor = &acquisition.sensor;
+        let ordinary_dark = sensor.dark_per_frame()?;
+        let transform = match self.post_filter {
+            PostFilter::None => Transform::Identity,
+            PostFilter::Bm3d => Transform::Integral,
+        };
+        let frame_count = burst.frames.len();
+        let vst = VarianceStabilizer::new(transform, sensor, acquisition.gain, frame_count as u32);
+        let counts = PreparedBurst::new(burst, acquisition);
+        let aligner = BlockAligner::new(&counts, self.block_length(acquisition)?);
+        let restore = |reference: usize| {
+            let (blocks, motion) = aligner.align(&counts, reference);
+            let merged =
+                MergedFrame::from_blocks(&counts, &blocks, &motion, self.settings.wiener_c);
+            let mut z = vst.stabilized(&merged.counts);
+            if self.post_filter == PostFilter::Bm3d {
+                let sigma = (frame_count as f64 * merged.noise).sqrt();
+                let sigma = self.settings.bm3d_sigma_factor * sigma;
+                z = denoise(SearchSettings::NORMAL, z, &vst, sigma);
+            }
+            image(&z, &vst, acquisition, ordinary_dark)
+        };
+        Ok(references.map(restore).collect())
+    }
+
     /// Chooses how many frames are summed into a block.
     pub(crate) fn block_length(self, acquisition: &Acquisition) -> Result<usize> {
         let sensor = &acquisition.sensor;
@@ -90,29 +137,8 @@ impl Restorer for Qbp {
     }
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let sensor = &acquisition.sensor;
-        let ordinary_dark = sensor.dark_per_frame()?;
-        let transform = match self.post_filter {
-            PostFilter::None => Transform::Identity,
-            PostFilter::Bm3d => Transform::Integral,
-        };
-        let frame_count = burst.frames.len();
-        let vst = VarianceStabilizer::new(transform, sensor, acquisition.gain, frame_count as u32);
-        let counts = PreparedBurst::new(burst, acquisition);
-        let aligner = BlockAligner::new(&counts, self.block_length(acquisition)?);
-        let restore = |reference: usize| {
-            let (blocks, motion) = aligner.align(&counts, reference);
-            let merged =
-                MergedFrame::from_blocks(&counts, &blocks, &motion, self.settings.wiener_c);
-            let mut z = vst.stabilized(&merged.counts);
-            if self.post_filter == PostFilter::Bm3d {
-                let sigma = (frame_count as f64 * merged.noise).sqrt();
-                let sigma = self.settings.bm3d_sigma_factor * sigma;
-                z = denoise(SearchSettings::NORMAL, z, &vst, sigma);
-            }
-            image(&z, &vst, acquisition, ordinary_dark)
-        };
-        Ok(Restored { frames: (0..frame_count).map(restore).collect(), std: None })
+        let all = 0..burst.frames.len();
+        Ok(Restored { frames: self.restore_frames(burst, acquisition, all)?, std: None })
     }
 }
 

@@ -10,7 +10,7 @@ use qudi_model::restorer::TILE;
 use std::path::PathBuf;
 
 /// The network, for the method `qudi`.
-#[derive(Clone, Debug, ClapArgs)]
+#[derive(Clone, Debug, Default, ClapArgs)]
 #[command(next_help_heading = "Network (method qudi)")]
 pub(crate) struct Network {
     /// Weights that `qudi train` wrote [default: those that come along]

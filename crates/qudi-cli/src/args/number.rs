@@ -17,6 +17,15 @@ pub(crate) const GAIN: RangeInclusive<f64> = 1e-9..=1e9;
 /// Mean image values.
 pub(crate) const EXPOSURE: RangeInclusive<f64> = 1e-6..=1.0;
 
+/// Numbers of frames summed into one.
+pub(crate) const SUM: RangeInclusive<u64> = 1..=1 << 24;
+
+/// Frames per second of what plays.
+pub(crate) const PLAYED: RangeInclusive<f64> = 0.01..=1000.0;
+
+/// Sample values in DN.
+pub(crate) const DN: RangeInclusive<f64> = 0.0..=65_535.0;
+
 /// Numbers of frames, or of bytes.
 pub(crate) const COUNT: RangeInclusive<u64> = 1..=1 << 40;
 
@@ -68,6 +77,7 @@ mod tests {
         ("demo", ""),
         ("light", ""),
         ("info", "c.npy"),
+        ("look", "c.npy"),
     ];
 
     #[test]

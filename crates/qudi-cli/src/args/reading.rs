@@ -1,12 +1,25 @@
 //! How captures are read: the same options for every command that reads one.
 
-use super::number;
+use super::{Sum, number};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
-use qudi_io::capture::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+use qudi_io::capture::{
+    Axes, BitOrder, Crop, MaskChoice, Mosaic, Orientation, PackAxis, ReadOptions,
+};
 use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
+
+/// Whether the capture tells how many of its frames are summed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum AutoSum {
+    /// It is asked for.
+    Asked,
+    /// Where no record settles it.
+    Open,
+    /// A number is given.
+    No,
+}
 
 /// What the user says about a capture that its file does not.
 #[derive(Clone, Debug, ClapArgs)]
@@ -31,9 +44,12 @@ pub(crate) struct Reading {
     /// Order of an array's axes (time, height, width), slowest first
     #[arg(long, value_name = "AXES", value_parser = words::<Axes>(&["thw", "twh", "hwt", "wht", "htw", "wth"]))]
     axes: Option<Axes>,
-    /// Colour channel to read as gray, from 0
+    /// Colour channel to read as gray, from 0; of a mosaic (--cfa), the letter of its pattern
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=4095))]
     channel: Option<usize>,
+    /// Colour filter array: the colours of a tile row by row, and where the first tile begins, as in rggb@0,0
+    #[arg(long, value_name = "PATTERN[@Y,X]")]
+    cfa: Option<Mosaic>,
     /// Array (variable, data set) in a file that holds several
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
@@ -43,6 +59,12 @@ pub(crate) struct Reading {
     /// Bits of a count, where the file does not say
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u8>(1..=16))]
     bits: Option<u8>,
+    /// Pedestal of sCMOS, qCMOS and EMCCD counts in DN: subtracted; what lies below counts 0
+    #[arg(long, value_name = "DN", allow_negative_numbers = true, value_parser = number::real(number::DN))]
+    offset: Option<f64>,
+    /// Count photons: a value more than this many DN above the pedestal is one detection
+    #[arg(long, value_name = "DN", allow_negative_numbers = true, value_parser = number::real(number::DN))]
+    threshold: Option<f64>,
     /// Bytes before the first frame of each raw file
     #[arg(long, value_name = "BYTES", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1 << 40))]
     header: Option<u64>,
@@ -61,9 +83,10 @@ pub(crate) struct Reading {
     /// Rows and columns to keep after turning, as in 2:256,0:496
     #[arg(long, value_name = "Y0:Y1,X0:X1")]
     crop: Option<Crop>,
-    /// Sum N frames into one (7 binary frames make 3 bits)
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u32>(1..=1 << 24))]
-    sum: Option<u32>,
+    /// Sum N frames into one (7 binary frames make 3 bits); auto: as many as light and motion want [default:
+    /// auto for binary captures without a record, where frames are restored or described; else 1]
+    #[arg(long, value_name = "N|auto", allow_negative_numbers = true)]
+    sum: Option<Sum>,
     /// Pixels to repair: a .npy or image nonzero at bad ones, auto (found in the capture), or none
     #[arg(long, value_name = "FILE|auto|none")]
     mask: Option<MaskChoice>,
@@ -76,6 +99,15 @@ pub(crate) struct Reading {
 }
 
 impl Reading {
+    /// Whether the capture shall tell how many frames are summed: asked for, or left open.
+    pub(crate) fn auto_sum(&self) -> AutoSum {
+        match self.sum {
+            Some(Sum::Auto) => AutoSum::Asked,
+            Some(Sum::Frames(_)) => AutoSum::No,
+            None => AutoSum::Open,
+        }
+    }
+
     /// Files that are read besides the capture.
     pub(crate) fn files(&self) -> Vec<&Path> {
         let mask = match &self.mask {
@@ -101,13 +133,19 @@ impl Reading {
             array: given.array,
             levels: given.levels,
             bits: given.bits,
+            cfa: given.cfa,
+            offset: given.offset,
+            threshold: given.threshold,
             header: given.header,
             trailer: given.trailer,
             frames_per_file: given.frames_per_file,
             start: given.start,
             end: given.end,
             crop: given.crop,
-            sum: given.sum,
+            sum: match given.sum {
+                Some(Sum::Frames(frames)) => Some(frames),
+                Some(Sum::Auto) | None => None,
+            },
             mask: given.mask.unwrap_or(mask),
             dcr: given.dcr,
             lenient: given.lenient,

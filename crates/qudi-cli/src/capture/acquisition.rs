@@ -72,6 +72,10 @@ pub(crate) fn acquisition(
     };
     acquisition.mean_level = match overrides.mean_level {
         Some(mean_level) => mean_level,
+        // So that what is restored has the brightness of the clip.
+        None if overrides.ppp.is_none() && capture.info().mean_level.is_some() => {
+            capture.info().mean_level.unwrap_or(USUAL_MEAN_LEVEL)
+        }
         None => mean_level_of(capture, &acquisition)?,
     };
     Ok((acquisition, source))

@@ -83,6 +83,11 @@ impl Report {
         }
     }
 
+    /// Prints what makes a result doubtful.
+    pub(crate) fn warning(&self, text: &str) {
+        self.remark(&format!("warning: {text}"));
+    }
+
     /// Makes a progress bar, which is hidden off a terminal, under --json and under --quiet; with --verbose,
     /// log lines take its place.
     pub(crate) fn bar(&self) -> Bar {

@@ -11,10 +11,11 @@ use qudi_core::{Frame, Size};
 use serde::Serialize;
 
 /// The templates, by the names that they include each other under.
-const TEMPLATES: [(&str, &str); 6] = [
+const TEMPLATES: [(&str, &str); 7] = [
     ("base.html", include_str!("templates/base.html")),
     ("demo.html", include_str!("templates/demo.html")),
     ("eval.html", include_str!("templates/eval.html")),
+    ("look.html", include_str!("templates/look.html")),
     ("plot.html", include_str!("templates/plot.html")),
     ("table.html", include_str!("templates/table.html")),
     ("train.html", include_str!("templates/train.html")),

@@ -12,6 +12,7 @@ const COMMANDS: &[(&str, &[&[&str]])] = &[
     ("eval", &[SETTINGS]),
     ("restore", &[&["sensor"]]),
     ("info", &[&["sensor"]]),
+    ("look", &[&["sensor"]]),
     ("calibrate", &[&["sensor"]]),
     ("light", &[&["sensor"]]),
     ("demo", &[&["sensor"]]),

@@ -82,6 +82,8 @@ pub(crate) const KEYS: &[Key] = &[
     value("sensor.quantum_efficiency", "", "detections per photon on the pixel's pitch: PDE with fill factor").flag("qe", "0..1", "Sensor"),
     value("sensor.dark", "", "dark electrons per pixel: a number is per native frame, `\"7.5/s\"` per second").flag("dark", "RATE", "Sensor"),
     value("sensor.read_noise", "", "read noise, e- rms").flag("read-noise", "E-", "Sensor"),
+    value("sensor.offset", "", "pedestal of a linear sensor in DN: added by `simulate`, subtracted when captures are read").flag("offset", "DN", "Sensor"),
+    value("sensor.threshold", "", "photon counting: DN above the pedestal beyond which a sample is one detection (binary sensors)"),
     value("sensor.full_well", "", "full-well capacity, e-; `\"unlimited\"` for none").flag("full-well", "E-", "Sensor"),
     value("sensor.gain", "", "DN per e-, or `quiver` (0.5 (2^bits - 1) / PPP), `unit` (1), `fwc` (full scale at full well), `auto` (half scale at the mean)").flag("gain", "GAIN", "Sensor"),
     value("sensor.fps", "", "native frames per second"),

@@ -145,7 +145,7 @@ fn finish(
         frames,
         dark: rates.iter().map(|&rate| rate as f32).collect(),
         bulk,
-        bad: BadPixels { hot, dead: Vec::new() },
+        bad: BadPixels { hot, ..BadPixels::default() },
         threshold,
         read_noise,
     })

@@ -26,11 +26,15 @@ pub enum FormatOption {
     Trailer,
     /// Frames in each file of a folder.
     FramesPerFile,
+    /// The pedestal of the values.
+    Offset,
+    /// Photon counting above a threshold.
+    Threshold,
 }
 
 impl FormatOption {
     /// All of them.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::Axes,
         Self::Channel,
         Self::Array,
@@ -41,6 +45,8 @@ impl FormatOption {
         Self::Header,
         Self::Trailer,
         Self::FramesPerFile,
+        Self::Offset,
+        Self::Threshold,
     ];
 
     /// Returns the name of the option, as messages print it.
@@ -56,6 +62,8 @@ impl FormatOption {
             Self::Header => "header",
             Self::Trailer => "trailer",
             Self::FramesPerFile => "frames_per_file",
+            Self::Offset => "offset",
+            Self::Threshold => "threshold",
         }
     }
 
@@ -72,6 +80,8 @@ impl FormatOption {
             Self::Header => options.header.is_some(),
             Self::Trailer => options.trailer.is_some(),
             Self::FramesPerFile => options.frames_per_file.is_some(),
+            Self::Offset => options.offset.is_some(),
+            Self::Threshold => options.threshold.is_some(),
         }
     }
 }

@@ -1,5 +1,6 @@
 //! What is known about a capture, and how it is known.
 
+use super::mosaic::Mosaic;
 use super::options::{BitOrder, Orientation, PackAxis};
 use qudi_core::sensor::Sensor;
 use serde::Serialize;
@@ -58,6 +59,10 @@ pub struct CaptureInfo {
     pub gain: Option<f64>,
     /// Incident photons per pixel and native frame, if a record says.
     pub ppp: Option<f64>,
+    /// Image value that receives `ppp` photons, if a record says.
+    pub mean_level: Option<f64>,
+    /// The colour filter array, if the file or the user says.
+    pub cfa: Option<Mosaic>,
     /// The camera preset that this format belongs to.
     pub preset: Option<&'static str>,
     /// What the user should know.
@@ -91,6 +96,8 @@ impl CaptureInfo {
             sensor: None,
             gain: None,
             ppp: None,
+            mean_level: None,
+            cfa: None,
             preset: None,
             notes: Vec::new(),
         }

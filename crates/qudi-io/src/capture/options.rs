@@ -1,5 +1,6 @@
 //! What the user may say about a capture that its file does not.
 
+use super::mosaic::Mosaic;
 use qudi_core::Size;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -21,14 +22,23 @@ pub struct ReadOptions {
     pub orient: Option<Orientation>,
     /// Order of the axes, slowest first.
     pub axes: Option<Axes>,
-    /// The colour channel to read, from 0.
+    /// The colour channel to read, from 0; of a mosaic, the letter of its pattern.
     pub channel: Option<usize>,
+    /// The colour filter array in front of the pixels.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cfa: Option<Mosaic>,
     /// The array in a file that holds several.
     pub array: Option<String>,
     /// Pixel values are means of so many binary frames: `count = round(value * levels / full scale)`.
     pub levels: Option<u16>,
     /// Bits of a native count, where the file does not say.
     pub bits: Option<u8>,
+    /// Pedestal in DN, subtracted from stored values; what lies below counts 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub offset: Option<f64>,
+    /// Photon counting: a value more than this many DN above the pedestal counts 1, any other 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threshold: Option<f64>,
     /// Bytes before the first frame of every raw file.
     pub header: Option<u64>,
     /// Bytes after the last frame of every raw file.

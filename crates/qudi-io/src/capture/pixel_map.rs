@@ -42,7 +42,7 @@ pub(crate) fn plan(
     if let Some(path) = options.dcr.as_ref().filter(|_| calibrated.is_none()) {
         let rates = load(capture, path)?;
         let hot = (0..rates.data.len()).filter(|&i| rates.data[i] > HOT_PER_SECOND).collect();
-        named = Some(BadPixels { hot, dead: Vec::new() });
+        named = Some(BadPixels { hot, ..BadPixels::default() });
         match capture.info.fps.or(sensor.and_then(|sensor| sensor.fps)) {
             Some(fps) => {
                 capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
@@ -90,7 +90,7 @@ fn find(capture: &mut Capture) -> Result<BadPixels> {
 
 fn nonzero(map: &Frame) -> BadPixels {
     let hot = (0..map.data.len()).filter(|&i| map.data[i] != 0.0).collect();
-    BadPixels { hot, dead: Vec::new() }
+    BadPixels { hot, ..BadPixels::default() }
 }
 
 /// A map of the frames in use; one of the stored frames is turned and cropped like them.

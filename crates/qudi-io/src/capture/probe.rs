@@ -3,7 +3,7 @@
 use super::raw_sample::{RawSample, stem};
 use qudi_core::limits::FOLDER_FILES;
 use qudi_core::natural_order::natural_order;
-use qudi_core::{Error, Result};
+use qudi_core::{Error, Result, Size};
 use std::cell::OnceCell;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -29,17 +29,19 @@ pub(crate) struct Probe {
     pub(crate) extension: String,
     /// The first bytes of a file.
     pub(crate) head: Vec<u8>,
+    /// The frame size that the user gives.
+    pub(crate) size: Option<Size>,
     files: OnceCell<Listing>,
     /// Filled by [`Probe::raw_sample`], which several formats ask.
     raw_sample: OnceCell<Option<RawSample>>,
 }
 
 impl Probe {
-    /// Looks at `path`.
+    /// Looks at `path`, whose frames are said to be of `size`.
     ///
     /// # Errors
     /// [`Error::Io`] if it cannot be read.
-    pub(crate) fn new(path: &Path) -> Result<Self> {
+    pub(crate) fn new(path: &Path, size: Option<Size>) -> Result<Self> {
         let io = |e| Error::io("open the capture", path, e);
         let found = std::fs::metadata(path).map_err(io)?;
         let mut head = Vec::new();
@@ -61,6 +63,7 @@ impl Probe {
             length: found.len(),
             extension: path.extension().unwrap_or_default().to_string_lossy().to_lowercase(),
             head,
+            size,
             files: OnceCell::new(),
             raw_sample: OnceCell::new(),
         })

@@ -147,7 +147,9 @@ fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
     };
     match (known.response, info.max_count) {
         (Response::Binary, Some(max)) => Some(Sensor { frames_summed: u32::from(max), ..known }),
-        _ => Some(known),
+        // How many frames a count sums is not known: no light follows from it.
+        (Response::Binary, None) => None,
+        (Response::Linear, _) => Some(known),
     }
 }
 
@@ -198,7 +200,10 @@ fn ppp(
         let light = |mean: f64| -n * (-(mean * sampled).min(trials - 0.5) / trials).ln_1p();
         Some(light_of_blocks(sums, capture.size(), sampled, light))
     } else {
-        gain.or(native.fixed_gain()).map(|gain| {
+        // Counts beyond the sensor's full scale are another sensor's.
+        let largest = sums.iter().copied().max().unwrap_or(0);
+        let fits = f64::from(largest) <= f64::from(native.max_count()) * per_frame * sampled;
+        gain.or(native.fixed_gain()).filter(|_| fits).map(|gain| {
             CountLaw::new(&native, gain).detections_for_mean(dn / per_frame) * per_frame
         })
     };

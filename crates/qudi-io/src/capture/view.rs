@@ -1,5 +1,6 @@
 //! Turning and cropping frames: where each pixel of the result comes from.
 
+use super::mosaic::MosaicPlane;
 use super::options::{Crop, Orientation};
 use qudi_core::Size;
 use qudi_core::{Error, Result};
@@ -13,14 +14,28 @@ pub(crate) struct View {
 }
 
 impl View {
-    /// `vendor` is what [`Orientation::Vendor`] means for this format.
+    /// `vendor` is what [`Orientation::Vendor`] means for this format; of a mosaic, only the pixels of
+    /// `plane` are seen.
     pub(crate) fn new(
         stored: Size,
+        plane: Option<MosaicPlane>,
         orient: Orientation,
         vendor: Orientation,
         crop: Option<Crop>,
     ) -> Result<Self> {
         let orient = if orient == Orientation::Vendor { vendor } else { orient };
+        let whole = MosaicPlane { step: 1, row: 0, column: 0 };
+        let MosaicPlane { step, row: top, column: left } = plane.unwrap_or(whole);
+        if stored.height < step || stored.width < step {
+            return Err(Error::request(
+                format!("a mosaic in frames of {stored}"),
+                "cfa",
+                "leave it out: the frames are smaller than a tile",
+            ));
+        }
+        // Whole tiles, so that all planes have one size.
+        let columns = stored.width;
+        let stored = Size { height: stored.height / step, width: stored.width / step };
         let quarter =
             matches!(orient, Orientation::Rot90 | Orientation::Rot270 | Orientation::Transpose);
         let turned =
@@ -35,7 +50,7 @@ impl View {
             ));
         }
         let size = Size { height: crop.bottom - crop.top, width: crop.right - crop.left };
-        if size == stored && matches!(orient, Orientation::Raw | Orientation::Vendor) {
+        if size == stored && step == 1 && matches!(orient, Orientation::Raw | Orientation::Vendor) {
             return Ok(Self { size, from: None });
         }
         let (last_row, last_column) = (stored.height - 1, stored.width - 1);
@@ -51,7 +66,7 @@ impl View {
                     Orientation::FlipV => (last_row - y, x),
                     Orientation::Transpose => (x, y),
                 };
-                from.push((row * stored.width + column) as u32);
+                from.push(((row * step + top) * columns + column * step + left) as u32);
             }
         }
         Ok(Self { size, from: Some(from) })
@@ -77,7 +92,7 @@ mod tests {
     fn turn(orient: Orientation, crop: Option<&str>) -> Vec<Vec<u8>> {
         let stored = Size { height: 2, width: 3 };
         let crop = crop.map(|text| text.parse().unwrap());
-        let view = View::new(stored, orient, Orientation::Rot90, crop).unwrap();
+        let view = View::new(stored, None, orient, Orientation::Rot90, crop).unwrap();
         let mut out = vec![0; view.size.pixels()];
         view.apply(b"abcdef", &mut out);
         out.chunks(view.size.width).map(<[u8]>::to_vec).collect()
@@ -97,12 +112,25 @@ mod tests {
     }
 
     #[test]
+    fn a_plane_of_a_mosaic_is_taken_before_turning() {
+        let stored = Size { height: 4, width: 5 };
+        let plane = Some(MosaicPlane { step: 2, row: 1, column: 0 });
+        let view = View::new(stored, plane, Orientation::FlipH, Orientation::Raw, None).unwrap();
+        assert_eq!((view.size.height, view.size.width), (2, 2));
+        let mut out = [0; 4];
+        view.apply(b"abcdefghijklmnopqrst", &mut out);
+        assert_eq!(&out, b"hfrp");
+        let small = Size { height: 1, width: 5 };
+        assert!(View::new(small, plane, Orientation::Raw, Orientation::Raw, None).is_err());
+    }
+
+    #[test]
     fn crops_the_turned_frame() {
         assert_eq!(turn(Orientation::Rot90, Some("1:3,0:1")), [b"b", b"a"]);
         assert_eq!(turn(Orientation::Raw, Some("0:2,1:3")), [b"bc", b"ef"]);
         let stored = Size { height: 2, width: 3 };
         let outside = Some("0:3,0:3".parse().unwrap());
-        assert!(View::new(stored, Orientation::Raw, Orientation::Raw, outside).is_err());
+        assert!(View::new(stored, None, Orientation::Raw, Orientation::Raw, outside).is_err());
         assert!("3:1,0:2".parse::<Crop>().is_err() && "1:2".parse::<Crop>().is_err());
     }
 }

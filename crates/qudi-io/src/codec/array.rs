@@ -1,5 +1,8 @@
 //! Arrays of counts, whatever file they lie in: axes, packing, colour.
 
+mod colour;
+mod spool;
+
 use crate::capture::byte_kind::ByteKind;
 use crate::capture::format_options::refuse_packing;
 use crate::capture::info::{CaptureInfo, Packing};
@@ -11,6 +14,7 @@ use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
 use crate::frames::samples::{Channel, MONO, SampleFrames, Scale};
 use crate::sidecar::{self, BurstLayout};
 use crate::writer::BurstFormat;
+use colour::{Colours, Layout};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
@@ -27,6 +31,8 @@ pub(crate) enum Place {
     /// Fetched in groups of frames.
     #[cfg_attr(not(feature = "hdf5"), expect(dead_code, reason = "only HDF5 is read so"))]
     Fetch { fetch: Fetch, group: u64 },
+    /// In an unnamed file, `available` bytes from byte `start` on.
+    Spool { file: File, start: u64, available: u64 },
     /// Through a pipe, at the first byte of the data.
     Pipe(Pipe),
 }
@@ -83,15 +89,22 @@ impl Array {
         hints: &Hints,
         info: &mut CaptureInfo,
     ) -> Result<Box<dyn CountFrames>> {
-        let (dims, channels) = self.dims()?;
         let axes = options.axes.unwrap_or(self.axes);
-        let (axes, dims) = if self.fortran {
-            (axes.reversed(), [dims[2], dims[1], dims[0]])
-        } else {
-            (axes, dims)
-        };
-        let channel = self.channel(channels, axes, options)?;
+        let axes = if self.fortran { axes.reversed() } else { axes };
         let at = axes.frame_position();
+        let Layout { dims, colours, index } = self.layout(axes, options)?;
+        let volumes = matches!(colours, Colours::Volumes(n) if n > 1);
+        if at != 0 || volumes {
+            self.spool()?;
+        }
+        if volumes {
+            self.choose_volume(dims, index);
+        }
+        let (channel, planes) = match colours {
+            Colours::Interleaved(of) => (Channel { of, index }, 1),
+            Colours::Planes(planes) => (MONO, planes),
+            Colours::Volumes(_) => (MONO, 1),
+        };
         let frames = dims[at];
         let mut rest = dims.iter().enumerate().filter(|(i, _)| *i != at).map(|(_, &d)| d);
         let (slow, fast) = (rest.next().unwrap_or(1), rest.next().unwrap_or(1));
@@ -100,29 +113,34 @@ impl Array {
             return Err(self.fault("the array holds no frames", "save at least one frame"));
         }
         let stored = Size::new(rows, columns, &self.path.display().to_string())?;
-        let frame_bytes = stored.pixels() * channel.of * self.sample.bytes();
+        let plane_bytes = stored.pixels() * channel.of * self.sample.bytes();
+        let frame_bytes = plane_bytes * planes;
         if let Place::Pipe(pipe) = &mut self.place {
             pipe.lay_out(frame_bytes, frames as u64);
         }
         self.check_record(hints, frames as u64, stored, options)?;
         let sample_bytes = self.sample_bytes(frames as u64, frame_bytes, info)?;
-        let packing = self.packing(options, hints, channel, stored, &sample_bytes)?;
-        let size = self.true_size(stored, packing, options.size.or(hints.size))?;
-        let scale = if hints.stored != Stored::Unsaid && options.levels.is_none() {
+        let packing = self.packing(options, hints, stored, &sample_bytes)?;
+        let known_size = options.size.or(hints.size);
+        let size = self.true_size(stored, packing, known_size)?;
+        let scale = if hints.stored != Stored::Unsaid && !asks_for_values(options) {
             Scale::Counts
         } else {
             self.scale(options, info, &sample_bytes)?
         };
         let (path, sample) = (self.path.clone(), self.sample);
-        let bytes = self.bytes(axes, dims, frame_bytes, options, info)?;
+        let mut bytes = self.bytes(axes, dims, [channel.of, frame_bytes], options, info)?;
+        if planes > 1 {
+            bytes = bytes.part_of_frames(index * plane_bytes, plane_bytes);
+        }
         info.packing = packing;
         if let Some(packing) = packing {
-            if options.levels.is_some() {
-                return Err(Error::request(
-                    "`levels` does not apply to packed bits",
-                    "levels",
-                    "leave it out: single bits are no means",
-                ));
+            refuse_values(options)?;
+            if channel.of > 1 {
+                bytes = bytes.every_byte(channel.index, channel.of);
+            }
+            if known_size.is_none() {
+                info.notes.push(whole_bytes(size, packing.axis));
             }
             info.max_count = Some(1);
             let placement = Placement::packed(size, packing.axis, axes.transposed());
@@ -147,52 +165,10 @@ impl Array {
         Error::data(what, &self.path, help)
     }
 
-    /// Three extents, and the channels of a fourth axis.
-    fn dims(&self) -> Result<([usize; 3], usize)> {
-        match *self.shape.as_slice() {
-            [h, w] if self.axes.frame_position() == 2 => Ok(([h, w, 1], 1)),
-            [h, w] => Ok(([1, h, w], 1)),
-            [a, b, c] => Ok(([a, b, c], 1)),
-            [t, 1, h, w] if !matches!(w, 3 | 4) => Ok(([t, h, w], 1)),
-            [a, b, c, d] if d <= 4 => Ok(([a, b, c], d.max(1))),
-            _ => Err(self.fault(
-                format!("an array of shape {:?} is no capture", self.shape),
-                "captures have the axes frames, height, width, and perhaps colour",
-            )),
-        }
-    }
-
-    fn channel(&self, channels: usize, axes: Axes, options: &ReadOptions) -> Result<Channel> {
-        if channels == 1 {
-            return match options.channel {
-                None | Some(0) => Ok(MONO),
-                Some(index) => Err(Error::request(
-                    format!("channel {index} of a gray capture, shape {:?}", self.shape),
-                    "channel",
-                    "leave it out: there is no colour to choose from",
-                )),
-            };
-        }
-        let Some(index) = options.channel else {
-            return Err(self.fault(
-                format!("a colour capture of {channels} channels, shape {:?}", self.shape),
-                "colour is not supported yet; read one channel as gray with `channel 0`, 1 or 2",
-            ));
-        };
-        if index >= channels || axes.frame_position() != 0 || self.fortran {
-            return Err(self.fault(
-                format!("channel {index} of an array of shape {:?}", self.shape),
-                format!("channels count from 0 to {} and lie on the last axis", channels - 1),
-            ));
-        }
-        Ok(Channel { of: channels, index })
-    }
-
     fn packing(
         &self,
         options: &ReadOptions,
         hints: &Hints,
-        channel: Channel,
         stored: Size,
         sampled: &[u8],
     ) -> Result<Option<Packing>> {
@@ -205,7 +181,7 @@ impl Array {
                     let order = options.bit_order.unwrap_or(packing.order);
                     Some(Packing { order, ..packing })
                 }
-                Stored::Unsaid if self.sample == Sample::U8 && options.levels.is_none() => {
+                Stored::Unsaid if self.sample == Sample::U8 && !asks_for_values(options) => {
                     // A size that fits only if eight pixels share a byte says that they do.
                     let implied = [PackAxis::Width, PackAxis::Height].into_iter().find(|&axis| {
                         options.size.is_some_and(|size| {
@@ -229,18 +205,10 @@ impl Array {
                 Stored::Counts | Stored::Unsaid => None,
             },
         };
-        if packing.is_some() && (self.sample != Sample::U8 || channel.of != 1) {
+        if packing.is_some() && self.sample != Sample::U8 {
             return Err(self.fault(
-                if channel.of == 1 {
-                    "packed bits are bytes (uint8), and the array holds other samples"
-                } else {
-                    "a packed colour capture"
-                },
-                if channel.of == 1 {
-                    "use `pack_axis none`"
-                } else {
-                    "colour is not supported yet; in Python, save one channel: numpy.save(NAME, cube[..., 0])"
-                },
+                "packed bits are bytes (uint8), and the array holds other samples",
+                "use `pack_axis none`",
             ));
         }
         Ok(packing)
@@ -276,13 +244,13 @@ impl Array {
     ) -> Result<Scale> {
         let full = self.sample.full_scale();
         match (self.sample, full) {
-            (_, Some(full)) if options.levels.is_some() => {
-                Ok(Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts))
-            }
             (_, None) if options.levels.is_some() => Err(self.fault(
                 "`levels` on wide integers, which have no full scale",
                 "leave `levels` out, or save the means as float",
             )),
+            (_, full) if asks_for_values(options) => {
+                Ok(Scale::asked(options, full.unwrap_or(1.0), info).unwrap_or(Scale::Counts))
+            }
             (Sample::U8 | Sample::U16 { .. }, Some(full)) => {
                 let samples = sampled.chunks_exact(self.sample.bytes());
                 let values = samples.map(|bytes| self.sample.decode(bytes) as u16).collect();
@@ -365,6 +333,12 @@ impl Array {
                 let count = (SAMPLE_BYTES / frame_bytes).clamp(1, frames as usize) as u64;
                 bytes = fetch((frames - count) / 2, count)?;
             }
+            Place::Spool { file, start, available } => {
+                let from = (*available / 2).saturating_sub(SAMPLE_BYTES as u64 / 2) & !63;
+                file.seek(SeekFrom::Start(*start + from)).map_err(io)?;
+                let there = (*available - from).min(SAMPLE_BYTES as u64);
+                file.by_ref().take(there).read_to_end(&mut bytes).map_err(io)?;
+            }
             Place::Pipe(pipe) => {
                 pipe.wait_for(frames.min(FIRST_WINDOW), &mut info.notes)?;
                 bytes = pipe.kept_bytes();
@@ -377,7 +351,7 @@ impl Array {
         self,
         axes: Axes,
         dims: [usize; 3],
-        frame_bytes: usize,
+        [channels, frame_bytes]: [usize; 2],
         options: &ReadOptions,
         info: &mut CaptureInfo,
     ) -> Result<FrameBytes> {
@@ -385,7 +359,7 @@ impl Array {
         let frames = dims[at] as u64;
         let promised = frames.checked_mul(frame_bytes as u64);
         let available = match &self.place {
-            Place::File { available, .. } => *available,
+            Place::File { available, .. } | Place::Spool { available, .. } => *available,
             Place::Stream(opener) if options.lenient => {
                 // What follows a damaged place is lost anyway.
                 let mut counted = Counter(0);
@@ -413,6 +387,8 @@ impl Array {
             }
             info.notes.push(format!("truncated: {} of {frames} frames dropped", frames - whole));
         }
+        let (outer, inner) = (dims[..at].iter().product(), dims[at + 1..].iter().product());
+        let (layout, element) = ([outer, dims[at], inner], self.sample.bytes() * channels);
         Ok(match self.place {
             Place::File { start, checksum, .. } if at == 0 => {
                 let segment = Segment { path: self.path, start, frames: whole };
@@ -421,11 +397,13 @@ impl Array {
                     None => FrameBytes::files(vec![segment], frame_bytes),
                 }
             }
-            Place::File { start, .. } => {
-                let outer = dims[..at].iter().product();
-                let inner = dims[at + 1..].iter().product();
-                let layout = [outer, dims[at], inner];
-                strewn(&self.path, start, self.sample.bytes(), layout)
+            Place::Spool { file, start, .. } if at == 0 => {
+                let segment = Segment { path: self.path, start, frames: whole };
+                FrameBytes::spool(segment, file, frame_bytes)
+            }
+            Place::File { start, .. } => strewn(&self.path, None, start, element, layout),
+            Place::Spool { file, start, .. } => {
+                strewn(&self.path, Some(file), start, element, layout)
             }
             Place::Stream(opener) if at == 0 => {
                 let after = if options.lenient { StreamEnd::Ignored } else { StreamEnd::Verified };
@@ -436,13 +414,40 @@ impl Array {
             }
             Place::Pipe(pipe) if at == 0 => FrameBytes::Pipe(pipe),
             Place::Stream(_) | Place::Fetch { .. } | Place::Pipe(_) => {
-                return Err(self.fault(
-                    "a compressed or piped array whose frame axis is not the first",
-                    "save it as .npy; then its frames are gathered in place",
-                ));
+                // Spooled before.
+                return Err(self.no_capture());
             }
         })
     }
+}
+
+/// Whether options say what stored values mean.
+fn asks_for_values(options: &ReadOptions) -> bool {
+    options.levels.is_some() || options.offset.is_some() || options.threshold.is_some()
+}
+
+/// Refuses options on the values of samples where samples are single bits.
+fn refuse_values(options: &ReadOptions) -> Result<()> {
+    let given = [
+        (options.levels.is_some(), "levels"),
+        (options.offset.is_some(), "offset"),
+        (options.threshold.is_some(), "threshold"),
+    ];
+    let Some((_, name)) = given.into_iter().find(|(given, _)| *given) else { return Ok(()) };
+    Err(Error::request(
+        format!("`{name}` does not apply to packed bits"),
+        name,
+        "leave it out: single bits are no means and have no pedestal",
+    ))
+}
+
+/// What is said where only whole bytes tell the length of packed rows.
+fn whole_bytes(size: Size, axis: PackAxis) -> String {
+    let (length, what) = match axis {
+        PackAxis::Height => (size.height, "columns are"),
+        PackAxis::Width | PackAxis::None => (size.width, "rows are"),
+    };
+    format!("packed {what} taken for {length} pixels; if fewer are used, say so with `size HxW`")
 }
 
 struct Counter(u64);

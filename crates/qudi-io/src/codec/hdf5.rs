@@ -56,6 +56,9 @@ fn open(
     })
     .map_err(damaged)?;
     found.sort_by(|(a, _), (b, _)| qudi_core::natural_order::natural_order(&a.path, &b.path));
+    if options.array.is_none() {
+        photon_hdf5(&found, path)?;
+    }
     let numbered = |c: &Candidate| {
         let name = c.path.rsplit('/').next().unwrap_or_default();
         !name.is_empty()
@@ -85,7 +88,7 @@ fn open(
         }
         let shape = vec![checked.len(), shape[0], shape[1]];
         return numbered_frames(file, checked, sample, shape, path).open(
-            options,
+            &gray(options, info),
             &Hints::default(),
             info,
         );
@@ -110,7 +113,13 @@ fn open(
         axes: if matlab { Axes::Twh } else { Axes::Thw },
         place: Place::Fetch { fetch: Box::new(fetch), group },
     };
-    array.open(options, &Hints::default(), info)
+    array.open(&gray(options, info), &Hints::default(), info)
+}
+
+/// Options for the array itself: the channel of a mosaic is none of its axes.
+fn gray(options: &ReadOptions, info: &CaptureInfo) -> ReadOptions {
+    let channel = options.channel.filter(|_| info.cfa.is_none());
+    ReadOptions { channel, ..options.clone() }
 }
 
 fn damaged(e: &str, path: &Path) -> Error {
@@ -156,16 +165,20 @@ fn metadata(
     info: &mut CaptureInfo,
     path: &Path,
 ) -> Result<()> {
+    attributes(file, dataset, info);
     let Some(text) = file.attribute(dataset, "metadata") else { return Ok(()) };
     let Ok(metadata) = serde_json::from_str::<serde_json::Value>(&text) else { return Ok(()) };
     if let Some(pattern) = metadata["cfa_pattern"].as_str() {
         let mono = ["", "none", "mono", "monochrome"].contains(&pattern.to_lowercase().as_str());
-        if !mono && options.channel.is_none() {
-            return Err(Error::data(
-                format!("a capture behind a colour filter array ({pattern})"),
-                path,
-                "colour is not supported yet; read the mosaic as if it were gray with `channel 0`",
-            ));
+        if !mono && options.cfa.is_none() {
+            info.cfa = pattern.parse().ok();
+            if info.cfa.is_none() {
+                return Err(Error::data(
+                    format!("a capture behind a colour filter array ({pattern})"),
+                    path,
+                    "say how its tiles lie and which colour to read, as in `cfa rggb@0,0` and `channel 0`",
+                ));
+            }
         }
     }
     let summed = metadata["polycam_metadata"]["num_integrated_binary_frames"].as_u64();
@@ -175,6 +188,37 @@ fn metadata(
     let rate = &metadata["node_history"][0]["schedule"]["base_schedule"]["binary_frame_rate_fps"];
     info.fps = rate.as_f64().map(|fps| fps / f64::from(info.max_count.unwrap_or(1)));
     Ok(())
+}
+
+/// Frame rate and depth in attributes of the data set, its groups or the file, by their usual names.
+fn attributes(file: &Hdf5, dataset: &str, info: &mut CaptureInfo) {
+    let number = |names: &[&str]| {
+        let found = names.iter().find_map(|name| file.number(dataset, name));
+        found.filter(|value| value.is_finite() && *value > 0.0)
+    };
+    if let Some(fps) = number(&["fps", "frame_rate", "frame_rate_hz", "framerate", "FrameRate"]) {
+        info.fps = Some(fps);
+        info.reasons.push(format!("attribute: {fps} frames per second"));
+    }
+    let bits = number(&["bits", "bit_depth", "bitdepth", "BitDepth"]);
+    if let Some(bits) = bits.filter(|bits| bits.fract() == 0.0 && *bits <= 16.0) {
+        info.max_count = Some(((1u32 << bits as u32) - 1) as u16);
+        info.reasons.push(format!("attribute: counts of {bits} bits"));
+    }
+}
+
+/// What a file of single photons with time stamps is, and what to do about it (Photon-HDF5, Ingargiola et al. 2016).
+fn photon_hdf5(found: &[(Candidate, hdf5_pure::Dataset)], path: &Path) -> Result<()> {
+    let stamps =
+        found.iter().any(|(c, _)| c.path.contains("photon_data") && c.path.ends_with("timestamps"));
+    if !stamps {
+        return Ok(());
+    }
+    Err(Error::data(
+        "a Photon-HDF5 file: arrival times of single photons, no frames",
+        path,
+        "bin its photons into frames first, as with `phconvert` in Python, and save them with numpy.save",
+    ))
 }
 
 fn choose(found: &[&Candidate], options: &ReadOptions, path: &Path) -> Result<usize> {

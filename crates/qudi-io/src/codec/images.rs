@@ -7,6 +7,7 @@ use crate::capture::levels::infer_levels;
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
+use crate::frames::reordered::reordered;
 use crate::frames::samples::{Scale, no_count};
 use image::DynamicImage;
 use qudi_core::Size;
@@ -48,6 +49,7 @@ pub(crate) struct Images {
     files: Vec<PathBuf>,
     size: Size,
     scale: Scale,
+    channel: Option<usize>,
 }
 
 fn open(
@@ -72,7 +74,7 @@ fn open(
                 "copy the missing frames, or remove burst.json if it belongs to another burst",
             ))
         }
-        _ => Ok(frames),
+        _ => reordered(frames, options.axes, &probe.path),
     }
 }
 
@@ -94,12 +96,13 @@ pub(crate) fn open_files(
     for file in &files {
         require_regular(file, "open the image")?;
     }
-    let (size, samples, full) = gray(first)?;
+    let (size, samples, full) = gray(first, options.channel)?;
     if lossy(first) {
         info.notes.push("JPEG is lossy: its values are not photon counts".to_owned());
     }
-    let mut images = Images { files, size, scale: Scale::Counts };
-    if let Some(scale) = Scale::asked(options.levels, f32::from(full), info) {
+    let channel = options.channel;
+    let mut images = Images { files, size, scale: Scale::Counts, channel };
+    if let Some(scale) = Scale::asked(options, f32::from(full), info) {
         images.scale = scale;
     } else if !recorded {
         images.infer_scale(samples, full, place, info)?;
@@ -124,7 +127,7 @@ impl Images {
         let mut values = distinct(first);
         let mut ladders = vec![infer_levels(&values, full)];
         for i in spread(self.files.len()) {
-            let more = distinct(gray(&self.files[i])?.1);
+            let more = distinct(gray(&self.files[i], self.channel)?.1);
             ladders.push(infer_levels(&more, full));
             values.extend(more);
             values = distinct(values);
@@ -159,8 +162,8 @@ fn lossy(path: &Path) -> bool {
     read.is_ok() && magic == [0xff, 0xd8, 0xff]
 }
 
-/// Gray samples of an image, its size, and full scale.
-fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
+/// Gray samples of an image, or those of one channel, its size, and full scale.
+fn gray(path: &Path, channel: Option<usize>) -> Result<(Size, Vec<u16>, u16)> {
     let image = decode_image(path)?;
     let size =
         Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
@@ -182,14 +185,28 @@ fn gray(path: &Path) -> Result<(Size, Vec<u16>, u16)> {
     };
     let colours = channels - usize::from(alpha);
     let coloured = samples.chunks_exact(channels).any(|p| p[..colours].iter().any(|&v| v != p[0]));
-    if coloured {
-        return Err(Error::data(
-            "a colour image",
-            path,
-            "colour is not supported yet; frames of counts are gray",
-        ));
-    }
-    Ok((size, samples.into_iter().step_by(channels).collect(), full))
+    let index = match channel {
+        None if coloured => {
+            return Err(Error::data(
+                "a colour image",
+                path,
+                format!("read one channel as gray with `channel 0` to {}", colours - 1),
+            ));
+        }
+        Some(channel) if channel >= colours => {
+            return Err(Error::data(
+                format!("channel {channel} of an image of {colours}"),
+                path,
+                if colours == 1 {
+                    "leave `channel` out: there is no colour to choose from".to_owned()
+                } else {
+                    format!("channels count from 0 to {}", colours - 1)
+                },
+            ));
+        }
+        chosen => chosen.unwrap_or(0),
+    };
+    Ok((size, samples.into_iter().skip(index).step_by(channels).collect(), full))
 }
 
 impl CountFrames for Images {
@@ -203,7 +220,7 @@ impl CountFrames for Images {
 
     fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
         let path = &self.files[frame as usize];
-        let (size, samples, _) = gray(path)?;
+        let (size, samples, _) = gray(path, self.channel)?;
         if size != self.size {
             return Err(Error::data(
                 format!("an image of {size} among images of {}", self.size),

@@ -126,7 +126,7 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
         return Err(Error::data(
             "a simulated colour-filter capture (`imbs`)",
             path,
-            "colour is not supported yet; read the mosaic as if it were gray with `array imbs`",
+            "read it with `array imbs`, and one of its colours with its pattern beside it, as in `cfa rggb@0,0` `channel 0`",
         ));
     }
     let captures: Vec<_> = found.iter().filter(|a| a.dims.len() >= 3).collect();

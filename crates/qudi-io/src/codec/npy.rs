@@ -137,6 +137,7 @@ pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayo
             info.binary = record.simulation.sensor.response == Response::Binary;
             info.gain = Some(record.gain);
             info.ppp = Some(record.light.ppp);
+            info.mean_level = Some(record.light.mean_level);
             info.sensor = Some(record.simulation.sensor);
             record.burst
         }

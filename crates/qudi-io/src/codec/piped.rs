@@ -53,6 +53,11 @@ pub(crate) fn open_pipe(
             ))
         });
     }
+    let mut container = options.clone();
+    if options.cfa.is_some() {
+        container.channel = None;
+    }
+    let options = &container;
     refuse_others(options, super::ARRAY, "npy")?;
     let mut start = Vec::new();
     (&mut reader).take(MAGIC).read_to_end(&mut start).map_err(|e| Error::io("read", place, e))?;

@@ -58,10 +58,12 @@ const BITS_OPTIONS: [FormatOption; 7] = [
     FormatOption::FramesPerFile,
 ];
 
-const SAMPLES_OPTIONS: [FormatOption; 6] = [
+const SAMPLES_OPTIONS: [FormatOption; 8] = [
     FormatOption::Axes,
     FormatOption::Size,
     FormatOption::Levels,
+    FormatOption::Offset,
+    FormatOption::Threshold,
     FormatOption::Header,
     FormatOption::Trailer,
     FormatOption::FramesPerFile,
@@ -184,7 +186,7 @@ fn samples(
     let size = size(options)?;
     let bytes = source(size.pixels() * sample.bytes(), info)?;
     let full = sample.full_scale().unwrap_or(1.0);
-    let scale = Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts);
+    let scale = Scale::asked(options, full, info).unwrap_or(Scale::Counts);
     let transposed = transposed(options)?;
     Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, place)))
 }

@@ -2,33 +2,46 @@
 //! which end in `DONE`. One bit, highest bit first; 4 to 8 bits in a byte; 9 to 12 in two.
 //! The vendor's software turns frames by a quarter to the left.
 
+mod region;
+
 use super::{Format, Recognition};
 use crate::capture::byte_kind::ByteKind;
 use crate::capture::format_options::FormatOption;
 use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, Orientation, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
-use crate::capture::raw_sample::{Convention, FRAME};
+use crate::capture::raw_sample::Convention;
 use crate::codec::raw::files::{ends_in_trailer, frame_files};
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
-use qudi_core::Result;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
+use qudi_core::{Error, Result};
+use std::fs::File;
+use std::io::Read;
 
 /// Options of files of one count a pixel.
-const COUNTS: &[FormatOption] =
-    &[FormatOption::Size, FormatOption::Header, FormatOption::Trailer, FormatOption::FramesPerFile];
+const COUNTS: &[FormatOption] = &[
+    FormatOption::Size,
+    FormatOption::Offset,
+    FormatOption::Threshold,
+    FormatOption::Header,
+    FormatOption::Trailer,
+    FormatOption::FramesPerFile,
+];
 
-/// The whole array; narrower read-outs are given with `size`.
+/// Bytes from which the width of rows is told.
+const LOOKED_AT: u64 = 1 << 20;
+
+/// The whole array; narrower read-outs show by their rows, or are given with `size`.
 const ARRAY: Size = Size { height: 512, width: 512 };
 
 pub(crate) const BINARY: Format = Format {
     name: "spad512s",
     title: "SPAD512S raw files, 1 bit",
     options: super::SIZED_BIT_FILES,
-    probe: |probe| recognise(probe, ByteKind::Packed, FRAME as u64),
+    probe: |probe| recognise(probe, ByteKind::Packed),
     open: open_binary,
 };
 
@@ -36,7 +49,7 @@ pub(crate) const BYTES: Format = Format {
     name: "spad512s-8",
     title: "SPAD512S raw files, 4 to 8 bits",
     options: COUNTS,
-    probe: |probe| recognise(probe, ByteKind::Counts, 8 * FRAME as u64),
+    probe: |probe| recognise(probe, ByteKind::Counts),
     open: |probe, options, info| open_samples(probe, options, info, Sample::U8),
 };
 
@@ -44,13 +57,22 @@ pub(crate) const WORDS: Format = Format {
     name: "spad512s-16",
     title: "SPAD512S raw files, 9 to 12 bits",
     options: COUNTS,
-    probe: |probe| recognise(probe, ByteKind::WideCounts, 16 * FRAME as u64),
+    probe: |probe| recognise(probe, ByteKind::WideCounts),
     open: |probe, options, info| {
         open_samples(probe, options, info, Sample::U16 { big_endian: false })
     },
 };
 
-fn recognise(probe: &Probe, kind: ByteKind, frame: u64) -> Result<Option<Recognition>> {
+/// Bytes of a frame of `size`.
+fn frame_bytes(size: Size, kind: ByteKind) -> u64 {
+    (match kind {
+        ByteKind::Packed | ByteKind::Unclear => size.height * size.width.div_ceil(8),
+        ByteKind::Counts => size.pixels(),
+        ByteKind::WideCounts => 2 * size.pixels(),
+    }) as u64
+}
+
+fn recognise(probe: &Probe, kind: ByteKind) -> Result<Option<Recognition>> {
     let Some(sample) = probe.raw_sample()? else { return Ok(None) };
     let binary = kind == ByteKind::Packed;
     let fits = match sample.kind {
@@ -61,7 +83,11 @@ fn recognise(probe: &Probe, kind: ByteKind, frame: u64) -> Result<Option<Recogni
     let first = probe.files(&["bin"])?.into_iter().next().unwrap_or_default();
     let trailer = ends_in_trailer(&first);
     let body = sample.length - if trailer { 4 } else { 0 };
-    if !fits || !body.is_multiple_of(frame) || body == 0 {
+    // A region of interest has frames of another length; then the camera must show otherwise.
+    let known = sample.convention == Convention::Spad512s || trailer;
+    let frame = frame_bytes(probe.size.unwrap_or(ARRAY), kind);
+    let whole = body.is_multiple_of(frame);
+    if !fits || body == 0 || !(whole || known && probe.size.is_none()) {
         return Ok(None);
     }
     let mut reasons = Vec::new();
@@ -91,13 +117,48 @@ fn common(info: &mut CaptureInfo) {
     info.orient = Orientation::Vendor;
 }
 
+/// The size of frames: given, or as their rows show.
+fn frame_size(probe: &Probe, kind: ByteKind, options: &ReadOptions) -> Result<Size> {
+    if let Some(size) = options.size {
+        return Ok(size);
+    }
+    // A header or a trailer of its own: nobody guesses then.
+    if options.header.is_some() || options.trailer.is_some() {
+        return Ok(ARRAY);
+    }
+    let first = probe.files(&["bin"])?.into_iter().next().unwrap_or_default();
+    let io = |e| Error::io("read", &first, e);
+    let file = File::open(&first).map_err(io)?;
+    let length = file.metadata().map_err(io)?.len();
+    let mut bytes = Vec::new();
+    file.take(LOOKED_AT).read_to_end(&mut bytes).map_err(io)?;
+    let body = length - if ends_in_trailer(&first) { length.min(4) } else { 0 };
+    let samples: Vec<f32> = match kind {
+        ByteKind::Packed | ByteKind::Unclear => {
+            let bits = bytes.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1));
+            bits.map(f32::from).collect()
+        }
+        ByteKind::Counts => bytes.iter().map(|&byte| f32::from(byte)).collect(),
+        ByteKind::WideCounts => {
+            let words = bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]]));
+            words.map(f32::from).collect()
+        }
+    };
+    let size = region::frame_size(&samples, body, |size| frame_bytes(size, kind), &first);
+    match size {
+        // An incomplete last frame of a whole array is dropped.
+        Err(_) if options.lenient => Ok(ARRAY),
+        other => other,
+    }
+}
+
 fn open_binary(
     probe: &Probe,
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     common(info);
-    let size = options.size.unwrap_or(ARRAY);
+    let size = frame_size(probe, ByteKind::Packed, options)?;
     let (rows, columns) = stored_bytes(size, PackAxis::Width);
     let bytes = frame_files(&probe.files(&["bin"])?, rows * columns, 0, options, info)?;
     let order = options.bit_order.unwrap_or(BitOrder::Msb);
@@ -114,9 +175,11 @@ fn open_samples(
     sample: Sample,
 ) -> Result<Box<dyn CountFrames>> {
     common(info);
-    let size = options.size.unwrap_or(ARRAY);
+    let kind = if sample == Sample::U8 { ByteKind::Counts } else { ByteKind::WideCounts };
+    let size = frame_size(probe, kind, options)?;
     let files = probe.files(&["bin"])?;
     let bytes = frame_files(&files, size.pixels() * sample.bytes(), 0, options, info)?;
-    let scale = Scale::Counts;
+    let full = sample.full_scale().unwrap_or(1.0);
+    let scale = Scale::asked(options, full, info).unwrap_or(Scale::Counts);
     Ok(Box::new(SampleFrames::new(bytes, sample, size, false, MONO, scale, &probe.path)))
 }

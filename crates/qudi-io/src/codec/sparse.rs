@@ -6,6 +6,7 @@ use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::{Orientation, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
+use crate::frames::chain::Chain;
 use qudi_core::Size;
 use qudi_core::{Error, Result};
 use std::fs::File;
@@ -17,7 +18,14 @@ pub(crate) const FORMAT: Format = Format {
     title: "SPAD512S sparse index stream",
     options: &[FormatOption::Size],
     probe: |probe| {
-        if !probe.has_extension(&["bin", "raw"]) || !probe.length.is_multiple_of(4) {
+        if !probe.is_folder && !probe.has_extension(&["bin", "raw"]) {
+            return Ok(None);
+        }
+        let Some(first) = probe.files(&["bin", "raw"])?.into_iter().next() else {
+            return Ok(None);
+        };
+        let length = std::fs::metadata(&first).map_err(|e| Error::io("open", &first, e))?.len();
+        if !length.is_multiple_of(4) {
             return Ok(None);
         }
         let middle = probe.middle(4)?;
@@ -53,19 +61,35 @@ fn open(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
-    let path = &probe.path;
-    if probe.is_folder {
-        return Err(Error::data("a folder", path, "name one file of the sparse stream"));
-    }
     let size = options.size.unwrap_or(ARRAY);
-    let io = |e| Error::io("read", path, e);
-    let mut file = File::open(path).map_err(io)?;
-    let starts = index(&mut file, size, path, options, info)?;
     info.preset = Some("spad512s");
     info.max_count = Some(1);
     info.vendor = Orientation::Rot90;
     info.orient = Orientation::Vendor;
-    Ok(Box::new(SparseFrames { file, path: path.clone(), size, starts, words: Vec::new() }))
+    let files = probe.files(&["bin", "raw"])?;
+    if let [path] = files.as_slice() {
+        return Ok(Box::new(open_file(path, size, options, info)?));
+    }
+    let mut lengths = Vec::with_capacity(files.len());
+    for path in &files {
+        lengths.push(open_file(path, size, options, info)?.frames());
+    }
+    let (options, template) = (options.clone(), info.clone());
+    let opener = move |part: usize| -> Result<Box<dyn CountFrames>> {
+        Ok(Box::new(open_file(&files[part], size, &options, &mut template.clone())?))
+    };
+    Ok(Box::new(Chain::new(size, &lengths, Box::new(opener))))
+}
+
+fn open_file(
+    path: &Path,
+    size: Size,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<SparseFrames> {
+    let mut file = File::open(path).map_err(|e| Error::io("read", path, e))?;
+    let starts = index(&mut file, size, path, options, info)?;
+    Ok(SparseFrames { file, path: path.to_owned(), size, starts, words: Vec::new() })
 }
 
 /// Reads the stream once, checks every index, and notes where frames start.

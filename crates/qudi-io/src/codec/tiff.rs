@@ -1,6 +1,7 @@
 //! TIFF stacks: one image file directory per frame, or ImageJ's single directory before one block
 //! of frames (which is how it goes beyond 4 GiB).
 
+mod description;
 mod pages;
 
 use super::npy::described;
@@ -9,10 +10,13 @@ use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
+use crate::frames::channel_pages::ChannelPages;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
+use crate::frames::reordered::reordered;
 use crate::frames::samples::{MONO, SampleFrames, Scale};
 use crate::sidecar::{self, BurstLayout};
-use pages::{TiffPages, bits_reversed, decoder, fault};
+use description::Description;
+use pages::{TiffPages, bits_reversed, decoder, fault, photometric};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
@@ -50,11 +54,79 @@ fn open(
         return Err(Error::data("a folder", path, "use `format images`, or name one file"));
     }
     let recorded = described(&sidecar::beside(path), info);
+    let description = describe(path)?;
+    let frames = stack(probe, description.as_ref(), recorded.as_ref(), options, info)?;
+    if let Some(description) = &description {
+        info.fps = info.fps.or(description.fps);
+    }
+    let frames = channel_of(frames, description, options, info, path)?;
+    reordered(frames, options.axes, path)
+}
+
+/// What ImageJ or OME say of the stack.
+fn describe(path: &Path) -> Result<Option<Description>> {
+    let text = decoder(path)?.find_tag(Tag::ImageDescription).ok().flatten();
+    Ok(text.and_then(|value| value.into_string().ok()).as_deref().and_then(Description::parse))
+}
+
+/// The frames of one channel, where channels are pages of their own.
+fn channel_of(
+    frames: Box<dyn CountFrames>,
+    description: Option<Description>,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+    path: &Path,
+) -> Result<Box<dyn CountFrames>> {
+    let pages = frames.frames();
+    let Some(Description { channels, run, program, .. }) = description.filter(|d| d.channels > 1)
+    else {
+        return Ok(frames);
+    };
+    if channels == pages && options.channel.is_none() {
+        // Some programs call the frames of a plain stack so.
+        info.notes.push(format!(
+            "{program}'s description says {channels} channels of one image: taken for frames; `channel` reads one"
+        ));
+        return Ok(frames);
+    }
+    info.reasons.push(format!("{program}'s description: {channels} channels"));
+    let Some(channel) = options.channel else {
+        return Err(Error::data(
+            format!(
+                "a stack of {channels} channels, {pages} pages, as {program}'s description says"
+            ),
+            path,
+            format!("read one channel as gray with `channel 0` to {}", channels - 1),
+        ));
+    };
+    match ChannelPages::new(frames, channels, channel as u64, run) {
+        Some(pages) => Ok(Box::new(pages)),
+        None => Err(Error::data(
+            format!("channel {channel} of {channels} in {pages} pages"),
+            path,
+            format!("channels count from 0 to {}, and every one has as many pages", channels - 1),
+        )),
+    }
+}
+
+/// The pages in the order of the file.
+fn stack(
+    probe: &Probe,
+    description: Option<&Description>,
+    recorded: Option<&BurstLayout>,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
+    let path = &probe.path;
+    let of_pages = description.is_some_and(|d| d.channels > 1);
     let Some(block) = block(probe)? else {
-        let pages = TiffPages::open(path, options, recorded.is_some(), info)?;
-        check_record(recorded.as_ref(), &pages, options, path)?;
+        let pages = TiffPages::open(path, options, recorded.is_some(), of_pages, info)?;
+        check_record(recorded, &pages, options, path)?;
         return Ok(Box::new(pages));
     };
+    if !of_pages {
+        refuse_channel(options, path)?;
+    }
     info.reasons.push(format!("ImageJ's description: {} images", block.frames));
     let frame_bytes = (block.size.pixels() * block.sample.bytes()) as u64;
     let whole = (probe.length.saturating_sub(block.start) / frame_bytes).min(block.frames);
@@ -74,10 +146,22 @@ fn open(
     let segment = Segment { path: path.clone(), start: block.start, frames: whole };
     let bytes = FrameBytes::files(vec![segment], frame_bytes as usize);
     let full = block.sample.full_scale().unwrap_or(1.0);
-    let scale = Scale::asked(options.levels, full, info).unwrap_or(Scale::Counts);
+    let scale = Scale::asked(options, full, info).unwrap_or(Scale::Counts);
     let frames = SampleFrames::new(bytes, block.sample, block.size, false, MONO, scale, path);
-    check_record(recorded.as_ref(), &frames, options, path)?;
+    check_record(recorded, &frames, options, path)?;
     Ok(Box::new(frames))
+}
+
+/// Refuses a channel of a gray stack.
+fn refuse_channel(options: &ReadOptions, path: &Path) -> Result<()> {
+    match options.channel {
+        Some(channel) if channel > 0 => Err(Error::data(
+            format!("channel {channel} of a gray stack"),
+            path,
+            "leave `channel` out: there is no colour to choose from",
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// Refuses a record that belongs to another stack, with what both say.
@@ -108,14 +192,12 @@ fn block(probe: &Probe) -> Result<Option<Block>> {
         return Ok(None);
     }
     let tag = |decoder: &mut tiff::decoder::Decoder<_>, tag| decoder.find_tag(tag).ok().flatten();
-    let description = tag(&mut decoder, Tag::ImageDescription).and_then(|v| v.into_string().ok());
-    let images =
-        description.as_deref().filter(|text| text.starts_with("ImageJ=")).and_then(|text| {
-            text.lines().find_map(|line| line.strip_prefix("images=")?.trim().parse::<u64>().ok())
-        });
+    let text = tag(&mut decoder, Tag::ImageDescription).and_then(|v| v.into_string().ok());
+    let images = text.as_deref().and_then(Description::parse).and_then(|d| d.images);
     let Some(frames) = images.filter(|&n| n > 1) else { return Ok(None) };
     let compression = tag(&mut decoder, Tag::Compression).and_then(|v| v.into_u16().ok());
-    if compression.unwrap_or(1) != 1 || bits_reversed(&mut decoder, path)? {
+    let inverted = photometric(&mut decoder, path)? == 0;
+    if compression.unwrap_or(1) != 1 || inverted || bits_reversed(&mut decoder, path)? {
         return Ok(None);
     }
     let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;

@@ -1,11 +1,13 @@
 //! Videos through ffmpeg, for what was stored as one. Lossy compression leaves no photon counts.
 
 use super::{Format, Recognition};
+use crate::capture::format_options::FormatOption;
 use crate::capture::info::{CaptureInfo, Certainty};
 use crate::capture::options::ReadOptions;
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
+use crate::frames::reordered::reordered;
 use crate::frames::samples::{MONO, SampleFrames, Scale};
 use qudi_core::Transfer;
 use qudi_core::npy::Sample;
@@ -16,7 +18,12 @@ use std::io::{BufWriter, Write};
 pub(crate) const FORMAT: Format = Format {
     name: "video",
     title: "video, decoded by ffmpeg",
-    options: super::PICTURES,
+    options: &[
+        FormatOption::Axes,
+        FormatOption::Levels,
+        FormatOption::Offset,
+        FormatOption::Threshold,
+    ],
     probe: |probe| {
         let found = probe.has_extension(&["mp4", "avi", "mkv", "mov", "webm", "m4v"]);
         Ok(found.then(|| Recognition::new(Certainty::Likely, &["the name"])))
@@ -46,8 +53,9 @@ fn open(
         "video is stored with loss: its values are not photon counts, and no figure made from them means much"
             .to_owned(),
     );
-    let scale = Scale::asked(options.levels, 255.0, info).unwrap_or(Scale::Counts);
+    let scale = Scale::asked(options, 255.0, info).unwrap_or(Scale::Counts);
     let segment = Segment { path: path.clone(), start: 0, frames };
     let bytes = FrameBytes::spool(segment, file, size.pixels());
-    Ok(Box::new(SampleFrames::new(bytes, Sample::U8, size, false, MONO, scale, path)))
+    let frames = SampleFrames::new(bytes, Sample::U8, size, false, MONO, scale, path);
+    reordered(Box::new(frames), options.axes, path)
 }

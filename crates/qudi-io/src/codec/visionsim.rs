@@ -9,6 +9,7 @@ use crate::capture::info::{CaptureInfo, Certainty, Packing};
 use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
 use crate::capture::probe::Probe;
 use crate::frames::CountFrames;
+use crate::frames::reordered::reordered;
 use qudi_core::Size;
 use qudi_core::limits::INDEX_BYTES;
 use qudi_core::regular_file::read_limited;
@@ -69,7 +70,7 @@ fn open(
         return Err(Error::data(
             format!("a colour capture of {} channels", transforms.c.unwrap_or(0)),
             &path,
-            "colour is not supported yet; read one channel of unpacked frames with `channel`",
+            "read one channel as gray with `channel 0`, 1 or 2",
         ));
     }
     if let Some(name) = &transforms.file_path {
@@ -81,7 +82,7 @@ fn open(
     let files: Option<Vec<PathBuf>> =
         transforms.frames.iter().map(|pose| inside(folder, pose.file_path.as_deref()?)).collect();
     let files = files.ok_or_else(|| fault("frames without file_path".to_owned()))?;
-    open_files(files, &path, false, options, info)
+    reordered(open_files(files, &path, false, options, info)?, options.axes, &path)
 }
 
 /// A path inside the data set.

@@ -32,6 +32,8 @@ pub(crate) enum FrameBytes {
     Batched(Batched),
     /// Frames that come once.
     Pipe(Pipe),
+    /// Some bytes of each frame.
+    Picked(Box<Picked>),
 }
 
 impl FrameBytes {
@@ -83,12 +85,24 @@ impl FrameBytes {
         })
     }
 
+    /// The same frames, `length` bytes of each from byte `start` on.
+    pub(crate) fn part_of_frames(self, start: usize, length: usize) -> Self {
+        Self::Picked(Box::new(Picked { inner: self, start, step: 1, length, frame: Vec::new() }))
+    }
+
+    /// The same frames, every `step`-th byte of each from byte `start` on.
+    pub(crate) fn every_byte(self, start: usize, step: usize) -> Self {
+        let length = self.frame_bytes() / step;
+        Self::Picked(Box::new(Picked { inner: self, start, step, length, frame: Vec::new() }))
+    }
+
     pub(crate) fn frames(&self) -> u64 {
         match self {
             Self::Files(files) => files.total,
             Self::Stream(stream) => stream.frames,
             Self::Batched(batched) => batched.frames,
             Self::Pipe(pipe) => pipe.arrived(),
+            Self::Picked(picked) => picked.inner.frames(),
         }
     }
 
@@ -98,17 +112,23 @@ impl FrameBytes {
             Self::Stream(stream) => stream.frame_bytes,
             Self::Batched(batched) => batched.frame_bytes,
             Self::Pipe(pipe) => pipe.frame_bytes(),
+            Self::Picked(picked) => picked.length,
         }
     }
 
     pub(crate) fn forward_only(&self) -> bool {
-        matches!(self, Self::Stream(_) | Self::Pipe(_))
+        match self {
+            Self::Stream(_) | Self::Pipe(_) => true,
+            Self::Files(_) | Self::Batched(_) => false,
+            Self::Picked(picked) => picked.inner.forward_only(),
+        }
     }
 
     /// Frames in all, if that is known.
     pub(crate) fn length(&self) -> Option<u64> {
         match self {
             Self::Pipe(pipe) => pipe.length(),
+            Self::Picked(picked) => picked.inner.length(),
             _ => Some(self.frames()),
         }
     }
@@ -117,14 +137,17 @@ impl FrameBytes {
     pub(crate) fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
         match self {
             Self::Pipe(pipe) => pipe.wait_for(frames, notes),
+            Self::Picked(picked) => picked.inner.wait_for(frames, notes),
             _ => Ok(self.frames()),
         }
     }
 
     /// No frame before `frame` is asked for again.
     pub(crate) fn discard_before(&mut self, frame: u64) {
-        if let Self::Pipe(pipe) = self {
-            pipe.discard_before(frame);
+        match self {
+            Self::Pipe(pipe) => pipe.discard_before(frame),
+            Self::Picked(picked) => picked.inner.discard_before(frame),
+            Self::Files(_) | Self::Stream(_) | Self::Batched(_) => {}
         }
     }
 
@@ -137,7 +160,31 @@ impl FrameBytes {
             Self::Stream(stream) => stream.read(first, bytes),
             Self::Batched(batched) => batched.read(first, bytes),
             Self::Pipe(pipe) => pipe.read(first, bytes),
+            Self::Picked(picked) => picked.read(first, bytes),
         }
+    }
+}
+
+/// Some bytes of each frame: one channel of several.
+pub(crate) struct Picked {
+    inner: FrameBytes,
+    start: usize,
+    step: usize,
+    length: usize,
+    frame: Vec<u8>,
+}
+
+impl Picked {
+    fn read(&mut self, first: u64, bytes: &mut [u8]) -> Result<()> {
+        self.frame.resize(self.inner.frame_bytes(), 0);
+        for (frame, out) in (first..).zip(bytes.chunks_exact_mut(self.length)) {
+            self.inner.read(frame, &mut self.frame)?;
+            let picked = self.frame[self.start..].iter().step_by(self.step);
+            for (to, &byte) in out.iter_mut().zip(picked) {
+                *to = byte;
+            }
+        }
+        Ok(())
     }
 }
 
@@ -357,16 +404,17 @@ impl Batched {
 }
 
 /// Fetches frames of an array with axes `outer x frames x inner`, elements of `element` bytes, that
-/// starts at byte `start` of a file.
+/// starts at byte `start` of the file `open`, or of the one at `path`.
 pub(crate) fn strewn(
     path: &Path,
+    mut open: Option<File>,
     start: u64,
     element: usize,
     [outer, frames, inner]: [usize; 3],
 ) -> FrameBytes {
     let size = outer * inner * element;
     let run = inner * element;
-    let (path, mut open) = (path.to_owned(), None);
+    let path = path.to_owned();
     let fetch = move |first: u64, count: u64| {
         let io = |e| Error::io("read", &path, e);
         if open.is_none() {

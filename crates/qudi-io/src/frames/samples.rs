@@ -4,6 +4,7 @@ use super::count_frames::CountFrames;
 use super::frame_bytes::FrameBytes;
 use crate::capture::info::CaptureInfo;
 use crate::capture::levels::infer_levels;
+use crate::capture::options::ReadOptions;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
@@ -16,12 +17,24 @@ pub(crate) enum Scale {
     Counts,
     /// They are means of `levels` binary frames, `full` standing for all ones.
     Means { levels: u16, full: f32 },
+    /// Counts lie above a pedestal of `offset` DN; with a threshold, one more than that above it counts 1.
+    Pedestal { offset: f32, threshold: Option<f32> },
 }
 
 impl Scale {
-    /// The scale that the option `levels` asks for; `full` is the value that stands for all ones.
-    pub(crate) fn asked(levels: Option<u16>, full: f32, info: &mut CaptureInfo) -> Option<Self> {
-        let levels = levels?;
+    /// The scale that the options `levels`, `offset` and `threshold` ask for; `full` is the value that
+    /// stands for all ones.
+    pub(crate) fn asked(options: &ReadOptions, full: f32, info: &mut CaptureInfo) -> Option<Self> {
+        if options.offset.is_some() || options.threshold.is_some() {
+            let offset = options.offset.unwrap_or(0.0) as f32;
+            let threshold = options.threshold.map(|threshold| threshold as f32);
+            if threshold.is_some() {
+                info.max_count = Some(1);
+                info.binary = true;
+            }
+            return Some(Self::Pedestal { offset, threshold });
+        }
+        let levels = options.levels?;
         info.max_count = Some(levels);
         info.binary = true;
         Some(Self::Means { levels, full })
@@ -43,6 +56,10 @@ impl Scale {
     pub(crate) fn count(self, value: f32) -> Option<u16> {
         let count = match self {
             Self::Counts => value,
+            Self::Pedestal { offset, threshold: None } => (value - offset).round().max(0.0),
+            Self::Pedestal { offset, threshold: Some(threshold) } => {
+                f32::from(u8::from(value - offset > threshold))
+            }
             Self::Means { levels, full } => {
                 let exact = value * f32::from(levels) / full;
                 let count = exact.round_ties_even();
@@ -151,6 +168,6 @@ pub(crate) fn no_count(value: f32, frame: u64, path: &Path) -> Error {
     Error::data(
         format!("frame {frame} holds {value}, and photon counts are whole numbers from 0 to 65535"),
         path,
-        "means of N binary frames are read with `levels N`; an image without photon counts is not a capture",
+        "means of N binary frames are read with `levels N`, counts above a pedestal with `offset DN`; an image without photon counts is not a capture",
     )
 }

@@ -1,5 +1,6 @@
 //! Runs a method over a capture of any length: windows, cross-fade, frames out in order.
 
+use super::instants::{Instants, Schedule};
 use crate::capture::Capture;
 use qudi_core::Frame;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
@@ -46,23 +47,86 @@ fn refuse_not_finite(first: u64, frames: &[Frame], path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Restores the frames `wanted` of `capture` and hands them to `sink`. A window is computed if it
-/// holds a wanted frame; what a frame looks like does not depend on which others are wanted, nor on
-/// whether it came from a file or a pipe. Memory holds two windows at most.
+/// Restores the pictures `wanted` of `capture`, those of `schedule`, and hands them to `sink`. What a picture
+/// looks like does not depend on which others are wanted, nor on whether it came from a file or a pipe. Memory
+/// holds two windows at most.
 ///
 /// # Errors
 /// [`Error`] if the capture cannot be read or the method or the sink fails;
-/// [`Error::Interrupted`] if `on`, which hears how many wanted frames are done of how many (if that is
+/// [`Error::Interrupted`] if `on`, which hears how many wanted pictures are done of how many (if that is
 /// known), says so.
 pub fn run(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
-    windows: &Windows,
+    schedule: &Schedule,
     wanted: Range<u64>,
     acquisition: &Acquisition,
     sink: &mut dyn RestoreSink,
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
+    match schedule.instants {
+        Instants::Frames { step } => {
+            run_windows(restorer, capture, (schedule.windows, step), wanted, acquisition, sink, on)
+        }
+        Instants::Centred { every } => {
+            run_centred(restorer, capture, every, wanted, acquisition, sink, on)
+        }
+    }
+}
+
+/// Each picture in the middle of a window of its own, or as near to it as the ends of the capture let it be.
+fn run_centred(
+    restorer: &mut dyn Restorer,
+    capture: &mut Capture,
+    every: u64,
+    wanted: Range<u64>,
+    acquisition: &Acquisition,
+    sink: &mut dyn RestoreSink,
+    on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
+) -> Result<()> {
+    let (size, sum) = (capture.size(), u64::from(capture.summed()));
+    let sums_there = capture.native_frames() / sum;
+    let length = (restorer.window() as u64).min(sums_there);
+    for picture in wanted.clone() {
+        if on(picture - wanted.start, Some(wanted.end - wanted.start)).is_break() {
+            return Err(Error::Interrupted);
+        }
+        let instant = picture * every;
+        let after = (capture.native_frames() - instant) / sum;
+        let most_before = (instant / sum).min(length - 1);
+        // Sums of the window before the picture's own.
+        let before = (length / 2).max(length.saturating_sub(after)).min(most_before);
+        let first = instant - before * sum;
+        let length = length.min(before + after);
+        let mut counts = vec![vec![0; size.pixels()]; length as usize];
+        for (number, counts) in (0..).zip(&mut counts) {
+            capture.read_from(first + number * sum, counts)?;
+        }
+        let acquisition = Acquisition { first_frame: first / sum, ..acquisition.clone() };
+        let restored = restorer.restore(BurstView { size, frames: &counts }, &acquisition)?;
+        refuse_not_finite(first / sum, &restored.frames, capture.path())?;
+        let at = before as usize;
+        sink.frame(picture, &restored.frames[at], &counts[at])?;
+        if let Some(uncertainty) = restored.std {
+            sink.uncertainty(picture, &uncertainty[at])?;
+        }
+    }
+    Ok(())
+}
+
+/// Windows one after the other, blended where they overlap, and every `step`-th of their frames.
+fn run_windows(
+    restorer: &mut dyn Restorer,
+    capture: &mut Capture,
+    (windows, step): (Windows, u64),
+    wanted: Range<u64>,
+    acquisition: &Acquisition,
+    sink: &mut dyn RestoreSink,
+    on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
+) -> Result<()> {
+    let pictures = wanted.clone();
+    let is_wanted = |frame: u64| frame.is_multiple_of(step) && pictures.contains(&(frame / step));
+    let wanted = wanted.start.saturating_mul(step)..wanted.end.saturating_mul(step);
     let size = capture.size();
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
     let mut first_held = 0;
@@ -76,8 +140,9 @@ pub fn run(
             break;
         }
         let range = windows.range(number);
-        let total = capture.length().map(|length| wanted.end.min(length) - wanted.start);
-        if on(range.start.saturating_sub(wanted.start), total).is_break() {
+        let total =
+            capture.length().map(|length| (wanted.end.min(length) - wanted.start).div_ceil(step));
+        if on(range.start.saturating_sub(wanted.start).div_ceil(step), total).is_break() {
             return Err(Error::Interrupted);
         }
         if counts.is_empty() {
@@ -104,13 +169,13 @@ pub fn run(
         let last = number + 1 == windows.count();
         let until = if last { range.end } else { windows.range(number + 1).start };
         while let Some((frame, image)) = fade.pop(until) {
-            if wanted.contains(&frame) {
-                sink.frame(frame, &image, &counts[(frame - first_held) as usize])?;
+            if is_wanted(frame) {
+                sink.frame(frame / step, &image, &counts[(frame - first_held) as usize])?;
             }
             if let Some((frame, uncertainty)) = uncertainties.pop(until)
-                && wanted.contains(&frame)
+                && is_wanted(frame)
             {
-                sink.uncertainty(frame, &uncertainty)?;
+                sink.uncertainty(frame / step, &uncertainty)?;
             }
         }
     }

@@ -48,7 +48,7 @@ pub enum ClipWriter {
 
 impl ClipWriter {
     /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
-    /// extension. `tiff` says what the samples of a `.tif` are.
+    /// extension. `tiff` says what the samples of a `.tif` are, `fps` how fast `.gif` and `.mp4` play.
     ///
     /// # Errors
     /// [`Error`] for other extensions, or if the name is taken or the folder cannot be written.
@@ -56,6 +56,7 @@ impl ClipWriter {
         path: &Path,
         size: Size,
         tiff: TiffSamples,
+        fps: f64,
         overwrite: Overwrite,
     ) -> Result<Self> {
         match path.extension().map(|e| e.to_string_lossy().to_lowercase()).as_deref() {
@@ -65,8 +66,8 @@ impl ClipWriter {
                 let stack = TiffStack::create(path, size, overwrite)?;
                 Ok(Self::Tiff(TiffWriter { stack, samples: tiff }))
             }
-            Some("gif") => GifWriter::create(path, overwrite, size, u16::MAX).map(Self::Gif),
-            Some("mp4") => Mp4Writer::create(path, size, overwrite).map(Self::Mp4Writer),
+            Some("gif") => GifWriter::create(path, overwrite, size, u16::MAX, fps).map(Self::Gif),
+            Some("mp4") => Mp4Writer::create(path, size, fps, overwrite).map(Self::Mp4Writer),
             None => {
                 let folder = PendingFolder::create(path, overwrite, FRAMES)?;
                 Ok(Self::Folder { folder, frames: 0 })

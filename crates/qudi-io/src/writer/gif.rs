@@ -11,6 +11,8 @@ pub struct GifWriter {
     size: (u16, u16),
     full_scale: f32,
     frames: usize,
+    /// Hundredths of a second per frame.
+    delay: u16,
 }
 
 impl std::fmt::Debug for GifWriter {
@@ -19,18 +21,24 @@ impl std::fmt::Debug for GifWriter {
     }
 }
 
-/// Hundredths of a second per frame: 20 frames per second.
-const DELAY: u16 = 5;
+/// Shortest time of a frame in hundredths of a second: browsers slow down what is faster.
+const SHORTEST_DELAY: f64 = 2.0;
 
 /// Longer previews would be larger than the data.
 const MAX_FRAMES: usize = 200;
 
 impl GifWriter {
-    /// Starts a preview of frames whose brightest value is `full_scale`.
+    /// Starts a preview of frames whose brightest value is `full_scale`, `fps` of them per second (50 at most).
     ///
     /// # Errors
     /// [`Error`] if the name is taken, the folder cannot be written, or frames are too large.
-    pub fn create(path: &Path, overwrite: Overwrite, size: Size, full_scale: u16) -> Result<Self> {
+    pub fn create(
+        path: &Path,
+        overwrite: Overwrite,
+        size: Size,
+        full_scale: u16,
+        fps: f64,
+    ) -> Result<Self> {
         let (Ok(width), Ok(height)) = (u16::try_from(size.width), u16::try_from(size.height))
         else {
             return Err(Error::data(
@@ -44,7 +52,9 @@ impl GifWriter {
         let mut encoder =
             gif::Encoder::new(file, width, height, &palette).map_err(|e| fault(path, e))?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| fault(path, e))?;
-        Ok(Self { encoder, size: (width, height), full_scale: f32::from(full_scale), frames: 0 })
+        let delay = (100.0 / fps).round().max(SHORTEST_DELAY) as u16;
+        let full_scale = f32::from(full_scale);
+        Ok(Self { encoder, size: (width, height), full_scale, frames: 0, delay })
     }
 
     /// Adds a frame of counts; those after the 200th are left out.
@@ -60,7 +70,7 @@ impl GifWriter {
         let mut frame = gif::Frame {
             width: self.size.0,
             height: self.size.1,
-            delay: DELAY,
+            delay: self.delay,
             buffer: counts.iter().map(gray).collect(),
             ..gif::Frame::default()
         };

@@ -9,9 +9,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use tempfile::NamedTempFile;
 
-/// Frames per second of the film, whatever the camera's rate was.
-const FPS: &str = "25";
-
 /// A film being written.
 #[derive(Debug)]
 pub struct Mp4Writer {
@@ -24,11 +21,11 @@ pub struct Mp4Writer {
 }
 
 impl Mp4Writer {
-    /// Starts a film of frames of `size`.
+    /// Starts a film of frames of `size`, `fps` of them per second.
     ///
     /// # Errors
     /// [`Error`] if the name is taken or there is no ffmpeg.
-    pub fn create(path: &Path, size: Size, overwrite: Overwrite) -> Result<Self> {
+    pub fn create(path: &Path, size: Size, fps: f64, overwrite: Overwrite) -> Result<Self> {
         refuse_taken(path, overwrite)?;
         let io = |e| Error::io("create the output", path, e);
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -41,10 +38,11 @@ impl Mp4Writer {
         // `file:` keeps ffmpeg from taking the name for a URL or an option.
         let mut url = std::ffi::OsString::from("file:");
         url.push(unfinished.path());
+        let rate = fps.to_string();
         let shape = format!("{}x{}", size.width, size.height);
         let spawned = Command::new("ffmpeg")
             .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "gray"])
-            .args(["-s", shape.as_str(), "-r", FPS, "-i", "-"])
+            .args(["-s", shape.as_str(), "-r", rate.as_str(), "-i", "-"])
             // Players want even sides and half-resolution colour.
             .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16"])
             .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"])

@@ -49,18 +49,36 @@ impl Picture {
         }
     }
 
+    /// The picture as the bytes of an 8-bit gray PNG.
+    ///
+    /// # Errors
+    /// [`Error`] if it is too large for a PNG.
+    pub fn to_png(&self) -> Result<Vec<u8>> {
+        let mut png = Vec::new();
+        self.encode(&mut png)
+            .map_err(|e| Error::io("make", Path::new("the picture"), std::io::Error::other(e)))?;
+        Ok(png)
+    }
+
+    fn encode(&self, out: impl std::io::Write) -> image::ImageResult<()> {
+        let value = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+        let bytes: Vec<u8> = self.canvas.data.iter().map(value).collect();
+        let Size { height, width } = self.canvas.size;
+        image::codecs::png::PngEncoder::new(out).write_image(
+            &bytes,
+            width as u32,
+            height as u32,
+            ExtendedColorType::L8,
+        )
+    }
+
     /// Writes it as an 8-bit gray PNG.
     ///
     /// # Errors
     /// [`Error`] if the name is taken or the folder cannot be written.
     pub fn save(&self, path: &Path, overwrite: Overwrite) -> Result<()> {
         let mut file = PendingFile::create(path, overwrite)?;
-        let bytes: Vec<u8> =
-            self.canvas.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        let Size { height, width } = self.canvas.size;
-        image::codecs::png::PngEncoder::new(&mut file)
-            .write_image(&bytes, width as u32, height as u32, ExtendedColorType::L8)
-            .map_err(|e| Error::io("write", path, std::io::Error::other(e)))?;
+        self.encode(&mut file).map_err(|e| Error::io("write", path, std::io::Error::other(e)))?;
         file.finish()
     }
 }

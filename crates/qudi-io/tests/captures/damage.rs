@@ -242,7 +242,7 @@ fn overwrites_folders_of_own_files_only() {
     let path = scratch.path().join("m");
     let size = Size { height: 2, width: 2 };
     let save = || {
-        let mut writer = ClipWriter::create(&path, size, TiffSamples::U16, Overwrite::Yes)?;
+        let mut writer = ClipWriter::create(&path, size, TiffSamples::U16, 25.0, Overwrite::Yes)?;
         writer.push(&Frame::filled(size, 0.5))?;
         writer.finish()
     };

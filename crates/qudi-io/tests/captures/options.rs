@@ -1,7 +1,9 @@
 //! Every format with every option: applied, or refused by name.
 
 use crate::{npy, pack, plain, refusal, scene, scratch, write};
-use qudi_io::capture::{Axes, BitOrder, Capture, FormatOption, PackAxis, ReadOptions};
+use qudi_io::capture::{
+    Axes, BitOrder, Capture, FormatOption, MaskChoice, Orientation, PackAxis, ReadOptions,
+};
 use qudi_io::codec::FORMATS;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -20,6 +22,8 @@ fn with(option: FormatOption, base: &ReadOptions) -> ReadOptions {
         FormatOption::Header => ReadOptions { header: Some(1), ..base },
         FormatOption::Trailer => ReadOptions { trailer: Some(1), ..base },
         FormatOption::FramesPerFile => ReadOptions { frames_per_file: Some(1), ..base },
+        FormatOption::Offset => ReadOptions { offset: Some(1.0), ..base },
+        FormatOption::Threshold => ReadOptions { threshold: Some(1.0), ..base },
     }
 }
 
@@ -52,6 +56,15 @@ fn file(format: &str, folder: &Path) -> Option<PathBuf> {
         "raw-bits" => {
             let bits: Vec<u8> = frames.iter().flat_map(|f| pack(f, 24, false)).collect();
             write(folder, "bits.bin", &bits)
+        }
+        "tiff" => {
+            let path = folder.join("a.tif");
+            let mut encoder =
+                tiff::encoder::TiffEncoder::new(std::fs::File::create(&path).unwrap()).unwrap();
+            for frame in counts.chunks(16 * 24) {
+                encoder.write_image::<tiff::encoder::colortype::Gray8>(24, 16, frame).unwrap();
+            }
+            path
         }
         "raw-u8" | "raw-u16" => write(folder, "counts.bin", &counts),
         "spad512s-sparse" => {
@@ -112,7 +125,9 @@ fn applies_options_that_a_format_takes() {
         };
         let usual = outcome(&path, &base);
         for &option in format.options {
-            let zeros = path.ends_with("zeros.bin") && option == FormatOption::BitOrder;
+            // Of zeros, neither the order of bits nor a pedestal can be told.
+            let of_values = [FormatOption::BitOrder, FormatOption::Offset];
+            let zeros = path.ends_with("zeros.bin") && of_values.contains(&option);
             let implied = format.name == "raw-bits" && option == FormatOption::PackAxis;
             let options = if implied {
                 ReadOptions { pack_axis: Some(PackAxis::Height), ..base.clone() }
@@ -122,5 +137,56 @@ fn applies_options_that_a_format_takes() {
             let other = outcome(&path, &options);
             assert!(zeros || other != usual, "{} ignores {}", format.name, option.name());
         }
+    }
+}
+
+/// Options that every format takes: turning, cropping, depth, mosaics, masks and dark maps.
+#[test]
+fn applies_options_of_all_captures_to_every_format() {
+    let folder = scratch();
+    let map = |name: &str, size: qudi_core::Size, values: &dyn Fn(usize) -> f32| {
+        let bytes: Vec<u8> = (0..size.pixels()).flat_map(|i| values(i).to_le_bytes()).collect();
+        let shape = format!("({}, {})", size.height, size.width);
+        write(folder.path(), name, &npy("<f4", "False", &shape, &bytes))
+    };
+    for format in FORMATS {
+        let Some(path) = file(format.name, folder.path()) else { continue };
+        let raw = format.name.starts_with("raw");
+        let base = ReadOptions {
+            format: Some(format.name.to_owned()),
+            size: raw.then(|| "16x24".parse().unwrap()),
+            ..plain()
+        };
+        let usual = outcome(&path, &base);
+        let size = Capture::open(&path, &base, None).unwrap().size();
+        let mask = map("mask.npy", size, &|i| f32::from(i == size.width + 1));
+        let dark = map("dark.npy", size, &|i| if i == 0 { 1e6 } else { 0.0 });
+        let all = [
+            ("orient", ReadOptions { orient: Some(Orientation::Rot180), ..base.clone() }),
+            ("crop", ReadOptions { crop: Some("0:8,8:16".parse().unwrap()), ..base.clone() }),
+            ("cfa", ReadOptions { cfa: Some("rggb".parse().unwrap()), ..base.clone() }),
+            ("sum", ReadOptions { sum: Some(2), ..base.clone() }),
+            ("start", ReadOptions { start: Some(1), ..base.clone() }),
+            ("bits", ReadOptions { bits: Some(5), ..base.clone() }),
+            ("bits", ReadOptions { bits: Some(17), ..base.clone() }),
+        ];
+        for (name, options) in all {
+            // Zeros look alike from every side.
+            let zeros = path.ends_with("zeros.bin") && name == "orient";
+            assert!(zeros || outcome(&path, &options) != usual, "{} ignores {name}", format.name);
+        }
+        let masked = ReadOptions { mask: MaskChoice::File(mask), ..base.clone() };
+        assert_eq!(Capture::open(&path, &masked, None).unwrap().bad_pixels().hot.len(), 1);
+        let dcr = ReadOptions { dcr: Some(dark), mask: MaskChoice::Auto, ..base.clone() };
+        assert_eq!(Capture::open(&path, &dcr, None).unwrap().bad_pixels().hot, [0]);
+        // A channel of a mosaic is one of its planes, whatever the container.
+        let plane = |channel| ReadOptions {
+            cfa: Some("rggb@0,0".parse().unwrap()),
+            channel: Some(channel),
+            ..base.clone()
+        };
+        let opened = Capture::open(&path, &plane(3), None).unwrap().size();
+        assert_eq!((opened.height, opened.width), (size.height / 2, size.width / 2));
+        assert!(refusal(Capture::open(&path, &plane(4), None)).contains("channel 4 of the mosaic"));
     }
 }

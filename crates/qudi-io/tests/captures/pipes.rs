@@ -8,7 +8,7 @@ use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_core::{Error, Frame};
 use qudi_io::capture::{Axes, Capture, PackAxis, ReadOptions};
-use qudi_io::restore::{RestoreSink, run};
+use qudi_io::restore::{RestoreSink, Schedule, run};
 use std::ops::ControlFlow;
 
 fn piped(bytes: &[u8], options: &ReadOptions) -> Result<Capture, Error> {
@@ -78,7 +78,15 @@ fn restored(capture: &mut Capture) -> Result<Vec<(u64, Frame)>, Error> {
     let windows = Windows::new(capture.frames(), 11, 3)?;
     let mut sink = Collected::default();
     let mut on = |_: u64, _: Option<u64>| ControlFlow::Continue(());
-    run(&mut Average, capture, &windows, 0..u64::MAX, &acquisition, &mut sink, &mut on)?;
+    run(
+        &mut Average,
+        capture,
+        &Schedule::all(windows),
+        0..u64::MAX,
+        &acquisition,
+        &mut sink,
+        &mut on,
+    )?;
     Ok(sink.0)
 }
 
@@ -155,5 +163,5 @@ fn rejects_formats_that_cannot_be_piped() {
     }
     let fortran = npy("|u1", "True", "(5, 4, 4)", &[1; 80]);
     let unpacked = ReadOptions { pack_axis: Some(PackAxis::None), ..plain() };
-    assert!(says(&fortran, &unpacked).contains("piped array whose frame axis"));
+    assert!(says(&fortran, &unpacked).contains("frame axis of a piped array"));
 }

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 /// visionsim do), a multi-page .tif, or a folder of PNG (no extension), with a record beside it.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Convert {
-    /// The capture: a file or a folder
+    /// The capture: a file or a folder, or - for a pipe of .npy or raw frames
     #[arg(value_hint = ValueHint::AnyPath)]
     pub(crate) capture: PathBuf,
     /// Where it goes
@@ -22,4 +22,11 @@ pub(crate) struct Convert {
     pub(crate) unpacked: bool,
     #[command(flatten)]
     pub(crate) reading: Reading,
+}
+
+impl Convert {
+    /// Whether the capture comes through standard input.
+    pub(crate) fn reads_pipe(&self) -> bool {
+        self.capture.as_os_str() == "-"
+    }
 }

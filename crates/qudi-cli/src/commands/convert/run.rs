@@ -1,7 +1,7 @@
 //! `qudi convert`: any capture into a format that everything reads.
 
 use super::args::Convert;
-use crate::args::Global;
+use crate::args::{AutoSum, Global};
 use crate::capture::remarks;
 use crate::error::{CliError, Result};
 use crate::interrupt;
@@ -9,10 +9,11 @@ use crate::places::Places;
 use crate::report::{Bar, Report};
 use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
-use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_io::capture::{Capture, MaskChoice, ReadOptions, choose_sum};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
 use qudi_io::writer::{BurstFormat, BurstWriter};
 use serde_json::Value;
+use std::io::IsTerminal;
 use std::path::Path;
 
 pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
@@ -27,22 +28,23 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
         .writes(record.filter(|record| !record.starts_with(&args.output)))
         .check()?;
     refuse_taken(&args.output, overwrite)?;
-    let mut capture = Capture::open(&args.capture, &options, None)?;
-    let max_count = largest_count(&mut capture)?;
+    let mut capture = open(args, &options)?;
+    let max_count = largest_count(&mut capture, args)?;
     let format = BurstFormat::for_path(&args.output, max_count, !args.unpacked)?;
     refuse_taken(&format.record_path(&args.output), overwrite)?;
     let size = capture.size();
     let mut writer = BurstWriter::create(&args.output, format, size, max_count, overwrite)?;
     let mut counts = vec![0u16; size.pixels()];
-    let frames = capture.frames();
     let mut bar = report.bar();
     let mut frame = copy_packed(&mut capture, format, &mut writer, &mut bar)?;
-    while frame < frames {
+    // A pipe tells its length at its end.
+    while frame < capture.wait_for(frame + 1)? {
         if interrupt::check().is_break() {
             return Err(CliError::Interrupted);
         }
-        bar.update("converting", frame, Some(frames));
+        bar.update("converting", frame, capture.length());
         capture.read(frame, &mut counts)?;
+        capture.discard_before(frame + 1);
         let largest = counts.iter().copied().max().unwrap_or(0);
         if largest > max_count {
             return Err(Error::data(
@@ -58,6 +60,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
         frame += 1;
     }
     drop(bar);
+    let frames = frame;
     let layout = BurstLayout::of_counts(format, frames, size, max_count, capture.fps());
     let record = conversion(args, &options, &capture, layout)?;
     let bytes = serde_json::to_vec_pretty(&record)
@@ -73,6 +76,27 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
 }
 
+/// The capture, from a file or a pipe, summed as asked.
+fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
+    if args.reads_pipe() {
+        if std::io::stdin().is_terminal() {
+            return Err(CliError::new(
+                "standard input is a terminal, and a capture comes through a pipe",
+                "-",
+                "pipe one in, as in `cat burst.npy | qudi convert - -o out.tif`, or name a file",
+            ));
+        }
+        return Ok(Capture::from_pipe(std::io::stdin(), options, None)?);
+    }
+    let mut capture = Capture::open(&args.capture, options, None)?;
+    if args.reading.auto_sum() == AutoSum::Asked
+        && let Some(choice) = choose_sum(&mut capture)?
+    {
+        capture = capture.summed_by(choice.frames, options, None)?;
+    }
+    Ok(capture)
+}
+
 /// Frames copied without unpacking them: all, or none.
 fn copy_packed(
     capture: &mut Capture,
@@ -82,7 +106,7 @@ fn copy_packed(
 ) -> Result<u64> {
     /// Bytes copied at once.
     const PIECE: usize = 1 << 20;
-    if format != BurstFormat::NpyPacked {
+    if format != BurstFormat::NpyPacked || capture.length().is_none() {
         return Ok(0);
     }
     let frame_bytes = capture.size().height * capture.size().width.div_ceil(8);
@@ -127,9 +151,16 @@ fn conversion(
 }
 
 /// The largest count that can appear: known, or that of the sample type needed for what is there.
-fn largest_count(capture: &mut Capture) -> Result<u16> {
+fn largest_count(capture: &mut Capture, args: &Convert) -> Result<u16> {
     if let Some(max) = capture.max_count() {
         return Ok(max);
+    }
+    if args.reads_pipe() {
+        return Err(CliError::new(
+            "the depth of the counts is unknown, and a pipe comes once",
+            "--bits",
+            "say how many bits a count has, as in --bits 8",
+        ));
     }
     // Unknown depth: every frame decides.
     let mut counts = vec![0u16; capture.size().pixels()];

@@ -2,6 +2,7 @@
 
 use crate::args::{Network, Reading, Shard, number};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_core::PppDefinition;
 use std::path::PathBuf;
 
 /// Compare methods on clips whose truth is known, or on a real capture: the same photons and frames for all
@@ -9,7 +10,7 @@ use std::path::PathBuf;
 /// DATA is a clip, or a folder of clips: folders of images, videos, GIF, Y4M, .npy, or scene:NAME.
 /// Each clip is exposed once per light level, with a seed of its own. Figures lead with PSNR after the
 /// best gain (psnr-a): counts do not fix the brightness of a picture, and no method is given it.
-/// Settings of `qudi simulate` apply to clips.
+/// Settings of `qudi simulate` apply to clips, --sum and --size as there.
 ///
 /// With --capture, DATA is a capture in any format. It has no truth, so that there are pictures (--html) and
 /// the chi-square of its counts given the result; a method that fits the noise gets below 1, one that blurs
@@ -29,6 +30,9 @@ pub(crate) struct Eval {
     /// estimated]
     #[arg(long, value_name = "PPP,...", value_delimiter = ',', allow_negative_numbers = true, value_parser = number::real(number::PPP))]
     pub(crate) ppp: Vec<f64>,
+    /// What --ppp counts for clips: incident photons, detected electrons, or dn, the mean output value
+    #[arg(long, value_name = "MEANING", conflicts_with = "capture")]
+    pub(crate) ppp_def: Option<Meaning>,
     /// Sensor: a name or a .toml file [default: qudi-paper; of a capture: known from record or format]
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
@@ -77,6 +81,28 @@ pub(crate) struct Eval {
     pub(crate) network: Network,
     #[command(flatten)]
     pub(crate) reading: Reading,
+}
+
+/// What photons per pixel count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Meaning {
+    /// Photons that fall on a pixel
+    Incident,
+    /// Electrons or avalanches, dark ones included
+    Detected,
+    /// The mean output value
+    Dn,
+}
+
+impl Meaning {
+    /// The definition of that name.
+    pub(crate) fn definition(self) -> PppDefinition {
+        match self {
+            Self::Incident => PppDefinition::Incident,
+            Self::Detected => PppDefinition::Detected,
+            Self::Dn => PppDefinition::Dn,
+        }
+    }
 }
 
 /// How a clip becomes photons, and which frames count.

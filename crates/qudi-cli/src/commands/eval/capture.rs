@@ -6,7 +6,7 @@ use super::html::Pictures;
 use super::plan::Plan;
 use super::score::{FrameScore, Row, Score};
 use crate::capture::acquisition::{LightOverrides, acquisition};
-use crate::capture::{open_capture, remarks, unknown_sensor};
+use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_sensor};
 use crate::error::Result;
 use crate::interrupt;
 use crate::memory::PeakMemory;
@@ -18,7 +18,7 @@ use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
 use qudi_core::windows::Windows;
 use qudi_io::capture::Capture;
-use qudi_io::restore::{RestoreSink, run as run_method};
+use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::time::Instant;
@@ -41,8 +41,12 @@ pub(crate) fn evaluate_capture(
     overrides.refuse(&["simulate."], "with --capture, whose photons are drawn already")?;
     let seed = plan.seed.unwrap_or(SEED);
     let path = Path::new(&plan.data);
-    let (mut capture, sensor) = open_capture(path, &plan.read, plan.sensor.as_deref(), overrides)?;
+    let OpenedCapture { mut capture, sensor, sum } =
+        open_summed(Some(path), &plan.read, plan.auto_sum, plan.sensor.as_deref(), overrides)?;
     let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
+    if let Some(choice) = &sum {
+        report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
+    }
     let light = LightOverrides {
         ppp: plan.ppp.first().copied(),
         gain: plan.gain,
@@ -79,6 +83,7 @@ pub(crate) fn evaluate_capture(
         "capture": plan.data,
         "format": capture.info().format,
         "frames": frames,
+        "sum": capture.summed(),
         "ppp_from": source,
         "gain": acquisition.gain,
         "sensor": acquisition.sensor,
@@ -112,7 +117,7 @@ fn score(
     run_method(
         restorer.as_mut(),
         capture,
-        &windows,
+        &Schedule::all(windows),
         0..frames,
         acquisition,
         &mut sink,

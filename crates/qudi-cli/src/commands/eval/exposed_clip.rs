@@ -16,7 +16,7 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::windows::Windows;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_io::capture::Capture;
-use qudi_io::restore::{RestoreSink, run as run_method};
+use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
 use qudi_sim::clip::{Input, Sampling};
 use qudi_sim::{Exposed, Sink, Start};
 use std::rc::Rc;
@@ -86,7 +86,7 @@ impl ExposedClip {
         run_method(
             restorer.as_mut(),
             &mut capture,
-            &windows,
+            &Schedule::all(windows),
             all,
             &self.acquisition,
             &mut sink,

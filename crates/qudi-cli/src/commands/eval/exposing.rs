@@ -48,8 +48,13 @@ impl Exposing {
             Some(seed) => seed,
             None => settings.given("simulate.seed")?.unwrap_or(SEED),
         };
+        let mut sensor = settings.sensor(&name)?;
+        if let Some(sum) = plan.read.sum {
+            sensor.frames_summed = sum;
+            sensor.validate()?;
+        }
         Ok(Self {
-            sensor: settings.sensor(&name)?,
+            sensor,
             seed,
             sampling: Sampling {
                 frames: Some(frames),
@@ -57,10 +62,16 @@ impl Exposing {
                 transfer: settings.get("simulate.transfer")?,
                 white: settings.get("simulate.white")?,
             },
-            ppp_def: settings.get("simulate.ppp_def")?,
+            ppp_def: match plan.ppp_def {
+                Some(definition) => definition,
+                None => settings.get("simulate.ppp_def")?,
+            },
             mean_level: settings.get("simulate.exposure")?,
             motion: settings.parse("simulate.motion")?,
-            size: settings.parse("simulate.size")?,
+            size: match plan.read.size {
+                Some(size) => Some(size),
+                None => settings.parse("simulate.size")?,
+            },
             scene_seed: settings.get("simulate.scene_seed")?,
             speed: settings.get("simulate.speed")?,
         })

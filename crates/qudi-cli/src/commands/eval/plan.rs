@@ -1,11 +1,12 @@
 //! The plan of an evaluation: its arguments, checked once.
 
-use super::args::{Eval, External, Protocol};
-use crate::args::Shard;
+use super::args::{Eval, External, Meaning, Protocol};
+use crate::args::{AutoSum, Shard};
 use crate::capture::acquisition::checked_mean_level;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{METHODS, is_method};
+use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::capture::{MaskChoice, ReadOptions};
 use std::path::PathBuf;
@@ -19,6 +20,8 @@ pub(super) struct Plan {
     pub(super) network: NetworkOptions,
     /// Light levels; none for the usual ones of clips, or that of the capture.
     pub(super) ppp: Vec<f64>,
+    /// What they count, for clips.
+    pub(super) ppp_def: Option<PppDefinition>,
     pub(super) sensor: Option<String>,
     /// The gain of a capture.
     pub(super) gain: Option<f64>,
@@ -37,6 +40,8 @@ pub(super) struct Plan {
     pub(super) pictures: bool,
     /// How a capture is read.
     pub(super) read: ReadOptions,
+    /// Whether the capture tells how many of its frames are summed.
+    pub(super) auto_sum: AutoSum,
     pub(super) overwrite: Overwrite,
 }
 
@@ -61,6 +66,7 @@ impl Plan {
             methods: args.method.clone(),
             network,
             ppp: args.ppp.clone(),
+            ppp_def: args.ppp_def.map(Meaning::definition),
             sensor: args.sensor.clone(),
             gain: args.gain,
             frames: args.frames,
@@ -73,6 +79,7 @@ impl Plan {
             shard: args.shard,
             pictures: args.html.is_some(),
             read: args.reading.options(MaskChoice::Auto),
+            auto_sum: args.reading.auto_sum(),
             overwrite,
         };
         if args.capture {
@@ -122,7 +129,16 @@ impl Plan {
                 "other programs are compared under the strict protocol",
             ));
         }
-        if self.read != ReadOptions::default() {
+        if self.auto_sum == AutoSum::Asked {
+            return Err(CliError::new(
+                "clips are exposed as they are asked for",
+                "--sum",
+                "give the number of binary frames that are summed, as in --sum 7",
+            ));
+        }
+        // Those two say how clips are exposed.
+        let read = ReadOptions { sum: None, size: None, ..self.read.clone() };
+        if read != ReadOptions::default() {
             return Err(CliError::new(
                 "options for reading captures, and DATA is taken for clips",
                 &self.data,

@@ -3,7 +3,7 @@
 use super::args::Info;
 use super::record::{origin, record_document};
 use crate::args::Global;
-use crate::capture::open_capture;
+use crate::capture::{OpenedCapture, describe_sum, open_summed, warnings};
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
 use crate::places::Places;
@@ -45,7 +45,10 @@ pub(crate) fn run(
         refuse_taken(preview, overwrite)?;
     }
     let options = info.reading.options(MaskChoice::Auto);
-    let (mut capture, sensor) = open_capture(path, &options, info.sensor.as_deref(), settings)?;
+    let auto = info.reading.auto_sum();
+    let name = info.sensor.as_deref();
+    let OpenedCapture { mut capture, sensor, sum } =
+        open_summed(Some(path), &options, auto, name, settings)?;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.preview {
@@ -55,12 +58,22 @@ pub(crate) fn run(
         }
         save(&picture, preview, overwrite)?;
     }
+    let warnings = warnings::of_capture(&capture, &summary, sensor.as_ref());
+    let sum_text = sum.as_ref().map(|choice| describe_sum(choice, &capture, sensor.as_ref()));
     let mut text = describe(&capture, &summary, sensor.as_ref());
+    if let Some(sum) = &sum_text {
+        let _ = writeln!(text, "sum        {sum}");
+    }
+    for warning in &warnings {
+        let _ = writeln!(text, "warning    {warning}");
+    }
     if let Some((record, path)) = record {
         text += &origin(record, path);
     }
     report.result(&text, || {
         let mut document = document(&capture, &summary, sensor.as_ref());
+        document["sum"] = json!(sum);
+        document["warnings"] = json!(warnings);
         document["record"] = record.map_or(Value::Null, |(record, _)| record_document(record));
         document
     })
@@ -77,7 +90,8 @@ fn save(picture: &Frame, path: &Path, overwrite: Overwrite) -> Result<()> {
     Ok(Picture::single(picture).save(path, overwrite)?)
 }
 
-fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> String {
+/// Describes a capture and what is in it, line by line.
+pub(crate) fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> String {
     let about = capture.info();
     let mut text = String::new();
     let mut line = |key: &str, value: String| {

@@ -1,8 +1,17 @@
 //! Options of `qudi restore`.
 
 use crate::args::{Network, Reading, Shard, number};
-use clap::{Args as ClapArgs, ValueHint};
+use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use std::path::PathBuf;
+
+/// The tone curve of what is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Tonemap {
+    /// Values are written as they are
+    None,
+    /// The curve of sRGB (IEC 61966-2-1)
+    Srgb,
+}
 
 /// Restore video from a capture
 ///
@@ -43,6 +52,18 @@ pub(crate) struct Restore {
     /// Frames that neighbouring windows share, blended
     #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1000))]
     pub(crate) overlap: u64,
+    /// Make a picture of every Nth frame of the capture only, counted before frames are summed; below the
+    /// number of frames summed (--sum), sums slide
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
+    pub(crate) every: Option<u64>,
+    /// Tone curve of what is written: none (values follow the light, as in the clip), or srgb, which brightens
+    /// shadows for the eye
+    #[arg(long, value_name = "CURVE", default_value = "none")]
+    pub(crate) tonemap: Tonemap,
+    /// Frames per second of what plays (.gif, .mp4, Y4M) [default: 25; the capture's own rate is in the
+    /// manifest]
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true, value_parser = number::real(number::PLAYED))]
+    pub(crate) fps: Option<f64>,
     /// Do part I of N (from 1), into the same folder as the other parts
     #[arg(long, value_name = "I/N")]
     pub(crate) shard: Option<Shard>,

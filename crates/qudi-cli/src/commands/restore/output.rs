@@ -1,20 +1,27 @@
 //! Where restored frames go.
 
+use super::args::Tonemap;
 use super::chi_square_map::ChiSquareMap;
+use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use super::y4m;
 use crate::error::Result;
-use qudi_core::atomic_file::Overwrite;
-use qudi_core::{Error, Frame};
+use qudi_core::{Error, Frame, linear_to_srgb, srgb_to_linear};
 use qudi_io::capture::Capture;
-use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink};
-use qudi_io::writer::{ClipWriter, TiffSamples};
+use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink, Schedule};
+use qudi_io::writer::ClipWriter;
 use serde_json::Value;
 use std::ops::Range;
 use std::path::Path;
 
-/// One place for frames.
-pub(super) enum Output {
+/// One place for frames, and the tone curve that they are written with.
+pub(super) struct Output {
+    place: Place,
+    tonemap: Tonemap,
+}
+
+/// A place for frames.
+enum Place {
     /// Frames appear one by one; an interrupted run goes on.
     Folder(FrameFolder),
     /// One file, whole or not at all.
@@ -24,55 +31,94 @@ pub(super) enum Output {
 }
 
 impl Output {
-    pub(super) fn open(
-        name: &str,
-        capture: &Capture,
-        run: FolderRun,
-        tiff: TiffSamples,
-        overwrite: Overwrite,
-    ) -> Result<Self> {
-        let (path, size) = (Path::new(name), capture.size());
-        if name == "-" {
-            y4m::write_header(size, capture.fps())?;
-            return Ok(Self::Pipe);
-        }
-        if path.extension().is_none() {
-            return Ok(Self::Folder(FrameFolder::open(path, size, run, overwrite)?));
-        }
-        Ok(Self::File(Some(ClipWriter::create(path, size, tiff, overwrite)?)))
+    pub(super) fn open(plan: &Plan, capture: &Capture, run: FolderRun) -> Result<Self> {
+        let (path, size) = (Path::new(&plan.output), capture.size());
+        let (fps, overwrite) = (plan.played_fps, plan.overwrite);
+        let place = if plan.output == "-" {
+            y4m::write_header(size, fps)?;
+            Place::Pipe
+        } else if path.extension().is_none() {
+            Place::Folder(FrameFolder::open(path, size, run, overwrite)?)
+        } else {
+            Place::File(Some(ClipWriter::create(path, size, plan.tiff, fps, overwrite)?))
+        };
+        Ok(Self { place, tonemap: plan.tonemap })
     }
 
     /// Frames from the start of `range` on that an earlier run finished.
     pub(super) fn finished(&self, range: Range<u64>) -> u64 {
-        match self {
-            Self::Folder(folder) => folder.finished(range),
+        match &self.place {
+            Place::Folder(folder) => folder.finished(range),
             _ => 0,
         }
     }
 
-    /// Measures frames that an earlier run finished.
+    /// Measures pictures that an earlier run finished.
     pub(super) fn measure_finished(
         &self,
         map: &mut ChiSquareMap,
         capture: &mut Capture,
-        frames: Range<u64>,
+        schedule: &Schedule,
+        pictures: Range<u64>,
     ) -> Result<()> {
-        let Self::Folder(folder) = self else { return Ok(()) };
+        let Place::Folder(folder) = &self.place else { return Ok(()) };
         let mut counts = vec![0; capture.size().pixels()];
-        for frame in frames {
-            capture.read(frame, &mut counts)?;
-            map.add(&folder.read(frame)?, &counts)?;
+        let sum = u64::from(capture.summed());
+        for picture in pictures {
+            capture.read_from(schedule.instants.begins_at(picture, sum), &mut counts)?;
+            map.add(&self.linear(folder.read(picture)?), &counts)?;
         }
         Ok(())
     }
 
     /// Gives a file its name, or notes in the folder's manifest that it is complete.
     pub(super) fn finish(&mut self, results: &Value, complete: bool) -> Result<()> {
-        match self {
-            Self::Folder(folder) if complete => Ok(folder.finish(results)?),
-            Self::Folder(_) | Self::Pipe => Ok(()),
-            Self::File(writer) => Ok(writer.take().map_or(Ok(()), ClipWriter::finish)?),
+        match &mut self.place {
+            Place::Folder(folder) if complete => Ok(folder.finish(results)?),
+            Place::Folder(_) | Place::Pipe => Ok(()),
+            Place::File(writer) => Ok(writer.take().map_or(Ok(()), ClipWriter::finish)?),
         }
+    }
+
+    /// A frame as it is written.
+    fn toned(&self, mut frame: Frame) -> Frame {
+        if self.tonemap == Tonemap::Srgb {
+            for value in &mut frame.data {
+                *value = linear_to_srgb(value.max(0.0));
+            }
+        }
+        frame
+    }
+
+    /// What was written, as light.
+    fn linear(&self, mut frame: Frame) -> Frame {
+        if self.tonemap == Tonemap::Srgb {
+            for value in &mut frame.data {
+                *value = srgb_to_linear(*value);
+            }
+        }
+        frame
+    }
+
+    /// Writes picture `number`; gives it as a reader of the file sees it, where that is another.
+    fn push(&mut self, number: u64, restored: &Frame) -> qudi_core::Result<Option<Frame>> {
+        let toned;
+        let frame = if self.tonemap == Tonemap::None {
+            restored
+        } else {
+            toned = self.toned(restored.clone());
+            &toned
+        };
+        match &mut self.place {
+            Place::Folder(folder) => {
+                let seen = folder.push(number, frame)?;
+                return Ok(Some(self.linear(seen)));
+            }
+            Place::File(writer) => writer.as_mut().map_or(Ok(()), |writer| writer.push(frame))?,
+            Place::Pipe => y4m::write_frame(frame)
+                .map_err(|e| Error::io("write to", Path::new("standard output"), e))?,
+        }
+        Ok(None)
     }
 }
 
@@ -100,18 +146,7 @@ impl RestoreSink for Sink<'_> {
 
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         // What a reader of the file will see is what is measured.
-        let seen = match &mut *self.output {
-            Output::Folder(folder) => Some(folder.push(number, restored)?),
-            Output::File(writer) => {
-                writer.as_mut().map_or(Ok(()), |writer| writer.push(restored))?;
-                None
-            }
-            Output::Pipe => {
-                y4m::write_frame(restored)
-                    .map_err(|e| Error::io("write to", Path::new("standard output"), e))?;
-                None
-            }
-        };
+        let seen = self.output.push(number, restored)?;
         match &mut self.map {
             Some(map) => map.add(seen.as_ref().unwrap_or(restored), counts),
             None => Ok(()),

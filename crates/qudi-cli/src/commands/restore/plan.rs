@@ -1,8 +1,8 @@
 //! The plan of a restoration: its arguments, checked once.
 
-use super::args::Restore;
+use super::args::{Restore, Tonemap};
 use crate::args::tiff_samples::tiff_samples;
-use crate::args::{Global, Shard};
+use crate::args::{AutoSum, Global, Shard};
 use crate::capture::acquisition::LightOverrides;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
@@ -12,6 +12,9 @@ use qudi_io::capture::{MaskChoice, ReadOptions};
 use qudi_io::writer::TiffSamples;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+
+/// Frames per second of what plays, unless said otherwise: captures of thousands would be over at once.
+const PLAYED_FPS: f64 = 25.0;
 
 /// Everything that a restoration is asked for.
 #[derive(Debug)]
@@ -23,6 +26,13 @@ pub(super) struct Plan {
     /// The sensor by name, unless record or format say it.
     pub(super) sensor: Option<String>,
     pub(super) read: ReadOptions,
+    /// Whether the capture tells how many of its frames are summed.
+    pub(super) auto_sum: AutoSum,
+    /// Native frames from one picture to the next, if not every frame becomes one.
+    pub(super) every: Option<u64>,
+    pub(super) tonemap: Tonemap,
+    /// Frames per second of what plays.
+    pub(super) played_fps: f64,
     pub(super) light: LightOverrides,
     /// `--seed`, if given.
     pub(super) seed_flag: Option<&'static str>,
@@ -84,6 +94,10 @@ impl Plan {
             output: args.output.clone(),
             sensor: args.sensor.clone(),
             read: args.reading.options(MaskChoice::Auto),
+            auto_sum: args.reading.auto_sum(),
+            every: args.every,
+            tonemap: args.tonemap,
+            played_fps: args.fps.unwrap_or(PLAYED_FPS),
             light: LightOverrides {
                 ppp: args.ppp,
                 gain: args.gain,
@@ -102,10 +116,24 @@ impl Plan {
             overwrite,
         };
         plan.check_output()?;
+        if args.fps.is_some() && !plan.plays() {
+            return Err(CliError::new(
+                format!("{} does not play: it holds frames without a rate", plan.output),
+                "--fps",
+                "leave it out, or write .gif, .mp4 or - (Y4M)",
+            ));
+        }
         if plan.reads_pipe() {
             plan.check_pipe()?;
         }
         Ok(plan)
+    }
+
+    /// Whether the output has a frame rate of its own.
+    fn plays(&self) -> bool {
+        let extension = Path::new(&self.output).extension();
+        let extension = extension.map(|e| e.to_string_lossy().to_lowercase());
+        self.output == "-" || matches!(extension.as_deref(), Some("gif" | "mp4"))
     }
 
     /// Whether the capture comes through standard input.

@@ -1,13 +1,13 @@
 //! `qudi restore`: a capture through a method into frames.
 
-use super::args::Restore;
+use super::args::{Restore, Tonemap};
 use super::chi_square_map::ChiSquareMap;
 use super::output::{Output, Sink};
 use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
 use crate::capture::acquisition::acquisition;
-use crate::capture::{open_capture, remarks, required_sensor, unknown_sensor};
+use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_sensor, warnings};
 use crate::device;
 use crate::error::Result;
 use crate::interrupt;
@@ -18,13 +18,16 @@ use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::windows::Windows;
-use qudi_io::capture::{Capture, MaskChoice};
-use qudi_io::restore::{FolderRun, Inputs, Share, run as run_method};
+use qudi_io::capture::{Capture, MaskChoice, Summary};
+use qudi_io::restore::{FolderRun, Inputs, Instants, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::ops::Range;
 use std::path::Path;
 use std::time::Instant;
+
+/// Seconds from which on it is said beforehand how long a run takes.
+const WORTH_TELLING: f64 = 300.0;
 
 pub(crate) fn run(
     args: &Restore,
@@ -33,12 +36,12 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let plan = Plan::new(args, global, report.json())?;
-    let mut job = Job::prepare(&plan, settings)?;
+    let mut job = Job::prepare(&plan, settings, report)?;
     let run = job.folder_run(&plan)?;
-    let mut output = Output::open(&plan.output, &job.capture, run, plan.tiff, plan.overwrite)?;
+    let mut output = Output::open(&plan, &job.capture, run)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
-    let frames = job.capture.length().unwrap_or(u64::MAX);
+    let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut map = ChiSquareMap::new(&job.capture, &job.acquisition);
     let done = output.finished(part.clone());
@@ -52,13 +55,15 @@ pub(crate) fn run(
         // the rest is made, so that a run that keeps being killed still gets on.
         let sink = Sink::new(&mut output, None, &mut uncertainty);
         job.run(rest, sink, &plan.network, report)?;
-        output.measure_finished(&mut map, &mut job.capture, part.clone())?;
+        output.measure_finished(&mut map, &mut job.capture, &job.schedule, part.clone())?;
     }
-    let frames = job.capture.frames();
+    let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(0);
     let part = part.start..part.end.min(frames);
     let is_network = !job.settings["network"].is_null();
     let mode = is_network.then(|| plan.network.mode()).transpose()?;
-    let results = json!({"chi_square": map.chi_square(), "mode": mode});
+    let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
+    job.warnings.extend(chi_square);
+    let results = json!({"chi_square": map.chi_square(), "mode": mode, "warnings": job.warnings});
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
     uncertainty.finish()?;
@@ -69,6 +74,9 @@ pub(crate) fn run(
         picture.save(path, plan.overwrite)?;
     }
     remarks(&job.capture, report);
+    for warning in &job.warnings {
+        report.warning(warning);
+    }
     let made = part.end - part.start - done;
     let seconds = (made > 0).then(|| start.elapsed().as_secs_f64() / made as f64);
     let frames = part.end - part.start;
@@ -98,42 +106,45 @@ struct Job {
     restorer: Box<dyn Restorer>,
     /// What the method chose for this clip.
     choice: String,
-    windows: Windows,
+    schedule: Schedule,
     settings: Value,
+    /// What makes the result doubtful.
+    warnings: Vec<String>,
 }
 
 impl Job {
-    fn prepare(plan: &Plan, overrides: &Settings) -> Result<Self> {
+    fn prepare(plan: &Plan, overrides: &Settings, report: &Report) -> Result<Self> {
+        let path = (!plan.reads_pipe()).then_some(plan.capture.as_path());
         let name = plan.sensor.as_deref();
-        let (mut capture, sensor) = if plan.reads_pipe() {
-            let named = name.map(|name| overrides.sensor(name)).transpose()?;
-            let capture = Capture::from_pipe(std::io::stdin(), &plan.read, named.as_ref())?;
-            let sensor = match named {
-                Some(sensor) => sensor,
-                None => overrides.adjusted(required_sensor(&capture)?)?,
-            };
-            (capture, sensor)
-        } else {
-            let (capture, sensor) = open_capture(&plan.capture, &plan.read, name, overrides)?;
-            let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
-            (capture, sensor)
-        };
+        let OpenedCapture { mut capture, sensor, sum } =
+            open_summed(path, &plan.read, plan.auto_sum, name, overrides)?;
+        let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
+        if let Some(choice) = &sum {
+            report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
+        }
         let (acquisition, source) = acquisition(&plan.light, &mut capture, &sensor)?;
+        let summary = Summary::measure(&mut capture, Some(&sensor), Some(acquisition.gain))?;
+        let warnings = warnings::of_capture(&capture, &summary, Some(&sensor));
         let name = match &plan.method {
-            Some(name) => name,
-            None => usual_method(&plan.network, &capture, &acquisition)?,
+            Some(name) => name.clone(),
+            None => announced_method(plan, &capture, &acquisition, report)?.to_owned(),
         };
+        let name = name.as_str();
         if let Some(flag) = plan.seed_flag.filter(|_| name != "qudi") {
             return Err(other_method(flag));
         }
         let (restorer, choice) = method(name, &mut capture, &acquisition, &plan.network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
+        let schedule = match plan.every {
+            Some(every) => Schedule { windows, instants: Instants::every(every, &capture)? },
+            None => Schedule::all(windows),
+        };
         let place = if plan.reads_pipe() {
             capture.path().to_owned()
         } else {
             std::path::absolute(&plan.capture).unwrap_or_else(|_| plan.capture.clone())
         };
-        let settings = json!({
+        let mut settings = json!({
             "capture": place,
             "format": capture.info().format,
             "read": plan.read,
@@ -152,7 +163,20 @@ impl Job {
             "sensor": acquisition.sensor,
             "repaired_pixels": capture.bad_pixels().len(),
         });
-        Ok(Self { capture, acquisition, source, restorer, choice, windows, settings })
+        // Noted where they were asked for, so that folders of earlier versions go on.
+        if capture.summed() > 1 && plan.read.sum.is_none() {
+            settings["sum"] = json!(capture.summed());
+        }
+        if let Some(every) = plan.every {
+            settings["every"] = json!(every);
+        }
+        if plan.tonemap != Tonemap::None {
+            settings["tonemap"] = json!("srgb");
+        }
+        if let Some(fps) = capture.fps().or(sensor_fps(&acquisition)) {
+            settings["capture_fps"] = json!(fps);
+        }
+        Ok(Self { capture, acquisition, source, restorer, choice, schedule, settings, warnings })
     }
 
     /// The entries of the manifest of an output folder. Weights are among the settings by their SHA-256.
@@ -191,16 +215,21 @@ impl Job {
             return Ok(());
         }
         let mut bar = report.bar();
+        let (begin, mut told) = (Instant::now(), false);
         let mut progress = |done: u64, total: Option<u64>| {
             bar.update("restoring", done, total);
+            if let Some(total) = total.filter(|_| done > 0 && !told) {
+                told = true;
+                tell_time(begin.elapsed().as_secs_f64() / done as f64, total, report);
+            }
             interrupt::check()
         };
         let (capture, acquisition) = (&mut self.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
         let restorer_is_network = restorer.name() == "qudi";
-        let windows = &self.windows;
+        let schedule = &self.schedule;
         let run = || {
-            run_method(restorer, capture, windows, wanted, acquisition, &mut sink, &mut progress)
+            run_method(restorer, capture, schedule, wanted, acquisition, &mut sink, &mut progress)
         };
         if restorer_is_network {
             // Devices report too little memory and broken drivers by panicking.
@@ -209,6 +238,42 @@ impl Job {
         }
         Ok(run()?)
     }
+}
+
+/// The method of those who name none; if it is not the network, the reason is said.
+fn announced_method(
+    plan: &Plan,
+    capture: &Capture,
+    acquisition: &Acquisition,
+    report: &Report,
+) -> Result<&'static str> {
+    let usual = usual_method(&plan.network, capture, acquisition)?;
+    if let Some(reason) = &usual.reason {
+        report.remark(&format!("note: {reason}: restoring by {}", usual.name));
+    }
+    Ok(usual.name)
+}
+
+/// Says how long all pictures take, if that is long enough to be worth a line.
+fn tell_time(seconds_per_picture: f64, pictures: u64, report: &Report) {
+    let seconds = seconds_per_picture * pictures as f64;
+    if seconds < WORTH_TELLING {
+        return;
+    }
+    let time = if seconds < 7200.0 {
+        format!("{:.0} minutes", (seconds / 60.0).ceil())
+    } else {
+        format!("{:.1} hours", seconds / 3600.0)
+    };
+    report.remark(&format!(
+        "note: {pictures} pictures take about {time} ({seconds_per_picture:.2} s each); --every N makes fewer"
+    ));
+}
+
+/// Output frames per second of a sensor whose rate is known.
+fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
+    let sensor = &acquisition.sensor;
+    sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed))
 }
 
 /// The settings of the network that frames depend on, where it makes them.

@@ -5,12 +5,16 @@ use qudi_core::{Frame, Size};
 use std::io::Write;
 
 /// Writes the header of a gray Y4M stream to standard output.
-pub(super) fn write_header(size: Size, fps: Option<f64>) -> Result<()> {
-    // Frame rates of thousands confuse players; without one, 25 is customary.
-    let fps = fps.map_or(25, |fps| fps.round().max(1.0) as u64);
+pub(super) fn write_header(size: Size, fps: f64) -> Result<()> {
+    let thousandths = (fps * 1000.0).round() as u64;
+    let (numerator, denominator) = if thousandths.is_multiple_of(1000) {
+        (thousandths / 1000, 1)
+    } else {
+        (thousandths, 1000)
+    };
     // Without the tag, readers take luma for the limited range of video, 16 to 235.
     let header = format!(
-        "YUV4MPEG2 W{} H{} F{fps}:1 Ip A1:1 Cmono XCOLORRANGE=FULL\n",
+        "YUV4MPEG2 W{} H{} F{numerator}:{denominator} Ip A1:1 Cmono XCOLORRANGE=FULL\n",
         size.width, size.height
     );
     std::io::stdout().write_all(header.as_bytes()).map_err(stdout_error)

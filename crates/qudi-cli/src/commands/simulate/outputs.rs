@@ -12,6 +12,9 @@ use serde_json::{Value, json};
 use std::io::{Write, stdout};
 use std::path::{Path, PathBuf};
 
+/// Frames per second of previews.
+const PREVIEW_FPS: f64 = 20.0;
+
 /// Counts of a frame as the bytes of a stream.
 type FrameEncoder = Box<dyn Fn(&[u16]) -> Vec<u8>>;
 
@@ -88,13 +91,16 @@ impl Sink for Outputs<'_> {
                 overwrite,
             )?);
         }
-        let create = |path: &PathBuf| ClipWriter::create(path, start.size, plan.tiff, overwrite);
+        let create = |path: &PathBuf| {
+            ClipWriter::create(path, start.size, plan.tiff, PREVIEW_FPS, overwrite)
+        };
         self.truth = plan.truth.as_ref().map(create).transpose()?;
         let create = |path: &PathBuf| {
             ArrayWriter::create(path, overwrite, "<f4", &[3, start.size.height, start.size.width])
         };
         self.flow = plan.flow.as_ref().map(create).transpose()?;
-        let create = |path: &PathBuf| GifWriter::create(path, overwrite, start.size, max_count);
+        let create =
+            |path: &PathBuf| GifWriter::create(path, overwrite, start.size, max_count, PREVIEW_FPS);
         self.preview = plan.preview.as_ref().map(create).transpose()?;
         Ok(())
     }

@@ -117,24 +117,52 @@ impl Hdf5 {
         walk(&self.file.root(), "", 0, &mut left, f)
     }
 
-    /// Text attributes called `name`, of the dataset and of the groups above it.
+    /// The text that attribute `name` of the dataset at `path`, of a group above or of the file holds.
     pub(crate) fn attribute(&self, path: &str, name: &str) -> Option<String> {
+        use hdf5_pure::AttrValue::{AsciiString, String, VarLenString};
+        self.find_attribute(path, name, |value| match value {
+            String(text) | AsciiString(text) | VarLenString(text) => Some(text),
+            _ => None,
+        })
+    }
+
+    /// The number that attribute `name` of the dataset at `path`, of a group above or of the file holds.
+    pub(crate) fn number(&self, path: &str, name: &str) -> Option<f64> {
+        use hdf5_pure::AttrValue::{F32, F64, I8, I16, I32, I64, U8, U16, U32, U64};
+        self.find_attribute(path, name, |value| match value {
+            F32(value) => Some(f64::from(value)),
+            F64(value) => Some(value),
+            I8(value) => Some(f64::from(value)),
+            I16(value) => Some(f64::from(value)),
+            I32(value) => Some(f64::from(value)),
+            I64(value) => Some(value as f64),
+            U8(value) => Some(f64::from(value)),
+            U16(value) => Some(f64::from(value)),
+            U32(value) => Some(f64::from(value)),
+            U64(value) => Some(value as f64),
+            _ => None,
+        })
+    }
+
+    /// What `convert` makes of attribute `name`, of the dataset at `path` or the nearest group that has it.
+    fn find_attribute<T>(
+        &self,
+        path: &str,
+        name: &str,
+        convert: impl Fn(hdf5_pure::AttrValue) -> Option<T>,
+    ) -> Option<T> {
         self.refill();
-        let text = |mut attributes: std::collections::HashMap<String, hdf5_pure::AttrValue>| {
-            use hdf5_pure::AttrValue::{AsciiString, String, VarLenString};
-            match attributes.remove(name)? {
-                String(text) | AsciiString(text) | VarLenString(text) => Some(text),
-                _ => None,
-            }
+        let read = |mut attributes: std::collections::HashMap<String, hdf5_pure::AttrValue>| {
+            convert(attributes.remove(name)?)
         };
-        let own = self.file.dataset(path).ok().and_then(|d| d.attrs().ok()).and_then(text);
+        let own = self.file.dataset(path).ok().and_then(|d| d.attrs().ok()).and_then(read);
         own.or_else(|| {
             let mut above = path;
             loop {
                 above = above.rsplit_once('/').map(|(above, _)| above)?;
                 let group =
                     if above.is_empty() { Ok(self.file.root()) } else { self.file.group(above) };
-                let found = group.ok().and_then(|g| g.attrs().ok()).and_then(text);
+                let found = group.ok().and_then(|g| g.attrs().ok()).and_then(read);
                 if found.is_some() || above.is_empty() {
                     return found;
                 }

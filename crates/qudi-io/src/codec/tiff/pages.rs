@@ -21,6 +21,8 @@ pub(crate) struct TiffPages {
     size: Size,
     frames: u64,
     scale: Scale,
+    /// Samples of a pixel, and the one that is read.
+    samples: (usize, usize),
     /// Rows of single bits, padded to bytes.
     bits: bool,
     /// Whether the first pixel of a byte is its lowest bit.
@@ -69,22 +71,86 @@ pub(super) fn bits_reversed(decoder: &mut TiffDecoder, path: &Path) -> Result<bo
     ))
 }
 
+/// What values mean: 0, where larger ones are darker; the decoder turns those round.
+pub(super) fn photometric(decoder: &mut TiffDecoder, path: &Path) -> Result<u16> {
+    let tag = decoder.find_tag(Tag::PhotometricInterpretation).map_err(|e| fault(path, e))?;
+    Ok(tag.and_then(|value| value.into_u16().ok()).unwrap_or(1))
+}
+
+/// Samples of a pixel, bits of a sample, and whether one of the samples is opacity.
+fn samples_of(color: ColorType) -> Option<(usize, u8, bool)> {
+    match color {
+        ColorType::Gray(bits) => Some((1, bits, false)),
+        ColorType::GrayA(bits) => Some((2, bits, true)),
+        ColorType::RGB(bits) => Some((3, bits, false)),
+        ColorType::RGBA(bits) => Some((4, bits, true)),
+        ColorType::Multiband { bit_depth, num_samples } => {
+            Some((usize::from(num_samples), bit_depth, false))
+        }
+        _ => None,
+    }
+}
+
+/// The sample of a pixel that is read; `of_pages`: channels are pages, and pages are gray.
+fn chosen_sample(
+    color: ColorType,
+    options: &ReadOptions,
+    of_pages: bool,
+    path: &Path,
+) -> Result<(usize, usize)> {
+    let Some((samples, _, opacity)) = samples_of(color) else {
+        return Err(Error::data(
+            format!("images of type {color:?}"),
+            path,
+            "save the stack as 8- or 16-bit gray or RGB",
+        ));
+    };
+    let colours = samples - usize::from(opacity);
+    match options.channel.filter(|_| !of_pages) {
+        None if colours == 1 => Ok((samples, 0)),
+        None => Err(Error::data(
+            format!("colour images of {colours} channels"),
+            path,
+            format!("read one channel as gray with `channel 0` to {}", colours - 1),
+        )),
+        Some(channel) if channel < colours => Ok((samples, channel)),
+        Some(channel) => Err(Error::data(
+            format!("channel {channel} of images of {colours}"),
+            path,
+            if colours == 1 {
+                "leave `channel` out: there is no colour to choose from".to_owned()
+            } else {
+                format!("channels count from 0 to {}", colours - 1)
+            },
+        )),
+    }
+}
+
 impl TiffPages {
     pub(crate) fn open(
         path: &Path,
         options: &ReadOptions,
         recorded: bool,
+        of_pages: bool,
         info: &mut CaptureInfo,
     ) -> Result<Self> {
         let mut decoder = decoder(path)?;
         let color = decoder.colortype().map_err(|e| fault(path, e))?;
-        let ColorType::Gray(bits) = color else {
+        let samples = chosen_sample(color, options, of_pages, path)?;
+        let bits = samples_of(color).map_or(8, |(_, bits, _)| bits);
+        let planes = decoder.find_tag(Tag::PlanarConfiguration).map_err(|e| fault(path, e))?;
+        if samples.0 > 1 && planes.and_then(|tag| tag.into_u16().ok()) == Some(2) {
             return Err(Error::data(
-                format!("images of type {color:?}"),
+                "colour images whose channels lie apart (planar configuration 2)",
                 path,
-                "colour is not supported yet; save the stack as 8- or 16-bit gray",
+                "save the stack with interleaved channels, or one channel as gray",
             ));
-        };
+        }
+        if photometric(&mut decoder, path)? == 0 && bits > 1 {
+            let text =
+                "white is zero in it (photometric interpretation 0): values are turned round";
+            info.notes.push(text.to_owned());
+        }
         let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;
         let size = Size::new(height as usize, width as usize, &path.display().to_string())?;
         let reversed = bits_reversed(&mut decoder, path)?;
@@ -101,7 +167,9 @@ impl TiffPages {
         }
         let path = path.to_owned();
         let scale = Scale::Counts;
-        let mut pages = Self { decoder, path, size, frames, scale, bits: bits == 1, reversed };
+        let bits_only = bits == 1 && samples.0 == 1;
+        let mut pages =
+            Self { decoder, path, size, frames, scale, samples, bits: bits_only, reversed };
         pages.drop_unreadable(options, info)?;
         pages.scale = pages.find_scale(bits, options, recorded, info)?;
         Ok(pages)
@@ -129,7 +197,7 @@ impl TiffPages {
         info: &mut CaptureInfo,
     ) -> Result<Scale> {
         let full = if bits <= 8 { 255u16 } else { 65535 };
-        if let Some(scale) = Scale::asked(options.levels, f32::from(full), info) {
+        if let Some(scale) = Scale::asked(options, f32::from(full), info) {
             return Ok(scale);
         }
         if bits == 1 {
@@ -140,9 +208,12 @@ impl TiffPages {
         }
         let mut values = Vec::new();
         for frame in [0, self.frames / 2, self.frames - 1] {
+            let (of, index) = self.samples;
             match self.page(frame)? {
-                DecodingResult::U8(v) => values.extend(v.into_iter().map(u16::from)),
-                DecodingResult::U16(v) => values.extend(v),
+                DecodingResult::U8(v) => {
+                    values.extend(v.into_iter().skip(index).step_by(of).map(u16::from));
+                }
+                DecodingResult::U16(v) => values.extend(v.into_iter().skip(index).step_by(of)),
                 _ => return Ok(Scale::Counts),
             }
         }
@@ -160,11 +231,12 @@ impl TiffPages {
                 "frames of one capture have one size",
             ));
         }
-        if !matches!(self.decoder.colortype().map_err(fault)?, ColorType::Gray(_)) {
+        let samples = samples_of(self.decoder.colortype().map_err(fault)?);
+        if samples.is_none_or(|(samples, ..)| samples != self.samples.0) {
             return Err(Error::data(
-                format!("frame {frame} is no gray image"),
+                format!("frame {frame} has other colours than the first"),
                 &self.path,
-                "colour is not supported yet; save the stack as 8- or 16-bit gray",
+                "frames of one capture are all gray, or all of the same channels",
             ));
         }
         if bits_reversed(&mut self.decoder, &self.path)? != self.reversed {
@@ -233,10 +305,12 @@ impl CountFrames for TiffPages {
                 ));
             }
         };
-        if values.len() != counts.len() {
+        let (of, index) = self.samples;
+        if values.len() != counts.len() * of {
             return Err(self.wrong_length(frame, values.len()));
         }
-        for (count, value) in counts.iter_mut().zip(values) {
+        let chosen = values.into_iter().skip(index).step_by(of);
+        for (count, value) in counts.iter_mut().zip(chosen) {
             *count = self.scale.count(value).ok_or_else(|| no_count(value, frame, &self.path))?;
         }
         Ok(())

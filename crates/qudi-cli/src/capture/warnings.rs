@@ -1,0 +1,85 @@
+//! What makes a result doubtful, and what to do about it.
+
+use qudi_core::sensor::{Response, Sensor};
+use qudi_io::capture::{Capture, Summary};
+
+/// Chi-square of counts that a result explains.
+const EXPLAINED: std::ops::RangeInclusive<f64> = 0.5..=2.0;
+
+/// Share of saturated samples beyond which parts of the picture are lower bounds.
+const SATURATED: f64 = 0.2;
+
+/// Share of ones among binary frames beyond which they tell little of the light.
+const ONES: f64 = 0.9;
+
+/// Share of bad and doubtful pixels that is more than defects.
+const BAD: f64 = 0.01;
+
+/// How far the light of a record and that of the counts may differ.
+const LIGHT: std::ops::RangeInclusive<f64> = 0.5..=2.0;
+
+/// Warnings on a capture itself; `sensor` is that of native frames.
+pub(crate) fn of_capture(
+    capture: &Capture,
+    summary: &Summary,
+    sensor: Option<&Sensor>,
+) -> Vec<String> {
+    let mut warnings = Vec::new();
+    if let Some(text) = saturation(capture, summary) {
+        warnings.push(text);
+    }
+    let bad = capture.bad_pixels();
+    let pixels = capture.size().pixels() as f64;
+    let doubtful = bad.doubtful;
+    let share = (bad.len() + doubtful) as f64 / pixels;
+    if share > BAD {
+        warnings.push(format!(
+            "{} pixels ({:.2} %) are repaired and {doubtful} more in clumps are doubtful, hot or small bright things: name those of the camera with --mask FILE or --dcr FILE",
+            bad.len(),
+            100.0 * share
+        ));
+    }
+    if let (Some(recorded), Some(found), Some(_)) =
+        (capture.info().ppp, summary.ppp.incident, sensor)
+    {
+        let recorded = recorded * f64::from(capture.summed());
+        if !LIGHT.contains(&(found / recorded)) {
+            warnings.push(format!(
+                "the record says {recorded:.4} photons per pixel and frame, and the counts show {found:.4}: remove the record if it belongs to another burst, or give the light with --ppp"
+            ));
+        }
+    }
+    warnings
+}
+
+/// Whether too many samples are at their largest value.
+fn saturation(capture: &Capture, summary: &Summary) -> Option<String> {
+    let max = capture.max_count()?;
+    let ones = summary.mean / f64::from(max);
+    let saturated = summary.saturated.unwrap_or(0.0);
+    let much = if capture.info().binary { ones > ONES } else { saturated > SATURATED };
+    (much || capture.info().binary && max > 1 && saturated > SATURATED).then(|| {
+        format!(
+            "{:.1} % of the samples are saturated ({:.1} % of the range on average): bright parts are lower bounds; expose shorter, or weaken the light",
+            100.0 * saturated,
+            100.0 * ones
+        )
+    })
+}
+
+/// A warning on the chi-square of the counts given the result.
+pub(crate) fn of_chi_square(chi_square: Option<f64>, sensor: &Sensor) -> Option<String> {
+    let chi_square = chi_square.filter(|chi_square| !EXPLAINED.contains(chi_square))?;
+    let help = match (chi_square < 1.0, sensor.response) {
+        (true, Response::Binary) => {
+            "the counts vary less than their light allows: check --bits and --levels, and whether frames were averaged or filtered before"
+        }
+        (true, Response::Linear) => {
+            "the counts vary less than the sensor's noise: check --sensor and its gain, and whether frames were averaged or filtered before"
+        }
+        (false, _) => {
+            "the result does not explain its counts: check --sensor, --gain, --bits and --offset, sum fewer frames (--sum N), or try --method qbp-refined"
+        }
+    };
+    Some(format!("chi-square is {chi_square:.3}, where 0.5 to 2 is usual: {help}"))
+}

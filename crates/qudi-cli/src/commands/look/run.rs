@@ -1,0 +1,192 @@
+//! `qudi look`: a capture at a glance.
+
+use super::args::Look;
+use crate::args::{Global, Network};
+use crate::capture::acquisition::{LightOverrides, acquisition};
+use crate::capture::{OpenedCapture, describe_sum, open_summed, warnings};
+use crate::commands::info::capture::describe;
+use crate::error::{CliError, Result};
+use crate::methods::usual_method;
+use crate::places::Places;
+use crate::report::html::{data_url, render};
+use crate::report::{Output, Report};
+use crate::settings::Settings;
+use qudi_burst::{PostFilter, Qbp};
+use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::sensor::{Response, Sensor};
+use qudi_core::{Frame, linear_to_srgb};
+use qudi_io::capture::{Capture, MaskChoice, Summary};
+use qudi_io::writer::Picture;
+use serde_json::{Value, json};
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Sums of the window that one instant is restored from.
+const WINDOW: u64 = 11;
+
+/// Seconds per picture of each method, in units of aligning and merging one instant: rough, for a forecast.
+const COSTS: [(&str, f64); 3] = [("qudi", 6.0), ("qbp-refined", 2.0), ("mle", 0.1)];
+
+pub(crate) fn run(
+    args: &Look,
+    settings: &Settings,
+    global: &Global,
+    report: &Report,
+) -> Result<()> {
+    let output = match &args.output {
+        Some(output) => output.clone(),
+        None => default_output(&args.capture),
+    };
+    let picture_only = match output.extension().map(|e| e.to_string_lossy().to_lowercase()) {
+        Some(extension) if extension == "html" => false,
+        Some(extension) if extension == "png" => true,
+        _ => {
+            let help = "use a name that ends in .html, or .png for the pictures alone";
+            return Err(CliError::new("a look is .html or .png", output.display(), help));
+        }
+    };
+    Places::default()
+        .reads_burst(&args.capture)
+        .reads(args.reading.files())
+        .reads(args.sensor.as_deref())
+        .writes([&output])
+        .check()?;
+    let file = Output::open(Some(&output), global.overwrite())?;
+    let options = args.reading.options(MaskChoice::Auto);
+    let auto = args.reading.auto_sum();
+    let OpenedCapture { mut capture, sensor, sum } =
+        open_summed(Some(&args.capture), &options, auto, args.sensor.as_deref(), settings)?;
+    let gain = capture.info().gain;
+    let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
+    let mut text = describe(&capture, &summary, sensor.as_ref());
+    let mut line = |key: &str, value: &str| {
+        let _ = writeln!(text, "{key:<11}{value}");
+    };
+    if let Some(choice) = &sum {
+        line("sum", &describe_sum(choice, &capture, sensor.as_ref()));
+    }
+    let warnings = warnings::of_capture(&capture, &summary, sensor.as_ref());
+    for warning in &warnings {
+        line("warning", warning);
+    }
+    let mean = shown(summary.picture(&capture, sensor.as_ref(), gain));
+    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0 };
+    let of_light = sensor_of(&capture, sensor).and_then(|sensor| {
+        acquisition(&light, &mut capture, &sensor).map(|(acquisition, _)| acquisition)
+    });
+    let mut picture = Picture::new(mean.size, 1, 2, 1);
+    picture.place(0, 0, &["MEAN"], &mean);
+    let mut forecast = Value::Null;
+    match of_light {
+        Ok(acquisition) => {
+            let start = Instant::now();
+            let instant = restore_instant(&mut capture, &acquisition)?;
+            let seconds = start.elapsed().as_secs_f64();
+            picture.place(0, 1, &["ONE INSTANT"], &shown(instant));
+            let (words, document) = plan(&capture, &acquisition, seconds)?;
+            line("restore", &words);
+            forecast = document;
+        }
+        Err(CliError::Error { what, .. }) => line("restore", &format!("not yet: {what}")),
+        Err(other) => return Err(other),
+    }
+    let png = picture.to_png()?;
+    if picture_only {
+        file.write(|| Ok(png))?;
+    } else {
+        file.write(|| {
+            let context = json!({
+                "title": args.capture.display().to_string(),
+                "picture": data_url(&png),
+                "averaged": summary.sampled,
+                "aligned": WINDOW.min(capture.frames()),
+                "text": text,
+            });
+            render("look.html", context)
+        })?;
+    }
+    let text = format!("{text}{}\n", output.display());
+    report.result(&text, || {
+        json!({
+            "output": output,
+            "format": capture.info().format,
+            "frames": capture.frames(),
+            "summed": capture.summed(),
+            "sum": sum,
+            "ppp": summary.ppp,
+            "warnings": warnings,
+            "restore": forecast,
+        })
+    })
+}
+
+/// `NAME-look.html` in the current folder.
+fn default_output(capture: &Path) -> PathBuf {
+    let stem = capture.file_stem().unwrap_or(capture.as_os_str()).to_string_lossy().into_owned();
+    PathBuf::from(format!("{stem}-look.html"))
+}
+
+/// The sensor; of binary frames of an unknown camera, one that detects every photon.
+fn sensor_of(capture: &Capture, sensor: Option<Sensor>) -> Result<Sensor> {
+    if let Some(sensor) = sensor {
+        return Ok(sensor);
+    }
+    if capture.info().binary {
+        let mut ideal = Sensor::load("ideal")?;
+        (ideal.response, ideal.bits, ideal.frames_summed) = (Response::Binary, 1, 1);
+        return Ok(ideal);
+    }
+    Err(CliError::new(
+        "its sensor is unknown: --sensor NAME (`qudi info --sensors`)",
+        capture.path().display(),
+        "name its sensor",
+    ))
+}
+
+/// The middle of the capture, sums aligned and merged.
+fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<Frame> {
+    let length = capture.frames().min(WINDOW);
+    let first = if capture.forward_only() { 0 } else { (capture.frames() - length) / 2 };
+    let size = capture.size();
+    let mut frames = vec![vec![0; size.pixels()]; length as usize];
+    for (frame, counts) in (first..).zip(&mut frames) {
+        capture.read(frame, counts)?;
+    }
+    let view = BurstView { size, frames: &frames };
+    Ok(Qbp::new(PostFilter::Bm3d).restore_one(view, acquisition, frames.len() / 2)?)
+}
+
+/// What `qudi restore` would do, and about how long that takes.
+fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(String, Value)> {
+    let usual = usual_method(&Network::default().options(), capture, acquisition)?;
+    let cost = COSTS.iter().find(|(name, _)| *name == usual.name).map_or(2.0, |(_, cost)| *cost);
+    let pictures = capture.frames();
+    let total = seconds * cost * pictures as f64;
+    let time = if total < 120.0 {
+        format!("{total:.0} seconds")
+    } else if total < 7200.0 {
+        format!("{:.0} minutes", total / 60.0)
+    } else {
+        format!("{:.1} hours", total / 3600.0)
+    };
+    let reason = usual.reason.map_or(String::new(), |reason| format!(" ({reason})"));
+    let sensor = &acquisition.sensor.name;
+    let words = format!(
+        "`qudi restore` makes {pictures} pictures by {}{reason}, sensor {sensor}, in about {time}; --every N makes fewer",
+        usual.name
+    );
+    let document = json!({"method": usual.name, "pictures": pictures, "seconds": total});
+    Ok((words, document))
+}
+
+/// A frame for the eye: white at its 99.5th percentile, sRGB.
+fn shown(mut frame: Frame) -> Frame {
+    let mut sorted = frame.data.clone();
+    sorted.sort_by(f32::total_cmp);
+    let white = sorted[(sorted.len() - 1) * 995 / 1000].max(f32::MIN_POSITIVE);
+    for value in &mut frame.data {
+        *value = linear_to_srgb((*value / white).clamp(0.0, 1.0));
+    }
+    frame
+}

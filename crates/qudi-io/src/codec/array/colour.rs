@@ -1,0 +1,117 @@
+//! The axes of an array in memory: where colour lies, and which of it is read.
+
+use super::{Array, Place};
+use crate::capture::options::{Axes, ReadOptions};
+use qudi_core::{Error, Result};
+
+/// The extents of an array in the order of memory, slowest first, without colour.
+pub(super) struct Layout {
+    pub(super) dims: [usize; 3],
+    pub(super) colours: Colours,
+    /// The channel that is read.
+    pub(super) index: usize,
+}
+
+/// Where the channels of a capture lie in memory, and how many there are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Colours {
+    /// Beside each other, pixel by pixel.
+    Interleaved(usize),
+    /// One plane of a frame after the other.
+    Planes(usize),
+    /// One capture after the other.
+    Volumes(usize),
+}
+
+impl Colours {
+    fn number(self) -> usize {
+        match self {
+            Self::Interleaved(n) | Self::Planes(n) | Self::Volumes(n) => n,
+        }
+    }
+}
+
+/// More channels than this are an axis of space or time.
+const MOST: usize = 4;
+
+impl Array {
+    /// What each extent is; `axes` are those of memory.
+    pub(super) fn layout(&self, axes: Axes, options: &ReadOptions) -> Result<Layout> {
+        let mut memory = self.shape.clone();
+        if self.fortran {
+            memory.reverse();
+        }
+        let frame_axis_first = axes.frame_position() == 0;
+        let (dims, colours) = match *memory.as_slice() {
+            [a, b] => {
+                let dims = match axes.frame_position() {
+                    0 => [1, a, b],
+                    1 => [a, 1, b],
+                    _ => [a, b, 1],
+                };
+                (dims, Colours::Interleaved(1))
+            }
+            [a, b, c] => ([a, b, c], Colours::Interleaved(1)),
+            [a, b, c, d] => {
+                let few = |n: usize| (1..=MOST).contains(&n);
+                let last = ([a, b, c], Colours::Interleaved(d));
+                let second = ([a, c, d], Colours::Planes(b));
+                if self.fortran && few(a) {
+                    ([b, c, d], Colours::Volumes(a))
+                } else if !self.fortran && few(d) && (b != 1 || matches!(d, 3 | 4)) {
+                    last
+                } else if few(b) && frame_axis_first {
+                    second
+                } else if few(d) {
+                    last
+                } else {
+                    return Err(self.no_capture());
+                }
+            }
+            _ => return Err(self.no_capture()),
+        };
+        let index = self.channel(colours.number(), options)?;
+        Ok(Layout { dims, colours, index })
+    }
+
+    pub(super) fn no_capture(&self) -> Error {
+        self.fault(
+            format!("an array of shape {:?} is no capture", self.shape),
+            "captures have the axes frames, height, width, and perhaps colour",
+        )
+    }
+
+    /// The channel that is read, of so many.
+    fn channel(&self, channels: usize, options: &ReadOptions) -> Result<usize> {
+        match (channels, options.channel) {
+            (1, None | Some(0)) => Ok(0),
+            (1, Some(index)) => Err(Error::request(
+                format!("channel {index} of a gray capture, shape {:?}", self.shape),
+                "channel",
+                "leave it out: there is no colour to choose from",
+            )),
+            (_, None) => Err(self.fault(
+                format!("a colour capture of {channels} channels, shape {:?}", self.shape),
+                format!("read one channel as gray with `channel 0` to {}", channels - 1),
+            )),
+            (_, Some(index)) if index < channels => Ok(index),
+            (_, Some(index)) => Err(self.fault(
+                format!("channel {index} of an array of shape {:?}", self.shape),
+                format!("channels count from 0 to {}", channels - 1),
+            )),
+        }
+    }
+
+    /// Goes on with one of several captures that lie one after the other.
+    pub(super) fn choose_volume(&mut self, dims: [usize; 3], index: usize) {
+        let bytes = (dims.iter().product::<usize>() * self.sample.bytes()) as u64;
+        match &mut self.place {
+            Place::File { start, available, .. } | Place::Spool { start, available, .. } => {
+                let before = bytes * index as u64;
+                *start += before;
+                *available = available.saturating_sub(before).min(bytes);
+            }
+            Place::Stream(_) | Place::Fetch { .. } | Place::Pipe(_) => {}
+        }
+    }
+}

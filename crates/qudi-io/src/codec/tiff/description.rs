@@ -1,0 +1,124 @@
+//! What ImageJ and OME write into a TIFF's description: order of pages, channels, frame interval.
+
+/// The axes of a stack beyond rows and columns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Description {
+    /// Images in all, if it says.
+    pub(super) images: Option<u64>,
+    /// Channels of the stack.
+    pub(super) channels: u64,
+    /// Pages between a channel and the next one of the same instant.
+    pub(super) run: u64,
+    /// Frames per second.
+    pub(super) fps: Option<f64>,
+    /// Who wrote it.
+    pub(super) program: &'static str,
+}
+
+impl Description {
+    /// Reads the text of the first page.
+    pub(super) fn parse(text: &str) -> Option<Self> {
+        if text.starts_with("ImageJ=") { Some(imagej(text)) } else { ome(text) }
+    }
+}
+
+/// `key=value` lines; pages are ordered channels first, then slices, then frames.
+fn imagej(text: &str) -> Description {
+    let value = |key: &str| {
+        text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix('=').map(str::trim))
+    };
+    let number = |key: &str| value(key)?.parse::<u64>().ok().filter(|&n| n > 0);
+    let interval = value("finterval").and_then(|text| text.parse::<f64>().ok());
+    let rate = value("fps").and_then(|text| text.parse::<f64>().ok());
+    let fps = interval.filter(|&seconds| seconds > 0.0).map(|seconds| 1.0 / seconds).or(rate);
+    Description {
+        images: number("images"),
+        channels: number("channels").unwrap_or(1),
+        run: 1,
+        fps: fps.filter(|fps| fps.is_finite() && *fps > 0.0),
+        program: "ImageJ",
+    }
+}
+
+/// The attributes of the first `<Pixels ...>` of OME-XML.
+fn ome(text: &str) -> Option<Description> {
+    let at = text.find("<OME").and_then(|at| Some(at + text[at..].find("Pixels ")?))?;
+    let element = &text[at..at + text[at..].find('>')?];
+    let attribute = |name: &str| {
+        let from = element.find(&format!(" {name}=\""))? + name.len() + 3;
+        element[from..].split('"').next()
+    };
+    let extent = |name: &str| {
+        let text = attribute(name)?;
+        text.parse::<u64>().ok().filter(|&n| n > 0)
+    };
+    let order = attribute("DimensionOrder").unwrap_or("XYZCT");
+    let before = order.split('C').next().unwrap_or_default();
+    let size = |axis: char| match axis {
+        'Z' => extent("SizeZ").unwrap_or(1),
+        'T' => extent("SizeT").unwrap_or(1),
+        _ => 1,
+    };
+    let run = before.chars().try_fold(1u64, |run, axis| run.checked_mul(size(axis)))?;
+    // Interleaved samples of a pixel are channels of its page, not pages.
+    let samples = text.find("SamplesPerPixel=\"").and_then(|at| {
+        let digits = text[at + "SamplesPerPixel=\"".len()..].split('"').next()?;
+        digits.parse::<u64>().ok().filter(|&n| n > 0)
+    });
+    let unit = match attribute("TimeIncrementUnit") {
+        Some("ms") => 1e-3,
+        Some("µs" | "us") => 1e-6,
+        Some("ns") => 1e-9,
+        _ => 1.0,
+    };
+    let increment = attribute("TimeIncrement").and_then(|text| text.parse::<f64>().ok());
+    let fps = increment.filter(|&seconds| seconds > 0.0).map(|seconds| 1.0 / (seconds * unit));
+    Some(Description {
+        images: None,
+        channels: (extent("SizeC").unwrap_or(1) / samples.unwrap_or(1)).max(1),
+        run,
+        fps: fps.filter(|fps| fps.is_finite()),
+        program: "OME",
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn reads_imagej() {
+        let text =
+            "ImageJ=1.11a\nimages=12\nchannels=3\nframes=4\nhyperstack=true\nfinterval=0.02\n";
+        let d = Description::parse(text).unwrap();
+        assert_eq!((d.images, d.channels, d.run, d.fps), (Some(12), 3, 1, Some(50.0)));
+        let plain = Description::parse("ImageJ=1.53\nimages=7\n").unwrap();
+        assert_eq!((plain.images, plain.channels, plain.fps), (Some(7), 1, None));
+    }
+
+    #[test]
+    fn reads_ome() {
+        let ome = |attributes: &str| {
+            format!(
+                "<?xml version=\"1.0\"?><OME><Image><Pixels {attributes}><Channel/></Pixels></Image></OME>"
+            )
+        };
+        let text = ome(
+            "DimensionOrder=\"XYZCT\" SizeC=\"3\" SizeT=\"5\" SizeZ=\"2\" TimeIncrement=\"10\" TimeIncrementUnit=\"ms\"",
+        );
+        let d = Description::parse(&text).unwrap();
+        assert_eq!((d.channels, d.run, d.fps), (3, 2, Some(100.0)));
+        let first =
+            Description::parse(&ome("DimensionOrder=\"XYCZT\" SizeC=\"2\" SizeT=\"4\"")).unwrap();
+        assert_eq!((first.channels, first.run), (2, 1));
+        assert_eq!(Description::parse("a microscope"), None);
+    }
+
+    proptest! {
+        #[test]
+        fn descriptions_from_strangers_never_panic(text in "(ImageJ=|<OME|Pixels |SizeC=\"|\"|>|[0-9]|channels=|\\n){0,20}") {
+            let _ = Description::parse(&text);
+        }
+    }
+}

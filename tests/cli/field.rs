@@ -1,0 +1,180 @@
+//! Real captures without a manual: sums by themselves, chosen instants, warnings, a first look.
+
+use crate::support::{listing, npy_bytes, qudi, refused, run, scratch};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// A folder with `c.npy`: binary frames of a bright square that moves by `speed` pixels a frame.
+fn capture(name: &str, frames: usize, rate: f64, speed: f64) -> PathBuf {
+    let folder = scratch(name);
+    let (height, width) = (32, 48);
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64;
+    let mut uniform = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state >> 11) as f64 / (1u64 << 53) as f64
+    };
+    let mut bits = Vec::new();
+    for t in 0..frames {
+        for i in 0..height * width {
+            let (x, y) = ((i % width) as f64 - speed * t as f64, (i / width) as f64);
+            let light = 1.0 + 0.8 * (0.6 * x).sin() * (0.5 * y).cos();
+            bits.push(u8::from(uniform() < rate * light));
+        }
+    }
+    let packed: Vec<u8> =
+        bits.chunks(8).map(|eight| eight.iter().fold(0, |byte, bit| byte << 1 | bit)).collect();
+    let shape = format!("({frames}, {height}, {})", width / 8);
+    std::fs::write(folder.join("c.npy"), npy_bytes("|u1", &shape, &packed)).unwrap();
+    folder
+}
+
+fn said(folder: &Path, args: &str) -> String {
+    let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{args}: {text}");
+    text
+}
+
+#[test]
+fn sums_frames_by_itself_and_says_why() {
+    let folder = capture("field-sum", 220, 0.05, 0.0);
+    let restore = "restore c.npy --sensor swissspad2 --method mle";
+    let text = said(&folder, &format!("{restore} -o auto.npy"));
+    assert!(text.contains("20 frames are summed into one"), "{text}");
+    assert!(text.contains("4885.0000 frames per second") && text.contains("--sum N"), "{text}");
+    run(&folder, &format!("{restore} -o twenty.npy --sum 20"));
+    let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    assert_eq!(read("auto.npy"), read("twenty.npy"));
+    let info: Value = serde_json::from_str(&run(&folder, "info c.npy --json")).unwrap();
+    assert_eq!((&info["sum"]["frames"], &info["frames"]), (&20.into(), &11.into()));
+    let one: Value = serde_json::from_str(&run(&folder, "info c.npy --sum 1 --json")).unwrap();
+    assert_eq!((&one["sum"], &one["frames"]), (&Value::Null, &220.into()));
+    run(&folder, "convert c.npy -o native.npy");
+    let native: Value =
+        serde_json::from_str(&run(&folder, "info native.npy --sum 1 --json")).unwrap();
+    assert_eq!(native["frames"], 220, "convert keeps frames unless asked");
+    refused(&folder, "restore c.npy --sensor swissspad2 -o x.npy --sum 0", &["or auto"]);
+}
+
+#[test]
+fn pictures_of_chosen_instants_are_those_of_all() {
+    let folder = capture("field-every", 132, 0.2, 0.0);
+    let restore = "restore c.npy --sensor swissspad2 --method mle --sum 3";
+    run(&folder, &format!("{restore} -o all"));
+    run(&folder, &format!("{restore} -o sixth --every 6"));
+    let frame = |run: &str, n: usize| {
+        std::fs::read(folder.join(run).join(format!("frame_{n:06}.png"))).unwrap()
+    };
+    assert_eq!(listing(&folder.join("sixth")).len(), 22 + 1);
+    for n in 0..22 {
+        assert_eq!(frame("sixth", n), frame("all", 2 * n), "picture {n}");
+    }
+    // Apart from each other, or between sums: each from a window of its own.
+    run(&folder, &format!("{restore} -o apart --every 33"));
+    assert_eq!(listing(&folder.join("apart")).len(), 4 + 1);
+    run(&folder, &format!("{restore} -o sliding --every 2 --end 60"));
+    assert_eq!(listing(&folder.join("sliding")).len(), 29 + 1);
+    let manifest = std::fs::read(folder.join("sliding/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
+    assert_eq!(manifest["settings"]["every"], 2);
+    assert_eq!(manifest["complete"], true);
+    let again = run(&folder, &format!("{restore} -o sliding --every 2 --end 60"));
+    assert!(again.contains("29 frames were there already"), "{again}");
+    refused(&folder, &format!("{restore} -o sliding --every 4 --end 60"), &["every was 2, now 4"]);
+    refused(&folder, &format!("{restore} -o none --every 500"), &["--every"]);
+}
+
+#[test]
+fn tone_curve_and_rate_apply_to_what_is_written() {
+    let folder = capture("field-tone", 77, 0.2, 0.0);
+    let restore = "restore c.npy --sensor swissspad2 --method mle --sum 7";
+    run(&folder, &format!("{restore} -o linear.npy"));
+    run(&folder, &format!("{restore} -o toned.npy --tonemap srgb"));
+    let values = |name: &str| -> Vec<f32> {
+        let bytes = std::fs::read(folder.join(name)).unwrap();
+        let data = &bytes[bytes.len() - 11 * 32 * 48 * 4..];
+        data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+    };
+    for (linear, toned) in values("linear.npy").iter().zip(values("toned.npy")) {
+        assert!((qudi_core::linear_to_srgb(linear.max(0.0)) - toned).abs() < 1e-6);
+    }
+    let played = |fps: &str| {
+        let args = format!("{restore} -o - {fps}");
+        qudi(&folder).args(args.split_whitespace()).output().unwrap().stdout
+    };
+    assert!(played("").starts_with(b"YUV4MPEG2 W48 H32 F25:1 "));
+    assert!(played("--fps 12.5").starts_with(b"YUV4MPEG2 W48 H32 F12500:1000 "));
+    refused(&folder, &format!("{restore} -o x.npy --fps 10"), &["--fps", "does not play"]);
+}
+
+#[test]
+fn warns_of_what_makes_a_result_doubtful() {
+    let folder = capture("field-warn", 77, 0.2, 0.0);
+    let ones = npy_bytes("|u1", "(22, 16, 2)", &[0xff; 22 * 16 * 2]);
+    std::fs::write(folder.join("ones.npy"), ones).unwrap();
+    let info: Value =
+        serde_json::from_str(&run(&folder, "info ones.npy --pack-axis width --json")).unwrap();
+    assert!(info["warnings"][0].as_str().unwrap().contains("saturated"), "{info}");
+    // Means of frames vary less than counts.
+    let even = npy_bytes("|u1", "(22, 16, 16)", &[3; 22 * 16 * 16]);
+    std::fs::write(folder.join("even.npy"), even).unwrap();
+    let args = "restore even.npy --bits 3 --sensor swissspad2 --method mle -o even";
+    let text = said(&folder, args);
+    assert!(text.contains("warning: chi-square is") && text.contains("averaged"), "{text}");
+    let manifest = std::fs::read(folder.join("even/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
+    let warnings = manifest["results"]["warnings"].as_array().unwrap();
+    assert!(warnings.iter().any(|w| w.as_str().unwrap().contains("chi-square")), "{manifest}");
+}
+
+#[test]
+fn default_method_says_why_it_is_not_the_network() {
+    let folder = capture("field-dim", 120, 0.005, 0.0);
+    let text = said(&folder, "restore c.npy --sensor swissspad2 --sum 5 -o dim.npy");
+    assert!(text.contains("detections per pixel and frame; the weights were trained"), "{text}");
+    assert!(text.contains("restoring by qbp-refined"), "{text}");
+}
+
+#[test]
+fn looks_at_a_capture_on_one_page() {
+    let folder = capture("field-look", 220, 0.2, 0.0);
+    let text = run(&folder, "look c.npy --sensor swissspad2");
+    assert!(text.contains("restore    `qudi restore` makes") && text.contains("sum  "), "{text}");
+    let page = std::fs::read_to_string(folder.join("c-look.html")).unwrap();
+    assert!(page.contains("base64,iVBOR") && page.contains("c.npy"));
+    // Without a sensor, binary frames are shown all the same.
+    run(&folder, "look c.npy -o look.png");
+    let size = image::image_dimensions(folder.join("look.png")).unwrap();
+    assert!(size.0 > 2 * 48 && size.1 > 32, "{size:?}");
+    refused(&folder, "look c.npy -o look.pdf", &["look.pdf", ".html"]);
+    refused(&folder, "look c.npy -o c.npy -f", &["c.npy"]);
+}
+
+#[test]
+fn clips_are_exposed_with_sums_and_detections_as_asked() {
+    let folder = scratch("field-eval");
+    let args = "eval scene:text --method mle --frames 11 --size 48x64 --ppp 4.9 --json";
+    let paper = "--sensor spad-qvga --sum 7 --ppp-def detected";
+    let row: Value = serde_json::from_str(&run(&folder, &format!("{args} {paper}"))).unwrap();
+    assert_eq!(row["sensor"]["frames_summed"], 7);
+    assert!(row["rows"][0]["psnr_a"]["all"]["mean"].as_f64().unwrap() > 10.0);
+    refused(&folder, &format!("{args} --sum auto"), &["--sum", "--sum 7"]);
+}
+
+#[test]
+fn pipes_are_converted() {
+    let folder = capture("field-pipe", 22, 0.2, 0.0);
+    let bytes = std::fs::read(folder.join("c.npy")).unwrap();
+    let convert = |args: &str, input: &[u8]| {
+        let args = format!("convert - {args} -q");
+        qudi(&folder).args(args.split_whitespace()).write_stdin(input).assert().success();
+    };
+    convert("-o piped.npy", &bytes);
+    run(&folder, "convert c.npy -o direct.npy");
+    let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    assert_eq!(read("piped.npy"), read("direct.npy"));
+    convert("-o raw.npy --format raw-bits --size 32x48", &bytes[bytes.len() - 22 * 32 * 6..]);
+    assert_eq!(read("raw.npy"), read("direct.npy"));
+}
