@@ -12,10 +12,12 @@ const APART: u64 = 8;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Instants {
-    /// One for every so many output frames, from the first on.
+    /// The output frame nearest before every so many native frames.
     Frames {
-        /// Output frames from one picture to the next.
-        step: u64,
+        /// Native frames from one picture to the next, no fewer than are summed.
+        every: u64,
+        /// Native frames of an output frame.
+        sum: u64,
     },
     /// One for every so many native frames, each in the middle of a window of its own: sums may overlap those
     /// of other pictures.
@@ -37,7 +39,7 @@ pub struct Schedule {
 impl Schedule {
     /// A picture of every output frame.
     pub fn all(windows: Windows) -> Self {
-        Self { windows, instants: Instants::Frames { step: 1 } }
+        Self { windows, instants: Instants::Frames { every: 1, sum: 1 } }
     }
 }
 
@@ -48,15 +50,15 @@ impl Instants {
     /// [`Error::Request`] if a pipe is asked for windows that overlap, or for more than its frames.
     pub fn every(every: u64, capture: &Capture) -> Result<Self> {
         let sum = u64::from(capture.summed());
-        let on_grid = every.is_multiple_of(sum);
-        if on_grid && (every / sum < APART || capture.length().is_none()) {
-            return Ok(Self::Frames { step: every / sum });
+        let close = every >= sum && every / sum < APART;
+        if close || every >= sum && capture.length().is_none() {
+            return Ok(Self::Frames { every, sum });
         }
         let fault = |what: String, help: String| Err(Error::request(what, "every", help));
         match capture.length() {
             None => fault(
                 format!("a picture for every {every} frames of a pipe whose sums are {sum} frames"),
-                format!("use a multiple of {sum}, or store the capture in a file"),
+                format!("use at least {sum}, or store the capture in a file"),
             ),
             Some(_) if every > capture.native_frames() => fault(
                 format!("a picture for every {every} frames of {}", capture.native_frames()),
@@ -64,16 +66,31 @@ impl Instants {
             ),
             Some(_) if capture.forward_only() => fault(
                 "a picture for every so many frames of a compressed file".to_owned(),
-                format!("use a multiple of {sum} below {}, or unpack the file", APART * sum),
+                format!("use {sum} to {}, or unpack the file", APART * sum - 1),
             ),
             Some(_) => Ok(Self::Centred { every }),
         }
     }
 
+    /// The output frame of a picture, where pictures are output frames.
+    pub(super) fn frame_of(self, picture: u64) -> u64 {
+        match self {
+            Self::Frames { every, sum } => picture.saturating_mul(every) / sum,
+            Self::Centred { .. } => picture,
+        }
+    }
+
+    /// The picture that output frame `frame` becomes, if it becomes one.
+    pub(super) fn picture_of(self, frame: u64) -> Option<u64> {
+        let Self::Frames { every, sum } = self else { return Some(frame) };
+        let picture = frame.saturating_mul(sum).div_ceil(every);
+        (self.frame_of(picture) == frame).then_some(picture)
+    }
+
     /// The native frame that the sum of `sum` frames of a picture begins with.
     pub fn begins_at(self, picture: u64, sum: u64) -> u64 {
         match self {
-            Self::Frames { step } => picture * step * sum,
+            Self::Frames { .. } => self.frame_of(picture) * sum,
             Self::Centred { every } => picture * every,
         }
     }
@@ -81,11 +98,33 @@ impl Instants {
     /// Pictures of `frames` output frames, or of a capture of `native` frames summed by `sum`.
     pub fn pictures(self, capture: &Capture) -> Option<u64> {
         match self {
-            Self::Frames { step } => capture.length().map(|frames| frames.div_ceil(step)),
+            Self::Frames { every, sum } => {
+                capture.length().map(|frames| frames.saturating_mul(sum).div_ceil(every))
+            }
             Self::Centred { every } => {
                 let sum = u64::from(capture.summed());
                 Some((capture.native_frames() - sum) / every + 1)
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_are_the_frames_nearest_before_their_instants() {
+        for (every, sum) in [(1, 1), (3, 1), (7, 7), (100, 73), (20, 7), (55, 7)] {
+            let instants = Instants::Frames { every, sum };
+            let frames: Vec<u64> = (0..40).map(|picture| instants.frame_of(picture)).collect();
+            for (picture, &frame) in (0..).zip(&frames) {
+                assert_eq!(instants.picture_of(frame), Some(picture), "{every} of {sum}");
+                let instant = picture * every;
+                assert!(frame * sum <= instant && instant < (frame + 1) * sum);
+            }
+            let between = (0..frames[39]).filter(|frame| !frames.contains(frame));
+            assert!(between.map(|frame| instants.picture_of(frame)).all(|none| none.is_none()));
         }
     }
 }

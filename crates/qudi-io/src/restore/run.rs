@@ -4,7 +4,7 @@ use super::instants::{Instants, Schedule};
 use crate::capture::Capture;
 use qudi_core::Frame;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
-use qudi_core::windows::{CrossFade, Windows};
+use qudi_core::windows::CrossFade;
 use qudi_core::{Error, Result};
 use std::collections::VecDeque;
 use std::ops::{ControlFlow, Range};
@@ -65,8 +65,8 @@ pub fn run(
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
     match schedule.instants {
-        Instants::Frames { step } => {
-            run_windows(restorer, capture, (schedule.windows, step), wanted, acquisition, sink, on)
+        Instants::Frames { .. } => {
+            run_windows(restorer, capture, schedule, wanted, acquisition, sink, on)
         }
         Instants::Centred { every } => {
             run_centred(restorer, capture, every, wanted, acquisition, sink, on)
@@ -114,35 +114,34 @@ fn run_centred(
     Ok(())
 }
 
-/// Windows one after the other, blended where they overlap, and every `step`-th of their frames.
+/// Windows one after the other, blended where they overlap, and those of their frames that become pictures.
 fn run_windows(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
-    (windows, step): (Windows, u64),
-    wanted: Range<u64>,
+    &Schedule { windows, instants }: &Schedule,
+    pictures: Range<u64>,
     acquisition: &Acquisition,
     sink: &mut dyn RestoreSink,
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
-    let pictures = wanted.clone();
-    let is_wanted = |frame: u64| frame.is_multiple_of(step) && pictures.contains(&(frame / step));
-    let wanted = wanted.start.saturating_mul(step)..wanted.end.saturating_mul(step);
+    let wanted = |frame| instants.picture_of(frame).filter(|picture| pictures.contains(picture));
+    let (first, end) = (instants.frame_of(pictures.start), instants.frame_of(pictures.end));
     let size = capture.size();
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
     let mut first_held = 0;
     let mut fade = CrossFade::default();
     let mut uncertainties = CrossFade::default();
-    for number in windows.first_with(wanted.start).. {
+    for number in windows.first_with(first).. {
         // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
         // the next one is whole, or no more frames come.
         let windows = windows.over(capture.wait_for(windows.nominal_end(number + 1))?);
-        if number >= windows.count() || windows.range(number).start >= wanted.end {
+        if number >= windows.count() || windows.range(number).start >= end {
             break;
         }
         let range = windows.range(number);
-        let total =
-            capture.length().map(|length| (wanted.end.min(length) - wanted.start).div_ceil(step));
-        if on(range.start.saturating_sub(wanted.start).div_ceil(step), total).is_break() {
+        let total = instants.pictures(capture).map(|all| pictures.end.min(all) - pictures.start);
+        let before = (first..range.start).filter_map(wanted).count() as u64;
+        if on(before, total).is_break() {
             return Err(Error::Interrupted);
         }
         if counts.is_empty() {
@@ -169,13 +168,13 @@ fn run_windows(
         let last = number + 1 == windows.count();
         let until = if last { range.end } else { windows.range(number + 1).start };
         while let Some((frame, image)) = fade.pop(until) {
-            if is_wanted(frame) {
-                sink.frame(frame / step, &image, &counts[(frame - first_held) as usize])?;
+            if let Some(picture) = wanted(frame) {
+                sink.frame(picture, &image, &counts[(frame - first_held) as usize])?;
             }
             if let Some((frame, uncertainty)) = uncertainties.pop(until)
-                && is_wanted(frame)
+                && let Some(picture) = wanted(frame)
             {
-                sink.uncertainty(frame / step, &uncertainty)?;
+                sink.uncertainty(picture, &uncertainty)?;
             }
         }
     }
