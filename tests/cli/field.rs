@@ -56,6 +56,38 @@ fn sums_frames_by_itself_and_says_why() {
         serde_json::from_str(&run(&folder, "info native.npy --sum 1 --json")).unwrap();
     assert_eq!(native["frames"], 220, "convert keeps frames unless asked");
     refused(&folder, "restore c.npy --sensor swissspad2 -o x.npy --sum 0", &["or auto"]);
+    run(&folder, "convert c.npy -o summed.npy --sum auto");
+    let summed: Value =
+        serde_json::from_str(&run(&folder, "info summed.npy --sum 1 --json")).unwrap();
+    assert_eq!((&summed["frames"], &summed["max_count"]), (&11.into(), &20.into()));
+    run(&folder, "convert c.npy -o threes.npy --sum 3");
+    let threes: Value = serde_json::from_str(&run(&folder, "info threes.npy --json")).unwrap();
+    assert_eq!(
+        (&threes["frames"], &threes["summed"]),
+        (&73.into(), &1.into()),
+        "a record settles it"
+    );
+    refused(&folder, "calibrate c.npy --sensor swissspad2 -o d.toml --sum auto", &["--sum"]);
+    std::fs::write(folder.join("deep.npy"), npy_bytes("|u1", "(3, 4, 4)", &[9; 48])).unwrap();
+    refused(
+        &folder,
+        "convert deep.npy -o x.npy --sum auto --pack-axis none",
+        &["--sum", "binary frames"],
+    );
+}
+
+#[test]
+fn pedestal_of_a_simulated_camera_is_subtracted_again() {
+    let folder = scratch("field-pedestal");
+    let simulate = "simulate scene:text --size 32x48 --frames 11 --bits 8 --gain 4 --seed 3 -o";
+    run(&folder, &format!("{simulate} plain.npy"));
+    run(&folder, &format!("{simulate} raised.npy --offset 20"));
+    let bytes = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    let (plain, raised) = (bytes("plain.npy"), bytes("raised.npy"));
+    let data = plain.len() - 11 * 32 * 48;
+    assert!(plain[data..].iter().zip(&raised[data..]).all(|(a, b)| a.saturating_add(20) == *b));
+    run(&folder, "convert raised.npy -o back.npy");
+    assert_eq!(bytes("back.npy")[data..], plain[data..]);
 }
 
 #[test]
@@ -175,6 +207,11 @@ fn pipes_are_converted() {
     run(&folder, "convert c.npy -o direct.npy");
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
     assert_eq!(read("piped.npy"), read("direct.npy"));
+    convert("-o auto.npy --sum auto", &bytes);
+    convert(
+        "-o plane.npy --format raw-bits --size 32x48 --cfa rggb --channel 3",
+        &bytes[bytes.len() - 22 * 32 * 6..],
+    );
     convert("-o raw.npy --format raw-bits --size 32x48", &bytes[bytes.len() - 22 * 32 * 6..]);
     assert_eq!(read("raw.npy"), read("direct.npy"));
 }

@@ -2,13 +2,13 @@
 
 mod network;
 pub(crate) mod number;
-mod reading;
+pub(crate) mod reading;
 mod shard;
 mod sum;
 pub(crate) mod tiff_samples;
 
 pub(crate) use network::Network;
-pub(crate) use reading::{AutoSum, Reading};
+pub(crate) use reading::Reading;
 pub(crate) use shard::Shard;
 pub(crate) use sum::Sum;
 

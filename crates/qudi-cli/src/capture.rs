@@ -3,13 +3,14 @@
 pub(crate) mod acquisition;
 pub(crate) mod warnings;
 
-use crate::args::AutoSum;
+use crate::args::Sum;
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::sensor::Sensor;
 use qudi_io::capture::{Capture, ReadOptions, SumChoice, choose_sum};
+use std::io::IsTerminal;
 use std::path::Path;
 
 /// The sensor that a record names, or the camera that the format belongs to.
@@ -71,43 +72,74 @@ pub(crate) struct OpenedCapture {
     pub(crate) sum: Option<SumChoice>,
 }
 
-/// Opens a capture as [`open_capture`] does; frames are summed as `auto` says. `None` opens standard input.
+/// Opens a capture as [`open_capture`] does. Frames are summed as `sum` says; if it says nothing, the capture
+/// chooses, unless a record beside it names its sensor or holds sums already. `None` opens standard input,
+/// whose frames are not held back unasked.
 pub(crate) fn open_summed(
     path: Option<&Path>,
     options: &ReadOptions,
-    auto: AutoSum,
+    sum: Option<Sum>,
     sensor: Option<&str>,
     settings: &Settings,
 ) -> Result<OpenedCapture> {
-    let (mut capture, sensor) = if let Some(path) = path {
+    let (capture, sensor) = if let Some(path) = path {
         open_capture(path, options, sensor, settings)?
     } else {
         let named = sensor.map(|name| settings.sensor(name)).transpose()?;
-        let mut capture = Capture::from_pipe(std::io::stdin(), options, named.as_ref())?;
-        // Frames that are restored as they come are not held back unasked.
-        if auto == AutoSum::Asked {
-            capture.wait_for(PIPED)?;
-        }
+        let capture = Capture::from_pipe(std::io::stdin(), options, named.as_ref())?;
         let known = named.or(known_sensor(&capture)?);
         (capture, known.map(|sensor| settings.adjusted(sensor)).transpose()?)
     };
-    let settled = capture.info().sensor.is_some();
-    let open = auto == AutoSum::Open && !settled && path.is_some();
-    let wanted = auto == AutoSum::Asked || open;
-    let sum = if wanted { choose_sum(&mut capture)? } else { None };
-    if auto == AutoSum::Asked && sum.is_none() {
-        return Err(CliError::new(
+    let about = capture.info();
+    let recorded = about.sensor.is_some() || about.is_recorded() && about.max_count != Some(1);
+    let chooses = sum.is_none() && !recorded && path.is_some();
+    let sum = if chooses { Some(Sum::Auto) } else { sum };
+    let of_sensor = sensor.as_ref();
+    let (capture, choice) = match sum {
+        Some(Sum::Auto) => sum_by_itself(capture, options, of_sensor, !chooses)?,
+        Some(Sum::Frames(_)) | None => (capture, None),
+    };
+    Ok(OpenedCapture { capture, sensor, sum: choice })
+}
+
+/// The capture with as many frames summed as it chooses, and why, if it sums any. Where it cannot choose and is
+/// `asked` to, it is refused.
+pub(crate) fn sum_by_itself(
+    mut capture: Capture,
+    options: &ReadOptions,
+    sensor: Option<&Sensor>,
+    asked: bool,
+) -> Result<(Capture, Option<SumChoice>)> {
+    // A pipe shows what has come through it.
+    capture.wait_for(PIPED)?;
+    match choose_sum(&mut capture)? {
+        Some(choice) if choice.frames > 1 => {
+            Ok((capture.summed_by(choice.frames, options, sensor)?, Some(choice)))
+        }
+        None if asked => Err(CliError::new(
             "sums are chosen for binary frames whose light is known",
             "--sum",
             "leave it out; say the depth with --bits 1 if these are binary frames",
-        ));
+        )),
+        _ => Ok((capture, None)),
     }
-    let sum = sum.filter(|choice| choice.frames > 1);
-    if let Some(choice) = &sum {
-        let of_sensor = sensor.as_ref();
-        capture = capture.summed_by(choice.frames, options, of_sensor)?;
+}
+
+/// Whether a path stands for standard input.
+pub(crate) fn is_pipe(path: &Path) -> bool {
+    path.as_os_str() == "-"
+}
+
+/// Refuses to wait for a capture from a terminal; `example` is a command that pipes one in.
+pub(crate) fn refuse_terminal(example: &str) -> Result<()> {
+    if !std::io::stdin().is_terminal() {
+        return Ok(());
     }
-    Ok(OpenedCapture { capture, sensor, sum })
+    Err(CliError::new(
+        "standard input is a terminal, and a capture comes through a pipe",
+        "-",
+        format!("pipe one in, as in `{example}`, or name a file"),
+    ))
 }
 
 /// Frames of a pipe that are waited for before it is said how many are summed.
@@ -132,12 +164,7 @@ pub(crate) fn describe_sum(
 
 /// Says on standard error what the user should know about a capture.
 pub(crate) fn remarks(capture: &Capture, report: &Report) {
-    let mut said: Vec<&String> = Vec::new();
     for remark in &capture.info().notes {
-        if said.contains(&remark) {
-            continue;
-        }
-        said.push(remark);
         report.remark(&format!("note: {}", flags_in_text(remark)));
     }
 }

@@ -5,6 +5,7 @@
 
 mod console;
 pub(crate) mod csv;
+mod duration;
 pub(crate) mod html;
 pub(crate) mod json;
 pub(crate) mod markdown;
@@ -14,6 +15,7 @@ pub(crate) mod svg;
 mod table;
 
 pub(crate) use console::{Bar, Report, print};
+pub(crate) use duration::duration;
 pub(crate) use output::Output;
 pub(crate) use printable::printable;
 pub(crate) use table::{Cell, Column, Table};

@@ -62,6 +62,19 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// The frame with white, 1, at its 99.5th percentile; what is brighter is clipped.
+    #[must_use]
+    pub fn with_white_at_highlights(mut self) -> Self {
+        let mut sorted = self.data.clone();
+        sorted.sort_by(f32::total_cmp);
+        let at = sorted.len().saturating_sub(1) * 995 / 1000;
+        let white = sorted.get(at).copied().unwrap_or(1.0).max(f32::MIN_POSITIVE);
+        for value in &mut self.data {
+            *value = (*value / white).min(1.0);
+        }
+        self
+    }
+
     /// A frame of one value.
     pub fn filled(size: Size, value: f32) -> Self {
         Self { size, data: vec![value; size.pixels()] }

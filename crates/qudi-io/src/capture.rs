@@ -167,7 +167,7 @@ fn check_sum(sum: u32, frames: u64, info: &CaptureInfo) -> Result<()> {
 fn depth_source(options: &ReadOptions, info: &CaptureInfo) -> &'static str {
     if options.levels.is_some() {
         "`levels`"
-    } else if info.reasons.iter().any(|reason| reason == codec::RECORD) {
+    } else if info.is_recorded() {
         "the record beside it"
     } else if options.bits.is_some() {
         "`bits`"
@@ -184,11 +184,13 @@ impl Capture {
     /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
         let options = &with_pedestal(options, sensor);
-        let (mut native, mut info) = codec::open(path, options)?;
-        let known = with_pedestal(options, info.sensor.as_ref());
-        let options = if known == *options { options } else { &known };
-        if info.sensor.as_ref().is_some_and(|sensor| sensor.offset > 0.0) {
-            (native, info) = codec::open(path, options)?;
+        let (native, info) = codec::open(path, options)?;
+        // A record beside the file may name a sensor with a pedestal; its counts were taken above it.
+        let recorded = info.sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
+        if recorded > 0.0 && options.offset.is_none() && options.threshold.is_none() {
+            let options = ReadOptions { offset: Some(recorded), ..options.clone() };
+            let (native, info) = codec::open(path, &options)?;
+            return Self::assemble(path, native, info, &options, sensor);
         }
         Self::assemble(path, native, info, options, sensor)
     }
@@ -277,9 +279,8 @@ impl Capture {
     ) -> Result<Self> {
         check_sum(sum, self.native_frames(), &self.info)?;
         self.sum = sum;
-        let window = FIRST_WINDOW.saturating_mul(sum.into());
         self.complete = false;
-        self.wait_for(window / u64::from(sum))?;
+        self.wait_for(FIRST_WINDOW)?;
         pixel_map::plan(&mut self, options, sensor)?;
         Ok(self)
     }

@@ -122,13 +122,9 @@ fn open_as(
     options: &ReadOptions,
     mut info: CaptureInfo,
 ) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
-    // The channel of a mosaic is one of its planes, whatever the container.
-    let mut container = options.clone();
-    if options.cfa.is_some() {
-        container.channel = None;
-    }
-    refuse_others(&container, format.options, format.name)?;
-    let frames = (format.open)(probe, &container, &mut info)?;
+    let options = &options.of_container(options.cfa.is_some());
+    refuse_others(options, format.options, format.name)?;
+    let frames = (format.open)(probe, options, &mut info)?;
     info.notes.extend(probe.note_on_skipped());
     Ok((frames, info))
 }

@@ -10,17 +10,6 @@ use qudi_io::capture::{
 use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 
-/// Whether the capture tells how many of its frames are summed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum AutoSum {
-    /// It is asked for.
-    Asked,
-    /// Where no record settles it.
-    Open,
-    /// A number is given.
-    No,
-}
-
 /// What the user says about a capture that its file does not.
 #[derive(Clone, Debug, ClapArgs)]
 #[group(skip)]
@@ -99,13 +88,9 @@ pub(crate) struct Reading {
 }
 
 impl Reading {
-    /// Whether the capture shall tell how many frames are summed: asked for, or left open.
-    pub(crate) fn auto_sum(&self) -> AutoSum {
-        match self.sum {
-            Some(Sum::Auto) => AutoSum::Asked,
-            Some(Sum::Frames(_)) => AutoSum::No,
-            None => AutoSum::Open,
-        }
+    /// How many frames are summed, if that is said.
+    pub(crate) fn sum(&self) -> Option<Sum> {
+        self.sum
     }
 
     /// Files that are read besides the capture.
@@ -154,7 +139,7 @@ impl Reading {
 }
 
 /// One of some words, read as the type that serde names so.
-fn words<T: DeserializeOwned + Clone + Send + Sync + 'static>(
+pub(crate) fn words<T: DeserializeOwned + Clone + Send + Sync + 'static>(
     all: &'static [&'static str],
 ) -> impl TypedValueParser<Value = T> {
     PossibleValuesParser::new(all)

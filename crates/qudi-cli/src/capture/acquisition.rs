@@ -20,21 +20,28 @@ pub(crate) struct LightOverrides {
     pub(crate) seed: u64,
 }
 
-/// The acquisition of a capture, and where its light comes from.
+impl LightOverrides {
+    /// The gain that is given, or that of the record.
+    pub(crate) fn known_gain(&self, capture: &Capture) -> Option<f64> {
+        self.gain.or(capture.info().gain)
+    }
+}
+
+/// The acquisition of a capture, of which `summary` was measured with the known gain, and where its light comes from.
 pub(crate) fn acquisition(
     overrides: &LightOverrides,
     capture: &mut Capture,
     sensor: &Sensor,
+    summary: &Summary,
 ) -> Result<(Acquisition, &'static str)> {
     checked_mean_level(overrides.mean_level)?;
     let of_frames = capture.output_sensor(sensor)?;
     let recorded = capture.info().ppp.map(|ppp| ppp * f64::from(capture.summed()));
-    let known_gain = overrides.gain.or(capture.info().gain);
+    let known_gain = overrides.known_gain(capture);
     let (ppp, source) = match (overrides.ppp, recorded) {
         (Some(ppp), _) => (ppp, "given"),
         (None, Some(ppp)) => (ppp, "from the record"),
         (None, None) => {
-            let summary = Summary::measure(capture, Some(sensor), known_gain)?;
             let ppp = summary.ppp.incident.ok_or_else(|| {
                 CliError::new(
                     format!(
@@ -70,12 +77,10 @@ pub(crate) fn acquisition(
         gain,
         dark,
     };
-    acquisition.mean_level = match overrides.mean_level {
+    // That of the record, so that what is restored has the brightness of the clip.
+    let recorded = capture.info().mean_level.filter(|_| overrides.ppp.is_none());
+    acquisition.mean_level = match overrides.mean_level.or(recorded) {
         Some(mean_level) => mean_level,
-        // So that what is restored has the brightness of the clip.
-        None if overrides.ppp.is_none() && capture.info().mean_level.is_some() => {
-            capture.info().mean_level.unwrap_or(USUAL_MEAN_LEVEL)
-        }
         None => mean_level_of(capture, &acquisition)?,
     };
     Ok((acquisition, source))

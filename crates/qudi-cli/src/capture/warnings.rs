@@ -18,30 +18,21 @@ const BAD: f64 = 0.01;
 /// How far the light of a record and that of the counts may differ.
 const LIGHT: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
-/// Warnings on a capture itself; `sensor` is that of native frames.
-pub(crate) fn of_capture(
-    capture: &Capture,
-    summary: &Summary,
-    sensor: Option<&Sensor>,
-) -> Vec<String> {
+/// Warnings on a capture itself.
+pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
     let mut warnings = Vec::new();
-    if let Some(text) = saturation(capture, summary) {
-        warnings.push(text);
-    }
+    warnings.extend(saturation(capture, summary));
     let bad = capture.bad_pixels();
-    let pixels = capture.size().pixels() as f64;
-    let doubtful = bad.doubtful;
-    let share = (bad.len() + doubtful) as f64 / pixels;
+    let share = (bad.len() + bad.doubtful) as f64 / capture.size().pixels() as f64;
     if share > BAD {
         warnings.push(format!(
-            "{} pixels ({:.2} %) are repaired and {doubtful} more in clumps are doubtful, hot or small bright things: name those of the camera with --mask FILE or --dcr FILE",
+            "{} pixels are repaired, and {} more in clumps are doubtful, hot or small bright things ({:.2} % in all): name those of the camera with --mask FILE or --dcr FILE",
             bad.len(),
+            bad.doubtful,
             100.0 * share
         ));
     }
-    if let (Some(recorded), Some(found), Some(_)) =
-        (capture.info().ppp, summary.ppp.incident, sensor)
-    {
+    if let (Some(recorded), Some(found)) = (capture.info().ppp, summary.ppp.incident) {
         let recorded = recorded * f64::from(capture.summed());
         if !LIGHT.contains(&(found / recorded)) {
             warnings.push(format!(
@@ -52,17 +43,19 @@ pub(crate) fn of_capture(
     warnings
 }
 
-/// Whether too many samples are at their largest value.
+/// Whether too many samples are at their largest value. A single bit is there as often as it is set.
 fn saturation(capture: &Capture, summary: &Summary) -> Option<String> {
     let max = capture.max_count()?;
-    let ones = summary.mean / f64::from(max);
+    let binary = capture.info().binary;
+    let range = summary.mean / f64::from(max);
     let saturated = summary.saturated.unwrap_or(0.0);
-    let much = if capture.info().binary { ones > ONES } else { saturated > SATURATED };
-    (much || capture.info().binary && max > 1 && saturated > SATURATED).then(|| {
+    let single_bits = binary && max == 1;
+    let much = saturated > SATURATED && !single_bits || range > ONES && binary;
+    much.then(|| {
         format!(
             "{:.1} % of the samples are saturated ({:.1} % of the range on average): bright parts are lower bounds; expose shorter, or weaken the light",
             100.0 * saturated,
-            100.0 * ones
+            100.0 * range
         )
     })
 }

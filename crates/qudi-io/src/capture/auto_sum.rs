@@ -12,16 +12,13 @@ use serde::Serialize;
 const ENOUGH: f64 = 20.0;
 
 /// Noise falls with a power of the light and blur grows with one of the motion, so that the best sum is
-/// `FACTOR * motion^-0.6 * detections^-0.4` frames. Fitted to simulated captures (docs/notes/sums.md).
+/// `FACTOR * motion^-0.6 * detections^-0.4` frames. Fitted to simulated captures (docs/notes/burst/sums.md).
 const FACTOR: f64 = 0.455;
 const MOTION_POWER: f64 = -0.6;
 const LIGHT_POWER: f64 = -0.4;
 
 /// Sums that methods restore together.
 const WINDOW: u64 = 11;
-
-/// Frames whose counts saturate above this rate hold no more light if they are summed.
-const LARGEST_SUM: u64 = 65_535;
 
 /// Places of the capture that are looked at.
 const PLACES: u64 = 6;
@@ -106,7 +103,8 @@ pub fn choose_sum(capture: &mut Capture) -> Result<Option<SumChoice>> {
     } else {
         SumLimit::Motion
     };
-    let largest = (LARGEST_SUM / u64::from(max_count)) as f64;
+    // Sums are held in 16 bits.
+    let largest = f64::from(u16::MAX / max_count);
     let frames = most.clamp(1.0, largest) as u32;
     Ok(Some(SumChoice { frames, detections, motion, still, limit }))
 }
@@ -172,8 +170,7 @@ impl Look<'_> {
         let mut tiles = Vec::new();
         let mut gradient = 0.0;
         for place in 0..places {
-            let first = room * place / places.max(2).saturating_sub(1).max(1);
-            let first = first.min(room);
+            let first = room * place / (places - 1).max(1);
             for (half, sums) in sums.iter_mut().enumerate() {
                 let start = first + half as u64 * length;
                 self.capture.total(start..(start + length).min(frames), sums)?;

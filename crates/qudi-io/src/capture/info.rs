@@ -80,6 +80,11 @@ pub struct Packing {
 }
 
 impl CaptureInfo {
+    /// Whether a record beside the file describes it.
+    pub fn is_recorded(&self) -> bool {
+        self.reasons.iter().any(|reason| reason == crate::codec::RECORD)
+    }
+
     /// A description with nothing but names; the rest is filled in by the format.
     pub(crate) fn new(format: &'static str, title: &'static str) -> Self {
         Self {

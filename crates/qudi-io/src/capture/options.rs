@@ -61,6 +61,15 @@ pub struct ReadOptions {
     pub lenient: bool,
 }
 
+impl ReadOptions {
+    /// The options of a container: behind a mosaic, the channel is one of its planes and none of an array's
+    /// axes.
+    pub(crate) fn of_container(&self, mosaic: bool) -> Self {
+        let channel = self.channel.filter(|_| !mosaic);
+        Self { channel, ..self.clone() }
+    }
+}
+
 /// Which pixel of a packed byte comes first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -169,6 +178,20 @@ impl Axes {
             Self::Htw | Self::Wth => 1,
             Self::Hwt | Self::Wht => 2,
         }
+    }
+
+    /// Rows and columns of a frame of an array with these extents, and the product of the extents before the
+    /// frame axis, of that axis, and after it.
+    pub(crate) fn split(self, dims: [usize; 3]) -> ([usize; 2], [usize; 3]) {
+        let at = self.frame_position();
+        let product = |part: &[usize]| part.iter().fold(1, |n: usize, &d| n.saturating_mul(d));
+        let layout = [product(&dims[..at]), dims[at], product(&dims[at + 1..])];
+        let [slow, fast] = match at {
+            0 => [dims[1], dims[2]],
+            1 => [dims[0], dims[2]],
+            _ => [dims[0], dims[1]],
+        };
+        (if self.transposed() { [fast, slow] } else { [slow, fast] }, layout)
     }
 
     /// Whether columns are slower than rows.

@@ -1,6 +1,7 @@
 //! Which pixels of a capture are bad, and how dark each one is: from files, or from the capture.
 
 use super::Capture;
+use super::info::CaptureInfo;
 use super::options::{MaskChoice, ReadOptions};
 use crate::codec::read_mat_map;
 use qudi_core::Frame;
@@ -43,14 +44,10 @@ pub(crate) fn plan(
         let rates = load(capture, path)?;
         let hot = (0..rates.data.len()).filter(|&i| rates.data[i] > HOT_PER_SECOND).collect();
         named = Some(BadPixels { hot, ..BadPixels::default() });
-        match capture.info.fps.or(sensor.and_then(|sensor| sensor.fps)) {
-            Some(fps) => {
-                capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
-            }
-            None => capture.info.notes.push(
-                "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a `sensor` knows its rate)"
-                    .to_owned(),
-            ),
+        if let Some(fps) = capture.info.fps.or(sensor.and_then(|sensor| sensor.fps)) {
+            capture.dark = Some(rates.data.iter().map(|rate| rate / fps as f32).collect());
+        } else {
+            note_unknown_rate(&mut capture.info);
         }
     }
     capture.bad = match (&options.mask, named) {
@@ -69,6 +66,14 @@ pub(crate) fn plan(
         ));
     }
     Ok(())
+}
+
+/// Notes once that dark rates are not subtracted: maps are planned anew where frames are summed.
+fn note_unknown_rate(info: &mut CaptureInfo) {
+    let note = "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a `sensor` knows its rate)";
+    if !info.notes.iter().any(|earlier| earlier == note) {
+        info.notes.push(note.to_owned());
+    }
 }
 
 /// Looks for hot and dead pixels in the capture itself.

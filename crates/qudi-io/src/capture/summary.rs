@@ -109,7 +109,7 @@ impl Summary {
     pub fn picture(&self, capture: &Capture, sensor: Option<&Sensor>, gain: Option<f64>) -> Frame {
         let size = capture.size();
         let frames = self.sampled as u32 * capture.sum;
-        let mut data = match native_sensor(capture, sensor) {
+        let data = match native_sensor(capture, sensor) {
             Some(sensor) => {
                 let gain = gain.or(sensor.fixed_gain()).unwrap_or(1.0);
                 let dark = sensor.dark_per_frame().unwrap_or(0.0);
@@ -122,13 +122,7 @@ impl Summary {
             }
             None => self.sums.iter().map(|&sum| sum as f32).collect::<Vec<_>>(),
         };
-        let mut sorted = data.clone();
-        sorted.sort_by(f32::total_cmp);
-        let white = sorted[(sorted.len() - 1) * 995 / 1000].max(f32::MIN_POSITIVE);
-        for value in &mut data {
-            *value = (*value / white).min(1.0);
-        }
-        Frame { size, data }
+        Frame { size, data }.with_white_at_highlights()
     }
 }
 

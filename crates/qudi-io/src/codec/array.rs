@@ -106,9 +106,7 @@ impl Array {
             Colours::Volumes(_) => (MONO, 1),
         };
         let frames = dims[at];
-        let mut rest = dims.iter().enumerate().filter(|(i, _)| *i != at).map(|(_, &d)| d);
-        let (slow, fast) = (rest.next().unwrap_or(1), rest.next().unwrap_or(1));
-        let (rows, columns) = if axes.transposed() { (fast, slow) } else { (slow, fast) };
+        let ([rows, columns], layout) = axes.split(dims);
         if frames == 0 {
             return Err(self.fault("the array holds no frames", "save at least one frame"));
         }
@@ -129,7 +127,7 @@ impl Array {
             self.scale(options, info, &sample_bytes)?
         };
         let (path, sample) = (self.path.clone(), self.sample);
-        let mut bytes = self.bytes(axes, dims, [channel.of, frame_bytes], options, info)?;
+        let mut bytes = self.bytes(at, layout, [channel.of, frame_bytes], options, info)?;
         if planes > 1 {
             bytes = bytes.part_of_frames(index * plane_bytes, plane_bytes);
         }
@@ -349,14 +347,13 @@ impl Array {
 
     fn bytes(
         self,
-        axes: Axes,
-        dims: [usize; 3],
+        at: usize,
+        layout: [usize; 3],
         [channels, frame_bytes]: [usize; 2],
         options: &ReadOptions,
         info: &mut CaptureInfo,
     ) -> Result<FrameBytes> {
-        let at = axes.frame_position();
-        let frames = dims[at] as u64;
+        let frames = layout[1] as u64;
         let promised = frames.checked_mul(frame_bytes as u64);
         let available = match &self.place {
             Place::File { available, .. } | Place::Spool { available, .. } => *available,
@@ -387,8 +384,7 @@ impl Array {
             }
             info.notes.push(format!("truncated: {} of {frames} frames dropped", frames - whole));
         }
-        let (outer, inner) = (dims[..at].iter().product(), dims[at + 1..].iter().product());
-        let (layout, element) = ([outer, dims[at], inner], self.sample.bytes() * channels);
+        let element = self.sample.bytes() * channels;
         Ok(match self.place {
             Place::File { start, checksum, .. } if at == 0 => {
                 let segment = Segment { path: self.path, start, frames: whole };

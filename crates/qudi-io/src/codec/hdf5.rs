@@ -88,7 +88,7 @@ fn open(
         }
         let shape = vec![checked.len(), shape[0], shape[1]];
         return numbered_frames(file, checked, sample, shape, path).open(
-            &gray(options, info),
+            &options.of_container(info.cfa.is_some()),
             &Hints::default(),
             info,
         );
@@ -113,13 +113,7 @@ fn open(
         axes: if matlab { Axes::Twh } else { Axes::Thw },
         place: Place::Fetch { fetch: Box::new(fetch), group },
     };
-    array.open(&gray(options, info), &Hints::default(), info)
-}
-
-/// Options for the array itself: the channel of a mosaic is none of its axes.
-fn gray(options: &ReadOptions, info: &CaptureInfo) -> ReadOptions {
-    let channel = options.channel.filter(|_| info.cfa.is_none());
-    ReadOptions { channel, ..options.clone() }
+    array.open(&options.of_container(info.cfa.is_some()), &Hints::default(), info)
 }
 
 fn damaged(e: &str, path: &Path) -> Error {

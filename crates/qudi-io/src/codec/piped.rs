@@ -37,6 +37,7 @@ pub(crate) fn open_pipe(
     options: &ReadOptions,
 ) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
     let place = Path::new(STDIN);
+    let options = &options.of_container(options.cfa.is_some());
     if options.frames_per_file.is_some() {
         return Err(Error::request(
             "a pipe has no files to count frames in",
@@ -53,11 +54,6 @@ pub(crate) fn open_pipe(
             ))
         });
     }
-    let mut container = options.clone();
-    if options.cfa.is_some() {
-        container.channel = None;
-    }
-    let options = &container;
     refuse_others(options, super::ARRAY, "npy")?;
     let mut start = Vec::new();
     (&mut reader).take(MAGIC).read_to_end(&mut start).map_err(|e| Error::io("read", place, e))?;

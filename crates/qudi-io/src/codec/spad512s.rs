@@ -31,7 +31,7 @@ const COUNTS: &[FormatOption] = &[
     FormatOption::FramesPerFile,
 ];
 
-/// Bytes from which the width of rows is told.
+/// Bytes that show the width of rows.
 const LOOKED_AT: u64 = 1 << 20;
 
 /// The whole array; narrower read-outs show by their rows, or are given with `size`.

@@ -21,7 +21,7 @@ pub(crate) const FORMAT: Format = Format {
         if !probe.is_folder && !probe.has_extension(&["bin", "raw"]) {
             return Ok(None);
         }
-        let Some(first) = probe.files(&["bin", "raw"])?.into_iter().next() else {
+        let Some(first) = probe.files(&["bin"])?.into_iter().next() else {
             return Ok(None);
         };
         let length = std::fs::metadata(&first).map_err(|e| Error::io("open", &first, e))?.len();
@@ -66,7 +66,7 @@ fn open(
     info.max_count = Some(1);
     info.vendor = Orientation::Rot90;
     info.orient = Orientation::Vendor;
-    let files = probe.files(&["bin", "raw"])?;
+    let files = probe.files(&["bin"])?;
     if let [path] = files.as_slice() {
         return Ok(Box::new(open_file(path, size, options, info)?));
     }

@@ -1,7 +1,7 @@
 //! Frames of a stack whose pages are not its frames: rows or columns of all pages together.
 
 use super::count_frames::CountFrames;
-use super::frame_bytes::{FrameBytes, strewn};
+use super::frame_bytes::strewn;
 use super::samples::{MONO, SampleFrames, Scale};
 use crate::capture::options::Axes;
 use qudi_core::npy::Sample;
@@ -33,14 +33,10 @@ pub(crate) fn reordered(
     }
     let file = file.into_inner().map_err(|e| io(e.into_error()))?;
     let dims = [pages as usize, page.height, page.width];
-    let at = axes.frame_position();
-    let mut rest = dims.iter().enumerate().filter(|(axis, _)| *axis != at).map(|(_, &d)| d);
-    let (slow, fast) = (rest.next().unwrap_or(1), rest.next().unwrap_or(1));
-    let (height, width) = if axes.transposed() { (fast, slow) } else { (slow, fast) };
+    let ([height, width], layout) = axes.split(dims);
     let size = Size::new(height, width, &path.display().to_string())?;
-    let layout = [dims[..at].iter().product(), dims[at], dims[at + 1..].iter().product()];
-    let bytes: FrameBytes = strewn(path, Some(file), 0, 2, layout);
+    let bytes = strewn(path, Some(file), 0, 2, layout);
     let sample = Sample::U16 { big_endian: false };
-    let transposed = axes.transposed();
-    Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, Scale::Counts, path)))
+    let (transposed, scale) = (axes.transposed(), Scale::Counts);
+    Ok(Box::new(SampleFrames::new(bytes, sample, size, transposed, MONO, scale, path)))
 }

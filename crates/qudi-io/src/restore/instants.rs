@@ -3,14 +3,12 @@
 use crate::capture::Capture;
 use qudi_core::windows::Windows;
 use qudi_core::{Error, Result};
-use serde::Serialize;
 
 /// Sums between pictures from which on a window of its own costs no more than windows that follow each other.
 const APART: u64 = 8;
 
 /// The pictures that are made of a capture.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Instants {
     /// The output frame nearest before every so many native frames.
     Frames {
@@ -82,9 +80,16 @@ impl Instants {
 
     /// The picture that output frame `frame` becomes, if it becomes one.
     pub(super) fn picture_of(self, frame: u64) -> Option<u64> {
-        let Self::Frames { every, sum } = self else { return Some(frame) };
-        let picture = frame.saturating_mul(sum).div_ceil(every);
+        let picture = self.pictures_before(frame);
         (self.frame_of(picture) == frame).then_some(picture)
+    }
+
+    /// Pictures that lie before output frame `frame`, where pictures are output frames.
+    pub(super) fn pictures_before(self, frame: u64) -> u64 {
+        match self {
+            Self::Frames { every, sum } => frame.saturating_mul(sum).div_ceil(every),
+            Self::Centred { .. } => frame,
+        }
     }
 
     /// The native frame that the sum of `sum` frames of a picture begins with.
@@ -95,12 +100,10 @@ impl Instants {
         }
     }
 
-    /// Pictures of `frames` output frames, or of a capture of `native` frames summed by `sum`.
+    /// The number of pictures of `capture`; `None` as long as the length of a pipe is unknown.
     pub fn pictures(self, capture: &Capture) -> Option<u64> {
         match self {
-            Self::Frames { every, sum } => {
-                capture.length().map(|frames| frames.saturating_mul(sum).div_ceil(every))
-            }
+            Self::Frames { .. } => capture.length().map(|frames| self.pictures_before(frames)),
             Self::Centred { every } => {
                 let sum = u64::from(capture.summed());
                 Some((capture.native_frames() - sum) / every + 1)

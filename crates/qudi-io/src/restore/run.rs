@@ -140,8 +140,8 @@ fn run_windows(
         }
         let range = windows.range(number);
         let total = instants.pictures(capture).map(|all| pictures.end.min(all) - pictures.start);
-        let before = (first..range.start).filter_map(wanted).count() as u64;
-        if on(before, total).is_break() {
+        let done = instants.pictures_before(range.start).saturating_sub(pictures.start);
+        if on(done, total).is_break() {
             return Err(Error::Interrupted);
         }
         if counts.is_empty() {

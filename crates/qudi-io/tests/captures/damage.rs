@@ -2,7 +2,7 @@
 
 use crate::{counts, npy, open, plain, refusal, scene, scratch, write};
 use qudi_core::{Frame, Size};
-use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_io::capture::{Axes, Capture, MaskChoice, ReadOptions};
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use zip::write::SimpleFileOptions;
@@ -251,4 +251,22 @@ fn overwrites_folders_of_own_files_only() {
     std::fs::write(path.join("notes.tex"), "mine").unwrap();
     assert!(save().unwrap_err().to_string().contains("`notes.tex`"));
     assert!(path.join("notes.tex").is_file() && path.join("frame_000000.png").is_file());
+}
+
+/// Extents of colour captures whose product no number holds, and folders without a file of the sparse stream.
+#[test]
+fn rejects_impossible_colour_arrays_and_reads_folders_of_raw_files() {
+    let folder = scratch();
+    let huge = "(4611686018427387904, 4611686018427387904, 3, 2)";
+    for (fortran, axes) in [("True", Axes::Thw), ("True", Axes::Hwt), ("False", Axes::Hwt)] {
+        let path = write(folder.path(), "huge.npy", &npy("|u1", fortran, huge, &[1; 64]));
+        for channel in [0, 1] {
+            let options = ReadOptions { axes: Some(axes), channel: Some(channel), ..plain() };
+            assert!(open(&path, &options).is_err());
+        }
+    }
+    write(folder.path(), "raw/frames.raw", &[1; 48]);
+    let options = ReadOptions { format: None, size: Some("4x4".parse().unwrap()), ..plain() };
+    let words = refusal(open(&folder.path().join("raw"), &options));
+    assert!(words.contains("no capture in a known format"), "{words}");
 }

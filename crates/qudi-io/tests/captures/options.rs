@@ -99,6 +99,12 @@ fn rejects_options_that_a_format_does_not_take_by_name() {
     }
 }
 
+/// Options that name the format, and what its file needs to be read at all.
+fn base(format: &str) -> ReadOptions {
+    let size = format.starts_with("raw").then(|| "16x24".parse().unwrap());
+    ReadOptions { format: Some(format.to_owned()), size, ..plain() }
+}
+
 /// What options make of a capture: all counts of its first frame and what is known, or the refusal.
 fn outcome(path: &Path, options: &ReadOptions) -> String {
     let read = || -> qudi_core::Result<String> {
@@ -117,15 +123,10 @@ fn applies_options_that_a_format_takes() {
     let folder = scratch();
     for format in FORMATS {
         let Some(path) = file(format.name, folder.path()) else { continue };
-        let raw = format.name.starts_with("raw");
-        let base = ReadOptions {
-            format: Some(format.name.to_owned()),
-            size: raw.then(|| "16x24".parse().unwrap()),
-            ..plain()
-        };
+        let base = base(format.name);
         let usual = outcome(&path, &base);
         for &option in format.options {
-            // Of zeros, neither the order of bits nor a pedestal can be told.
+            // Zeros show neither the order of bits nor a pedestal.
             let of_values = [FormatOption::BitOrder, FormatOption::Offset];
             let zeros = path.ends_with("zeros.bin") && of_values.contains(&option);
             let implied = format.name == "raw-bits" && option == FormatOption::PackAxis;
@@ -151,12 +152,7 @@ fn applies_options_of_all_captures_to_every_format() {
     };
     for format in FORMATS {
         let Some(path) = file(format.name, folder.path()) else { continue };
-        let raw = format.name.starts_with("raw");
-        let base = ReadOptions {
-            format: Some(format.name.to_owned()),
-            size: raw.then(|| "16x24".parse().unwrap()),
-            ..plain()
-        };
+        let base = base(format.name);
         let usual = outcome(&path, &base);
         let size = Capture::open(&path, &base, None).unwrap().size();
         let mask = map("mask.npy", size, &|i| f32::from(i == size.width + 1));

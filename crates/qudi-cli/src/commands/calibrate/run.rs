@@ -1,7 +1,7 @@
 //! `qudi calibrate`: a dark capture into a sensor file with maps.
 
 use super::args::Calibrate;
-use crate::args::Global;
+use crate::args::{Global, Sum};
 use crate::capture::{remarks, required_sensor};
 use crate::error::{CliError, Result};
 use crate::interrupt;
@@ -41,6 +41,13 @@ pub(crate) fn run(
         .check()?;
     for path in maps.iter().chain([&args.output]) {
         refuse_taken(path, overwrite)?;
+    }
+    if args.reading.sum() == Some(Sum::Auto) {
+        return Err(CliError::new(
+            "a dark capture does not say how many frames to sum",
+            "--sum",
+            "leave it out, or give a number",
+        ));
     }
     let mut capture = Capture::open(&args.capture, &args.reading.options(MaskChoice::None), None)?;
     let (base, sensor) = base_sensor(args, settings, &capture)?;

@@ -23,10 +23,3 @@ pub(crate) struct Convert {
     #[command(flatten)]
     pub(crate) reading: Reading,
 }
-
-impl Convert {
-    /// Whether the capture comes through standard input.
-    pub(crate) fn reads_pipe(&self) -> bool {
-        self.capture.as_os_str() == "-"
-    }
-}

@@ -1,19 +1,18 @@
 //! `qudi convert`: any capture into a format that everything reads.
 
 use super::args::Convert;
-use crate::args::{AutoSum, Global};
-use crate::capture::remarks;
+use crate::args::{Global, Sum};
+use crate::capture::{is_pipe, refuse_terminal, remarks, sum_by_itself};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::places::Places;
 use crate::report::{Bar, Report};
 use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
-use qudi_io::capture::{Capture, MaskChoice, ReadOptions, choose_sum};
+use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
 use qudi_io::writer::{BurstFormat, BurstWriter};
 use serde_json::Value;
-use std::io::IsTerminal;
 use std::path::Path;
 
 pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
@@ -78,23 +77,16 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
 
 /// The capture, from a file or a pipe, summed as asked.
 fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
-    if args.reads_pipe() {
-        if std::io::stdin().is_terminal() {
-            return Err(CliError::new(
-                "standard input is a terminal, and a capture comes through a pipe",
-                "-",
-                "pipe one in, as in `cat burst.npy | qudi convert - -o out.tif`, or name a file",
-            ));
-        }
-        return Ok(Capture::from_pipe(std::io::stdin(), options, None)?);
+    let capture = if is_pipe(&args.capture) {
+        refuse_terminal("cat burst.npy | qudi convert - -o out.tif")?;
+        Capture::from_pipe(std::io::stdin(), options, None)?
+    } else {
+        Capture::open(&args.capture, options, None)?
+    };
+    match args.reading.sum() {
+        Some(Sum::Auto) => Ok(sum_by_itself(capture, options, None, true)?.0),
+        Some(Sum::Frames(_)) | None => Ok(capture),
     }
-    let mut capture = Capture::open(&args.capture, options, None)?;
-    if args.reading.auto_sum() == AutoSum::Asked
-        && let Some(choice) = choose_sum(&mut capture)?
-    {
-        capture = capture.summed_by(choice.frames, options, None)?;
-    }
-    Ok(capture)
 }
 
 /// Frames copied without unpacking them: all, or none.
@@ -155,7 +147,7 @@ fn largest_count(capture: &mut Capture, args: &Convert) -> Result<u16> {
     if let Some(max) = capture.max_count() {
         return Ok(max);
     }
-    if args.reads_pipe() {
+    if is_pipe(&args.capture) {
         return Err(CliError::new(
             "the depth of the counts is unknown, and a pipe comes once",
             "--bits",

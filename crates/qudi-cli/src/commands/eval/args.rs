@@ -1,5 +1,6 @@
 //! Options of `qudi eval`.
 
+use crate::args::reading::words;
 use crate::args::{Network, Reading, Shard, number};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_core::PppDefinition;
@@ -31,8 +32,8 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "PPP,...", value_delimiter = ',', allow_negative_numbers = true, value_parser = number::real(number::PPP))]
     pub(crate) ppp: Vec<f64>,
     /// What --ppp counts for clips: incident photons, detected electrons, or dn, the mean output value
-    #[arg(long, value_name = "MEANING", conflicts_with = "capture")]
-    pub(crate) ppp_def: Option<Meaning>,
+    #[arg(long, value_name = "MEANING", conflicts_with = "capture", value_parser = words::<PppDefinition>(&["incident", "detected", "dn"]))]
+    pub(crate) ppp_def: Option<PppDefinition>,
     /// Sensor: a name or a .toml file [default: qudi-paper; of a capture: known from record or format]
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
@@ -81,28 +82,6 @@ pub(crate) struct Eval {
     pub(crate) network: Network,
     #[command(flatten)]
     pub(crate) reading: Reading,
-}
-
-/// What photons per pixel count.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Meaning {
-    /// Photons that fall on a pixel
-    Incident,
-    /// Electrons or avalanches, dark ones included
-    Detected,
-    /// The mean output value
-    Dn,
-}
-
-impl Meaning {
-    /// The definition of that name.
-    pub(crate) fn definition(self) -> PppDefinition {
-        match self {
-            Self::Incident => PppDefinition::Incident,
-            Self::Detected => PppDefinition::Detected,
-            Self::Dn => PppDefinition::Dn,
-        }
-    }
 }
 
 /// How a clip becomes photons, and which frames count.

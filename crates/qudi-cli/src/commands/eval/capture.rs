@@ -17,7 +17,7 @@ use qudi_core::Frame;
 use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
 use qudi_core::windows::Windows;
-use qudi_io::capture::Capture;
+use qudi_io::capture::{Capture, Summary};
 use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -42,7 +42,7 @@ pub(crate) fn evaluate_capture(
     let seed = plan.seed.unwrap_or(SEED);
     let path = Path::new(&plan.data);
     let OpenedCapture { mut capture, sensor, sum } =
-        open_summed(Some(path), &plan.read, plan.auto_sum, plan.sensor.as_deref(), overrides)?;
+        open_summed(Some(path), &plan.read, plan.sum, plan.sensor.as_deref(), overrides)?;
     let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
     if let Some(choice) = &sum {
         report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
@@ -53,7 +53,9 @@ pub(crate) fn evaluate_capture(
         mean_level: plan.mean_level,
         seed,
     };
-    let (acquisition, source) = acquisition(&light, &mut capture, &sensor)?;
+    let gain = light.known_gain(&capture);
+    let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
+    let (acquisition, source) = acquisition(&light, &mut capture, &sensor, &summary)?;
     let frames = capture.frames().min(plan.frames.unwrap_or(FRAMES));
     let mut counts = vec![0; capture.size().pixels()];
     capture.read(frames / 2, &mut counts)?;

@@ -1,7 +1,7 @@
 //! The plan of an evaluation: its arguments, checked once.
 
-use super::args::{Eval, External, Meaning, Protocol};
-use crate::args::{AutoSum, Shard};
+use super::args::{Eval, External, Protocol};
+use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
@@ -40,8 +40,8 @@ pub(super) struct Plan {
     pub(super) pictures: bool,
     /// How a capture is read.
     pub(super) read: ReadOptions,
-    /// Whether the capture tells how many of its frames are summed.
-    pub(super) auto_sum: AutoSum,
+    /// How many frames are summed, if that is said.
+    pub(super) sum: Option<Sum>,
     pub(super) overwrite: Overwrite,
 }
 
@@ -66,7 +66,7 @@ impl Plan {
             methods: args.method.clone(),
             network,
             ppp: args.ppp.clone(),
-            ppp_def: args.ppp_def.map(Meaning::definition),
+            ppp_def: args.ppp_def,
             sensor: args.sensor.clone(),
             gain: args.gain,
             frames: args.frames,
@@ -79,7 +79,7 @@ impl Plan {
             shard: args.shard,
             pictures: args.html.is_some(),
             read: args.reading.options(MaskChoice::Auto),
-            auto_sum: args.reading.auto_sum(),
+            sum: args.reading.sum(),
             overwrite,
         };
         if args.capture {
@@ -129,7 +129,7 @@ impl Plan {
                 "other programs are compared under the strict protocol",
             ));
         }
-        if self.auto_sum == AutoSum::Asked {
+        if self.sum == Some(Sum::Auto) {
             return Err(CliError::new(
                 "clips are exposed as they are asked for",
                 "--sum",

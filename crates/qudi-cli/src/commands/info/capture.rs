@@ -12,7 +12,7 @@ use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
-use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, Summary};
+use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, SumChoice, Summary};
 use qudi_io::sidecar::Sidecar;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
@@ -45,10 +45,9 @@ pub(crate) fn run(
         refuse_taken(preview, overwrite)?;
     }
     let options = info.reading.options(MaskChoice::Auto);
-    let auto = info.reading.auto_sum();
     let name = info.sensor.as_deref();
     let OpenedCapture { mut capture, sensor, sum } =
-        open_summed(Some(path), &options, auto, name, settings)?;
+        open_summed(Some(path), &options, info.reading.sum(), name, settings)?;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.preview {
@@ -58,15 +57,8 @@ pub(crate) fn run(
         }
         save(&picture, preview, overwrite)?;
     }
-    let warnings = warnings::of_capture(&capture, &summary, sensor.as_ref());
-    let sum_text = sum.as_ref().map(|choice| describe_sum(choice, &capture, sensor.as_ref()));
-    let mut text = describe(&capture, &summary, sensor.as_ref());
-    if let Some(sum) = &sum_text {
-        let _ = writeln!(text, "sum        {sum}");
-    }
-    for warning in &warnings {
-        let _ = writeln!(text, "warning    {warning}");
-    }
+    let warnings = warnings::of_capture(&capture, &summary);
+    let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
     if let Some((record, path)) = record {
         text += &origin(record, path);
     }
@@ -91,7 +83,13 @@ fn save(picture: &Frame, path: &Path, overwrite: Overwrite) -> Result<()> {
 }
 
 /// Describes a capture and what is in it, line by line.
-pub(crate) fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> String {
+pub(crate) fn describe(
+    capture: &Capture,
+    summary: &Summary,
+    sensor: Option<&Sensor>,
+    sum: Option<&SumChoice>,
+    warnings: &[String],
+) -> String {
     let about = capture.info();
     let mut text = String::new();
     let mut line = |key: &str, value: String| {
@@ -156,6 +154,12 @@ pub(crate) fn describe(capture: &Capture, summary: &Summary, sensor: Option<&Sen
     histogram(&mut text, &summary.histogram);
     for remark in &about.notes {
         let _ = writeln!(text, "note       {}", flags_in_text(remark));
+    }
+    if let Some(choice) = sum {
+        let _ = writeln!(text, "sum        {}", describe_sum(choice, capture, sensor));
+    }
+    for warning in warnings {
+        let _ = writeln!(text, "warning    {warning}");
     }
     text
 }

@@ -3,13 +3,13 @@
 use super::args::Look;
 use crate::args::{Global, Network};
 use crate::capture::acquisition::{LightOverrides, acquisition};
-use crate::capture::{OpenedCapture, describe_sum, open_summed, warnings};
+use crate::capture::{OpenedCapture, open_summed, unknown_sensor, warnings};
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
 use crate::methods::usual_method;
 use crate::places::Places;
 use crate::report::html::{data_url, render};
-use crate::report::{Output, Report};
+use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::{PostFilter, Qbp};
 use qudi_core::restorer::{Acquisition, BurstView};
@@ -54,41 +54,43 @@ pub(crate) fn run(
         .check()?;
     let file = Output::open(Some(&output), global.overwrite())?;
     let options = args.reading.options(MaskChoice::Auto);
-    let auto = args.reading.auto_sum();
-    let OpenedCapture { mut capture, sensor, sum } =
-        open_summed(Some(&args.capture), &options, auto, args.sensor.as_deref(), settings)?;
+    let OpenedCapture { mut capture, sensor, sum } = open_summed(
+        Some(&args.capture),
+        &options,
+        args.reading.sum(),
+        args.sensor.as_deref(),
+        settings,
+    )?;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
-    let mut text = describe(&capture, &summary, sensor.as_ref());
-    let mut line = |key: &str, value: &str| {
-        let _ = writeln!(text, "{key:<11}{value}");
+    let warnings = warnings::of_capture(&capture, &summary);
+    let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
+    let mut line = |value: &str| {
+        let _ = writeln!(text, "restore    {value}");
     };
-    if let Some(choice) = &sum {
-        line("sum", &describe_sum(choice, &capture, sensor.as_ref()));
-    }
-    let warnings = warnings::of_capture(&capture, &summary, sensor.as_ref());
-    for warning in &warnings {
-        line("warning", warning);
-    }
-    let mean = shown(summary.picture(&capture, sensor.as_ref(), gain));
+    let mean = for_the_eye(summary.picture(&capture, sensor.as_ref(), gain));
     let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0 };
-    let of_light = sensor_of(&capture, sensor).and_then(|sensor| {
-        acquisition(&light, &mut capture, &sensor).map(|(acquisition, _)| acquisition)
-    });
+    let of_light = match sensor {
+        Some(sensor) => acquisition(&light, &mut capture, &sensor, &summary),
+        None => ideal_sensor(&capture).and_then(|sensor| {
+            let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
+            acquisition(&light, &mut capture, &sensor, &summary)
+        }),
+    };
     let mut picture = Picture::new(mean.size, 1, 2, 1);
     picture.place(0, 0, &["MEAN"], &mean);
     let mut forecast = Value::Null;
     match of_light {
-        Ok(acquisition) => {
+        Ok((acquisition, _)) => {
             let start = Instant::now();
             let instant = restore_instant(&mut capture, &acquisition)?;
             let seconds = start.elapsed().as_secs_f64();
-            picture.place(0, 1, &["ONE INSTANT"], &shown(instant));
+            picture.place(0, 1, &["ONE INSTANT"], &for_the_eye(instant.with_white_at_highlights()));
             let (words, document) = plan(&capture, &acquisition, seconds)?;
-            line("restore", &words);
+            line(&words);
             forecast = document;
         }
-        Err(CliError::Error { what, .. }) => line("restore", &format!("not yet: {what}")),
+        Err(CliError::Error { what, .. }) => line(&format!("not yet: {what}")),
         Err(other) => return Err(other),
     }
     let png = picture.to_png()?;
@@ -127,21 +129,14 @@ fn default_output(capture: &Path) -> PathBuf {
     PathBuf::from(format!("{stem}-look.html"))
 }
 
-/// The sensor; of binary frames of an unknown camera, one that detects every photon.
-fn sensor_of(capture: &Capture, sensor: Option<Sensor>) -> Result<Sensor> {
-    if let Some(sensor) = sensor {
-        return Ok(sensor);
+/// For binary frames of an unknown camera, a sensor that detects every photon.
+fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
+    if !capture.info().binary {
+        return Err(unknown_sensor(capture));
     }
-    if capture.info().binary {
-        let mut ideal = Sensor::load("ideal")?;
-        (ideal.response, ideal.bits, ideal.frames_summed) = (Response::Binary, 1, 1);
-        return Ok(ideal);
-    }
-    Err(CliError::new(
-        "its sensor is unknown: --sensor NAME (`qudi info --sensors`)",
-        capture.path().display(),
-        "name its sensor",
-    ))
+    let mut ideal = Sensor::load("ideal")?;
+    (ideal.response, ideal.bits, ideal.frames_summed) = (Response::Binary, 1, 1);
+    Ok(ideal)
 }
 
 /// The middle of the capture, sums aligned and merged.
@@ -163,13 +158,7 @@ fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(S
     let cost = COSTS.iter().find(|(name, _)| *name == usual.name).map_or(2.0, |(_, cost)| *cost);
     let pictures = capture.frames();
     let total = seconds * cost * pictures as f64;
-    let time = if total < 120.0 {
-        format!("{total:.0} seconds")
-    } else if total < 7200.0 {
-        format!("{:.0} minutes", total / 60.0)
-    } else {
-        format!("{:.1} hours", total / 3600.0)
-    };
+    let time = duration(total);
     let reason = usual.reason.map_or(String::new(), |reason| format!(" ({reason})"));
     let sensor = &acquisition.sensor.name;
     let words = format!(
@@ -180,13 +169,10 @@ fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(S
     Ok((words, document))
 }
 
-/// A frame for the eye: white at its 99.5th percentile, sRGB.
-fn shown(mut frame: Frame) -> Frame {
-    let mut sorted = frame.data.clone();
-    sorted.sort_by(f32::total_cmp);
-    let white = sorted[(sorted.len() - 1) * 995 / 1000].max(f32::MIN_POSITIVE);
+/// A frame with the tone curve of screens.
+fn for_the_eye(mut frame: Frame) -> Frame {
     for value in &mut frame.data {
-        *value = linear_to_srgb((*value / white).clamp(0.0, 1.0));
+        *value = linear_to_srgb(*value);
     }
     frame
 }

@@ -11,6 +11,7 @@ use qudi_io::capture::Capture;
 use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink, Schedule};
 use qudi_io::writer::ClipWriter;
 use serde_json::Value;
+use std::borrow::Cow;
 use std::ops::Range;
 use std::path::Path;
 
@@ -81,13 +82,12 @@ impl Output {
     }
 
     /// A frame as it is written.
-    fn toned(&self, mut frame: Frame) -> Frame {
-        if self.tonemap == Tonemap::Srgb {
-            for value in &mut frame.data {
-                *value = linear_to_srgb(value.max(0.0));
-            }
+    fn toned<'a>(&self, frame: &'a Frame) -> Cow<'a, Frame> {
+        if self.tonemap == Tonemap::None {
+            return Cow::Borrowed(frame);
         }
-        frame
+        let data = frame.data.iter().map(|value| linear_to_srgb(value.max(0.0))).collect();
+        Cow::Owned(Frame { size: frame.size, data })
     }
 
     /// What was written, as light.
@@ -102,20 +102,14 @@ impl Output {
 
     /// Writes picture `number`; gives it as a reader of the file sees it, where that is another.
     fn push(&mut self, number: u64, restored: &Frame) -> qudi_core::Result<Option<Frame>> {
-        let toned;
-        let frame = if self.tonemap == Tonemap::None {
-            restored
-        } else {
-            toned = self.toned(restored.clone());
-            &toned
-        };
+        let frame = self.toned(restored);
         match &mut self.place {
             Place::Folder(folder) => {
-                let seen = folder.push(number, frame)?;
+                let seen = folder.push(number, &frame)?;
                 return Ok(Some(self.linear(seen)));
             }
-            Place::File(writer) => writer.as_mut().map_or(Ok(()), |writer| writer.push(frame))?,
-            Place::Pipe => y4m::write_frame(frame)
+            Place::File(writer) => writer.as_mut().map_or(Ok(()), |writer| writer.push(&frame))?,
+            Place::Pipe => y4m::write_frame(&frame)
                 .map_err(|e| Error::io("write to", Path::new("standard output"), e))?,
         }
         Ok(None)

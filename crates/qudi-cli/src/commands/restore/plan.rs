@@ -2,15 +2,15 @@
 
 use super::args::{Restore, Tonemap};
 use crate::args::tiff_samples::tiff_samples;
-use crate::args::{AutoSum, Global, Shard};
+use crate::args::{Global, Shard, Sum};
 use crate::capture::acquisition::LightOverrides;
+use crate::capture::{is_pipe, refuse_terminal};
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
 use crate::places::Places;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_io::capture::{MaskChoice, ReadOptions};
 use qudi_io::writer::TiffSamples;
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 /// Frames per second of what plays, unless said otherwise: captures of thousands would be over at once.
@@ -26,8 +26,8 @@ pub(super) struct Plan {
     /// The sensor by name, unless record or format say it.
     pub(super) sensor: Option<String>,
     pub(super) read: ReadOptions,
-    /// Whether the capture tells how many of its frames are summed.
-    pub(super) auto_sum: AutoSum,
+    /// How many frames are summed, if that is said.
+    pub(super) sum: Option<Sum>,
     /// Native frames from one picture to the next, if not every frame becomes one.
     pub(super) every: Option<u64>,
     pub(super) tonemap: Tonemap,
@@ -94,7 +94,7 @@ impl Plan {
             output: args.output.clone(),
             sensor: args.sensor.clone(),
             read: args.reading.options(MaskChoice::Auto),
-            auto_sum: args.reading.auto_sum(),
+            sum: args.reading.sum(),
             every: args.every,
             tonemap: args.tonemap,
             played_fps: args.fps.unwrap_or(PLAYED_FPS),
@@ -138,7 +138,7 @@ impl Plan {
 
     /// Whether the capture comes through standard input.
     pub(super) fn reads_pipe(&self) -> bool {
-        self.capture.as_os_str() == "-"
+        is_pipe(&self.capture)
     }
 
     /// Refuses a taken name before any work is done. Folders may be resumed.
@@ -159,13 +159,7 @@ impl Plan {
 
     /// Refuses what needs a capture that can be read again.
     fn check_pipe(&self) -> Result<()> {
-        if std::io::stdin().is_terminal() {
-            return Err(CliError::new(
-                "standard input is a terminal, and a capture comes through a pipe",
-                "-",
-                "pipe one in, as in `cat burst.npy | qudi restore - -o out`, or name a file",
-            ));
-        }
+        refuse_terminal("cat burst.npy | qudi restore - -o out")?;
         if self.shard.is_some() {
             return Err(CliError::new(
                 "a pipe comes once and whole",

@@ -14,7 +14,7 @@ use crate::interrupt;
 use crate::methods::network::device_failed;
 use crate::methods::options::{NetworkOptions, other_method};
 use crate::methods::{method, usual_method};
-use crate::report::Report;
+use crate::report::{Report, duration};
 use crate::settings::Settings;
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::windows::Windows;
@@ -27,7 +27,7 @@ use std::path::Path;
 use std::time::Instant;
 
 /// Seconds from which on it is said beforehand how long a run takes.
-const WORTH_TELLING: f64 = 300.0;
+const LONG_RUN: f64 = 300.0;
 
 pub(crate) fn run(
     args: &Restore,
@@ -117,14 +117,15 @@ impl Job {
         let path = (!plan.reads_pipe()).then_some(plan.capture.as_path());
         let name = plan.sensor.as_deref();
         let OpenedCapture { mut capture, sensor, sum } =
-            open_summed(path, &plan.read, plan.auto_sum, name, overrides)?;
+            open_summed(path, &plan.read, plan.sum, name, overrides)?;
         let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
         if let Some(choice) = &sum {
             report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
         }
-        let (acquisition, source) = acquisition(&plan.light, &mut capture, &sensor)?;
-        let summary = Summary::measure(&mut capture, Some(&sensor), Some(acquisition.gain))?;
-        let warnings = warnings::of_capture(&capture, &summary, Some(&sensor));
+        let gain = plan.light.known_gain(&capture);
+        let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
+        let (acquisition, source) = acquisition(&plan.light, &mut capture, &sensor, &summary)?;
+        let warnings = warnings::of_capture(&capture, &summary);
         let name = match &plan.method {
             Some(name) => name.clone(),
             None => announced_method(plan, &capture, &acquisition, report)?.to_owned(),
@@ -215,12 +216,12 @@ impl Job {
             return Ok(());
         }
         let mut bar = report.bar();
-        let (begin, mut told) = (Instant::now(), false);
+        let (begin, mut forecast) = (Instant::now(), false);
         let mut progress = |done: u64, total: Option<u64>| {
             bar.update("restoring", done, total);
-            if let Some(total) = total.filter(|_| done > 0 && !told) {
-                told = true;
-                tell_time(begin.elapsed().as_secs_f64() / done as f64, total, report);
+            if let Some(total) = total.filter(|_| done > 0 && !forecast) {
+                forecast = true;
+                forecast_time(begin.elapsed().as_secs_f64() / done as f64, total, report);
             }
             interrupt::check()
         };
@@ -255,16 +256,12 @@ fn announced_method(
 }
 
 /// Says how long all pictures take, if that is long enough to be worth a line.
-fn tell_time(seconds_per_picture: f64, pictures: u64, report: &Report) {
+fn forecast_time(seconds_per_picture: f64, pictures: u64, report: &Report) {
     let seconds = seconds_per_picture * pictures as f64;
-    if seconds < WORTH_TELLING {
+    if seconds < LONG_RUN {
         return;
     }
-    let time = if seconds < 7200.0 {
-        format!("{:.0} minutes", (seconds / 60.0).ceil())
-    } else {
-        format!("{:.1} hours", seconds / 3600.0)
-    };
+    let time = duration(seconds);
     report.remark(&format!(
         "note: {pictures} pictures take about {time} ({seconds_per_picture:.2} s each); --every N makes fewer"
     ));

@@ -104,11 +104,15 @@ impl Array {
 
     /// Goes on with one of several captures that lie one after the other.
     pub(super) fn choose_volume(&mut self, dims: [usize; 3], index: usize) {
-        let bytes = (dims.iter().product::<usize>() * self.sample.bytes()) as u64;
+        // Extents come from a header: what is too large is found missing later.
+        let bytes = dims.iter().try_fold(self.sample.bytes() as u64, |bytes, &extent| {
+            bytes.checked_mul(extent as u64)
+        });
+        let bytes = bytes.unwrap_or(u64::MAX);
         match &mut self.place {
             Place::File { start, available, .. } | Place::Spool { start, available, .. } => {
-                let before = bytes * index as u64;
-                *start += before;
+                let before = bytes.saturating_mul(index as u64);
+                *start = start.saturating_add(before);
                 *available = available.saturating_sub(before).min(bytes);
             }
             Place::Stream(_) | Place::Fetch { .. } | Place::Pipe(_) => {}

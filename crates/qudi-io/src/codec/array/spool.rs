@@ -1,6 +1,7 @@
 //! Arrays whose frames cannot be read in turn are stored in an unnamed file first.
 
 use super::{Array, Place};
+use qudi_core::limits::DEFLATE_RATIO;
 use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{Read, Write};
@@ -47,6 +48,13 @@ impl Array {
                 }
             }
             Place::Fetch { fetch, group } => {
+                let stored = std::fs::metadata(&self.path).map_err(io)?.len();
+                if bytes > stored.saturating_mul(DEFLATE_RATIO) {
+                    return Err(self.fault(
+                        format!("an array of shape {:?} in a file of {stored} bytes", self.shape),
+                        "it promises more than they can hold: export the file again",
+                    ));
+                }
                 let mut file = tempfile::tempfile().map_err(io)?;
                 let rows = self.shape.first().copied().unwrap_or(0) as u64;
                 let fit = (PIECE / (bytes / rows.max(1)).max(1)).max(1);
