@@ -2,6 +2,10 @@
 //!
 //! Exposed frames depend on the seed, the frame's number and the scene alone, never on threads.
 
+mod rolling_shutter;
+
+pub use rolling_shutter::RollingShutter;
+
 use crate::error::{Error, Result};
 use crate::frame::{Frame, Size};
 use crate::light::Light;

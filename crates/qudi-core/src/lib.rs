@@ -34,7 +34,7 @@ pub mod sensor;
 mod transfer;
 pub mod windows;
 
-pub use camera::Camera;
+pub use camera::{Camera, RollingShutter};
 pub use error::{Error, Result, nearest};
 pub use files::{atomic_file, natural_order, npy, regular_file};
 pub use frame::{Frame, Size};

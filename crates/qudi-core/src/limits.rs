@@ -35,6 +35,9 @@ pub const INDEX_BYTES: u64 = 1 << 28;
 /// The most bytes of an array's header: NumPy writes about 100, MATLAB some hundreds.
 pub const ARRAY_HEADER_BYTES: usize = 1 << 16;
 
+/// The most bytes of an array that is read whole, since its axes are turned.
+pub const HELD_ARRAY_BYTES: u64 = 1 << 31;
+
 /// The most files of one capture's folder.
 pub const FOLDER_FILES: usize = 4_000_000;
 

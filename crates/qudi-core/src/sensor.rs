@@ -86,6 +86,9 @@ pub struct Sensor {
     /// Binary frames summed into one output frame.
     #[serde(default = "one")]
     pub frames_summed: u32,
+    /// Time from the first row to the last, as a share of a native frame: 0 for a global shutter. Simulated only.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub rolling_shutter: f64,
     /// Imperfect pixels; all off by default.
     #[serde(default)]
     pub defects: Defects,
@@ -208,6 +211,7 @@ impl Sensor {
         self.within("dark", self.dark.value(), 0.0..=1e9)?;
         self.within("read_noise", self.read_noise, 0.0..=1e6)?;
         self.within("offset", self.offset, 0.0..=65_535.0)?;
+        self.within("rolling_shutter", self.rolling_shutter, 0.0..=1.0)?;
         if let Some(threshold) = self.threshold {
             self.within("threshold", threshold, 0.0..=65_535.0)?;
             if self.response == Response::Linear {

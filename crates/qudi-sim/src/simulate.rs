@@ -3,10 +3,10 @@
 //! Memory holds one exposure at a time, however long the clip.
 
 use crate::clip::{Input, Sampling};
-use qudi_core::Camera;
 use qudi_core::Checksum;
 use qudi_core::flow::Flow;
 use qudi_core::sensor::{PixelMaps, Sensor};
+use qudi_core::{Camera, RollingShutter};
 use qudi_core::{ClipStatistics, Light, PppDefinition, resolve_light};
 use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
@@ -69,7 +69,7 @@ pub struct Exposed<'a> {
     pub index: u64,
     /// The counts, `[height * width]`.
     pub counts: &'a [u16],
-    /// The scene in the middle of the exposure.
+    /// The scene in the middle of the exposure, of each row's own behind a rolling shutter.
     pub truth: &'a Frame,
 }
 
@@ -156,17 +156,23 @@ pub fn simulate(
     let mut source = input.open(sampling)?;
     let (mut sum, mut saturated) = (0u64, 0u64);
     let mut again = Checksum::default();
+    let mut shutter = RollingShutter::new(sensor);
     for index in 0..frames {
         let Some(exposure) = source.next()? else {
             return Err(changed(input));
         };
         exposure.instants.iter().for_each(|frame| again.add(&frame.data));
-        let instants: Vec<&Frame> = exposure.instants.iter().collect();
+        let rolled = shutter.rolls().then(|| shutter.roll(&exposure.instants));
+        let (instants, truth) = match &rolled {
+            Some(rolled) => (rolled, &rolled[rolled.len() / 2]),
+            None => (&exposure.instants, exposure.truth()),
+        };
+        let instants: Vec<&Frame> = instants.iter().collect();
         let counts = camera.expose(index, &instants)?;
         sum += counts.iter().map(|&c| u64::from(c)).sum::<u64>();
         saturated += counts.iter().filter(|&&c| c == sensor.max_count()).count() as u64;
         let flow = || if index + 1 < frames { source.flow(index) } else { None };
-        sink.frame(Exposed { index, counts: &counts, truth: exposure.truth() }, &flow)?;
+        sink.frame(Exposed { index, counts: &counts, truth }, &flow)?;
         progress(Stage::Exposing, index + 1, Some(frames))?;
     }
     if again.crc32() != clip.crc32() {

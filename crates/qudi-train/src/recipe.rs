@@ -268,6 +268,7 @@ impl Recipe {
         (!from.is_empty()).then(|| DataConfig {
             frames: validation.frames,
             crop: validation.crop,
+            instants: 1,
             sensor: vec![SensorMix {
                 name: validation.sensor.clone(),
                 ppp: LightRange::Of(validation.ppp.clone()),

@@ -21,6 +21,7 @@ const FIELDS: &[&str] = &[
     "format",
     "frames",
     "frames_per_file",
+    "frames_per_image",
     "gain",
     "header",
     "instants",

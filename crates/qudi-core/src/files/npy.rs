@@ -4,10 +4,10 @@
 
 use crate::error::{Error, Result};
 use crate::frame::{Frame, Size};
-use crate::limits::ARRAY_HEADER_BYTES;
+use crate::limits::{ARRAY_HEADER_BYTES, HELD_ARRAY_BYTES};
 use crate::regular_file::open_regular;
 use std::fs::File;
-use std::io::{BufReader, Read, Write};
+use std::io::{BufReader, Cursor, Read, Write};
 use std::path::Path;
 
 /// Sample types that images and counts come in.
@@ -174,19 +174,55 @@ impl Header {
         Ok(Self { sample, shape, fortran, data_start: (prefix + length) as u64 })
     }
 
-    /// Refuses arrays whose first axis is the fastest.
+    /// The data that follow this header in `reader`, the last axis the fastest. An array in Fortran order is
+    /// read whole.
     ///
     /// # Errors
-    /// [`Error::Data`] naming `path`.
-    pub fn require_c_order(&self, path: &Path) -> Result<()> {
+    /// [`Error`] if an array in Fortran order cannot be read, or is too large to be held.
+    pub fn in_c_order(&self, reader: impl Read + 'static, path: &Path) -> Result<Box<dyn Read>> {
         if !self.fortran {
-            return Ok(());
+            return Ok(Box::new(reader));
         }
-        Err(Error::data(
-            "the array is in Fortran order",
-            path,
-            "save it as numpy.save(NAME, numpy.ascontiguousarray(array))",
-        ))
+        let bytes = self.data_bytes().unwrap_or(u64::MAX);
+        if bytes > HELD_ARRAY_BYTES {
+            return Err(Error::data(
+                format!(
+                    "an array of {bytes} bytes in Fortran order, which is read whole; at most {HELD_ARRAY_BYTES} are"
+                ),
+                path,
+                "save it as numpy.save(NAME, numpy.ascontiguousarray(array))",
+            ));
+        }
+        let mut data = Vec::new();
+        reader
+            .take(bytes)
+            .read_to_end(&mut data)
+            .map_err(|e| Error::io("read the array", path, e))?;
+        if data.len() as u64 != bytes {
+            return Err(Error::data("the array ends early", path, "copy or export it again"));
+        }
+        Ok(Box::new(Cursor::new(self.transposed(&data))))
+    }
+
+    /// Data in Fortran order with the last axis the fastest.
+    fn transposed(&self, data: &[u8]) -> Vec<u8> {
+        let length = self.sample.bytes();
+        let stride = |axis: usize| self.shape[..axis].iter().product::<usize>();
+        let strides: Vec<usize> = (0..self.shape.len()).map(stride).collect();
+        let mut at = vec![0; self.shape.len()];
+        let mut turned = Vec::with_capacity(data.len());
+        while turned.len() < data.len() {
+            let place: usize = at.iter().zip(&strides).map(|(at, stride)| at * stride).sum();
+            turned.extend_from_slice(&data[place * length..][..length]);
+            for (at, &extent) in at.iter_mut().zip(&self.shape).rev() {
+                *at += 1;
+                if *at < extent {
+                    break;
+                }
+                *at = 0;
+            }
+        }
+        turned
     }
 
     /// Bytes of data that the header promises, if that is a possible number.
@@ -297,8 +333,7 @@ pub fn read_image(path: &Path) -> Result<Frame> {
 /// # Errors
 /// [`Error`] if it cannot be read, has other axes, or holds values that are not finite.
 pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
-    let (header, mut reader) = Header::open(path)?;
-    header.require_c_order(path)?;
+    let (header, reader) = Header::open(path)?;
     let (&[frames, height, width], Some(full)) =
         (header.shape.as_slice(), header.sample.full_scale())
     else {
@@ -314,6 +349,7 @@ pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
     let size = Size::new(height, width, &path.display().to_string())?;
     let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
     let mut clip = Vec::new();
+    let mut reader = header.in_c_order(reader, path)?;
     for _ in 0..frames.min(most) {
         reader.read_exact(&mut bytes).map_err(|e| Error::io("read a frame", path, e))?;
         let samples = bytes.chunks_exact(header.sample.bytes());
@@ -363,6 +399,32 @@ mod tests {
             assert_eq!(header.sample, Sample::U16 { big_endian: false });
             assert_eq!(header.data_start, bytes.len() as u64);
         }
+    }
+
+    #[test]
+    fn arrays_in_fortran_order_are_turned() {
+        let shape = vec![2, 3, 4];
+        let header = Header {
+            sample: Sample::U16 { big_endian: false },
+            shape,
+            fortran: true,
+            data_start: 0,
+        };
+        // Element (t, y, x) is 100 t + 10 y + x; t is the fastest.
+        let value = |t: u16, y: u16, x: u16| 100 * t + 10 * y + x;
+        let columns = (0..4).flat_map(|x| (0..3).flat_map(move |y| (0..2).map(move |t| (t, y, x))));
+        let data: Vec<u8> = columns.flat_map(|(t, y, x)| value(t, y, x).to_le_bytes()).collect();
+        let rows = (0..2).flat_map(|t| (0..3).flat_map(move |y| (0..4).map(move |x| (t, y, x))));
+        let expected: Vec<u8> = rows.flat_map(|(t, y, x)| value(t, y, x).to_le_bytes()).collect();
+        let path = Path::new("a.npy");
+        let mut turned = Vec::new();
+        let data = Cursor::new(data);
+        header.in_c_order(data.clone(), path).unwrap().read_to_end(&mut turned).unwrap();
+        assert_eq!(turned, expected);
+        let short = Cursor::new(data.into_inner()[..47].to_vec());
+        assert!(header.in_c_order(short, path).is_err());
+        let huge = Header { shape: vec![1 << 20, 1 << 10, 4], ..header };
+        assert!(huge.in_c_order(Cursor::new(vec![0]), path).is_err());
     }
 
     #[test]

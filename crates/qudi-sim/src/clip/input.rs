@@ -4,7 +4,7 @@ use super::gif::Gif;
 use super::image_file::{EXTENSIONS, read_still};
 use super::images::ImageFolder;
 use super::npy::NpyFrames;
-use super::recorded::Recorded;
+use super::recorded::{Recorded, Repeated};
 use super::synthetic::Synthetic;
 use super::video::Video;
 use super::y4m::Y4m;
@@ -78,6 +78,10 @@ pub struct Sampling {
     pub frames: Option<u64>,
     /// Instants per exposure; 1: nothing moves while a frame is exposed.
     pub instants: usize,
+    /// Times that a frame of a recorded clip comes in a row: cameras of thousands of frames per second see the
+    /// same image of a video again and again.
+    #[serde(default = "one")]
+    pub frames_per_image: u64,
     /// What file values mean.
     pub transfer: Transfer,
     /// File value of white in `.npy` arrays, if not the type's full scale.
@@ -86,8 +90,18 @@ pub struct Sampling {
 
 impl Default for Sampling {
     fn default() -> Self {
-        Self { frames: None, instants: 1, transfer: Transfer::AsIs, white: None }
+        Self {
+            frames: None,
+            instants: 1,
+            frames_per_image: 1,
+            transfer: Transfer::AsIs,
+            white: None,
+        }
     }
+}
+
+fn one() -> u64 {
+    1
 }
 
 /// Length of synthetic clips unless said otherwise: one window of the paper's network.
@@ -203,6 +217,13 @@ impl Input {
                 format!("between 1 (no motion during an exposure) and {EXPOSURE_INSTANTS}"),
             ));
         }
+        if sampling.frames_per_image == 0 || sampling.frames_per_image > 1 && self.is_synthetic() {
+            return Err(Error::request(
+                format!("{} frames of each image", sampling.frames_per_image),
+                "frames_per_image",
+                "give 1 or more; of scenes and stills 1, which move between frames: lower their motion",
+            ));
+        }
         if let Some(white) = sampling.white
             && !(white.is_finite() && white > 0.0)
         {
@@ -260,6 +281,7 @@ impl Input {
                 )));
             }
         };
+        let reader = Box::new(Repeated::new(reader, sampling.frames_per_image));
         Ok(Box::new(Recorded::new(reader, sampling.instants, sampling.frames)))
     }
 

@@ -6,12 +6,11 @@ use qudi_core::Transfer;
 use qudi_core::npy::{Header, Sample};
 use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
-use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 pub(super) struct NpyFrames {
-    reader: BufReader<File>,
+    reader: Box<dyn Read>,
     sample: Sample,
     size: Size,
     channels: usize,
@@ -25,7 +24,6 @@ pub(super) struct NpyFrames {
 impl NpyFrames {
     pub(super) fn open(path: &Path, transfer: Transfer, white: Option<f32>) -> Result<Self> {
         let (header, reader) = Header::open(path)?;
-        header.require_c_order(path)?;
         let Some(white) = white.or(header.sample.full_scale()) else {
             return Err(Error::data(
                 "an array of wide integers, whose value of white is unknown",
@@ -49,7 +47,7 @@ impl NpyFrames {
             return Err(Error::data("the array holds no frames", path, "save at least one frame"));
         }
         Ok(Self {
-            reader,
+            reader: header.in_c_order(reader, path)?,
             sample: header.sample,
             size: Size::new(height, width, &path.display().to_string())?,
             channels,

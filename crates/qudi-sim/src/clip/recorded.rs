@@ -1,8 +1,47 @@
 //! Recorded clips as exposures: each output frame sees `instants` recorded frames in turn.
 
 use super::{ClipInfo, Exposure, ExposureSource, FrameReader};
-use qudi_core::Result;
 use qudi_core::flow::Flow;
+use qudi_core::{Frame, Result, Size};
+
+/// A clip whose every frame comes several times.
+pub(super) struct Repeated {
+    reader: Box<dyn FrameReader>,
+    times: u64,
+    /// The frame that comes, and how often it still does.
+    current: Option<(Frame, u64)>,
+}
+
+impl Repeated {
+    /// Every frame of `reader`, `times` times in a row.
+    pub(super) fn new(reader: Box<dyn FrameReader>, times: u64) -> Self {
+        Self { reader, times, current: None }
+    }
+}
+
+impl FrameReader for Repeated {
+    fn size(&self) -> Size {
+        self.reader.size()
+    }
+
+    fn frames(&self) -> Option<u64> {
+        self.reader.frames().map(|frames| frames.saturating_mul(self.times))
+    }
+
+    fn next(&mut self) -> Result<Option<Frame>> {
+        if let Some((frame, left)) = &mut self.current
+            && *left > 0
+        {
+            *left -= 1;
+            return Ok(Some(frame.clone()));
+        }
+        let next = self.reader.next()?;
+        if self.times > 1 {
+            self.current = next.clone().map(|frame| (frame, self.times - 1));
+        }
+        Ok(next)
+    }
+}
 
 pub(super) struct Recorded {
     reader: Box<dyn FrameReader>,

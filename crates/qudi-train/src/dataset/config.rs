@@ -15,6 +15,10 @@ pub struct DataConfig {
     pub frames: usize,
     /// Side of a sample in pixels.
     pub crop: usize,
+    /// Instants that one exposure sees, an odd number: more than one lets the scene move within a frame. Of
+    /// clips they are recorded frames.
+    #[serde(default = "one_frame", skip_serializing_if = "is_one")]
+    pub instants: usize,
     /// Sensors with the light that falls on them.
     pub sensor: Vec<SensorMix>,
     /// Where scenes come from.
@@ -100,6 +104,11 @@ fn one_frame() -> usize {
     1
 }
 
+#[allow(clippy::trivially_copy_pass_by_ref)] // serde passes a reference
+fn is_one(count: &usize) -> bool {
+    *count == 1
+}
+
 fn usual_speed() -> f64 {
     4.0
 }
@@ -164,6 +173,13 @@ impl DataConfig {
         }
         if !(16..=4096).contains(&self.crop) {
             return fault("data.crop", format!("is {}", self.crop), "use 16 to 4096 pixels");
+        }
+        if !((1..=99).contains(&self.instants) && self.instants % 2 == 1) {
+            return fault(
+                "data.instants",
+                format!("is {}", self.instants),
+                "use an odd number from 1 to 99: one of them is the middle",
+            );
         }
         if self.sensor.is_empty() || self.source.is_empty() {
             let key = if self.sensor.is_empty() { "data.sensor" } else { "data.source" };

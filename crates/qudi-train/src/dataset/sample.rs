@@ -3,13 +3,11 @@
 use super::config::{DataConfig, SourceConfig, SourceKind};
 use super::crop::{Crop, shrunk};
 use super::pack::Pack;
-use qudi_core::Camera;
 use qudi_core::Light;
 use qudi_core::random::{Domain, Streams, uniform};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
-use qudi_core::{Error, Result};
-use qudi_core::{Frame, Size};
+use qudi_core::{Camera, Error, Frame, Result, RollingShutter, Size};
 use qudi_sim::scene::{Procedural, ProceduralScene, StillMotion, still_scene};
 use rand::Rng;
 use std::f64::consts::TAU;
@@ -71,29 +69,35 @@ impl Dataset {
         let mut rng = Streams::new(seed).row(Domain::Training, number, 0);
         let weights: Vec<f64> = self.config.source.iter().map(|source| source.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
-        let (truth, mean_level) = match self.config.source[at].kind {
+        let (instants, mean_level) = match self.config.source[at].kind {
             SourceKind::Clips => self.clip(at, &mut rng)?,
             SourceKind::Stills => self.still(at, &mut rng)?,
             SourceKind::Scenes => self.scene(at, &mut rng),
         };
-        let (truth, mean_level) = rescaled(truth, mean_level, uniform(&mut rng));
+        let (instants, mean_level) = rescaled(instants, mean_level, uniform(&mut rng));
         let weights: Vec<f64> = self.config.sensor.iter().map(|mix| mix.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
         let sensor = self.sensors[at].clone();
         let light = Light { ppp: self.config.sensor[at].ppp.at(uniform(&mut rng)), mean_level };
         let seed = rng.next_u64();
-        let mut camera = Camera::new(&sensor, truth[0].size, light, seed)?;
-        let counts = (0..).zip(&truth).map(|(t, frame)| camera.expose(t, &[frame]));
-        let counts = counts.collect::<Result<_>>()?;
+        let mut camera = Camera::new(&sensor, instants[0].size, light, seed)?;
+        let mut shutter = RollingShutter::new(&sensor);
+        let (mut truth, mut counts) = (Vec::new(), Vec::new());
+        for (t, seen) in (0..).zip(instants.chunks(self.config.instants)) {
+            let mut seen = shutter.roll(seen);
+            counts.push(camera.expose(t, &seen.iter().collect::<Vec<_>>())?);
+            truth.push(seen.swap_remove(seen.len() / 2));
+        }
         let acquisition = Acquisition::new(sensor, light.ppp, mean_level)?.with_seed(seed);
         Ok(Sample { truth, counts, acquisition })
     }
 
+    /// The instants of a clip's exposures, one after the other, and the clip's mean.
     fn clip(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
         let pack = self.pack.as_mut().expect("checked at the start");
         let number = self.clips[source][below(self.clips[source].len(), rng)];
         let clip = pack.clips()[number].clone();
-        let steps = self.config.frames - 1;
+        let steps = self.config.frames * self.config.instants - 1;
         let longest = self.config.source[source].stride.min((clip.frames - 1) / steps.max(1));
         let stride = 1 + below(longest.max(1), rng);
         let first = below(clip.frames - steps * stride, rng);
@@ -116,6 +120,7 @@ impl Dataset {
         let number = self.clips[source][below(self.clips[source].len(), rng)];
         let clip = pack.clips()[number].clone();
         let (side, frames) = (self.config.crop, self.config.frames);
+        let instants = self.config.instants;
         let (angle, speed) = (TAU * uniform(rng), self.config.source[source].speed * uniform(rng));
         let mut motion = StillMotion {
             pan: [speed * angle.cos(), speed * angle.sin()],
@@ -134,7 +139,7 @@ impl Dataset {
         let crop = cut(clip.size, enlarged(part, factor), rng);
         let image = shrunk(crop.of(&pack.frame(number, 0)?), part);
         let scene = still_scene(image, motion, Size { height: side, width: side }, rng.next_u64());
-        Ok((rendered(&scene, frames), clip.mean))
+        Ok((rendered(&scene, frames, instants), clip.mean))
     }
 
     fn scene(&self, source: usize, rng: &mut impl Rng) -> (Vec<Frame>, f64) {
@@ -144,7 +149,7 @@ impl Dataset {
         let kind = ProceduralScene::by_name(name).expect("checked with the recipe");
         let speed = speed * uniform(rng);
         let scene = Procedural { kind, size, seed: rng.next_u64(), speed }.scene();
-        let frames = rendered(&scene, self.config.frames);
+        let frames = rendered(&scene, self.config.frames, self.config.instants);
         let mean = frames.iter().map(Frame::mean).sum::<f64>() / frames.len() as f64;
         (frames, mean)
     }
@@ -182,7 +187,8 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
         let help = "make the pack again from this recipe";
         return Err(Error::data(what, pack.path(), help));
     }
-    let frames = if source.kind == SourceKind::Clips { config.frames } else { 1 };
+    let exposed = config.frames * config.instants;
+    let frames = if source.kind == SourceKind::Clips { exposed } else { 1 };
     for &number in &list {
         let clip = &pack.clips()[number];
         let small = clip.size.height.min(clip.size.width) < config.crop;
@@ -193,7 +199,7 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
                     clip.name, clip.frames, clip.size, config.crop, config.crop
                 ),
                 pack.path(),
-                "lower data.crop or data.frames, or leave the clip out",
+                "lower data.crop, data.frames or data.instants, or leave the clip out",
             ));
         }
     }
@@ -213,10 +219,14 @@ fn rescaled(mut truth: Vec<Frame>, mean_level: f64, u: f64) -> (Vec<Frame>, f64)
     (truth, mean_level * factor)
 }
 
-/// Frames around time 0.
-fn rendered(scene: &qudi_sim::scene::Scene, frames: usize) -> Vec<Frame> {
+/// The instants of exposures around time 0, as many for each.
+fn rendered(scene: &qudi_sim::scene::Scene, frames: usize, instants: usize) -> Vec<Frame> {
     let middle = (frames / 2) as f64;
-    (0..frames).map(|t| scene.render(t as f64 - middle)).collect()
+    let time = |k: usize| {
+        let within = ((k % instants) as f64 + 0.5) / instants as f64 - 0.5;
+        (k / instants) as f64 - middle + within
+    };
+    (0..frames * instants).map(|k| scene.render(time(k))).collect()
 }
 
 /// A number below `count`, which is positive.

@@ -41,7 +41,7 @@ pub(crate) fn evaluate_capture(
     overrides.refuse(&["simulate."], "with --capture, whose photons are drawn already")?;
     let seed = plan.seed.unwrap_or(SEED);
     let path = Path::new(&plan.data);
-    let OpenedCapture { mut capture, sensor, sum } =
+    let OpenedCapture { mut capture, sensor, sum, .. } =
         open_summed(Some(path), &plan.read, plan.sum, plan.sensor.as_deref(), overrides)?;
     let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
     if let Some(choice) = &sum {

@@ -59,6 +59,7 @@ impl Exposing {
             sampling: Sampling {
                 frames: Some(frames),
                 instants: settings.get("simulate.instants")?,
+                frames_per_image: settings.get("simulate.frames_per_image")?,
                 transfer: settings.get("simulate.transfer")?,
                 white: settings.get("simulate.white")?,
             },

@@ -200,6 +200,7 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
         sampling: Sampling {
             frames,
             instants: settings.get("simulate.instants")?,
+            frames_per_image: settings.get("simulate.frames_per_image")?,
             transfer: settings.get("simulate.transfer")?,
             white: settings.get("simulate.white")?,
         },
