@@ -90,6 +90,54 @@ fn pedestal_of_a_simulated_camera_is_subtracted_again() {
     assert_eq!(bytes("back.npy")[data..], plain[data..]);
 }
 
+/// A texture that moves evenly is restored from sums along its motion, by methods that follow motion.
+#[test]
+fn aligns_sums_by_itself_where_things_move() {
+    let folder = capture("field-align", 330, 0.2, 0.15);
+    let restore = "restore c.npy --sensor swissspad2 --every 30";
+    let text = said(&folder, &format!("{restore} --method qbp -o aligned"));
+    assert!(text.contains("motion is followed") && text.contains("aligned along it"), "{text}");
+    let manifest = std::fs::read_to_string(folder.join("aligned/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_str(&manifest).unwrap();
+    let aligned = manifest["settings"]["aligned_sums"].as_u64().unwrap();
+    assert!((2..=30).contains(&aligned), "{aligned}");
+    for other in ["--method mle", "--method qbp --sum 5"] {
+        let text = said(&folder, &format!("{restore} {other} -o other.npy -f"));
+        assert!(!text.contains("motion is followed"), "{other}: {text}");
+    }
+    // All pictures, and those of an interrupted run with the others.
+    run(&folder, "restore c.npy --sensor swissspad2 --method qbp -o all");
+    let pictures = listing(&folder.join("all"));
+    let frame = |n: usize| folder.join(format!("all/frame_{n:06}.png"));
+    let before = std::fs::read(frame(7)).unwrap();
+    for n in 5..pictures.len() - 2 {
+        std::fs::remove_file(frame(n)).unwrap();
+    }
+    run(&folder, "restore c.npy --sensor swissspad2 --method qbp -o all");
+    assert_eq!(listing(&folder.join("all")), pictures);
+    assert_eq!(std::fs::read(frame(7)).unwrap(), before);
+}
+
+#[test]
+fn warns_of_mosaics() {
+    let folder = scratch("field-mosaic");
+    let (height, width, frames) = (128, 160, 40);
+    let mut state = 1_u64;
+    let mut counts = Vec::new();
+    for i in 0..frames * height * width {
+        let (x, y) = (i % width, i / width % height);
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        let filter = [[8, 5], [5, 3]][y % 2][x % 2];
+        counts.push((filter + (state >> 62)) as u8);
+    }
+    let shape = format!("({frames}, {height}, {width})");
+    std::fs::write(folder.join("m.npy"), npy_bytes("|u1", &shape, &counts)).unwrap();
+    let text = run(&folder, "info m.npy --bits 4");
+    assert!(text.contains("--cfa rggb@0,0 --channel 0"), "{text}");
+    let text = run(&folder, "info m.npy --bits 4 --cfa rggb --channel 0");
+    assert!(!text.contains("colour filter array: name it"), "{text}");
+}
+
 #[test]
 fn pictures_of_chosen_instants_are_those_of_all() {
     let folder = capture("field-every", 132, 0.2, 0.0);

@@ -32,6 +32,12 @@ pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
             100.0 * share
         ));
     }
+    if let Some(contrast) = summary.mosaic {
+        warnings.push(format!(
+            "pixels of a tile of 2 x 2 differ by {:.0} % all over the picture, as behind a colour filter array: name it and a plane (--cfa rggb@0,0 --channel 0), or colours are restored as texture",
+            100.0 * contrast
+        ));
+    }
     if let (Some(recorded), Some(found)) = (capture.info().ppp, summary.ppp.incident) {
         let recorded = recorded * f64::from(capture.summed());
         if !LIGHT.contains(&(found / recorded)) {

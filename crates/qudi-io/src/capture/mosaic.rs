@@ -1,5 +1,6 @@
 //! Colour filter arrays: which pixels of a mosaic see which colour.
 
+use qudi_core::Size;
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
@@ -98,9 +99,84 @@ impl From<Mosaic> for String {
     }
 }
 
+/// Side of the blocks that are asked whether they show a mosaic.
+const BLOCK: usize = 32;
+
+/// Blocks that must be lit for an answer.
+const LEAST_BLOCKS: usize = 12;
+
+/// Share of the blocks that must agree on which pixels are the brighter ones.
+const AGREED: f64 = 0.9;
+
+/// Contrast between the pixels of a tile that is more than uneven readout.
+const CONTRAST: f64 = 0.02;
+
+/// By how much the pixels of tiles of 2 x 2 differ all over the picture `sums`, as a share of their mean, if it
+/// looks like that of a colour filter array: the two diagonals differ, or rows and columns both. Stripes along
+/// one axis are readout.
+pub(crate) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<f64> {
+    let mut contrasts: [Vec<f64>; 3] = Default::default();
+    for top in (0..size.height.saturating_sub(BLOCK - 1)).step_by(BLOCK) {
+        for left in (0..size.width.saturating_sub(BLOCK - 1)).step_by(BLOCK) {
+            let mut phases = [[0.0; 2]; 2];
+            for y in top..top + BLOCK {
+                for x in left..left + BLOCK {
+                    phases[y % 2][x % 2] += f64::from(sums[y * size.width + x]);
+                }
+            }
+            let [[a, b], [c, d]] = phases;
+            let total = a + b + c + d;
+            if total > 0.0 {
+                let of_block = [a + d - b - c, a + b - c - d, a + c - b - d];
+                for (all, contrast) in contrasts.iter_mut().zip(of_block) {
+                    all.push(2.0 * contrast / total);
+                }
+            }
+        }
+    }
+    let [diagonal, rows, columns] = contrasts.map(agreed_contrast);
+    diagonal.or(rows.and(columns))
+}
+
+/// The median of contrasts that nearly all have the same sign and are large enough.
+fn agreed_contrast(mut contrasts: Vec<f64>) -> Option<f64> {
+    let positive = contrasts.iter().filter(|&&contrast| contrast > 0.0).count();
+    let agree = positive.max(contrasts.len() - positive) as f64 >= AGREED * contrasts.len() as f64;
+    if contrasts.len() < LEAST_BLOCKS || !agree {
+        return None;
+    }
+    contrasts.sort_unstable_by(f64::total_cmp);
+    let median = contrasts[contrasts.len() / 2].abs();
+    (median > CONTRAST).then_some(median)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use qudi_core::random::{Domain, Streams, uniform};
+
+    /// A picture with gradients and noise, seen through filters.
+    fn seen(filters: [[f64; 2]; 2]) -> Option<f64> {
+        let size = Size { height: 128, width: 160 };
+        let mut rng = Streams::new(5).row(Domain::Photons, 0, 0);
+        let value = |i: usize| {
+            let (x, y) = (i % size.width, i / size.width);
+            let light = 20.0 + 0.1 * x as f64 + 15.0 * (0.3 * y as f64).sin().powi(2);
+            let noise = 1.0 + 0.4 * (uniform(&mut rng) - 0.5);
+            (light * noise * filters[y % 2][x % 2]) as u32
+        };
+        mosaic_contrast(&(0..size.pixels()).map(value).collect::<Vec<_>>(), size)
+    }
+
+    #[test]
+    fn mosaics_show_in_the_picture_and_stripes_do_not_count() {
+        assert_eq!(seen([[1.0, 1.0], [1.0, 1.0]]), None);
+        assert_eq!(seen([[1.0, 0.8], [1.0, 0.8]]), None, "columns of a readout");
+        let rggb = seen([[0.7, 1.0], [1.0, 0.5]]).unwrap();
+        assert!((0.4..0.6).contains(&rggb), "{rggb}");
+        // Diagonals alike.
+        assert!(seen([[1.0, 0.9], [0.7, 0.6]]).is_some());
+    }
 
     #[test]
     fn planes_begin_where_the_pattern_says() {

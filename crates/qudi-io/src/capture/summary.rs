@@ -2,6 +2,7 @@
 
 use super::Capture;
 use super::bit_order::{SURE, bit_order_z_score};
+use super::mosaic::mosaic_contrast;
 use super::options::{BitOrder, PackAxis};
 use qudi_core::PppDefinition;
 use qudi_core::Result;
@@ -24,6 +25,9 @@ pub struct Summary {
     pub ppp: Ppp,
     /// Whether the picture agrees with the bit order in use; packed captures only.
     pub bit_order: Option<BitOrderCheck>,
+    /// By how much the pixels of tiles of 2 x 2 differ, where the picture looks like that of a colour filter
+    /// array that nobody has named.
+    pub mosaic: Option<f64>,
     /// Sum of the frames looked at, repaired.
     pub sums: Vec<u32>,
 }
@@ -100,6 +104,7 @@ impl Summary {
             saturated,
             ppp,
             bit_order,
+            mosaic: if capture.info.cfa.is_none() { mosaic_contrast(&sums, size) } else { None },
             sums,
         })
     }
