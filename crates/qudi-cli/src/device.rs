@@ -133,6 +133,20 @@ fn card(kind: DeviceType, number: usize) -> Option<Device> {
     Device::enumerate(kind).into_vec().into_iter().nth(number)
 }
 
+/// Keeps drivers of graphics cards from complaining on standard error that there is no desktop session. They look
+/// for sockets below this folder only, and find none.
+///
+/// To be called before there are threads.
+#[cfg(any(feature = "wgpu", feature = "vulkan"))]
+#[allow(unsafe_code)]
+pub(crate) fn quieten_drivers() {
+    const FOLDER: &str = "XDG_RUNTIME_DIR";
+    if cfg!(unix) && std::env::var_os(FOLDER).is_none() {
+        // SAFETY: called at the start of `main`, when no other thread can read the environment.
+        unsafe { std::env::set_var(FOLDER, std::env::temp_dir()) };
+    }
+}
+
 /// Backends with the names of their cards; looked for once, since drivers talk on standard error.
 fn all_cards() -> &'static [(&'static str, Vec<String>)] {
     static CARDS: OnceLock<Vec<(&'static str, Vec<String>)>> = OnceLock::new();

@@ -24,6 +24,8 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
     memory::keep_freed_pages();
+    #[cfg(any(feature = "wgpu", feature = "vulkan"))]
+    device::quieten_drivers();
     if let Err(error) = check_arguments() {
         return report::Report::plain().error(&error);
     }
