@@ -7,6 +7,7 @@
 #![warn(missing_docs)]
 
 mod aligned_burst;
+mod aligned_sums;
 mod denoise;
 mod merge;
 pub mod methods;
@@ -18,6 +19,7 @@ mod reference;
 mod temporal_filter;
 
 pub use aligned_burst::{AlignedBurst, AlignedFrame, Alignments};
+pub use aligned_sums::{AlignedSums, choose_count};
 pub use denoise::bm3d::bm3d;
 pub use denoise::vst::{Transform, VarianceStabilizer};
 pub use methods::{Average, Mle, PatchFlow, PostFilter, Qbp, QbpSettings, TransformDenoise};

@@ -52,22 +52,29 @@ impl ReferenceEstimate {
     /// # Errors
     /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.
     pub fn compute(view: BurstView<'_>, acquisition: &Acquisition) -> Result<Self> {
+        let all: Vec<usize> = (0..view.frames.len()).collect();
+        Self::of_frames(view, acquisition, &all)
+    }
+
+    /// Restores the frames `wanted` of the window in the second pass.
+    fn of_frames(view: BurstView<'_>, acquisition: &Acquisition, wanted: &[usize]) -> Result<Self> {
         let Acquisition { sensor, gain, .. } = acquisition;
         let ordinary_dark = sensor.dark_per_frame()?;
         let frame_count = view.frames.len();
         let vst = VarianceStabilizer::new(Transform::Integral, sensor, *gain, frame_count as u32);
         let burst = PreparedBurst::new(view, acquisition);
-        let velocity = ConstantVelocity::find(&burst);
+        let velocity = ConstantVelocity::find(&burst, 0.0);
 
         // Restores all frames with stabilized variance.
-        let restored = |merge: &dyn Fn(usize) -> MergedFrame, search, sigma_factor: f64| {
-            let restore = |frame: usize| {
-                let MergedFrame { counts, noise, .. } = merge(frame);
-                let sigma = sigma_factor * (frame_count as f64 * noise).sqrt();
-                denoise(search, vst.stabilized(&counts), &vst, sigma)
+        let restored =
+            |merge: &dyn Fn(usize) -> MergedFrame, frames: &[usize], search, sigma_factor: f64| {
+                let restore = |frame: usize| {
+                    let MergedFrame { counts, noise, .. } = merge(frame);
+                    let sigma = sigma_factor * (frame_count as f64 * noise).sqrt();
+                    denoise(search, vst.stabilized(&counts), &vst, sigma)
+                };
+                frames.iter().map(|&frame| restore(frame)).collect::<Vec<Frame>>()
             };
-            (0..frame_count).map(restore).collect::<Vec<Frame>>()
-        };
         let mean_counts = |z: &Frame| {
             let mean = |&z: &f32| vst.mean_count(f64::from(z)) as f32;
             let means: Vec<f32> = z.data.iter().map(mean).collect();
@@ -83,7 +90,8 @@ impl ReferenceEstimate {
             let motion = select_on_counts(&burst, velocity, global, reference, matched);
             MergedFrame::from_blocks(&burst, &blocks, &motion, qbp.settings.wiener_c)
         };
-        let first = restored(&merge, FIRST_SEARCH, qbp.settings.bm3d_sigma_factor);
+        let all: Vec<usize> = (0..frame_count).collect();
+        let first = restored(&merge, &all, FIRST_SEARCH, qbp.settings.bm3d_sigma_factor);
 
         let first = first.iter().map(mean_counts).collect();
         let references = ReferenceFrames::new(&burst, first, FIRST_PASS_ERROR);
@@ -93,7 +101,7 @@ impl ReferenceEstimate {
             let motion = select_on_estimates(&burst, velocity, &references, reference, matched);
             MergedFrame::on_reference_frames(&burst, &references, reference, &motion, WIENER_C)
         };
-        let second = restored(&merge, SECOND_SEARCH, SIGMA_FACTOR);
+        let second = restored(&merge, wanted, SECOND_SEARCH, SIGMA_FACTOR);
 
         let frames = second.iter().map(|z| image(z, &vst, acquisition, ordinary_dark)).collect();
         let mean_counts = second.iter().map(mean_counts).collect();
@@ -116,6 +124,16 @@ impl Restorer for QbpRefined {
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
         let frames = ReferenceEstimate::compute(burst, acquisition)?.frames;
+        Ok(Restored { frames, std: None })
+    }
+
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        wanted: &[usize],
+    ) -> Result<Restored> {
+        let frames = ReferenceEstimate::of_frames(burst, acquisition, wanted)?.frames;
         Ok(Restored { frames, std: None })
     }
 }

@@ -1,6 +1,7 @@
 //! Captures as commands open them: with the sensor that is named or known, and with remarks for the user.
 
 pub(crate) mod acquisition;
+pub(crate) mod aligned;
 pub(crate) mod warnings;
 
 use crate::args::Sum;
@@ -70,6 +71,8 @@ pub(crate) struct OpenedCapture {
     pub(crate) sensor: Option<Sensor>,
     /// Why so many frames are summed, where nobody said so.
     pub(crate) sum: Option<SumChoice>,
+    /// What light and motion want, where nobody said how many frames are summed: perhaps a single one.
+    pub(crate) choice: Option<SumChoice>,
 }
 
 /// Opens a capture as [`open_capture`] does. Frames are summed as `sum` says; if it says nothing, the capture
@@ -99,10 +102,11 @@ pub(crate) fn open_summed(
         Some(Sum::Auto) => sum_by_itself(capture, options, of_sensor, !chooses)?,
         Some(Sum::Frames(_)) | None => (capture, None),
     };
-    Ok(OpenedCapture { capture, sensor, sum: choice })
+    let sum = choice.clone().filter(|choice| choice.frames > 1);
+    Ok(OpenedCapture { capture, sensor, sum, choice })
 }
 
-/// The capture with as many frames summed as it chooses, and why, if it sums any. Where it cannot choose and is
+/// The capture with as many frames summed as it chooses, and why. Where it cannot choose and is
 /// `asked` to, it is refused.
 pub(crate) fn sum_by_itself(
     mut capture: Capture,
@@ -121,7 +125,7 @@ pub(crate) fn sum_by_itself(
             "--sum",
             "leave it out; say the depth with --bits 1 if these are binary frames",
         )),
-        _ => Ok((capture, None)),
+        choice => Ok((capture, choice)),
     }
 }
 

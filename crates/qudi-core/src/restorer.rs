@@ -54,6 +54,25 @@ pub trait Restorer {
     /// # Errors
     /// [`Error`](crate::Error) if the method cannot work with this burst.
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored>;
+
+    /// Restores only the frames `wanted` of `burst`, to what [`Self::restore`] makes of them. Methods that need
+    /// not restore the others for it save their time.
+    ///
+    /// # Errors
+    /// As [`Self::restore`].
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        wanted: &[usize],
+    ) -> Result<Restored> {
+        let all = self.restore(burst, acquisition)?;
+        if wanted.len() == all.frames.len() {
+            return Ok(all);
+        }
+        let only = |frames: Vec<Frame>| wanted.iter().map(|&n| frames[n].clone()).collect();
+        Ok(Restored { frames: only(all.frames), std: all.std.map(only) })
+    }
 }
 
 impl Acquisition {

@@ -59,14 +59,22 @@ impl Windows {
         self.length.min(self.frames)
     }
 
+    /// The weight of window `number` at `frame`, which it shares with the window before: over an overlap of `n`
+    /// frames it grows linearly from `1 / (n + 1)` to `n / (n + 1)`.
+    pub fn weight(&self, number: u64, frame: u64) -> f32 {
+        let range = self.range(number);
+        let before = self.range(number.saturating_sub(1));
+        let shared = before.end.saturating_sub(range.start);
+        (frame - range.start + 1) as f32 / (shared + 1) as f32
+    }
+
     /// The first window that holds `frame`.
     pub fn first_with(&self, frame: u64) -> u64 {
         (0..self.count()).find(|&n| self.range(n).end > frame).unwrap_or(0)
     }
 }
 
-/// Blends overlapping windows frame by frame: over an overlap of `n` frames the new window's weight
-/// grows linearly from `1 / (n + 1)` to `n / (n + 1)`.
+/// Blends the pictures of overlapping windows.
 #[derive(Debug, Default)]
 pub struct CrossFade {
     /// Number of the first waiting frame.
@@ -75,16 +83,19 @@ pub struct CrossFade {
 }
 
 impl CrossFade {
-    /// Takes the result of the window that starts at frame `start`.
-    pub fn push(&mut self, start: u64, frames: Vec<Frame>) {
+    /// Takes the pictures of a window, from number `start` on. `weight` says how much of it goes into a picture
+    /// that the window before has made, too.
+    pub fn push(&mut self, start: u64, frames: Vec<Frame>, weight: impl Fn(u64) -> f32) {
         if self.waiting.is_empty() {
             self.first = start;
         }
         let shared = (self.first + self.waiting.len() as u64 - start) as usize;
         let from = self.waiting.len() - shared;
         let mut frames = frames.into_iter();
-        for (i, (old, new)) in self.waiting.iter_mut().skip(from).zip(&mut frames).enumerate() {
-            let weight = (i + 1) as f32 / (shared + 1) as f32;
+        for (number, (old, new)) in
+            (start..).zip(self.waiting.iter_mut().skip(from).zip(&mut frames))
+        {
+            let weight = weight(number);
             for (old, new) in old.data.iter_mut().zip(new.data) {
                 *old += weight * (new - *old);
             }
@@ -92,7 +103,7 @@ impl CrossFade {
         self.waiting.extend(frames);
     }
 
-    /// The next frame before `until`, the start of the next window, with its number.
+    /// The next picture before `until`, the first of the next window, with its number.
     pub fn pop(&mut self, until: u64) -> Option<(u64, Frame)> {
         if self.first >= until {
             return None;
@@ -137,7 +148,9 @@ mod tests {
         assert_eq!((windows.count(), windows.range(1)), (2, 8..19));
         let (mut fade, mut out) = (CrossFade::default(), Vec::new());
         for n in 0..2 {
-            fade.push(windows.range(n).start, vec![Frame::filled(size, n as f32); 11]);
+            let range = windows.range(n);
+            let weight = |frame| windows.weight(n, frame);
+            fade.push(range.start, vec![Frame::filled(size, n as f32); 11], weight);
             let until = if n == 0 { 8 } else { 19 };
             out.extend(std::iter::from_fn(|| fade.pop(until)));
         }

@@ -43,6 +43,16 @@ impl HotPixels {
         }
         repaired
     }
+
+    /// Counts with bad pixels replaced by a good neighbour, another one in every frame: their noise stays that
+    /// of a count.
+    pub(crate) fn replaced(&self, counts: &[u16], frame: usize) -> Vec<u16> {
+        let mut replaced = counts.to_vec();
+        for (i, neighbours) in self.pixels.iter().filter(|(_, good)| !good.is_empty()) {
+            replaced[*i] = counts[neighbours[frame % neighbours.len()]];
+        }
+        replaced
+    }
 }
 
 #[cfg(test)]

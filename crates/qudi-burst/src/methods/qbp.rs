@@ -14,7 +14,6 @@ use crate::prepared_burst::PreparedBurst;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
-use std::ops::Range;
 
 /// The filter that follows the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -67,26 +66,12 @@ impl Qbp {
         Self { post_filter, settings }
     }
 
-    /// Restores frame `reference` of a window only.
-    ///
-    /// # Errors
-    /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.
-    pub fn restore_one(
-        &self,
-        burst: BurstView<'_>,
-        acquisition: &Acquisition,
-        reference: usize,
-    ) -> Result<Frame> {
-        let mut one = self.restore_frames(burst, acquisition, reference..reference + 1)?;
-        Ok(one.swap_remove(0))
-    }
-
     /// Restores the frames `references`, each from the whole window.
-    fn restore_frames(
+    fn merge_frames(
         &self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        references: Range<usize>,
+        references: &[usize],
     ) -> Result<Vec<Frame>> {
         let sensor = &acquisition.sensor;
         let ordinary_dark = sensor.dark_per_frame()?;
@@ -110,7 +95,7 @@ impl Qbp {
             }
             image(&z, &vst, acquisition, ordinary_dark)
         };
-        Ok(references.map(restore).collect())
+        Ok(references.iter().map(|&reference| restore(reference)).collect())
     }
 
     /// Chooses how many frames are summed into a block.
@@ -137,8 +122,17 @@ impl Restorer for Qbp {
     }
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let all = 0..burst.frames.len();
-        Ok(Restored { frames: self.restore_frames(burst, acquisition, all)?, std: None })
+        let all: Vec<usize> = (0..burst.frames.len()).collect();
+        self.restore_frames(burst, acquisition, &all)
+    }
+
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        wanted: &[usize],
+    ) -> Result<Restored> {
+        Ok(Restored { frames: self.merge_frames(burst, acquisition, wanted)?, std: None })
     }
 }
 

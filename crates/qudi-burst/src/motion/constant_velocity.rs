@@ -21,8 +21,9 @@ pub(crate) struct ConstantVelocity {
 }
 
 impl ConstantVelocity {
-    /// Finds the velocities of a window; none if there are too few frames to agree.
-    pub(crate) fn find(burst: &PreparedBurst) -> Option<Self> {
+    /// Finds the velocities of a window; none if there are too few frames to agree. They are rest, or that of
+    /// the whole frame, unless another fits better by `evidence` nats.
+    pub(crate) fn find(burst: &PreparedBurst, evidence: f32) -> Option<Self> {
         let frames = &burst.frames;
         if frames.len() < 3 {
             return None;
@@ -30,7 +31,7 @@ impl ConstantVelocity {
         let search = VelocitySearch::new(frames, &burst.moments);
         let grid = &burst.grid;
         let anchors = ((frames.len() - 1) % ANCHORS / 2..frames.len()).step_by(ANCHORS);
-        let found: Vec<_> = anchors.map(|k| (k, search.velocities(grid, k))).collect();
+        let found: Vec<_> = anchors.map(|k| (k, search.velocities(grid, k, evidence))).collect();
         let of = |frame: usize| {
             let (anchor, velocities) = found.iter().min_by_key(|(k, _)| k.abs_diff(frame))?;
             let time = *anchor as f32 - frame as f32;
@@ -38,6 +39,11 @@ impl ConstantVelocity {
         };
         let velocities = (0..frames.len()).map(of).collect::<Option<_>>()?;
         Some(Self { smoothed: frames.par_iter().map(smooth).collect(), velocities })
+    }
+
+    /// The velocities of the patches of frame `frame`, in pixels per frame.
+    pub(crate) fn velocities(&self, frame: usize) -> &[[f32; 2]] {
+        &self.velocities[frame]
     }
 
     /// The motion of every patch of frame `reference` to every frame.

@@ -361,7 +361,7 @@ mod tests {
     }
 
     fn velocity(burst: &PreparedBurst) -> ConstantVelocity {
-        ConstantVelocity::find(burst).unwrap_or_else(|| panic!("enough frames"))
+        ConstantVelocity::find(burst, 0.0).unwrap_or_else(|| panic!("enough frames"))
     }
 
     #[test]

@@ -22,6 +22,9 @@ const FASTEST: usize = 20;
 const ACROSS: usize = 2 * FASTEST + 1;
 const VELOCITIES: usize = ACROSS * ACROSS;
 
+/// The label of no motion.
+const REST: usize = FASTEST * ACROSS + FASTEST;
+
 /// Pixels here around a patch's centre, to either side, that decide for it.
 const RADIUS: usize = 2;
 
@@ -66,8 +69,8 @@ impl VelocitySearch {
     }
 
     /// The velocity of every patch of frame `reference`, in the pixels of the frames per frame, right and
-    /// down.
-    pub(crate) fn velocities(&self, grid: &Grid, reference: usize) -> Vec<[f32; 2]> {
+    /// down. It is rest, or that of the whole frame, unless another fits better by `evidence` nats.
+    pub(crate) fn velocities(&self, grid: &Grid, reference: usize, evidence: f32) -> Vec<[f32; 2]> {
         let places: Vec<[usize; 2]> = (0..grid.len())
             .map(|i| grid.corner(i).map(|corner| (corner + grid.side / 2) / SHRINK))
             .collect();
@@ -82,7 +85,17 @@ impl VelocitySearch {
             .map(|i| columns.iter().map(|column: &Vec<f32>| column[i]).collect())
             .collect();
         let total = matched(&cost, grid.xs.len());
-        total.iter().map(|total| lowest(total).map(|v| v * SHRINK as f32)).collect()
+        let usual = common(&columns);
+        let velocity = |total: &Vec<f32>| {
+            let best = total.iter().copied().fold(f32::INFINITY, f32::min);
+            for prior in [REST, usual] {
+                if evidence > 0.0 && total[prior] - best < evidence {
+                    return lowest_around(total, prior);
+                }
+            }
+            lowest(total)
+        };
+        total.iter().map(|total| velocity(total).map(|v| v * SHRINK as f32)).collect()
     }
 
     /// By how much the frames vary along a velocity more than noise does, in its variance, at every pixel.
@@ -237,9 +250,21 @@ fn along(cost: &[Vec<f32>], line: &[usize]) -> Vec<Vec<f32>> {
     summed
 }
 
+/// The label of the velocity that costs all patches together the least.
+fn common(columns: &[Vec<f32>]) -> usize {
+    let cost = |label: usize| columns[label].iter().map(|&cost| f64::from(cost)).sum::<f64>();
+    let costs: Vec<f64> = (0..VELOCITIES).map(cost).collect();
+    (0..VELOCITIES).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(REST)
+}
+
 /// The velocity of least cost, between the lattice's by parabolas.
 fn lowest(total: &[f32]) -> [f32; 2] {
     let best = (0..VELOCITIES).min_by(|&a, &b| total[a].total_cmp(&total[b])).unwrap_or(0);
+    lowest_around(total, best)
+}
+
+/// The velocity of label `best`, between the lattice's by parabolas.
+fn lowest_around(total: &[f32], best: usize) -> [f32; 2] {
     let at = velocity(best);
     let offset = |k: usize, step: usize| {
         if k == 0 || k + 1 == ACROSS {
@@ -302,7 +327,7 @@ mod tests {
             .collect();
         let moments = CountMoments::new(&CountLaw::new(&sensor, camera.gain()));
         let grid = Grid::new(size, 16, 8);
-        let found = VelocitySearch::new(&frames, &moments).velocities(&grid, 5);
+        let found = VelocitySearch::new(&frames, &moments).velocities(&grid, 5, 0.0);
         let error = |v: &[f32; 2]| (v[0] - velocity[0]).hypot(v[1] - velocity[1]);
         let mut errors: Vec<f32> = found.iter().map(error).collect();
         errors.sort_unstable_by(f32::total_cmp);

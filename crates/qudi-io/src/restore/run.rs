@@ -103,18 +103,18 @@ fn run_centred(
             capture.read_from(first + number * sum, counts)?;
         }
         let acquisition = Acquisition { first_frame: first / sum, ..acquisition.clone() };
-        let restored = restorer.restore(BurstView { size, frames: &counts }, &acquisition)?;
-        refuse_not_finite(first / sum, &restored.frames, capture.path())?;
-        let at = before as usize;
-        sink.frame(picture, &restored.frames[at], &counts[at])?;
+        let (view, at) = (BurstView { size, frames: &counts }, before as usize);
+        let restored = restorer.restore_frames(view, &acquisition, &[at])?;
+        refuse_not_finite(picture, &restored.frames, capture.path())?;
+        sink.frame(picture, &restored.frames[0], &counts[at])?;
         if let Some(uncertainty) = restored.std {
-            sink.uncertainty(picture, &uncertainty[at])?;
+            sink.uncertainty(picture, &uncertainty[0])?;
         }
     }
     Ok(())
 }
 
-/// Windows one after the other, blended where they overlap, and those of their frames that become pictures.
+/// Windows one after the other: those of their frames that become pictures, blended where windows overlap.
 fn run_windows(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
@@ -124,7 +124,6 @@ fn run_windows(
     sink: &mut dyn RestoreSink,
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
-    let wanted = |frame| instants.picture_of(frame).filter(|picture| pictures.contains(picture));
     let (first, end) = (instants.frame_of(pictures.start), instants.frame_of(pictures.end));
     let size = capture.size();
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
@@ -158,22 +157,30 @@ fn run_windows(
         }
         capture.discard_before(range.end);
         let acquisition = Acquisition { first_frame: range.start, ..acquisition.clone() };
-        let burst = BurstView { size, frames: counts.make_contiguous() };
-        let restored = restorer.restore(burst, &acquisition)?;
-        refuse_not_finite(range.start, &restored.frames, capture.path())?;
-        fade.push(range.start, restored.frames);
-        if let Some(uncertainty) = restored.std {
-            uncertainties.push(range.start, uncertainty);
+        let before = instants.pictures_before(range.start);
+        let here = before..instants.pictures_before(range.end);
+        let frames = here.map(|picture| (instants.frame_of(picture) - range.start) as usize);
+        let frames: Vec<usize> = frames.collect();
+        if !frames.is_empty() {
+            let burst = BurstView { size, frames: counts.make_contiguous() };
+            let restored = restorer.restore_frames(burst, &acquisition, &frames)?;
+            refuse_not_finite(before, &restored.frames, capture.path())?;
+            let weight = |picture| windows.weight(number, instants.frame_of(picture));
+            fade.push(before, restored.frames, weight);
+            if let Some(uncertainty) = restored.std {
+                uncertainties.push(before, uncertainty, weight);
+            }
         }
         let last = number + 1 == windows.count();
         let until = if last { range.end } else { windows.range(number + 1).start };
-        while let Some((frame, image)) = fade.pop(until) {
-            if let Some(picture) = wanted(frame) {
+        let until = instants.pictures_before(until);
+        while let Some((picture, image)) = fade.pop(until) {
+            let wanted = pictures.contains(&picture);
+            let frame = instants.frame_of(picture);
+            if wanted {
                 sink.frame(picture, &image, &counts[(frame - first_held) as usize])?;
             }
-            if let Some((frame, uncertainty)) = uncertainties.pop(until)
-                && let Some(picture) = wanted(frame)
-            {
+            if let Some((_, uncertainty)) = uncertainties.pop(until).filter(|_| wanted) {
                 sink.uncertainty(picture, &uncertainty)?;
             }
         }

@@ -46,7 +46,7 @@ pub(crate) fn run(
     }
     let options = info.reading.options(MaskChoice::Auto);
     let name = info.sensor.as_deref();
-    let OpenedCapture { mut capture, sensor, sum } =
+    let OpenedCapture { mut capture, sensor, sum, .. } =
         open_summed(Some(path), &options, info.reading.sum(), name, settings)?;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;

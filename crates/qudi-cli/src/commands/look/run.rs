@@ -12,7 +12,7 @@ use crate::report::html::{data_url, render};
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::{PostFilter, Qbp};
-use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::{Capture, MaskChoice, Summary};
@@ -54,7 +54,7 @@ pub(crate) fn run(
         .check()?;
     let file = Output::open(Some(&output), global.overwrite())?;
     let options = args.reading.options(MaskChoice::Auto);
-    let OpenedCapture { mut capture, sensor, sum } = open_summed(
+    let OpenedCapture { mut capture, sensor, sum, .. } = open_summed(
         Some(&args.capture),
         &options,
         args.reading.sum(),
@@ -149,7 +149,8 @@ fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<F
         capture.read(frame, counts)?;
     }
     let view = BurstView { size, frames: &frames };
-    Ok(Qbp::new(PostFilter::Bm3d).restore_one(view, acquisition, frames.len() / 2)?)
+    let mut qbp = Qbp::new(PostFilter::Bm3d);
+    Ok(qbp.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
 }
 
 /// What `qudi restore` would do, and about how long that takes.

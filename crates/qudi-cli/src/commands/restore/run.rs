@@ -7,6 +7,7 @@ use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
 use crate::capture::acquisition::acquisition;
+use crate::capture::aligned::{Alignment, align_by_itself};
 use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_sensor, warnings};
 use crate::device;
 use crate::error::Result;
@@ -116,29 +117,49 @@ impl Job {
     fn prepare(plan: &Plan, overrides: &Settings, report: &Report) -> Result<Self> {
         let path = (!plan.reads_pipe()).then_some(plan.capture.as_path());
         let name = plan.sensor.as_deref();
-        let OpenedCapture { mut capture, sensor, sum } =
+        let OpenedCapture { mut capture, sensor, sum, choice } =
             open_summed(path, &plan.read, plan.sum, name, overrides)?;
         let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
         if let Some(choice) = &sum {
             report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
         }
+        let mut alignment = None;
+        if let Some(choice) = &choice {
+            let method = plan.method.as_deref();
+            (capture, alignment) = align_by_itself(capture, choice, method, &plan.read, &sensor)?;
+        }
+        if let Some(alignment) = alignment {
+            report.remark(&format!("note: {}", alignment.describe()));
+        }
         let gain = plan.light.known_gain(&capture);
         let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
         let (acquisition, source) = acquisition(&plan.light, &mut capture, &sensor, &summary)?;
         let warnings = warnings::of_capture(&capture, &summary);
+        let of_method = match alignment {
+            Some(alignment) => alignment.acquisition(&acquisition)?,
+            None => acquisition.clone(),
+        };
         let name = match &plan.method {
             Some(name) => name.clone(),
-            None => announced_method(plan, &capture, &acquisition, report)?.to_owned(),
+            None => announced_method(plan, &capture, &of_method, report)?.to_owned(),
         };
         let name = name.as_str();
         if let Some(flag) = plan.seed_flag.filter(|_| name != "qudi") {
             return Err(other_method(flag));
         }
-        let (restorer, choice) = method(name, &mut capture, &acquisition, &plan.network)?;
-        let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
+        let (restorer, choice) = method(name, &mut capture, &of_method, &plan.network)?;
+        let restorer = match alignment {
+            Some(alignment) => alignment.around(restorer),
+            None => restorer,
+        };
+        let overlap = plan.overlap * alignment.map_or(1, |alignment| alignment.count as u64);
+        let windows = Windows::new(capture.frames(), restorer.window() as u64, overlap)?;
         let schedule = match plan.every {
             Some(every) => Schedule { windows, instants: Instants::every(every, &capture)? },
-            None => Schedule::all(windows),
+            None => match alignment {
+                Some(alignment) => Schedule { windows, instants: alignment.instants() },
+                None => Schedule::all(windows),
+            },
         };
         let place = if plan.reads_pipe() {
             capture.path().to_owned()
@@ -155,7 +176,7 @@ impl Job {
             "method": restorer.name(),
             "choice": choice,
             "window": restorer.window(),
-            "overlap": plan.overlap,
+            "overlap": overlap,
             "seed": plan.light.seed,
             "network": network_settings(restorer.name(), &plan.network)?,
             "ppp": acquisition.ppp,
@@ -168,6 +189,9 @@ impl Job {
         if capture.summed() > 1 && plan.read.sum.is_none() {
             settings["sum"] = json!(capture.summed());
         }
+        if let Some(alignment) = alignment {
+            settings["aligned_sums"] = json!(alignment.native_frames());
+        }
         if let Some(every) = plan.every {
             settings["every"] = json!(every);
         }
@@ -175,7 +199,8 @@ impl Job {
             settings["tonemap"] = json!("srgb");
         }
         if let Some(fps) = capture.fps().or(sensor_fps(&acquisition)) {
-            settings["capture_fps"] = json!(fps);
+            let step = alignment.map_or(1, Alignment::step);
+            settings["capture_fps"] = json!(fps / step as f64);
         }
         Ok(Self { capture, acquisition, source, restorer, choice, schedule, settings, warnings })
     }
