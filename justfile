@@ -18,7 +18,7 @@ test-remote:
 # Formatting and lints
 lint:
     cargo fmt --all --check
-    cargo clippy --workspace --all-targets -- -D warnings
+    cargo clippy --workspace --all-targets --features qudi-cli/wgpu -- -D warnings
 
 # API documentation
 doc:

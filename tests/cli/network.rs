@@ -119,6 +119,8 @@ fn rejects_unfit_weights_and_options_in_three_parts() {
         &["no device `nothing`"],
     );
     refused(&folder, &with("").replace("--device cpu", "--device wgpu:99"), &["wgpu:99"]);
+    #[cfg(not(feature = "wgpu"))]
+    refused(&folder, &with("").replace("--device cpu", "--device wgpu"), &["--features wgpu"]);
     std::fs::write(
         folder.join("torn.safetensors"),
         &std::fs::read(folder.join("w.safetensors")).unwrap()[..5000],
@@ -213,6 +215,7 @@ fn processor_passes_selftest() {
 }
 
 /// Where there is a graphics card, or a driver that imitates one: what such a driver does in seconds.
+#[cfg(feature = "wgpu")]
 #[test]
 #[expect(clippy::print_stderr, reason = "says that it is skipped")]
 fn graphics_card_matches_the_processor() {

@@ -42,6 +42,19 @@ pub(crate) fn list() -> Vec<Listed> {
     devices
 }
 
+/// The feature that this build lacks for a backend.
+fn feature_of(backend: &str) -> Option<&'static str> {
+    let features = [
+        ("wgpu", cfg!(feature = "wgpu")),
+        ("vulkan", cfg!(feature = "vulkan")),
+        ("metal", cfg!(feature = "metal")),
+        ("cuda", cfg!(feature = "cuda")),
+        ("ndarray", cfg!(feature = "ndarray")),
+    ];
+    let lacks = |(name, built): &&(&'static str, bool)| *name == backend && !built;
+    features.iter().find(lacks).map(|(name, _)| *name)
+}
+
 /// Opens a device by name and computes something small on it.
 pub(crate) fn open(name: &str) -> Result<Opened> {
     let name = if name == "auto" { best() } else { name.to_owned() };
@@ -54,11 +67,14 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
     };
     let missing = || {
         let names: Vec<_> = list().into_iter().map(|device| device.name).collect();
-        CliError::new(
-            format!("there is no device `{name}`"),
-            "--device",
-            format!("this build and machine have {}; or use auto", names.join(", ")),
-        )
+        let names = names.join(", ");
+        let help = match feature_of(backend) {
+            Some(feature) => {
+                format!("this build has {names}; build it with `--features {feature}` for more")
+            }
+            None => format!("this build and machine have {names}; or use auto"),
+        };
+        CliError::new(format!("there is no device `{name}`"), "--device", help)
     };
     let number = number.ok_or_else(missing)?;
     let on_card = || all_cards().iter().any(|(b, cards)| *b == backend && number < cards.len());

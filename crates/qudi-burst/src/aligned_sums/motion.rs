@@ -8,6 +8,7 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Result, Size};
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Blocks along which velocities are taken for constant.
 const STRETCH: usize = 2 * LONGEST_HALF + 1;
@@ -18,9 +19,9 @@ const EVIDENCE: f32 = 6.0;
 
 /// The counts of a burst and the velocity at every place of every block of frames.
 #[derive(Debug)]
-pub(super) struct BlockMotion {
+pub(super) struct BlockMotion<'a> {
     size: Size,
-    counts: Vec<Vec<u16>>,
+    counts: Vec<Cow<'a, [u16]>>,
     /// Frames of a block.
     block: usize,
     /// Pixels per frame, `[block][patch]`.
@@ -29,15 +30,15 @@ pub(super) struct BlockMotion {
     patch: Vec<u32>,
 }
 
-impl BlockMotion {
+impl<'a> BlockMotion<'a> {
     /// Finds the velocities between sums of `block` frames.
     pub(super) fn find(
-        burst: BurstView<'_>,
+        burst: BurstView<'a>,
         acquisition: &Acquisition,
         block: usize,
     ) -> Result<Self> {
         let hot = HotPixels::find(burst, acquisition.sensor.max_count());
-        let counts: Vec<Vec<u16>> =
+        let counts: Vec<Cow<'a, [u16]>> =
             (0..).zip(burst.frames).map(|(n, counts)| hot.replaced(counts, n)).collect();
         let block = block.min(counts.len());
         let blocks: Vec<Vec<u16>> = counts.par_chunks_exact(block).map(plain_sum).collect();
@@ -131,10 +132,10 @@ impl BlockMotion {
 }
 
 /// The sum of frames, nothing aligned.
-fn plain_sum(frames: &[Vec<u16>]) -> Vec<u16> {
-    let mut sum = frames[0].clone();
+fn plain_sum(frames: &[Cow<'_, [u16]>]) -> Vec<u16> {
+    let mut sum = frames[0].to_vec();
     for frame in &frames[1..] {
-        sum.iter_mut().zip(frame).for_each(|(sum, &count)| *sum = sum.saturating_add(count));
+        sum.iter_mut().zip(frame.iter()).for_each(|(sum, &count)| *sum = sum.saturating_add(count));
     }
     sum
 }

@@ -3,6 +3,7 @@
 
 use qudi_core::bad_pixels::BadPixels;
 use qudi_core::restorer::BurstView;
+use std::borrow::Cow;
 
 /// Bad pixels, each with its good neighbours.
 #[derive(Clone, Debug)]
@@ -46,12 +47,15 @@ impl HotPixels {
 
     /// Counts with bad pixels replaced by a good neighbour, another one in every frame: their noise stays that
     /// of a count.
-    pub(crate) fn replaced(&self, counts: &[u16], frame: usize) -> Vec<u16> {
+    pub(crate) fn replaced<'a>(&self, counts: &'a [u16], frame: usize) -> Cow<'a, [u16]> {
+        if self.pixels.is_empty() {
+            return Cow::Borrowed(counts);
+        }
         let mut replaced = counts.to_vec();
         for (i, neighbours) in self.pixels.iter().filter(|(_, good)| !good.is_empty()) {
             replaced[*i] = counts[neighbours[frame % neighbours.len()]];
         }
-        replaced
+        Cow::Owned(replaced)
     }
 }
 

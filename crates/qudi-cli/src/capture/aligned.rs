@@ -23,7 +23,8 @@ const FASTEST: f64 = 6.0;
 /// Picture distances of which an aligned sum may consist. One is no alignment.
 const MULTIPLES: [usize; 8] = [1, 2, 3, 5, 8, 12, 18, 27];
 
-/// Fine sums in a picture distance, where it has that many frames: few enough are held back to choose by.
+/// Fine sums in a picture distance, where it has that many frames, and in an aligned sum: few enough are held back to
+/// choose by, and lengths are met well enough.
 const STEPS: f64 = 8.0;
 
 /// Side of the part of the picture that is looked at.
@@ -35,8 +36,11 @@ const WINDOW: usize = 11;
 /// Detections per pixel of a sum beyond which more light is not needed.
 const ENOUGH: f64 = 20.0;
 
+/// Native frames of a sum, at most: sums hold 16 bits.
+const LONGEST: u32 = 60_000;
+
 /// Bytes of the counts of a window, at most.
-const WINDOW_BYTES: usize = 256 << 20;
+const WINDOW_BYTES: u64 = 256 << 20;
 
 /// Stretches of the capture that are looked at.
 const PLACES: u64 = 4;
@@ -44,18 +48,43 @@ const PLACES: u64 = 4;
 /// How the fine sums of a capture, read as its frames, are aligned.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Alignment {
-    /// Fine sums in an aligned one.
-    pub(crate) count: usize,
-    /// Fine sums in a block.
-    block: usize,
-    /// Fine sums from one picture to the next.
-    step: u64,
     /// Native frames in a fine sum.
     fine: u32,
+    /// Fine sums from one picture to the next.
+    step: u64,
+    /// Fine sums in a block.
+    block: usize,
+    /// Fine sums in an aligned one.
+    pub(crate) count: usize,
+}
+
+/// Native frames in an aligned sum, and in the blocks between which motion is found.
+#[derive(Clone, Copy, Debug)]
+struct Lengths {
+    sum: f64,
+    block: f64,
 }
 
 impl Alignment {
-    /// The pictures that are made, one for each sum that motion allows.
+    /// `lengths` in fine sums of a capture that moves by `motion` pixels a native frame, for a picture every
+    /// `distance` native frames. Where sums are longer than that, they are multiples of it: pictures whose
+    /// distance is a multiple of a sum are restored together.
+    fn new(lengths: Lengths, motion: f64, distance: u32) -> Self {
+        let slow = |fine: &u32| {
+            f64::from(*fine) * motion <= FINE && STEPS * f64::from(*fine) <= lengths.sum
+        };
+        let divides = |fine: &u32| distance.is_multiple_of(*fine);
+        let fine = (1..=distance.min(LONGEST)).rev().filter(divides).find(slow).unwrap_or(1);
+        let step = (distance / fine) as usize;
+        let of = |native: f64| ((native / f64::from(fine)).round() as usize).max(1);
+        let mut count = of(lengths.sum);
+        if count > step {
+            count = (count + step / 2) / step * step;
+        }
+        Self { fine, step: step as u64, block: of(lengths.block), count }
+    }
+
+    /// The pictures that are made.
     pub(crate) fn instants(self) -> Instants {
         let sum = u64::from(self.fine);
         Instants::Frames { every: self.step * sum, sum }
@@ -90,12 +119,13 @@ impl Alignment {
     }
 }
 
-/// Finds out whether sums of `capture`, which motion keeps short, can be aligned for `method`. If so, its frames
-/// become the fine sums that are shifted.
+/// Finds out whether sums of `capture`, which motion keeps short, can be aligned for `method`, with a picture for
+/// every `every` native frames or every sum. If so, its frames become the fine sums that are shifted.
 pub(crate) fn align_by_itself(
     capture: Capture,
     choice: &SumChoice,
     method: Option<&str>,
+    every: Option<u64>,
     options: &ReadOptions,
     sensor: &Sensor,
 ) -> Result<(Capture, Option<Alignment>)> {
@@ -105,40 +135,44 @@ pub(crate) fn align_by_itself(
     if choice.limit != SumLimit::Motion || choice.still || !readable || !aligns || !known {
         return Ok((capture, None));
     }
-    let sum = choice.frames;
+    let (sum, frames) = (choice.frames, capture.native_frames());
+    let distance = every.map_or(u64::from(sum), |every| every.min(frames)) as u32;
+    let bytes = capture.size().pixels() * size_of::<u16>();
     let steps = (f64::from(sum) * choice.motion / FINE).ceil();
     let steps = steps.max(STEPS).clamp(1.0, f64::from(sum));
     let fine = (f64::from(sum) / steps).round().max(1.0) as u32;
     let mut capture = capture.summed_by(fine, options, Some(sensor))?;
-    let step = steps as usize;
-    let candidate = Alignment { count: step, block: 0, step: step as u64, fine };
-    match choose(&mut capture, choice, candidate, sensor)? {
-        Some(alignment) => Ok((capture, Some(alignment))),
-        None => Ok((capture.summed_by(sum, options, Some(sensor))?, None)),
-    }
+    let lengths = choose(&mut capture, choice, steps as usize, sensor)?;
+    let alignment = lengths.map(|lengths| Alignment::new(lengths, choice.motion, distance));
+    let fits = |alignment: &Alignment| {
+        let held = (WINDOW * alignment.count) as u64;
+        held * u64::from(alignment.fine) <= frames && held * bytes as u64 <= WINDOW_BYTES
+    };
+    let alignment = alignment.filter(fits);
+    let sum = alignment.map_or(sum, |alignment| alignment.fine);
+    Ok((capture.summed_by(sum, options, Some(sensor))?, alignment))
 }
 
-/// Chooses block and count for the fine sums of `capture`.
+/// Chooses block and sum for a capture, read in fine sums of which `step` make a plain sum.
 fn choose(
     capture: &mut Capture,
     choice: &SumChoice,
-    candidate: Alignment,
+    step: usize,
     sensor: &Sensor,
-) -> Result<Option<Alignment>> {
-    let (frames, pixels) = (capture.frames() as usize, capture.size().pixels());
-    let light = choice.detections * f64::from(candidate.fine);
-    let motion = choice.motion * f64::from(candidate.fine);
-    let block = ((FOUND / light).ceil() as usize).max(candidate.count);
+) -> Result<Option<Lengths>> {
+    let frames = capture.frames() as usize;
+    let fine = f64::from(capture.summed());
+    let (light, motion) = (choice.detections * fine, choice.motion * fine);
+    let block = ((FOUND / light).ceil() as usize).max(step);
     let block = block.min((FASTEST / motion) as usize).min(frames / WINDOW);
     let fits = |&count: &usize| {
         count * WINDOW <= frames
             && count <= block * WINDOW
             && count as f64 * light <= ENOUGH
-            && count * WINDOW * pixels * size_of::<u16>() <= WINDOW_BYTES
+            && count as f64 * fine <= f64::from(LONGEST)
     };
-    let multiples = MULTIPLES.into_iter().chain([frames / WINDOW / candidate.count]);
-    let mut counts: Vec<usize> =
-        multiples.map(|times| times * candidate.count).filter(fits).collect();
+    let multiples = MULTIPLES.into_iter().chain([frames / WINDOW / step]);
+    let mut counts: Vec<usize> = multiples.map(|times| times * step).filter(fits).collect();
     counts.sort_unstable();
     counts.dedup();
     let (Some(&most), true) = (counts.last(), block > 0 && counts.len() > 1) else {
@@ -151,13 +185,9 @@ fn choose(
     let samples = samples(capture, length)?;
     let size = part(capture.size());
     let views: Vec<_> = samples.iter().map(|frames| BurstView { size, frames }).collect();
-    let held = (candidate.count / 4).max(1);
-    let count = choose_count(&views, &acquisition, block, held, &counts)?;
-    Ok(count.filter(|&count| count > candidate.count).map(|count| Alignment {
-        count,
-        block,
-        ..candidate
-    }))
+    let count = choose_count(&views, &acquisition, block, (step / 4).max(1), &counts)?;
+    let lengths = |count: usize| Lengths { sum: count as f64 * fine, block: block as f64 * fine };
+    Ok(count.filter(|&count| count > step).map(lengths))
 }
 
 /// The size of what is looked at.
@@ -184,4 +214,22 @@ fn samples(capture: &mut Capture, length: usize) -> Result<Vec<Vec<Vec<u16>>>> {
         samples.push(stretch);
     }
     Ok(samples)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_share_sums_where_they_can() {
+        let lengths = Lengths { sum: 576.0, block: 140.0 };
+        let alignment = Alignment::new(lengths, 0.021, 100);
+        let Alignment { fine, step, block, count } = alignment;
+        assert_eq!((fine, step, block, count), (20, 5, 7, 30));
+        assert_eq!(alignment.native_frames(), 600);
+        assert_eq!(alignment.instants(), Instants::Frames { every: 100, sum: 20 });
+        // Pictures farther apart than sums are long need no common length; primes have no divisors.
+        assert_eq!(Alignment::new(lengths, 0.021, 1000).count, 29);
+        assert_eq!(Alignment::new(lengths, 0.3, 7).fine, 1);
+    }
 }

@@ -128,6 +128,7 @@ fn run_windows(
     let size = capture.size();
     let mut counts: VecDeque<Vec<u16>> = VecDeque::new();
     let mut first_held = 0;
+    let mut restored_until = 0;
     let mut fade = CrossFade::default();
     let mut uncertainties = CrossFade::default();
     for number in windows.first_with(first).. {
@@ -139,7 +140,7 @@ fn run_windows(
         }
         let range = windows.range(number);
         let total = instants.pictures(capture).map(|all| pictures.end.min(all) - pictures.start);
-        let done = instants.pictures_before(range.start).saturating_sub(pictures.start);
+        let done = instants.pictures_before(restored_until).saturating_sub(pictures.start);
         if on(done, total).is_break() {
             return Err(Error::Interrupted);
         }
@@ -171,6 +172,7 @@ fn run_windows(
                 uncertainties.push(before, uncertainty, weight);
             }
         }
+        restored_until = range.end;
         let last = number + 1 == windows.count();
         let until = if last { range.end } else { windows.range(number + 1).start };
         let until = instants.pictures_before(until);

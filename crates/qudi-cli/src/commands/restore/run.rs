@@ -126,7 +126,8 @@ impl Job {
         let mut alignment = None;
         if let Some(choice) = &choice {
             let method = plan.method.as_deref();
-            (capture, alignment) = align_by_itself(capture, choice, method, &plan.read, &sensor)?;
+            (capture, alignment) =
+                align_by_itself(capture, choice, method, plan.every, &plan.read, &sensor)?;
         }
         if let Some(alignment) = alignment {
             report.remark(&format!("note: {}", alignment.describe()));
@@ -154,13 +155,12 @@ impl Job {
         };
         let overlap = plan.overlap * alignment.map_or(1, |alignment| alignment.count as u64);
         let windows = Windows::new(capture.frames(), restorer.window() as u64, overlap)?;
-        let schedule = match plan.every {
-            Some(every) => Schedule { windows, instants: Instants::every(every, &capture)? },
-            None => match alignment {
-                Some(alignment) => Schedule { windows, instants: alignment.instants() },
-                None => Schedule::all(windows),
-            },
+        let instants = match (alignment, plan.every) {
+            (Some(alignment), _) => alignment.instants(),
+            (None, Some(every)) => Instants::every(every, &capture)?,
+            (None, None) => Schedule::all(windows).instants,
         };
+        let schedule = Schedule { windows, instants };
         let place = if plan.reads_pipe() {
             capture.path().to_owned()
         } else {
