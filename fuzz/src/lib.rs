@@ -2,12 +2,13 @@
 //!
 //! Any result is fine, except a panic, a hang, or memory beyond libFuzzer's limit.
 
-use qudi_io::capture::{Capture, ReadOptions};
+use qudi_io::capture::{Axes, Capture, ReadOptions, choose_sum};
 
 /// Frames read from each file.
 const FRAMES: u64 = 4;
 
-/// Opens `bytes` as a capture called `name`, with `options`, strictly and leniently.
+/// Opens `bytes` as a capture called `name`, with `options`: strictly, leniently, with other axes, one colour channel,
+/// one plane of a mosaic, a pedestal.
 pub fn read(name: &str, options: &ReadOptions, bytes: &[u8]) {
     let Ok(folder) = tempfile::tempdir_in(if cfg!(target_os = "linux") { "/dev/shm" } else { "." })
     else {
@@ -15,8 +16,17 @@ pub fn read(name: &str, options: &ReadOptions, bytes: &[u8]) {
     };
     let path = folder.path().join(name);
     std::fs::write(&path, bytes).expect("a temporary file");
-    for lenient in [false, true] {
-        let options = ReadOptions { lenient, ..options.clone() };
+    let plain = || options.clone();
+    let cfa = "rggb@0,1".parse().ok();
+    let variants = [
+        plain(),
+        ReadOptions { lenient: true, ..plain() },
+        ReadOptions { axes: Some(Axes::Hwt), ..plain() },
+        ReadOptions { channel: Some(1), ..plain() },
+        ReadOptions { channel: Some(2), cfa, ..plain() },
+        ReadOptions { offset: Some(3.0), threshold: Some(2.0), sum: Some(2), ..plain() },
+    ];
+    for options in variants {
         let Ok(mut capture) = Capture::open(&path, &options, None) else { continue };
         let pixels = capture.size().pixels();
         if pixels > 1 << 22 {
@@ -28,6 +38,9 @@ pub fn read(name: &str, options: &ReadOptions, bytes: &[u8]) {
         }
         let mut sums = vec![0; pixels];
         let _ = capture.total(0..capture.frames().min(FRAMES), &mut sums);
+        if capture.summed() == 1 && capture.frames() < 1000 && pixels < 1 << 14 {
+            let _ = choose_sum(&mut capture);
+        }
     }
 }
 

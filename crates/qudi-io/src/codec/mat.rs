@@ -113,7 +113,7 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
     let found = arrays(path)?;
     let listed = || {
         let names: Vec<_> = found.iter().map(|a| format!("{} {:?}", a.name, a.dims)).collect();
-        if names.is_empty() { "it holds no numeric arrays".to_owned() } else { names.join(", ") }
+        names.join(", ")
     };
     if let Some(wanted) = &options.array {
         return found
@@ -134,6 +134,11 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
     match (customary, captures.as_slice()) {
         (Some(array), _) => Ok(array.clone()),
         (None, [one]) => Ok((*one).clone()),
+        (None, []) if found.is_empty() => Err(Error::data(
+            "it holds no numeric arrays; structs and cells are not looked into",
+            path,
+            "save the array itself, as with `frames = s.frames; save('NAME.mat', 'frames')`",
+        )),
         (None, []) => Err(Error::data(
             format!("no array of frames in it; there are: {}", listed()),
             path,
