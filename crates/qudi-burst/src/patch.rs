@@ -63,6 +63,17 @@ pub(crate) fn bilinear(image: &Frame, corner: [f32; 2]) -> Patch {
     })
 }
 
+/// The sum of all samples of a patch, sixteen at a time.
+pub(crate) fn total(patch: &Patch) -> f32 {
+    let mut lanes = [0.0f32; SIDE];
+    for row in patch {
+        for (lane, value) in lanes.iter_mut().zip(row) {
+            *lane += value;
+        }
+    }
+    lanes.iter().sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

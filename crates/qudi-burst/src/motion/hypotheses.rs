@@ -11,7 +11,7 @@ use super::global_motion::GlobalMotion;
 use super::patch_refinement::refine;
 use super::pyramid::smooth;
 use super::reference_frames::ReferenceFrames;
-use crate::patch::{Patch, PatchMotion, SIDE, bilinear, inside};
+use crate::patch::{Patch, PatchMotion, SIDE, bilinear, inside, total};
 use crate::prepared_burst::PreparedBurst;
 use qudi_core::Frame;
 use rayon::prelude::*;
@@ -250,7 +250,12 @@ impl HypothesisSelector<'_> {
         };
         let noise = left(d[0]) * left(d[1]);
         let (rows, columns) = (both(1, size.height), both(0, size.width));
-        sums.outside += (SIDE * SIDE - rows.len() * columns.len()) as f32;
+        let pixels = rows.len() * columns.len();
+        if pixels == SIDE * SIDE {
+            sums.add_whole(here, &there, noise);
+            return;
+        }
+        sums.outside += (SIDE * SIDE - pixels) as f32;
         for y in rows {
             for x in columns.clone() {
                 let residual = there[y][x] - here[y][x];
@@ -271,11 +276,15 @@ struct Own {
 
 /// Sums of the differences from the template over the frames of a path, by pixel.
 struct Sums {
-    sum: [[f32; SIDE]; SIDE],
-    squares: [[f32; SIDE]; SIDE],
-    count: [[f32; SIDE]; SIDE],
-    /// Variances of the noise, in that of a whole pixel.
-    noise: [[f32; SIDE]; SIDE],
+    sum: Patch,
+    squares: Patch,
+    /// Frames in which only a part of the patch lies inside, and the variances of their noise, in that of a whole
+    /// pixel.
+    count: Patch,
+    noise: Patch,
+    /// The same of frames in which all of it does.
+    whole_count: f32,
+    whole_noise: f32,
     /// Pixels of frames that lie outside.
     outside: f32,
 }
@@ -283,26 +292,46 @@ struct Sums {
 impl Sums {
     fn new() -> Self {
         let zero = [[0.0; SIDE]; SIDE];
-        Self { sum: zero, squares: zero, count: zero, noise: zero, outside: 0.0 }
+        Self {
+            sum: zero,
+            squares: zero,
+            count: zero,
+            noise: zero,
+            whole_count: 0.0,
+            whole_noise: 0.0,
+            outside: 0.0,
+        }
+    }
+
+    /// Adds the residuals of a frame in which the whole patch lies inside.
+    fn add_whole(&mut self, here: &Patch, there: &Patch, noise: f32) {
+        for y in 0..SIDE {
+            for x in 0..SIDE {
+                let residual = there[y][x] - here[y][x];
+                self.sum[y][x] += residual;
+                self.squares[y][x] += residual * residual;
+            }
+        }
+        self.whole_count += 1.0;
+        self.whole_noise += noise;
     }
 
     /// Squared differences over what noise makes.
     fn misfit(&self, variance: f32, outside: f32) -> f32 {
-        let squares: f32 = self.squares.iter().flatten().sum();
-        let noise: f32 = self.noise.iter().flatten().sum();
-        squares / variance - noise + outside * self.outside
+        let noise = total(&self.noise) + self.whole_noise * (SIDE * SIDE) as f32;
+        total(&self.squares) / variance - noise + outside * self.outside
     }
 
     /// As much of it as a difference common to all frames explains.
     fn common(&self, known: f32, variance: f32) -> f32 {
-        let mut common = 0.0;
-        for y in 0..SIDE {
-            for x in 0..SIDE {
-                let weight = 1.0 / (known + self.count[y][x]).max(1.0);
-                common += weight * (self.sum[y][x] * self.sum[y][x] / variance - self.noise[y][x]);
-            }
-        }
-        common
+        let common: Patch = std::array::from_fn(|y| {
+            std::array::from_fn(|x| {
+                let weight = 1.0 / (known + self.whole_count + self.count[y][x]).max(1.0);
+                let noise = self.whole_noise + self.noise[y][x];
+                weight * (self.sum[y][x] * self.sum[y][x] / variance - noise)
+            })
+        });
+        total(&common)
     }
 }
 

@@ -2,7 +2,7 @@
 //! registration technique", IJCAI 1981), and their regularization: flat patches move with their surroundings.
 
 use super::grid::Grid;
-use crate::patch::{SIDE, bilinear};
+use crate::patch::{Patch, SIDE, bilinear};
 use qudi_core::Frame;
 
 /// Steps of the refinement, as in the authors' experiments.
@@ -51,34 +51,36 @@ fn refine_patch(
     start: [f32; 2],
     variance: f32,
 ) -> Refined {
-    let (width, height) = (image.size.width, image.size.height);
-    let mut slopes_x = [[0.0f32; SIDE]; SIDE];
-    let mut slopes_y = slopes_x;
-    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-    for (y, (slopes_x, slopes_y)) in (y0..).zip(slopes_x.iter_mut().zip(&mut slopes_y)) {
+    let height = image.size.height;
+    let [mut slopes_x, mut slopes_y, mut own] = [[[0.0f32; SIDE]; SIDE]; 3];
+    for r in 0..SIDE {
+        let y = y0 + r;
         let row = image.row(y);
         let (up, down) = (image.row(y.saturating_sub(1)), image.row((y + 1).min(height - 1)));
-        for (x, (sx, sy)) in (x0..).zip(slopes_x.iter_mut().zip(slopes_y)) {
-            *sx = 0.5 * (row[(x + 1).min(width - 1)] - row[x.saturating_sub(1)]);
-            *sy = 0.5 * (down[x] - up[x]);
-            xx += *sx * *sx;
-            xy += *sx * *sy;
-            yy += *sy * *sy;
+        own[r].copy_from_slice(&row[x0..x0 + SIDE]);
+        let [mut left, mut right] = [own[r]; 2];
+        // At a border the last pixel is its own neighbour.
+        left[1..].copy_from_slice(&row[x0..x0 + SIDE - 1]);
+        left[0] = row[x0.saturating_sub(1)];
+        right[..SIDE - 1].copy_from_slice(&row[x0 + 1..x0 + SIDE]);
+        right[SIDE - 1] = row[(x0 + SIDE).min(row.len() - 1)];
+        let (up, down) = (&up[x0..x0 + SIDE], &down[x0..x0 + SIDE]);
+        for c in 0..SIDE {
+            slopes_x[r][c] = 0.5 * (right[c] - left[c]);
+            slopes_y[r][c] = 0.5 * (down[c] - up[c]);
         }
     }
+    let [xx, xy, yy] = [(&slopes_x, &slopes_x), (&slopes_x, &slopes_y), (&slopes_y, &slopes_y)]
+        .map(|(a, b)| total_product(a, b));
     let solve = Damped::new([xx, xy, yy], variance / (STEP_SIGMA * STEP_SIGMA));
     let mut d = start;
     for _ in 0..STEPS {
         let moved = bilinear(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
-        let (mut bx, mut by) = (0.0, 0.0);
-        for (r, moved) in moved.iter().enumerate() {
-            let row = &image.row(y0 + r)[x0..x0 + SIDE];
-            let slopes = slopes_x[r].iter().zip(&slopes_y[r]);
-            for ((moved, here), (sx, sy)) in moved.iter().zip(row).zip(slopes) {
-                bx += sx * (moved - here);
-                by += sy * (moved - here);
-            }
+        let mut away = moved;
+        for (away, own) in away.iter_mut().flatten().zip(own.iter().flatten()) {
+            *away -= own;
         }
+        let [bx, by] = [total_product(&slopes_x, &away), total_product(&slopes_y, &away)];
         let step = solve.solve([bx, by]);
         for k in 0..2 {
             let from_start = d[k] - step[k] - start[k];
@@ -86,6 +88,17 @@ fn refine_patch(
         }
     }
     Refined { flow: d, slopes: [xx, xy, yy] }
+}
+
+/// The sum of the products of two patches' samples, sixteen at a time.
+fn total_product(a: &Patch, b: &Patch) -> f32 {
+    let mut lanes = [0.0f32; SIDE];
+    for (a, b) in a.iter().zip(b) {
+        for ((lane, a), b) in lanes.iter_mut().zip(a).zip(b) {
+            *lane += a * b;
+        }
+    }
+    lanes.iter().sum()
 }
 
 /// Draws every patch towards the median motion of its neighbourhood, as far as its own gradients leave its
