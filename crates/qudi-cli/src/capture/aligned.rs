@@ -142,37 +142,41 @@ pub(crate) fn align_by_itself(
     let steps = steps.max(STEPS).clamp(1.0, f64::from(sum));
     let fine = (f64::from(sum) / steps).round().max(1.0) as u32;
     let mut capture = capture.summed_by(fine, options, Some(sensor))?;
-    let lengths = choose(&mut capture, choice, steps as usize, sensor)?;
-    let alignment = lengths.map(|lengths| Alignment::new(lengths, choice.motion, distance));
-    let fits = |alignment: &Alignment| {
-        let held = (WINDOW * alignment.count) as u64;
-        held * u64::from(alignment.fine) <= frames && held * bytes as u64 <= WINDOW_BYTES
+    let alignment = |lengths| Alignment::new(lengths, choice.motion, distance);
+    let fits = |lengths: Lengths| {
+        let Alignment { fine, count, .. } = alignment(lengths);
+        let held = (WINDOW * count) as u64;
+        held * u64::from(fine) <= frames && held * bytes as u64 <= WINDOW_BYTES
     };
-    let alignment = alignment.filter(fits);
+    let lengths = choose(&mut capture, choice, steps as usize, sensor, &fits)?;
+    let alignment = lengths.map(alignment);
     let sum = alignment.map_or(sum, |alignment| alignment.fine);
     Ok((capture.summed_by(sum, options, Some(sensor))?, alignment))
 }
 
-/// Chooses block and sum for a capture, read in fine sums of which `step` make a plain sum.
+/// Chooses block and sum for a capture, read in fine sums of which `step` make a plain sum, among those that fit.
 fn choose(
     capture: &mut Capture,
     choice: &SumChoice,
     step: usize,
     sensor: &Sensor,
+    fits: &dyn Fn(Lengths) -> bool,
 ) -> Result<Option<Lengths>> {
     let frames = capture.frames() as usize;
     let fine = f64::from(capture.summed());
     let (light, motion) = (choice.detections * fine, choice.motion * fine);
     let block = ((FOUND / light).ceil() as usize).max(step);
     let block = block.min((FASTEST / motion) as usize).min(frames / WINDOW);
-    let fits = |&count: &usize| {
+    let lengths = |count: usize| Lengths { sum: count as f64 * fine, block: block as f64 * fine };
+    let wanted = |&count: &usize| {
         count * WINDOW <= frames
             && count <= block * WINDOW
             && count as f64 * light <= ENOUGH
             && count as f64 * fine <= f64::from(LONGEST)
+            && (count == step || fits(lengths(count)))
     };
     let multiples = MULTIPLES.into_iter().chain([frames / WINDOW / step]);
-    let mut counts: Vec<usize> = multiples.map(|times| times * step).filter(fits).collect();
+    let mut counts: Vec<usize> = multiples.map(|times| times * step).filter(wanted).collect();
     counts.sort_unstable();
     counts.dedup();
     let (Some(&most), true) = (counts.last(), block > 0 && counts.len() > 1) else {
@@ -186,7 +190,6 @@ fn choose(
     let size = part(capture.size());
     let views: Vec<_> = samples.iter().map(|frames| BurstView { size, frames }).collect();
     let count = choose_count(&views, &acquisition, block, (step / 4).max(1), &counts)?;
-    let lengths = |count: usize| Lengths { sum: count as f64 * fine, block: block as f64 * fine };
     Ok(count.filter(|&count| count > step).map(lengths))
 }
 

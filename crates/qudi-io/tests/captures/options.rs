@@ -27,6 +27,11 @@ fn with(option: FormatOption, base: &ReadOptions) -> ReadOptions {
     }
 }
 
+/// A capture that another program wrote.
+fn golden(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/captures").join(name)
+}
+
 /// A file that is opened as `format`; `None` where one takes more than a few bytes to make.
 fn file(format: &str, folder: &Path) -> Option<PathBuf> {
     let frames = scene(4, 16, 24, 9);
@@ -76,6 +81,9 @@ fn file(format: &str, folder: &Path) -> Option<PathBuf> {
             std::fs::create_dir_all(&path).unwrap();
             write(&path, "zeros.bin", &vec![0; 3 * 9600])
         }
+        "mat" => golden("mat/plain.mat"),
+        "hdf5" => golden("hdf5/contiguous.h5"),
+        "visionsim" => golden("visionsim1"),
         "swissspad2" | "swissspad2-full" | "spad512s" | "spad512s-8" | "spad512s-16" => {
             write(folder, "zeros.bin", &vec![0; 1 << 21])
         }
