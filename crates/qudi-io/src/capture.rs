@@ -32,7 +32,9 @@ pub use summary::{BitOrderCheck, Summary};
 use crate::codec;
 use crate::frames::depth::DepthChecked;
 use crate::frames::{CountFrames, memory};
-use mosaic::MosaicPlane;
+use info::{check_sum, depth_source, state_depth};
+use mosaic::mosaic_plane;
+use options::with_pedestal;
 use pipe::{FIRST_WINDOW, STDIN};
 use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
@@ -71,108 +73,6 @@ impl std::fmt::Debug for Capture {
             .field("path", &self.path)
             .field("info", &self.info)
             .finish_non_exhaustive()
-    }
-}
-
-/// The options, with the pedestal and the threshold of the sensor where they say nothing of either.
-fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
-    let mut options = options.clone();
-    if options.offset.is_none()
-        && options.threshold.is_none()
-        && let Some(sensor) = sensor
-    {
-        options.offset = (sensor.offset > 0.0).then_some(sensor.offset);
-        options.threshold = sensor.threshold;
-    }
-    options
-}
-
-/// What the user says of the depth, unless the file knows better.
-fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
-    if !(1..=16).contains(&bits) {
-        return Err(Error::request(format!("{bits} bits"), "bits", "counts have 1 to 16 bits"));
-    }
-    let max = ((1u32 << bits) - 1) as u16;
-    match info.max_count {
-        Some(known) if known != max => Err(Error::request(
-            format!("{bits} bits, where the file has counts up to {known}"),
-            "bits",
-            "leave it out: the file knows its depth",
-        )),
-        _ => {
-            info.max_count = Some(max);
-            Ok(())
-        }
-    }
-}
-
-/// The pixels of a mosaic that are read; `None` where there is none.
-fn mosaic_plane(
-    info: &mut CaptureInfo,
-    options: &ReadOptions,
-    path: &Path,
-) -> Result<Option<MosaicPlane>> {
-    let Some(mosaic) = options.cfa.clone().or(info.cfa.take()) else { return Ok(None) };
-    info.cfa = Some(mosaic.clone());
-    let letters = mosaic.pattern();
-    let index = match options.channel {
-        Some(index) => index,
-        None if options.cfa.is_some() => {
-            let first = letters.chars().next().unwrap_or_default();
-            info.notes.push(format!(
-                "one colour of the mosaic {mosaic} is read, the first ({first}); all are {}",
-                mosaic.choices()
-            ));
-            0
-        }
-        None => {
-            return Err(Error::data(
-                format!("a capture behind a colour filter array ({})", letters.to_uppercase()),
-                path,
-                format!("read one of its colours as gray: {}", mosaic.choices()),
-            ));
-        }
-    };
-    let plane = mosaic.plane(index);
-    if plane.is_none() {
-        return Err(Error::request(
-            format!("channel {index} of the mosaic {mosaic}"),
-            "channel",
-            format!("it has {}", mosaic.choices()),
-        ));
-    }
-    Ok(plane)
-}
-
-/// Refuses sums of no frames, of more than there are, and those that 16 bits do not hold.
-fn check_sum(sum: u32, frames: u64, info: &CaptureInfo) -> Result<()> {
-    if sum == 0 || u64::from(sum) > frames {
-        return Err(Error::request(
-            format!("{sum} frames summed into one, of {frames}"),
-            "sum",
-            "sum between 1 and all frames",
-        ));
-    }
-    if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
-        return Err(Error::request(
-            format!("sums of {sum} frames do not fit into 16 bits"),
-            "sum",
-            "counts go up to 65535: sum fewer frames",
-        ));
-    }
-    Ok(())
-}
-
-/// Who says how deep the counts of a capture are.
-fn depth_source(options: &ReadOptions, info: &CaptureInfo) -> &'static str {
-    if options.levels.is_some() {
-        "`levels`"
-    } else if info.is_recorded() {
-        "the record beside it"
-    } else if options.bits.is_some() {
-        "`bits`"
-    } else {
-        "the file itself"
     }
 }
 

@@ -1,7 +1,10 @@
 //! Colour filter arrays: which pixels of a mosaic see which colour.
 
-use qudi_core::Size;
+use super::info::CaptureInfo;
+use super::options::ReadOptions;
+use qudi_core::{Error, Result, Size};
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 use std::str::FromStr;
 
 /// The pattern of a colour filter array, and where its first tile begins: `rggb@0,0`.
@@ -58,7 +61,7 @@ impl Mosaic {
 impl FromStr for Mosaic {
     type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, String> {
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
         let wanted = || {
             format!(
                 "expected the colours of a tile of 2 x 2 or 4 x 4 pixels and the row and column where it begins, as in rggb@0,0 (letters {LETTERS}); not `{text}`"
@@ -88,7 +91,7 @@ impl std::fmt::Display for Mosaic {
 impl TryFrom<String> for Mosaic {
     type Error = String;
 
-    fn try_from(text: String) -> Result<Self, String> {
+    fn try_from(text: String) -> std::result::Result<Self, String> {
         text.parse()
     }
 }
@@ -97,6 +100,44 @@ impl From<Mosaic> for String {
     fn from(mosaic: Mosaic) -> Self {
         mosaic.to_string()
     }
+}
+
+/// The pixels of a mosaic that are read; `None` where there is none.
+pub(super) fn mosaic_plane(
+    info: &mut CaptureInfo,
+    options: &ReadOptions,
+    path: &Path,
+) -> Result<Option<MosaicPlane>> {
+    let Some(mosaic) = options.cfa.clone().or(info.cfa.take()) else { return Ok(None) };
+    info.cfa = Some(mosaic.clone());
+    let letters = mosaic.pattern();
+    let index = match options.channel {
+        Some(index) => index,
+        None if options.cfa.is_some() => {
+            let first = letters.chars().next().unwrap_or_default();
+            info.notes.push(format!(
+                "one colour of the mosaic {mosaic} is read, the first ({first}); all are {}",
+                mosaic.choices()
+            ));
+            0
+        }
+        None => {
+            return Err(Error::data(
+                format!("a capture behind a colour filter array ({})", letters.to_uppercase()),
+                path,
+                format!("read one of its colours as gray: {}", mosaic.choices()),
+            ));
+        }
+    };
+    let plane = mosaic.plane(index);
+    if plane.is_none() {
+        return Err(Error::request(
+            format!("channel {index} of the mosaic {mosaic}"),
+            "channel",
+            format!("it has {}", mosaic.choices()),
+        ));
+    }
+    Ok(plane)
 }
 
 /// Side of the blocks that are asked whether they show a mosaic.

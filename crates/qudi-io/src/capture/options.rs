@@ -2,6 +2,7 @@
 
 use super::mosaic::Mosaic;
 use qudi_core::Size;
+use qudi_core::sensor::Sensor;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -270,4 +271,17 @@ impl FromStr for MaskChoice {
             file => Self::File(file.into()),
         })
     }
+}
+
+/// The options, with the pedestal and the threshold of the sensor where they say nothing of either.
+pub(super) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
+    let mut options = options.clone();
+    if options.offset.is_none()
+        && options.threshold.is_none()
+        && let Some(sensor) = sensor
+    {
+        options.offset = (sensor.offset > 0.0).then_some(sensor.offset);
+        options.threshold = sensor.threshold;
+    }
+    options
 }
