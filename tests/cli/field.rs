@@ -118,6 +118,24 @@ fn aligns_sums_by_itself_where_things_move() {
     assert_eq!(std::fs::read(frame(7)).unwrap(), before);
 }
 
+/// Frames of a clip are repeated, those of scenes cannot be; rows of a rolling shutter lie behind.
+#[test]
+fn clips_repeat_frames_and_rows_roll() {
+    let folder = scratch("field-rolling");
+    let frames: Vec<u8> = (0..4u8).flat_map(|t| [60 * t + 20; 16 * 20]).collect();
+    std::fs::write(folder.join("clip.npy"), npy_bytes("|u1", "(4, 16, 20)", &frames)).unwrap();
+    let simulate = "simulate clip.npy --sensor spad-qvga --frames-per-image 3 --seed 1 --ppp 5";
+    run(&folder, &format!("{simulate} -o still.npy --truth still-truth.npy"));
+    run(&folder, &format!("{simulate} -o rolls.npy --truth rolls-truth.npy --rolling-shutter 1"));
+    let info: Value = serde_json::from_str(&run(&folder, "info still.npy --sum 1 --json")).unwrap();
+    assert_eq!(info["frames"], 12);
+    let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    assert_ne!(read("still-truth.npy"), read("rolls-truth.npy"));
+    assert_ne!(read("still.npy"), read("rolls.npy"));
+    refused(&folder, "simulate scene:text -o s.npy --frames-per-image 3", &["--frames-per-image"]);
+    refused(&folder, "simulate clip.npy -o s.npy --rolling-shutter 2", &["rolling_shutter"]);
+}
+
 #[test]
 fn warns_of_mosaics() {
     let folder = scratch("field-mosaic");
