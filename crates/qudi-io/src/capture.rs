@@ -20,7 +20,7 @@ pub(crate) mod raw_sample;
 mod summary;
 mod view;
 
-pub use auto_sum::{SumChoice, SumLimit, choose_sum};
+pub use auto_sum::{ENOUGH, SumChoice, SumLimit, choose_sum};
 pub use bit_order::{SURE, bit_order_z_score};
 pub use calibrate::{Calibration, calibrate};
 pub use format_options::FormatOption;

@@ -85,15 +85,12 @@ impl VelocitySearch {
             .map(|i| columns.iter().map(|column: &Vec<f32>| column[i]).collect())
             .collect();
         let total = matched(&cost, grid.xs.len());
-        let usual = common(&columns);
+        let priors = if evidence > 0.0 { vec![REST, common(&columns)] } else { Vec::new() };
         let velocity = |total: &Vec<f32>| {
-            let best = total.iter().copied().fold(f32::INFINITY, f32::min);
-            for prior in [REST, usual] {
-                if evidence > 0.0 && total[prior] - best < evidence {
-                    return lowest_around(total, prior);
-                }
-            }
-            lowest(total)
+            let best = lowest_label(total);
+            let as_good = |&&prior: &&usize| total[prior] - total[best] < evidence;
+            let label = priors.iter().find(as_good).copied().unwrap_or(best);
+            lowest_around(total, label)
         };
         total.iter().map(|total| velocity(total).map(|v| v * SHRINK as f32)).collect()
     }
@@ -257,10 +254,9 @@ fn common(columns: &[Vec<f32>]) -> usize {
     (0..VELOCITIES).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(REST)
 }
 
-/// The velocity of least cost, between the lattice's by parabolas.
-fn lowest(total: &[f32]) -> [f32; 2] {
-    let best = (0..VELOCITIES).min_by(|&a, &b| total[a].total_cmp(&total[b])).unwrap_or(0);
-    lowest_around(total, best)
+/// The label of the velocity of least cost.
+fn lowest_label(total: &[f32]) -> usize {
+    (0..VELOCITIES).min_by(|&a, &b| total[a].total_cmp(&total[b])).unwrap_or(0)
 }
 
 /// The velocity of label `best`, between the lattice's by parabolas.
@@ -342,7 +338,8 @@ mod tests {
             let [x, y] = velocity(label);
             (x - at[0]).powi(2) + (y - at[1]).powi(2)
         };
-        let found = lowest(&(0..VELOCITIES).map(cost).collect::<Vec<f32>>());
+        let costs: Vec<f32> = (0..VELOCITIES).map(cost).collect();
+        let found = lowest_around(&costs, lowest_label(&costs));
         assert!((found[0] - at[0]).abs() < 1e-3 && (found[1] - at[1]).abs() < 1e-3, "{found:?}");
     }
 

@@ -5,7 +5,8 @@ use qudi_burst::{AlignedSums, choose_count};
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_io::capture::{Capture, ReadOptions, SumChoice, SumLimit};
+use qudi_core::windows::LONGEST_HALF;
+use qudi_io::capture::{Capture, ENOUGH, ReadOptions, SumChoice, SumLimit};
 use qudi_io::restore::Instants;
 
 /// Methods that sums are aligned for: those that align frames themselves.
@@ -23,18 +24,15 @@ const FASTEST: f64 = 6.0;
 /// Picture distances of which an aligned sum may consist. One is no alignment.
 const MULTIPLES: [usize; 8] = [1, 2, 3, 5, 8, 12, 18, 27];
 
-/// Fine sums in a picture distance, where it has that many frames, and in an aligned sum: few enough are held back to
-/// choose by, and lengths are met well enough.
+/// Fine sums in a picture distance, where it has that many frames, and in an aligned sum: few enough are held back
+/// to choose by, and lengths are met well enough.
 const STEPS: f64 = 8.0;
 
 /// Side of the part of the picture that is looked at.
 const SIDE: usize = 160;
 
 /// Blocks along which motion is taken for even, and sums that methods restore together.
-const WINDOW: usize = 11;
-
-/// Detections per pixel of a sum beyond which more light is not needed.
-const ENOUGH: f64 = 20.0;
+const WINDOW: usize = 2 * LONGEST_HALF + 1;
 
 /// Native frames of a sum, at most: sums hold 16 bits.
 const LONGEST: u32 = 60_000;

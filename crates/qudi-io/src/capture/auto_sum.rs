@@ -9,7 +9,7 @@ use qudi_core::{Result, Size};
 use serde::Serialize;
 
 /// Detections per pixel and sum beyond which more light is not worth the loss of frame rate.
-const ENOUGH: f64 = 20.0;
+pub const ENOUGH: f64 = 20.0;
 
 /// Noise falls with a power of the light and blur grows with one of the motion, so that the best sum is
 /// `FACTOR * motion^-0.6 * detections^-0.4` frames. Fitted to simulated captures (docs/notes/burst/sums.md).
