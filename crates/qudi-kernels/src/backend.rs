@@ -21,6 +21,24 @@ pub fn is_flex(device: &Device) -> bool {
     }
 }
 
+/// Whether tensors of this device are computed by a graphics card.
+pub(crate) fn is_cube<const D: usize>(tensor: &Tensor<D>) -> bool {
+    #[cfg(feature = "cube")]
+    {
+        use burn::backend::DispatchDevice;
+        let is_cube = match tensor.device().as_dispatch() {
+            DispatchDevice::Autodiff(device) => matches!(**device, DispatchDevice::Cube(_)),
+            device => matches!(device, DispatchDevice::Cube(_)),
+        };
+        is_cube && tensor.dtype() == burn::tensor::DType::F32 && !STOCK.get()
+    }
+    #[cfg(not(feature = "cube"))]
+    {
+        let _ = tensor;
+        false
+    }
+}
+
 thread_local! {
     /// Whether this thread goes without our own operations.
     static STOCK: Cell<bool> = const { Cell::new(false) };

@@ -4,8 +4,8 @@
 //! several frames reads the neighbours from there. On the flex backend the work is done here, directly
 //! on the planes: a tile of all input planes is copied to scratch memory with its borders, and blocks of
 //! output channels and pixels run over all taps in registers. Against unfolding into a matrix (im2col) this
-//! copies each value once instead of once a tap, which matters with few channels. Other backends use
-//! Burn's convolutions.
+//! copies each value once instead of once a tap, which matters with few channels. Graphics cards use Burn's
+//! convolutions, and products of matrices for the gradient of the weights; other backends use Burn's alone.
 
 #[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
@@ -20,12 +20,14 @@ mod pass;
 mod run;
 #[cfg(feature = "flex")]
 mod source;
+#[cfg(any(feature = "cube", test))]
+mod stock;
 #[cfg(feature = "flex")]
 mod weight_gradient;
 
 pub use geometry::Geometry;
 
-use crate::backend::is_native;
+use crate::backend::{is_cube, is_native};
 use crate::precision::{ComputePrecision, Reduced, with_precision};
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
@@ -72,14 +74,18 @@ pub fn conv_2d(
     bias: Tensor<1>,
     options: Options,
 ) -> Tensor<4> {
+    let [outputs, channels, rows, columns] = weight.dims();
+    if is_cube(&inputs[0]) {
+        let weight = weight.reshape([outputs, channels, 1, rows, columns]);
+        return extended(inputs, weight, bias, 1, options, Reduced::of(&inputs[0]).is_some());
+    }
     if let Some(numbers) = Reduced::of(&inputs[0]) {
         let sum = |inputs: &[_], weight, zeros, options| conv_2d(inputs, weight, zeros, options);
         return reduced(numbers, inputs, weight, bias, options, sum);
     }
-    let [outputs, channels, rows, columns] = weight.dims();
     if is_native(&inputs[0]) {
         let weight = weight.reshape([outputs, channels, 1, rows, columns]);
-        return native(inputs, weight, bias, 1, options);
+        return extended(inputs, weight, bias, 1, options, false);
     }
     let stride = [options.stride, options.stride];
     let padding = [rows / 2, columns / 2];
@@ -100,13 +106,16 @@ pub fn conv_3d(
     frames: usize,
     options: Options,
 ) -> Tensor<4> {
+    if is_cube(&inputs[0]) {
+        return extended(inputs, weight, bias, frames, options, Reduced::of(&inputs[0]).is_some());
+    }
     if let Some(numbers) = Reduced::of(&inputs[0]) {
         let sum =
             |inputs: &[_], weight, zeros, options| conv_3d(inputs, weight, zeros, frames, options);
         return reduced(numbers, inputs, weight, bias, options, sum);
     }
     if is_native(&inputs[0]) {
-        return native(inputs, weight, bias, frames, options);
+        return extended(inputs, weight, bias, frames, options, false);
     }
     let [outputs, _, depth, rows, columns] = weight.dims();
     let joined = joined(inputs);
@@ -154,15 +163,17 @@ fn finish(mut output: Tensor<4>, options: Options) -> Tensor<4> {
     }
 }
 
-fn native(
+/// The convolution as one operation of the backend, ours.
+fn extended(
     inputs: &[Tensor<4>],
     weight: Tensor<5>,
     bias: Tensor<1>,
     frames: usize,
     options: Options,
+    bf16: bool,
 ) -> Tensor<4> {
     if inputs.len() > INPUTS {
-        return native(&[joined(inputs)], weight, bias, frames, options);
+        return extended(&[joined(inputs)], weight, bias, frames, options, bf16);
     }
     let [images, _, height, width] = inputs[0].dims();
     let [outputs, _, depth, rows, columns] = weight.dims();
@@ -177,6 +188,7 @@ fn native(
         stride: options.stride,
         addend: options.addend.is_some(),
         relu: options.activation == Activation::Relu,
+        bf16,
     };
     geometry.check(inputs, &weight, &bias, options.addend.as_ref());
     let unused = Tensor::<1>::zeros([1], &bias.device()).into_dispatch();

@@ -11,6 +11,9 @@ use serde::{Deserialize, Serialize};
 pub struct NetworkConfig {
     /// Pixels of a side that become channels before the network and pixels again after it.
     pub fold: usize,
+    /// What the network starts from.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub reference: ReferenceKind,
     /// Pre-denoiser.
     pub pre: PreConfig,
     /// Spatio-temporal features.
@@ -24,6 +27,39 @@ pub struct NetworkConfig {
     /// Parts of the method that are left out, to measure what they are worth.
     #[serde(default, alias = "without", skip_serializing_if = "Vec::is_empty")]
     pub ablate: Vec<Part>,
+}
+
+/// What the network starts from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ReferenceKind {
+    /// Counts alone, as in the paper: the pre-denoiser sees one frame.
+    None,
+    /// The reference estimate of the whole burst, and neighbours aligned on it.
+    #[default]
+    QbpRefined,
+}
+
+/// What the features of the noisy image see.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NoisyFeatures {
+    /// The noisy image itself, as in the paper.
+    Image,
+    /// Its difference from the pre-denoised image, in sigmas.
+    #[default]
+    Residual,
+}
+
+/// What the output of the U-Net is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum UNetPrediction {
+    /// The clean image itself, as in the paper.
+    X0,
+    /// A correction of the pre-denoised image with inputs and output of unit variance (Karras et al. 2022).
+    #[default]
+    Edm,
 }
 
 /// A part of the method that can be left out.
@@ -52,7 +88,8 @@ pub struct PreConfig {
     pub blocks: usize,
     /// Channels that each layer of a block adds.
     pub growth: usize,
-    /// Neighbours that are aligned with each frame, the nearest ones.
+    /// Neighbours that are aligned with each frame, the nearest ones; none without a reference estimate.
+    #[serde(default)]
     pub neighbours: usize,
     /// Alignments of each neighbour: by the selected motion; with 2 also as matched frame by frame; with 3
     /// also pixel by pixel, but only on frames that a refinement stage has restored.
@@ -94,6 +131,19 @@ fn one() -> usize {
     1
 }
 
+fn yes() -> bool {
+    true
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_true(switch: &bool) -> bool {
+    *switch
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
 #[allow(clippy::trivially_copy_pass_by_ref)]
 fn is_one(number: &usize) -> bool {
     *number == 1
@@ -117,6 +167,9 @@ pub struct FeaturesConfig {
     pub low: [usize; 3],
     /// Channels of the noisy image's features.
     pub high: [usize; 3],
+    /// What the noisy image's features see.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub noisy: NoisyFeatures,
 }
 
 /// Sizes of the flow network.
@@ -133,6 +186,10 @@ pub struct FlowConfig {
     pub widths: [usize; 4],
     /// Reverse steps, from 1, that estimate the flow again; others keep the last one.
     pub steps: Vec<usize>,
+    /// Whether steps of Lucas and Kanade register the reference estimate on every level before the network
+    /// corrects the flow; without, SPyNet alone estimates it.
+    #[serde(default = "yes", skip_serializing_if = "is_true")]
+    pub registration: bool,
 }
 
 /// Sizes of the fusion.
@@ -163,6 +220,9 @@ pub struct UNetConfig {
     pub temporal: bool,
     /// Size of the embedding of timestep and sensor.
     pub embedding: usize,
+    /// What its output is.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub predicts: UNetPrediction,
 }
 
 /// The file of a preset.
@@ -175,6 +235,7 @@ struct Document {
 pub const PRESETS: &[(&str, &str)] = &[
     ("tiny", include_str!("../../../configs/tiny.toml")),
     ("small", include_str!("../../../configs/small.toml")),
+    ("paper-mini", include_str!("../../../configs/paper-mini.toml")),
     ("base", include_str!("../../../configs/base.toml")),
     ("paper", include_str!("../../../configs/paper.toml")),
 ];
@@ -215,7 +276,25 @@ impl NetworkConfig {
         let levels = self.unet.multipliers.len();
         let widths = |widths: &[usize]| widths.iter().all(|&width| (1..=4096).contains(&width));
         let channels = self.unet.multipliers.iter().map(|m| m.saturating_mul(self.unet.width));
+        let has_reference = self.reference != ReferenceKind::None;
+        let pre = &self.pre;
         let rules = [
+            (
+                "pre.neighbours",
+                has_reference || pre.neighbours == 0,
+                "must be 0 where network.reference is \"none\": nothing aligns neighbours",
+            ),
+            (
+                "pre",
+                has_reference
+                    || (pre.alignments == 1 && pre.weight_channels == 0 && pre.stages == 1),
+                "can have no alignments, weight_channels or stages where network.reference is \"none\"",
+            ),
+            (
+                "flow.registration",
+                has_reference || !self.flow.registration,
+                "must be false where network.reference is \"none\": it registers the reference estimate",
+            ),
             ("fold", matches!(self.fold, 1 | 2 | 4), "must be 1, 2 or 4"),
             ("pre", widths(&[self.pre.width, self.pre.growth]), SIZES),
             ("pre.neighbours", self.pre.neighbours <= 64, "must be at most 64"),
@@ -276,7 +355,7 @@ mod tests {
             .iter()
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
             .collect();
-        assert_eq!(multiples, [8, 32, 32, 16]);
+        assert_eq!(multiples, [8, 32, 16, 32, 16]);
     }
 
     #[test]

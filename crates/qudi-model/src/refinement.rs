@@ -206,8 +206,8 @@ mod tests {
         };
         let tensors =
             |further| planes(further).into_tensors(Size { height: 16, width: 16 }, &device);
-        let first = network.predenoise(&tensors(0)).0;
-        let second = network.with_stage_added(more).predenoise(&tensors(more)).0;
+        let first = network.predenoise_aligned(&tensors(0)).0;
+        let second = network.with_stage_added(more).predenoise_aligned(&tensors(more)).0;
         let difference: f32 = (first - second).abs().max().into_scalar();
         assert!(difference < 1e-6, "{difference}");
     }
@@ -225,7 +225,7 @@ mod tests {
             tensors.counts.dims(),
             [1, 1 + 3 * config.pre.neighbours, SIZE.height, SIZE.width]
         );
-        let (frame, _) = network.predenoise(&tensors);
+        let (frame, _) = network.predenoise_aligned(&tensors);
         assert_eq!(frame.dims(), [1, 1, SIZE.height, SIZE.width]);
     }
 }

@@ -2,15 +2,16 @@
 
 use super::burst_cache::BurstSampler;
 use super::burst_cache::burst::ConditionedBurst;
-use super::recipe::Recipe;
-use crate::loss::{Example, training_timestep};
+use super::recipe::{Recipe, TrainConfig};
+use crate::loss::Example;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
 use qudi_model::conditioning::{
-    AlignedPlanes, Conditioning, SENSOR_NUMBERS, linear_estimates, sensor_numbers,
+    AlignedPlanes, Conditioning, CountPlanes, SENSOR_NUMBERS, sensor_numbers,
 };
 use qudi_model::diffusion::noise::Noise;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::tensor::to_tensor;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -22,8 +23,8 @@ pub struct Batch {
     pub number: u64,
     size: Size,
     frames: usize,
-    linear_estimates: Vec<f32>,
-    aligned: AlignedPlanes,
+    counts: CountPlanes,
+    aligned: Option<AlignedPlanes>,
     truth: Vec<f32>,
     noise: Vec<f32>,
     numbers: Vec<f32>,
@@ -44,8 +45,8 @@ impl Batch {
             number,
             size,
             frames,
-            linear_estimates: Vec::new(),
-            aligned: AlignedPlanes::default(),
+            counts: CountPlanes::default(),
+            aligned: None,
             truth: Vec::new(),
             noise: Vec::new(),
             numbers: Vec::new(),
@@ -55,20 +56,24 @@ impl Batch {
         for sample in (number * count as u64..).take(count) {
             let ConditionedBurst { sample: drawn, aligned, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
-            batch.linear_estimates.extend(linear_estimates(view, &drawn.acquisition));
-            batch.aligned.extend(aligned);
+            batch.counts.extend(CountPlanes::new(view, &drawn.acquisition));
+            if let Some(aligned) = aligned {
+                batch.aligned.get_or_insert_default().extend(aligned);
+            }
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
             let noise = Noise::new(drawn.acquisition.seed, 0);
             let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
-            let timestep = training_timestep(
-                random.random(),
-                random.random(),
-                recipe.train.noise_start_fraction,
-            );
-            batch.timesteps.push(timestep);
+            let TrainConfig { timesteps, noise_start_fraction, .. } = recipe.train;
+            let at_start = random.random::<f64>() < noise_start_fraction;
+            let quantile = random.random();
+            batch.timesteps.push(if at_start {
+                NUM_TIMESTEPS - 1
+            } else {
+                timesteps.timestep(quantile)
+            });
             batch.acquisitions.push(drawn.acquisition);
         }
         Ok(batch)
@@ -88,8 +93,9 @@ impl Batch {
     pub(super) fn conditioning(&self, device: &Device) -> Conditioning {
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
         Conditioning {
-            linear_estimate: to_tensor(self.linear_estimates.clone(), self.size, device),
-            aligned: self.aligned.clone().into_tensors(self.size, device),
+            counts: to_tensor(self.counts.y.clone(), self.size, device),
+            linear_estimate: to_tensor(self.counts.u.clone(), self.size, device),
+            aligned: self.aligned.clone().map(|planes| planes.into_tensors(self.size, device)),
             sensor: Tensor::from_data(numbers, device),
             frames: self.frames,
         }

@@ -14,7 +14,7 @@ use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Frame, Result, Size};
 use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
-use qudi_model::config::Part;
+use qudi_model::config::{Part, ReferenceKind};
 use qudi_model::refinement::RefinementStage;
 use qudi_model::tensor::read as read_tensor;
 use rand::{Rng, RngExt};
@@ -42,9 +42,9 @@ pub struct Files {
 pub(super) struct CachedBurst {
     size: Size,
     sample: Sample,
-    /// Reference estimate, merged frame, and sigma of its noise.
+    /// Reference estimate, merged frame, and sigma of its noise; none of a network without reference estimate.
     images: Vec<Vec<f32>>,
-    /// Standardized counts, then expectations.
+    /// Standardized counts, then expectations; none likewise.
     standardized: Vec<Vec<i8>>,
 }
 
@@ -65,6 +65,9 @@ fn expanded(byte: i8) -> f32 {
 impl CachedBurst {
     pub(super) fn new(burst: ConditionedBurst) -> Self {
         let ConditionedBurst { size, sample, aligned } = burst;
+        let Some(aligned) = aligned else {
+            return Self { size, sample, images: Vec::new(), standardized: Vec::new() };
+        };
         let AlignedPlanes { reference, merged, noise_sigma, counts, expected } = aligned;
         let standardized = counts.into_iter().chain(expected);
         let standardized = standardized.map(|plane| plane.into_iter().map(compressed).collect());
@@ -107,13 +110,13 @@ impl CachedBurst {
         };
         let mut counts_and_expected = self.standardized.iter().map(standardized);
         let neighbours = self.standardized.len() / 2;
-        let aligned = AlignedPlanes {
+        let aligned = (!self.images.is_empty()).then(|| AlignedPlanes {
             reference: image(&self.images[0]),
             merged: image(&self.images[1]),
             noise_sigma: image(&self.images[2]),
             counts: counts_and_expected.by_ref().take(1 + neighbours).collect(),
             expected: counts_and_expected.collect(),
-        };
+        });
         ConditionedBurst { size, sample: Sample { truth, counts, acquisition }, aligned }
     }
 }
@@ -131,7 +134,8 @@ pub(super) struct BurstCache {
     key: CacheKey,
     /// Frames, height, width.
     shape: [usize; 3],
-    neighbours: AlignedNeighbours,
+    /// The aligned neighbours; none of a network without reference estimate.
+    neighbours: Option<AlignedNeighbours>,
 }
 
 /// Everything that decides a burst, its number aside. Files hold it as JSON.
@@ -142,6 +146,8 @@ struct CacheKey {
     seed: u64,
     #[serde(alias = "kept")]
     cached_frames: usize,
+    #[serde(default, skip_serializing_if = "is_usual")]
+    reference: ReferenceKind,
     neighbours: usize,
     #[serde(alias = "motions")]
     alignments: usize,
@@ -150,6 +156,11 @@ struct CacheKey {
     /// Hashes of the weights of the refinement stages.
     #[serde(default, alias = "drafts", skip_serializing_if = "Vec::is_empty")]
     stages: Vec<String>,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_usual(reference: &ReferenceKind) -> bool {
+    *reference == ReferenceKind::default()
 }
 
 impl CacheKey {
@@ -204,6 +215,7 @@ impl BurstCache {
             data: recipe.data.clone(),
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,
+            reference: recipe.network.reference,
             neighbours: recipe.network.pre.neighbours,
             alignments: recipe.network.pre.aligned_neighbours().alignments.count(),
             mean_level: !recipe.network.ablates(Part::MeanLevel),
@@ -218,7 +230,8 @@ impl BurstCache {
                 recipe.data.crop,
                 recipe.data.crop,
             ],
-            neighbours: recipe.network.pre.aligned_neighbours(),
+            neighbours: (recipe.network.reference != ReferenceKind::None)
+                .then(|| recipe.network.pre.aligned_neighbours()),
         })
     }
 
@@ -229,8 +242,9 @@ impl BurstCache {
     /// Names and types of a file's tensors, each of one value for every pixel of every frame.
     fn tensors(&self) -> Vec<(String, Dtype)> {
         let mut list = vec![("truth".to_owned(), Dtype::F32), ("counts".to_owned(), Dtype::U16)];
+        let Some(neighbours) = self.neighbours else { return list };
         list.extend((0..IMAGES).map(|i| (format!("image.{i}"), Dtype::F32)));
-        let standardized = self.neighbours.standardized_planes();
+        let standardized = neighbours.standardized_planes();
         list.extend((0..standardized).map(|i| (format!("deviation.{i}"), Dtype::I8)));
         list
     }
@@ -333,8 +347,9 @@ impl BurstCache {
             dark: None,
         };
         let sample = Sample { truth, counts: counts.collect(), acquisition };
-        let images = planes[2..2 + IMAGES].iter().map(|plane| words(plane)).collect();
-        let standardized = planes[2 + IMAGES..].iter();
+        let (images, standardized) = planes[2..].split_at(IMAGES.min(planes.len() - 2));
+        let images = images.iter().map(|plane| words(plane)).collect();
+        let standardized = standardized.iter();
         let standardized =
             standardized.map(|plane| plane.iter().map(|&b| b.cast_signed()).collect()).collect();
         Ok(Some(CachedBurst { size, sample, images, standardized }))

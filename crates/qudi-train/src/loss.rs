@@ -18,21 +18,38 @@ use qudi_core::restorer::Acquisition;
 use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::conditioning::Conditioning;
 use qudi_model::network::Qudi;
-use reconstruction::relative_reconstruction;
+use reconstruction::{relative_reconstruction, root_mean_square};
 use self_conditioning::network_inputs;
+use serde::{Deserialize, Serialize};
 
 pub use gaussian_nll::gaussian_nll;
 pub use reconstruction::reconstruction;
 pub use self_conditioning::{LoopOptions, SelfConditioning};
-pub use timesteps::training_timestep;
+pub use timesteps::TimestepLaw;
 
 /// The least unit that a pixel's error is counted in, in [-1, 1]: half a step of 8 bits.
 const LEAST_UNIT: f32 = 0.004;
 
-/// The weight of each term of the loss. That of the predicted uncertainty is 1, for nothing else learns from
+/// The error that pre-denoised frames usually have, in units of the linear estimate's noise.
+const USUAL_ERROR: f32 = 0.3;
+
+/// How the errors of images count.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LossForm {
+    /// Squared error and total variation of the error, in [0, 1], as in the paper.
+    L2Tv,
+    /// Squared errors in units of what is unknown of every pixel, and relative to the reference estimate.
+    #[default]
+    Edm,
+}
+
+/// The form of the loss, and the weight of each term. That of the predicted uncertainty is 1, for nothing else learns from
 /// it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossWeights {
+    /// How the errors of images count.
+    pub form: LossForm,
     /// The weight of the prediction.
     pub prediction: f32,
     /// The weight of the pre-denoised frames.
@@ -45,7 +62,7 @@ pub struct LossWeights {
 
 impl Default for LossWeights {
     fn default() -> Self {
-        Self { prediction: 1.0, pre: 0.2, perceptual: 0.0, flow: 0.0 }
+        Self { form: LossForm::default(), prediction: 1.0, pre: 0.2, perceptual: 0.0, flow: 0.0 }
     }
 }
 
@@ -72,10 +89,11 @@ pub struct Example<'a> {
 pub struct LossTerms {
     /// The weighted sum.
     pub total: Tensor<1>,
-    /// The squared error of the prediction; about 1 where it knows no more than the predicted uncertainty of
-    /// every pixel.
+    /// The error of the prediction; with [`LossForm::Edm`] about 1 where it knows no more than the predicted
+    /// uncertainty of every pixel.
     pub prediction: Tensor<1>,
-    /// The error of the pre-denoised frames; 1 where it is that of the reference estimate.
+    /// The error of the pre-denoised frames; with [`LossForm::Edm`] 1 where it is that of the reference
+    /// estimate, or, without one, some tenths of the noise.
     pub pre: Tensor<1>,
     /// The perceptual distance of the prediction.
     pub perceptual: Option<Tensor<1>>,
@@ -121,18 +139,22 @@ pub fn loss_terms(
     let (state, simulated) = network_inputs(network, example, self_conditioning, options)?;
     let encoded = network.encode(conditioning);
     let result = network.forward(&encoded, simulated.as_ref(), &state, None);
-    let error = result.x0.clone() - (truth.clone() * 2.0 - 1.0);
-    let prediction = (error / result.c_out.clamp_min(LEAST_UNIT)).powi_scalar(2).mean();
-    let image = (result.x0 + 1.0) * 0.5;
+    let image = (result.x0.clone() + 1.0) * 0.5;
+    let prediction = match weights.form {
+        LossForm::L2Tv => reconstruction(image.clone(), truth.clone()),
+        LossForm::Edm => {
+            let error = result.x0 - (truth.clone() * 2.0 - 1.0);
+            (error / result.c_out.clamp_min(LEAST_UNIT)).powi_scalar(2).mean()
+        }
+    };
     // Feature differences are small differences of large numbers.
     let perceptual = perceptual
         .map(|lpips| with_precision(ComputePrecision::F32, || lpips.loss(image, truth.clone())));
-    let pre = pre_denoiser_loss(example, result.d);
+    let pre = pre_denoiser_loss(example, result.d, weights.form);
     let flow = (weights.flow > 0.0)
         .then(|| result.flows.warping_error(truth.clone(), conditioning.frames));
     // The uncertainty is that of the frames before any simulated measurement.
-    let uncertainty =
-        network.predicts_uncertainty().then(|| network.predenoise(&conditioning.aligned));
+    let uncertainty = network.predicts_uncertainty().then(|| network.predenoise(conditioning));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));
     let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     Ok(LossTerms { total, prediction, pre, perceptual, flow, uncertainty }.weighted(weights))
@@ -145,23 +167,30 @@ fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights
     let Example { conditioning, truth, .. } = example;
     let (d, sigma, flows) = if weights.flow > 0.0 {
         let (d, flows) = network.predenoise_and_align(&network.encode(conditioning));
-        let sigma =
-            network.predicts_uncertainty().then(|| network.predenoise(&conditioning.aligned).1);
+        let sigma = network.predicts_uncertainty().then(|| network.predenoise(conditioning).1);
         (d, sigma.flatten(), Some(flows))
     } else {
-        let (d, sigma) = network.predenoise(&conditioning.aligned);
+        let (d, sigma) = network.predenoise(conditioning);
         (d, sigma, None)
     };
     let uncertainty = uncertainty_loss(&d, truth, sigma);
-    let pre = pre_denoiser_loss(example, d);
+    let pre = pre_denoiser_loss(example, d, weights.form);
     let flow = flows.map(|flows| flows.warping_error(truth.clone(), conditioning.frames));
     let (total, prediction) = (pre.clone() * weights.pre, pre.zeros_like());
     LossTerms { total, prediction, pre, perceptual: None, flow, uncertainty }.weighted(weights)
 }
 
-/// The error of pre-denoised frames relative to the reference estimate's.
-fn pre_denoiser_loss(example: &Example<'_>, frames: Tensor<4>) -> Tensor<1> {
+/// The error of pre-denoised frames.
+fn pre_denoiser_loss(example: &Example<'_>, frames: Tensor<4>, form: LossForm) -> Tensor<1> {
     let Example { conditioning, truth, .. } = example;
-    let reference = conditioning.aligned.reference.clone();
-    relative_reconstruction(frames, truth.clone(), reference, conditioning.frames)
+    if form == LossForm::L2Tv {
+        return reconstruction(frames, truth.clone());
+    }
+    let unit = match &conditioning.aligned {
+        Some(aligned) => {
+            root_mean_square(aligned.reference.clone() - truth.clone(), conditioning.frames)
+        }
+        None => conditioning.noise_variance().sqrt() * USUAL_ERROR,
+    };
+    relative_reconstruction(frames, truth.clone(), unit)
 }

@@ -2,11 +2,13 @@
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 use crate::loss::lpips::PerceptualKind;
+use crate::loss::{LossForm, TimestepLaw};
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
 use qudi_kernels::ComputePrecision;
 use qudi_model::config::{NetworkConfig, PRESETS};
+use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -55,6 +57,9 @@ pub struct TrainConfig {
     pub precision: ComputePrecision,
     /// Share of the average of weights that a step keeps.
     pub ema: f64,
+    /// Law of the timesteps that the network learns at.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub timesteps: TimestepLaw,
     /// Fraction of the samples at the noisiest timestep, where sampling begins.
     #[serde(alias = "start")]
     pub noise_start_fraction: f64,
@@ -82,10 +87,13 @@ pub struct CropsConfig {
     pub side: usize,
 }
 
-/// Weights of the loss's terms.
+/// Form of the loss, and weights of its terms.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossConfig {
+    /// How the errors of images count.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub form: LossForm,
     /// The weight of the prediction.
     pub prediction: f32,
     /// The weight of the pre-denoised frames.
@@ -116,8 +124,15 @@ pub struct ValidationConfig {
     pub ppp: Vec<f64>,
     /// Reverse steps; 0 judges the pre-denoiser.
     pub steps: usize,
+    /// Spacing of their timesteps, which the weights keep for restoring.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub spacing: TimestepSpacing,
     /// Training steps between validations.
     pub every: u64,
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 /// Source of validation clips in packs.
@@ -172,6 +187,11 @@ impl Recipe {
             return 0;
         }
         self.validation.as_ref().map_or(1, |validation| validation.steps)
+    }
+
+    /// Spacing of the timesteps that the weights are made for.
+    pub(super) fn default_spacing(&self) -> TimestepSpacing {
+        self.validation.as_ref().map_or_else(TimestepSpacing::default, |v| v.spacing)
     }
 
     /// Whether only the pre-denoiser learns: frame by frame.

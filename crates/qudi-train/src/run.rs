@@ -134,18 +134,24 @@ impl Run {
         let mut prefetcher =
             Prefetcher::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
         let mut metrics = self.metrics()?;
+        if self.trainer.step_number() == 0
+            && let Some(validation) = self.validate(0)?
+        {
+            self.log(&mut metrics, &Line::Validation(&validation))?;
+            if on(Event::Validation(&validation)).is_break() {
+                return Err(Error::Interrupted);
+            }
+        }
         while self.trainer.step_number() < train.steps {
             let report = self.trainer.step(&mut prefetcher)?;
             self.log(&mut metrics, &Line::Step(&report))?;
             let step = report.step;
             let mut go_on = on(Event::Step(&report));
             let last = step == train.steps;
-            if let Some(validator) = &self.validator
-                && (step.is_multiple_of(validator.every()) || last)
+            let every = self.validator.as_ref().map(Validator::every);
+            if every.is_some_and(|every| step.is_multiple_of(every) || last)
+                && let Some(validation) = self.validate(step)?
             {
-                let network = self.trainer.averaged();
-                let sizes = &self.recipe.network;
-                let validation = validator.measure(&network, sizes, &self.device, step)?;
                 self.log(&mut metrics, &Line::Validation(&validation))?;
                 if on(Event::Validation(&validation)).is_break() {
                     go_on = ControlFlow::Break(());
@@ -164,6 +170,13 @@ impl Run {
             }
         }
         Ok(())
+    }
+
+    /// Measures the averaged weights after `step` steps, if the recipe measures anything.
+    fn validate(&self, step: u64) -> Result<Option<Validation>> {
+        let Some(validator) = &self.validator else { return Ok(None) };
+        let (network, sizes) = (self.trainer.averaged(), &self.recipe.network);
+        validator.measure(&network, sizes, &self.device, step).map(Some)
     }
 
     fn save_weights(&self) -> Result<()> {
@@ -190,6 +203,7 @@ impl Run {
             commit: self.commit.clone(),
             licence: recipe.train.licence.clone(),
             default_steps: Some(recipe.default_steps()),
+            spacing: Some(recipe.default_spacing()),
             kind: None,
         };
         let path = self.folder.join(WEIGHTS);
@@ -222,7 +236,8 @@ impl Run {
         let taken = self.trainer.step_number();
         let kept = text.lines().filter(|line| {
             let line: Option<serde_json::Value> = serde_json::from_str(line).ok();
-            line.and_then(|line| line["step"].as_u64()).is_some_and(|step| step <= taken)
+            let step = line.and_then(|line| line["step"].as_u64());
+            taken > 0 && step.is_some_and(|step| step <= taken)
         });
         let kept: String = kept.flat_map(|line| [line, "\n"]).collect();
         self.write(METRICS, kept.as_bytes())

@@ -241,14 +241,15 @@ fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
         Tensor::cat((0..count).map(|plane| image(first + plane as u32)).collect(), 1)
     };
     let conditioning = Conditioning {
+        counts: image(21) * 0.5,
         linear_estimate: image(22),
-        aligned: AlignedTensors {
+        aligned: Some(AlignedTensors {
             reference: image(29),
             merged: image(30),
             noise_sigma: image(31) * 0.5 + 0.2,
             counts: planes(32, 1 + neighbours),
             expected: Some(planes(100, neighbours)),
-        },
+        }),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
     };

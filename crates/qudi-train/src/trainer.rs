@@ -7,7 +7,7 @@ use super::parameters::{gradients, parameters, with_parameters};
 use super::prefetch::Prefetcher;
 use super::recipe::{LossConfig, Recipe};
 use crate::loss::lpips::Lpips;
-use crate::loss::{LoopOptions, LossWeights, SelfConditioning, loss_terms};
+use crate::loss::{LoopOptions, LossTerms, LossWeights, SelfConditioning, loss_terms};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
@@ -54,7 +54,7 @@ pub struct StepReport {
     pub norm: f64,
     /// Seconds that the step waited for data.
     pub data_s: f64,
-    /// Seconds of the forward passes.
+    /// Seconds of the forward passes; on devices that compute on their own, of asking for them.
     pub forward_s: f64,
     /// Seconds of the backward passes.
     pub backward_s: f64,
@@ -246,36 +246,28 @@ impl Trainer {
         let terms = with_precision(self.recipe.train.precision, || {
             loss_terms(network, &example, self_conditioning, weights, loop_options, perceptual)
         })?;
-        let number_of = |term: &Tensor<1>| Ok(f64::from(read(term.clone())?[0]));
-        let optional = |term: &Option<Tensor<1>>| term.as_ref().map_or(Ok(0.0), number_of);
-        let loss = LossValues {
-            total: number_of(&terms.total)?,
-            prediction: number_of(&terms.prediction)?,
-            pre: number_of(&terms.pre)?,
-            perceptual: optional(&terms.perceptual)?,
-            flow: optional(&terms.flow)?,
-            uncertainty: optional(&terms.uncertainty)?,
-        };
+        let forward_s = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let gradients = gradients(network, &terms.total.clone().backward());
+        // Reading waits for the device: all numbers at once, when there is nothing left to ask it for.
+        let loss = LossValues::read(terms)?;
         self.check("prediction loss", loss.prediction)?;
         self.check("pre-denoiser loss", loss.pre)?;
         self.check("perceptual loss", loss.perceptual)?;
         self.check("flow loss", loss.flow)?;
         self.check("uncertainty loss", loss.uncertainty)?;
-        let forward_s = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        let gradients = gradients(network, &terms.total.backward());
         let backward_s = start.elapsed().as_secs_f64();
         Ok(Pass { gradients, loss, forward_s, backward_s })
     }
 
     fn options(&self) -> (LossWeights, LoopOptions) {
-        let LossConfig { prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
+        let LossConfig { form, prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
         let network = &self.recipe.network;
         let loop_options = LoopOptions {
             forward_model: !network.ablates(Part::ForwardModel),
             self_conditioning: !network.ablates(Part::SelfConditioning),
         };
-        (LossWeights { prediction, pre, perceptual, flow }, loop_options)
+        (LossWeights { form, prediction, pre, perceptual, flow }, loop_options)
     }
 
     fn check(&self, what: &str, value: f64) -> Result<()> {
@@ -294,6 +286,25 @@ impl Trainer {
 }
 
 impl LossValues {
+    /// Reads the terms from the device; those that are not there are zero.
+    fn read(terms: LossTerms) -> Result<Self> {
+        let LossTerms { total, prediction, pre, perceptual, flow, uncertainty } = terms;
+        let nothing = pre.zeros_like();
+        let optional = |term: Option<Tensor<1>>| term.unwrap_or_else(|| nothing.clone());
+        let optional = [perceptual, flow, uncertainty].map(optional);
+        let all = Tensor::cat([total, prediction, pre].into_iter().chain(optional).collect(), 0);
+        let numbers = read(all.inner())?;
+        let number = |at: usize| f64::from(numbers[at]);
+        Ok(Self {
+            total: number(0),
+            prediction: number(1),
+            pre: number(2),
+            perceptual: number(3),
+            flow: number(4),
+            uncertainty: number(5),
+        })
+    }
+
     fn add(&mut self, other: Self, share: f64) {
         self.total += share * other.total;
         self.prediction += share * other.prediction;

@@ -133,7 +133,8 @@ impl Validator {
         device: &Device,
         step: u64,
     ) -> Result<Validation> {
-        let options = SampleOptions { steps: self.config.steps, ..SampleOptions::default() };
+        let ValidationConfig { steps, spacing, .. } = self.config;
+        let options = SampleOptions { steps, spacing, ..SampleOptions::default() };
         let model = Model {
             network: network.clone(),
             config: sizes.clone(),

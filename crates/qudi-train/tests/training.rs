@@ -8,17 +8,18 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_model::conditioning::{
-    AlignedPlanes, Conditioning, SENSOR_NUMBERS, linear_estimates, sensor_numbers,
+    AlignedPlanes, Conditioning, CountPlanes, SENSOR_NUMBERS, sensor_numbers,
 };
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::noise::Noise;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_model::refinement::align;
 use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::{
-    Example, LoopOptions, LossTerms, LossWeights, SelfConditioning, gaussian_nll, loss_terms,
-    training_timestep,
+    Example, LoopOptions, LossTerms, LossWeights, SelfConditioning, TimestepLaw, gaussian_nll,
+    loss_terms,
 };
 use qudi_train::{Adam, gradients, parameters, with_parameters};
 use std::collections::HashMap;
@@ -65,10 +66,12 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let aligned = align(view, &acquisition, &[]).unwrap();
     let neighbours = tiny().pre.aligned_neighbours();
     let aligned = AlignedPlanes::new(&aligned, neighbours, 0..view.frames.len());
+    let planes = CountPlanes::new(view, &acquisition);
     let numbers = TensorData::new(sensor_numbers(&acquisition).to_vec(), [1, SENSOR_NUMBERS]);
     let conditioning = Conditioning {
-        linear_estimate: to_tensor(linear_estimates(view, &acquisition), size, device),
-        aligned: aligned.into_tensors(size, device),
+        counts: to_tensor(planes.y, size, device),
+        linear_estimate: to_tensor(planes.u, size, device),
+        aligned: Some(aligned.into_tensors(size, device)),
         sensor: Tensor::from_data(numbers, device),
         frames,
     };
@@ -82,7 +85,9 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
     let noise = Noise::new(number, 1);
     let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
     let place = (number as f64 * 0.618_034).fract();
-    let timestep = training_timestep((number as f64 * 0.414_214).fract(), place, 0.2);
+    let at_start = (number as f64 * 0.414_214).fract() < 0.2;
+    let timestep =
+        if at_start { NUM_TIMESTEPS - 1 } else { TimestepLaw::LogLogistic.timestep(place) };
     let noise = to_tensor(values, burst.size, &burst.truth.device());
     let timesteps = [timestep];
     let example = burst.example(noise, &timesteps);

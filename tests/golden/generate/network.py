@@ -13,6 +13,7 @@ import math
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -153,8 +154,28 @@ def aligned(guide: Tensor) -> Tensor:
     return torch.cat([seen.clamp(-8, 8) / 2, torch.asinh(2 * expected)], 1)
 
 
-def normalized_input(guide: Tensor) -> tuple[Tensor, ...]:
-    """Restored image, deviation of the merged one's noise, and what of both the networks see."""
+@dataclass
+class Single:
+    """What a network without reference estimate is given of single frames, [B*N, 1, H, W] each."""
+
+    u: Tensor
+    y: Tensor
+    deviation: Tensor
+
+    @classmethod
+    def of(cls, u: Tensor, y: Tensor, sensor: Tensor) -> "Single":
+        frames = len(u) // len(sensor)
+        return cls(u, y, mean_variance(sensor, frames).sqrt().clamp(min=1e-3).expand_as(u))
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+
+def normalized_input(guide: "Tensor | Single") -> tuple[Tensor, ...]:
+    """Restored image, deviation of the merged one's noise, and what of both the networks see. Without a reference
+    estimate: linear estimate, deviation of its noise, counts, and no contrast."""
+    if isinstance(guide, Single):
+        return guide.u, guide.deviation, 2 * guide.y - 1, None, guide.deviation.log() + 3
     clean, merged, noise = guide[:, :3].split(1, 1)
     deviation = noise.clamp(min=1e-3)
     difference = ((merged - clean) / deviation).clamp(-5, 5) / 2
@@ -194,7 +215,8 @@ class PreDenoiser(nn.Module):
         self.fold = config["fold"]
         cells, pre = self.fold**2, config["pre"]
         self.neighbours, width = aligned_neighbours(config), pre["width"]
-        self.static_in = conv((guide_planes(config) + 1) * cells, width, 3)
+        single = config.get("reference") == "none"
+        self.static_in = conv((3 if single else guide_planes(config) + 1) * cells, width, 3)
         if pre.get("trust"):
             self.trust = Trust(config)
             self.trusted_in = conv(2 * cells + pre["trust"], width, 3, bias=False)
@@ -207,6 +229,8 @@ class PreDenoiser(nn.Module):
     def prepare(self, guide: Tensor) -> Tensor:
         """What no simulated measurement changes."""
         clean, _, difference, contrast, level = normalized_input(guide)
+        if isinstance(guide, Single):
+            return self.static_in(F.pixel_unshuffle(torch.cat([2 * clean - 1, difference, level], 1), self.fold))
         planes = [difference, contrast, 2 * clean - 1, level, aligned(guide)]
         static = F.pixel_unshuffle(torch.cat(planes, 1), self.fold)
         s = self.static_in(static)
@@ -222,14 +246,15 @@ class PreDenoiser(nn.Module):
         s = self.prepare(guide)
         simulated = F.pixel_unshuffle(torch.cat([y_sim, u_sim], 1), self.fold)
         frames = len(guide) // len(flag)
-        plane = flag.to(guide).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *s.shape[2:])
+        plane = flag.to(s).repeat_interleave(frames)[:, None, None, None].expand(-1, 1, *s.shape[2:])
         s = s + self.simulated_in(torch.cat([simulated, plane], 1))
         x, outputs = s, []
         for block in self.blocks:
             x = block(x)
             outputs.append(x)
         g = self.spread(self.gather(torch.cat(outputs, 1))) + s
-        return clean + 0.3 * deviation * F.pixel_shuffle(self.out(g), self.fold), g
+        factor = 1 if isinstance(guide, Single) else 0.3
+        return clean + factor * deviation * F.pixel_shuffle(self.out(g), self.fold), g
 
 
 class ErrorHead(nn.Module):
@@ -322,6 +347,7 @@ class Flow(nn.Module):
         super().__init__()
         flow = config["flow"]
         self.scale, self.pyramid = flow["scale"], flow["levels"]
+        self.registration = flow.get("registration", True)
         self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["networks"]))
 
     def forward(self, d: Tensor, clean: Tensor, variance: Tensor, frames: int) -> Flows:
@@ -341,7 +367,8 @@ class Flow(nn.Module):
             neighbour = torch.cat([x[:, 1:], x[:, :-1]], 1).flatten(0, 1)
             if j < self.pyramid - 1:
                 flow = up2(flow) * 2
-            flow = flow + lucas_kanade(reference[:, 1:], neighbour[:, 1:], flow, prior)
+            if self.registration:
+                flow = flow + lucas_kanade(reference[:, 1:], neighbour[:, 1:], flow, prior)
             if j >= skipped:
                 images = (4 * (x - 0.5) for x in (reference[:, :1], warp(neighbour[:, :1], flow)))
                 flow = flow + self.levels[j - skipped](torch.cat([*images, flow], 1)) / 10
@@ -499,6 +526,7 @@ class Preconditioned:
         bars = torch.as_tensor(alpha_bar())[t.to("cpu").long()].to(base)
         each = lambda x: x.repeat_interleave(frames)[:, None, None, None]
         signal, noise = each(bars.sqrt()), each((1 - bars).sqrt())
+        self.x_t, self.given = x_t, x0_prev * each(flag.to(base))
         left = signal * error
         scale = (left**2 + noise**2).sqrt()
         self.base, self.known, self.unknown = base, error * left / scale, error * noise / scale
@@ -521,7 +549,8 @@ class UNet(nn.Module):
         widths = [unet["width"] * m for m in unet["multipliers"]]
         levels, blocks = len(widths), unet["blocks"]
         before = [widths[0], *widths[:-1]]
-        self.inp = conv(6 * self.fold**2, widths[0], 3)
+        self.predicts = unet.get("predicts", "edm")
+        self.inp = conv((4 if self.predicts == "x0" else 6) * self.fold**2, widths[0], 3)
         self.merge = nn.ModuleList(
             conv(x + fused, x, 1) for x, fused in zip(before, config["fusion"]["widths"])
         )
@@ -548,6 +577,8 @@ class UNet(nn.Module):
         emb = self.embed(t, sensor).repeat_interleave(frames, 0)
         clean, _, difference, _, _ = normalized_input(guide)
         images = [noisy.base, noisy.residual, noisy.earlier, 2 * clean - 1, difference, noisy.clarity]
+        if self.predicts == "x0":
+            images = [noisy.base, noisy.x_t, noisy.given, 2 * clean - 1]
         x = self.inp(F.pixel_unshuffle(torch.cat(images, 1), self.fold))
         skips: list[Tensor] = []
         for k, level in enumerate(self.encoder):
@@ -564,12 +595,14 @@ class UNet(nn.Module):
                 x = level.step(j, torch.cat([x, skips.pop()], 1), emb, frames)
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
-        return noisy.prediction(F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold))
+        out = F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
+        return out if self.predicts == "x0" else noisy.prediction(out)
 
 
 class Qudi(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
+        self.noisy = config["features"].get("noisy", "residual")
         self.pre = PreDenoiser(config)
         if config["pre"].get("error"):
             self.error = ErrorHead(config)
@@ -618,9 +651,10 @@ class Qudi(nn.Module):
     ) -> tuple[Tensor, Flows]:
         """What follows the pre-denoiser."""
         low = self.low(u, u_sim, d, frames)
-        high = self.high(noisy.residual, noisy.earlier, frames)
+        images = (noisy.x_t, noisy.given) if self.noisy == "image" else (noisy.residual, noisy.earlier)
+        high = self.high(*images, frames)
         if flows is None:
-            flows = self.flow(d, guide[:, :1].detach(), mean_variance(sensor, frames), frames)
+            flows = self.flow(d, normalized_input(guide)[0].detach(), mean_variance(sensor, frames), frames)
         fused = self.fusion(low, high, g, flows, frames)
         return self.unet(noisy, guide, fused, t, sensor, frames), flows
 

@@ -35,7 +35,9 @@ values; 1.0 * L((x0 + 1) / 2, truth) + 0.2 * L(d, truth), nothing clipped.
 float64, with `times` and `after` (-1: finished), and `alpha_bar` at `alpha_bar_t`. `uniform` is
 uniform("input.x", 8) and `gaussian` gaussian("noise.0", [8]), to check the generator.
 
-`sample_ddim`, `sample_ancestral`: ten steps, preset tiny, one burst. x_T is `uniform.gaussian("noise.0")`
+`paper`: like `network`, with every switch on the paper's side.
+
+`sample_ddim`, `sample_ancestral`, and `sample_paper` with those switches: ten steps, one burst. x_T is `uniform.gaussian("noise.0")`
 and the noise of step K (from 1; none at the last) `gaussian("noise.K")`, of shape [4, 1, 32, 32].
 `counts` [4, 32, 32] are the burst, `simulated` [9, 4, 32, 32] the simulated measurements of steps 2 to
 10; y = counts / 7; u = `u_table`[counts], u_sim of step K = `u_sim_table`[K - 2][counts]. The flows of
@@ -46,6 +48,7 @@ each step at the flat indices 61 i; `x0_last` is the result.
 import json
 import math
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,6 +64,17 @@ from uniform import affine, gaussian, parameter, uniform
 OUT = network.ROOT / "tests/golden"
 KERNELS = {"conv", "group_norm", "warp"}
 Tensors = dict[str, Tensor]
+
+
+# The network of the golden values, and the same with every switch on the paper's side.
+TINY = network.with_former_keys(tomllib.loads((OUT / "tiny.toml").read_text())["network"])
+PAPER = TINY | {
+    "reference": "none",
+    "pre": {"width": 8, "blocks": 2, "growth": 4, "neighbours": 0},
+    "features": TINY["features"] | {"noisy": "image"},
+    "flow": TINY["flow"] | {"registration": False},
+    "unet": TINY["unet"] | {"predicts": "x0"},
+}
 
 
 class Kinks:
@@ -337,7 +351,7 @@ GUIDE = (0.55, 0.45)
 
 def pre_file(name: str = "pre", **settings: int) -> File:
     file = File(name, 128)
-    config = variant(network.load("tiny"), pre=settings)
+    config = variant(TINY, pre=settings)
     module = network.PreDenoiser(config)
     shape = (6, 1, 12, 20)
     measured = {"guide": spread((6, network.guide_planes(config), 12, 20), *GUIDE)}
@@ -353,7 +367,7 @@ def pre_file(name: str = "pre", **settings: int) -> File:
 
 def error_file() -> File:
     file = File("error", 128)
-    config = variant(network.load("tiny"), pre={"error": True})
+    config = variant(TINY, pre={"error": True})
     module = network.ErrorHead(config)
     guide = spread((6, network.guide_planes(config), 12, 20), *GUIDE)
     inputs = {"g": spread((6, config["pre"]["width"], 6, 10), *CENTRED), "guide": guide}
@@ -364,7 +378,7 @@ def error_file() -> File:
 
 def feature_file() -> File:
     file = File("features", 128)
-    config = network.load("tiny")
+    config = TINY
     shape = (6, 1, 16, 24)
     low, high = network.Low(config), network.High(config)
     inputs = {"u": spread(shape, *LINEAR), "u_sim": spread(shape, *LINEAR), "d": spread(shape, *COUNTS)}
@@ -386,7 +400,7 @@ def sensors(*deviations: list[float]) -> dict:
 
 def flow_file() -> File:
     file = File("flow", 128)
-    config = network.load("tiny")
+    config = TINY
     for levels, networks in ((2, 2), (3, 2)):
         config = variant(config, flow={"levels": levels, "networks": networks})
         module = network.Flow(config)
@@ -401,7 +415,7 @@ def flow_file() -> File:
 def fusion_file() -> File:
     file = File("fusion", 128)
     for level in range(3):
-        config = variant(network.load("tiny"), fusion={"level": level, "widths": [6, 8, 10]}, flow={"scale": 4})
+        config = variant(TINY, fusion={"level": level, "widths": [6, 8, 10]}, flow={"scale": 4})
         module = network.Fusion(config)
         inputs: dict[str, dict] = {}
         for kind in ("low", "high"):
@@ -423,7 +437,7 @@ def fusion_file() -> File:
 
 def unet_file() -> File:
     file = File("unet", 128)
-    tiny = network.load("tiny")
+    tiny = TINY
     all_on = {"width": 16, "multipliers": [1, 1, 2, 2], "blocks": 2, "attention": [1, 3]}
     all_on |= {"temporal": True, "embedding": 8}
     full = variant(tiny | {"fold": 1}, unet=all_on, fusion={"widths": [3, 5, 6]})
@@ -450,9 +464,36 @@ def unet_file() -> File:
 # The whole
 
 
+def paper_file() -> File:
+    """The same with every switch on the paper's side."""
+    file = File("paper", 128)
+    config = PAPER
+    module = network.Qudi(config)
+    shape = (8, 1, 32, 48)
+    inputs = {"u": spread(shape, *LINEAR), "y": spread(shape, *COUNTS), "y_sim": spread(shape, *COUNTS)}
+    inputs |= {"u_sim": spread(shape, *LINEAR), "flag": given([1, 0])}
+    inputs |= {"x_t": spread(shape), "x0_prev": spread(shape, *CENTRED)}
+    inputs |= {"t": given([700, 40]), "truth": spread(shape, 0.5, 0.4)}
+    inputs |= sensors([0.0, -1.0], [-0.5, -1.2])
+
+    def run(**x: Tensor) -> Tensors:
+        x.pop("truth", None)
+        single = network.Single.of(x["u"], x.pop("y"), x["sensor"])
+        x0, d, flows = module(guide=single, **x, frames=4)
+        return {"x0": x0, "d": d, "to_next": flows[0], "to_prev": flows[1]}
+
+    def loss(outputs: Tensors, inputs: Tensors) -> Tensor:
+        outputs["loss"] = network.loss(outputs["x0"], outputs["d"], inputs["truth"]).reshape(1)
+        return outputs["loss"].sum()
+
+    about = {"config": config, "frames": 4, "loss": "1.0 L((x0 + 1) / 2, truth) + 0.2 L(d, truth)"}
+    file.case("paper", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), loss)
+    return file
+
+
 def network_file() -> File:
     file = File("network", 128)
-    config = network.load("tiny")
+    config = TINY
     module = network.Qudi(config)
     shape = (8, 1, 32, 48)
     # Chosen so that no coordinate of a warp is within 4e-6 of a kink.
@@ -493,9 +534,8 @@ def step_file() -> File:
 PPP, EXPOSURE, FRAMES, SIZE = 3.25, 0.45, 4, 32
 
 
-def sample_file(ancestral: bool) -> File:
-    file = File("sample_ancestral" if ancestral else "sample_ddim")
-    config = network.load("tiny")
+def sample_file(ancestral: bool, config: dict, name: str) -> File:
+    file = File(name)
     module = network.Qudi(config)
     shape = (FRAMES, 1, SIZE, SIZE)
     rng = np.random.default_rng(7)
@@ -505,7 +545,7 @@ def sample_file(ancestral: bool) -> File:
     # Any guide serves: an estimate, a noisier one, the deviation of its noise, and deviations.
     around = lambda noise: (scene + noise * rng.standard_normal(scene.shape)).astype(np.float32)
     guide = [around(0.05), around(0.1), rng.uniform(0.05, 0.15, scene.shape).astype(np.float32)]
-    more = network.guide_planes(config) - len(guide)
+    more = 0 if config.get("reference") == "none" else network.guide_planes(config) - len(guide)
     guide += [rng.standard_normal(scene.shape).astype(np.float32) for _ in range(more)]
     table = network.linear(PPP, EXPOSURE)
     tables = np.stack([network.linear(network.light(PPP, t), EXPOSURE) for t, _ in network.steps(10)[1:]])
@@ -527,9 +567,12 @@ def sample_file(ancestral: bool) -> File:
 
         noise = lambda k: torch.from_numpy(gaussian(f"noise.{k}", shape)).to(dtype)
         sensor = torch.tensor([network.sensor_numbers(PPP, EXPOSURE)]).to(dtype)
-        planes = torch.from_numpy(np.concatenate(guide, 1)).to(dtype)
+        y, u = both(counts, table)
+        planes: Tensor | network.Single = torch.from_numpy(np.concatenate(guide, 1)).to(dtype)
+        if config.get("reference") == "none":
+            planes = network.Single.of(u, y, sensor)
         run = network.sample(
-            module, both(counts, table)[1], planes, sensor, FRAMES, config["flow"]["steps"], noise, measure, ancestral=ancestral
+            module, u, planes, sensor, FRAMES, config["flow"]["steps"], noise, measure, ancestral=ancestral
         )
         with torch.no_grad():
             states = list(run)
@@ -566,9 +609,11 @@ FILES: dict[str, Callable[[], File]] = {
     "fusion": fusion_file,
     "unet": unet_file,
     "network": network_file,
+    "paper": paper_file,
     "steps": step_file,
-    "sample_ddim": lambda: sample_file(False),
-    "sample_ancestral": lambda: sample_file(True),
+    "sample_ddim": lambda: sample_file(False, TINY, "sample_ddim"),
+    "sample_ancestral": lambda: sample_file(True, TINY, "sample_ancestral"),
+    "sample_paper": lambda: sample_file(False, PAPER, "sample_paper"),
 }
 
 

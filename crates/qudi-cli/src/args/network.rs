@@ -21,7 +21,8 @@ pub(crate) struct Network {
     /// what the weights say of themselves]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
     steps: Option<usize>,
-    /// Spacing of the timesteps of these steps [default: log-logistic]
+    /// Spacing of the timesteps of these steps [default: what the weights say of themselves, usually
+    /// log-logistic]
     #[arg(long, value_name = "NAME")]
     spacing: Option<SpacingName>,
     /// Sampler of these steps [default: ddim]
@@ -49,7 +50,7 @@ impl Network {
         NetworkOptions {
             weights: Weights::of(self.weights.as_deref()),
             steps: self.steps,
-            spacing: self.spacing.map_or_else(TimestepSpacing::default, SpacingName::spacing),
+            spacing: self.spacing.map(SpacingName::spacing),
             sampler: self.sampler.map_or_else(Sampler::default, SamplerName::sampler),
             samples: self.samples.unwrap_or(1),
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),

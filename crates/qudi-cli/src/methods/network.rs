@@ -41,7 +41,7 @@ pub(crate) fn restorer(
 pub(crate) fn sample_options(options: &NetworkOptions) -> Result<SampleOptions> {
     Ok(SampleOptions {
         steps: options.steps()?,
-        spacing: options.spacing,
+        spacing: options.spacing()?,
         sampler: options.sampler,
         samples: options.samples,
         tile: options.tile,
@@ -188,6 +188,7 @@ mod tests {
             commit: None,
             licence: String::new(),
             default_steps: None,
+            spacing: None,
             kind: None,
         }
     }

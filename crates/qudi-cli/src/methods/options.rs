@@ -15,8 +15,8 @@ pub(crate) struct NetworkOptions {
     pub(crate) weights: Weights,
     /// Reverse steps; none for those that the weights were made for.
     pub(crate) steps: Option<usize>,
-    /// The spacing of their timesteps.
-    pub(crate) spacing: TimestepSpacing,
+    /// The spacing of their timesteps; none for that which the weights were made for.
+    pub(crate) spacing: Option<TimestepSpacing>,
     /// The sampler.
     pub(crate) sampler: Sampler,
     /// The number of samples.
@@ -51,12 +51,20 @@ impl NetworkOptions {
         })
     }
 
-    /// The name of the spacing on the command line.
-    pub(crate) fn spacing_name(&self) -> &'static str {
+    /// The spacing of the timesteps: that asked for, or that which the weights were made for.
+    pub(crate) fn spacing(&self) -> Result<TimestepSpacing> {
         match self.spacing {
+            Some(spacing) => Ok(spacing),
+            None => Ok(self.weights.describe()?.spacing.unwrap_or_default()),
+        }
+    }
+
+    /// The name of the spacing on the command line.
+    pub(crate) fn spacing_name(&self) -> Result<&'static str> {
+        Ok(match self.spacing()? {
             TimestepSpacing::Linear => "linear",
             TimestepSpacing::LogLogistic => "log-logistic",
-        }
+        })
     }
 
     /// The name of the sampler on the command line.

@@ -34,6 +34,7 @@ fn geometry(planes: usize, outputs: usize, cells: usize) -> Geometry {
         stride: 1,
         addend: false,
         relu: false,
+        bf16: false,
     }
 }
 

@@ -16,7 +16,7 @@ pub(super) const INPUTS: usize = 5;
 ///
 /// Extensions of Burn take no lists of tensors: unused inputs, and an addend where there is none, are any
 /// tensors; the geometry says what counts.
-#[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
+#[backend_extension(Flex: cfg(feature = "flex"), Cube: cfg(feature = "cube"), Autodiff)]
 #[allow(clippy::too_many_arguments)]
 pub trait ConvBackend: Backend {
     /// Inputs `[images, channels, height, width]`, weight `[outputs, channels, frames, rows, columns]`, an
@@ -129,6 +129,52 @@ mod flex {
             let [depth, rows, columns] = geometry.kernel;
             let weight = [geometry.outputs, geometry.all_channels(), depth, rows, columns];
             (tensor(sums.weight, weight), tensor(sums.bias, [geometry.outputs]))
+        }
+    }
+}
+
+#[cfg(feature = "cube")]
+mod cube {
+    use super::super::stock;
+    use super::{ConvBackend, ConvGradients, Geometry};
+    use burn::backend::Cube;
+    use burn::backend::tensor::FloatTensor;
+
+    impl ConvBackend for Cube {
+        fn conv_frames(
+            a: FloatTensor<Self>,
+            b: FloatTensor<Self>,
+            c: FloatTensor<Self>,
+            d: FloatTensor<Self>,
+            e: FloatTensor<Self>,
+            addend: FloatTensor<Self>,
+            weight: FloatTensor<Self>,
+            bias: FloatTensor<Self>,
+            geometry: Geometry,
+        ) -> FloatTensor<Self> {
+            let inputs = [a, b, c, d, e].into_iter().take(geometry.channels.len()).collect();
+            let addend = geometry.addend.then_some(addend);
+            stock::forward::<Self>(&geometry, inputs, addend, weight, bias)
+        }
+    }
+
+    impl ConvGradients for Cube {
+        fn conv_input_gradients(
+            weight: FloatTensor<Self>,
+            gradient: FloatTensor<Self>,
+            output: Option<FloatTensor<Self>>,
+            geometry: Geometry,
+        ) -> Vec<FloatTensor<Self>> {
+            stock::input_gradients::<Self>(&geometry, weight, gradient, output)
+        }
+
+        fn conv_weight_gradients(
+            inputs: Vec<FloatTensor<Self>>,
+            gradient: FloatTensor<Self>,
+            output: Option<FloatTensor<Self>>,
+            geometry: Geometry,
+        ) -> (FloatTensor<Self>, FloatTensor<Self>) {
+            stock::weight_gradients::<Self>(&geometry, inputs, gradient, output)
         }
     }
 }

@@ -23,6 +23,8 @@ pub struct Geometry {
     pub addend: bool,
     /// Whether negative results become zero.
     pub relu: bool,
+    /// Whether products take bfloat16; sums and all besides have 32 bits.
+    pub bf16: bool,
 }
 
 impl Geometry {

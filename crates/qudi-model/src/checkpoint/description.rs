@@ -2,6 +2,7 @@
 
 use super::ModelKind;
 use crate::config::NetworkConfig;
+use crate::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 
 /// The description of a weight file.
@@ -30,6 +31,9 @@ pub struct Description {
     /// Reverse diffusion steps unless the user says otherwise; 0 for regression. Older files do not say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default_steps: Option<usize>,
+    /// Spacing of their timesteps unless the user says otherwise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub spacing: Option<TimestepSpacing>,
     /// Which parts of the network have learnt. Writing sets it from the weights; reading an older file, which
     /// does not say, too.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -4,7 +4,7 @@ use super::{MAX_IMAGE, dark_per_frame};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, Sensor};
 
-/// Counts as the network sees those of a simulated measurement, frame after frame, row-major.
+/// Counts as the network sees them, frame after frame, row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CountPlanes {
     /// Counts over full scale.
@@ -13,24 +13,41 @@ pub struct CountPlanes {
     pub u: Vec<f32>,
 }
 
-/// The linear estimates of a captured burst in image units, in [0, 2], frame after frame.
-pub fn linear_estimates(burst: BurstView<'_>, acquisition: &Acquisition) -> Vec<f32> {
-    let response = CountResponse::new(
-        &acquisition.sensor,
-        acquisition.photons_per_unit(),
-        acquisition.gain,
-        dark_per_frame(&acquisition.sensor),
-    );
-    let frame = |counts: &Vec<u16>| -> Vec<f32> {
-        match &acquisition.dark {
-            None => counts.iter().map(|&count| response.of(count).1).collect(),
-            Some(map) => {
-                let pixels = counts.iter().zip(map);
-                pixels.map(|(&count, &dark)| response.estimate(count, f64::from(dark))).collect()
+impl CountPlanes {
+    /// The planes of a captured burst.
+    pub fn new(burst: BurstView<'_>, acquisition: &Acquisition) -> Self {
+        let response = CountResponse::new(
+            &acquisition.sensor,
+            acquisition.photons_per_unit(),
+            acquisition.gain,
+            dark_per_frame(&acquisition.sensor),
+        );
+        let mut planes = Self::default();
+        for counts in burst.frames {
+            match &acquisition.dark {
+                None => response.append(counts, &mut planes),
+                Some(map) => {
+                    for (&count, &dark) in counts.iter().zip(map) {
+                        planes.y.push(response.of(count).0);
+                        planes.u.push(response.estimate(count, f64::from(dark)));
+                    }
+                }
             }
         }
-    };
-    burst.frames.iter().flat_map(frame).collect()
+        planes
+    }
+
+    /// Appends the frames of other planes.
+    pub fn extend(&mut self, more: Self) {
+        self.y.extend(more.y);
+        self.u.extend(more.u);
+    }
+
+    /// Changes both planes by `f`.
+    #[must_use]
+    pub fn map(&self, f: impl Fn(&[f32]) -> Vec<f32>) -> Self {
+        Self { y: f(&self.y), u: f(&self.u) }
+    }
 }
 
 /// What a count of a sensor under a certain light means.
@@ -106,7 +123,7 @@ mod tests {
         let size = Size { height: 1, width: 4 };
         let frames = [vec![0, 3, 7, 9]];
         let estimates = |acquisition: &Acquisition| {
-            linear_estimates(BurstView { size, frames: &frames }, acquisition)
+            CountPlanes::new(BurstView { size, frames: &frames }, acquisition).u
         };
         let flat = estimates(&acquisition);
         assert_eq!(flat[0], 0.0);

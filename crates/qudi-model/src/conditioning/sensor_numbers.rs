@@ -2,6 +2,7 @@
 
 use super::count_response::CountResponse;
 use super::dark_per_frame;
+use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Response;
 
@@ -10,6 +11,12 @@ pub const SENSOR_NUMBERS: usize = 11;
 
 /// The place of log10 of the sigma of the linear estimate at the mean light.
 pub const MEAN_LIGHT_SIGMA: usize = 10;
+
+/// The numbers of one burst, `[1, 11]`.
+pub fn sensor_tensor(acquisition: &Acquisition, device: &Device) -> Tensor<2> {
+    let numbers = TensorData::new(sensor_numbers(acquisition).to_vec(), [1, SENSOR_NUMBERS]);
+    Tensor::from_data(numbers, device)
+}
 
 /// The sensor and its light in numbers (docs/network.md, "Inputs").
 pub fn sensor_numbers(acquisition: &Acquisition) -> [f32; SENSOR_NUMBERS] {

@@ -5,7 +5,7 @@
 //! few hundredths of difference between two images, and give them back, learns little else for a long time.
 
 use crate::diffusion::schedule::NoiseSchedule;
-use crate::diffusion::state::DiffusionState;
+use crate::diffusion::state::{DiffusionState, per_image};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use burn::tensor::Tensor;
 
@@ -40,19 +40,13 @@ impl Preconditioned {
     pub(crate) fn new(mean: Tensor<4>, sigma: Tensor<4>, state: &DiffusionState) -> Self {
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let images = mean.dims()[0];
-        let bursts = state.timesteps.len();
-        let each = |values: Vec<f32>| {
-            let values = Tensor::<1>::from_floats(values.as_slice(), &mean.device());
-            let values = values.reshape([bursts, 1]).repeat_dim(1, images / bursts);
-            values.reshape([images, 1, 1, 1]).expand(mean.dims())
-        };
+        let each = |values: Vec<f32>| per_image(values, images, &mean.device()).expand(mean.dims());
         let level = |f: fn(f64) -> f64| {
             let value = |&timestep: &usize| f(schedule.alpha_bar(Some(timestep))) as f32;
             each(state.timesteps.iter().map(value).collect())
         };
         let (signal, noise) = (level(f64::sqrt), level(|a| (1.0 - a).sqrt()));
-        let flags = state.has_previous.iter().map(|&has| f32::from(u8::from(has)));
-        let flag = each(flags.collect());
+        let flag = state.has_previous_flag().expand(mean.dims());
         let scaled = sigma.clone() * signal.clone();
         let total = (scaled.clone().powi_scalar(2) + noise.clone().powi_scalar(2)).sqrt();
         let previous = (state.x0_prev.clone() - mean.clone()) / sigma.clone();

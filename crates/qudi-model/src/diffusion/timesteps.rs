@@ -1,6 +1,7 @@
 //! The timesteps of training and sampling.
 
 use super::schedule::NoiseSchedule;
+use serde::{Deserialize, Serialize};
 
 /// The number of timesteps in training.
 pub const NUM_TIMESTEPS: usize = 1000;
@@ -13,7 +14,8 @@ const MEDIAN_NOISE: f64 = 0.08;
 const SCALE: f64 = 0.6;
 
 /// How the timesteps of sampling are spaced.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum TimestepSpacing {
     /// Evenly, as in the paper: of ten timesteps one is low enough to show what a good start has left wrong.
     Linear,

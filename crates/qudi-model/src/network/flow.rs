@@ -1,5 +1,5 @@
-//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), whose networks correct what
-//! steps of Lucas and Kanade find on every level.
+//! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), alone or correcting what steps
+//! of Lucas and Kanade find on every level.
 
 use super::layers::resample::{avg_pool2, by_burst, rescale_flow, shrink, upsample2};
 use super::layers::{Bias, Conv2d, FLOW_CORRECTION};
@@ -35,6 +35,8 @@ pub struct Flow {
     /// Levels of the pyramid; the finest may have no network.
     pyramid: usize,
     scale: usize,
+    /// Whether steps of Lucas and Kanade come before the network of a level.
+    registration: bool,
     /// Whether nothing moves.
     off: bool,
 }
@@ -50,6 +52,7 @@ impl FlowConfig {
             levels: (0..self.networks).map(level).collect(),
             pyramid: self.levels,
             scale: self.scale,
+            registration: self.registration,
             off,
         }
     }
@@ -76,7 +79,9 @@ impl Flow {
             return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
         }
         // Both directions of every pair of neighbours at once; both kinds of image as channels.
-        let finest = shrink(Tensor::cat(vec![d, reference.detach()], 1), self.scale);
+        let images_of_both =
+            if self.registration { Tensor::cat(vec![d, reference.detach()], 1) } else { d };
+        let finest = shrink(images_of_both, self.scale);
         let mut finer = both(finest, frames);
         let mut pyramid = Vec::with_capacity(self.pyramid);
         for _ in 1..self.pyramid {
@@ -93,8 +98,10 @@ impl Flow {
                 flow = upsample2(flow) * 2.0;
             }
             let kind = |x: &Tensor<4>, channel| x.clone().narrow(1, channel, 1);
-            let (i, j) = (kind(&reference, 1), kind(&neighbour, 1));
-            flow = flow.clone() + lucas_kanade(i, j, flow, variance.clone());
+            if self.registration {
+                let (i, j) = (kind(&reference, 1), kind(&neighbour, 1));
+                flow = flow.clone() + lucas_kanade(i, j, flow, variance.clone());
+            }
             if let Some(at) = number.checked_sub(self.pyramid - self.levels.len()) {
                 let (i, j) = (kind(&reference, 0), kind(&neighbour, 0));
                 flow = self.levels[at].correct(i, j, flow);

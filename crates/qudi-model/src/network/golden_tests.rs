@@ -1,6 +1,8 @@
 //! Every block, and the whole network, against PyTorch, forward and backward, on both CPU backends.
 #![allow(clippy::unwrap_used)]
 
+mod whole;
+
 use super::flow::Flows;
 use super::layers::attention::Attention;
 use super::layers::dense_block::DenseBlock;
@@ -10,7 +12,7 @@ use super::unet::ResidualBlock;
 use super::{Pyramid, Simulated, former_name, init_parameters};
 use crate::cases::{self, Case, File, parameter};
 use crate::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS, sensor_numbers};
-use crate::config::NetworkConfig;
+use crate::config::{NetworkConfig, UNetPrediction};
 use crate::diffusion::precondition::Preconditioned;
 use crate::diffusion::sampler::{Sampler, Step, sample};
 use crate::diffusion::schedule::NoiseSchedule;
@@ -63,7 +65,7 @@ fn aligned(planes: &Tensor<4>) -> AlignedTensors {
 }
 
 fn normalized(planes: &Tensor<4>) -> NormalizedInput {
-    NormalizedInput::new(&aligned(planes))
+    NormalizedInput::aligned(&aligned(planes))
 }
 
 /// Compares the gradients of all parameters; none may be missing.
@@ -113,18 +115,6 @@ fn check<M: Module>(
         case.check_gradient(name, input.grad(&grads).unwrap());
     }
     compare(case, &grads, module, prefix);
-}
-
-/// The squared error plus 0.01 of the total variation of the error, as the reference computes it.
-fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
-    let error = p - q;
-    let [_, _, height, width] = error.dims();
-    let difference = |axis: usize, size: usize| {
-        let part = |first| error.clone().narrow(axis, first, size - 1);
-        (part(1) - part(0)).abs().mean()
-    };
-    let variation = difference(3, width) + difference(2, height);
-    error.powi_scalar(2).mean() + variation * 0.01
 }
 
 #[test]
@@ -202,7 +192,7 @@ fn check_pre_denoiser(file: &str) {
     for device in devices() {
         for case in file.cases() {
             let config = config(&case);
-            let pre = weighted(config.pre.init(config.fold, &device), "pre");
+            let pre = weighted(config.pre.init(config.reference, config.fold, &device), "pre");
             let [guide, y_sim, u_sim] = ["guide", "y_sim", "u_sim"]
                 .map(|name| -> Tensor<4> { case.input(name, &device).require_grad() });
             let frames = guide.dims()[0] / 2;
@@ -340,7 +330,9 @@ fn u_net_matches_pytorch() {
             let sigma = normalized.sigma.clone() * 0.6;
             let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma, &state);
             let sensor = unet.encode(sensor);
-            let x0 = unet.forward(noisy, &normalized, fused.clone(), &timesteps, sensor, frames);
+            let images = UNetPrediction::Edm.images(&noisy, &state, &normalized);
+            let output = unet.forward(images, fused.clone(), &timesteps, sensor, frames);
+            let x0 = noisy.prediction(output);
             let inputs = [
                 ("x_t", &x_t),
                 ("x0_prev", &x0_prev),
@@ -353,147 +345,4 @@ fn u_net_matches_pytorch() {
             check(&case, &[("x0", x0)], &inputs, &unet, "unet");
         }
     }
-}
-
-#[test]
-fn whole_network_matches_pytorch() {
-    let file = File::open("network/network");
-    for device in [flex()] {
-        let case = file.case("tiny");
-        let network = init_parameters(config(&case).init(0, &device), reference_parameter);
-        let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
-        let [u, guide, y_sim, u_sim, x_t, x0_prev] =
-            ["u", "guide", "y_sim", "u_sim", "x_t", "x0_prev"].map(input);
-        let conditioning = Conditioning {
-            linear_estimate: u.clone(),
-            aligned: aligned(&guide),
-            sensor: case.input("sensor", &device),
-            frames: case.number("frames"),
-        };
-        let exists: Vec<bool> = case.values("flag").iter().map(|&flag| flag > 0.0).collect();
-        let has_previous = exists.clone();
-        let simulated = Simulated { y: y_sim.clone(), u: u_sim.clone(), exists };
-        let timesteps = case.values("t").iter().map(|&t| t as usize).collect();
-        let state =
-            DiffusionState { x_t: x_t.clone(), x0_prev: x0_prev.clone(), has_previous, timesteps };
-        let encoded = network.encode(&conditioning);
-        let prediction = network.forward(&encoded, Some(&simulated), &state, None);
-        case.check_output("x0", prediction.x0.clone().inner());
-        case.check_output("d", prediction.d.clone().inner());
-        case.check_output("to_next", prediction.flows.to_next.clone().inner());
-        case.check_output("to_prev", prediction.flows.to_prev.clone().inner());
-        let truth: Tensor<4> = case.input("truth", &device);
-        let image = (prediction.x0 + 1.0) * 0.5;
-        let loss = reconstruction(image, truth.clone()) + reconstruction(prediction.d, truth) * 0.2;
-        case.check_output("loss", loss.clone().inner());
-        let grads = loss.backward();
-        let inputs = [
-            ("u", &u),
-            ("guide", &guide),
-            ("y_sim", &y_sim),
-            ("u_sim", &u_sim),
-            ("x_t", &x_t),
-            ("x0_prev", &x0_prev),
-        ];
-        for (name, tensor) in inputs {
-            case.check_gradient(name, tensor.grad(&grads).unwrap());
-        }
-        compare(&case, &grads, &network, "");
-    }
-}
-
-#[test]
-fn sampler_weights_match_numpy() {
-    let file = File::open("network/steps");
-    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    for (name, sampler) in [("ddim", Sampler::Ddim), ("ancestral", Sampler::Ancestral)] {
-        let expected = file.f64s(name);
-        let steps = sampler.steps(&schedule, 10, TimestepSpacing::Linear);
-        assert_eq!(steps.len(), 10);
-        for (step, expected) in steps.iter().zip(expected.chunks_exact(3)) {
-            let got = [step.clean, step.noisy, step.sigma];
-            for (got, expected) in got.iter().zip(expected) {
-                assert!((got - expected).abs() < 1e-9, "{name}: {step:?}, reference {expected}");
-            }
-        }
-    }
-}
-
-/// Ten steps from noise to picture with the reference's noise and its simulated counts.
-#[test]
-fn ten_sampling_steps_match_pytorch() {
-    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    let size = Size { height: 32, width: 32 };
-    for (name, sampler) in [("ddim", Sampler::Ddim), ("ancestral", Sampler::Ancestral)] {
-        let file = File::open(&format!("network/sample_{name}"));
-        let case = file.case("sample");
-        let device = Device::flex();
-        let config = config(&case);
-        let network = init_parameters(config.init(0, &device), reference_parameter);
-        let frames = case.number("frames");
-        let sensor: Vec<f32> = serde_json::from_value(case.about["sensor"].clone()).unwrap();
-        let ours = paper_numbers();
-        assert!(ours.iter().zip(&sensor).all(|(a, b)| (a - b).abs() < 1e-6), "{ours:?}");
-        let planes = |counts: &[u8], table: &[f32]| {
-            let y = counts.iter().map(|&c| f32::from(c) / 7.0).collect();
-            let u = counts.iter().map(|&c| table[usize::from(c)]).collect();
-            (to_tensor(y, size, &device), to_tensor(u, size, &device))
-        };
-        let (_, u) = planes(&file.bytes("counts"), &file.f32s("u_table"));
-        let sensor = Tensor::<1>::from_floats(sensor.as_slice(), &device).unsqueeze();
-        let channels = 3 + config.pre.aligned_neighbours().standardized_planes();
-        let shape = [frames, channels, size.height, size.width];
-        let guide = Tensor::from_data(TensorData::new(file.f32s("guide"), shape), &device);
-        let (aligned, linear_estimate) = (aligned(&guide), u);
-        let conditioning = Conditioning { linear_estimate, aligned, sensor, frames };
-        let encoded = network.encode(&conditioning);
-        let (simulated, tables) = (file.bytes("simulated"), file.f32s("u_sim_table"));
-        let count = frames * size.pixels();
-        let mut flows = None;
-        let (expected_x, expected_x0) = (file.f32s("x"), file.f32s("x0"));
-        let close = |what: &str, got: &[f32], expected: &[f32], step: usize| {
-            for i in 0..64 {
-                let difference = got[61 * i] - expected[64 * (step - 1) + i];
-                assert!(difference.abs() < 1e-3, "{name}, step {step}: {what} by {difference}");
-            }
-        };
-        let predict = |step: &Step, x: &[f32], x0: &[f32]| {
-            let k = step.number;
-            if k > 1 {
-                close("x", x, &expected_x, k - 1);
-            }
-            let simulated = k.checked_sub(2).map(|n| {
-                let counts = &simulated[n * count..(n + 1) * count];
-                let (y, u) = planes(counts, &tables[8 * n..8 * n + 8]);
-                Simulated { y, u, exists: vec![true] }
-            });
-            if config.flow.steps.contains(&k) {
-                flows = None;
-            }
-            let state = DiffusionState {
-                x_t: to_tensor(x.to_vec(), size, &device),
-                x0_prev: to_tensor(x0.to_vec(), size, &device),
-                has_previous: vec![k > 1],
-                timesteps: vec![step.timestep],
-            };
-            let result = network.forward(&encoded, simulated.as_ref(), &state, flows.take());
-            flows = Some(result.flows);
-            let x0 = read(result.x0.clamp(-1.0, 1.0))?;
-            close("x0", &x0, &expected_x0, k);
-            Ok::<_, qudi_core::Error>(x0)
-        };
-        let noise = |k: usize| cases::gaussian(&format!("noise.{k}"), count);
-        let steps = sampler.steps(&schedule, 10, TimestepSpacing::Linear);
-        let fresh = |step: &Step| noise(step.number).into_iter();
-        let x0 = sample(&steps, noise(0), predict, fresh).unwrap();
-        let last = file.f32s("x0_last");
-        let worst = x0.iter().zip(&last).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        assert!(worst < 1e-3, "{name}: the result is off by {worst}");
-    }
-}
-
-/// The numbers of the paper's sensor at its lowest light.
-fn paper_numbers() -> [f32; SENSOR_NUMBERS] {
-    let sensor = qudi_core::sensor::Sensor::load("qudi-paper").unwrap();
-    sensor_numbers(&Acquisition::new(sensor, 3.25, 0.45).unwrap())
 }

@@ -1,7 +1,6 @@
 //! Registration that needs no training: steps of Lucas and Kanade (1981) under a prior.
 
 use super::layers::resample::{differences, mean_around};
-use crate::conditioning::MEAN_LIGHT_SIGMA;
 use burn::tensor::Tensor;
 use qudi_kernels::warp;
 
@@ -19,21 +18,6 @@ const STEPS: usize = 3;
 
 /// Farthest motion found on one level, in cells.
 const FARTHEST: f32 = 3.0;
-
-/// The least variance: below it, float arithmetic is the noise.
-const MIN_VARIANCE: f32 = 1e-8;
-
-/// The variance of the linear estimate's noise at the mean light, from the numbers of each burst's sensor.
-///
-/// # Shapes
-/// - sensor: `[bursts, 11]`
-/// - result: `[bursts * frames, 1, 1, 1]`
-pub(super) fn noise_variance(sensor: &Tensor<2>, frames: usize) -> Tensor<4> {
-    let [bursts, _] = sensor.dims();
-    let log_sigma = sensor.clone().narrow(1, MEAN_LIGHT_SIGMA, 1).detach();
-    let variance = (log_sigma * (2.0 * std::f32::consts::LN_10)).exp().clamp_min(MIN_VARIANCE);
-    variance.repeat_dim(1, frames).reshape([bursts * frames, 1, 1, 1])
-}
 
 /// How much further than `start` to look into `neighbour` for what `reference` shows, in cells: `[pairs, 2,
 /// h, w]`.

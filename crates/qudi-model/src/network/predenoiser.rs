@@ -3,16 +3,19 @@
 
 use super::layers::dense_block::DenseBlock;
 use super::layers::resample::{pixel_shuffle, pixel_unshuffle};
-use super::layers::{Bias, CORRECTION, Conv2d};
+use super::layers::{Bias, Conv2d};
 use super::neighbour_weighting::NeighbourWeighting;
 use super::normalized_input::NormalizedInput;
 use crate::conditioning::AlignedTensors;
-use crate::config::PreConfig;
+use crate::config::{PreConfig, ReferenceKind};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-/// The planes that the three images become.
+/// The planes that the images of an aligned frame become.
 const IMAGE_PLANES: usize = 4;
+
+/// The planes of a frame without reference estimate: linear estimate, counts, noise.
+const SINGLE_IMAGE_PLANES: usize = 3;
 
 /// The pre-denoiser.
 #[derive(Module, Debug)]
@@ -30,9 +33,14 @@ pub struct PreDenoiser {
 
 impl PreConfig {
     /// The pre-denoiser on planes whose squares of `fold` pixels are channels, all weights zero.
-    pub fn init(&self, fold: usize, device: &Device) -> PreDenoiser {
+    pub fn init(&self, reference: ReferenceKind, fold: usize, device: &Device) -> PreDenoiser {
         let (width, planes) = (self.width, fold * fold);
-        let inputs = IMAGE_PLANES + self.aligned_neighbours().standardized_planes();
+        let inputs = match reference {
+            ReferenceKind::None => SINGLE_IMAGE_PLANES,
+            ReferenceKind::QbpRefined => {
+                IMAGE_PLANES + self.aligned_neighbours().standardized_planes()
+            }
+        };
         let conv = |sizes, kernel, bias| Conv2d::zeros(sizes, kernel, bias, device);
         let block = |_| DenseBlock::zeros(width, self.growth, device);
         let weighted = self.weighting_channels(fold);
@@ -66,9 +74,7 @@ impl PreDenoiser {
 
     /// Encodes what does not depend on the step, `[images, width, h, w]`.
     pub(super) fn encode(&self, input: &NormalizedInput) -> Tensor<4> {
-        let NormalizedInput { difference, contrast, log_sigma, aligned, .. } = input.clone();
-        let planes = vec![difference, contrast, input.signed(), log_sigma, aligned];
-        let planes = pixel_unshuffle(Tensor::cat(planes, 1), self.fold);
+        let planes = pixel_unshuffle(input.planes.clone(), self.fold);
         let encoded = self.static_in.linear(std::slice::from_ref(&planes));
         match (&self.weighting, &self.weighted_in) {
             (Some(weighting), Some(weighted_in)) => {
@@ -83,17 +89,17 @@ impl PreDenoiser {
     /// # Shapes
     /// - result: `[images, 1, height, width]`
     pub fn predenoise(&self, aligned: &AlignedTensors) -> Tensor<4> {
-        self.predenoise_normalized(&NormalizedInput::new(aligned)).0
+        self.predenoise_normalized(&NormalizedInput::aligned(aligned)).0
     }
 
     /// [`Self::predenoise`] of normalized inputs, with the features.
     pub(super) fn predenoise_normalized(&self, input: &NormalizedInput) -> (Tensor<4>, Tensor<4>) {
-        let nothing = input.reference.zeros_like().repeat_dim(1, 2);
+        let nothing = input.start.zeros_like().repeat_dim(1, 2);
         let flag = nothing.clone().narrow(1, 0, 1).narrow(2, 0, 1).narrow(3, 0, 1);
         self.forward(self.encode(input), input, nothing, flag)
     }
 
-    /// Corrects the reference estimate: the frames in image units, `[images, 1, H, W]`, and features
+    /// Corrects what `input` starts from: the frames in image units, `[images, 1, H, W]`, and features
     /// `[images, width, h, w]`. `encoded` is [`Self::encode`] of the same `input`; `simulated` are `y_sim`
     /// and `u_sim`; `flag` says of every image whether they exist, `[images, 1, 1, 1]`.
     pub(super) fn forward(
@@ -114,7 +120,7 @@ impl PreDenoiser {
         }
         let features = self.spread.add(&[self.gather.linear(&outputs)], shallow);
         let correction = pixel_shuffle(self.out.linear(std::slice::from_ref(&features)), self.fold);
-        let correction = correction * input.sigma.clone() * CORRECTION;
-        (input.reference.clone() + correction, features)
+        let correction = correction * input.sigma.clone() * input.correction;
+        (input.start.clone() + correction, features)
     }
 }

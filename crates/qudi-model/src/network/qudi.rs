@@ -4,14 +4,13 @@ use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
 use super::fusion::Fusion;
 use super::layers::CORRECTION;
-use super::lucas_kanade::noise_variance;
 use super::normalized_input::NormalizedInput;
 use super::parameters::{init_parameters, initial_values};
 use super::predenoiser::PreDenoiser;
 use super::uncertainty::UncertaintyHead;
 use super::unet::UNet;
 use crate::conditioning::{AlignedTensors, Conditioning};
-use crate::config::{NetworkConfig, Part};
+use crate::config::{NetworkConfig, NoisyFeatures, Part, UNetPrediction};
 use crate::diffusion::precondition::Preconditioned;
 use crate::diffusion::state::DiffusionState;
 use burn::module::Module;
@@ -55,8 +54,7 @@ pub struct Encoded {
 pub struct Prediction {
     /// The clean image, about in [-1, 1].
     pub x0: Tensor<4>,
-    /// The unit of the correction in `x0`: sigma of what is unknown if the errors of the pre-denoised frames
-    /// are white.
+    /// The unit of a correction of the pre-denoised frames: sigma of what is unknown if their errors are white.
     pub c_out: Tensor<4>,
     /// The pre-denoised frames, in image units.
     pub d: Tensor<4>,
@@ -77,6 +75,10 @@ pub struct Qudi {
     flow: Flow,
     fusion: Fusion,
     unet: UNet,
+    #[module(skip)]
+    noisy: NoisyFeatures,
+    #[module(skip)]
+    predicts: UNetPrediction,
 }
 
 impl NetworkConfig {
@@ -89,16 +91,18 @@ impl NetworkConfig {
 
     /// The network without weights: it takes no memory yet.
     pub fn uninitialized(&self, device: &Device) -> Qudi {
-        let stage = |_| self.pre.stage().init(self.fold, device);
+        let stage = |_| self.pre.stage().init(self.reference, self.fold, device);
         Qudi {
             stages: (1..self.pre.stages).map(stage).collect(),
-            pre: self.pre.init(self.fold, device),
+            pre: self.pre.init(self.reference, self.fold, device),
             uncertainty: self.pre.init_uncertainty(self.fold, device),
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
             flow: self.flow.init(self.ablates(Part::Flow), device),
             fusion: self.fusion.init(&self.features, self.pre.width, self.fold, device),
             unet: self.unet.init(&self.fusion, self.fold, device),
+            noisy: self.features.noisy,
+            predicts: self.unet.predicts,
         }
     }
 }
@@ -106,14 +110,14 @@ impl NetworkConfig {
 impl Qudi {
     /// Encodes what does not depend on the step.
     pub fn encode(&self, conditioning: &Conditioning) -> Encoded {
-        let Conditioning { linear_estimate: u, aligned, sensor, frames } = conditioning;
-        let input = NormalizedInput::new(aligned);
+        let Conditioning { linear_estimate: u, sensor, frames, .. } = conditioning;
+        let input = NormalizedInput::new(conditioning);
         Encoded {
             pre: self.pre.encode(&input),
             low: self.low.encode(u.clone(), *frames),
             sensor: self.unet.encode(sensor.clone()),
             input,
-            variance: noise_variance(sensor, *frames),
+            variance: conditioning.noise_variance(),
             u: u.clone(),
             frames: *frames,
             predenoised: None,
@@ -145,10 +149,18 @@ impl Qudi {
     ///
     /// # Shapes
     /// - results: `[images, 1, height, width]`
-    pub fn predenoise(&self, aligned: &AlignedTensors) -> (Tensor<4>, Option<Tensor<4>>) {
-        let input = NormalizedInput::new(aligned);
-        let (d, features) = self.pre.predenoise_normalized(&input);
-        (d, self.uncertainty.as_ref().map(|head| head.forward(features.detach(), &input)))
+    pub fn predenoise(&self, conditioning: &Conditioning) -> (Tensor<4>, Option<Tensor<4>>) {
+        self.predenoise_normalized(&NormalizedInput::new(conditioning))
+    }
+
+    /// [`Self::predenoise`] for networks with a reference estimate, which need no more than aligned frames.
+    pub fn predenoise_aligned(&self, aligned: &AlignedTensors) -> (Tensor<4>, Option<Tensor<4>>) {
+        self.predenoise_normalized(&NormalizedInput::aligned(aligned))
+    }
+
+    fn predenoise_normalized(&self, input: &NormalizedInput) -> (Tensor<4>, Option<Tensor<4>>) {
+        let (d, features) = self.pre.predenoise_normalized(input);
+        (d, self.uncertainty.as_ref().map(|head| head.forward(features.detach(), input)))
     }
 
     /// Whether the network predicts the uncertainty of its pre-denoised frames.
@@ -191,7 +203,7 @@ impl Qudi {
     }
 
     fn estimate_flow(&self, encoded: &Encoded, d: Tensor<4>) -> Flows {
-        let reference = encoded.input.reference.clone();
+        let reference = encoded.input.start.clone();
         self.flow.forward(d, reference, encoded.variance.clone(), encoded.frames)
     }
 
@@ -211,17 +223,17 @@ impl Qudi {
         simulated: Option<&Simulated>,
     ) -> (Tensor<4>, Tensor<4>) {
         let Encoded { pre, input, frames, .. } = encoded;
-        let reference = &input.reference;
-        let bursts = reference.dims()[0] / frames;
+        let start = &input.start;
+        let bursts = start.dims()[0] / frames;
         let (y_sim, u_sim, flags) = match simulated {
             Some(simulated) => {
                 let flags = simulated.exists.iter().map(|&exists| f32::from(u8::from(exists)));
                 (simulated.y.clone(), simulated.u.clone(), flags.collect())
             }
-            None => (reference.zeros_like(), reference.zeros_like(), vec![0.0; bursts]),
+            None => (start.zeros_like(), start.zeros_like(), vec![0.0; bursts]),
         };
         let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
-        let flag = Tensor::<4>::from_data(flags, &reference.device()).repeat_dim(1, *frames);
+        let flag = Tensor::<4>::from_data(flags, &start.device()).repeat_dim(1, *frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim], 1);
         self.pre.forward(pre.clone(), input, both, flag)
@@ -248,14 +260,23 @@ impl Qudi {
         // A sigma spans twice as much in [-1, 1].
         let sigma = self.error_sigma(&features, input) * 2.0;
         let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma, state);
-        let high = self.high.forward(noisy.residual.clone(), noisy.previous.clone(), frames);
+        let [image, previous] = match self.noisy {
+            NoisyFeatures::Image => [state.x_t.clone(), state.previous()],
+            NoisyFeatures::Residual => [noisy.residual.clone(), noisy.previous.clone()],
+        };
+        let high = self.high.forward(image, previous, frames);
         done("high");
         let flows = flows.unwrap_or_else(|| self.estimate_flow(encoded, d.clone()));
         done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
         let (c_out, sensor) = (noisy.c_out.clone(), encoded.sensor.clone());
-        let x0 = self.unet.forward(noisy, input, fused, &state.timesteps, sensor, frames);
+        let images = self.predicts.images(&noisy, state, input);
+        let output = self.unet.forward(images, fused, &state.timesteps, sensor, frames);
+        let x0 = match self.predicts {
+            UNetPrediction::X0 => output,
+            UNetPrediction::Edm => noisy.prediction(output),
+        };
         done("unet");
         Prediction { x0, c_out, d, flows }
     }

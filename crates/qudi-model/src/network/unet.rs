@@ -7,14 +7,12 @@ use super::layers::resample::{pixel_shuffle, pixel_unshuffle, repeat};
 use super::layers::{Bias, Conv2d, GroupNorm, Linear};
 use super::normalized_input::NormalizedInput;
 use crate::conditioning::SENSOR_NUMBERS;
-use crate::config::{FusionConfig, UNetConfig};
+use crate::config::{FusionConfig, UNetConfig, UNetPrediction};
 use crate::diffusion::precondition::Preconditioned;
+use crate::diffusion::state::DiffusionState;
 use burn::module::Module;
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor, TensorData};
-
-/// Images that the U-Net sees besides the fused features.
-const PLANES: usize = 6;
 
 /// Two convolutions with norms, modulated by the embedding (FiLM, Perez et al. 2018).
 #[derive(Module, Debug)]
@@ -113,6 +111,32 @@ pub struct UNet {
     fold: usize,
 }
 
+impl UNetPrediction {
+    /// The number of images that the U-Net sees besides the fused features.
+    fn planes(self) -> usize {
+        match self {
+            Self::X0 => 4,
+            Self::Edm => 6,
+        }
+    }
+
+    /// These images.
+    pub(super) fn images(
+        self,
+        noisy: &Preconditioned,
+        state: &DiffusionState,
+        input: &NormalizedInput,
+    ) -> Vec<Tensor<4>> {
+        let Preconditioned { mean, residual, previous, log_snr, .. } = noisy.clone();
+        match self {
+            Self::X0 => vec![mean, state.x_t.clone(), state.previous(), input.signed()],
+            Self::Edm => {
+                vec![mean, residual, previous, input.signed(), input.difference.clone(), log_snr]
+            }
+        }
+    }
+}
+
 impl UNetConfig {
     /// The U-Net that takes fused features of these widths, all weights zero.
     pub fn init(&self, fusion: &FusionConfig, fold: usize, device: &Device) -> UNet {
@@ -135,7 +159,7 @@ impl UNetConfig {
             time_out: linear(size),
             sensor_in: linear(SENSOR_NUMBERS),
             sensor_out: linear(size),
-            inp: conv([PLANES * fold * fold, channels[0]], 3),
+            inp: conv([self.predicts.planes() * fold * fold, channels[0]], 3),
             merge: (0..levels.min(3))
                 .map(|k| conv([before(k) + fusion.widths[k], before(k)], 1))
                 .collect(),
@@ -170,22 +194,17 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// Predicts the clean image, `[images, 1, H, W]` in [-1, 1]: the pre-denoised image, corrected by the
-    /// noisy one and by what the U-Net sees in it. `timesteps` has one number for each burst; `sensor` is as
-    /// from [`Self::encode`].
+    /// The output of the U-Net, `[images, 1, H, W]`. `planes` are images that it sees besides the fused
+    /// features; `timesteps` has one number for each burst; `sensor` is as from [`Self::encode`].
     pub(super) fn forward(
         &self,
-        noisy: Preconditioned,
-        input: &NormalizedInput,
+        planes: Vec<Tensor<4>>,
         fused: Pyramid,
         timesteps: &[usize],
         sensor: Tensor<2>,
         frames: usize,
     ) -> Tensor<4> {
         let embedding = silu(self.embed(timesteps, sensor));
-        let Preconditioned { mean, residual, previous, log_snr, .. } = noisy.clone();
-        let (reference, difference) = (input.signed(), input.difference.clone());
-        let planes = vec![mean, residual, previous, reference, difference, log_snr];
         let mut x = self.inp.linear(&[pixel_unshuffle(Tensor::cat(planes, 1), self.fold)]);
         let mut skips = Vec::new();
         let mut fused = fused.into_iter();
@@ -216,6 +235,6 @@ impl UNet {
                 x = self.up[k - 1].linear(&[repeat(x)]);
             }
         }
-        noisy.prediction(pixel_shuffle(self.out.linear(&[self.norm.silu(x)]), self.fold))
+        pixel_shuffle(self.out.linear(&[self.norm.silu(x)]), self.fold)
     }
 }

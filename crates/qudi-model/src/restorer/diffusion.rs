@@ -3,10 +3,8 @@
 use super::tiling::Tiling;
 use super::{Model, SampleOptions};
 use crate::checkpoint::ModelKind;
-use crate::conditioning::{
-    AlignedPlanes, Conditioning, CountPlanes, SENSOR_NUMBERS, linear_estimates, sensor_numbers,
-};
-use crate::config::{NetworkConfig, Part};
+use crate::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
+use crate::config::{NetworkConfig, Part, ReferenceKind};
 use crate::diffusion::forward_model::ForwardModel;
 use crate::diffusion::noise::Noise;
 use crate::diffusion::sampler::{Step, sample};
@@ -16,7 +14,7 @@ use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use crate::network::{Encoded, Flows, Qudi, Simulated};
 use crate::refinement::{RefinementStage, align};
 use crate::tensor::{read, to_tensor};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored};
 
@@ -37,10 +35,9 @@ pub struct DiffusionRestorer {
 /// A window, padded.
 struct Window<'a> {
     acquisition: &'a Acquisition,
-    sensor: [f32; SENSOR_NUMBERS],
-    linear_estimates: Vec<f32>,
-    /// Empty once the only tile is encoded.
-    aligned: AlignedPlanes,
+    counts: CountPlanes,
+    /// None without a reference estimate, and once the only tile is encoded.
+    aligned: Option<AlignedPlanes>,
     frames: usize,
     tiling: Tiling,
     /// The encoded tile, kept for all steps where there is only one: it takes memory.
@@ -92,20 +89,25 @@ impl DiffusionRestorer {
     ) -> Result<Window<'a>> {
         let frames = burst.frames.len();
         let tiling = Tiling::new(burst.size, self.config.multiple(), self.options.tile);
-        let neighbours = self.config.pre.aligned_neighbours();
-        let aligned = align(burst, acquisition, &self.stages)?;
-        let aligned = AlignedPlanes::new(&aligned, neighbours, 0..frames);
+        let aligned = match self.config.reference {
+            ReferenceKind::None => None,
+            ReferenceKind::QbpRefined => {
+                let neighbours = self.config.pre.aligned_neighbours();
+                let aligned = align(burst, acquisition, &self.stages)?;
+                let planes = AlignedPlanes::new(&aligned, neighbours, 0..frames);
+                Some(planes.map(|plane| tiling.padded(plane)))
+            }
+        };
         let mut window = Window {
             acquisition,
-            sensor: sensor_numbers(acquisition),
-            linear_estimates: tiling.padded(&linear_estimates(burst, acquisition)),
-            aligned: aligned.map(|plane| tiling.padded(plane)),
+            counts: CountPlanes::new(burst, acquisition).map(|plane| tiling.padded(plane)),
+            aligned,
             frames,
             tiling,
             encoded: None,
         };
         if window.tiling.tiles.count() == 1 {
-            let aligned = std::mem::take(&mut window.aligned);
+            let aligned = window.aligned.take();
             window.encoded = Some(self.encode(&window, 0, aligned));
         }
         Ok(window)
@@ -175,7 +177,8 @@ impl DiffusionRestorer {
         let encoded = if let Some(encoded) = &window.encoded {
             encoded
         } else {
-            let aligned = window.aligned.map(|plane| window.tiling.tiles.crop(number, plane));
+            let crop = |plane: &[f32]| window.tiling.tiles.crop(number, plane);
+            let aligned = window.aligned.as_ref().map(|planes| planes.map(crop));
             fresh = self.encode(window, number, aligned);
             &fresh
         };
@@ -204,12 +207,18 @@ impl DiffusionRestorer {
     }
 
     /// Encodes what does not depend on the step, of tile `number`, whose planes are `aligned`.
-    fn encode(&self, window: &Window<'_>, number: usize, aligned: AlignedPlanes) -> Encoded {
-        let sensor = TensorData::new(window.sensor.to_vec(), [1, SENSOR_NUMBERS]);
+    fn encode(
+        &self,
+        window: &Window<'_>,
+        number: usize,
+        aligned: Option<AlignedPlanes>,
+    ) -> Encoded {
+        let size = window.tiling.tiles.tile;
         let encoded = self.network.encode(&Conditioning {
-            linear_estimate: self.tile(window, number, &window.linear_estimates),
-            aligned: aligned.into_tensors(window.tiling.tiles.tile, &self.device),
-            sensor: Tensor::from_data(sensor, &self.device),
+            counts: self.tile(window, number, &window.counts.y),
+            linear_estimate: self.tile(window, number, &window.counts.u),
+            aligned: aligned.map(|planes| planes.into_tensors(size, &self.device)),
+            sensor: sensor_tensor(window.acquisition, &self.device),
             frames: window.frames,
         });
         if self.predenoises_once { self.network.predenoise_once(encoded) } else { encoded }

@@ -2,15 +2,16 @@
 
 use super::Model;
 use super::tiling::Tiling;
-use crate::conditioning::AlignedTensors;
-use crate::config::NetworkConfig;
+use crate::conditioning::{AlignedTensors, Conditioning, CountPlanes, sensor_tensor};
+use crate::config::{NetworkConfig, ReferenceKind};
 use crate::network::Qudi;
 use crate::refinement::{
     PredenoisedFrames, RefinementStage, align, filter_over_time, predenoise_frames,
 };
+use crate::tensor::to_tensor;
 use burn::tensor::Device;
-use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored};
+use qudi_core::{Frame, Result};
 
 /// The largest standard deviation that a value in [0, 1] can have (Popoviciu 1935).
 const MAX_UNCERTAINTY: f32 = 0.5;
@@ -46,19 +47,61 @@ impl RegressionRestorer {
         burst: BurstView<'_>,
         acquisition: &Acquisition,
     ) -> Result<Restored> {
+        if self.config.reference == ReferenceKind::None {
+            return self.restore_single_images(burst, acquisition);
+        }
         let neighbours = self.config.pre.aligned_neighbours();
         let aligned = align(burst, acquisition, &self.stages)?;
         let tiling = Tiling::new(burst.size, self.config.multiple(), self.tile);
         let predenoise = |aligned: &AlignedTensors| {
-            let (d, uncertainty) = self.network.predenoise(aligned);
+            let (d, uncertainty) = self.network.predenoise_aligned(aligned);
             std::iter::once(d).chain(uncertainty).collect()
         };
-        let PredenoisedFrames { frames, mut uncertainty, noise_sigmas } =
+        let PredenoisedFrames { frames, uncertainty, noise_sigmas } =
             predenoise_frames(&aligned, neighbours, &tiling, &self.device, predenoise)?;
-        for sigma in uncertainty.iter_mut().flat_map(|frame| &mut frame.data) {
-            *sigma = sigma.min(MAX_UNCERTAINTY);
-        }
-        let frames = filter_over_time(&aligned, frames, noise_sigmas, 1.0);
-        Ok(Restored { frames, std: (!uncertainty.is_empty()).then_some(uncertainty) })
+        Ok(restored(filter_over_time(&aligned, frames, noise_sigmas, 1.0), uncertainty))
     }
+
+    /// Pre-denoises frames one by one: without a reference estimate there is no motion to filter along.
+    fn restore_single_images(
+        &self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+    ) -> Result<Restored> {
+        let tiling = Tiling::new(burst.size, self.config.multiple(), self.tile);
+        let (mut frames, mut uncertainty) = (Vec::new(), Vec::new());
+        for number in 0..burst.frames.len() {
+            let view = BurstView { frames: &burst.frames[number..=number], ..burst };
+            let planes = CountPlanes::new(view, acquisition).map(|plane| tiling.padded(plane));
+            let predenoise = |tile: usize| {
+                let tensor = |plane: &[f32]| {
+                    let part = tiling.tiles.crop(tile, plane);
+                    to_tensor(part, tiling.tiles.tile, &self.device)
+                };
+                let (d, uncertainty) = self.network.predenoise(&Conditioning {
+                    counts: tensor(&planes.y),
+                    linear_estimate: tensor(&planes.u),
+                    aligned: None,
+                    sensor: sensor_tensor(acquisition, &self.device),
+                    frames: 1,
+                });
+                std::iter::once(d).chain(uncertainty).collect()
+            };
+            let mut images = tiling.joined(predenoise)?.into_iter();
+            frames.extend(images.next());
+            uncertainty.extend(images.next());
+        }
+        for value in frames.iter_mut().flat_map(|frame| &mut frame.data) {
+            *value = value.clamp(0.0, 1.0);
+        }
+        Ok(restored(frames, uncertainty))
+    }
+}
+
+/// Frames and their uncertainty, if it is predicted.
+fn restored(frames: Vec<Frame>, mut uncertainty: Vec<Frame>) -> Restored {
+    for sigma in uncertainty.iter_mut().flat_map(|frame| &mut frame.data) {
+        *sigma = sigma.min(MAX_UNCERTAINTY);
+    }
+    Restored { frames, std: (!uncertainty.is_empty()).then_some(uncertainty) }
 }

@@ -68,10 +68,18 @@ impl Tiling {
         predenoise: impl Fn(&AlignedTensors) -> Vec<Tensor<4>>,
     ) -> Result<Vec<Frame>> {
         let tiles = &self.tiles;
+        self.joined(|number| {
+            let planes = planes.map(|plane| tiles.crop(number, plane));
+            predenoise(&planes.into_tensors(tiles.tile, device))
+        })
+    }
+
+    /// Joins the tiles of an image or of several, which `of_tile` gives by their number, and crops them.
+    pub(crate) fn joined(&self, of_tile: impl Fn(usize) -> Vec<Tensor<4>>) -> Result<Vec<Frame>> {
+        let tiles = &self.tiles;
         let mut images: Vec<Vec<f32>> = Vec::new();
         for number in 0..tiles.count() {
-            let planes = planes.map(|plane| tiles.crop(number, plane));
-            let parts = predenoise(&planes.into_tensors(tiles.tile, device));
+            let parts = of_tile(number);
             images.resize(parts.len(), vec![0.0; self.size.pixels()]);
             for (part, image) in parts.into_iter().zip(&mut images) {
                 tiles.blend(number, &read(part)?, image);

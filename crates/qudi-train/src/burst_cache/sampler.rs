@@ -7,7 +7,7 @@ use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Error, Result, Size, USUAL_MEAN_LEVEL};
 use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
-use qudi_model::config::Part;
+use qudi_model::config::{Part, ReferenceKind};
 use qudi_model::refinement::{RefinementStage, align};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -24,6 +24,7 @@ pub struct BurstSampler {
     seed: u64,
     crop: usize,
     neighbours: AlignedNeighbours,
+    reference: ReferenceKind,
     mean_level: bool,
     crops: Option<(CropsConfig, Cached)>,
     stages: Vec<RefinementStage>,
@@ -45,6 +46,7 @@ impl BurstSampler {
             seed: recipe.train.seed,
             crop: recipe.data.crop,
             neighbours: recipe.network.pre.aligned_neighbours(),
+            reference: recipe.network.reference,
             mean_level: !recipe.network.ablates(Part::MeanLevel),
             crops: recipe.train.crops.map(cells),
             stages,
@@ -148,8 +150,13 @@ impl BurstSampler {
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let aligned = align(view, &sample.acquisition, &self.stages)?;
-        let aligned = AlignedPlanes::new(&aligned, self.neighbours, range.clone());
+        let aligned = match self.reference {
+            ReferenceKind::None => None,
+            ReferenceKind::QbpRefined => {
+                let aligned = align(view, &sample.acquisition, &self.stages)?;
+                Some(AlignedPlanes::new(&aligned, self.neighbours, range.clone()))
+            }
+        };
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
         Ok(ConditionedBurst { size, sample, aligned })
@@ -184,7 +191,8 @@ mod tests {
     fn pixels(burst: &ConditionedBurst) -> Vec<(u32, u16, u32)> {
         let truth = burst.sample.truth.iter().flat_map(|frame| frame.data.clone());
         let counts = burst.sample.counts.iter().flatten();
-        let pixels = truth.zip(counts).zip(&burst.aligned.reference);
+        let aligned = burst.aligned.as_ref().unwrap_or_else(|| panic!("not aligned"));
+        let pixels = truth.zip(counts).zip(&aligned.reference);
         let mut list: Vec<_> = pixels.map(|((t, &y), c)| (t.to_bits(), y, c.to_bits())).collect();
         list.sort_unstable();
         list
@@ -199,7 +207,7 @@ mod tests {
         for number in 0..16 {
             let crop = sample(&mut bursts, number);
             assert!(whole.contains(&pixels(&crop)), "sample {number}");
-            corners.insert(crop.aligned.reference[0].to_bits());
+            corners.insert(pixels(&crop)[0]);
         }
         assert!(corners.len() > 4, "two bursts in eight positions, and {} corners", corners.len());
     }
@@ -213,8 +221,8 @@ mod tests {
         let pixels = whole.size.pixels();
         let first = whole.sample.truth.iter().position(|frame| *frame == cached.sample.truth[0]);
         let first = first.unwrap_or_else(|| panic!("no frame of the whole"));
-        let part = whole.aligned.map(|all| all[first * pixels..][..2 * pixels].to_vec());
-        assert!(part == cached.aligned);
+        let part = |all: &[f32]| all[first * pixels..][..2 * pixels].to_vec();
+        assert!(whole.aligned.map(|planes| planes.map(part)) == cached.aligned);
     }
 
     #[test]

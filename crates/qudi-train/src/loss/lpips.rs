@@ -207,12 +207,17 @@ fn unit(x: Tensor<4>) -> Tensor<4> {
 }
 
 /// Downloads the weights of a kind into `folder` with the `curl` program, and checks their hashes. Files that
-/// are there already are checked and kept. Gives the paths: none for [`PerceptualKind::None`].
+/// are there already are checked and kept; converted ones (docs/training.md) are enough. Gives the paths: none for [`PerceptualKind::None`].
 ///
 /// # Errors
 /// [`Error`] if curl is missing or fails, or a file is not the published one.
 pub fn fetch(kind: PerceptualKind, folder: &Path) -> Result<Vec<PathBuf>> {
-    let files = kind.net().map(weight_files::files);
-    let files = files.iter().flatten();
+    let Some(net) = kind.net() else { return Ok(Vec::new()) };
+    let converted = folder.join(weight_files::converted(net));
+    if converted.is_file() {
+        return Ok(vec![converted]);
+    }
+    let files = weight_files::files(net);
+    let files = files.iter();
     files.map(|file| fetch::fetch(file, file.base, folder)).collect()
 }

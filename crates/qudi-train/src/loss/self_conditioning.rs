@@ -12,6 +12,7 @@ use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::{Qudi, Simulated};
 use qudi_model::tensor::{read, to_tensor};
+use rayon::prelude::*;
 
 /// Which results of the previous step the network is given.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -107,24 +108,21 @@ fn first_estimate(
         ));
     }
     let burst = conditioning.frames * size.pixels();
-    let mut planes = CountPlanes::default();
     let exists: Vec<bool> = example.timesteps.iter().map(|&t| t < NUM_TIMESTEPS - 1).collect();
-    for (number, (x0, acquisition)) in
-        x0.chunks_exact_mut(burst).zip(example.acquisitions).enumerate()
-    {
+    let measured = |(number, x0): (usize, &mut [f32])| {
         if !exists[number] {
             x0.fill(0.0);
-            planes.y.resize(planes.y.len() + burst, 0.0);
-            planes.u.resize(planes.u.len() + burst, 0.0);
-            continue;
+            return Ok(CountPlanes { y: vec![0.0; burst], u: vec![0.0; burst] });
         }
         let images: Vec<f32> = x0.iter().map(|x0| (x0 + 1.0) * 0.5).collect();
-        let model = ForwardModel::new(acquisition, example.timesteps[number]);
+        let model = ForwardModel::new(&example.acquisitions[number], example.timesteps[number]);
         let first = (number * conditioning.frames) as u64;
-        let more = model.measure(&images, size, first, seed)?;
-        planes.y.extend(more.y);
-        planes.u.extend(more.u);
-    }
+        model.measure(&images, size, first, seed)
+    };
+    let measured: Result<Vec<CountPlanes>> =
+        x0.par_chunks_exact_mut(burst).enumerate().map(measured).collect();
+    let mut planes = CountPlanes::default();
+    measured?.into_iter().for_each(|more| planes.extend(more));
     let tensor = |values| to_tensor(values, size, &device);
     let simulated = Simulated { y: tensor(planes.y), u: tensor(planes.u), exists };
     Ok((tensor(x0), simulated))

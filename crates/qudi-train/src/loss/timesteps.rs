@@ -2,14 +2,29 @@
 
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::timesteps::{NUM_TIMESTEPS, log_logistic_timestep};
+use serde::{Deserialize, Serialize};
 
-/// Turns two uniform numbers in [0, 1) into a timestep to train at: a fraction `noise_start_fraction` of all
-/// samples is at the noisiest one, where sampling begins, the others follow [`log_logistic_timestep`].
-pub fn training_timestep(kind: f64, place: f64, noise_start_fraction: f64) -> usize {
-    if kind < noise_start_fraction {
-        return NUM_TIMESTEPS - 1;
+/// The law of the timesteps that the network learns at.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum TimestepLaw {
+    /// All alike (Ho et al. 2020, algorithm 1), as in the paper.
+    Uniform,
+    /// Most where noise is about as large as what pre-denoisers leave wrong ([`log_logistic_timestep`]).
+    #[default]
+    LogLogistic,
+}
+
+impl TimestepLaw {
+    /// The timestep at a quantile in [0, 1).
+    pub fn timestep(self, quantile: f64) -> usize {
+        match self {
+            Self::Uniform => ((quantile * NUM_TIMESTEPS as f64) as usize).min(NUM_TIMESTEPS - 1),
+            Self::LogLogistic => {
+                log_logistic_timestep(&NoiseSchedule::cosine(NUM_TIMESTEPS), quantile)
+            }
+        }
     }
-    log_logistic_timestep(&NoiseSchedule::cosine(NUM_TIMESTEPS), place)
 }
 
 /// The timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale of their

@@ -13,7 +13,7 @@ use qudi_core::Size;
 use qudi_core::restorer::{BurstView, Restorer};
 use qudi_model::checkpoint::ModelKind;
 use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
-use qudi_model::config::NetworkConfig;
+use qudi_model::config::{NetworkConfig, ReferenceKind};
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::network::{Qudi, Simulated};
 use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
@@ -165,14 +165,15 @@ fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) ->
     let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
     let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
     let neighbours = config.pre.aligned_neighbours().count();
-    let aligned = AlignedTensors {
+    let aligned = (config.reference != ReferenceKind::None).then(|| AlignedTensors {
         reference: image(),
         merged: image(),
         noise_sigma: image(),
         counts: image().repeat_dim(1, 1 + neighbours),
         expected: (neighbours > 0).then(|| image().repeat_dim(1, neighbours)),
-    };
-    let conditioning = Conditioning { linear_estimate: image(), aligned, sensor, frames };
+    });
+    let (counts, linear_estimate) = (image(), image());
+    let conditioning = Conditioning { counts, linear_estimate, aligned, sensor, frames };
     let simulated = Simulated { y: image(), u: image(), exists: vec![true] };
     let (has_previous, timesteps) = (vec![true], vec![500]);
     let state = DiffusionState { x_t: image(), x0_prev: image(), has_previous, timesteps };

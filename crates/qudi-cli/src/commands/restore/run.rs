@@ -307,7 +307,7 @@ fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Val
         "weights": options.weights.to_string(),
         "weights_sha256": options.weights.sha256()?,
         "steps": options.steps()?,
-        "spacing": options.spacing_name(),
+        "spacing": options.spacing_name()?,
         "sampler": options.sampler_name(),
         "samples": options.samples,
         "tile": options.tile,

@@ -1,16 +1,26 @@
-//! Named tensors of the `.pth` files that PyTorch writes.
+//! Named tensors of the `.pth` files that PyTorch writes, and of SafeTensors files.
 //!
 //! Files come from elsewhere. The reader executes nothing, bounds what it builds, and reads a tensor's bytes
 //! only after its type and shape are known to be those of the network.
 
 use pytorch_reader::{DType, PytorchReader};
+use qudi_core::regular_file::read_limited;
 use qudi_core::{Error, Result};
+use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
+
+/// Longest SafeTensors file: VGG16 up to its last used layer has 59 MB.
+const LONGEST: u64 = 100 << 20;
 
 /// An open file of weights.
 pub(super) struct StateDict {
     path: PathBuf,
-    reader: PytorchReader,
+    reader: Reader,
+}
+
+enum Reader {
+    Pytorch(PytorchReader),
+    SafeTensors(Vec<u8>),
 }
 
 impl StateDict {
@@ -19,6 +29,14 @@ impl StateDict {
     /// # Errors
     /// [`Error`] if the file cannot be read, or is no dictionary of tensors.
     pub(super) fn open(path: &Path) -> Result<Self> {
+        if path.extension().is_some_and(|extension| extension == "safetensors") {
+            let bytes = read_limited(path, LONGEST, "read the weights")?;
+            SafeTensors::deserialize(&bytes).map_err(|e| {
+                let help = "convert the weights again, or copy the whole file";
+                Error::data(format!("not a whole SafeTensors file: {e}"), path, help)
+            })?;
+            return Ok(Self { path: path.to_owned(), reader: Reader::SafeTensors(bytes) });
+        }
         // The reader names no file where one is missing.
         std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
         let reader = PytorchReader::new(path).map_err(|e| {
@@ -26,7 +44,7 @@ impl StateDict {
                 "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
             Error::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
-        Ok(Self { path: path.to_owned(), reader })
+        Ok(Self { path: path.to_owned(), reader: Reader::Pytorch(reader) })
     }
 
     /// The values of one tensor, row-major.
@@ -38,17 +56,32 @@ impl StateDict {
             let help = "these are weights of another network, or the file is damaged";
             Error::data(what, &self.path, help)
         };
-        let tensor = self.reader.get(name).ok_or_else(|| wrong(format!("`{name}` is missing")))?;
-        if tensor.shape() != shape {
-            return Err(wrong(format!("`{name}` is {:?}, expected {shape:?}", tensor.shape())));
-        }
-        if tensor.dtype() != DType::F32 {
-            let what = format!("`{name}` has numbers of type {:?}, expected F32", tensor.dtype());
-            return Err(wrong(what));
-        }
-        let bytes = tensor
-            .read()
-            .map_err(|e| wrong(format!("the values of `{name}` cannot be read: {e}")))?;
+        let missing = || wrong(format!("`{name}` is missing"));
+        let check = |found: &[usize], kind: &dyn std::fmt::Debug, is_f32: bool| {
+            if found != shape {
+                return Err(wrong(format!("`{name}` is {found:?}, expected {shape:?}")));
+            }
+            if !is_f32 {
+                let what = format!("`{name}` has numbers of type {kind:?}, expected F32");
+                return Err(wrong(what));
+            }
+            Ok(())
+        };
+        let bytes = match &self.reader {
+            Reader::Pytorch(reader) => {
+                let tensor = reader.get(name).ok_or_else(missing)?;
+                check(tensor.shape(), &tensor.dtype(), tensor.dtype() == DType::F32)?;
+                tensor
+                    .read()
+                    .map_err(|e| wrong(format!("the values of `{name}` cannot be read: {e}")))?
+            }
+            Reader::SafeTensors(bytes) => {
+                let tensors = SafeTensors::deserialize(bytes).map_err(|e| wrong(e.to_string()))?;
+                let tensor = tensors.tensor(name).map_err(|_| missing())?;
+                check(tensor.shape(), &tensor.dtype(), tensor.dtype() == Dtype::F32)?;
+                tensor.data().to_vec()
+            }
+        };
         let words = bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
         let values: Vec<f32> = words.map(f32::from_le_bytes).collect();
         if values.len() != shape.iter().product::<usize>() {

@@ -55,14 +55,26 @@ pub(super) fn files(net: Net) -> [WeightFile; 2] {
     }
 }
 
-/// The paths of backbone and heads: in `folder`, if one is given, or else where Burn keeps them.
+/// The name of the SafeTensors file that `scripts/convert/lpips.py` writes: backbone and heads in one.
+pub(super) fn converted(net: Net) -> &'static str {
+    match net {
+        Net::Vgg => "vgg16.safetensors",
+        Net::Alex => "alexnet.safetensors",
+    }
+}
+
+/// The paths of backbone and heads, which may be one file: in `folder`, if one is given, or else where Burn keeps them.
 ///
 /// # Errors
 /// [`Error::Request`] that names the missing files, where they were looked for, and how to get them.
 pub(super) fn find(net: Net, folder: Option<&Path>) -> Result<[PathBuf; 2]> {
     let folders: Vec<PathBuf> =
         folder.map(Path::to_owned).into_iter().chain(cache_folder()).collect();
-    locate(&files(net), &folders)
+    let one = folders.iter().map(|folder| folder.join(converted(net))).find(|path| path.is_file());
+    match one {
+        Some(path) => Ok([path.clone(), path]),
+        None => locate(&files(net), &folders),
+    }
 }
 
 fn locate(files: &[WeightFile; 2], folders: &[PathBuf]) -> Result<[PathBuf; 2]> {
