@@ -37,6 +37,7 @@ fn weights(path: &Path, value: f32) {
         licence: "MIT OR Apache-2.0".into(),
         default_steps: None,
         kind: None,
+        spacing: None,
     };
     let mut module = network.init(1, &Device::flex());
     if value != 0.0 {

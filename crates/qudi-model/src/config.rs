@@ -251,8 +251,16 @@ impl NetworkConfig {
             let help = format!("there are {}", names.join(", "));
             return Err(Error::request(format!("no preset named `{name}`"), "preset", help));
         };
+        Self::parse(text, name)
+    }
+
+    /// The `[network]` table of a TOML document; `place` names it in errors.
+    ///
+    /// # Errors
+    /// [`Error::Request`] if there is none, or a key of it is wrong.
+    pub fn parse(text: &str, place: &str) -> Result<Self> {
         let document: Document = toml::from_str(text)
-            .map_err(|e| Error::request(e.message(), name, "correct the preset's file"))?;
+            .map_err(|e| Error::request(e.message(), place, "correct the [network] table"))?;
         document.network.checked()
     }
 
@@ -356,6 +364,23 @@ mod tests {
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
             .collect();
         assert_eq!(multiples, [8, 32, 16, 32, 16]);
+    }
+
+    /// Without a reference estimate there is nothing to align neighbours on, or to register.
+    #[test]
+    fn rejects_switches_that_contradict_each_other() {
+        let paper = NetworkConfig::preset("paper").unwrap();
+        assert_eq!(paper.reference, ReferenceKind::None);
+        assert_eq!(paper.features.noisy, NoisyFeatures::Image);
+        assert_eq!(paper.unet.predicts, UNetPrediction::X0);
+        let mut wrong = [paper.clone(), paper.clone(), paper];
+        wrong[0].pre.neighbours = 4;
+        wrong[1].flow.registration = true;
+        wrong[2].pre.stages = 2;
+        for (config, key) in wrong.into_iter().zip(["pre.neighbours", "flow.registration", "pre"]) {
+            let error = config.checked().unwrap_err().to_string();
+            assert!(error.contains(key) && error.contains("network.reference"), "{error}");
+        }
     }
 
     #[test]

@@ -152,7 +152,9 @@ mod tests {
 
     /// A network of the sizes of `tiny` whose parameters are not zero.
     fn network(alignments: usize, stages: usize) -> (NetworkConfig, Qudi) {
-        let mut config = NetworkConfig::preset("tiny").unwrap_or_else(|e| panic!("{e}"));
+        let mut config =
+            NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
+                .unwrap_or_else(|e| panic!("{e}"));
         config.pre = PreConfig { alignments, stages, ..config.pre };
         let network = init_parameters(config.init(1, &Device::flex()), |_, shape| {
             let count: usize = shape.iter().product();

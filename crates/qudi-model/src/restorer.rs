@@ -159,7 +159,10 @@ mod tests {
             .collect();
         let sensor = Sensor::load("qudi-paper").unwrap();
         let acquisition = Acquisition::new(sensor, 3.25, 0.3).unwrap().with_seed(1);
-        let (config, device) = (NetworkConfig::preset("tiny").unwrap(), Device::flex());
+        let (config, device) = (
+            NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap(),
+            Device::flex(),
+        );
         let options = SampleOptions { steps: 1, tile: 32, ..SampleOptions::default() };
         let burst = BurstView { size, frames: &counts };
         let restored = |kind: ModelKind| {

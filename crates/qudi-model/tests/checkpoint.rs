@@ -12,7 +12,8 @@ fn description() -> Description {
     Description {
         program: "qudi test".into(),
         preset: Some("tiny".into()),
-        network: NetworkConfig::preset("tiny").unwrap(),
+        network: NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
+            .unwrap(),
         window: 11,
         sensors: vec!["qudi-paper".into()],
         ppp: [3.25, 26.0],
@@ -22,11 +23,14 @@ fn description() -> Description {
         licence: "MIT OR Apache-2.0".into(),
         default_steps: None,
         kind: None,
+        spacing: None,
     }
 }
 
 fn network(seed: u64) -> Qudi {
-    NetworkConfig::preset("tiny").unwrap().init(seed, &Device::flex())
+    NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
+        .unwrap()
+        .init(seed, &Device::flex())
 }
 
 /// Values of all parameters by name.
@@ -95,7 +99,9 @@ fn half_precision_file_is_small_and_accurate() {
 #[test]
 fn initial_weights_are_equal_on_all_backends() {
     #[allow(deprecated)] // asked for by name
-    let ndarray = NetworkConfig::preset("tiny").unwrap().init(5, &Device::ndarray());
+    let ndarray = NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
+        .unwrap()
+        .init(5, &Device::ndarray());
     assert_eq!(values(ndarray), values(network(5)));
 }
 

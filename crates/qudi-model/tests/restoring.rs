@@ -19,7 +19,8 @@ fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
 
 /// A tiny network whose last layers are not zero, so that everything matters.
 fn restorer(options: SampleOptions, device: &Device) -> QudiRestorer {
-    let config = NetworkConfig::preset("tiny").unwrap();
+    let config =
+        NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap();
     let network = init_parameters(config.init(2, device), |name, shape| {
         let count: usize = shape.iter().product();
         let seed = name.bytes().fold(7u32, |h, b| h.wrapping_mul(31).wrapping_add(b.into()));
@@ -146,7 +147,8 @@ fn rejects_short_bursts_and_impossible_options() {
         .restore(BurstView { size, frames: &two }, &acquisition(1, 0))
         .unwrap_err();
     assert!(error.to_string().contains("2 frames") && error.help().is_some(), "{error}");
-    let config = NetworkConfig::preset("tiny").unwrap();
+    let config =
+        NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap();
     for options in [
         SampleOptions { steps: 0, samples: 2, ..quick() },
         SampleOptions { steps: 1001, ..quick() },

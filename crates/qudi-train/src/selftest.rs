@@ -10,7 +10,7 @@ use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
 use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
-use qudi_model::config::NetworkConfig;
+use qudi_model::config::{NetworkConfig, ReferenceKind};
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::network::Simulated;
 use qudi_model::tensor::read;
@@ -229,11 +229,15 @@ fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
     with_gradients(output, &[x])
 }
 
-/// `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the loss's gradient for the
+/// A network of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the loss's gradient for the
 /// noisy image.
 fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
-    let config = NetworkConfig::preset("tiny")?;
+    let mut config = NetworkConfig::preset("tiny")?;
+    // With all that the default network has.
+    config.reference = ReferenceKind::QbpRefined;
+    config.pre.neighbours = 4;
+    config.flow.registration = true;
     let network = config.init(1, &device);
     let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
     let neighbours = config.pre.aligned_neighbours().count();

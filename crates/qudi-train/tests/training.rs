@@ -45,7 +45,7 @@ impl Burst {
 }
 
 fn tiny() -> NetworkConfig {
-    NetworkConfig::preset("tiny").unwrap()
+    NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap()
 }
 
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {

@@ -9,21 +9,15 @@ use super::layers::dense_block::DenseBlock;
 use super::layers::{embedding, resample};
 use super::normalized_input::NormalizedInput;
 use super::unet::ResidualBlock;
-use super::{Pyramid, Simulated, former_name, init_parameters};
-use crate::cases::{self, Case, File, parameter};
-use crate::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS, sensor_numbers};
+use super::{Pyramid, former_name, init_parameters};
+use crate::cases::{Case, File, parameter};
+use crate::conditioning::AlignedTensors;
 use crate::config::{NetworkConfig, UNetPrediction};
 use crate::diffusion::precondition::Preconditioned;
-use crate::diffusion::sampler::{Sampler, Step, sample};
-use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::DiffusionState;
-use crate::diffusion::timesteps::{NUM_TIMESTEPS, TimestepSpacing};
-use crate::tensor::{read, to_tensor};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::activation::silu;
-use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use qudi_core::Size;
-use qudi_core::restorer::Acquisition;
+use burn::tensor::{Device, Gradients, Tensor};
 
 fn devices() -> [Device; 2] {
     #[allow(deprecated)] // asked for by name

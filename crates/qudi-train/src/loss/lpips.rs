@@ -117,6 +117,14 @@ pub struct Lpips {
 }
 
 impl Lpips {
+    /// Checks that the weights of `kind` are where [`load`](Self::load) looks for them.
+    ///
+    /// # Errors
+    /// [`Error`] that says which are missing, and where to get them.
+    pub fn find(kind: PerceptualKind, folder: Option<&Path>) -> Result<()> {
+        kind.net().map_or(Ok(()), |net| weight_files::find(net, folder).map(drop))
+    }
+
     /// Reads the weights of `kind` onto `device`: from `folder`, if one is given, or else from
     /// [`cache_folder`]. Gives nothing for [`PerceptualKind::None`].
     ///

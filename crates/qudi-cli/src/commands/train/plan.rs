@@ -88,7 +88,7 @@ fn recipe(args: &Train, settings: &Settings) -> Result<Recipe> {
             return Err(CliError::new(
                 "no recipe",
                 "RECIPE",
-                "name one: tiny, small, base, paper, or a .toml file",
+                "name one: tiny, small, paper-mini, base, paper, or a .toml file",
             ));
         }
     };

@@ -14,7 +14,7 @@ use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::Overwrite;
 use qudi_train::dataset::Pack;
-use qudi_train::loss::lpips::fetch;
+use qudi_train::loss::lpips::{Lpips, fetch};
 use qudi_train::{From, METRICS, RECIPE, Run, Validation, WEIGHTS, draw_bursts};
 use serde_json::json;
 
@@ -58,6 +58,7 @@ fn train(plan: &Plan, report: &Report) -> Result<()> {
             report.remark(&format!("{} is there", path.display()));
         }
     }
+    Lpips::find(recipe.train.loss.term, plan.backbones.as_deref())?;
     let files = files(plan, report)?;
     let from = if plan.action == Action::Resume {
         From::State

@@ -99,10 +99,11 @@ impl<'a> Watch<'a> {
     }
 
     fn validation(&mut self, validation: &Validation) -> Result<()> {
-        let loss = self.loss.unwrap_or(f64::NAN);
         let minutes = self.start.elapsed().as_secs_f64() / 60.0;
+        // None before the first step.
+        let loss = self.loss.map_or(String::new(), |loss| format!("loss {loss:.5}; "));
         let text = format!(
-            "step {} of {}, {minutes:.1} min: loss {loss:.5}; {}",
+            "step {} of {}, {minutes:.1} min: {loss}{}",
             validation.step,
             self.steps,
             quality_text(&validation.means())
