@@ -44,24 +44,24 @@ impl BadPixels {
             })
             .collect();
         let mut bad = Self::default();
-        let mut around = Vec::with_capacity(24);
         for i in 0..size.pixels() {
-            neighbours(i, size, REACH, |j| around.push(detections[j]));
-            around.sort_by(f64::total_cmp);
-            let n = around.len();
-            if n >= 5 {
-                // The very brightest may be a defect itself.
-                let bright = around[n - 2];
-                let noise = (bright + 1.0).sqrt();
-                if detections[i] > HOT_FACTOR * bright
-                    && detections[i] > bright + HOT_SIGMAS * noise
-                {
-                    bad.hot.push(i);
-                } else if sums[i] == 0 && around[2] > DEAD_EXPECTED {
-                    bad.dead.push(i);
-                }
+            // Beyond what noise alone can do, or empty: others need no look at their neighbours.
+            let (bright, empty) = (detections[i] > HOT_SIGMAS, sums[i] == 0);
+            if !bright && !empty {
+                continue;
             }
-            around.clear();
+            let around = Neighbours::of(i, size, &detections);
+            if around.count < 5 {
+                continue;
+            }
+            // The very brightest may be a defect itself.
+            let usual = around.brightest[1];
+            let noise = (usual + 1.0).sqrt();
+            if detections[i] > HOT_FACTOR * usual && detections[i] > usual + HOT_SIGMAS * noise {
+                bad.hot.push(i);
+            } else if empty && around.dark < 3 {
+                bad.dead.push(i);
+            }
         }
         bad.doubtful = doubtful(&detections, size, &bad);
         bad
@@ -100,6 +100,33 @@ impl BadPixels {
     }
 }
 
+/// What the pixels around one show.
+struct Neighbours {
+    count: usize,
+    /// The brightest two.
+    brightest: [f64; 2],
+    /// How many are too dark to tell a dead pixel by.
+    dark: usize,
+}
+
+impl Neighbours {
+    fn of(i: usize, size: Size, detections: &[f64]) -> Self {
+        let mut around = Self { count: 0, brightest: [f64::NEG_INFINITY; 2], dark: 0 };
+        neighbours(i, size, REACH, |j| {
+            let value = detections[j];
+            around.count += 1;
+            around.dark += usize::from(value <= DEAD_EXPECTED);
+            let [first, second] = &mut around.brightest;
+            if value > *first {
+                *second = std::mem::replace(first, value);
+            } else if value > *second {
+                *second = value;
+            }
+        });
+        around
+    }
+}
+
 /// Reach of the surroundings of a clump: 9 x 9 pixels.
 const WIDE: isize = 4;
 
@@ -112,7 +139,8 @@ fn doubtful(detections: &[f64], size: Size, bad: &BadPixels) -> usize {
     let mut around = Vec::with_capacity(80);
     let mut count = 0;
     for i in 0..size.pixels() {
-        if known[i] {
+        // What noise alone can do is no clump.
+        if known[i] || detections[i] <= HOT_SIGMAS {
             continue;
         }
         // Most pixels are darker than their surroundings and need no second look.
