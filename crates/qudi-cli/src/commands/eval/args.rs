@@ -75,6 +75,10 @@ pub(crate) struct Eval {
     /// Write a report with plot and pictures as one HTML file
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) html: Option<PathBuf>,
+    /// Measure LPIPS as well, after the best gain, with the weights of AlexNet and VGG16 in this folder
+    /// (docs/training.md says how to get them)
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, conflicts_with = "capture")]
+    pub(crate) backbones: Option<PathBuf>,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,

@@ -116,7 +116,16 @@ impl Clip {
         } else {
             Motion::True(std::mem::take(&mut photons.flow))
         };
-        Ok(ExposedClip { name: self.name.clone(), size, ppp, seed, photons, motion, acquisition })
+        Ok(ExposedClip {
+            name: self.name.clone(),
+            size,
+            ppp,
+            seed,
+            photons,
+            motion,
+            acquisition,
+            perceptual: plan.perceptual.clone(),
+        })
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::args::External;
 use super::html::Pictures;
+use super::perceptual::Perceptual;
 use super::plan::Plan;
 use super::score::{Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
@@ -70,6 +71,7 @@ pub(super) struct ExposedClip {
     pub(super) photons: Photons,
     pub(super) motion: Motion,
     pub(super) acquisition: Acquisition,
+    pub(super) perceptual: Option<Rc<Perceptual>>,
 }
 
 impl ExposedClip {
@@ -164,11 +166,16 @@ impl ExposedClip {
                 "use larger frames",
             )
         };
+        let perceptual = self.perceptual.as_ref();
+        let distances = perceptual.map(|p| p.distances(&aligned(image, truth), truth));
+        let [lpips_alex, lpips_vgg] = distances.transpose()?.unwrap_or_default();
         Ok(FrameScore {
             psnr_a: Some(gain_aligned_psnr(image, truth)),
             psnr: Some(psnr(image, truth)),
             ssim: Some(ssim(image, truth).ok_or_else(small)?),
             ssim_g: Some(gaussian_ssim(image, truth).ok_or_else(small)?),
+            lpips_alex,
+            lpips_vgg,
             chi_square: None,
         })
     }

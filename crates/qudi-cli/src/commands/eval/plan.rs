@@ -1,8 +1,10 @@
 //! The plan of an evaluation: its arguments, checked once.
 
 use super::args::{Eval, External, Protocol};
+use super::perceptual::Perceptual;
 use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
+use crate::device;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{METHODS, is_method};
@@ -10,6 +12,7 @@ use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::capture::{MaskChoice, ReadOptions};
 use std::path::PathBuf;
+use std::rc::Rc;
 
 /// Everything that an evaluation is asked for.
 #[derive(Debug)]
@@ -38,6 +41,8 @@ pub(super) struct Plan {
     pub(super) shard: Option<Shard>,
     /// Whether pictures are wanted.
     pub(super) pictures: bool,
+    /// LPIPS, if it is measured.
+    pub(super) perceptual: Option<Rc<Perceptual>>,
     /// How a capture is read.
     pub(super) read: ReadOptions,
     /// How many frames are summed, if that is said.
@@ -61,6 +66,13 @@ impl Plan {
         }
         let network = args.network.options();
         network.check_methods(args.method.iter().map(String::as_str))?;
+        let perceptual = match &args.backbones {
+            None => None,
+            Some(folder) => {
+                let device = device::open(&network.device)?.device;
+                Some(Rc::new(Perceptual::load(folder, device)?))
+            }
+        };
         let plan = Self {
             data: args.data.clone(),
             methods: args.method.clone(),
@@ -78,6 +90,7 @@ impl Plan {
             external: args.external.clone(),
             shard: args.shard,
             pictures: args.html.is_some(),
+            perceptual,
             read: args.reading.options(MaskChoice::Auto),
             sum: args.reading.sum(),
             overwrite,

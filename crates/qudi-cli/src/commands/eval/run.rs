@@ -37,6 +37,7 @@ pub(crate) fn run(
         .reads(external)
         .reads(args.sensor.as_deref())
         .reads(&args.network.weights)
+        .reads(&args.backbones)
         .writes(outputs.into_iter().flatten())
         .check()?;
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
@@ -176,6 +177,8 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
             "psnr": of(|f| f.psnr),
             "ssim": of(|f| f.ssim),
             "ssim_g": of(|f| f.ssim_g),
+            "lpips_alex": of(|f| f.lpips_alex),
+            "lpips_vgg": of(|f| f.lpips_vgg),
             "chi_square": row.mean(|s| s.chi_square),
             "flicker": row.mean(|s| s.flicker),
             "flow": row.flow(),

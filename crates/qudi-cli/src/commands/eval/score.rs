@@ -16,6 +16,10 @@ pub(crate) struct FrameScore {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) ssim_g: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) lpips_alex: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) lpips_vgg: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) chi_square: Option<f64>,
 }
 

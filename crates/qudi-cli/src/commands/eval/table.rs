@@ -1,6 +1,6 @@
 //! The tables of `qudi eval`: figures of methods, and of every frame.
 
-use super::score::{FlowKind, FrameScore, Row};
+use super::score::{Figure, FlowKind, Row};
 use crate::report::{Cell, Column, Table};
 use qudi_core::metrics::Statistics;
 
@@ -19,6 +19,8 @@ pub(crate) fn summary(rows: &[Row]) -> Table {
         Column::new("psnr", "psnr all"),
         Column::new("ssim", "ssim all"),
         Column::new("ssim_g", "ssim-g all"),
+        Column::new("lpips_alex", "lpips-alex"),
+        Column::new("lpips_vgg", "lpips-vgg"),
         Column::new("chi_square", "chi-square"),
         Column::new("flicker", flicker),
         Column::new("seconds_per_frame", "s/frame"),
@@ -45,6 +47,8 @@ fn cells(row: &Row) -> Vec<Cell> {
         mean(row.over_clips(|f| f.psnr), 2),
         mean(row.over_clips(|f| f.ssim), 3),
         mean(row.over_clips(|f| f.ssim_g), 3),
+        Cell::number(row.over_clips(|f| f.lpips_alex).map(|s| s.mean), 3),
+        Cell::number(row.over_clips(|f| f.lpips_vgg).map(|s| s.mean), 3),
         Cell::number(row.mean(|s| s.chi_square), 3),
         Cell::number(row.mean(|s| s.flicker), 3),
         Cell::number(row.mean(|s| s.seconds_per_frame), 4),
@@ -52,22 +56,37 @@ fn cells(row: &Row) -> Vec<Cell> {
     ]
 }
 
-/// One row for every method, light level, clip and frame.
+/// One row for every method, light level, clip and frame; LPIPS where it was measured.
 pub(crate) fn frames(rows: &[Row]) -> Table {
-    let keys = ["method", "ppp", "clip", "frame", "psnr_a", "psnr", "ssim", "ssim_g", "chi_square"];
-    let mut table = Table::new(keys.map(|key| Column::new(key, key)).to_vec());
+    let figures: [(&str, Figure, usize); 7] = [
+        ("psnr_a", |f| f.psnr_a, 2),
+        ("psnr", |f| f.psnr, 2),
+        ("ssim", |f| f.ssim, 3),
+        ("ssim_g", |f| f.ssim_g, 3),
+        ("lpips_alex", |f| f.lpips_alex, 4),
+        ("lpips_vgg", |f| f.lpips_vgg, 4),
+        ("chi_square", |f| f.chi_square, 3),
+    ];
+    let all = || rows.iter().flat_map(|row| &row.scores).flat_map(|score| &score.frames);
+    let is_shown = |(key, figure, _): &(&str, Figure, usize)| {
+        !key.starts_with("lpips") || all().any(|frame| figure(frame).is_some())
+    };
+    let figures: Vec<_> = figures.into_iter().filter(is_shown).collect();
+    let keys = ["method", "ppp", "clip", "frame"].into_iter().chain(figures.iter().map(|f| f.0));
+    let mut table = Table::new(keys.map(|key| Column::new(key, key)).collect());
     for row in rows {
         for score in &row.scores {
-            for (n, &frame) in score.frames.iter().enumerate() {
-                let FrameScore { psnr_a, psnr, ssim, ssim_g, chi_square } = frame;
+            for (n, frame) in score.frames.iter().enumerate() {
                 let mut cells = vec![
                     Cell::text(&row.method),
                     Cell::Exact(row.ppp),
                     Cell::text(&score.clip),
                     Cell::Exact(n as f64),
                 ];
-                let figures = [(psnr_a, 2), (psnr, 2), (ssim, 3), (ssim_g, 3), (chi_square, 3)];
-                cells.extend(figures.map(|(figure, digits)| Cell::number(figure, digits)));
+                let figures = figures.iter();
+                cells.extend(
+                    figures.map(|(_, figure, digits)| Cell::number(figure(frame), *digits)),
+                );
                 table.rows.push(cells);
             }
         }

@@ -1,0 +1,62 @@
+//! LPIPS of restored frames, where its weights are given.
+
+use crate::error::{CliError, Result};
+use burn::tensor::Device;
+use qudi_core::Frame;
+use qudi_model::tensor::{read, to_tensor};
+use qudi_train::loss::lpips::{Lpips, PerceptualKind};
+use std::path::Path;
+
+/// The distances that are measured, in the order of [`Distances`].
+const KINDS: [PerceptualKind; 2] = [PerceptualKind::LpipsAlex, PerceptualKind::LpipsVgg];
+
+/// LPIPS with AlexNet and with VGG16; none where its weights are missing.
+pub(super) type Distances = [Option<f64>; 2];
+
+/// LPIPS with the weights that there are.
+#[derive(Debug)]
+pub(super) struct Perceptual {
+    nets: [Option<Lpips>; 2],
+    device: Device,
+}
+
+impl Perceptual {
+    /// Reads the weights in `folder` onto `device`.
+    ///
+    /// # Errors
+    /// [`CliError`] if there are none, or they do not fit.
+    pub(super) fn load(folder: &Path, device: Device) -> Result<Self> {
+        let mut nets = [None, None];
+        let mut missing = None;
+        for (net, kind) in nets.iter_mut().zip(KINDS) {
+            match Lpips::find(kind, Some(folder)) {
+                Ok(()) => *net = Lpips::load(kind, Some(folder), &device)?,
+                Err(error) => missing = Some(error),
+            }
+        }
+        match missing {
+            Some(_) if nets.iter().all(Option::is_none) => Err(CliError::new(
+                "there are no weights of LPIPS",
+                folder.display(),
+                "make them with scripts/convert/lpips.py, or leave --backbones out",
+            )),
+            _ => Ok(Self { nets, device }),
+        }
+    }
+
+    /// The distances of an image from the truth.
+    ///
+    /// # Errors
+    /// [`CliError`] if the frames are too small, or the device fails.
+    pub(super) fn distances(&self, image: &Frame, truth: &Frame) -> Result<Distances> {
+        let mut distances = [None, None];
+        for (distance, net) in distances.iter_mut().zip(&self.nets) {
+            let Some(net) = net else { continue };
+            net.check(truth.size)?;
+            let tensor = |frame: &Frame| to_tensor(frame.data.clone(), frame.size, &self.device);
+            let values = read(net.distances(tensor(image), tensor(truth)))?;
+            *distance = values.first().map(|&value| f64::from(value));
+        }
+        Ok(distances)
+    }
+}

@@ -1,0 +1,99 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy", "pillow", "safetensors", "torch"]
+# ///
+"""Compare LPIPS of `qudi eval` with a second writing of it in PyTorch, with the published weights.
+
+    python scripts/convert/lpips.py weights
+    python scripts/compare/lpips.py path/to/qudi weights
+
+Three pictures are compared with noisy, blurred and shifted copies. Prints both distances and the largest
+difference, and exits with 1 where it is above 1e-4.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from safetensors.numpy import load_file
+
+SIZE = 96
+POOLS = {"alexnet": {3, 6}, "vgg16": {5, 10, 17, 24}}
+TAPS = {"alexnet": [0, 3, 6, 8, 10], "vgg16": [2, 7, 14, 21, 28]}
+
+
+def features(net: str, weights: dict[str, torch.Tensor], x: torch.Tensor) -> list[torch.Tensor]:
+    """The outputs that are compared, as in torchvision's `features` up to the last of them."""
+    taken = []
+    for place in sorted({int(name.split(".")[1]) for name in weights if name.startswith("features")}):
+        if place in POOLS[net]:
+            x = F.max_pool2d(x, 3 if net == "alexnet" else 2, 2)
+        weight, bias = (weights[f"features.{place}.{kind}"] for kind in ("weight", "bias"))
+        stride = 4 if net == "alexnet" and place == 0 else 1
+        padding = 2 if stride == 4 else weight.shape[2] // 2
+        x = F.relu(F.conv2d(x, weight, bias, stride, padding))
+        if place in TAPS[net]:
+            taken.append(x)
+    return taken
+
+
+def distance(net: str, weights: dict[str, torch.Tensor], p: np.ndarray, q: np.ndarray) -> float:
+    """LPIPS 0.1 of two gray images in [0, 1] (Zhang et al. 2018)."""
+    shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
+    scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
+    sides = []
+    for image in (p, q):
+        x = (torch.from_numpy(image).float()[None, None].expand(1, 3, -1, -1) * 2 - 1 - shift) / scale
+        sides.append([f / (f.square().sum(1, keepdim=True) + 1e-10).sqrt() for f in features(net, weights, x)])
+    heads = (weights[f"lin{tap}.model.1.weight"] for tap in range(5))
+    return sum(F.conv2d((a - b).square(), head).mean().item() for a, b, head in zip(*sides, heads))
+
+
+def pictures() -> np.ndarray:
+    """Three smooth textures."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    waves = [np.sin(x / a + y / b) for a, b in ((3, 7), (5, -4), (11, 3))]
+    return np.stack([0.5 + 0.3 * np.roll(wave, 5 * i, 1) * rng.uniform(0.6, 1) for i, wave in enumerate(waves)])
+
+
+def main() -> None:
+    qudi, folder = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
+    rng = np.random.default_rng(4)
+    truth = np.round(pictures() * 255)
+    copies = truth / 255 + 0.1 * rng.standard_normal(truth.shape)
+    copies[1] = F.avg_pool2d(torch.from_numpy(truth[1:2] / 255), 5, 1, 2).numpy()[0]
+    copies[2] = np.roll(truth[2] / 255, 2, 1)
+    copies = copies.clip(0, 1).astype(np.float32)
+    with tempfile.TemporaryDirectory() as scratch:
+        work = Path(scratch)
+        (work / "clip").mkdir()
+        for i, frame in enumerate(truth):
+            Image.fromarray(frame.astype(np.uint8)).save(work / f"clip/{i}.png")
+        (work / "other").mkdir()
+        np.save(work / "other/clip-ppp9_75.npy", copies)
+        command = [qudi, "eval", "clip", "--ppp", "9.75", "--external", "copy=other", "--method", "average"]
+        command += ["--backbones", folder, "--device", "cpu", "--json"]
+        text = subprocess.run(command, cwd=work, check=True, capture_output=True, text=True).stdout
+    rows = {row["method"]: row for row in json.loads(text)["rows"]}
+    worst = 0.0
+    for net, key in (("alexnet", "lpips_alex"), ("vgg16", "lpips_vgg")):
+        weights = {name: torch.from_numpy(value) for name, value in load_file(folder / f"{net}.safetensors").items()}
+        for frame, scores in enumerate(rows["copy"]["clips"][0]["frames"]):
+            p, q = copies[frame].astype(np.float64), truth[frame] / 255
+            gain = (p * q).sum() / (p * p).sum()
+            expected = distance(net, weights, (p * gain).clip(0, 1), q)
+            worst = max(worst, abs(scores[key] - expected))
+            print(f"{net:8} frame {frame}: qudi {scores[key]:.6f}, PyTorch {expected:.6f}")
+    print(f"largest difference {worst:.1e}")
+    sys.exit(worst > 1e-4)
+
+
+if __name__ == "__main__":
+    main()
