@@ -44,9 +44,11 @@ impl BadPixels {
             })
             .collect();
         let mut bad = Self::default();
+        // Where nothing is bright, no pixel is known to be dead.
+        let is_lit = detections.iter().any(|&value| value > DEAD_EXPECTED);
         for i in 0..size.pixels() {
             // Beyond what noise alone can do, or empty: others need no look at their neighbours.
-            let (bright, empty) = (detections[i] > HOT_SIGMAS, sums[i] == 0);
+            let (bright, empty) = (detections[i] > HOT_SIGMAS, is_lit && sums[i] == 0);
             if !bright && !empty {
                 continue;
             }

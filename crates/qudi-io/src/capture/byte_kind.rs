@@ -14,31 +14,36 @@ pub(crate) enum ByteKind {
 }
 
 /// Set bits needed to compare their rates.
-const FEWEST: u64 = 400;
+const FEWEST: f64 = 400.0;
 
 /// In packed captures the columns of each bit see the same scene; their rates agree closely.
 const SPREAD: f64 = 0.25;
 
 impl ByteKind {
     pub(crate) fn of(bytes: &[u8]) -> Self {
-        let total: u64 = bytes.iter().map(|b| u64::from(b.count_ones())).sum();
+        // How often every value occurs in even and in odd places: one look at what can be many bytes.
+        let mut seen = [[0u64; 256]; 2];
+        for (i, &byte) in bytes.iter().enumerate() {
+            seen[i % 2][usize::from(byte)] += 1;
+        }
+        let set = |bit: u32, odd: usize| {
+            let chosen = seen[odd].iter().enumerate().filter(|(value, _)| value >> bit & 1 == 1);
+            chosen.map(|(_, &count)| count).sum::<u64>() as f64
+        };
+        let rates: Vec<f64> = (0..8).map(|bit| set(bit, 0) + set(bit, 1)).collect();
+        let total: f64 = rates.iter().sum();
         if total < FEWEST {
             return Self::Unclear;
         }
-        let set = |bit: u32, odd: Option<usize>| {
-            let chosen = bytes.iter().enumerate().filter(|(i, _)| odd.is_none_or(|o| i % 2 == o));
-            chosen.filter(|(_, b)| *b >> bit & 1 == 1).count() as f64
-        };
-        let rates: Vec<f64> = (0..8).map(|bit| set(bit, None)).collect();
-        let mean = total as f64 / 8.0;
+        let mean = total / 8.0;
         let noise = 4.0 / mean.sqrt();
         if rates.iter().all(|rate| (rate / mean - 1.0).abs() < SPREAD + noise) {
             return Self::Packed;
         }
         // Samples of 9 to 12 bits: nothing above bit 3 of the high byte, much in the low byte.
-        let high: f64 = (4..8).map(|bit| set(bit, Some(1))).sum();
-        let low: f64 = (0..8).map(|bit| set(bit, Some(0))).sum();
-        let odd: f64 = (0..8).map(|bit| set(bit, Some(1))).sum();
+        let high: f64 = (4..8).map(|bit| set(bit, 1)).sum();
+        let low: f64 = (0..8).map(|bit| set(bit, 0)).sum();
+        let odd: f64 = (0..8).map(|bit| set(bit, 1)).sum();
         if high == 0.0 && odd < 0.5 * low { Self::WideCounts } else { Self::Counts }
     }
 }

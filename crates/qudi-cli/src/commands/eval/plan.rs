@@ -64,7 +64,11 @@ impl Plan {
                 format!("there are {}", METHODS.join(", ")),
             ));
         }
-        let network = args.network.options();
+        let mut network = args.network.options();
+        if args.backbones.is_some() {
+            // LPIPS is computed there, too.
+            network.device_flag = None;
+        }
         network.check_methods(args.method.iter().map(String::as_str))?;
         let perceptual = match &args.backbones {
             None => None,
