@@ -56,6 +56,19 @@ impl Conditioning {
         variance.repeat_dim(1, self.frames).reshape([bursts * self.frames, 1, 1, 1])
     }
 
+    /// The inputs of image `number` alone, as a burst of one frame.
+    #[must_use]
+    pub fn image(&self, number: usize) -> Self {
+        let one = |images: Tensor<4>| images.narrow(0, number, 1);
+        Self {
+            counts: one(self.counts.clone()),
+            linear_estimate: one(self.linear_estimate.clone()),
+            aligned: self.aligned.as_ref().map(|aligned| aligned.map(one)),
+            sensor: self.sensor.clone().narrow(0, number / self.frames, 1),
+            frames: 1,
+        }
+    }
+
     /// The same inputs outside autodiff.
     #[must_use]
     pub fn inner(&self) -> Self {

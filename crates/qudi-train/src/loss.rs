@@ -6,6 +6,7 @@
 
 mod gaussian_nll;
 pub mod lpips;
+mod recomputation;
 mod reconstruction;
 mod self_conditioning;
 mod timesteps;
@@ -23,6 +24,7 @@ use self_conditioning::network_inputs;
 use serde::{Deserialize, Serialize};
 
 pub use gaussian_nll::gaussian_nll;
+pub use recomputation::Recomputation;
 pub use reconstruction::reconstruction;
 pub use self_conditioning::{LoopOptions, SelfConditioning};
 pub use timesteps::TimestepLaw;
@@ -101,6 +103,8 @@ pub struct LossTerms {
     pub flow: Option<Tensor<1>>,
     /// The negative log-likelihood of the pre-denoised frames' errors, if their uncertainty is predicted.
     pub uncertainty: Option<Tensor<1>>,
+    /// What is left to do for the gradients of the pre-denoiser, if it is computed again for them.
+    pub recomputation: Option<Recomputation>,
 }
 
 impl LossTerms {
@@ -137,7 +141,13 @@ pub fn loss_terms(
     }
     let Example { conditioning, truth, .. } = example;
     let (state, simulated) = network_inputs(network, example, self_conditioning, options)?;
-    let encoded = network.encode(conditioning);
+    let mut encoded = network.encode(conditioning);
+    let recomputation =
+        options.recomputes.then(|| Recomputation::new(network, conditioning, simulated.as_ref()));
+    if let Some(recomputation) = &recomputation {
+        let (d, features) = recomputation.results();
+        encoded = network.with_predenoised(encoded, d, features);
+    }
     let result = network.forward(&encoded, simulated.as_ref(), &state, None);
     let image = (result.x0.clone() + 1.0) * 0.5;
     let prediction = match weights.form {
@@ -157,7 +167,8 @@ pub fn loss_terms(
     let uncertainty = network.predicts_uncertainty().then(|| network.predenoise(conditioning));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));
     let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
-    Ok(LossTerms { total, prediction, pre, perceptual, flow, uncertainty }.weighted(weights))
+    let terms = LossTerms { total, prediction, pre, perceptual, flow, uncertainty, recomputation };
+    Ok(terms.weighted(weights))
 }
 
 /// Computes the terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no
@@ -177,7 +188,9 @@ fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights
     let pre = pre_denoiser_loss(example, d, weights.form);
     let flow = flows.map(|flows| flows.warping_error(truth.clone(), conditioning.frames));
     let (total, prediction) = (pre.clone() * weights.pre, pre.zeros_like());
-    LossTerms { total, prediction, pre, perceptual: None, flow, uncertainty }.weighted(weights)
+    let (perceptual, recomputation) = (None, None);
+    let terms = LossTerms { total, prediction, pre, perceptual, flow, uncertainty, recomputation };
+    terms.weighted(weights)
 }
 
 /// The error of pre-denoised frames.

@@ -55,6 +55,10 @@ pub struct TrainConfig {
     /// Numbers that convolutions multiply.
     #[serde(default)]
     pub precision: ComputePrecision,
+    /// Whether the pre-denoiser is computed twice, image by image, to save its memory (gradient
+    /// checkpointing); gradients are the same but for rounding.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub gradient_checkpointing: bool,
     /// Share of the average of weights that a step keeps.
     pub ema: f64,
     /// Law of the timesteps that the network learns at.

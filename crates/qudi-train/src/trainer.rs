@@ -236,7 +236,7 @@ impl Trainer {
         let (weights, loop_options) = self.options();
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
-        let self_conditioning = if from_nothing || loop_options == LoopOptions::NONE {
+        let self_conditioning = if from_nothing || loop_options.needs_no_estimate() {
             SelfConditioning::Off
         } else {
             SelfConditioning::On(random.next_u64())
@@ -248,7 +248,12 @@ impl Trainer {
         })?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let gradients = gradients(network, &terms.total.clone().backward());
+        let after = terms.total.clone().backward();
+        let mut gradients = gradients(network, &after);
+        if let Some(recomputation) = &terms.recomputation {
+            let more = recomputation.gradients(network, &conditioning, &after);
+            gradients = gradients.into_iter().zip(more).map(|(a, b)| a + b).collect();
+        }
         // Reading waits for the device: all numbers at once, when there is nothing left to ask it for.
         let loss = LossValues::read(terms)?;
         self.check("prediction loss", loss.prediction)?;
@@ -266,6 +271,7 @@ impl Trainer {
         let loop_options = LoopOptions {
             forward_model: !network.ablates(Part::ForwardModel),
             self_conditioning: !network.ablates(Part::SelfConditioning),
+            recomputes: self.recipe.train.gradient_checkpointing,
         };
         (LossWeights { form, prediction, pre, perceptual, flow }, loop_options)
     }
@@ -288,7 +294,7 @@ impl Trainer {
 impl LossValues {
     /// Reads the terms from the device; those that are not there are zero.
     fn read(terms: LossTerms) -> Result<Self> {
-        let LossTerms { total, prediction, pre, perceptual, flow, uncertainty } = terms;
+        let LossTerms { total, prediction, pre, perceptual, flow, uncertainty, .. } = terms;
         let nothing = pre.zeros_like();
         let optional = |term: Option<Tensor<1>>| term.unwrap_or_else(|| nothing.clone());
         let optional = [perceptual, flow, uncertainty].map(optional);

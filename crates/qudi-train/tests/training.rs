@@ -125,6 +125,40 @@ fn first_stage_terms_equal_those_of_the_whole_network() {
     assert!(idle("unet.") && idle("fusion.") && idle("low.") && idle("high."));
 }
 
+/// Computing the pre-denoiser again, image by image, changes rounding alone.
+#[test]
+fn recomputed_gradients_equal_kept_ones() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let network = init_parameters(tiny().init(3, &device), |_, shape| {
+        let count: usize = shape.iter().product();
+        (0..count).map(|i| 0.05 * (i as f32).sin() + 0.01).collect()
+    });
+    let gradients_with = |recomputes: bool| -> Vec<Vec<f32>> {
+        let options = LoopOptions { recomputes, ..LoopOptions::ALL };
+        let weights = LossWeights { flow: 0.5, ..LossWeights::default() };
+        let example = burst.example(burst.truth.clone() * 0.3, &[400]);
+        let terms = loss_terms(&network, &example, SelfConditioning::On(7), weights, options, None);
+        let terms = terms.unwrap();
+        let after = terms.total.clone().backward();
+        let mut list = gradients(&network, &after);
+        assert_eq!(terms.recomputation.is_some(), recomputes);
+        if let Some(recomputation) = &terms.recomputation {
+            let more = recomputation.gradients(&network, &burst.conditioning, &after);
+            list = list.into_iter().zip(more).map(|(a, b)| a + b).collect();
+        }
+        list.into_iter().map(|list| list.into_data().try_into_vec().unwrap()).collect()
+    };
+    let names: Vec<_> = parameter_shapes(&network).into_iter().map(|(name, _)| name).collect();
+    let pairs = gradients_with(false).into_iter().zip(gradients_with(true));
+    for (name, (kept, again)) in names.iter().zip(pairs) {
+        let largest = kept.iter().fold(1e-6f32, |most, v| most.max(v.abs()));
+        let worst = kept.iter().zip(&again).fold(0.0f32, |most, (a, b)| most.max((a - b).abs()));
+        assert!(worst < 1e-3 * largest, "{name}: {worst} of {largest}");
+        assert!(!name.starts_with("pre.") || largest > 1e-6, "{name} has no gradient");
+    }
+}
+
 /// Only the uncertainty head learns from the uncertainty loss.
 #[test]
 fn uncertainty_loss_has_no_gradient_to_the_frames() {

@@ -30,6 +30,22 @@ pub struct Simulated {
     pub exists: Vec<bool>,
 }
 
+impl Simulated {
+    /// The measurement of image `number` alone, of bursts of `frames` frames.
+    #[must_use]
+    pub fn image(&self, number: usize, frames: usize) -> Self {
+        let one = |images: &Tensor<4>| images.clone().narrow(0, number, 1);
+        Self { y: one(&self.y), u: one(&self.u), exists: vec![self.exists[number / frames]] }
+    }
+
+    /// The same measurement outside autodiff.
+    #[must_use]
+    pub fn inner(&self) -> Self {
+        let inner = |images: &Tensor<4>| images.clone().inner();
+        Self { y: inner(&self.y), u: inner(&self.u), exists: self.exists.clone() }
+    }
+}
+
 /// A burst's conditioning as the network encodes it, the same in every reverse step.
 #[derive(Clone, Debug)]
 pub struct Encoded {
@@ -132,6 +148,27 @@ impl Qudi {
         Encoded { predenoised: Some(predenoised), ..encoded }
     }
 
+    /// The encoding with pre-denoised frames and their features, in place of those that the network would
+    /// compute.
+    #[must_use]
+    pub fn with_predenoised(&self, encoded: Encoded, d: Tensor<4>, features: Tensor<4>) -> Encoded {
+        Encoded { predenoised: Some((d, features)), ..encoded }
+    }
+
+    /// Pre-denoises frames and gives their features.
+    ///
+    /// # Shapes
+    /// - results: `[images, 1, height, width]` in image units, `[images, width, h, w]`
+    pub fn predenoise_simulated(
+        &self,
+        conditioning: &Conditioning,
+        simulated: Option<&Simulated>,
+    ) -> (Tensor<4>, Tensor<4>) {
+        let input = NormalizedInput::new(conditioning);
+        let pre = self.pre.encode(&input);
+        self.predenoise_encoded(pre, &input, simulated, conditioning.frames)
+    }
+
     /// Predicts the clean frames. `flows` are those of an earlier step; estimated if there are none.
     pub fn forward(
         &self,
@@ -223,6 +260,16 @@ impl Qudi {
         simulated: Option<&Simulated>,
     ) -> (Tensor<4>, Tensor<4>) {
         let Encoded { pre, input, frames, .. } = encoded;
+        self.predenoise_encoded(pre.clone(), input, simulated, *frames)
+    }
+
+    fn predenoise_encoded(
+        &self,
+        pre: Tensor<4>,
+        input: &NormalizedInput,
+        simulated: Option<&Simulated>,
+        frames: usize,
+    ) -> (Tensor<4>, Tensor<4>) {
         let start = &input.start;
         let bursts = start.dims()[0] / frames;
         let (y_sim, u_sim, flags) = match simulated {
@@ -233,10 +280,10 @@ impl Qudi {
             None => (start.zeros_like(), start.zeros_like(), vec![0.0; bursts]),
         };
         let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
-        let flag = Tensor::<4>::from_data(flags, &start.device()).repeat_dim(1, *frames);
+        let flag = Tensor::<4>::from_data(flags, &start.device()).repeat_dim(1, frames);
         let flag = flag.reshape([bursts * frames, 1, 1, 1]);
         let both = Tensor::cat(vec![y_sim, u_sim], 1);
-        self.pre.forward(pre.clone(), input, both, flag)
+        self.pre.forward(pre, input, both, flag)
     }
 
     /// [`Self::forward`], which calls `done` with the name of every block that is done.

@@ -14,20 +14,25 @@ use qudi_model::network::{Qudi, Simulated};
 use qudi_model::tensor::{read, to_tensor};
 use rayon::prelude::*;
 
-/// Which results of the previous step the network is given.
+/// How a pass goes: which results of the previous step the network is given, and what is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LoopOptions {
     /// Whether it is given the previous estimate as the sensor would measure it.
     pub forward_model: bool,
     /// Whether it is given the previous estimate.
     pub self_conditioning: bool,
+    /// Whether the pre-denoiser is computed again for its gradients ([`Recomputation`](super::Recomputation)).
+    pub recomputes: bool,
 }
 
 impl LoopOptions {
-    /// The options with everything on.
-    pub const ALL: Self = Self { forward_model: true, self_conditioning: true };
-    /// The options with everything off: a first pass would be in vain.
-    pub const NONE: Self = Self { forward_model: false, self_conditioning: false };
+    /// The network is given both, and nothing is computed again.
+    pub const ALL: Self = Self { forward_model: true, self_conditioning: true, recomputes: false };
+
+    /// Whether a first pass would be in vain.
+    pub(crate) fn needs_no_estimate(self) -> bool {
+        !self.forward_model && !self.self_conditioning
+    }
 }
 
 /// Whether a first pass makes the estimate that the network is given, as after the first step of sampling

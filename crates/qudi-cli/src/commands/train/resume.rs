@@ -14,6 +14,7 @@ const MAY_CHANGE: &[&str] = &[
     "train.accumulate",
     "train.checkpoint",
     "train.precision",
+    "train.gradient_checkpointing",
     "data.crop",
     "validation",
 ];
