@@ -190,14 +190,27 @@ impl Array {
                     if let Some(axis) = implied {
                         return Ok(Some(Packing { axis, order }));
                     }
+                    let ask = "say what its bytes are: `pack_axis width` (8 pixels each), height, or none (one count each)";
                     match ByteKind::of(sampled) {
-                        ByteKind::Packed if sampled.iter().all(|&byte| byte == 0 || byte == 255) => None,
+                        ByteKind::Packed if sampled.iter().all(|&byte| byte == 255) => {
+                            return Err(self.fault(
+                                "every byte of the array is 255, so that packed bits look like counts",
+                                ask,
+                            ));
+                        }
+                        ByteKind::Packed
+                            if sampled.iter().all(|&byte| byte == 0 || byte == 255) =>
+                        {
+                            None
+                        }
                         ByteKind::Packed => Some(Packing { axis: PackAxis::Width, order }),
                         ByteKind::Counts | ByteKind::WideCounts => None,
-                        ByteKind::Unclear => return Err(self.fault(
-                            "the array is nearly empty, so that packed bits look like counts",
-                            "say what its bytes are: `pack_axis width` (8 pixels each), height, or none (one count each)",
-                        )),
+                        ByteKind::Unclear => {
+                            return Err(self.fault(
+                                "the array is nearly empty, so that packed bits look like counts",
+                                ask,
+                            ));
+                        }
                     }
                 }
                 Stored::Counts | Stored::Unsaid => None,

@@ -41,6 +41,20 @@ fn packing_along_the_height_is_read() {
     assert_eq!(frames[0], [1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0]);
 }
 
+/// Saturated counts of 8 bits, or packed bits that are all one: nobody can tell.
+#[test]
+fn bytes_that_are_all_one_are_asked_about() {
+    let folder = scratch();
+    let data = [255; 20 * 64 * 6];
+    let path = write(folder.path(), "a.npy", &npy("|u1", "False", "(20, 64, 6)", &data));
+    let refused = refusal(open(&path, &plain()));
+    assert!(refused.contains("255") && refused.contains("pack_axis"), "{refused}");
+    for (axis, width) in [(PackAxis::Width, 48), (PackAxis::None, 6)] {
+        let told = ReadOptions { pack_axis: Some(axis), ..plain() };
+        assert_eq!(open(&path, &told).unwrap().size().width, width);
+    }
+}
+
 #[test]
 fn packed_bits_and_counts_are_told_apart() {
     let folder = scratch();
