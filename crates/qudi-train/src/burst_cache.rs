@@ -7,7 +7,7 @@ mod sampler;
 
 use crate::dataset::{DataConfig, Pack, Sample};
 use crate::parameters::parameters;
-use crate::recipe::{CropsConfig, Recipe};
+use crate::recipe::{CropsConfig, Recipe, is_default};
 use burst::ConditionedBurst;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
@@ -146,7 +146,7 @@ struct CacheKey {
     seed: u64,
     #[serde(alias = "kept")]
     cached_frames: usize,
-    #[serde(default, skip_serializing_if = "is_usual")]
+    #[serde(default, skip_serializing_if = "is_default")]
     reference: ReferenceKind,
     neighbours: usize,
     #[serde(alias = "motions")]
@@ -156,11 +156,6 @@ struct CacheKey {
     /// Hashes of the weights of the refinement stages.
     #[serde(default, alias = "drafts", skip_serializing_if = "Vec::is_empty")]
     stages: Vec<String>,
-}
-
-#[allow(clippy::trivially_copy_pass_by_ref)]
-fn is_usual(reference: &ReferenceKind) -> bool {
-    *reference == ReferenceKind::default()
 }
 
 impl CacheKey {

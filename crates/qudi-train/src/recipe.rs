@@ -135,7 +135,7 @@ pub struct ValidationConfig {
     pub every: u64,
 }
 
-fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+pub(super) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
@@ -239,6 +239,13 @@ impl Recipe {
                 "must be from 0 to train.lr",
             ),
             ("train.clip", train.clip > 0.0, "must be above 0"),
+            (
+                "train.gradient_checkpointing",
+                !train.gradient_checkpointing
+                    || train.loss.prediction > 0.0
+                    || train.loss.term != PerceptualKind::None,
+                "must be false where pre-denoiser and flow learn alone: nothing is computed again there",
+            ),
             ("train.ema", share(train.ema), "must be from 0 to below 1"),
             (
                 "train.noise_start_fraction",

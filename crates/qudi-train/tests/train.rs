@@ -320,6 +320,11 @@ fn rejects_wrong_recipes_by_key() {
         ("train.steps", "0", "train.steps"),
         ("train.lr", "-1", "train.lr"),
         ("train.ema", "1.0", "train.ema"),
+        ("train.timesteps", "often", "often"),
+        ("train.loss.form", "l3", "l3"),
+        ("validation.spacing", "odd", "odd"),
+        ("network.reference", "other", "other"),
+        ("network.pre.neighbours", "4", "network.reference"),
         ("train.learning", "3", "learning"),
         ("trains.steps", "3", "trains.steps"),
         ("data.crop", "50", "data.crop"),
@@ -341,6 +346,16 @@ fn rejects_wrong_recipes_by_key() {
         BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
     let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
     assert_eq!(again.len(), 2);
+}
+
+/// Nothing is computed again where the pre-denoiser learns alone.
+#[test]
+fn checkpointing_without_a_prediction_is_refused() {
+    let changes = [("train.gradient_checkpointing", "true"), ("train.loss.prediction", "0")];
+    let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
+    let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
+    assert!(error.contains("train.gradient_checkpointing"), "{error}");
+    assert!(Recipe::load("tiny", &changes[..1]).unwrap().train.gradient_checkpointing);
 }
 
 /// Recipes with the former names of keys equal today's.

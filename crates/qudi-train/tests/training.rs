@@ -3,13 +3,11 @@
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{AdamConfig, GradientsParams};
-use burn::tensor::{Device, Gradients, Tensor, TensorData};
+use burn::tensor::{Device, Gradients, Tensor};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
-use qudi_model::conditioning::{
-    AlignedPlanes, Conditioning, CountPlanes, SENSOR_NUMBERS, sensor_numbers,
-};
+use qudi_model::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
@@ -18,8 +16,8 @@ use qudi_model::refinement::align;
 use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::{
-    Example, LoopOptions, LossTerms, LossWeights, SelfConditioning, TimestepLaw, gaussian_nll,
-    loss_terms,
+    Example, LoopOptions, LossForm, LossTerms, LossWeights, SelfConditioning, TimestepLaw,
+    gaussian_nll, loss_terms, reconstruction,
 };
 use qudi_train::{Adam, gradients, parameters, with_parameters};
 use std::collections::HashMap;
@@ -67,12 +65,11 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     let neighbours = tiny().pre.aligned_neighbours();
     let aligned = AlignedPlanes::new(&aligned, neighbours, 0..view.frames.len());
     let planes = CountPlanes::new(view, &acquisition);
-    let numbers = TensorData::new(sensor_numbers(&acquisition).to_vec(), [1, SENSOR_NUMBERS]);
     let conditioning = Conditioning {
         counts: to_tensor(planes.y, size, device),
         linear_estimate: to_tensor(planes.u, size, device),
         aligned: Some(aligned.into_tensors(size, device)),
-        sensor: Tensor::from_data(numbers, device),
+        sensor: sensor_tensor(&acquisition, device),
         frames,
     };
     let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
@@ -123,6 +120,26 @@ fn first_stage_terms_equal_those_of_the_whole_network() {
     // Other layers of the two lie behind last layers that start at zero.
     assert!(!idle("pre.out") && !idle("flow.levels.0.layers.4"));
     assert!(idle("unet.") && idle("fusion.") && idle("low.") && idle("high."));
+}
+
+/// The paper's form: plain errors in [0, 1], in no unit of any burst.
+#[test]
+fn plain_loss_is_that_of_images() {
+    let device = Device::flex().autodiff();
+    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
+    let network = tiny().init(3, &device);
+    let weights = LossWeights { form: LossForm::L2Tv, ..LossWeights::default() };
+    let example = burst.example(burst.truth.zeros_like(), &[500]);
+    let terms =
+        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None);
+    let terms = terms.unwrap();
+    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
+    let d = network.predenoise(&burst.conditioning).0;
+    let expected = value(&reconstruction(d, burst.truth.clone()));
+    assert!((value(&terms.pre) - expected).abs() < 1e-6 * expected);
+    let total = value(&terms.prediction) + 0.2 * expected;
+    assert!((value(&terms.total) - total).abs() < 1e-5 * total);
+    assert!(value(&terms.prediction) < 0.5, "squared errors of images");
 }
 
 /// Computing the pre-denoiser again, image by image, changes rounding alone.

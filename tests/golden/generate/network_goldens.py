@@ -464,6 +464,12 @@ def unet_file() -> File:
 # The whole
 
 
+def whole_loss(outputs: Tensors, inputs: Tensors) -> Tensor:
+    """The loss of a whole network, which joins the outputs."""
+    outputs["loss"] = network.loss(outputs["x0"], outputs["d"], inputs["truth"]).reshape(1)
+    return outputs["loss"].sum()
+
+
 def paper_file() -> File:
     """The same with every switch on the paper's side."""
     file = File("paper", 128)
@@ -482,12 +488,8 @@ def paper_file() -> File:
         x0, d, flows = module(guide=single, **x, frames=4)
         return {"x0": x0, "d": d, "to_next": flows[0], "to_prev": flows[1]}
 
-    def loss(outputs: Tensors, inputs: Tensors) -> Tensor:
-        outputs["loss"] = network.loss(outputs["x0"], outputs["d"], inputs["truth"]).reshape(1)
-        return outputs["loss"].sum()
-
     about = {"config": config, "frames": 4, "loss": "1.0 L((x0 + 1) / 2, truth) + 0.2 L(d, truth)"}
-    file.case("paper", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), loss)
+    file.case("paper", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), whole_loss)
     return file
 
 
@@ -508,12 +510,8 @@ def network_file() -> File:
         x0, d, flows = module(**x, frames=4)
         return {"x0": x0, "d": d, "to_next": flows[0], "to_prev": flows[1]}
 
-    def loss(outputs: Tensors, inputs: Tensors) -> Tensor:
-        outputs["loss"] = network.loss(outputs["x0"], outputs["d"], inputs["truth"]).reshape(1)
-        return outputs["loss"].sum()
-
     about = {"config": config, "frames": 4, "loss": "1.0 L((x0 + 1) / 2, truth) + 0.2 L(d, truth)"}
-    file.case("tiny", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), loss)
+    file.case("tiny", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), whole_loss)
     return file
 
 

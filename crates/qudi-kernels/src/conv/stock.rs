@@ -108,14 +108,13 @@ pub(super) fn input_gradients<B: Backend>(
     output: Option<FloatTensor<B>>,
 ) -> Vec<FloatTensor<B>> {
     let gradient = uncut::<B>(gradient, output);
-    let device = gradient.device();
     let Geometry { images, frames, height, width, .. } = *geometry;
     let channels = geometry.all_channels();
-    let dtype = if geometry.bf16 { FloatDType::BF16 } else { FloatDType::F32 };
-    // Only the shape of what stands for the inputs counts.
-    let like = |shape: Shape| B::float_zeros(shape, &device, dtype);
     let (narrowed, weight) =
         (narrow::<B>(gradient.clone(), geometry), narrow::<B>(weight, geometry));
+    // Only the shape of what stands for the inputs counts.
+    let (device, dtype) = (weight.device(), weight.dtype());
+    let like = |shape: Shape| B::float_zeros(shape, &device, dtype.into());
     let all = if geometry.is_deep() {
         let like = like(Shape::new([images / frames, channels, frames, height, width]));
         let narrowed = by_burst::<B>(narrowed, frames);
@@ -178,9 +177,8 @@ fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> 
         return x;
     }
     let [images, channels, height, width] = x.shape().dims();
-    let dtype = if geometry.bf16 { FloatDType::BF16 } else { FloatDType::F32 };
     let shape = Shape::new([images, channels, height + 2 * rows, width + 2 * columns]);
-    let zeros = B::float_zeros(shape, &x.device(), dtype);
+    let zeros = B::float_zeros(shape, &x.device(), x.dtype().into());
     let inside = [
         Slice::full(),
         Slice::full(),

@@ -32,7 +32,7 @@ impl DiffusionState {
 }
 
 /// One value for every image of a burst: `[images, 1, 1, 1]` from one value for every burst.
-pub(crate) fn per_image(values: Vec<f32>, images: usize, device: &Device) -> Tensor<4> {
+pub fn per_image(values: Vec<f32>, images: usize, device: &Device) -> Tensor<4> {
     let bursts = values.len();
     let values = Tensor::<1>::from_floats(values.as_slice(), device);
     values.reshape([bursts, 1]).repeat_dim(1, images / bursts).reshape([images, 1, 1, 1])

@@ -12,9 +12,9 @@ use super::unet::UNet;
 use crate::conditioning::{AlignedTensors, Conditioning};
 use crate::config::{NetworkConfig, NoisyFeatures, Part, UNetPrediction};
 use crate::diffusion::precondition::Preconditioned;
-use crate::diffusion::state::DiffusionState;
+use crate::diffusion::state::{DiffusionState, per_image};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 
 /// The simulated measurement of the previous estimate.
 ///
@@ -279,9 +279,7 @@ impl Qudi {
             }
             None => (start.zeros_like(), start.zeros_like(), vec![0.0; bursts]),
         };
-        let flags = TensorData::new(flags, [bursts, 1, 1, 1]);
-        let flag = Tensor::<4>::from_data(flags, &start.device()).repeat_dim(1, frames);
-        let flag = flag.reshape([bursts * frames, 1, 1, 1]);
+        let flag = per_image(flags, bursts * frames, &start.device());
         let both = Tensor::cat(vec![y_sim, u_sim], 1);
         self.pre.forward(pre, input, both, flag)
     }

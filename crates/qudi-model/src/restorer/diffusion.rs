@@ -35,6 +35,7 @@ pub struct DiffusionRestorer {
 /// A window, padded.
 struct Window<'a> {
     acquisition: &'a Acquisition,
+    sensor: Tensor<2>,
     counts: CountPlanes,
     /// None without a reference estimate, and once the only tile is encoded.
     aligned: Option<AlignedPlanes>,
@@ -100,6 +101,7 @@ impl DiffusionRestorer {
         };
         let mut window = Window {
             acquisition,
+            sensor: sensor_tensor(acquisition, &self.device),
             counts: CountPlanes::new(burst, acquisition).map(|plane| tiling.padded(plane)),
             aligned,
             frames,
@@ -218,7 +220,7 @@ impl DiffusionRestorer {
             counts: self.tile(window, number, &window.counts.y),
             linear_estimate: self.tile(window, number, &window.counts.u),
             aligned: aligned.map(|planes| planes.into_tensors(size, &self.device)),
-            sensor: sensor_tensor(window.acquisition, &self.device),
+            sensor: window.sensor.clone(),
             frames: window.frames,
         });
         if self.predenoises_once { self.network.predenoise_once(encoded) } else { encoded }

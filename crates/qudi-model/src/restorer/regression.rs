@@ -69,10 +69,12 @@ impl RegressionRestorer {
         acquisition: &Acquisition,
     ) -> Result<Restored> {
         let tiling = Tiling::new(burst.size, self.config.multiple(), self.tile);
+        let sensor = sensor_tensor(acquisition, &self.device);
+        let all = CountPlanes::new(burst, acquisition);
+        let pixels = burst.size.pixels();
         let (mut frames, mut uncertainty) = (Vec::new(), Vec::new());
-        for number in 0..burst.frames.len() {
-            let view = BurstView { frames: &burst.frames[number..=number], ..burst };
-            let planes = CountPlanes::new(view, acquisition).map(|plane| tiling.padded(plane));
+        for first in (0..burst.frames.len()).map(|number| number * pixels) {
+            let planes = all.map(|plane| tiling.padded(&plane[first..first + pixels]));
             let predenoise = |tile: usize| {
                 let tensor = |plane: &[f32]| {
                     let part = tiling.tiles.crop(tile, plane);
@@ -82,7 +84,7 @@ impl RegressionRestorer {
                     counts: tensor(&planes.y),
                     linear_estimate: tensor(&planes.u),
                     aligned: None,
-                    sensor: sensor_tensor(acquisition, &self.device),
+                    sensor: sensor.clone(),
                     frames: 1,
                 });
                 std::iter::once(d).chain(uncertainty).collect()

@@ -8,7 +8,7 @@ use qudi_core::{Error, Result, Size};
 use qudi_model::conditioning::CountPlanes;
 use qudi_model::diffusion::forward_model::ForwardModel;
 use qudi_model::diffusion::schedule::NoiseSchedule;
-use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::diffusion::state::{DiffusionState, per_image};
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::{Qudi, Simulated};
 use qudi_model::tensor::{read, to_tensor};
@@ -73,16 +73,11 @@ pub(super) fn network_inputs(
 fn noisy_images(example: &Example<'_>, timesteps: &[usize]) -> Tensor<4> {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let clean = example.truth.clone() * 2.0 - 1.0;
-    let bursts = timesteps.len();
-    let [images, _, height, width] = clean.dims();
     let level = |f: fn(f64) -> f64| {
-        let values: Vec<f32> =
-            timesteps.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32).collect();
-        let values = Tensor::<1>::from_floats(values.as_slice(), &clean.device());
-        values.reshape([bursts, 1]).repeat_dim(1, images / bursts).reshape([images, 1, 1, 1])
+        let values = timesteps.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32).collect();
+        per_image(values, clean.dims()[0], &clean.device()).expand(clean.dims())
     };
-    let signal = level(f64::sqrt).expand([images, 1, height, width]);
-    let noise = level(|a| (1.0 - a).sqrt()).expand([images, 1, height, width]);
+    let (signal, noise) = (level(f64::sqrt), level(|a| (1.0 - a).sqrt()));
     clean * signal + example.noise.clone() * noise
 }
 

@@ -34,3 +34,15 @@ pub(super) fn previous_timestep(timestep: usize) -> usize {
     let share = ((timestep + 1) as f64 / all).sqrt() + 0.1;
     ((all * share * share).round() as usize - 1).min(NUM_TIMESTEPS - 1)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn uniform_timesteps_are_all_alike() {
+        let timestep = |quantile| TimestepLaw::Uniform.timestep(quantile);
+        assert_eq!([0.0, 0.25, 0.5, 0.9999].map(timestep), [0, 250, 500, 999]);
+        assert!(TimestepLaw::LogLogistic.timestep(0.5) < 100);
+    }
+}

@@ -27,21 +27,19 @@ impl Perceptual {
     /// [`CliError`] if there are none, or they do not fit.
     pub(super) fn load(folder: &Path, device: Device) -> Result<Self> {
         let mut nets = [None, None];
-        let mut missing = None;
         for (net, kind) in nets.iter_mut().zip(KINDS) {
-            match Lpips::find(kind, Some(folder)) {
-                Ok(()) => *net = Lpips::load(kind, Some(folder), &device)?,
-                Err(error) => missing = Some(error),
+            if Lpips::find(kind, Some(folder)).is_ok() {
+                *net = Lpips::load(kind, Some(folder), &device)?;
             }
         }
-        match missing {
-            Some(_) if nets.iter().all(Option::is_none) => Err(CliError::new(
+        if nets.iter().all(Option::is_none) {
+            return Err(CliError::new(
                 "there are no weights of LPIPS",
                 folder.display(),
                 "make them with scripts/convert/lpips.py, or leave --backbones out",
-            )),
-            _ => Ok(Self { nets, device }),
+            ));
         }
+        Ok(Self { nets, device })
     }
 
     /// The distances of an image from the truth.
