@@ -50,7 +50,8 @@ impl Perceptual {
         let mut distances = [None, None];
         for (distance, net) in distances.iter_mut().zip(&self.nets) {
             let Some(net) = net else { continue };
-            net.check(truth.size)?;
+            let small = |e| CliError::new(e, "--backbones", "use larger frames, or leave it out");
+            net.check(truth.size).map_err(small)?;
             let tensor = |frame: &Frame| to_tensor(frame.data.clone(), frame.size, &self.device);
             let values = read(net.distances(tensor(image), tensor(truth)))?;
             *distance = values.first().map(|&value| f64::from(value));
