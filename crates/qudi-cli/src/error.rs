@@ -5,6 +5,7 @@ pub(crate) mod fields;
 use clap::error::{ContextKind, ErrorKind};
 use fields::{flags, flags_in_text};
 use qudi_core::Error;
+use qudi_model::{MatrixUnits, MatrixUnitsError};
 use std::fmt::Display;
 use std::io;
 
@@ -63,6 +64,16 @@ impl From<Error> for CliError {
                 help: e.help().map(|help| flags_in_text(&help)),
             },
         }
+    }
+}
+
+impl From<MatrixUnitsError> for CliError {
+    fn from(e: MatrixUnitsError) -> Self {
+        let help = match e {
+            MatrixUnitsError::Unknown(_) => "use f32, avx512bf16 or amx",
+            MatrixUnitsError::Unavailable(_) => "unset it to use what this machine has",
+        };
+        Self::new(e, MatrixUnits::VARIABLE, help)
     }
 }
 

@@ -16,6 +16,7 @@ mod weights;
 use args::{Args, Command};
 use clap::Parser;
 use error::CliError;
+use qudi_model::MatrixUnits;
 use std::process::ExitCode;
 
 /// See [`memory::keep_freed_pages`].
@@ -60,6 +61,7 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
     if let Some(threads) = args.global.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }
+    MatrixUnits::chosen()?;
     // Loaded for every command, so that none ignores what is set.
     let settings = settings::Settings::load(&args.global, args.command.name())?;
     match &args.command {

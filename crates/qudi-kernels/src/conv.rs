@@ -4,9 +4,12 @@
 //! several frames reads the neighbours from there. On the flex backend the work is done here, directly
 //! on the planes: a tile of all input planes is copied to scratch memory with its borders, and blocks of
 //! output channels and pixels run over all taps in registers. Against unfolding into a matrix (im2col) this
-//! copies each value once instead of once a tap, which matters with few channels. Graphics cards use Burn's
+//! copies each value once instead of once a tap, which matters with few channels. With bfloat16 the copy is
+//! rounded, and blocks run on the processor's matrix units. Graphics cards use Burn's
 //! convolutions, and products of matrices for the gradient of the weights; other backends use Burn's alone.
 
+#[cfg(all(feature = "flex", target_arch = "x86_64"))]
+mod amx;
 #[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
 mod geometry;
@@ -14,21 +17,30 @@ mod geometry;
 mod micro;
 #[cfg(feature = "flex")]
 pub(crate) mod native;
+#[cfg(all(feature = "flex", target_arch = "x86_64"))]
+mod pairs;
 #[cfg(feature = "flex")]
 mod pass;
 #[cfg(feature = "flex")]
 mod run;
 #[cfg(feature = "flex")]
+mod scratch;
+#[cfg(feature = "flex")]
 mod source;
 #[cfg(any(feature = "cube", test))]
 mod stock;
+#[cfg(feature = "flex")]
+mod tiles;
 #[cfg(feature = "flex")]
 mod weight_gradient;
 
 pub use geometry::Geometry;
 
+#[cfg(all(feature = "flex", target_arch = "x86_64"))]
+pub(crate) use amx::agrees as tiles_multiply;
+
 use crate::backend::{is_cube, is_native};
-use crate::precision::{ComputePrecision, Reduced, with_precision};
+use crate::precision::{ComputePrecision, Reduced};
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
@@ -75,17 +87,13 @@ pub fn conv_2d(
     options: Options,
 ) -> Tensor<4> {
     let [outputs, channels, rows, columns] = weight.dims();
-    if is_cube(&inputs[0]) {
+    if is_cube(&inputs[0]) || is_native(&inputs[0]) {
         let weight = weight.reshape([outputs, channels, 1, rows, columns]);
-        return extended(inputs, weight, bias, 1, options, Reduced::of(&inputs[0]).is_some());
+        return extended(inputs, weight, bias, 1, options);
     }
     if let Some(numbers) = Reduced::of(&inputs[0]) {
         let sum = |inputs: &[_], weight, zeros, options| conv_2d(inputs, weight, zeros, options);
         return reduced(numbers, inputs, weight, bias, options, sum);
-    }
-    if is_native(&inputs[0]) {
-        let weight = weight.reshape([outputs, channels, 1, rows, columns]);
-        return extended(inputs, weight, bias, 1, options, false);
     }
     let stride = [options.stride, options.stride];
     let padding = [rows / 2, columns / 2];
@@ -106,16 +114,13 @@ pub fn conv_3d(
     frames: usize,
     options: Options,
 ) -> Tensor<4> {
-    if is_cube(&inputs[0]) {
-        return extended(inputs, weight, bias, frames, options, Reduced::of(&inputs[0]).is_some());
+    if is_cube(&inputs[0]) || is_native(&inputs[0]) {
+        return extended(inputs, weight, bias, frames, options);
     }
     if let Some(numbers) = Reduced::of(&inputs[0]) {
         let sum =
             |inputs: &[_], weight, zeros, options| conv_3d(inputs, weight, zeros, frames, options);
         return reduced(numbers, inputs, weight, bias, options, sum);
-    }
-    if is_native(&inputs[0]) {
-        return extended(inputs, weight, bias, frames, options, false);
     }
     let [outputs, _, depth, rows, columns] = weight.dims();
     let joined = joined(inputs);
@@ -141,12 +146,9 @@ fn reduced<const D: usize>(
     let narrow: Vec<_> = inputs.iter().map(|input| numbers.narrow(input.clone())).collect();
     let zeros = numbers.narrow(bias.zeros_like().detach());
     let alone = Options { stride: options.stride, ..Options::default() };
-    // Numbers that are only rounded have 32 bits again and must not be taken for new ones.
-    let sum = with_precision(ComputePrecision::F32, || {
-        sum(&narrow, numbers.narrow(weight), zeros, alone)
-    });
+    let sum = sum(&narrow, numbers.narrow(weight), zeros, alone);
     let outputs = bias.dims()[0];
-    finish(numbers.widen(sum) + bias.reshape([1, outputs, 1, 1]), options)
+    finish(Reduced::widen(sum) + bias.reshape([1, outputs, 1, 1]), options)
 }
 
 fn joined(inputs: &[Tensor<4>]) -> Tensor<4> {
@@ -170,10 +172,9 @@ fn extended(
     bias: Tensor<1>,
     frames: usize,
     options: Options,
-    bf16: bool,
 ) -> Tensor<4> {
     if inputs.len() > INPUTS {
-        return extended(&[joined(inputs)], weight, bias, frames, options, bf16);
+        return extended(&[joined(inputs)], weight, bias, frames, options);
     }
     let [images, _, height, width] = inputs[0].dims();
     let [outputs, _, depth, rows, columns] = weight.dims();
@@ -188,7 +189,7 @@ fn extended(
         stride: options.stride,
         addend: options.addend.is_some(),
         relu: options.activation == Activation::Relu,
-        bf16,
+        bf16: ComputePrecision::reduces(&inputs[0]),
     };
     geometry.check(inputs, &weight, &bias, options.addend.as_ref());
     let unused = Tensor::<1>::zeros([1], &bias.device()).into_dispatch();

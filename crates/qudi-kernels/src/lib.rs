@@ -14,6 +14,7 @@ mod exp;
 #[cfg(feature = "flex")]
 mod flex;
 pub mod group_norm;
+mod matrix_units;
 mod precision;
 #[cfg(feature = "flex")]
 mod uninitialised;
@@ -21,5 +22,6 @@ mod warp;
 
 pub use attention::attention;
 pub use backend::{is_flex, with_stock_operations};
+pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
 pub use precision::{ComputePrecision, with_precision};
 pub use warp::warp;

@@ -1,11 +1,12 @@
-//! Numbers that convolutions multiply (Micikevicius et al. 2018, section 3): of 16 bits, graphics cards
-//! multiply several times as many, and what is kept for the gradient is half as large. Weights, sums and all
-//! between convolutions have 32 bits.
+//! Numbers that convolutions multiply (Micikevicius et al. 2018, section 3): of 16 bits, graphics cards and
+//! the matrix units of processors multiply several times as many. Weights, sums and all between convolutions
+//! have 32 bits.
 //!
 //! Of the two kinds of 16 bits only that with the range of 32 will do: nothing holds the U-Net's residual
 //! sums below what the other one can hold (docs/notes/training/sixteen-bits.md).
 
-use crate::backend::{Switch, is_native};
+use crate::backend::{Switch, is_flex};
+use crate::matrix_units::MatrixUnits;
 use burn::tensor::{DType, Device, FloatDType, Tensor};
 use serde::{Deserialize, Serialize};
 use std::cell::Cell;
@@ -33,10 +34,22 @@ pub fn with_precision<T>(precision: ComputePrecision, run: impl FnOnce() -> T) -
 }
 
 impl ComputePrecision {
-    /// Whether a device computes with such numbers. The flex backend does not, but rounds to them: results
-    /// are those of a card that does, at no better speed.
+    /// Whether a device computes with such numbers. A processor without units for them rounds to them, at no
+    /// better speed.
     pub fn is_supported(self, device: &Device) -> bool {
         device.supports_dtype(self.dtype())
+    }
+
+    /// The fastest of those that restore equally well on this device: 16 bits on a processor with units for
+    /// them, else 32.
+    pub fn fastest(device: &Device) -> Self {
+        let has_units = MatrixUnits::current() != MatrixUnits::F32;
+        if is_flex(device) && has_units { Self::Bf16 } else { Self::F32 }
+    }
+
+    /// Whether a convolution of `input` on this thread has fewer bits than `input`.
+    pub(crate) fn reduces(input: &Tensor<4>) -> bool {
+        PRECISION.get() != Self::F32 && input.dtype() == DType::F32
     }
 
     fn dtype(self) -> FloatDType {
@@ -57,31 +70,25 @@ impl fmt::Display for ComputePrecision {
     }
 }
 
-/// Numbers of the thread's precision around one convolution.
+/// Numbers of the thread's precision around one of Burn's convolutions.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Reduced {
     dtype: FloatDType,
-    /// Whether they are only rounded: our own operations take numbers of 32 bits.
-    rounded: bool,
 }
 
 impl Reduced {
     /// For a convolution of `input`; none if it is computed as it is.
     pub(crate) fn of(input: &Tensor<4>) -> Option<Self> {
-        let precision = PRECISION.get();
-        let reduces = precision != ComputePrecision::F32 && input.dtype() == DType::F32;
-        reduces.then(|| Self { dtype: precision.dtype(), rounded: is_native(input) })
+        ComputePrecision::reduces(input).then(|| Self { dtype: PRECISION.get().dtype() })
     }
 
     /// What is multiplied.
     pub(crate) fn narrow<const D: usize>(self, x: Tensor<D>) -> Tensor<D> {
-        let x = x.cast(self.dtype);
-        if self.rounded { x.cast(FloatDType::F32) } else { x }
+        x.cast(self.dtype)
     }
 
-    /// What comes of it, rounded as a device stores it, in 32 bits.
-    pub(crate) fn widen(self, sum: Tensor<4>) -> Tensor<4> {
-        let sum = if self.rounded { sum.cast(self.dtype) } else { sum };
+    /// What comes of it, in 32 bits.
+    pub(crate) fn widen(sum: Tensor<4>) -> Tensor<4> {
         sum.cast(FloatDType::F32)
     }
 }

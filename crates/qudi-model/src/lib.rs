@@ -21,4 +21,4 @@ pub mod refinement;
 pub mod restorer;
 pub mod tensor;
 
-pub use qudi_kernels::{ComputePrecision, with_precision};
+pub use qudi_kernels::{ComputePrecision, MatrixUnits, MatrixUnitsError, with_precision};

@@ -13,6 +13,7 @@ use crate::network::Qudi;
 use burn::tensor::Device;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Result};
+use qudi_kernels::{ComputePrecision, with_precision};
 
 pub use diffusion::DiffusionRestorer;
 pub use regression::RegressionRestorer;
@@ -37,6 +38,8 @@ pub struct SampleOptions {
     pub samples: usize,
     /// Side of the tiles that the network sees, in pixels.
     pub tile: usize,
+    /// Numbers that convolutions multiply.
+    pub precision: ComputePrecision,
 }
 
 impl Default for SampleOptions {
@@ -47,6 +50,7 @@ impl Default for SampleOptions {
             sampler: Sampler::Ddim,
             samples: 1,
             tile: TILE,
+            precision: ComputePrecision::F32,
         }
     }
 }
@@ -66,7 +70,14 @@ pub struct Model {
 
 /// Restores by regression or by diffusion, as model and options say.
 #[derive(Debug)]
-pub enum QudiRestorer {
+pub struct QudiRestorer {
+    way: Way,
+    precision: ComputePrecision,
+}
+
+/// How frames are made.
+#[derive(Debug)]
+enum Way {
     /// By regression: the pre-denoised frames.
     Regression(Box<RegressionRestorer>),
     /// By diffusion, which starts from them.
@@ -105,11 +116,12 @@ impl QudiRestorer {
             let help = format!("this network needs at least {smallest}");
             return Err(Error::request(what, "tile", help));
         }
-        Ok(if diffuses && options.steps > 0 {
-            Self::Diffusion(Box::new(DiffusionRestorer::new(model, options, device)))
+        let way = if diffuses && options.steps > 0 {
+            Way::Diffusion(Box::new(DiffusionRestorer::new(model, options, device)))
         } else {
-            Self::Regression(Box::new(RegressionRestorer::new(model, options.tile, device)))
-        })
+            Way::Regression(Box::new(RegressionRestorer::new(model, options.tile, device)))
+        };
+        Ok(Self { way, precision: options.precision })
     }
 }
 
@@ -119,9 +131,9 @@ impl Restorer for QudiRestorer {
     }
 
     fn window(&self) -> usize {
-        match self {
-            Self::Regression(restorer) => restorer.window(),
-            Self::Diffusion(restorer) => restorer.window(),
+        match &self.way {
+            Way::Regression(restorer) => restorer.window(),
+            Way::Diffusion(restorer) => restorer.window(),
         }
     }
 
@@ -134,10 +146,10 @@ impl Restorer for QudiRestorer {
                 format!("it needs at least {MIN_FRAMES}, better {}", self.window()),
             ));
         }
-        match self {
-            Self::Regression(restorer) => restorer.restore(burst, acquisition),
-            Self::Diffusion(restorer) => restorer.restore(burst, acquisition),
-        }
+        with_precision(self.precision, || match &mut self.way {
+            Way::Regression(restorer) => restorer.restore(burst, acquisition),
+            Way::Diffusion(restorer) => restorer.restore(burst, acquisition),
+        })
     }
 }
 
@@ -169,10 +181,7 @@ mod tests {
             let (network, config) = (config.init(2, &device), config.clone());
             let model = Model { network, config, kind, window: 11 };
             let mut restorer = QudiRestorer::new(model, options, &device).unwrap();
-            assert_eq!(
-                matches!(restorer, QudiRestorer::Regression(_)),
-                kind == ModelKind::Regression
-            );
+            assert_eq!(matches!(restorer.way, Way::Regression(_)), kind == ModelKind::Regression);
             restorer.restore(burst, &acquisition).unwrap().frames
         };
         let regression = restored(ModelKind::Regression);

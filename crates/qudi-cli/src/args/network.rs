@@ -4,6 +4,7 @@ use super::number;
 use crate::methods::options::NetworkOptions;
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use qudi_model::restorer::TILE;
@@ -39,6 +40,10 @@ pub(crate) struct Network {
     /// 512]
     #[arg(long, value_name = "PIXELS", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1 << 16))]
     tile: Option<usize>,
+    /// Numbers that its convolutions multiply; sums have 32 bits with each [default: bf16 on processors that
+    /// multiply it faster, else f32]
+    #[arg(long, value_name = "NAME")]
+    precision: Option<PrecisionName>,
 }
 
 impl Network {
@@ -55,6 +60,7 @@ impl Network {
             samples: self.samples.unwrap_or(1),
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),
             tile: self.tile.unwrap_or(TILE),
+            precision: self.precision.map(PrecisionName::precision),
             result_flag: first(&[
                 (self.weights.is_some(), "--weights"),
                 (self.steps.is_some(), "--steps"),
@@ -62,6 +68,7 @@ impl Network {
                 (self.sampler.is_some(), "--sampler"),
                 (self.samples.is_some(), "--samples"),
                 (self.tile.is_some(), "--tile"),
+                (self.precision.is_some(), "--precision"),
             ]),
             device_flag: self.device.is_some().then_some("--device"),
             diffusion_flag: first(&[
@@ -69,6 +76,24 @@ impl Network {
                 (self.sampler.is_some(), "--sampler"),
                 (self.samples.is_some_and(|samples| samples > 1), "--samples"),
             ]),
+        }
+    }
+}
+
+/// Precisions of products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum PrecisionName {
+    /// 32 bits
+    F32,
+    /// 16 bits, 8 of them for the value
+    Bf16,
+}
+
+impl PrecisionName {
+    fn precision(self) -> ComputePrecision {
+        match self {
+            Self::F32 => ComputePrecision::F32,
+            Self::Bf16 => ComputePrecision::Bf16,
         }
     }
 }

@@ -1,7 +1,7 @@
 //! The network behind `--method qudi`: weights, device, options.
 
 use super::options::NetworkOptions;
-use crate::device;
+use crate::device::{self, Opened};
 use crate::error::{CliError, Result};
 use crate::memory::available_bytes;
 use crate::weights::Weights;
@@ -33,18 +33,19 @@ pub(crate) fn restorer(
         kind: description.kind.unwrap_or(ModelKind::Diffusion),
         window: description.window,
     };
-    let restorer = QudiRestorer::new(model, sample_options(options)?, &device.device)?;
+    let restorer = QudiRestorer::new(model, sample_options(options, &device)?, &device.device)?;
     let way = options.mode()?;
     Ok((Box::new(restorer), format!(" ({way}) on {}", device.name)))
 }
 
-pub(crate) fn sample_options(options: &NetworkOptions) -> Result<SampleOptions> {
+pub(crate) fn sample_options(options: &NetworkOptions, device: &Opened) -> Result<SampleOptions> {
     Ok(SampleOptions {
         steps: options.steps()?,
         spacing: options.spacing()?,
         sampler: options.sampler,
         samples: options.samples,
         tile: options.tile,
+        precision: options.precision(device)?,
     })
 }
 

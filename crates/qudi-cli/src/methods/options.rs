@@ -1,7 +1,9 @@
 //! What the method `qudi` is asked for, defaults filled in.
 
+use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::weights::Weights;
+use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 
@@ -25,6 +27,8 @@ pub(crate) struct NetworkOptions {
     pub(crate) device: String,
     /// Side of the tiles in pixels.
     pub(crate) tile: usize,
+    /// Numbers that convolutions multiply; none for the fastest.
+    pub(crate) precision: Option<ComputePrecision>,
     /// The first flag given that changes the result.
     pub(crate) result_flag: Option<&'static str>,
     /// `--device`, if given.
@@ -57,6 +61,16 @@ impl NetworkOptions {
             Some(spacing) => Ok(spacing),
             None => Ok(self.weights.describe()?.spacing.unwrap_or_default()),
         }
+    }
+
+    /// Numbers that convolutions multiply on a device.
+    pub(crate) fn precision(&self, device: &Opened) -> Result<ComputePrecision> {
+        let precision = self.precision.unwrap_or_else(|| ComputePrecision::fastest(&device.device));
+        if precision.is_supported(&device.device) {
+            return Ok(precision);
+        }
+        let what = format!("{} cannot compute with {precision} numbers", device.name);
+        Err(CliError::new(what, "--precision", "ask for another, or another --device"))
     }
 
     /// The name of the spacing on the command line.

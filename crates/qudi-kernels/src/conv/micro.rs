@@ -6,26 +6,31 @@
 // Plain indices over arrays of known length: the compiler unrolls them into registers.
 #![allow(unsafe_code, clippy::needless_range_loop)]
 
+use super::scratch::Format;
+use super::tiles;
 use pulp::{Arch, Simd, WithSimd};
 
 /// Channels and vectors of the kinds of blocks: 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512,
 /// NEON). Best first: the more channels, the fewer loads.
-pub(super) const KINDS: [(usize, usize); 4] = [(12, 2), (8, 3), (6, 2), (4, 3)];
+pub(super) const KINDS: [(usize, usize); 6] = [(12, 2), (10, 2), (8, 3), (8, 2), (6, 2), (4, 3)];
 
-/// Channels of the kind of block that wastes least on results of `outputs` channels and `columns` pixels.
-pub(super) fn block(outputs: usize, columns: usize) -> usize {
+/// The kind of block that wastes least on results of `outputs` channels and `columns` pixels.
+pub(super) fn block(outputs: usize, columns: usize) -> (usize, usize) {
     let (lanes, registers) = machine();
     let fits = |&(channels, vectors): &(usize, usize)| channels * vectors < registers;
     let cost = |&(channels, vectors): &(usize, usize)| {
         outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors * lanes)
     };
     // Of equals the first.
-    KINDS.into_iter().filter(fits).min_by_key(cost).map_or(KINDS[3].0, |kind| kind.0)
+    KINDS.into_iter().filter(fits).min_by_key(cost).unwrap_or(KINDS[5])
 }
 
 /// Longest run of pixels of a block on this machine.
-pub(super) fn longest_run() -> usize {
-    KINDS.map(|kind| kind.1).into_iter().max().unwrap_or(1) * lanes()
+pub(super) fn longest_run(format: Format) -> usize {
+    match format {
+        Format::Tiles(_) => tiles::PIXELS,
+        _ => KINDS.map(|kind| kind.1).into_iter().max().unwrap_or(1) * lanes(),
+    }
 }
 
 /// Values of a vector on this machine.
@@ -46,13 +51,33 @@ fn machine() -> (usize, usize) {
     Arch::new().dispatch(Machine)
 }
 
+/// How the 32 bits of scratch memory and of the weights are multiplied.
+pub(super) trait Products<S: Simd> {
+    /// `a * b + sum`.
+    ///
+    /// # Safety
+    /// The machine must have the instructions.
+    unsafe fn multiply_add(simd: S, a: S::f32s, b: S::f32s, sum: S::f32s) -> S::f32s;
+}
+
+/// They are one number.
+#[derive(Debug)]
+pub(super) struct Single;
+
+impl<S: Simd> Products<S> for Single {
+    #[inline(always)]
+    unsafe fn multiply_add(simd: S, a: S::f32s, b: S::f32s, sum: S::f32s) -> S::f32s {
+        simd.mul_add_e_f32s(a, b, sum)
+    }
+}
+
 /// `sums[m][v] += sum over k of weights[k * M + m] * x[offsets[k] + v * lanes ..]`.
 ///
 /// # Safety
 /// `x` must be valid for reads of `V * S::F32_LANES` values from every one of the `offsets`, and
-/// `weights` for `offsets.len() * M` values.
+/// `weights` for `offsets.len() * M` values; the machine must have the instructions of `P`.
 #[inline(always)]
-pub(super) unsafe fn accumulate<S: Simd, const M: usize, const V: usize>(
+pub(super) unsafe fn accumulate<S: Simd, P: Products<S>, const M: usize, const V: usize>(
     simd: S,
     x: *const f32,
     offsets: &[u32],
@@ -72,7 +97,7 @@ pub(super) unsafe fn accumulate<S: Simd, const M: usize, const V: usize>(
             for m in 0..M {
                 let factor = simd.splat_f32s(*weight.add(m));
                 for v in 0..V {
-                    acc[m][v] = simd.mul_add_e_f32s(factor, pixels[v], acc[m][v]);
+                    acc[m][v] = P::multiply_add(simd, factor, pixels[v], acc[m][v]);
                 }
             }
             weight = weight.add(M);
@@ -84,13 +109,13 @@ pub(super) unsafe fn accumulate<S: Simd, const M: usize, const V: usize>(
 /// `sums[m][k] += sum over the pixels p < length of dy[m][p] * x[offsets[k] + p]`, lane by lane.
 ///
 /// # Safety
-/// Each `dy` must be valid for `length` values and `x` for `length` values from each of the
-/// `offsets`; `length` is a multiple of the lanes.
+/// A value has `T`'s size. Each `dy` must be valid for `length` values and `x` for `length` values from each
+/// of the `offsets`; they fill whole vectors. The machine must have the instructions of `P`.
 #[inline(always)]
-pub(super) unsafe fn correlate<S: Simd, const M: usize, const K: usize>(
+pub(super) unsafe fn correlate<S: Simd, P: Products<S>, T, const M: usize, const K: usize>(
     simd: S,
-    dy: [*const f32; M],
-    x: *const f32,
+    dy: [*const T; M],
+    x: *const T,
     offsets: [usize; K],
     length: usize,
     sums: &mut [[S::f32s; K]; M],
@@ -107,11 +132,11 @@ pub(super) unsafe fn correlate<S: Simd, const M: usize, const K: usize>(
             for m in 0..M {
                 let gradient = dy[m].add(p).cast::<S::f32s>().read_unaligned();
                 for k in 0..K {
-                    acc[m][k] = simd.mul_add_e_f32s(gradient, taps[k], acc[m][k]);
+                    acc[m][k] = P::multiply_add(simd, gradient, taps[k], acc[m][k]);
                 }
             }
         }
-        p += S::F32_LANES;
+        p += size_of::<S::f32s>() / size_of::<T>();
     }
     *sums = acc;
 }

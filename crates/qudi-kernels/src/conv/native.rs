@@ -2,7 +2,6 @@
 #![allow(unsafe_code)]
 
 use super::geometry::Geometry;
-use super::micro::longest_run;
 use super::pass::Pass;
 use super::run::{Finish, Packed, Target, run};
 use super::source::Source;
@@ -19,20 +18,17 @@ pub(crate) fn forward(
     let addend = geometry.addend.then(|| inputs[inputs.len() - 1]);
     let geometry = &geometry.flattened();
     let pass = Pass::forward(geometry);
-    let depth = geometry.kernel[0];
-    let planes = geometry.all_channels() * depth;
+    let planes = geometry.all_channels() * geometry.kernel[0];
     let taps = pass.taps.len();
-    let columns = pass.tiling(planes, longest_run()).columns;
-    let packed = Packed::new(columns, geometry.outputs, planes, taps, |output, plane, tap| {
-        weight[(output * planes + plane) * taps + tap]
-    });
+    let weight = |output, plane, tap| weight[(output * planes + plane) * taps + tap];
+    let packed = Packed::new(&pass, geometry.bf16, geometry.outputs, planes, weight);
     let inputs = with_channels(inputs, geometry);
     let source = Source { inputs: &inputs, ..source(geometry) };
     let [rows, columns] = pass.grid;
     let mut parts = [(Vec::new(), geometry.outputs)];
     let target = Target::new(&mut parts, geometry.images, rows, columns);
     let finish = Finish { bias: Some(bias), addend, relu: geometry.relu };
-    run(source, planes, geometry.images, &pass, &packed, finish, &target);
+    run(source, geometry.images, &pass, &packed, finish, &target);
     // SAFETY: the pass covers the whole grid.
     let [(output, _)] = unsafe { written(parts, geometry.images * rows * columns) };
     output
@@ -40,7 +36,7 @@ pub(crate) fn forward(
 
 /// Gradients for the inputs, one for each, the addend excepted; `output` is what [`forward`] gave, where it
 /// cut at zero.
-pub(super) fn input_gradients(
+pub(crate) fn input_gradients(
     geometry: &Geometry,
     weight: &[f32],
     gradient: &[f32],
@@ -58,15 +54,14 @@ pub(super) fn input_gradients(
         let parity = [parity / geometry.stride, parity % geometry.stride];
         let Some((pass, kernel)) = Pass::backward(geometry, parity) else { continue };
         let planes = geometry.outputs * depth;
-        let columns = pass.tiling(planes, longest_run()).columns;
-        let packed = Packed::new(columns, channels, planes, kernel.len(), |channel, plane, tap| {
+        let packed = Packed::new(&pass, geometry.bf16, channels, planes, |channel, plane, tap| {
             let (output, frame) = (plane / depth, depth - 1 - plane % depth);
             let [y, x] = kernel[tap];
             let plane = (output * channels + channel) * depth + frame;
             weight[(plane * kernel_rows + y) * kernel_columns + x]
         });
         let finish = Finish { bias: None, addend: None, relu: false };
-        run(source, planes, geometry.images, &pass, &packed, finish, &target);
+        run(source, geometry.images, &pass, &packed, finish, &target);
     }
     // SAFETY: the passes of all parities cover the whole grid.
     let parts = unsafe { written(parts, geometry.images * geometry.height * geometry.width) };
@@ -95,7 +90,8 @@ pub(crate) fn weight_gradients(
     let gradient = [(gradient, geometry.outputs)];
     let gradient =
         Source { inputs: &gradient, mask: output, height, width, depth: 1, ..source(geometry) };
-    weight_gradient(values, planes, geometry.images, &pass, gradient, geometry.outputs)
+    let sizes = [planes, geometry.images, geometry.outputs];
+    weight_gradient(values, sizes, &pass, gradient, geometry.bf16)
 }
 
 fn with_channels<'a>(inputs: &[&'a [f32]], geometry: &Geometry) -> Vec<(&'a [f32], usize)> {

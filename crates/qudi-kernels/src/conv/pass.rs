@@ -4,6 +4,7 @@
 //! is four, one for each parity of row and column, so that no multiplication with a zero is done.
 
 use super::geometry::Geometry;
+use super::scratch::Format;
 
 /// Values of scratch that one tile may use: a quarter of a megabyte stays in a core's second-level cache.
 const SCRATCH: usize = 64 * 1024;
@@ -41,8 +42,10 @@ pub(super) struct Tiling {
     /// Scratch values of an input row, and of one column parity where the stride is 2.
     pub(super) row: usize,
     pub(super) half: usize,
-    /// Planes that fit into scratch at once.
+    /// Scratch planes that fit into scratch at once.
     pub(super) planes: usize,
+    /// What a place of scratch holds.
+    pub(super) format: Format,
 }
 
 impl Pass {
@@ -98,9 +101,11 @@ impl Pass {
     }
 
     /// Tiles whose input fits the second-level cache. Does not depend on the number of threads: sums
-    /// over tiles come out the same with any number. `run` is the longest run of pixels of a block.
-    pub(super) fn tiling(&self, planes: usize, run: usize) -> Tiling {
+    /// over tiles come out the same with any number. `planes` are scratch planes, `run` is the longest run of
+    /// pixels of a block.
+    pub(super) fn tiling(&self, format: Format, planes: usize, run: usize) -> Tiling {
         let [grid_rows, grid_columns] = self.grid;
+        let group = format.group();
         // One long row is cut so that all planes fit at once; sums of parts would go through memory.
         let widest = if grid_rows == 1 { (SCRATCH / planes).clamp(4 * run, TILE) } else { 8 * run };
         let across = grid_columns.div_ceil(widest);
@@ -124,7 +129,8 @@ impl Pass {
             input_rows: input_rows(rows),
             row,
             half,
-            planes: (SCRATCH / plane).clamp(1, planes),
+            planes: (SCRATCH / plane / group * group).clamp(group, planes),
+            format,
         }
     }
 }
@@ -147,10 +153,15 @@ impl Tiling {
         (at, size)
     }
 
-    /// Scratch offsets of the taps of `planes` planes, in the order of the weights.
+    /// Scratch values of a tile, with one spare row.
+    pub(super) fn scratch(&self) -> usize {
+        self.planes * self.plane() + self.row
+    }
+
+    /// Scratch offsets of the taps of `planes` scratch planes, or of their groups, in the order of the weights.
     pub(super) fn offsets(&self, pass: &Pass, planes: usize) -> Vec<u32> {
         let mut offsets = Vec::with_capacity(planes * pass.taps.len());
-        for plane in 0..planes {
+        for plane in (0..planes).step_by(self.format.group()) {
             for &[y, x] in &pass.taps {
                 let column = if pass.stride == 1 { x } else { x % 2 * self.half + x / 2 };
                 offsets.push((plane * self.plane() + y * self.row + column) as u32);

@@ -1,9 +1,15 @@
 //! Runs a pass: fills scratch, calls the innermost loops, writes results.
 #![allow(unsafe_code)]
 
-use super::micro::{self, KINDS};
+#[cfg(all(target_arch = "x86_64", not(test)))]
+use super::amx;
+use super::micro::{self, KINDS, Products, Single};
+#[cfg(target_arch = "x86_64")]
+use super::pairs;
 use super::pass::{Pass, Tiling};
+use super::scratch::Format;
 use super::source::Source;
+use super::tiles;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -60,37 +66,56 @@ impl Target {
     }
 }
 
-/// Weights in the order of the innermost loops: `[block][plane][tap][channel of the block]`.
+/// A pass over input planes, cut into tiles, with its weights in the order of the innermost loops.
 #[derive(Clone, Debug)]
 pub(super) struct Packed {
+    /// `[block][scratch plane][tap][channel of the block]`; empty where there are tiles.
     values: Vec<f32>,
-    /// Channels of a block.
-    block: usize,
-    outputs: usize,
+    /// The weights as [`tiles::packed`]; else empty.
+    pub(super) tiles: Vec<tiles::Row>,
+    /// Channels and vectors of a block.
+    block: (usize, usize),
+    pub(super) outputs: usize,
+    /// Scratch planes.
+    planes: usize,
+    tiling: Tiling,
 }
 
 impl Packed {
-    /// `weight(output, plane, tap)` of a pass whose tiles are `columns` wide.
+    /// `weight(output, plane, tap)` over so many input planes.
     pub(super) fn new(
-        columns: usize,
+        pass: &Pass,
+        bf16: bool,
         outputs: usize,
         planes: usize,
-        taps: usize,
         weight: impl Fn(usize, usize, usize) -> f32,
     ) -> Self {
-        let block = micro::block(outputs, columns);
-        let mut values = Vec::with_capacity(outputs.next_multiple_of(block) * planes * taps);
-        for first in (0..outputs).step_by(block) {
-            for plane in 0..planes {
-                for tap in 0..taps {
-                    for output in first..first + block {
-                        let inside = output < outputs;
-                        values.push(if inside { weight(output, plane, tap) } else { 0.0 });
+        let format = Format::new(bf16, planes);
+        let scratch_planes = format.scratch_planes(planes);
+        let tiling = pass.tiling(format, scratch_planes, micro::longest_run(format));
+        let taps = pass.taps.len();
+        let weight = |output: usize, number: usize, tap: usize| {
+            let value = |plane| if plane < planes { weight(output, plane, tap) } else { 0.0 };
+            if output < outputs { format.place(number, value) } else { 0.0 }
+        };
+        let block = micro::block(outputs, tiling.columns);
+        let (mut values, mut tiles) = (Vec::new(), Vec::new());
+        if let Format::Tiles(group) = format {
+            tiles = tiles::packed(outputs, scratch_planes, group, taps, weight);
+        } else {
+            let size = outputs.next_multiple_of(block.0) * scratch_planes * taps;
+            values.reserve_exact(size);
+            for first in (0..outputs).step_by(block.0) {
+                for plane in 0..scratch_planes {
+                    for tap in 0..taps {
+                        values.extend(
+                            (first..first + block.0).map(|output| weight(output, plane, tap)),
+                        );
                     }
                 }
             }
         }
-        Self { values, block, outputs }
+        Self { values, tiles, block, outputs, planes: scratch_planes, tiling }
     }
 }
 
@@ -108,31 +133,31 @@ pub(super) struct Finish<'a> {
 /// once by one thread, and its sum runs in the same order whatever the tiles.
 pub(super) fn run(
     source: Source<'_>,
-    planes: usize,
     images: usize,
     pass: &Pass,
     weights: &Packed,
     finish: Finish<'_>,
     target: &Target,
 ) {
-    let tiling = pass.tiling(planes, micro::longest_run());
+    let (tiling, planes) = (weights.tiling, weights.planes);
     let offsets = tiling.offsets(pass, tiling.planes);
     let arch = Arch::new();
     (0..images * tiling.count()).into_par_iter().for_each(|task| {
         let (image, number) = (task / tiling.count(), task % tiling.count());
         let (at, size) = tiling.tile(number, pass.grid);
         SCRATCH.with_borrow_mut(|scratch| {
-            let needed = tiling.planes * tiling.plane();
+            let needed = tiling.scratch();
             if scratch.len() < needed {
                 scratch.resize(needed, 0.0);
             }
+            let scratch = &mut scratch[..needed];
             let mut first = 0;
             while first < planes {
                 let end = (first + tiling.planes).min(planes);
                 source.fill(image, first..end, pass, &tiling, at, scratch);
                 let tile = Tile {
                     scratch,
-                    offsets: &offsets[..(end - first) * pass.taps.len()],
+                    offsets: &offsets[..(end - first) / tiling.format.group() * pass.taps.len()],
                     planes: (first, end, planes),
                     pass,
                     tiling: &tiling,
@@ -143,7 +168,7 @@ pub(super) fn run(
                     at,
                     size,
                 };
-                arch.dispatch(tile);
+                tile.run(arch);
                 first = end;
             }
         });
@@ -151,19 +176,19 @@ pub(super) fn run(
 }
 
 /// The work on one filled tile.
-struct Tile<'a> {
-    scratch: &'a [f32],
-    offsets: &'a [u32],
-    /// First, end and number of the planes in scratch.
-    planes: (usize, usize, usize),
-    pass: &'a Pass,
-    tiling: &'a Tiling,
-    weights: &'a Packed,
+pub(super) struct Tile<'a> {
+    pub(super) scratch: &'a [f32],
+    pub(super) offsets: &'a [u32],
+    /// First, end and number of the scratch planes that are filled.
+    pub(super) planes: (usize, usize, usize),
+    pub(super) pass: &'a Pass,
+    pub(super) tiling: &'a Tiling,
+    pub(super) weights: &'a Packed,
     finish: Finish<'a>,
     target: &'a Target,
     image: usize,
     at: [usize; 2],
-    size: [usize; 2],
+    pub(super) size: [usize; 2],
 }
 
 impl WithSimd for Tile<'_> {
@@ -171,18 +196,58 @@ impl WithSimd for Tile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        match self.weights.block {
-            block if block == KINDS[0].0 => self.blocks::<S, { KINDS[0].0 }, { KINDS[0].1 }>(simd),
-            block if block == KINDS[1].0 => self.blocks::<S, { KINDS[1].0 }, { KINDS[1].1 }>(simd),
-            block if block == KINDS[2].0 => self.blocks::<S, { KINDS[2].0 }, { KINDS[2].1 }>(simd),
-            _ => self.blocks::<S, { KINDS[3].0 }, { KINDS[3].1 }>(simd),
-        }
+        // SAFETY: these products are the machine's own.
+        unsafe { self.products::<S, Single>(simd) }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl pairs::PairWork for Tile<'_> {
+    #[inline(always)]
+    unsafe fn work(self, simd: pulp::x86::V4) {
+        // SAFETY: the caller's promise.
+        unsafe { self.products::<_, pairs::Pairs>(simd) }
     }
 }
 
 impl Tile<'_> {
+    fn run(self, arch: Arch) {
+        match self.tiling.format {
+            Format::Single | Format::Rounded => arch.dispatch(self),
+            #[cfg(target_arch = "x86_64")]
+            Format::Pairs => pairs::with_pairs(self),
+            #[cfg(not(target_arch = "x86_64"))]
+            Format::Pairs => unreachable!("units were asked for"),
+            #[cfg(all(target_arch = "x86_64", not(test)))]
+            // SAFETY: there are tiles only where the processor has the unit, and with permission.
+            Format::Tiles(group) => unsafe { amx::work(&self, group) },
+            #[cfg(any(not(target_arch = "x86_64"), test))]
+            // SAFETY: the model needs no unit.
+            Format::Tiles(group) => unsafe { tiles::blocks(&tiles::Model, &self, group) },
+        }
+    }
+
+    /// # Safety
+    /// The machine must have the instructions of `P`.
     #[inline(always)]
-    fn blocks<S: Simd, const M: usize, const V: usize>(&self, simd: S) {
+    unsafe fn products<S: Simd, P: Products<S>>(&self, simd: S) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match self.weights.block {
+                b if b == KINDS[0] => self.blocks::<S, P, { KINDS[0].0 }, { KINDS[0].1 }>(simd),
+                b if b == KINDS[1] => self.blocks::<S, P, { KINDS[1].0 }, { KINDS[1].1 }>(simd),
+                b if b == KINDS[2] => self.blocks::<S, P, { KINDS[2].0 }, { KINDS[2].1 }>(simd),
+                b if b == KINDS[3] => self.blocks::<S, P, { KINDS[3].0 }, { KINDS[3].1 }>(simd),
+                b if b == KINDS[4] => self.blocks::<S, P, { KINDS[4].0 }, { KINDS[4].1 }>(simd),
+                _ => self.blocks::<S, P, { KINDS[5].0 }, { KINDS[5].1 }>(simd),
+            }
+        }
+    }
+
+    /// # Safety
+    /// The machine must have the instructions of `P`.
+    #[inline(always)]
+    unsafe fn blocks<S: Simd, P: Products<S>, const M: usize, const V: usize>(&self, simd: S) {
         let run = V * S::F32_LANES;
         let taps = self.pass.taps.len();
         for first in (0..self.weights.outputs).step_by(M) {
@@ -196,7 +261,7 @@ impl Tile<'_> {
                     // SAFETY: a scratch row holds whole runs past the tile's last column, and the
                     // offsets stay within the planes that were filled (`Pass::tiling`).
                     unsafe {
-                        micro::accumulate(
+                        micro::accumulate::<S, P, M, V>(
                             simd,
                             self.scratch.as_ptr().add(base),
                             self.offsets,
@@ -218,6 +283,49 @@ impl Tile<'_> {
         let x = x + self.pass.step * (self.at[1] + column);
         // SAFETY: the pass's grid lies within the target.
         unsafe { self.target.plane(self.image, channel).add(y * self.target.width + x) }
+    }
+
+    /// Writes a run of results of one channel, where `sums` holds the sums over the planes in scratch.
+    #[inline(always)]
+    pub(super) fn finish(&self, channel: usize, row: usize, column: usize, sums: &mut [f32]) {
+        let to = self.place(channel, row, column);
+        if self.planes.0 > 0 {
+            for (p, sum) in sums.iter_mut().enumerate() {
+                // SAFETY: this thread wrote it for the planes before.
+                *sum += unsafe { *to.add(p * self.pass.step) };
+            }
+        } else if let Some(bias) = self.finish.bias {
+            for sum in sums.iter_mut() {
+                *sum += bias[channel];
+            }
+            if let Some(addend) = self.addends(channel, row, column, sums.len()) {
+                sums.iter_mut().zip(addend).for_each(|(sum, addend)| *sum += addend);
+            }
+        }
+        if self.finish.relu && self.planes.1 == self.planes.2 {
+            for sum in sums.iter_mut() {
+                *sum = sum.max(0.0);
+            }
+        }
+        if self.pass.step == 1 {
+            // SAFETY: the results lie next to each other from there.
+            unsafe { std::ptr::copy_nonoverlapping(sums.as_ptr(), to, sums.len()) };
+        } else {
+            for (p, &sum) in sums.iter().enumerate() {
+                // SAFETY: the results lie `step` apart from there.
+                unsafe { to.add(p * self.pass.step).write(sum) };
+            }
+        }
+    }
+
+    /// What is added to a run of results of one channel.
+    #[inline(always)]
+    fn addends(&self, channel: usize, row: usize, column: usize, count: usize) -> Option<&[f32]> {
+        let addend = self.finish.addend?;
+        let channel = self.image * self.weights.outputs + channel;
+        let line = channel * self.target.height + self.at[0] + row;
+        let from = line * self.target.width + self.at[1] + column;
+        Some(&addend[from..from + count])
     }
 
     /// The bias, or what the planes before these have added up to.
@@ -246,12 +354,9 @@ impl Tile<'_> {
                 }
             } else if let Some(bias) = self.finish.bias {
                 *sum = [simd.splat_f32s(bias[first + m]); V];
-                if let Some(addend) = self.finish.addend {
-                    let channel = self.image * self.weights.outputs + first + m;
-                    let line = channel * self.target.height + self.at[0] + row;
-                    let from = line * self.target.width + self.at[1] + column;
+                if let Some(addend) = self.addends(first + m, row, column, count) {
                     let values: &mut [f32] = pulp::bytemuck::cast_slice_mut(sum);
-                    for (value, addend) in values.iter_mut().zip(&addend[from..from + count]) {
+                    for (value, addend) in values.iter_mut().zip(addend) {
                         *value += addend;
                     }
                 }

@@ -1,6 +1,8 @@
 //! The planes that a convolution reads, and their copy into scratch memory.
 
 use super::pass::{Pass, Tiling};
+use super::scratch::{Format, Row, fill_row};
+use pulp::Arch;
 
 /// Inputs joined by channel, `[images, channels, height, width]` each.
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +42,8 @@ impl<'a> Source<'a> {
         None
     }
 
-    /// Copies what a tile of `pass` needs of the planes `planes` of `image`, zeros around the edges.
+    /// Copies what a tile of `pass` needs of the scratch planes `planes` of `image`, zeros around the edges.
+    /// The last row of scratch is spare.
     pub(super) fn fill(
         &self,
         image: usize,
@@ -52,32 +55,48 @@ impl<'a> Source<'a> {
     ) {
         let top = pass.first[0] + (pass.stride * at[0]) as isize;
         let left = pass.first[1] + (pass.stride * at[1]) as isize;
-        for (number, to) in planes.zip(scratch.chunks_exact_mut(tiling.plane())) {
-            let Some((plane, mask)) = self.plane(image, number) else {
-                to.fill(0.0);
-                continue;
-            };
-            for (row, to) in (top..).zip(to.chunks_exact_mut(tiling.row)) {
-                if row < 0 || row >= self.height as isize {
-                    to.fill(0.0);
-                    continue;
-                }
-                let place = row as usize * self.width..(row as usize + 1) * self.width;
-                let (from, mask) = (&plane[place.clone()], mask.map(|mask| &mask[place]));
-                if pass.stride == 1 {
-                    copy_row(from, mask, left, 1, to);
-                } else {
-                    let (even, odd) = to.split_at_mut(tiling.half);
-                    copy_row(from, mask, left, 2, even);
-                    copy_row(from, mask, left + 1, 2, odd);
+        let (scratch, spare) = scratch.split_at_mut(scratch.len() - tiling.row);
+        let format = tiling.format;
+        let fill = || {
+            for (number, to) in planes.zip(scratch.chunks_exact_mut(tiling.plane())) {
+                let sources = match format {
+                    Format::Single | Format::Rounded => [self.plane(image, number), None],
+                    Format::Pairs | Format::Tiles(_) => {
+                        [2 * number, 2 * number + 1].map(|number| self.plane(image, number))
+                    }
+                };
+                for (row, to) in (top..).zip(to.chunks_exact_mut(tiling.row)) {
+                    if row < 0 || row >= self.height as isize {
+                        to.fill(0.0);
+                        continue;
+                    }
+                    let place = row as usize * self.width..(row as usize + 1) * self.width;
+                    let rows: [Option<Row<'_>>; 2] = sources.map(|source| {
+                        let (plane, mask) = source?;
+                        Some((&plane[place.clone()], mask.map(|mask| &mask[place.clone()])))
+                    });
+                    if pass.stride == 1 {
+                        fill_row(format, rows, left, 1, to, spare);
+                    } else {
+                        let (even, odd) = to.split_at_mut(tiling.half);
+                        fill_row(format, rows, left, 2, even, spare);
+                        fill_row(format, rows, left + 1, 2, odd, spare);
+                    }
                 }
             }
-        }
+        };
+        if format == Format::Single { fill() } else { Arch::new().dispatch(fill) }
     }
 }
 
 /// `to[i] = from[left + i * step]`, zero outside and where the mask is not positive.
-fn copy_row(from: &[f32], mask: Option<&[f32]>, left: isize, step: usize, to: &mut [f32]) {
+pub(super) fn copy_row(
+    from: &[f32],
+    mask: Option<&[f32]>,
+    left: isize,
+    step: usize,
+    to: &mut [f32],
+) {
     let step = step as isize;
     // The first and the end of the places inside.
     let inside = |place: isize| (place.max(0) as usize).min(to.len());

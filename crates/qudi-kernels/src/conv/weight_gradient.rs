@@ -2,9 +2,14 @@
 #![allow(unsafe_code)]
 
 use super::micro;
+use super::micro::{Products, Single};
+#[cfg(target_arch = "x86_64")]
+use super::pairs::{PairWork, Pairs, with_pairs};
 use super::pass::{Pass, Tiling};
 use super::run::SCRATCH;
+use super::scratch::{Format, round, upper};
 use super::source::Source;
+use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -21,17 +26,21 @@ pub(crate) struct WeightGradient {
     pub(crate) bias: Vec<f32>,
 }
 
-/// Sums over all images and results of `gradient` (of the pass's grid, `outputs` channels) times what
-/// the taps read of `source`.
+/// Neighbouring pixels of a vector of bfloat16.
+const HALVES: usize = 32;
+
+/// Sums over all images and results of `gradient` (of the pass's grid) times what the taps read of `source`.
+/// Sizes: planes of `source`, images, channels of `gradient`.
 pub(super) fn weight_gradient(
     source: Source<'_>,
-    planes: usize,
-    images: usize,
+    [planes, images, outputs]: [usize; 3],
     pass: &Pass,
     gradient: Source<'_>,
-    outputs: usize,
+    bf16: bool,
 ) -> WeightGradient {
-    let tiling = pass.tiling(planes, micro::longest_run());
+    let halves = bf16 && MatrixUnits::current() != MatrixUnits::F32;
+    let run = if halves { HALVES } else { micro::longest_run(Format::Single) };
+    let tiling = pass.tiling(Format::Single, planes, run);
     let offsets = tiling.offsets(pass, tiling.planes);
     let arch = Arch::new();
     let tasks = images * tiling.count();
@@ -45,25 +54,43 @@ pub(super) fn weight_gradient(
             let (image, number) = (task / tiling.count(), task % tiling.count());
             let (at, size) = tiling.tile(number, pass.grid);
             SCRATCH.with_borrow_mut(|scratch| {
-                let length = tiling.columns.next_multiple_of(micro::lanes());
-                let area = tiling.planes * tiling.plane();
+                let lanes = if halves { HALVES } else { micro::lanes() };
+                let length = tiling.columns.next_multiple_of(lanes);
+                let area = tiling.scratch();
                 let needed = area + outputs * tiling.rows * length;
-                if scratch.len() < needed {
-                    scratch.resize(needed, 0.0);
+                // What is rounded lies behind what it was rounded from.
+                let all = if halves { needed + needed.div_ceil(2) } else { needed };
+                if scratch.len() < all {
+                    scratch.resize(all, 0.0);
                 }
-                let (taps, dy) = scratch.split_at_mut(area);
+                let (values, narrow) = scratch[..all].split_at_mut(needed);
+                let (taps, dy) = values.split_at_mut(area);
                 let dy = &mut dy[..outputs * size[0] * length];
+                let narrow: &mut [u16] = pulp::bytemuck::cast_slice_mut(narrow);
+                let (narrow_taps, narrow_dy) = narrow.split_at_mut(if halves { area } else { 0 });
                 gradient.copy_tile(image, at, size, length, dy);
                 for (channel, sum) in dy.chunks_exact(size[0] * length).zip(&mut sums.bias) {
                     *sum += channel.iter().sum::<f32>();
+                }
+                if halves {
+                    arch.dispatch(|| narrow_all(dy, narrow_dy));
+                } else if bf16 {
+                    round_all(dy);
                 }
                 let mut first = 0;
                 while first < planes {
                     let end = (first + tiling.planes).min(planes);
                     source.fill(image, first..end, pass, &tiling, at, taps);
-                    arch.dispatch(Tile {
+                    if halves {
+                        arch.dispatch(|| narrow_all(taps, narrow_taps));
+                    } else if bf16 {
+                        round_all(taps);
+                    }
+                    let tile = Tile {
                         taps,
                         dy,
+                        narrow_taps,
+                        narrow_dy,
                         offsets: &offsets[..(end - first) * pass.taps.len()],
                         first: first * pass.taps.len(),
                         all: planes * pass.taps.len(),
@@ -73,7 +100,15 @@ pub(super) fn weight_gradient(
                         pass,
                         tiling: &tiling,
                         weight: &mut sums.weight,
-                    });
+                    };
+                    #[cfg(target_arch = "x86_64")]
+                    if halves {
+                        with_pairs(tile);
+                    } else {
+                        arch.dispatch(tile);
+                    }
+                    #[cfg(not(target_arch = "x86_64"))]
+                    arch.dispatch(tile);
                     first = end;
                 }
             });
@@ -89,6 +124,19 @@ pub(super) fn weight_gradient(
     sums
 }
 
+#[inline(always)]
+fn narrow_all(from: &[f32], to: &mut [u16]) {
+    for (to, &from) in to.iter_mut().zip(from) {
+        *to = upper(from) as u16;
+    }
+}
+
+fn round_all(values: &mut [f32]) {
+    for value in values {
+        *value = round(*value);
+    }
+}
+
 fn add(to: &mut [f32], from: &[f32]) {
     for (to, from) in to.iter_mut().zip(from) {
         *to += from;
@@ -100,6 +148,9 @@ struct Tile<'a> {
     taps: &'a [f32],
     /// `[outputs][rows][length]`, zero past the tile's columns.
     dy: &'a [f32],
+    /// The same in bfloat16, where that is multiplied.
+    narrow_taps: &'a [u16],
+    narrow_dy: &'a [u16],
     offsets: &'a [u32],
     /// Number of the first offset among `all` taps of one output.
     first: usize,
@@ -117,18 +168,37 @@ impl WithSimd for Tile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // As many output channels as registers hold.
-        if S::REGISTER_COUNT >= 32 {
-            self.blocks::<S, 8, TAPS>(simd);
-        } else {
-            self.blocks::<S, 4, TAPS>(simd);
+        let values = (self.taps.as_ptr(), self.dy.as_ptr());
+        // SAFETY: these products are the machine's own. As many output channels as registers hold.
+        unsafe {
+            if S::REGISTER_COUNT >= 32 {
+                self.blocks::<S, Single, f32, 8, TAPS>(simd, values);
+            } else {
+                self.blocks::<S, Single, f32, 4, TAPS>(simd, values);
+            }
         }
     }
 }
 
-impl Tile<'_> {
+#[cfg(target_arch = "x86_64")]
+impl PairWork for Tile<'_> {
     #[inline(always)]
-    fn blocks<S: Simd, const M: usize, const K: usize>(self, simd: S) {
+    unsafe fn work(self, simd: pulp::x86::V4) {
+        let values = (self.narrow_taps.as_ptr(), self.narrow_dy.as_ptr());
+        // SAFETY: the caller's promise.
+        unsafe { self.blocks::<_, Pairs, u16, 8, TAPS>(simd, values) }
+    }
+}
+
+impl Tile<'_> {
+    /// # Safety
+    /// The machine must have the instructions of `P`; `taps` and `dy` are this tile's.
+    #[inline(always)]
+    unsafe fn blocks<S: Simd, P: Products<S>, T, const M: usize, const K: usize>(
+        self,
+        simd: S,
+        (taps, dy): (*const T, *const T),
+    ) {
         let channel = self.rows * self.length;
         for m in (0..self.outputs).step_by(M) {
             for k in (0..self.offsets.len()).step_by(K) {
@@ -143,10 +213,16 @@ impl Tile<'_> {
                     // SAFETY: rows of `dy` are `length` long, whole vectors; so much lies in scratch
                     // after every tap of a row (`Pass::tiling`).
                     unsafe {
-                        let dy =
-                            outputs.map(|start| self.dy.as_ptr().add(start + row * self.length));
-                        let x = self.taps.as_ptr().add(self.pass.stride * row * self.tiling.row);
-                        micro::correlate(simd, dy, x, offsets, self.length, &mut sums);
+                        let dy = outputs.map(|start| dy.add(start + row * self.length));
+                        let x = taps.add(self.pass.stride * row * self.tiling.row);
+                        micro::correlate::<S, P, T, M, K>(
+                            simd,
+                            dy,
+                            x,
+                            offsets,
+                            self.length,
+                            &mut sums,
+                        );
                     }
                 }
                 for (i, sums) in sums.iter().enumerate().take(self.outputs - m) {

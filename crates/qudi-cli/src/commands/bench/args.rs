@@ -1,9 +1,8 @@
 //! Options of `qudi bench`.
 
 use crate::args::{Network, number};
-use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
-use qudi_model::ComputePrecision;
 use std::path::PathBuf;
 
 /// Measure speed and memory of methods
@@ -30,27 +29,6 @@ pub(crate) struct Bench {
     /// Instead of methods, measure networks of these sizes with random weights: tiny, small, paper-mini, base, paper
     #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
     pub(crate) preset: Vec<String>,
-    /// Numbers that convolutions of these networks multiply, as with train.precision
-    #[arg(long, value_name = "NAME", default_value = "f32", requires = "preset")]
-    pub(crate) precision: PrecisionName,
     #[command(flatten)]
     pub(crate) network: Network,
-}
-
-/// Precisions of products.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum PrecisionName {
-    /// 32 bits
-    F32,
-    /// 16 bits, 8 of them for the value
-    Bf16,
-}
-
-impl PrecisionName {
-    pub(crate) fn precision(self) -> ComputePrecision {
-        match self {
-            Self::F32 => ComputePrecision::F32,
-            Self::Bf16 => ComputePrecision::Bf16,
-        }
-    }
 }

@@ -17,7 +17,7 @@ use qudi_model::config::{NetworkConfig, ReferenceKind};
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::network::{Qudi, Simulated};
 use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
-use qudi_model::with_precision;
+use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::reconstruction;
 use serde::Serialize;
 use serde_json::json;
@@ -58,12 +58,8 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
     }
     let options = args.network.options();
     let device = device::open(&options.device)?;
-    let precision = args.precision.precision();
-    if !precision.is_supported(&device.device) {
-        let what = format!("{} cannot compute with {precision} numbers", device.name);
-        return Err(CliError::new(what, "--precision", "ask for another, or another --device"));
-    }
-    let (steps, sampling) = (options.steps()?, sample_options(&options)?);
+    let (steps, sampling) = (options.steps()?, sample_options(&options, &device)?);
+    let precision = sampling.precision;
     let mut bar = report.bar();
     let mut all = Vec::new();
     for preset in &args.preset {
@@ -74,7 +70,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         all.push(figures);
     }
     drop(bar);
-    report.result(&describe(&all, args, steps, &device), || {
+    report.result(&describe(&all, args, steps, precision, &device), || {
         json!({
             "program": format!("qudi {}", env!("CARGO_PKG_VERSION")),
             "device": device.name,
@@ -211,7 +207,13 @@ fn forward_backward(network: &Qudi, inputs: &Inputs, device: &Device) -> f64 {
     start.elapsed().as_secs_f64()
 }
 
-fn describe(all: &[Figures], args: &Bench, steps: usize, device: &Opened) -> String {
+fn describe(
+    all: &[Figures],
+    args: &Bench,
+    steps: usize,
+    precision: ComputePrecision,
+    device: &Opened,
+) -> String {
     let mut text = format!(
         "{:<8}{:>12}{:>13}{:>9}{:>10}{:>10}{:>10}{:>11}\n",
         "preset",
@@ -249,7 +251,7 @@ fn describe(all: &[Figures], args: &Bench, steps: usize, device: &Opened) -> Str
         steps,
         device.name,
         rayon::current_num_threads(),
-        args.precision.precision(),
+        precision,
         args.rounds
     );
     text

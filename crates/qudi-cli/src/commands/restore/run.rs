@@ -311,6 +311,7 @@ fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Val
         "sampler": options.sampler_name(),
         "samples": options.samples,
         "tile": options.tile,
+        "precision": options.precision(&device::open(&options.device)?)?,
     })))
 }
 

@@ -6,6 +6,7 @@ use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::Report;
 use burn::tensor::Device;
+use qudi_model::MatrixUnits;
 use qudi_train::selftest::{BF16_TOLERANCE, CHECKS, TOLERANCE, Verdict};
 use serde_json::json;
 use std::fmt::Write;
@@ -23,6 +24,10 @@ pub(crate) fn run(args: &Selftest, report: &Report) -> Result<()> {
         return Err(CliError::new("no check of that name", "--only", help));
     }
     let mut text = format!("{} against the stock operations of cpu\n", device.name);
+    let units = (device.name == "cpu").then(MatrixUnits::chosen).transpose()?;
+    if let Some(units) = units {
+        let _ = writeln!(text, "  bf16 is multiplied by {}", in_words(units));
+    }
     let mut results = Vec::new();
     let mut missed = Vec::new();
     let mut bar = report.bar();
@@ -62,11 +67,26 @@ pub(crate) fn run(args: &Selftest, report: &Report) -> Result<()> {
         text,
         "largest difference over the largest value; below {TOLERANCE:.0e} is right, with bf16 below {BF16_TOLERANCE:.0e}"
     );
-    report.result(&text, || json!({"device": device.name, "checks": results}))?;
+    report.result(&text, || {
+        json!({
+            "device": device.name,
+            "matrix_units": units.map(|units| units.to_string()),
+            "checks": results,
+        })
+    })?;
     if missed.is_empty() {
         return Ok(());
     }
     Err(CliError::Missed(format!("{} is wrong in {}", device.name, missed.join(", "))))
+}
+
+fn in_words(units: MatrixUnits) -> String {
+    let what = match units {
+        MatrixUnits::F32 => "numbers are rounded, at no better speed",
+        MatrixUnits::Avx512Bf16 => "the vector unit's products of pairs",
+        MatrixUnits::Amx => "the matrix unit's tiles",
+    };
+    format!("{units}: {what}")
 }
 
 fn word(verdict: Verdict) -> &'static str {

@@ -1,0 +1,231 @@
+//! Convolutions by tiles of a processor's matrix unit (AMX).
+//!
+//! A tile of weights, 16 output channels by up to 16 pairs of planes, times a tile of scratch memory, the
+//! same pairs by 16 neighbouring pixels, adds to 16 channels by 16 pixels. Scratch memory holds pairs of
+//! planes, so a tile's rows are read from there with the plane's stride, at the offset of every tap, and
+//! results lie as planes do: nothing is unfolded or transposed.
+#![allow(unsafe_code)]
+
+use super::run::Tile;
+
+/// Results of a block: two tiles of channels by two of pixels.
+pub(super) const OUTPUTS: usize = 2 * SIDE;
+pub(super) const PIXELS: usize = 2 * SIDE;
+
+/// Rows of a tile, and 32-bit places of a row.
+pub(super) const SIDE: usize = 16;
+
+/// A row of a tile of weights, in one cache line: pairs of planes of one channel.
+#[repr(C, align(64))]
+#[derive(Clone, Debug)]
+pub(super) struct Row(pub(super) [f32; SIDE]);
+
+/// Sums of a block, `[channel][pixel]`.
+#[repr(C, align(64))]
+#[derive(Clone, Debug)]
+pub(super) struct Sums(pub(super) [[f32; PIXELS]; OUTPUTS]);
+
+/// What a block multiplies.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Block<'a> {
+    /// Tiles of weights, one or two (`tiles`) for every offset.
+    pub(super) weights: *const Row,
+    pub(super) tiles: usize,
+    /// The block's first pixel in the first scratch plane.
+    pub(super) pixels: *const f32,
+    /// Where the first plane of a group lies for a tap, in places from `pixels`.
+    pub(super) offsets: &'a [u32],
+    /// Pairs of planes of a group.
+    pub(super) group: usize,
+    /// Places from one scratch plane to the next.
+    pub(super) plane: usize,
+}
+
+/// A matrix unit, or its model.
+pub(super) trait MatrixUnit {
+    /// The sums of a block; with one tile of weights those of the first 16 channels.
+    ///
+    /// # Safety
+    /// The machine must have the unit. All tiles, 32 pixels wide, must be readable.
+    unsafe fn multiply(&self, block: &Block<'_>, sums: &mut Sums);
+}
+
+/// Weights as tiles, `[block][group][tap][tile of channels][channel][pair]`; the last block has one tile of
+/// channels if that is enough.
+pub(super) fn packed(
+    outputs: usize,
+    planes: usize,
+    group: usize,
+    taps: usize,
+    weight: impl Fn(usize, usize, usize) -> f32,
+) -> Vec<Row> {
+    let mut rows = Vec::with_capacity(outputs.next_multiple_of(SIDE) * planes / group * taps);
+    for first in (0..outputs).step_by(OUTPUTS) {
+        for start in (0..planes).step_by(group) {
+            for tap in 0..taps {
+                for channel in first..(first + OUTPUTS).min(outputs.next_multiple_of(SIDE)) {
+                    let pair = |number| {
+                        if number < group { weight(channel, start + number, tap) } else { 0.0 }
+                    };
+                    rows.push(Row(std::array::from_fn(pair)));
+                }
+            }
+        }
+    }
+    rows
+}
+
+/// All blocks of a tile of the image.
+///
+/// # Safety
+/// The machine must have the unit.
+#[inline(always)]
+pub(super) unsafe fn blocks(unit: &impl MatrixUnit, tile: &Tile<'_>, group: usize) {
+    let taps = tile.pass.taps.len();
+    let (start, _, planes) = tile.planes;
+    let mut sums = Sums([[0.0; PIXELS]; OUTPUTS]);
+    for first in (0..tile.weights.outputs).step_by(OUTPUTS) {
+        let tiles = (tile.weights.outputs - first).div_ceil(SIDE).min(2);
+        let before = first / SIDE * planes / group + tiles * start / group;
+        let weights = &tile.weights.tiles[before * taps * SIDE..];
+        debug_assert!(weights.len() >= tiles * tile.offsets.len() * SIDE);
+        for row in 0..tile.size[0] {
+            for column in (0..tile.size[1]).step_by(PIXELS) {
+                let base = tile.pass.stride * row * tile.tiling.row + column;
+                // SAFETY: a scratch row holds whole blocks past the tile's last column.
+                unsafe {
+                    let block = Block {
+                        weights: weights.as_ptr(),
+                        tiles,
+                        pixels: tile.scratch.as_ptr().add(base),
+                        offsets: tile.offsets,
+                        group,
+                        plane: tile.tiling.plane(),
+                    };
+                    unit.multiply(&block, &mut sums);
+                }
+                let count = PIXELS.min(tile.size[1] - column);
+                for (m, sums) in sums.0.iter_mut().enumerate().take(tile.weights.outputs - first) {
+                    tile.finish(first + m, row, column, &mut sums[..count]);
+                }
+            }
+        }
+    }
+}
+
+/// The unit's sums by plain loops: what tests on machines without it check the rest with.
+#[derive(Debug)]
+pub(super) struct Model;
+
+impl MatrixUnit for Model {
+    unsafe fn multiply(&self, block: &Block<'_>, sums: &mut Sums) {
+        let halves = |bits: f32| {
+            let bits = bits.to_bits();
+            [f32::from_bits(bits << 16), f32::from_bits(bits & 0xffff_0000)]
+        };
+        for (channel, sums) in sums.0.iter_mut().enumerate().take(block.tiles * SIDE) {
+            sums.fill(0.0);
+            for (step, &offset) in block.offsets.iter().enumerate() {
+                for plane in 0..block.group {
+                    // SAFETY: the caller's promise.
+                    let weight = unsafe {
+                        (*block.weights.add(step * block.tiles * SIDE + channel)).0[plane]
+                    };
+                    let weight = halves(weight);
+                    for (pixel, sum) in sums.iter_mut().enumerate() {
+                        // SAFETY: the caller's promise.
+                        let value = unsafe {
+                            *block.pixels.add(offset as usize + plane * block.plane + pixel)
+                        };
+                        let value = halves(value);
+                        *sum += weight[0] * value[0] + weight[1] * value[1];
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::conv::{Geometry, native};
+    use crate::matrix_units::{MatrixUnits, with_matrix_units};
+
+    /// Repeatable numbers in [-1, 1).
+    fn numbers(seed: usize, count: usize) -> Vec<f32> {
+        let mut state = (seed as u32).wrapping_mul(2_654_435_769) | 1;
+        let mut next = || {
+            state ^= state << 13;
+            state ^= state >> 17;
+            state ^= state << 5;
+            state as f32 / 2f32.powi(31) - 1.0
+        };
+        (0..count).map(|_| next()).collect()
+    }
+
+    fn assert_close(got: &[f32], expected: &[f32], about: &Geometry) {
+        let scale = expected.iter().fold(1e-3f32, |scale, value| scale.max(value.abs()));
+        assert_eq!(got.len(), expected.len(), "{about:?}");
+        for (got, expected) in got.iter().zip(expected) {
+            assert!((got - expected).abs() < 3e-6 * scale, "{got} and {expected}: {about:?}");
+        }
+    }
+
+    /// Sums over tiles, by the model of the matrix unit, are those over rounded numbers.
+    #[test]
+    fn tiles_cover_every_shape() {
+        // Channels of the inputs, outputs, frames, rows, columns, kernel, stride.
+        let shapes: [(&[usize], usize, usize, [usize; 2], [usize; 3], usize); 9] = [
+            (&[1], 1, 1, [1, 1], [1, 1, 1], 1),
+            (&[3, 4], 5, 2, [7, 9], [1, 3, 3], 1),
+            (&[32], 32, 1, [5, 33], [1, 3, 3], 1),
+            (&[33, 8], 17, 2, [12, 70], [1, 3, 3], 2),
+            (&[40], 40, 1, [16, 16], [1, 3, 3], 1),
+            (&[120], 48, 1, [9, 31], [1, 1, 1], 1),
+            (&[16], 33, 2, [20, 21], [1, 7, 7], 1),
+            (&[2], 16, 5, [11, 13], [5, 5, 5], 1),
+            (&[300, 40], 40, 1, [40, 130], [1, 3, 3], 1), // more planes than scratch memory holds at once
+        ];
+        for (seed, (channels, outputs, frames, grid, kernel, stride)) in
+            shapes.into_iter().enumerate()
+        {
+            let geometry = Geometry {
+                images: 2 * frames,
+                frames,
+                channels: channels.to_vec(),
+                height: grid[0],
+                width: grid[1],
+                outputs,
+                kernel,
+                stride,
+                addend: true,
+                relu: true,
+                bf16: true,
+            };
+            let plane = geometry.images * grid[0] * grid[1];
+            let results = geometry.images * geometry.output_grid().iter().product::<usize>();
+            let inputs = channels.iter().enumerate();
+            let mut inputs: Vec<_> =
+                inputs.map(|(i, c)| numbers(10 * seed + i, c * plane)).collect();
+            inputs.push(numbers(10 * seed + 5, outputs * results));
+            let inputs: Vec<&[f32]> = inputs.iter().map(Vec::as_slice).collect();
+            let weight = numbers(10 * seed + 6, outputs * geometry.taps());
+            let bias = numbers(10 * seed + 7, outputs);
+            let gradient = numbers(10 * seed + 8, outputs * results);
+            let run = |units| {
+                let run = || {
+                    let output = native::forward(&geometry, &inputs, &weight, &bias);
+                    let of_inputs =
+                        native::input_gradients(&geometry, &weight, &gradient, Some(&gradient));
+                    (output, of_inputs)
+                };
+                with_matrix_units(units, run).expect("the model is there")
+            };
+            let ((output, of_inputs), expected) = (run(MatrixUnits::Amx), run(MatrixUnits::F32));
+            assert_close(&output, &expected.0, &geometry);
+            for (got, expected) in of_inputs.iter().zip(&expected.1) {
+                assert_close(got, expected, &geometry);
+            }
+        }
+    }
+}

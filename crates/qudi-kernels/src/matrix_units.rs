@@ -1,0 +1,170 @@
+//! The processor's units for products of bfloat16, and which of them convolutions use.
+#![allow(unsafe_code)]
+
+use crate::backend::Switch;
+use std::cell::Cell;
+use std::fmt;
+use std::str::FromStr;
+use std::sync::OnceLock;
+
+/// What multiplies bfloat16 in convolutions on the processor. Sums have 32 bits with each of them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MatrixUnits {
+    /// None: numbers are rounded to bfloat16, then multiplied with 32 bits, at no better speed.
+    F32,
+    /// The vector unit's products of pairs (AVX512-BF16).
+    Avx512Bf16,
+    /// Tiles of 16 x 32 values (AMX).
+    Amx,
+}
+
+/// Units that cannot be used.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum MatrixUnitsError {
+    /// No units have this name.
+    Unknown(String),
+    /// This processor, or its operating system, has no such units.
+    Unavailable(MatrixUnits),
+}
+
+impl fmt::Display for MatrixUnitsError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unknown(name) => write!(f, "there are no matrix units called `{name}`"),
+            Self::Unavailable(units) => {
+                write!(f, "this processor or its operating system lacks the matrix units {units}")
+            }
+        }
+    }
+}
+
+impl std::error::Error for MatrixUnitsError {}
+
+impl fmt::Display for MatrixUnits {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::Avx512Bf16 => "avx512bf16",
+            Self::Amx => "amx",
+        })
+    }
+}
+
+impl FromStr for MatrixUnits {
+    type Err = MatrixUnitsError;
+
+    fn from_str(name: &str) -> Result<Self, MatrixUnitsError> {
+        [Self::F32, Self::Avx512Bf16, Self::Amx]
+            .into_iter()
+            .find(|units| units.to_string() == name)
+            .ok_or_else(|| MatrixUnitsError::Unknown(name.into()))
+    }
+}
+
+thread_local! {
+    /// Units that this thread was told to use.
+    static TOLD: Cell<Option<MatrixUnits>> = const { Cell::new(None) };
+}
+
+impl MatrixUnits {
+    /// The environment variable that forces one of them.
+    pub const VARIABLE: &str = "QUDI_KERNELS";
+
+    /// Whether this machine has them.
+    pub fn is_available(self) -> bool {
+        match self {
+            Self::F32 => true,
+            Self::Avx512Bf16 => vectors_of_pairs(),
+            Self::Amx => {
+                static AMX: OnceLock<bool> = OnceLock::new();
+                // Tests of this crate run a model of it.
+                cfg!(test) || *AMX.get_or_init(|| vectors_of_pairs() && tiles())
+            }
+        }
+    }
+
+    /// The best that this machine has, or those that `QUDI_KERNELS` names.
+    ///
+    /// # Errors
+    /// [`MatrixUnitsError`] if the variable names none, or some that this machine lacks.
+    pub fn chosen() -> Result<Self, MatrixUnitsError> {
+        static CHOSEN: OnceLock<Result<MatrixUnits, MatrixUnitsError>> = OnceLock::new();
+        let choose = || match std::env::var(Self::VARIABLE) {
+            Ok(name) => {
+                let units: Self = name.parse()?;
+                let available = units.is_available();
+                if available { Ok(units) } else { Err(MatrixUnitsError::Unavailable(units)) }
+            }
+            Err(_) => Ok([Self::Amx, Self::Avx512Bf16]
+                .into_iter()
+                .find(|units| units.is_available())
+                .unwrap_or(Self::F32)),
+        };
+        CHOSEN.get_or_init(choose).clone()
+    }
+
+    /// Those that a convolution on this thread uses.
+    pub(crate) fn current() -> Self {
+        TOLD.get().unwrap_or_else(|| Self::chosen().unwrap_or(Self::F32))
+    }
+}
+
+/// Runs `run` with these units on this thread.
+///
+/// # Errors
+/// [`MatrixUnitsError::Unavailable`] if this machine lacks them.
+pub fn with_matrix_units<T>(
+    units: MatrixUnits,
+    run: impl FnOnce() -> T,
+) -> Result<T, MatrixUnitsError> {
+    if !units.is_available() {
+        return Err(MatrixUnitsError::Unavailable(units));
+    }
+    let _switch = Switch::turn(&TOLD, Some(units));
+    Ok(run())
+}
+
+#[cfg(target_arch = "x86_64")]
+fn vectors_of_pairs() -> bool {
+    pulp::x86::V4::is_available() && is_x86_feature_detected!("avx512bf16")
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn vectors_of_pairs() -> bool {
+    false
+}
+
+/// Whether there are tiles, and the operating system lets this process use them.
+#[cfg(all(feature = "flex", target_arch = "x86_64", target_os = "linux"))]
+fn tiles() -> bool {
+    use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
+    /// Bits of leaf 7: tiles, and their products of bfloat16.
+    const AMX: u32 = 1 << 24 | 1 << 22;
+    /// The state of tiles in XCR0: configuration and data.
+    const STATE: u64 = 1 << 17 | 1 << 18;
+    /// `ARCH_REQ_XCOMP_PERM` of Linux, and the component of tile data.
+    const REQUEST: libc::c_long = 0x1023;
+    const TILE_DATA: libc::c_long = 18;
+
+    #[target_feature(enable = "xsave")]
+    fn enabled() -> u64 {
+        // SAFETY: the register 0 exists wherever the instruction does.
+        unsafe { _xgetbv(0) }
+    }
+    let present = __cpuid(0).eax >= 7 && __cpuid_count(7, 0).edx & AMX == AMX;
+    if !present || !is_x86_feature_detected!("xsave") {
+        return false;
+    }
+    // SAFETY: the processor has the instruction, as was asked.
+    if unsafe { enabled() } & STATE != STATE {
+        return false;
+    }
+    // SAFETY: the call takes two numbers and touches no memory of ours.
+    let permitted = unsafe { libc::syscall(libc::SYS_arch_prctl, REQUEST, TILE_DATA) } == 0;
+    permitted && crate::conv::tiles_multiply()
+}
+
+#[cfg(not(all(feature = "flex", target_arch = "x86_64", target_os = "linux")))]
+fn tiles() -> bool {
+    false
+}
