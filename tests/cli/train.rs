@@ -2,6 +2,7 @@
 
 use crate::support::{listing, refused, run, scratch};
 use image::{GrayImage, Luma};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Settings that make `tiny` a matter of seconds.
@@ -192,4 +193,57 @@ fn rejects_impossible_recipes_and_folders() {
     }
     std::fs::write(folder.join("taken"), "a file").unwrap();
     refused(&folder, "train tiny -o taken", &["taken"]);
+}
+
+/// Stages go on from each other, skip what is done, and touch nothing but what they name.
+#[test]
+fn stages_train_one_after_the_other() {
+    let folder = with_reference_recipe("train-stages");
+    let mut recipe = std::fs::read_to_string(folder.join("reference.toml")).unwrap();
+    recipe.push_str(
+        "
+[[stage]]
+name = \"first\"
+changes = { \"network.pre.stages\" = 1, \"train.loss.prediction\" = 0.0, \"train.loss.flow\" = 0.0 }
+
+[[stage]]
+name = \"second\"
+changes = { \"network.pre.stages\" = 2, \"train.loss.prediction\" = 0.0, \"train.loss.flow\" = 0.0 }
+
+[[stage]]
+name = \"rest\"
+changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.loss.pre\" = 0.0, \"train.loss.flow\" = 0.0, \"train.seed\" = 7 }
+",
+    );
+    std::fs::write(folder.join("stages.toml"), recipe).unwrap();
+    run(&folder, &format!("train stages.toml -o run {QUICK}"));
+    let names = listing(&folder.join("run"));
+    assert_eq!(names, ["1-first", "2-second", "3-rest", "recipe.toml", "weights.safetensors"]);
+    let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    let whole = read("run/weights.safetensors");
+    assert!(whole == read("run/3-rest/weights.safetensors"));
+    // Only the U-Net has learnt in the last stage.
+    let tensors = |name: &str| {
+        let bytes = read(name);
+        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        let tensors = file.tensors().into_iter();
+        tensors.map(|(name, view)| (name, view.data().to_vec())).collect::<BTreeMap<_, _>>()
+    };
+    let (before, after) =
+        (tensors("run/2-second/weights.safetensors"), tensors("run/3-rest/weights.safetensors"));
+    assert_eq!(before.len(), after.len());
+    let changed = after.iter().filter(|(name, values)| before[*name] != **values);
+    let changed: Vec<&String> = changed.map(|(name, _)| name).collect();
+    assert!(!changed.is_empty() && changed.iter().all(|n| n.starts_with("unet.")), "{changed:?}");
+    // Killed in the second stage: the rest comes out the same.
+    std::fs::remove_dir_all(folder.join("run/3-rest")).unwrap();
+    std::fs::remove_file(folder.join("run/weights.safetensors")).unwrap();
+    std::fs::remove_dir_all(folder.join("run/2-second/state")).unwrap();
+    run(&folder, "train -o run --resume --device cpu -q");
+    assert!(whole == read("run/weights.safetensors"));
+    refused(&folder, &format!("train stages.toml -o run {QUICK}"), &["--resume", "--force"]);
+    refused(&folder, "train stages.toml --bursts b --draw-only", &["--draw-only"]);
+    let learns = format!("train tiny -o other {QUICK} --set");
+    refused(&folder, &format!("{learns} train.learns=[\"unet\"]"), &["train.learns"]);
+    refused(&folder, &format!("{learns} train.learns=[\"eyes\"]"), &["eyes"]);
 }

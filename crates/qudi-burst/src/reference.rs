@@ -15,6 +15,7 @@ use crate::motion::hypotheses::{select_on_counts, select_on_estimates};
 use crate::motion::reference_frames::ReferenceFrames;
 use crate::patch::padded;
 use crate::prepared_burst::PreparedBurst;
+use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
@@ -66,15 +67,20 @@ impl ReferenceEstimate {
         let velocity = ConstantVelocity::find(&burst, 0.0);
 
         // Restores all frames with stabilized variance.
-        let restored =
-            |merge: &dyn Fn(usize) -> MergedFrame, frames: &[usize], search, sigma_factor: f64| {
-                let restore = |frame: usize| {
-                    let MergedFrame { counts, noise, .. } = merge(frame);
-                    let sigma = sigma_factor * (frame_count as f64 * noise).sqrt();
-                    denoise(search, vst.stabilized(&counts), &vst, sigma)
-                };
-                frames.iter().map(|&frame| restore(frame)).collect::<Vec<Frame>>()
+        let restored = |stage: &'static str,
+                        merge: &dyn Fn(usize) -> MergedFrame,
+                        frames: &[usize],
+                        search,
+                        sigma_factor: f64|
+         -> Result<Vec<Frame>> {
+            let restore = |(number, &frame): (usize, &usize)| {
+                progress(stage, number, frames.len())?;
+                let MergedFrame { counts, noise, .. } = merge(frame);
+                let sigma = sigma_factor * (frame_count as f64 * noise).sqrt();
+                Ok(denoise(search, vst.stabilized(&counts), &vst, sigma))
             };
+            frames.iter().enumerate().map(restore).collect()
+        };
         let mean_counts = |z: &Frame| {
             let mean = |&z: &f32| vst.mean_count(f64::from(z)) as f32;
             let means: Vec<f32> = z.data.iter().map(mean).collect();
@@ -91,7 +97,8 @@ impl ReferenceEstimate {
             MergedFrame::from_blocks(&burst, &blocks, &motion, qbp.settings.wiener_c)
         };
         let all: Vec<usize> = (0..frame_count).collect();
-        let first = restored(&merge, &all, FIRST_SEARCH, qbp.settings.bm3d_sigma_factor);
+        let factor = qbp.settings.bm3d_sigma_factor;
+        let first = restored("first estimate", &merge, &all, FIRST_SEARCH, factor)?;
 
         let first = first.iter().map(mean_counts).collect();
         let references = ReferenceFrames::new(&burst, first, FIRST_PASS_ERROR);
@@ -101,7 +108,7 @@ impl ReferenceEstimate {
             let motion = select_on_estimates(&burst, velocity, &references, reference, matched);
             MergedFrame::on_reference_frames(&burst, &references, reference, &motion, WIENER_C)
         };
-        let second = restored(&merge, wanted, SECOND_SEARCH, SIGMA_FACTOR);
+        let second = restored("second estimate", &merge, wanted, SECOND_SEARCH, SIGMA_FACTOR)?;
 
         let frames = second.iter().map(|z| image(z, &vst, acquisition, ordinary_dark)).collect();
         let mean_counts = second.iter().map(mean_counts).collect();

@@ -109,5 +109,6 @@ pub(crate) mod train {
     mod report;
     mod resume;
     pub(crate) mod run;
+    mod stages;
     mod watch;
 }

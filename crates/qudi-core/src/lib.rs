@@ -28,6 +28,7 @@ mod frame;
 mod light;
 pub mod limits;
 pub mod metrics;
+pub mod progress;
 pub mod random;
 pub mod restorer;
 pub mod sensor;

@@ -10,6 +10,7 @@ use crate::network::{PreDenoiser, Qudi};
 use crate::restorer::tiling::Tiling;
 use burn::tensor::{Device, Tensor};
 use qudi_burst::{AlignedBurst, ReferenceEstimate};
+use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Frame, Result};
 
@@ -53,8 +54,14 @@ impl RefinementStage {
     pub fn restore(&self, burst: &AlignedBurst<'_>) -> Result<Vec<Frame>> {
         let tiling = Tiling::new(burst.size(), self.fold, self.tile);
         let predenoise = |aligned: &AlignedTensors| vec![self.predenoiser.predenoise(aligned)];
-        let PredenoisedFrames { frames, noise_sigmas, .. } =
-            predenoise_frames(burst, self.neighbours, &tiling, &self.device, predenoise)?;
+        let PredenoisedFrames { frames, noise_sigmas, .. } = predenoise_frames(
+            "refining",
+            burst,
+            self.neighbours,
+            &tiling,
+            &self.device,
+            predenoise,
+        )?;
         Ok(filter_over_time(burst, frames, noise_sigmas, MAX_IMAGE as f32))
     }
 }
@@ -87,9 +94,10 @@ pub(crate) struct PredenoisedFrames {
     pub(crate) noise_sigmas: Vec<Frame>,
 }
 
-/// Pre-denoises the frames of a window one by one. `predenoise` gives the frame, and its uncertainty if
+/// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and its uncertainty if
 /// predicted.
 pub(crate) fn predenoise_frames(
+    stage: &'static str,
     burst: &AlignedBurst<'_>,
     neighbours: AlignedNeighbours,
     tiling: &Tiling,
@@ -98,6 +106,7 @@ pub(crate) fn predenoise_frames(
 ) -> Result<PredenoisedFrames> {
     let mut all = PredenoisedFrames::default();
     for number in 0..burst.frame_count() {
+        progress(stage, number, burst.frame_count())?;
         let frame = neighbours.frame(burst, number);
         all.noise_sigmas.push(frame.noise_sigma.clone());
         let planes = AlignedPlanes::from_frame(frame).map(|plane| tiling.padded(plane));

@@ -15,11 +15,15 @@ impl Ema {
         Self { decay, average: parameters }
     }
 
-    /// Moves the average towards `parameters`, after `steps` steps before this one.
-    pub(super) fn update(&mut self, parameters: &[Tensor<1>], steps: u64) {
+    /// Moves the average towards `parameters`, after `steps` steps before this one. What does not learn stays
+    /// as it is: an average of equal numbers is not always that number.
+    pub(super) fn update(&mut self, parameters: &[Tensor<1>], learns: &[bool], steps: u64) {
         // An average over few steps at first, or the initial weights would stay in it for long.
         let keep = self.decay.min((1 + steps) as f64 / (10 + steps) as f64);
-        let average = std::mem::take(&mut self.average).into_iter().zip(parameters);
-        self.average = average.map(|(a, b)| a * keep + b.clone() * (1.0 - keep)).collect();
+        for ((a, b), _) in
+            self.average.iter_mut().zip(parameters).zip(learns).filter(|(_, learns)| **learns)
+        {
+            *a = a.clone() * keep + b.clone() * (1.0 - keep);
+        }
     }
 }

@@ -30,7 +30,9 @@ pub use burst_cache::{BurstSampler, Files, draw_bursts};
 pub use optimizer::{Adam, learning_rate};
 pub use parameters::{gradients, parameters, with_parameters};
 pub use prefetch::Prefetcher;
-pub use recipe::{CropsConfig, LossConfig, Recipe, TrainConfig, ValidationConfig};
+pub use recipe::{
+    CropsConfig, LearningPart, LossConfig, Recipe, StageConfig, TrainConfig, ValidationConfig,
+};
 pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};

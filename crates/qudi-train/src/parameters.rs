@@ -24,6 +24,22 @@ pub fn with_parameters(network: Qudi, values: Vec<Tensor<1>>) -> Qudi {
     network.map(&mut Replace { values: values.into_iter() })
 }
 
+/// The network with gradients for those parameters alone that learn, in the order of [`parameters`].
+pub(super) fn with_frozen(network: Qudi, learns: &[bool]) -> Qudi {
+    network.map(&mut Freeze { learns: learns.iter() })
+}
+
+struct Freeze<'a> {
+    learns: std::slice::Iter<'a, bool>,
+}
+
+impl ModuleMapper for Freeze<'_> {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let learns = self.learns.next().expect("one answer for every parameter");
+        param.set_require_grad(*learns)
+    }
+}
+
 struct Collect<'a> {
     gradients: Option<&'a Gradients>,
     list: Vec<Tensor<1>>,

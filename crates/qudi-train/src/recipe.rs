@@ -1,5 +1,7 @@
 //! Recipes: everything that decides what a training gives, in one TOML document.
 
+mod stage;
+
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 use crate::loss::lpips::PerceptualKind;
 use crate::loss::{LossForm, TimestepLaw};
@@ -11,6 +13,8 @@ use qudi_model::config::{NetworkConfig, PRESETS};
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+
+pub use stage::{LearningPart, StageConfig};
 
 /// A recipe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,6 +29,9 @@ pub struct Recipe {
     /// How its progress is measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub validation: Option<ValidationConfig>,
+    /// Trainings one after the other, each from the weights of the one before; without any, one training.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub stage: Vec<StageConfig>,
 }
 
 /// How the network learns.
@@ -52,6 +59,9 @@ pub struct TrainConfig {
     pub warmup: u64,
     /// Largest norm of a step's gradient; longer ones are shortened.
     pub clip: f64,
+    /// Parts of the network that learn; all if none is named. Others stay as they are, bit for bit.
+    #[serde(default)]
+    pub learns: Vec<LearningPart>,
     /// Numbers that convolutions multiply.
     #[serde(default)]
     pub precision: ComputePrecision,
@@ -166,11 +176,17 @@ impl Recipe {
         let mut document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
         modernize(&mut document, "");
-        for (key, value) in changes {
-            set(&mut document, &modern_key(key), value)?;
+        for (key, text) in changes {
+            set(&mut document, &modern_key(key), value(text))?;
         }
-        let recipe: Self =
+        let mut recipe: Self =
             document.try_into().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
+        // What is changed here is changed in every stage.
+        for stage in &mut recipe.stage {
+            for (key, text) in changes.iter().filter(|(key, _)| !key.starts_with("stage.")) {
+                stage.changes.insert(modern_key(key), value(text));
+            }
+        }
         recipe.checked()
     }
 
@@ -239,13 +255,6 @@ impl Recipe {
                 "must be from 0 to train.lr",
             ),
             ("train.clip", train.clip > 0.0, "must be above 0"),
-            (
-                "train.gradient_checkpointing",
-                !train.gradient_checkpointing
-                    || train.loss.prediction > 0.0
-                    || train.loss.term != PerceptualKind::None,
-                "must be false where pre-denoiser and flow learn alone: nothing is computed again there",
-            ),
             ("train.ema", share(train.ema), "must be from 0 to below 1"),
             (
                 "train.noise_start_fraction",
@@ -267,7 +276,9 @@ impl Recipe {
                 "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
             ),
         ];
-        for (key, good, problem) in rules {
+        let named = stage::have_good_names(&self.stage);
+        let stages = ("stage", named, "must have names of a-z, 0-9 and -, each its own");
+        for (key, good, problem) in rules.into_iter().chain(stage::rules(train)).chain([stages]) {
             if !good {
                 let what = format!("{key} {problem}");
                 return Err(Error::request(what, key, "correct the recipe"));
@@ -288,6 +299,7 @@ impl Recipe {
                 ));
             }
         }
+        self.stages()?;
         Ok(Self { network, data, ..self })
     }
 
@@ -388,15 +400,19 @@ fn modern_key(key: &str) -> String {
     modern.join(".")
 }
 
+/// A value of TOML, or a word as text.
+fn value(text: &str) -> toml::Value {
+    let value = format!("v = {text}").parse::<toml::Table>().ok();
+    let value = value.and_then(|mut table| table.remove("v"));
+    value.unwrap_or_else(|| toml::Value::String(text.to_owned()))
+}
+
 /// Sets a key below tables; numbers name the elements of a list, as in `data.source.0.weight`.
-fn set(document: &mut toml::Table, key: &str, text: &str) -> Result<()> {
+fn set(document: &mut toml::Table, key: &str, value: toml::Value) -> Result<()> {
     let unknown = || {
         let help = "name keys of the recipe, as in train.steps or data.source.0.weight";
         Error::request(format!("`{key}` is no key of the recipe"), key, help)
     };
-    let value = format!("v = {text}").parse::<toml::Table>().ok();
-    let value = value.and_then(|mut table| table.remove("v"));
-    let value = value.unwrap_or_else(|| toml::Value::String(text.to_owned()));
     let (path, last) = key.rsplit_once('.').ok_or_else(unknown)?;
     let mut parts = path.split('.');
     let first = parts.next().ok_or_else(unknown)?;

@@ -114,6 +114,14 @@ impl Run {
         state::exists(folder)
     }
 
+    /// Steps taken by the state in a folder.
+    ///
+    /// # Errors
+    /// [`Error`] if there is none, or it is damaged.
+    pub fn steps_taken(folder: &Path) -> Result<u64> {
+        state::steps_taken(folder)
+    }
+
     /// Steps taken, and in all.
     pub fn progress(&self) -> [u64; 2] {
         [self.trainer.step_number(), self.recipe.train.steps]

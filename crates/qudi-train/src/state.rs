@@ -106,23 +106,10 @@ impl Trainer {
         devices: &[Device],
         backbones: Option<&Path>,
     ) -> Result<Self> {
-        let [state, _, old] = names(run);
-        // Killed between two renames: the old state is the whole one.
-        let folder = if state.exists() { state } else { old };
-        let damaged = |what: String| {
-            Error::data(
-                format!("the training state cannot be used: {what}"),
-                &folder,
-                "start a new run in another folder from this run's weights.safetensors",
-            )
-        };
-        let open = |name: &str| {
-            let path = folder.join(name);
-            std::fs::read(&path).map_err(|e| Error::io("read the training state", &path, e))
-        };
-        let counters: Counters =
-            serde_json::from_slice(&open(COUNTERS)?).map_err(|e| damaged(e.to_string()))?;
-        let bytes = open(TENSORS)?;
+        let folder = last(run);
+        let damaged = |what: String| damaged(&folder, &what);
+        let counters = counters(&folder)?;
+        let bytes = open(&folder, TENSORS)?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
         let mut trainer = Self::new(recipe, None, devices, backbones)?;
         let names = parameter_shapes(&trainer.network);
@@ -149,6 +136,36 @@ impl Trainer {
         trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
         Ok(trainer)
     }
+}
+
+/// The last whole state of a run.
+fn last(run: &Path) -> PathBuf {
+    let [state, _, old] = names(run);
+    // Killed between two renames: the old state is the whole one.
+    if state.exists() { state } else { old }
+}
+
+fn damaged(folder: &Path, what: &str) -> Error {
+    Error::data(
+        format!("the training state cannot be used: {what}"),
+        folder,
+        "start a new run in another folder from this run's weights.safetensors",
+    )
+}
+
+fn open(folder: &Path, name: &str) -> Result<Vec<u8>> {
+    let path = folder.join(name);
+    std::fs::read(&path).map_err(|e| Error::io("read the training state", &path, e))
+}
+
+fn counters(folder: &Path) -> Result<Counters> {
+    let bytes = open(folder, COUNTERS)?;
+    serde_json::from_slice(&bytes).map_err(|e| damaged(folder, &e.to_string()))
+}
+
+/// Steps that the state of a run has taken.
+pub(super) fn steps_taken(run: &Path) -> Result<u64> {
+    Ok(counters(&last(run))?.step)
 }
 
 /// Whether a folder holds a state to go on from.

@@ -3,9 +3,9 @@
 use super::batch::Batch;
 use super::ema::Ema;
 use super::optimizer::{Adam, learning_rate};
-use super::parameters::{gradients, parameters, with_parameters};
+use super::parameters::{gradients, parameters, with_frozen, with_parameters};
 use super::prefetch::Prefetcher;
-use super::recipe::{LossConfig, Recipe};
+use super::recipe::{LearningPart, LossConfig, Recipe};
 use crate::loss::lpips::Lpips;
 use crate::loss::{LoopOptions, LossTerms, LossWeights, SelfConditioning, loss_terms};
 use burn::module::Module;
@@ -13,7 +13,7 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
 use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::config::Part;
-use qudi_model::network::Qudi;
+use qudi_model::network::{Qudi, parameter_shapes};
 use qudi_model::tensor::read;
 use rand::rngs::ChaCha8Rng;
 use rand::{Rng, SeedableRng};
@@ -72,6 +72,8 @@ pub struct Trainer {
     pub(super) ema: Ema,
     pub(super) adam: Adam,
     perceptual: Vec<Lpips>,
+    /// Whether each parameter learns.
+    learns: Vec<bool>,
 }
 
 /// The gradients and losses of one batch, and the seconds that they took.
@@ -106,6 +108,8 @@ impl Trainer {
         if let Some(network) = network {
             learner = with_parameters(learner, parameters(&network));
         }
+        let learns = learning(&learner, &recipe.train.learns);
+        learner = with_frozen(learner, &learns);
         let start = parameters(&learner);
         let (_, side) = recipe.sample_size();
         let mut perceptual = Vec::new();
@@ -122,6 +126,7 @@ impl Trainer {
             network: learner,
             devices,
             perceptual,
+            learns,
         })
     }
 
@@ -137,10 +142,7 @@ impl Trainer {
 
     /// The network with averaged weights, for use.
     pub fn averaged(&self) -> Qudi {
-        let network = self.network.valid();
-        // Refinement stages do not learn, and an average of equal numbers is not always that number.
-        let stages = network.stages().to_vec();
-        with_parameters(network, self.ema.average.clone()).with_stages(stages)
+        with_parameters(self.network.valid(), self.ema.average.clone())
     }
 
     /// Takes one step.
@@ -175,7 +177,7 @@ impl Trainer {
         let lr = learning_rate(train, taken);
         let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
         let moved = self.adam.step(parameters(&self.network), gradients, scale, lr);
-        self.ema.update(&moved, taken);
+        self.ema.update(&moved, &self.learns, taken);
         self.network = with_parameters(self.network.clone(), moved);
         let optimizer_s = start.elapsed().as_secs_f64();
         Ok(StepReport {
@@ -206,6 +208,7 @@ impl Trainer {
                     let weights = weights.into_iter().map(|w| w.to_device(&inner)).collect();
                     let network =
                         with_parameters(self.recipe.network.uninitialized(device), weights);
+                    let network = with_frozen(network, &self.learns);
                     mine.map(|(at, batch)| Ok((at, self.pass(&network, batch, number)?))).collect()
                 }
             };
@@ -289,6 +292,15 @@ impl Trainer {
             "lower train.lr or train.clip, and resume from the checkpoint",
         ))
     }
+}
+
+/// Whether each parameter of a network learns. Refinement stages never do.
+fn learning(network: &Qudi, parts: &[LearningPart]) -> Vec<bool> {
+    let learns = |name: &str| {
+        let chosen = parts.is_empty() || parts.iter().any(|part| part.has(name));
+        chosen && !name.starts_with("stages.")
+    };
+    parameter_shapes(network).iter().map(|(name, _)| learns(name)).collect()
 }
 
 impl LossValues {

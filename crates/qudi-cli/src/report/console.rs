@@ -5,10 +5,12 @@ use crate::args::{Color, Global};
 use crate::error::{CliError, Result, stdout_error};
 use crate::interrupt;
 use crate::report::json::document;
-use crate::report::printable;
+use crate::report::{duration, printable};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use qudi_core::progress::Progress;
 use std::io::{IsTerminal, Write};
 use std::process::ExitCode;
+use std::time::Instant;
 use tracing_subscriber::EnvFilter;
 
 /// Prints what a run has to say, as its options ask.
@@ -95,9 +97,9 @@ impl Report {
         let target =
             if shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(None, target);
-        let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {per_sec} {eta}");
+        let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}");
         bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Bar { bar, tenth: 0 }
+        Bar { line: bar, tenth: 0, work: Work::default() }
     }
 
     /// Prints an error and returns the exit code of the program.
@@ -144,50 +146,93 @@ pub(crate) fn print(text: &str) -> Result<()> {
 /// Shows the progress of one command.
 #[derive(Debug)]
 pub(crate) struct Bar {
-    bar: ProgressBar,
+    line: ProgressBar,
     tenth: u64,
+    work: Work,
+}
+
+/// The work that a bar shows.
+#[derive(Debug, Default)]
+struct Work {
+    what: &'static str,
+    /// When it was heard of first, and how much of it was done then.
+    start: Option<(Instant, u64)>,
+    /// Its speed and the time left, in words.
+    speed: String,
+}
+
+impl Work {
+    fn measure(&mut self, done: u64, total: Option<u64>) {
+        let (start, before) = *self.start.get_or_insert_with(|| (Instant::now(), done));
+        let (seconds, made) = (start.elapsed().as_secs_f64(), done.saturating_sub(before) as f64);
+        if made == 0.0 || seconds == 0.0 {
+            return;
+        }
+        let rate = made / seconds;
+        self.speed = if rate >= 1.0 {
+            format!(", {rate:.1} a second")
+        } else {
+            format!(", {:.1} s each", 1.0 / rate)
+        };
+        if let Some(left) = total.map(|total| total.saturating_sub(done)).filter(|&left| left > 0) {
+            self.speed += &format!(", {} left", duration(left as f64 / rate));
+        }
+    }
 }
 
 impl Bar {
     /// Shows how far the work `what` has come; another `what` starts at zero.
     pub(crate) fn update(&mut self, what: &'static str, done: u64, total: Option<u64>) {
-        if self.bar.message() != what {
-            self.bar.set_message(what);
-            self.bar.reset();
+        if self.work.what != what {
+            self.work = Work { what, ..Work::default() };
+            self.line.reset();
             self.tenth = 0;
         }
+        self.work.measure(done, total);
+        let speed = self.work.speed.clone();
+        self.line.set_message(format!("{what}{speed}"));
         if let Some(total) = total {
-            self.bar.set_length(total);
+            self.line.set_length(total);
         }
-        self.bar.set_position(done);
+        self.line.set_position(done);
         let tenth = total.map_or(done / 100, |total| 10 * done / total.max(1));
         if tenth > self.tenth {
             self.tenth = tenth;
             let total = total.map_or("?".to_owned(), |total| total.to_string());
-            tracing::info!("{what}: {done}/{total} frames");
+            tracing::info!("{what}: {done}/{total} frames{speed}");
+        }
+    }
+
+    /// Shows what is done for the next frames of the work.
+    pub(crate) fn stage(&self, progress: Progress) {
+        let Progress { stage, done, total } = progress;
+        let Work { what, speed, .. } = &self.work;
+        self.line.set_message(format!("{what}{speed}: {stage} {done}/{total}"));
+        if done == 0 {
+            tracing::info!("{stage} of {total}");
         }
     }
 
     /// Shows the progress of training, with figures in `words`.
     pub(crate) fn learning(&mut self, words: String, done: u64, total: u64) {
-        self.bar.set_length(total);
-        self.bar.set_position(done);
+        self.line.set_length(total);
+        self.line.set_position(done);
         let percent = 100 * done / total.max(1);
         if percent > self.tenth {
             self.tenth = percent;
             tracing::info!("step {done}/{total}: {words}");
         }
-        self.bar.set_message(words);
+        self.line.set_message(words);
     }
 
     /// Prints a remark above the bar.
     pub(crate) fn above(&self, text: &str, report: &Report) {
-        self.bar.suspend(|| report.remark(text));
+        self.line.suspend(|| report.remark(text));
     }
 }
 
 impl Drop for Bar {
     fn drop(&mut self) {
-        self.bar.finish_and_clear();
+        self.line.finish_and_clear();
     }
 }

@@ -12,7 +12,9 @@ pub(super) const SHOWN: &str = "small";
 /// Keys of a recipe with their values, numbers of lists as `0`.
 pub(super) fn of_preset(name: &str) -> Vec<(String, Value)> {
     let mut leaves = Vec::new();
-    if let Ok(recipe) = Recipe::load(name, &[]) {
+    if let Ok(mut recipe) = Recipe::load(name, &[]) {
+        // Stages change keys that are there already.
+        recipe.stage.clear();
         let document = serde_json::to_value(recipe).unwrap_or(Value::Null);
         for (key, value) in tables(document) {
             leaves.push((key, value));

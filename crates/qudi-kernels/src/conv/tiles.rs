@@ -175,6 +175,7 @@ mod tests {
     #[test]
     fn tiles_cover_every_shape() {
         // Channels of the inputs, outputs, frames, rows, columns, kernel, stride.
+        #[allow(clippy::type_complexity)]
         let shapes: [(&[usize], usize, usize, [usize; 2], [usize; 3], usize); 9] = [
             (&[1], 1, 1, [1, 1], [1, 1, 1], 1),
             (&[3, 4], 5, 2, [7, 9], [1, 3, 3], 1),

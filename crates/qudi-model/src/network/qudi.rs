@@ -215,13 +215,6 @@ impl Qudi {
     pub fn stages(&self) -> &[PreDenoiser] {
         &self.stages
     }
-
-    /// The network with other refinement stages, as many as it has.
-    #[must_use]
-    pub fn with_stages(self, stages: Vec<PreDenoiser>) -> Self {
-        Self { stages, ..self }
-    }
-
     /// Adds a refinement stage: the pre-denoiser becomes that stage, and a copy of it that sees `more`
     /// aligned neighbours, of zero weight at first, becomes the pre-denoiser.
     #[must_use]

@@ -16,6 +16,7 @@ use crate::refinement::{RefinementStage, align};
 use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
+use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored};
 
 /// Restores windows by sampling.
@@ -127,7 +128,9 @@ impl DiffusionRestorer {
         let mut flows: Vec<Option<Flows>> = vec![None; tiles.count()];
         let SampleOptions { sampler, steps, spacing, .. } = self.options;
         let steps = sampler.steps(&self.schedule, steps, spacing);
+        let count = steps.len();
         let predict = |step: &Step, x: &[f32], x0: &[f32]| {
+            progress("diffusing", step.number, count)?;
             let simulated = self.simulated(window, step, x0, noise.photon_seed(step.number))?;
             if self.config.flow.steps.contains(&step.number) {
                 flows.fill(None);

@@ -10,6 +10,7 @@ use crate::refinement::{
 };
 use crate::tensor::to_tensor;
 use burn::tensor::Device;
+use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored};
 use qudi_core::{Frame, Result};
 
@@ -57,8 +58,14 @@ impl RegressionRestorer {
             let (d, uncertainty) = self.network.predenoise_aligned(aligned);
             std::iter::once(d).chain(uncertainty).collect()
         };
-        let PredenoisedFrames { frames, uncertainty, noise_sigmas } =
-            predenoise_frames(&aligned, neighbours, &tiling, &self.device, predenoise)?;
+        let PredenoisedFrames { frames, uncertainty, noise_sigmas } = predenoise_frames(
+            "denoising",
+            &aligned,
+            neighbours,
+            &tiling,
+            &self.device,
+            predenoise,
+        )?;
         Ok(restored(filter_over_time(&aligned, frames, noise_sigmas, 1.0), uncertainty))
     }
 
@@ -73,7 +80,9 @@ impl RegressionRestorer {
         let all = CountPlanes::new(burst, acquisition);
         let pixels = burst.size.pixels();
         let (mut frames, mut uncertainty) = (Vec::new(), Vec::new());
-        for first in (0..burst.frames.len()).map(|number| number * pixels) {
+        for number in 0..burst.frames.len() {
+            progress("denoising", number, burst.frames.len())?;
+            let first = number * pixels;
             let planes = all.map(|plane| tiling.padded(&plane[first..first + pixels]));
             let predenoise = |tile: usize| {
                 let tensor = |plane: &[f32]| {

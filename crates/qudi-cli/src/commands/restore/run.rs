@@ -17,14 +17,17 @@ use crate::methods::options::{NetworkOptions, other_method};
 use crate::methods::{method, usual_method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
+use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::windows::Windows;
 use qudi_io::capture::{Capture, MaskChoice, Summary};
 use qudi_io::restore::{FolderRun, Inputs, Instants, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
+use std::cell::RefCell;
 use std::fmt::Write as _;
 use std::ops::Range;
 use std::path::Path;
+use std::rc::Rc;
 use std::time::Instant;
 
 /// Seconds from which on it is said beforehand how long a run takes.
@@ -240,22 +243,30 @@ impl Job {
         if wanted.is_empty() {
             return Ok(());
         }
-        let mut bar = report.bar();
+        let bar = Rc::new(RefCell::new(report.bar()));
         let (begin, mut forecast) = (Instant::now(), false);
         let mut progress = |done: u64, total: Option<u64>| {
-            bar.update("restoring", done, total);
+            bar.borrow_mut().update("restoring", done, total);
             if let Some(total) = total.filter(|_| done > 0 && !forecast) {
                 forecast = true;
                 forecast_time(begin.elapsed().as_secs_f64() / done as f64, total, report);
             }
             interrupt::check()
         };
+        let shown = bar.clone();
+        let observer: Observer = Rc::new(move |progress| {
+            shown.borrow().stage(progress);
+            interrupt::check()
+        });
         let (capture, acquisition) = (&mut self.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
         let restorer_is_network = restorer.name() == "qudi";
         let schedule = &self.schedule;
         let run = || {
-            run_method(restorer, capture, schedule, wanted, acquisition, &mut sink, &mut progress)
+            observed(observer, || {
+                let on = &mut progress;
+                run_method(restorer, capture, schedule, wanted, acquisition, &mut sink, on)
+            })
         };
         if restorer_is_network {
             // Devices report too little memory and broken drivers by panicking.

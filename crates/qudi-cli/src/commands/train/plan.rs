@@ -22,7 +22,7 @@ pub(super) enum Action {
 }
 
 /// Everything that a training run is asked for.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Plan {
     pub(super) action: Action,
     pub(super) recipe: Recipe,

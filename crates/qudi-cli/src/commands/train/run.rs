@@ -5,6 +5,7 @@ use super::data::{files, initial, make_folder, make_pack};
 use super::environment::{ENVIRONMENT, environment};
 use super::plan::{Action, Plan};
 use super::resume::{check_pack, check_recipe};
+use super::stages::train_stages;
 use super::watch::{Watch, quality_text, write, write_report};
 use crate::args::Global;
 use crate::device;
@@ -28,7 +29,10 @@ pub(crate) fn run(
     match plan.action {
         Action::MakePack => pack(&plan, report),
         Action::DrawBursts => draw(&plan, report),
-        Action::Start | Action::Resume => train(&plan, report),
+        Action::Start | Action::Resume => match plan.recipe.stages()? {
+            stages if stages.is_empty() => train(&plan, report),
+            stages => train_stages(&plan, stages, report),
+        },
     }
 }
 
@@ -44,7 +48,7 @@ fn pack(plan: &Plan, report: &Report) -> Result<()> {
 }
 
 /// Trains to the end of the recipe.
-fn train(plan: &Plan, report: &Report) -> Result<()> {
+pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     let (folder, recipe) = (&plan.folder, &plan.recipe);
     check_folder(plan)?;
     if plan.action == Action::Resume {
@@ -107,6 +111,13 @@ fn train(plan: &Plan, report: &Report) -> Result<()> {
 fn draw(plan: &Plan, report: &Report) -> Result<()> {
     let opened = device::open(plan.devices.first().map_or("auto", String::as_str))?;
     let (folder, recipe) = (&plan.folder, &plan.recipe);
+    if !recipe.stage.is_empty() {
+        return Err(CliError::new(
+            "bursts of a later stage are drawn with what the one before has learnt",
+            "--draw-only",
+            "leave it out: each stage draws its own, and keeps them in --bursts",
+        ));
+    }
     let files = files(plan, report)?;
     let network = match &plan.init {
         Some(path) => *initial(path, recipe, &opened)?,
@@ -138,7 +149,7 @@ fn draw(plan: &Plan, report: &Report) -> Result<()> {
 }
 
 /// Refuses a folder without a state to resume from, or with a run that would be lost.
-fn check_folder(plan: &Plan) -> Result<()> {
+pub(super) fn check_folder(plan: &Plan) -> Result<()> {
     let folder = &plan.folder;
     let exists = Run::exists(folder);
     let resume = plan.action == Action::Resume;
