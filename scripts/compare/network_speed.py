@@ -6,6 +6,7 @@
 
     python scripts/compare/network_speed.py small --threads 2             # one reverse step
     python scripts/compare/network_speed.py small --backward              # and its gradients, 128x128
+    python scripts/compare/network_speed.py small --backward --bf16       # in bfloat16, channels last
     python scripts/compare/network_speed.py small --per-block
     python scripts/compare/network_speed.py small --mode steps            # the ten-step loop
     python scripts/compare/network_speed.py small --mode train --frames 7 --size 96 --batch 2
@@ -130,6 +131,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--backward", action="store_true", help="time forward and backward together")
     parser.add_argument("--per-block", action="store_true")
+    parser.add_argument("--bf16", action="store_true", help="autocast to bfloat16, convolutions channels last")
     parser.add_argument("--ancestral", action="store_true", help="sampler of --mode steps")
     args = parser.parse_args()
 
@@ -138,8 +140,13 @@ def main() -> None:
     size = args.size or (128 if args.backward else 256)
     config = network.load(args.preset)
     model = network.Qudi(config)
+    if args.bf16:
+        for module in model.modules():
+            if isinstance(module, torch.nn.Conv2d):
+                module.to(memory_format=torch.channels_last)
+        torch.autocast("cpu", torch.bfloat16).__enter__()
     x = inputs(config, args.frames, size, args.batch)
-    result = {"preset": args.preset, "threads": args.threads, "size": size, "frames": args.frames}
+    result = {"preset": args.preset, "threads": args.threads, "size": size, "frames": args.frames, "bf16": args.bf16}
     result |= {"torch": torch.__version__, "parameters": sum(p.numel() for p in model.parameters())}
     result["base_mib"] = peak_mib()
     if args.mode == "train":

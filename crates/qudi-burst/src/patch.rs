@@ -1,5 +1,6 @@
 //! Patches of 16 x 16 pixels: the unit of alignment and merging (Ma et al. 2020, section 5).
 
+use multiversion::multiversion;
 use qudi_core::{Frame, Size};
 use std::ops::Range;
 
@@ -31,39 +32,55 @@ pub(crate) fn inside(start: f32, length: usize) -> Range<usize> {
 }
 
 /// Samples the patch whose corner is at `corner` bilinearly; the image's borders are repeated.
+#[multiversion(targets("x86_64+avx2"))]
 pub(crate) fn bilinear(image: &Frame, corner: [f32; 2]) -> Patch {
+    bilinear_samples(image, corner)
+}
+
+/// [`bilinear`], compiled for the vector unit of its caller.
+#[inline(always)]
+pub(crate) fn bilinear_samples(image: &Frame, corner: [f32; 2]) -> Patch {
     let (width, height) = (image.size.width as isize, image.size.height as isize);
     let [x, y] = corner.map(|c| c.floor() as isize);
     let [fx, fy] = corner.map(|c| c - c.floor());
     let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
     let side = SIDE as isize;
-    let mut around = [[0.0; SIDE + 1]; SIDE + 1];
+    let mut patch = [[0.0; SIDE]; SIDE];
     if x >= 0 && y >= 0 && x + side < width && y + side < height {
-        for (r, row) in around.iter_mut().enumerate() {
-            if let Some(source) = image.row(y as usize + r)[x as usize..].first_chunk() {
-                *row = *source;
-            }
+        let row = |r: usize| &image.row(y as usize + r)[x as usize..x as usize + SIDE + 1];
+        for (r, patch) in patch.iter_mut().enumerate() {
+            *patch = between(weights, row(r), row(r + 1));
         }
-    } else {
-        for (r, row) in around.iter_mut().enumerate() {
-            let source = image.row((y + r as isize).clamp(0, height - 1) as usize);
-            for (c, value) in row.iter_mut().enumerate() {
-                *value = source[(x + c as isize).clamp(0, width - 1) as usize];
-            }
-        }
+        return patch;
     }
-    std::array::from_fn(|r| {
-        let (upper, lower) = (&around[r], &around[r + 1]);
-        std::array::from_fn(|c| {
-            upper[c] * weights[0]
-                + upper[c + 1] * weights[1]
-                + lower[c] * weights[2]
-                + lower[c + 1] * weights[3]
-        })
-    })
+    let row = |r: usize| -> [f32; SIDE + 1] {
+        let source = image.row((y + r as isize).clamp(0, height - 1) as usize);
+        std::array::from_fn(|c| source[(x + c as isize).clamp(0, width - 1) as usize])
+    };
+    let mut upper = row(0);
+    for (r, patch) in patch.iter_mut().enumerate() {
+        let lower = row(r + 1);
+        *patch = between(weights, &upper, &lower);
+        upper = lower;
+    }
+    patch
+}
+
+/// A row between the pixels of two rows.
+#[inline(always)]
+fn between(weights: [f32; 4], upper: &[f32], lower: &[f32]) -> [f32; SIDE] {
+    let (a, b) = (&upper[..SIDE], &upper[1..1 + SIDE]);
+    let (c, d) = (&lower[..SIDE], &lower[1..1 + SIDE]);
+    // A plain loop: closures are not compiled for the caller's vector unit.
+    let mut row = [0.0; SIDE];
+    for x in 0..SIDE {
+        row[x] = a[x] * weights[0] + b[x] * weights[1] + c[x] * weights[2] + d[x] * weights[3];
+    }
+    row
 }
 
 /// The sum of all samples of a patch, sixteen at a time.
+#[inline(always)]
 pub(crate) fn total(patch: &Patch) -> f32 {
     let mut lanes = [0.0f32; SIDE];
     for row in patch {

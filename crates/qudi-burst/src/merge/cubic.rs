@@ -2,6 +2,7 @@
 //! processing", IEEE TASSP 29(6), 1981), which keeps fine texture that bilinear means lose.
 
 use crate::patch::{Patch, SIDE, inside};
+use multiversion::multiversion;
 use qudi_core::Frame;
 
 /// Weights of the samples at -1, 0, 1 and 2 for the place `part` between 0 and 1 (Keys 1981, eq. 15).
@@ -17,6 +18,7 @@ pub(crate) fn noise_factor(part: f32) -> f32 {
 }
 
 /// Samples the patch whose corner is at `corner`; the image's borders are repeated.
+#[multiversion(targets("x86_64+avx2"))]
 fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     let (width, height) = (image.size.width as isize, image.size.height as isize);
     let [x, y] = corner.map(|c| c.floor() as isize - 1);
@@ -26,16 +28,12 @@ fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     let within = x >= 0 && x + (SIDE as isize) + 3 <= width;
     for (r, row) in (y..).zip(&mut rows) {
         let source = image.row(r.clamp(0, height - 1) as usize);
-        let mut around = [0.0f32; SIDE + 3];
         if within {
-            around.copy_from_slice(&source[x as usize..x as usize + SIDE + 3]);
+            *row = along(across, &source[x as usize..x as usize + SIDE + 3]);
         } else {
-            for (c, value) in (x..).zip(&mut around) {
-                *value = source[c.clamp(0, width - 1) as usize];
-            }
-        }
-        for c in 0..SIDE {
-            row[c] = weighted(across, [around[c], around[c + 1], around[c + 2], around[c + 3]]);
+            let around: [f32; SIDE + 3] =
+                std::array::from_fn(|c| source[(x + c as isize).clamp(0, width - 1) as usize]);
+            *row = along(across, &around);
         }
     }
     let mut patch = [[0.0f32; SIDE]; SIDE];
@@ -64,6 +62,20 @@ pub(crate) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [us
     patch
 }
 
+/// A row between the pixels of `source`.
+#[inline(always)]
+fn along(taps: [f32; 4], source: &[f32]) -> [f32; SIDE] {
+    let (a, b) = (&source[..SIDE], &source[1..1 + SIDE]);
+    let (c, d) = (&source[2..2 + SIDE], &source[3..3 + SIDE]);
+    // A plain loop: closures are not compiled for the caller's vector unit.
+    let mut row = [0.0; SIDE];
+    for x in 0..SIDE {
+        row[x] = weighted(taps, [a[x], b[x], c[x], d[x]]);
+    }
+    row
+}
+
+#[inline(always)]
 fn weighted(taps: [f32; 4], values: [f32; 4]) -> f32 {
     taps[0] * values[0] + taps[1] * values[1] + taps[2] * values[2] + taps[3] * values[3]
 }

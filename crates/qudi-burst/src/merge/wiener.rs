@@ -4,6 +4,7 @@
 
 use super::dft16::{Spectrum, forward, inverse};
 use crate::patch::{Patch, SIDE};
+use multiversion::multiversion;
 
 /// The patch of a block of frames, aligned with the reference.
 #[derive(Clone, Debug)]
@@ -39,6 +40,7 @@ pub(crate) fn merge_by_reference(
 
 /// Merges the `spectra` of `patches`. The robustness weight of each coefficient follows from how far
 /// `criterion` differs from that of the reference.
+#[multiversion(targets("x86_64+avx2"))]
 fn merge_spectra(
     patches: &[AlignedPatch],
     spectra: &[Spectrum],
@@ -81,13 +83,16 @@ fn merge_spectra(
 }
 
 /// Squared magnitudes of the difference's coefficients.
+#[inline(always)]
 fn powers(a: &Spectrum, b: &Spectrum) -> Patch {
-    std::array::from_fn(|y| {
-        std::array::from_fn(|x| {
+    let mut powers = [[0.0; SIDE]; SIDE];
+    for y in 0..SIDE {
+        for x in 0..SIDE {
             let (dr, di) = (a.re[y][x] - b.re[y][x], a.im[y][x] - b.im[y][x]);
-            dr * dr + di * di
-        })
-    })
+            powers[y][x] = dr * dr + di * di;
+        }
+    }
+    powers
 }
 
 #[cfg(test)]

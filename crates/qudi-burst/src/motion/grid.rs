@@ -1,6 +1,7 @@
 //! Patches that cover an image.
 
 use crate::patch::{Patch, SIDE};
+use multiversion::multiversion;
 use qudi_core::{Frame, Size};
 
 /// Corners of square patches, the last ones at the borders.
@@ -47,14 +48,13 @@ impl Grid {
         });
         for i in 0..self.len() {
             let [x, y] = self.corner(i);
-            for (r, row) in patch(i).iter().enumerate() {
-                for (c, value) in row.iter().enumerate() {
-                    let weight = window[r] * window[c];
-                    let at = (y + r) * from.width + x + c;
-                    sum.data[at] += weight * value;
-                    weights.data[at] += weight;
-                }
-            }
+            let at = y * from.width + x;
+            add_weighted(
+                &patch(i),
+                &window,
+                from.width,
+                [&mut sum.data[at..], &mut weights.data[at..]],
+            );
         }
         Frame::from_fn(to, |x, y| sum.row(y)[x] / weights.row(y)[x])
     }
@@ -107,6 +107,25 @@ impl Grid {
             values[..n].sort_unstable_by(f32::total_cmp);
             0.5 * (values[(n - 1) / 2] + values[n / 2])
         })
+    }
+}
+
+/// Adds a patch times its window, and the window, to the rows of an image from the patch's corner on.
+#[multiversion(targets("x86_64+avx2"))]
+fn add_weighted(
+    patch: &Patch,
+    window: &[f32; SIDE],
+    width: usize,
+    [sum, weights]: [&mut [f32]; 2],
+) {
+    for (r, row) in patch.iter().enumerate() {
+        let place = r * width..r * width + SIDE;
+        let (sum, weights) = (&mut sum[place.clone()], &mut weights[place]);
+        for c in 0..SIDE {
+            let weight = window[r] * window[c];
+            sum[c] += weight * row[c];
+            weights[c] += weight;
+        }
     }
 }
 

@@ -13,6 +13,7 @@ use super::pyramid::smooth;
 use super::reference_frames::ReferenceFrames;
 use crate::patch::{Patch, PatchMotion, SIDE, bilinear, inside, total};
 use crate::prepared_burst::PreparedBurst;
+use multiversion::multiversion;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
@@ -305,13 +306,7 @@ impl Sums {
 
     /// Adds the residuals of a frame in which the whole patch lies inside.
     fn add_whole(&mut self, here: &Patch, there: &Patch, noise: f32) {
-        for y in 0..SIDE {
-            for x in 0..SIDE {
-                let residual = there[y][x] - here[y][x];
-                self.sum[y][x] += residual;
-                self.squares[y][x] += residual * residual;
-            }
-        }
+        add_residuals(here, there, &mut self.sum, &mut self.squares);
         self.whole_count += 1.0;
         self.whole_noise += noise;
     }
@@ -324,15 +319,32 @@ impl Sums {
 
     /// As much of it as a difference common to all frames explains.
     fn common(&self, known: f32, variance: f32) -> f32 {
-        let common: Patch = std::array::from_fn(|y| {
-            std::array::from_fn(|x| {
-                let weight = 1.0 / (known + self.whole_count + self.count[y][x]).max(1.0);
-                let noise = self.whole_noise + self.noise[y][x];
-                weight * (self.sum[y][x] * self.sum[y][x] / variance - noise)
-            })
-        });
-        total(&common)
+        common(self, known, variance)
     }
+}
+
+#[multiversion(targets("x86_64+avx2"))]
+fn add_residuals(here: &Patch, there: &Patch, sum: &mut Patch, squares: &mut Patch) {
+    for y in 0..SIDE {
+        for x in 0..SIDE {
+            let residual = there[y][x] - here[y][x];
+            sum[y][x] += residual;
+            squares[y][x] += residual * residual;
+        }
+    }
+}
+
+#[multiversion(targets("x86_64+avx2"))]
+fn common(sums: &Sums, known: f32, variance: f32) -> f32 {
+    let mut common = [[0.0; SIDE]; SIDE];
+    for y in 0..SIDE {
+        for x in 0..SIDE {
+            let weight = 1.0 / (known + sums.whole_count + sums.count[y][x]).max(1.0);
+            let noise = sums.whole_noise + sums.noise[y][x];
+            common[y][x] = weight * (sums.sum[y][x] * sums.sum[y][x] / variance - noise);
+        }
+    }
+    total(&common)
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@
 use super::grid::Grid;
 use super::patch_refinement::refine;
 use super::pyramid::{Level, Pyramid};
+use multiversion::multiversion;
 use qudi_core::Frame;
 
 /// Cost of a search's step per squared pixel, in nats, at each level: where there is little to see, a
@@ -63,6 +64,31 @@ fn median(flow: &[[isize; 2]]) -> [isize; 2] {
     })
 }
 
+/// [`Matching::best`].
+#[multiversion(targets("x86_64+avx2"))]
+fn best<'a>(matching: &Matching<'a>, corner: [usize; 2], starts: &[[isize; 2]]) -> [isize; 2] {
+    let mut start = (f32::INFINITY, [0; 2]);
+    for (i, &d) in starts.iter().enumerate() {
+        let d = matching.inside(corner, d);
+        let difference = matching.difference(corner, d);
+        if !starts[..i].contains(&d) && difference < start.0 {
+            start = (difference, d);
+        }
+    }
+    let (mut best, start) = (start, start.1);
+    for dy in -matching.radius..=matching.radius {
+        for dx in -matching.radius..=matching.radius {
+            let d = matching.inside(corner, [start[0] + dx, start[1] + dy]);
+            let cost =
+                matching.difference(corner, d) + matching.reluctance * (dx * dx + dy * dy) as f32;
+            if cost < best.0 {
+                best = (cost, d);
+            }
+        }
+    }
+    best.1
+}
+
 /// The search for one level's patches.
 struct Matching<'a> {
     image: &'a Frame,
@@ -76,29 +102,11 @@ struct Matching<'a> {
 impl Matching<'_> {
     /// The displacement of least squared difference within `radius` of the best of `starts`.
     fn best(&self, corner: [usize; 2], starts: &[[isize; 2]]) -> [isize; 2] {
-        let mut start = (f32::INFINITY, [0; 2]);
-        for (i, &d) in starts.iter().enumerate() {
-            let d = self.inside(corner, d);
-            let difference = self.difference(corner, d);
-            if !starts[..i].contains(&d) && difference < start.0 {
-                start = (difference, d);
-            }
-        }
-        let (mut best, start) = (start, start.1);
-        for dy in -self.radius..=self.radius {
-            for dx in -self.radius..=self.radius {
-                let d = self.inside(corner, [start[0] + dx, start[1] + dy]);
-                let cost =
-                    self.difference(corner, d) + self.reluctance * (dx * dx + dy * dy) as f32;
-                if cost < best.0 {
-                    best = (cost, d);
-                }
-            }
-        }
-        best.1
+        best(self, corner, starts)
     }
 
     /// Kept inside the image: what has left it cannot be found.
+    #[inline(always)]
     fn inside(&self, corner: [usize; 2], d: [isize; 2]) -> [isize; 2] {
         let size = self.image.size;
         let most = [size.width - self.side, size.height - self.side];
@@ -107,12 +115,14 @@ impl Matching<'_> {
         })
     }
 
+    #[inline(always)]
     fn difference(&self, corner: [usize; 2], d: [isize; 2]) -> f32 {
         let at = [0, 1].map(|k| corner[k].wrapping_add_signed(d[k]));
         squared_difference(self.image, corner, self.there, at, self.side)
     }
 }
 
+#[inline(always)]
 fn squared_difference(
     a: &Frame,
     [ax, ay]: [usize; 2],

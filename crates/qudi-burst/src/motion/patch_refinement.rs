@@ -2,7 +2,8 @@
 //! registration technique", IJCAI 1981), and their regularization: flat patches move with their surroundings.
 
 use super::grid::Grid;
-use crate::patch::{Patch, SIDE, bilinear};
+use crate::patch::{Patch, SIDE, bilinear_samples};
+use multiversion::multiversion;
 use qudi_core::Frame;
 
 /// Steps of the refinement, as in the authors' experiments.
@@ -44,6 +45,7 @@ struct Refined {
 
 /// Takes Gauss-Newton steps towards the displacement of least squared difference, with the gradients of
 /// `image`.
+#[multiversion(targets("x86_64+avx2"))]
 fn refine_patch(
     image: &Frame,
     there: &Frame,
@@ -58,24 +60,23 @@ fn refine_patch(
         let row = image.row(y);
         let (up, down) = (image.row(y.saturating_sub(1)), image.row((y + 1).min(height - 1)));
         own[r].copy_from_slice(&row[x0..x0 + SIDE]);
-        let [mut left, mut right] = [own[r]; 2];
-        // At a border the last pixel is its own neighbour.
-        left[1..].copy_from_slice(&row[x0..x0 + SIDE - 1]);
-        left[0] = row[x0.saturating_sub(1)];
-        right[..SIDE - 1].copy_from_slice(&row[x0 + 1..x0 + SIDE]);
-        right[SIDE - 1] = row[(x0 + SIDE).min(row.len() - 1)];
-        let (up, down) = (&up[x0..x0 + SIDE], &down[x0..x0 + SIDE]);
-        for c in 0..SIDE {
-            slopes_x[r][c] = 0.5 * (right[c] - left[c]);
-            slopes_y[r][c] = 0.5 * (down[c] - up[c]);
+        if x0 > 0 && x0 + SIDE < row.len() {
+            slopes_x[r] = half_difference(&row[x0 + 1..x0 + 1 + SIDE], &row[x0 - 1..x0 - 1 + SIDE]);
+        } else {
+            // At a border the last pixel is its own neighbour.
+            let at = |x: usize| row[x.min(row.len() - 1)];
+            let right: [f32; SIDE] = std::array::from_fn(|c| at(x0 + c + 1));
+            let left: [f32; SIDE] = std::array::from_fn(|c| at((x0 + c).saturating_sub(1)));
+            slopes_x[r] = half_difference(&right, &left);
         }
+        slopes_y[r] = half_difference(&down[x0..x0 + SIDE], &up[x0..x0 + SIDE]);
     }
     let [xx, xy, yy] = [(&slopes_x, &slopes_x), (&slopes_x, &slopes_y), (&slopes_y, &slopes_y)]
         .map(|(a, b)| total_product(a, b));
     let solve = Damped::new([xx, xy, yy], variance / (STEP_SIGMA * STEP_SIGMA));
     let mut d = start;
     for _ in 0..STEPS {
-        let moved = bilinear(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
+        let moved = bilinear_samples(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
         let mut away = moved;
         for (away, own) in away.iter_mut().flatten().zip(own.iter().flatten()) {
             *away -= own;
@@ -90,7 +91,18 @@ fn refine_patch(
     Refined { flow: d, slopes: [xx, xy, yy] }
 }
 
+#[inline(always)]
+fn half_difference(a: &[f32], b: &[f32]) -> [f32; SIDE] {
+    let (a, b) = (&a[..SIDE], &b[..SIDE]);
+    let mut row = [0.0; SIDE];
+    for c in 0..SIDE {
+        row[c] = 0.5 * (a[c] - b[c]);
+    }
+    row
+}
+
 /// The sum of the products of two patches' samples, sixteen at a time.
+#[inline(always)]
 fn total_product(a: &Patch, b: &Patch) -> f32 {
     let mut lanes = [0.0f32; SIDE];
     for (a, b) in a.iter().zip(b) {

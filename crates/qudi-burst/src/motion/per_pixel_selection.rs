@@ -5,6 +5,7 @@
 use super::reference_frames::ReferenceFrames;
 use crate::patch::{Patch, PatchMotion, SIDE, inside};
 use crate::prepared_burst::PreparedBurst;
+use multiversion::multiversion;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
@@ -55,20 +56,32 @@ pub(crate) fn per_pixel_selection(
                 }
             }
             let counts = sample(&burst.frames[k], i, d);
-            for y in 0..SIDE {
-                for x in 0..SIDE {
-                    if own || misfit[y][x] < least[y][x] {
-                        least[y][x] = misfit[y][x];
-                        best[0][y][x] = counts[y][x];
-                        best[1][y][x] = there[y][x];
-                    }
-                }
-            }
+            take_better(&misfit, &mut least, [&counts, &there], &mut best, own);
         }
         best
     };
     let patches: Vec<[Patch; 2]> = (0..burst.grid.len()).into_par_iter().map(patch).collect();
     [0, 1].map(|image| burst.blended(|i| patches[i][image]))
+}
+
+/// Takes what fits better, or all of it.
+#[multiversion(targets("x86_64+avx2"))]
+fn take_better(
+    misfit: &Patch,
+    least: &mut Patch,
+    [counts, there]: [&Patch; 2],
+    best: &mut [Patch; 2],
+    all: bool,
+) {
+    let [best_counts, best_there] = best;
+    for y in 0..SIDE {
+        for x in 0..SIDE {
+            let better = all || misfit[y][x] < least[y][x];
+            least[y][x] = if better { misfit[y][x] } else { least[y][x] };
+            best_counts[y][x] = if better { counts[y][x] } else { best_counts[y][x] };
+            best_there[y][x] = if better { there[y][x] } else { best_there[y][x] };
+        }
+    }
 }
 
 /// Lists the motions of patch `i`, of those that touch it, and rest; each once.
@@ -105,6 +118,7 @@ fn exclude_outside(burst: &PreparedBurst, misfit: &mut Patch, i: usize, d: [f32;
 }
 
 /// Squared differences, summed over the squares around each pixel as far as they lie in the patch.
+#[multiversion(targets("x86_64+avx2"))]
 fn misfit(a: &Patch, b: &Patch) -> Patch {
     let mut rows = [[0.0f32; SIDE]; SIDE + 2 * RADIUS];
     for y in 0..SIDE {

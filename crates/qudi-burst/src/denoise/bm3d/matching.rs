@@ -5,6 +5,7 @@
 //! eight neighbouring columns: a third of the work of comparing block by block, and along rows.
 
 use super::block::BLOCK;
+use multiversion::multiversion;
 use qudi_core::Size;
 
 /// Where similar blocks are looked for, and which count as similar.
@@ -139,6 +140,7 @@ impl Matcher {
 }
 
 /// `out[x]` is the sum over eight rows of the squared differences at column `x`.
+#[multiversion(targets("x86_64+avx2"))]
 fn square_differences(a: [&[f32]; BLOCK], b: [&[f32]; BLOCK], out: &mut [f32]) {
     let n = out.len();
     let ([a0, a1, a2, a3, a4, a5, a6, a7], [b0, b1, b2, b3, b4, b5, b6, b7]) =
@@ -154,6 +156,7 @@ fn square_differences(a: [&[f32]; BLOCK], b: [&[f32]; BLOCK], out: &mut [f32]) {
 }
 
 /// `out[x] = sums[x] + sums[x + step]`.
+#[multiversion(targets("x86_64+avx2"))]
 fn sum_neighbours(sums: &[f32], step: usize, out: &mut [f32]) {
     for ((out, a), b) in out.iter_mut().zip(sums).zip(&sums[step..]) {
         *out = a + b;

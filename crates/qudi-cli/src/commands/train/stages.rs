@@ -1,5 +1,6 @@
 //! Recipes of several stages: one run after the other, each in a folder of its own.
 
+use super::data::{files, make_folder};
 use super::plan::{Action, Plan};
 use super::run::{check_folder, train};
 use super::watch::write;
@@ -26,7 +27,9 @@ pub(super) fn train_stages(
             "start without --resume, or name the run's folder with -o",
         ));
     }
-    super::data::make_folder(folder, "the run's folder", "choose another with -o")?;
+    make_folder(folder, "the run's folder", "choose another with -o")?;
+    // A run whose files are not there leaves nothing behind.
+    files(plan, report)?;
     write(folder, RECIPE, plan.recipe.text().as_bytes())?;
     let count = stages.len();
     let mut init = plan.init.clone();
