@@ -5,6 +5,8 @@
 //! in, all its frames out, in image units. Constants were chosen on training clips, those of the
 //! [`ReferenceEstimate`] on validation clips.
 #![warn(missing_docs)]
+// Loops over patches are inlined into functions that are compiled for the vector unit, and plain for them.
+#![allow(clippy::inline_always, clippy::needless_range_loop)]
 
 mod aligned_burst;
 mod aligned_sums;

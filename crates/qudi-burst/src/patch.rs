@@ -47,7 +47,7 @@ pub(crate) fn bilinear_samples(image: &Frame, corner: [f32; 2]) -> Patch {
     let side = SIDE as isize;
     let mut patch = [[0.0; SIDE]; SIDE];
     if x >= 0 && y >= 0 && x + side < width && y + side < height {
-        let row = |r: usize| &image.row(y as usize + r)[x as usize..x as usize + SIDE + 1];
+        let row = |r: usize| &image.row(y as usize + r)[x as usize..][..=SIDE];
         for (r, patch) in patch.iter_mut().enumerate() {
             *patch = between(weights, row(r), row(r + 1));
         }
@@ -69,8 +69,8 @@ pub(crate) fn bilinear_samples(image: &Frame, corner: [f32; 2]) -> Patch {
 /// A row between the pixels of two rows.
 #[inline(always)]
 fn between(weights: [f32; 4], upper: &[f32], lower: &[f32]) -> [f32; SIDE] {
-    let (a, b) = (&upper[..SIDE], &upper[1..1 + SIDE]);
-    let (c, d) = (&lower[..SIDE], &lower[1..1 + SIDE]);
+    let (a, b) = (&upper[..SIDE], &upper[1..=SIDE]);
+    let (c, d) = (&lower[..SIDE], &lower[1..=SIDE]);
     // A plain loop: closures are not compiled for the caller's vector unit.
     let mut row = [0.0; SIDE];
     for x in 0..SIDE {

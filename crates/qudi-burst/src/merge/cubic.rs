@@ -65,7 +65,7 @@ pub(crate) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [us
 /// A row between the pixels of `source`.
 #[inline(always)]
 fn along(taps: [f32; 4], source: &[f32]) -> [f32; SIDE] {
-    let (a, b) = (&source[..SIDE], &source[1..1 + SIDE]);
+    let (a, b) = (&source[..SIDE], &source[1..=SIDE]);
     let (c, d) = (&source[2..2 + SIDE], &source[3..3 + SIDE]);
     // A plain loop: closures are not compiled for the caller's vector unit.
     let mut row = [0.0; SIDE];
