@@ -1,6 +1,6 @@
 //! The method `qudi` on the command line: weights, devices, options, and what is refused.
 
-use crate::support::{listing, qudi, refused, scratch};
+use crate::support::{listing, qudi, refused, run, scratch};
 use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
 use qudi_model::checkpoint::{Description, Precision, save};
@@ -232,4 +232,35 @@ fn graphics_card_matches_the_processor() {
     let output = qudi(&folder).args(device).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// Products of 16 bits restore what those of 32 do, on any number of threads, and units must be there.
+#[test]
+fn precisions_restore_alike() {
+    let folder = scratch("network-precision");
+    run(&folder, "simulate scene:text --size 48x64 --frames 4 --ppp 9.75 --seed 2 -o b.npy -q");
+    let restored = |options: &str, to: &str| {
+        run(&folder, &format!("restore b.npy --device cpu -o {to} -q {options}"));
+        std::fs::read(folder.join(to)).unwrap()
+    };
+    let values = |bytes: &[u8]| -> Vec<f32> {
+        let data = &bytes[bytes.len() - 4 * 4 * 48 * 64..];
+        data.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+    };
+    let exact = restored("--precision f32", "f32.npy");
+    let short = restored("--precision bf16 --threads 1", "bf16.npy");
+    assert!(short == restored("--precision bf16 --threads 3", "threads.npy"));
+    assert!(exact != short, "the option does nothing");
+    let (exact, short) = (values(&exact), values(&short));
+    let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
+    let error = exact.iter().zip(&short).map(square).sum::<f64>() / exact.len() as f64;
+    assert!(error.sqrt() < 2e-3, "{}", error.sqrt());
+    let kernels = |units: &str| {
+        let mut command = qudi(&folder);
+        let output = command.env("QUDI_KERNELS", units).args(["info", "weights"]).output().unwrap();
+        (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    assert_eq!(kernels("f32").0, Some(0));
+    let (code, said) = kernels("fast");
+    assert!(code == Some(2) && said.contains("`fast`") && said.contains("avx512bf16"), "{said}");
 }

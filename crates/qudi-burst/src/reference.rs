@@ -144,3 +144,45 @@ impl Restorer for QbpRefined {
         Ok(Restored { frames, std: None })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_core::progress::{Observer, observed};
+    use qudi_core::sensor::Sensor;
+    use qudi_core::{Error, Size};
+    use std::cell::RefCell;
+    use std::ops::ControlFlow;
+    use std::rc::Rc;
+
+    /// Both passes tell of every frame before they begin it, and stop there if they are asked to.
+    #[test]
+    fn passes_tell_of_every_frame_and_stop() {
+        let size = Size { height: 32, width: 40 };
+        let count = |t: usize, i: usize| ((i * 7 + i / size.width + 3 * t) % 8) as u16;
+        let counts: Vec<Vec<u16>> =
+            (0..3).map(|t| (0..size.pixels()).map(|i| count(t, i)).collect()).collect();
+        let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
+        let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
+        let heard_before = |stop: usize| {
+            let heard = Rc::new(RefCell::new(Vec::new()));
+            let list = heard.clone();
+            let observer: Observer = Rc::new(move |progress| {
+                let mut list = list.borrow_mut();
+                list.push((progress.stage, progress.done, progress.total));
+                if list.len() < stop { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            });
+            let view = BurstView { size, frames: &counts };
+            let restored = observed(observer, || QbpRefined.restore(view, &acquisition));
+            (heard.take(), restored)
+        };
+        let (heard, restored) = heard_before(usize::MAX);
+        let stages = ["first estimate", "second estimate"];
+        let expected = stages.map(|stage| [0, 1, 2].map(|done| (stage, done, 3)));
+        assert_eq!(heard, expected.concat());
+        assert!(restored.is_ok_and(|restored| restored.frames.len() == 3));
+        let (heard, restored) = heard_before(5);
+        assert_eq!(heard.len(), 5);
+        assert!(matches!(restored, Err(Error::Interrupted)));
+    }
+}
