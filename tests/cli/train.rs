@@ -243,6 +243,16 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     assert!(whole == read("run/weights.safetensors"));
     refused(&folder, &format!("train stages.toml -o run {QUICK}"), &["--resume", "--force"]);
     refused(&folder, "train stages.toml --bursts b --draw-only", &["--draw-only"]);
+    let changed = "train -o run --resume --device cpu -q --set train.lr=2e-3";
+    refused(&folder, changed, &["train.lr"]);
+    // A run that starts anew, and stops at once, must not find the stages of the one before.
+    refused(&folder, &format!("train stages.toml -o run --force --init none {QUICK}"), &["none"]);
+    assert!(!folder.join("run/2-second/state").exists());
+    let recipe = std::fs::read_to_string(folder.join("stages.toml")).unwrap();
+    for (good, bad) in [("\"first\"", "\"../first\""), ("train.seed", "train.seeds")] {
+        std::fs::write(folder.join("bad.toml"), recipe.replace(good, bad)).unwrap();
+        refused(&folder, &format!("train bad.toml -o bad {QUICK}"), &["stage"]);
+    }
     let learns = format!("train tiny -o other {QUICK} --set");
     refused(&folder, &format!("{learns} train.learns=[\"unet\"]"), &["train.learns"]);
     refused(&folder, &format!("{learns} train.learns=[\"eyes\"]"), &["eyes"]);

@@ -2,6 +2,7 @@
 
 use super::data::{files, make_folder};
 use super::plan::{Action, Plan};
+use super::resume::check_recipe;
 use super::run::{check_folder, train};
 use super::watch::write;
 use crate::error::{CliError, Result};
@@ -17,9 +18,11 @@ pub(super) fn train_stages(
     report: &Report,
 ) -> Result<()> {
     let folder = &plan.folder;
-    let resumes = plan.action == Action::Resume;
-    if !resumes {
-        check_folder(plan)?;
+    let stages: Vec<Plan> =
+        stages.into_iter().enumerate().map(|stage| of_stage(plan, stage)).collect();
+    if plan.action == Action::Start {
+        // No stage of an earlier run may be taken for one of this.
+        std::iter::once(plan).chain(&stages).try_for_each(check_folder)?;
     } else if !folder.join(RECIPE).exists() {
         return Err(CliError::new(
             "there is no run to go on with",
@@ -27,42 +30,51 @@ pub(super) fn train_stages(
             "start without --resume, or name the run's folder with -o",
         ));
     }
+    // Before anything is written: a recipe that is refused must not become the run's.
+    for stage in stages.iter().filter(|stage| Run::exists(&stage.folder)) {
+        check_recipe(&stage.folder, &stage.recipe)?;
+    }
     make_folder(folder, "the run's folder", "choose another with -o")?;
     // A run whose files are not there leaves nothing behind.
     files(plan, report)?;
     write(folder, RECIPE, plan.recipe.text().as_bytes())?;
     let count = stages.len();
     let mut init = plan.init.clone();
-    let mut weights = folder.join(WEIGHTS);
-    for (number, (name, recipe)) in stages.into_iter().enumerate() {
-        let own = format!("{}-{name}", number + 1);
-        let stage = Plan {
-            folder: folder.join(&own),
-            bursts: plan.bursts.as_ref().map(|bursts| bursts.join(&own)),
-            init: init.take(),
-            recipe,
-            action: Action::Start,
-            ..plan.clone()
-        };
-        weights = stage.folder.join(WEIGHTS);
-        init = Some(weights.clone());
+    for (number, stage) in stages.into_iter().enumerate() {
+        let weights = stage.folder.join(WEIGHTS);
+        let from = init.replace(weights);
         let exists = Run::exists(&stage.folder);
-        if resumes && exists && Run::steps_taken(&stage.folder)? >= stage.recipe.train.steps {
+        if exists && Run::steps_taken(&stage.folder)? >= stage.recipe.train.steps {
             continue;
         }
-        report.remark(&format!("stage {} of {count}: {name}", number + 1));
-        if resumes && exists {
-            train(&Plan { action: Action::Resume, init: None, ..stage }, report)?;
+        report.remark(&format!("stage {} of {count}: {}", number + 1, stage.folder.display()));
+        if exists {
+            train(&Plan { action: Action::Resume, ..stage }, report)?;
         } else {
-            // What an interrupted run left before its first state is of no use.
-            let overwrite = if resumes { Overwrite::Yes } else { stage.overwrite };
-            train(&Plan { overwrite, ..stage }, report)?;
+            // What was left without a state is of no use.
+            train(
+                &Plan { action: Action::Start, init: from, overwrite: Overwrite::Yes, ..stage },
+                report,
+            )?;
         }
     }
+    let weights = init.unwrap_or_default();
     let bytes = std::fs::read(&weights)
         .map_err(|e| qudi_core::Error::io("read the last stage's weights", &weights, e))?;
     write(folder, WEIGHTS, &bytes)?;
     let weights = folder.join(WEIGHTS);
     let text = format!("{}: the last of {count} stages", weights.display());
     report.result(&text, || json!({"weights": weights, "stages": count}))
+}
+
+/// The plan of stage `number`, in a folder of its own.
+fn of_stage(plan: &Plan, (number, (name, recipe)): (usize, (String, Recipe))) -> Plan {
+    let own = format!("{}-{name}", number + 1);
+    Plan {
+        folder: plan.folder.join(&own),
+        bursts: plan.bursts.as_ref().map(|bursts| bursts.join(&own)),
+        init: None,
+        recipe,
+        ..plan.clone()
+    }
 }
