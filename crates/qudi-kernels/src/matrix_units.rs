@@ -62,8 +62,8 @@ impl FromStr for MatrixUnits {
 }
 
 thread_local! {
-    /// Units that this thread was told to use.
-    static TOLD: Cell<Option<MatrixUnits>> = const { Cell::new(None) };
+    /// Units forced on this thread.
+    static FORCED: Cell<Option<MatrixUnits>> = const { Cell::new(None) };
 }
 
 impl MatrixUnits {
@@ -105,7 +105,7 @@ impl MatrixUnits {
 
     /// Those that a convolution on this thread uses.
     pub(crate) fn current() -> Self {
-        TOLD.get().unwrap_or_else(|| Self::chosen().unwrap_or(Self::F32))
+        FORCED.get().unwrap_or_else(|| Self::chosen().unwrap_or(Self::F32))
     }
 }
 
@@ -120,7 +120,7 @@ pub fn with_matrix_units<T>(
     if !units.is_available() {
         return Err(MatrixUnitsError::Unavailable(units));
     }
-    let _switch = Switch::turn(&TOLD, Some(units));
+    let _switch = Switch::turn(&FORCED, Some(units));
     Ok(run())
 }
 
@@ -159,7 +159,7 @@ fn tiles() -> bool {
     if unsafe { enabled() } & STATE != STATE {
         return false;
     }
-    // SAFETY: the call takes two numbers and touches no memory of ours.
+    // SAFETY: the call takes two integers and accesses no memory of this process.
     let permitted = unsafe { libc::syscall(libc::SYS_arch_prctl, REQUEST, TILE_DATA) } == 0;
     permitted && crate::conv::tiles_multiply()
 }

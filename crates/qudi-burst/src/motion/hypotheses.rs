@@ -225,7 +225,7 @@ impl HypothesisSelector<'_> {
                 self.add(&own, k, d, &mut sums);
             }
             cost += sums.misfit(variance, self.settings.outside)
-                - sums.common(self.settings.known, variance);
+                - common(&sums, self.settings.known, variance);
         }
         cost
     }
@@ -316,11 +316,6 @@ impl Sums {
         let noise = total(&self.noise) + self.whole_noise * (SIDE * SIDE) as f32;
         total(&self.squares) / variance - noise + outside * self.outside
     }
-
-    /// As much of it as a difference common to all frames explains.
-    fn common(&self, known: f32, variance: f32) -> f32 {
-        common(self, known, variance)
-    }
 }
 
 #[multiversion(targets("x86_64+avx2"))]
@@ -334,6 +329,7 @@ fn add_residuals(here: &Patch, there: &Patch, sum: &mut Patch, squares: &mut Pat
     }
 }
 
+/// As much of a misfit as a difference common to all frames explains.
 #[multiversion(targets("x86_64+avx2"))]
 fn common(sums: &Sums, known: f32, variance: f32) -> f32 {
     let mut common = [[0.0; SIDE]; SIDE];

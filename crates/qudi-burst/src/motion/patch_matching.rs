@@ -40,11 +40,11 @@ pub(crate) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<
         let overall = parents.as_ref().map_or([0; 2], |(_, flow)| median(flow));
         let search = |i: usize| {
             let corner = grid.corner(i);
-            let Some((coarse, flow)) = &parents else { return matching.best(corner, &[[0; 2]]) };
+            let Some((coarse, flow)) = &parents else { return best(&matching, corner, &[[0; 2]]) };
             let centre = corner.map(|c| (c as f32 + 0.5 * side as f32) / ratio as f32);
             let [a, b, c, d, e] = coarse.around(centre).map(|p| flow[p]);
             let starts = [a, b, c, d, e, overall].map(|d| d.map(|d| d * ratio as isize));
-            matching.best(corner, &starts)
+            best(&matching, corner, &starts)
         };
         let flow = (0..grid.len()).map(search).collect();
         parents = Some((grid, flow));
@@ -64,7 +64,7 @@ fn median(flow: &[[isize; 2]]) -> [isize; 2] {
     })
 }
 
-/// [`Matching::best`].
+/// The displacement of least squared difference within `radius` of the best of `starts`.
 #[multiversion(targets("x86_64+avx2"))]
 fn best<'a>(matching: &Matching<'a>, corner: [usize; 2], starts: &[[isize; 2]]) -> [isize; 2] {
     let mut start = (f32::INFINITY, [0; 2]);
@@ -100,11 +100,6 @@ struct Matching<'a> {
 }
 
 impl Matching<'_> {
-    /// The displacement of least squared difference within `radius` of the best of `starts`.
-    fn best(&self, corner: [usize; 2], starts: &[[isize; 2]]) -> [isize; 2] {
-        best(self, corner, starts)
-    }
-
     /// Kept inside the image: what has left it cannot be found.
     #[inline(always)]
     fn inside(&self, corner: [usize; 2], d: [isize; 2]) -> [isize; 2] {

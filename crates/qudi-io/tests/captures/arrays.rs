@@ -50,8 +50,8 @@ fn bytes_that_are_all_one_are_asked_about() {
     let refused = refusal(open(&path, &plain()));
     assert!(refused.contains("255") && refused.contains("pack_axis"), "{refused}");
     for (axis, width) in [(PackAxis::Width, 48), (PackAxis::None, 6)] {
-        let told = ReadOptions { pack_axis: Some(axis), ..plain() };
-        assert_eq!(open(&path, &told).unwrap().size().width, width);
+        let options = ReadOptions { pack_axis: Some(axis), ..plain() };
+        assert_eq!(open(&path, &options).unwrap().size().width, width);
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::source::copy_row;
 use crate::matrix_units::MatrixUnits;
+use pulp::{Arch, Simd, WithSimd};
 
 /// What one place in scratch memory, 32 bits, holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -83,7 +84,6 @@ pub(super) type Row<'a> = (&'a [f32], Option<&'a [f32]>);
 
 /// Copies rows of input planes, `left` and `step` as in [`copy_row`], to a row of scratch. `spare` is as long
 /// as the row.
-#[inline(always)]
 pub(super) fn fill_row(
     format: Format,
     rows: [Option<Row<'_>>; 2],
@@ -99,13 +99,52 @@ pub(super) fn fill_row(
     copy(rows[0], to);
     match format {
         Format::Single => {}
-        Format::Rounded => to.iter_mut().for_each(|value| *value = round(*value)),
+        Format::Rounded => round_all(to),
         Format::Pairs | Format::Tiles(_) => {
-            let spare = &mut spare[..to.len()];
-            copy(rows[1], spare);
-            for (to, &second) in to.iter_mut().zip(&*spare) {
-                *to = pair(*to, second);
-            }
+            let second = &mut spare[..to.len()];
+            copy(rows[1], second);
+            Arch::new().dispatch(PairRows { to, second });
+        }
+    }
+}
+
+/// Rounds values in place.
+pub(super) fn round_all(values: &mut [f32]) {
+    for value in values {
+        *value = round(*value);
+    }
+}
+
+/// Joins two rows into one of pairs. A struct, since closures are not compiled for the vector unit.
+struct PairRows<'a> {
+    to: &'a mut [f32],
+    second: &'a [f32],
+}
+
+impl WithSimd for PairRows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        for (to, &second) in self.to.iter_mut().zip(self.second) {
+            *to = pair(*to, second);
+        }
+    }
+}
+
+/// Rounds values into half the memory.
+pub(super) struct Narrow<'a> {
+    pub(super) from: &'a [f32],
+    pub(super) to: &'a mut [u16],
+}
+
+impl WithSimd for Narrow<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        for (to, &from) in self.to.iter_mut().zip(self.from) {
+            *to = upper(from) as u16;
         }
     }
 }

@@ -2,7 +2,6 @@
 
 use super::pass::{Pass, Tiling};
 use super::scratch::{Format, Row, fill_row};
-use pulp::Arch;
 
 /// Inputs joined by channel, `[images, channels, height, width]` each.
 #[derive(Clone, Copy, Debug)]
@@ -57,35 +56,32 @@ impl<'a> Source<'a> {
         let left = pass.first[1] + (pass.stride * at[1]) as isize;
         let (scratch, spare) = scratch.split_at_mut(scratch.len() - tiling.row);
         let format = tiling.format;
-        let fill = || {
-            for (number, to) in planes.zip(scratch.chunks_exact_mut(tiling.plane())) {
-                let sources = match format {
-                    Format::Single | Format::Rounded => [self.plane(image, number), None],
-                    Format::Pairs | Format::Tiles(_) => {
-                        [2 * number, 2 * number + 1].map(|number| self.plane(image, number))
-                    }
-                };
-                for (row, to) in (top..).zip(to.chunks_exact_mut(tiling.row)) {
-                    if row < 0 || row >= self.height as isize {
-                        to.fill(0.0);
-                        continue;
-                    }
-                    let place = row as usize * self.width..(row as usize + 1) * self.width;
-                    let rows: [Option<Row<'_>>; 2] = sources.map(|source| {
-                        let (plane, mask) = source?;
-                        Some((&plane[place.clone()], mask.map(|mask| &mask[place.clone()])))
-                    });
-                    if pass.stride == 1 {
-                        fill_row(format, rows, left, 1, to, spare);
-                    } else {
-                        let (even, odd) = to.split_at_mut(tiling.half);
-                        fill_row(format, rows, left, 2, even, spare);
-                        fill_row(format, rows, left + 1, 2, odd, spare);
-                    }
+        for (number, to) in planes.zip(scratch.chunks_exact_mut(tiling.plane())) {
+            let sources = match format {
+                Format::Single | Format::Rounded => [self.plane(image, number), None],
+                Format::Pairs | Format::Tiles(_) => {
+                    [2 * number, 2 * number + 1].map(|number| self.plane(image, number))
+                }
+            };
+            for (row, to) in (top..).zip(to.chunks_exact_mut(tiling.row)) {
+                if row < 0 || row >= self.height as isize {
+                    to.fill(0.0);
+                    continue;
+                }
+                let place = row as usize * self.width..(row as usize + 1) * self.width;
+                let rows: [Option<Row<'_>>; 2] = sources.map(|source| {
+                    let (plane, mask) = source?;
+                    Some((&plane[place.clone()], mask.map(|mask| &mask[place.clone()])))
+                });
+                if pass.stride == 1 {
+                    fill_row(format, rows, left, 1, to, spare);
+                } else {
+                    let (even, odd) = to.split_at_mut(tiling.half);
+                    fill_row(format, rows, left, 2, even, spare);
+                    fill_row(format, rows, left + 1, 2, odd, spare);
                 }
             }
-        };
-        if format == Format::Single { fill() } else { Arch::new().dispatch(fill) }
+        }
     }
 }
 

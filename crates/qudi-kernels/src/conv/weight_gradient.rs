@@ -7,7 +7,7 @@ use super::micro::{Products, Single};
 use super::pairs::{PairWork, Pairs, with_pairs};
 use super::pass::{Pass, Tiling};
 use super::run::SCRATCH;
-use super::scratch::{Format, round, upper};
+use super::scratch::{Format, Narrow, round_all};
 use super::source::Source;
 use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
@@ -73,7 +73,7 @@ pub(super) fn weight_gradient(
                     *sum += channel.iter().sum::<f32>();
                 }
                 if halves {
-                    arch.dispatch(|| narrow_all(dy, narrow_dy));
+                    arch.dispatch(Narrow { from: dy, to: narrow_dy });
                 } else if bf16 {
                     round_all(dy);
                 }
@@ -82,7 +82,7 @@ pub(super) fn weight_gradient(
                     let end = (first + tiling.planes).min(planes);
                     source.fill(image, first..end, pass, &tiling, at, taps);
                     if halves {
-                        arch.dispatch(|| narrow_all(taps, narrow_taps));
+                        arch.dispatch(Narrow { from: taps, to: narrow_taps });
                     } else if bf16 {
                         round_all(taps);
                     }
@@ -122,19 +122,6 @@ pub(super) fn weight_gradient(
         add(&mut sums.bias, &part.bias);
     }
     sums
-}
-
-#[inline(always)]
-fn narrow_all(from: &[f32], to: &mut [u16]) {
-    for (to, &from) in to.iter_mut().zip(from) {
-        *to = upper(from) as u16;
-    }
-}
-
-fn round_all(values: &mut [f32]) {
-    for value in values {
-        *value = round(*value);
-    }
 }
 
 fn add(to: &mut [f32], from: &[f32]) {
