@@ -60,6 +60,9 @@ pub enum UNetPrediction {
     /// A correction of the pre-denoised image with inputs and output of unit variance (Karras et al. 2022).
     #[default]
     Edm,
+    /// A correction of the pre-denoised image, in sigmas of its errors. Inputs are those of `Edm`; of the noise
+    /// nothing reaches the prediction but through the network.
+    Correction,
 }
 
 /// A part of the method that can be left out.
@@ -71,6 +74,8 @@ pub enum Part {
     ForwardModel,
     /// Optical flow: neighbours are taken as they are.
     Flow,
+    /// Temporal fusion: every frame is restored from itself alone.
+    Fusion,
     /// The previous estimate as an input.
     SelfConditioning,
     /// The mean level of the image as an input.

@@ -18,6 +18,7 @@ use qudi_core::Result;
 use qudi_core::restorer::Acquisition;
 use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::conditioning::Conditioning;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::Qudi;
 use reconstruction::{relative_reconstruction, root_mean_square};
 use self_conditioning::network_inputs;
@@ -97,7 +98,7 @@ pub struct LossTerms {
     /// The error of the pre-denoised frames; with [`LossForm::Edm`] 1 where it is that of the reference
     /// estimate, or, without one, some tenths of the noise.
     pub pre: Tensor<1>,
-    /// The perceptual distance of the prediction.
+    /// The perceptual distance of the predictions, but for those from noise alone.
     pub perceptual: Option<Tensor<1>>,
     /// The misfit of neighbours, warped along the flows, and the truth; computed only where it has a weight.
     pub flow: Option<Tensor<1>>,
@@ -154,12 +155,10 @@ pub fn loss_terms(
         LossForm::L2Tv => reconstruction(image.clone(), truth.clone()),
         LossForm::Edm => {
             let error = result.x0 - (truth.clone() * 2.0 - 1.0);
-            (error / result.c_out.clamp_min(LEAST_UNIT)).powi_scalar(2).mean()
+            (error / result.unit.clamp_min(LEAST_UNIT)).powi_scalar(2).mean()
         }
     };
-    // Feature differences are small differences of large numbers.
-    let perceptual = perceptual
-        .map(|lpips| with_precision(ComputePrecision::F32, || lpips.loss(image, truth.clone())));
+    let perceptual = perceptual.map(|lpips| perceptual_loss(lpips, &image, example));
     let pre = pre_denoiser_loss(example, result.d, weights.form);
     let flow = (weights.flow > 0.0)
         .then(|| result.flows.warping_error(truth.clone(), conditioning.frames));
@@ -169,6 +168,24 @@ pub fn loss_terms(
     let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     let terms = LossTerms { total, prediction, pre, perceptual, flow, uncertainty, recomputation };
     Ok(terms.weighted(weights))
+}
+
+/// The perceptual distance of predictions, but for those from noise alone: that step gives the mean of all images
+/// that fit, the later ones draw one of them. Zero if there are no others.
+fn perceptual_loss(lpips: &Lpips, images: &Tensor<4>, example: &Example<'_>) -> Tensor<1> {
+    let frames = example.conditioning.frames;
+    let starts = example.timesteps.iter().map(|&timestep| timestep == NUM_TIMESTEPS - 1);
+    let later: Vec<_> = (0..).zip(starts).filter(|(_, starts)| !starts).collect();
+    if later.is_empty() {
+        return images.clone().mean() * 0.0;
+    }
+    let only = |images: &Tensor<4>| {
+        let burst =
+            |&(number, _): &(usize, bool)| images.clone().narrow(0, number * frames, frames);
+        Tensor::cat(later.iter().map(burst).collect(), 0)
+    };
+    // Feature differences are small differences of large numbers.
+    with_precision(ComputePrecision::F32, || lpips.loss(only(images), only(&example.truth)))
 }
 
 /// Computes the terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no

@@ -22,6 +22,8 @@ const MAX_LOG_SNR: f32 = 4.0;
 pub(crate) struct Preconditioned {
     /// The pre-denoised image in [-1, 1]: the mean of what is possible before any noise is seen.
     pub(crate) mean: Tensor<4>,
+    /// Sigma of the mean's errors.
+    pub(crate) sigma: Tensor<4>,
     /// The noisy image's difference from the noisy mean, in its sigma.
     pub(crate) residual: Tensor<4>,
     /// The previous estimate's difference from the mean in sigmas of the mean's errors; zero where there is
@@ -56,7 +58,8 @@ impl Preconditioned {
             previous: previous.clamp(-MAX_PREVIOUS, MAX_PREVIOUS) * flag,
             log_snr: log_snr * 0.5,
             c_skip: sigma.clone() * scaled / total.clone(),
-            c_out: sigma * noise / total,
+            c_out: sigma.clone() * noise / total,
+            sigma,
             mean,
         }
     }

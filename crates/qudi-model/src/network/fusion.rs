@@ -26,15 +26,19 @@ pub struct Fusion {
     cell: Cell,
     /// Scale of level 0.
     fold: usize,
+    /// Whether no frame sees another (an ablation).
+    ablated: bool,
 }
 
 impl FusionConfig {
-    /// The fusion of features of these widths and of `pre` features of the pre-denoiser, all weights zero.
+    /// The fusion of features of these widths and of `pre` features of the pre-denoiser, all weights zero. If it is
+    /// `ablated`, no frame sees another.
     pub fn init(
         &self,
         features: &FeaturesConfig,
         pre: usize,
         fold: usize,
+        ablated: bool,
         device: &Device,
     ) -> Fusion {
         let conv = |sizes, kernel| Conv2d::zeros(sizes, kernel, Bias::Yes, device);
@@ -57,6 +61,7 @@ impl FusionConfig {
                 leave: conv([3 * width, width], 1),
             },
             fold,
+            ablated,
         }
     }
 }
@@ -86,7 +91,13 @@ impl Fusion {
                 x
             } else {
                 let flows = flows.at(self.fold << k);
-                if k < level {
+                if self.ablated {
+                    if k < level {
+                        self.align[k].relu(&[x.clone(), x.clone(), x])
+                    } else {
+                        self.cell.alone(x)
+                    }
+                } else if k < level {
                     self.aligned(k, x, &flows, frames)
                 } else {
                     self.cell.forward(x, &flows, frames)
@@ -106,6 +117,12 @@ impl Fusion {
 }
 
 impl Cell {
+    /// The first frame of both sweeps, for every frame.
+    fn alone(&self, x: Tensor<4>) -> Tensor<4> {
+        let h = self.block.forward(self.join.relu(&[x.clone(), x.zeros_like()]));
+        self.leave.relu(&[h.clone(), h, x])
+    }
+
     fn forward(&self, x: Tensor<4>, flows: &Flows, frames: usize) -> Tensor<4> {
         let [images, c, h, w] = x.dims();
         let bursts = images / frames;

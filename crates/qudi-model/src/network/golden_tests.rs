@@ -275,7 +275,8 @@ fn fusion_matches_pytorch() {
         for case in file.cases() {
             let sizes = config(&case);
             let input = |name: &str| -> Tensor<4> { case.input(name, &device).require_grad() };
-            let fusion = sizes.fusion.init(&sizes.features, sizes.pre.width, sizes.fold, &device);
+            let fusion =
+                sizes.fusion.init(&sizes.features, sizes.pre.width, sizes.fold, false, &device);
             let fusion = weighted(fusion, "fusion");
             let low = ["low_0", "low_1", "low_2"].map(input);
             let high = ["high_0", "high_1", "high_2"].map(input);

@@ -65,13 +65,14 @@ pub struct Encoded {
 /// The network's prediction.
 ///
 /// # Shapes
-/// - x0, c_out, d: `[bursts * frames, 1, height, width]`
+/// - x0, unit, d: `[bursts * frames, 1, height, width]`
 #[derive(Clone, Debug)]
 pub struct Prediction {
     /// The clean image, about in [-1, 1].
     pub x0: Tensor<4>,
-    /// The unit of a correction of the pre-denoised frames: sigma of what is unknown if their errors are white.
-    pub c_out: Tensor<4>,
+    /// The unit of a correction of the pre-denoised frames: sigma of what is unknown of them if their errors are
+    /// white, or of their errors themselves ([`UNetPrediction::Correction`]).
+    pub unit: Tensor<4>,
     /// The pre-denoised frames, in image units.
     pub d: Tensor<4>,
     /// The flows that were used.
@@ -115,7 +116,13 @@ impl NetworkConfig {
             low: self.features.init_low(self.fold, device),
             high: self.features.init_high(self.fold, device),
             flow: self.flow.init(self.ablates(Part::Flow), device),
-            fusion: self.fusion.init(&self.features, self.pre.width, self.fold, device),
+            fusion: self.fusion.init(
+                &self.features,
+                self.pre.width,
+                self.fold,
+                self.ablates(Part::Fusion),
+                device,
+            ),
             unet: self.unet.init(&self.fusion, self.fold, device),
             noisy: self.features.noisy,
             predicts: self.unet.predicts,
@@ -308,14 +315,19 @@ impl Qudi {
         done("flow");
         let fused = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
-        let (c_out, sensor) = (noisy.c_out.clone(), encoded.sensor.clone());
+        let sensor = encoded.sensor.clone();
         let images = self.predicts.images(&noisy, state, input);
         let output = self.unet.forward(images, fused, &state.timesteps, sensor, frames);
+        let unit = match self.predicts {
+            UNetPrediction::X0 | UNetPrediction::Edm => noisy.c_out.clone(),
+            UNetPrediction::Correction => noisy.sigma.clone(),
+        };
         let x0 = match self.predicts {
             UNetPrediction::X0 => output,
             UNetPrediction::Edm => noisy.prediction(output),
+            UNetPrediction::Correction => noisy.mean + output * noisy.sigma,
         };
         done("unet");
-        Prediction { x0, c_out, d, flows }
+        Prediction { x0, unit, d, flows }
     }
 }

@@ -116,7 +116,7 @@ impl UNetPrediction {
     fn planes(self) -> usize {
         match self {
             Self::X0 => 4,
-            Self::Edm => 6,
+            Self::Edm | Self::Correction => 6,
         }
     }
 
@@ -130,7 +130,7 @@ impl UNetPrediction {
         let Preconditioned { mean, residual, previous, log_snr, .. } = noisy.clone();
         match self {
             Self::X0 => vec![mean, state.x_t.clone(), state.previous(), input.signed()],
-            Self::Edm => {
+            Self::Edm | Self::Correction => {
                 vec![mean, residual, previous, input.signed(), input.difference.clone(), log_snr]
             }
         }
