@@ -2,6 +2,7 @@
 
 mod features;
 mod flow;
+mod fused;
 mod fusion;
 #[cfg(test)]
 mod golden_tests;
@@ -17,6 +18,7 @@ mod unet;
 
 pub use features::{HighFeatures, LowFeatures, Pyramid};
 pub use flow::{Flow, Flows};
+pub use fused::{Fused, FusedGradient};
 pub use fusion::Fusion;
 pub use layers::resample::{avg_pool2, pixel_unshuffle};
 pub use parameters::{former_name, init_parameters, parameter_shapes};

@@ -11,6 +11,7 @@ mod reconstruction;
 mod self_conditioning;
 mod timesteps;
 
+use crate::parameters::gradients;
 use burn::tensor::Tensor;
 use gaussian_nll::uncertainty_loss;
 use lpips::Lpips;
@@ -20,12 +21,12 @@ use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::conditioning::Conditioning;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::Qudi;
+use recomputation::{PreDenoised, Predicted, Recomputation};
 use reconstruction::{relative_reconstruction, root_mean_square};
 use self_conditioning::network_inputs;
 use serde::{Deserialize, Serialize};
 
 pub use gaussian_nll::gaussian_nll;
-pub use recomputation::Recomputation;
 pub use reconstruction::reconstruction;
 pub use self_conditioning::{LoopOptions, SelfConditioning};
 pub use timesteps::TimestepLaw;
@@ -104,8 +105,8 @@ pub struct LossTerms {
     pub flow: Option<Tensor<1>>,
     /// The negative log-likelihood of the pre-denoised frames' errors, if their uncertainty is predicted.
     pub uncertainty: Option<Tensor<1>>,
-    /// What is left to do for the gradients of the pre-denoiser, if it is computed again for them.
-    pub recomputation: Option<Recomputation>,
+    /// What is left to do for the gradients, if parts are computed again for them.
+    recomputation: Option<Recomputation>,
 }
 
 impl LossTerms {
@@ -122,6 +123,15 @@ impl LossTerms {
             }
         }
         self
+    }
+
+    /// The gradients of the total for all parameters of `network`, in their order, `[values]` each. `conditioning` is
+    /// that of the example.
+    pub fn gradients(&self, network: &Qudi, conditioning: &Conditioning) -> Vec<Tensor<1>> {
+        match &self.recomputation {
+            Some(recomputation) => recomputation.gradients(network, conditioning),
+            None => gradients(network, &self.total.backward()),
+        }
     }
 }
 
@@ -143,31 +153,44 @@ pub fn loss_terms(
     let Example { conditioning, truth, .. } = example;
     let (state, simulated) = network_inputs(network, example, self_conditioning, options)?;
     let mut encoded = network.encode(conditioning);
-    let recomputation =
-        options.recomputes.then(|| Recomputation::new(network, conditioning, simulated.as_ref()));
-    if let Some(recomputation) = &recomputation {
-        let (d, features) = recomputation.results();
+    let predenoised =
+        options.recomputes.then(|| PreDenoised::new(network, conditioning, simulated.as_ref()));
+    if let Some(predenoised) = &predenoised {
+        let (d, features) = predenoised.results();
         encoded = network.with_predenoised(encoded, d, features);
     }
-    let result = network.forward(&encoded, simulated.as_ref(), &state, None);
-    let image = (result.x0.clone() + 1.0) * 0.5;
+    let fused = network.fuse(&encoded, simulated.as_ref(), &state, None, &mut |_| ());
+    let (d, flows) = (fused.d().clone(), fused.flows().clone());
+    let predicted =
+        predenoised.is_some().then(|| Predicted::new(network, fused.clone(), conditioning.frames));
+    let (x0, unit) = match &predicted {
+        Some(predicted) => predicted.results(),
+        None => network.predict(&fused),
+    };
+    let image = (x0.clone() + 1.0) * 0.5;
     let prediction = match weights.form {
         LossForm::L2Tv => reconstruction(image.clone(), truth.clone()),
         LossForm::Edm => {
-            let error = result.x0 - (truth.clone() * 2.0 - 1.0);
-            (error / result.unit.clamp_min(LEAST_UNIT)).powi_scalar(2).mean()
+            let error = x0 - (truth.clone() * 2.0 - 1.0);
+            (error / unit.clamp_min(LEAST_UNIT)).powi_scalar(2).mean()
         }
     };
     let perceptual = perceptual.map(|lpips| perceptual_loss(lpips, &image, example));
-    let pre = pre_denoiser_loss(example, result.d, weights.form);
-    let flow = (weights.flow > 0.0)
-        .then(|| result.flows.warping_error(truth.clone(), conditioning.frames));
+    let pre = pre_denoiser_loss(example, d, weights.form);
+    let flow =
+        (weights.flow > 0.0).then(|| flows.warping_error(truth.clone(), conditioning.frames));
     // The uncertainty is that of the frames before any simulated measurement.
     let uncertainty = network.predicts_uncertainty().then(|| network.predenoise(conditioning));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));
     let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
-    let terms = LossTerms { total, prediction, pre, perceptual, flow, uncertainty, recomputation };
-    Ok(terms.weighted(weights))
+    let terms =
+        LossTerms { total, prediction, pre, perceptual, flow, uncertainty, recomputation: None };
+    let recomputation = predenoised.zip(predicted).map(|(predenoised, predicted)| {
+        let of_images = LossTerms { flow: None, ..terms.clone() }.weighted(weights).total;
+        let of_flows = terms.flow.clone().map(|flow| flow * weights.flow);
+        Recomputation { predenoised, predicted, of_images, of_flows }
+    });
+    Ok(LossTerms { recomputation, ..terms.weighted(weights) })
 }
 
 /// The perceptual distance of predictions, but for those from noise alone: that step gives the mean of all images

@@ -3,7 +3,7 @@
 use super::batch::Batch;
 use super::ema::Ema;
 use super::optimizer::{Adam, learning_rate};
-use super::parameters::{gradients, parameters, with_frozen, with_parameters};
+use super::parameters::{parameters, with_frozen, with_parameters};
 use super::prefetch::Prefetcher;
 use super::recipe::{LearningPart, LossConfig, Recipe};
 use crate::loss::lpips::Lpips;
@@ -246,17 +246,13 @@ impl Trainer {
         };
         let example = batch.example(&conditioning);
         let perceptual = self.perceptual.get(number);
-        let terms = with_precision(self.recipe.train.precision, || {
+        let precision = self.recipe.train.precision;
+        let terms = with_precision(precision, || {
             loss_terms(network, &example, self_conditioning, weights, loop_options, perceptual)
         })?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let after = terms.total.clone().backward();
-        let mut gradients = gradients(network, &after);
-        if let Some(recomputation) = &terms.recomputation {
-            let more = recomputation.gradients(network, &conditioning, &after);
-            gradients = gradients.into_iter().zip(more).map(|(a, b)| a + b).collect();
-        }
+        let gradients = with_precision(precision, || terms.gradients(network, &conditioning));
         // Reading waits for the device: all numbers at once, when there is nothing left to ask it for.
         let loss = LossValues::read(terms)?;
         self.check("prediction loss", loss.prediction)?;

@@ -530,6 +530,7 @@ class Preconditioned:
         left = signal * error
         scale = (left**2 + noise**2).sqrt()
         self.base, self.known, self.unknown = base, error * left / scale, error * noise / scale
+        self.error = error
         self.residual = (x_t - signal * base) / scale
         self.earlier = ((x0_prev - base) / error).clamp(-5, 5) * each(flag.to(base))
         self.clarity = (left / noise).log().clamp(-4, 4) / 2
@@ -596,6 +597,8 @@ class UNet(nn.Module):
             if k > 0:
                 x = self.up[k - 1](F.interpolate(x, scale_factor=2, mode="nearest"))
         out = F.pixel_shuffle(self.out(F.silu(self.norm(x))), self.fold)
+        if self.predicts == "correction":
+            return noisy.base + noisy.error * out
         return out if self.predicts == "x0" else noisy.prediction(out)
 
 

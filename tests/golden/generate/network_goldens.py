@@ -75,6 +75,8 @@ PAPER = TINY | {
     "flow": TINY["flow"] | {"registration": False},
     "unet": TINY["unet"] | {"predicts": "x0"},
 }
+# From photons alone, but with corrections of pre-denoised frames.
+CORRECTION = PAPER | {"features": TINY["features"], "unet": TINY["unet"] | {"predicts": "correction"}}
 
 
 class Kinks:
@@ -470,10 +472,9 @@ def whole_loss(outputs: Tensors, inputs: Tensors) -> Tensor:
     return outputs["loss"].sum()
 
 
-def paper_file() -> File:
-    """The same with every switch on the paper's side."""
-    file = File("paper", 128)
-    config = PAPER
+def single_file(name: str, config: dict) -> File:
+    """The same from photons alone."""
+    file = File(name, 128)
     module = network.Qudi(config)
     shape = (8, 1, 32, 48)
     inputs = {"u": spread(shape, *LINEAR), "y": spread(shape, *COUNTS), "y_sim": spread(shape, *COUNTS)}
@@ -489,7 +490,7 @@ def paper_file() -> File:
         return {"x0": x0, "d": d, "to_next": flows[0], "to_prev": flows[1]}
 
     about = {"config": config, "frames": 4, "loss": "1.0 L((x0 + 1) / 2, truth) + 0.2 L(d, truth)"}
-    file.case("paper", run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), whole_loss)
+    file.case(name, run, inputs, module, "", about, ("flag", "t", "truth", "sensor"), whole_loss)
     return file
 
 
@@ -607,11 +608,13 @@ FILES: dict[str, Callable[[], File]] = {
     "fusion": fusion_file,
     "unet": unet_file,
     "network": network_file,
-    "paper": paper_file,
+    "paper": lambda: single_file("paper", PAPER),
+    "correction": lambda: single_file("correction", CORRECTION),
     "steps": step_file,
     "sample_ddim": lambda: sample_file(False, TINY, "sample_ddim"),
     "sample_ancestral": lambda: sample_file(True, TINY, "sample_ancestral"),
     "sample_paper": lambda: sample_file(False, PAPER, "sample_paper"),
+    "sample_correction": lambda: sample_file(False, CORRECTION, "sample_correction"),
 }
 
 

@@ -38,7 +38,8 @@ pub(super) fn weight_gradient(
     gradient: Source<'_>,
     bf16: bool,
 ) -> WeightGradient {
-    let halves = bf16 && MatrixUnits::current() != MatrixUnits::F32;
+    // Processors with tiles are Intel's, whose products of pairs do not pay (MatrixUnits).
+    let halves = bf16 && MatrixUnits::current() == MatrixUnits::Avx512Bf16;
     let run = if halves { HALVES } else { micro::longest_run(Format::Single) };
     let tiling = pass.tiling(Format::Single, planes, run);
     let offsets = tiling.offsets(pass, tiling.planes);

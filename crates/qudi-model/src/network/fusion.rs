@@ -91,16 +91,11 @@ impl Fusion {
                 x
             } else {
                 let flows = flows.at(self.fold << k);
-                if self.ablated {
-                    if k < level {
-                        self.align[k].relu(&[x.clone(), x.clone(), x])
-                    } else {
-                        self.cell.alone(x)
-                    }
-                } else if k < level {
-                    self.aligned(k, x, &flows, frames)
-                } else {
-                    self.cell.forward(x, &flows, frames)
+                match (k < level, self.ablated) {
+                    (true, false) => self.aligned(k, x, &flows, frames),
+                    (true, true) => self.align[k].relu(&[x.clone(), x.clone(), x]),
+                    (false, false) => self.cell.forward(x, &flows, frames),
+                    (false, true) => self.cell.alone(x),
                 }
             });
         }

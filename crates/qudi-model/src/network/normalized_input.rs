@@ -80,6 +80,17 @@ impl NormalizedInput {
         Self { planes: Tensor::cat(planes, 1), start, sigma, difference: counts, correction: 1.0 }
     }
 
+    /// The same with `f` of every tensor.
+    pub(super) fn map(&self, f: &dyn Fn(Tensor<4>) -> Tensor<4>) -> Self {
+        Self {
+            start: f(self.start.clone()),
+            sigma: f(self.sigma.clone()),
+            difference: f(self.difference.clone()),
+            planes: f(self.planes.clone()),
+            correction: self.correction,
+        }
+    }
+
     /// What the pre-denoiser corrects, in [-1, 1].
     pub(super) fn signed(&self) -> Tensor<4> {
         self.start.clone() * 2.0 - 1.0

@@ -2,6 +2,7 @@
 
 use super::features::{HighFeatures, LowFeatures};
 use super::flow::{Flow, Flows};
+use super::fused::Fused;
 use super::fusion::Fusion;
 use super::layers::CORRECTION;
 use super::normalized_input::NormalizedInput;
@@ -293,6 +294,22 @@ impl Qudi {
         flows: Option<Flows>,
         done: &mut dyn FnMut(&'static str),
     ) -> Prediction {
+        let fused = self.fuse(encoded, simulated, state, flows, done);
+        let (x0, unit) = self.predict(&fused);
+        done("unet");
+        let Fused { d, flows, .. } = fused;
+        Prediction { x0, unit, d, flows }
+    }
+
+    /// Computes all but the U-Net, and calls `done` with the name of every block that is done.
+    pub fn fuse(
+        &self,
+        encoded: &Encoded,
+        simulated: Option<&Simulated>,
+        state: &DiffusionState,
+        flows: Option<Flows>,
+        done: &mut dyn FnMut(&'static str),
+    ) -> Fused {
         let frames = encoded.frames;
         let u = encoded.u.clone();
         let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
@@ -301,33 +318,36 @@ impl Qudi {
         done("pre");
         let low = self.low.forward(encoded.low.clone(), u_sim, d.clone(), frames);
         done("low");
-        let input = &encoded.input;
+        let input = encoded.input.clone();
         // A sigma spans twice as much in [-1, 1].
-        let sigma = self.error_sigma(&features, input) * 2.0;
-        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma, state);
+        let sigma = self.error_sigma(&features, &input) * 2.0;
         let [image, previous] = match self.noisy {
             NoisyFeatures::Image => [state.x_t.clone(), state.previous()],
-            NoisyFeatures::Residual => [noisy.residual.clone(), noisy.previous.clone()],
+            NoisyFeatures::Residual => {
+                let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma.clone(), state);
+                [noisy.residual, noisy.previous]
+            }
         };
         let high = self.high.forward(image, previous, frames);
         done("high");
         let flows = flows.unwrap_or_else(|| self.estimate_flow(encoded, d.clone()));
         done("flow");
-        let fused = self.fusion.forward(low, high, features, &flows, frames);
+        let pyramid = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
-        let sensor = encoded.sensor.clone();
-        let images = self.predicts.images(&noisy, state, input);
-        let output = self.unet.forward(images, fused, &state.timesteps, sensor, frames);
-        let unit = match self.predicts {
-            UNetPrediction::X0 | UNetPrediction::Edm => noisy.c_out.clone(),
-            UNetPrediction::Correction => noisy.sigma.clone(),
-        };
-        let x0 = match self.predicts {
-            UNetPrediction::X0 => output,
-            UNetPrediction::Edm => noisy.prediction(output),
-            UNetPrediction::Correction => noisy.mean + output * noisy.sigma,
-        };
-        done("unet");
-        Prediction { x0, unit, d, flows }
+        let (sensor, state) = (encoded.sensor.clone(), state.clone());
+        Fused { pyramid, d, sigma, input, sensor, state, frames, flows }
+    }
+
+    pub(super) fn unet(&self) -> &UNet {
+        &self.unet
+    }
+
+    pub(super) fn predicts(&self) -> UNetPrediction {
+        self.predicts
+    }
+
+    /// Whether the U-Net sees the frames of a burst together.
+    pub fn attends_over_time(&self) -> bool {
+        self.unet.attends_over_time()
     }
 }

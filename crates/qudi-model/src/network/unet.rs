@@ -181,6 +181,11 @@ impl UNetConfig {
 }
 
 impl UNet {
+    /// Whether the frames of a burst are seen together.
+    pub(super) fn attends_over_time(&self) -> bool {
+        self.middle.temporal.is_some()
+    }
+
     /// Encodes the sensor for the embedding, `[bursts, M]`; does not depend on the step.
     pub fn encode(&self, sensor: Tensor<2>) -> Tensor<2> {
         self.sensor_out.forward(silu(self.sensor_in.forward(sensor)))

@@ -21,7 +21,7 @@ pub struct LoopOptions {
     pub forward_model: bool,
     /// Whether it is given the previous estimate.
     pub self_conditioning: bool,
-    /// Whether the pre-denoiser is computed again for its gradients ([`Recomputation`](super::Recomputation)).
+    /// Whether pre-denoiser and U-Net are computed again for their gradients, image by image.
     pub recomputes: bool,
 }
 

@@ -26,10 +26,10 @@ fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
     error.powi_scalar(2).mean() + variation * 0.01
 }
 
-/// With a reference estimate, and with every switch on the paper's side.
+/// With a reference estimate, with every switch on the paper's side, and from photons with corrections.
 #[test]
 fn whole_network_matches_pytorch() {
-    for (file, case) in [("network", "tiny"), ("paper", "paper")] {
+    for (file, case) in [("network", "tiny"), ("paper", "paper"), ("correction", "correction")] {
         let file = File::open(&format!("network/{file}"));
         let case = file.case(case);
         let device = flex();
@@ -102,8 +102,12 @@ fn sampler_weights_match_numpy() {
 fn ten_sampling_steps_match_pytorch() {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let size = Size { height: 32, width: 32 };
-    let samplers =
-        [("ddim", Sampler::Ddim), ("ancestral", Sampler::Ancestral), ("paper", Sampler::Ddim)];
+    let samplers = [
+        ("ddim", Sampler::Ddim),
+        ("ancestral", Sampler::Ancestral),
+        ("paper", Sampler::Ddim),
+        ("correction", Sampler::Ddim),
+    ];
     for (name, sampler) in samplers {
         let file = File::open(&format!("network/sample_{name}"));
         let case = file.case("sample");

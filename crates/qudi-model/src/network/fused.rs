@@ -1,0 +1,164 @@
+//! A step between fusion and U-Net: all that the U-Net goes on from, so that it can be computed part by part.
+
+use super::features::Pyramid;
+use super::flow::Flows;
+use super::normalized_input::NormalizedInput;
+use super::qudi::Qudi;
+use crate::config::UNetPrediction;
+use crate::diffusion::precondition::Preconditioned;
+use crate::diffusion::state::DiffusionState;
+use burn::tensor::{Gradients, Tensor};
+
+/// What the U-Net goes on from.
+#[derive(Clone, Debug)]
+pub struct Fused {
+    /// Fused features on three levels.
+    pub(super) pyramid: Pyramid,
+    /// The pre-denoised frames, in image units: `[images, 1, height, width]`.
+    pub(super) d: Tensor<4>,
+    /// Sigma of their errors in [-1, 1].
+    pub(super) sigma: Tensor<4>,
+    pub(super) input: NormalizedInput,
+    /// The encoded sensor, `[bursts, M]`.
+    pub(super) sensor: Tensor<2>,
+    pub(super) state: DiffusionState,
+    /// Frames of a burst.
+    pub(super) frames: usize,
+    /// The flows that were used.
+    pub(super) flows: Flows,
+}
+
+/// Gradients for what the U-Net goes on from.
+#[derive(Clone, Debug)]
+pub struct FusedGradient {
+    /// For the fused features.
+    pub pyramid: Pyramid,
+    /// For the pre-denoised frames.
+    pub d: Tensor<4>,
+    /// For the encoded sensor.
+    pub sensor: Tensor<2>,
+}
+
+impl Qudi {
+    /// The clean image in about [-1, 1], and the unit of a correction
+    /// ([`Prediction`](super::Prediction)).
+    ///
+    /// # Shapes
+    /// - results: `[images, 1, height, width]`
+    pub fn predict(&self, fused: &Fused) -> (Tensor<4>, Tensor<4>) {
+        let Fused { pyramid, d, sigma, input, sensor, state, frames, .. } = fused;
+        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma.clone(), state);
+        let images = self.predicts().images(&noisy, state, input);
+        let (pyramid, sensor) = (pyramid.clone(), sensor.clone());
+        let output = self.unet().forward(images, pyramid, &state.timesteps, sensor, *frames);
+        match self.predicts() {
+            UNetPrediction::X0 => (output, noisy.c_out),
+            UNetPrediction::Edm => (noisy.clone().prediction(output), noisy.c_out),
+            UNetPrediction::Correction => (noisy.mean + output * noisy.sigma.clone(), noisy.sigma),
+        }
+    }
+}
+
+impl Fused {
+    /// The number of images.
+    pub fn images(&self) -> usize {
+        self.d.dims()[0]
+    }
+
+    /// The pre-denoised frames, in image units: `[images, 1, height, width]`.
+    pub fn d(&self) -> &Tensor<4> {
+        &self.d
+    }
+
+    /// The flows that were used.
+    pub fn flows(&self) -> &Flows {
+        &self.flows
+    }
+
+    /// The same outside autodiff.
+    #[must_use]
+    pub fn inner(&self) -> Self {
+        self.map(&|x| x.inner(), self.sensor.clone().inner())
+    }
+
+    /// `count` images from number `first` on, all of one burst.
+    #[must_use]
+    pub fn part(&self, first: usize, count: usize) -> Self {
+        let burst = first / self.frames;
+        let sensor = self.sensor.clone().narrow(0, burst, 1);
+        let mut part = self.map(&|x| x.narrow(0, first, count), sensor);
+        part.state.has_previous = vec![self.state.has_previous[burst]];
+        part.state.timesteps = vec![self.state.timesteps[burst]];
+        part.frames = count;
+        part
+    }
+
+    /// The same with gradients of its own, apart from what made it. It must be outside autodiff.
+    #[must_use]
+    pub fn into_leaf(self) -> Self {
+        let sensor = Tensor::from_inner(self.sensor.clone()).require_grad();
+        let leaf = self.map(&Tensor::from_inner, sensor);
+        Self { pyramid: leaf.pyramid.map(Tensor::require_grad), d: leaf.d.require_grad(), ..leaf }
+    }
+
+    /// The gradients of a [leaf](Self::into_leaf).
+    pub fn gradient(&self, gradients: &Gradients) -> FusedGradient {
+        let of =
+            |x: &Tensor<4>| x.grad(gradients).unwrap_or_else(|| x.clone().inner().zeros_like());
+        let sensor = self.sensor.grad(gradients);
+        FusedGradient {
+            pyramid: self.pyramid.each_ref().map(of),
+            d: of(&self.d),
+            sensor: sensor.unwrap_or_else(|| self.sensor.clone().inner().zeros_like()),
+        }
+    }
+
+    /// The sum of the features and the encoded sensors times these gradients: its gradient is what is left to
+    /// do for them.
+    pub fn product(&self, gradient: &FusedGradient) -> Tensor<1> {
+        let features = self.pyramid.iter().zip(&gradient.pyramid);
+        let sum = (self.sensor.clone() * Tensor::from_inner(gradient.sensor.clone())).sum();
+        features.fold(sum, |sum, (x, gradient)| {
+            sum + (x.clone() * Tensor::from_inner(gradient.clone())).sum()
+        })
+    }
+
+    fn map(&self, f: &dyn Fn(Tensor<4>) -> Tensor<4>, sensor: Tensor<2>) -> Self {
+        Self {
+            pyramid: self.pyramid.clone().map(f),
+            d: f(self.d.clone()),
+            sigma: f(self.sigma.clone()),
+            input: self.input.map(f),
+            sensor,
+            state: DiffusionState {
+                x_t: f(self.state.x_t.clone()),
+                x0_prev: f(self.state.x0_prev.clone()),
+                ..self.state.clone()
+            },
+            frames: self.frames,
+            flows: self.flows.clone(),
+        }
+    }
+}
+
+impl FusedGradient {
+    /// The gradients for all bursts of `frames` frames from those of their parts, in their order.
+    ///
+    /// # Panics
+    /// Without parts.
+    #[must_use]
+    pub fn joined(parts: Vec<Self>, frames: usize) -> Self {
+        let joined =
+            |of: &dyn Fn(&Self) -> Tensor<4>| Tensor::cat(parts.iter().map(of).collect(), 0);
+        let sensors = Tensor::cat(parts.iter().map(|part| part.sensor.clone()).collect(), 0);
+        let (pyramid, d) = (
+            [0, 1, 2].map(|k| joined(&|part| part.pyramid[k].clone())),
+            joined(&|part| part.d.clone()),
+        );
+        let [rows, size] = sensors.dims();
+        let bursts = d.dims()[0] / frames;
+        let sensor =
+            sensors.reshape([bursts, rows / bursts, size]).sum_dim(1).reshape([bursts, size]);
+        Self { pyramid, d, sensor }
+    }
+}
