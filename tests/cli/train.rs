@@ -2,8 +2,9 @@
 
 use crate::support::{listing, refused, run, scratch};
 use image::{GrayImage, Luma};
+use safetensors::SafeTensors;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Settings that make `tiny` a matter of seconds.
 const QUICK: &str = "--device cpu -q --set train.steps=4 --set train.checkpoint=2 --set data.crop=32 \
@@ -58,6 +59,48 @@ fn tiny_recipe_trains_without_files() {
     let (first, last) = (quality(validations[0]), quality(validations[7]));
     for (first, last) in first.into_iter().zip(last) {
         assert!(last > first + 4.0 && last > 14.6 + 2.0, "from {first} to {last} dB");
+    }
+    simulated_measurements_reach_learnt_weights(&folder);
+}
+
+/// The pre-denoiser has learnt from simulated measurements, and more than one step uses what it has learnt.
+fn simulated_measurements_reach_learnt_weights(folder: &Path) {
+    const NAME: &str = "pre.simulated_in.weight";
+    let bytes = std::fs::read(folder.join("run/weights.safetensors")).unwrap();
+    let values = |bytes: &[u8]| -> Vec<f32> {
+        let file = SafeTensors::deserialize(bytes).unwrap();
+        let data = file.tensor(NAME).unwrap().data();
+        data.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+    };
+    run(
+        folder,
+        "train tiny -o initial --device cpu -q --set train.steps=1 --set train.lr=1e-9 --set train.min_lr=0",
+    );
+    let initial = values(&std::fs::read(folder.join("initial/weights.safetensors")).unwrap());
+    let learnt = values(&bytes);
+    let moved = learnt.iter().zip(&initial).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+    let moved = (moved / learnt.len() as f32).sqrt();
+    assert!(moved > 0.01, "{NAME} moved by {moved}");
+    // Without them.
+    let mut lesioned = bytes.clone();
+    let place =
+        SafeTensors::deserialize(&bytes).unwrap().tensor(NAME).unwrap().data().as_ptr_range();
+    let first = place.start as usize - bytes.as_ptr() as usize;
+    lesioned[first..first + 4 * learnt.len()].fill(0);
+    std::fs::write(folder.join("lesioned.safetensors"), lesioned).unwrap();
+    for steps in [1, 4] {
+        for (name, weights) in [("whole", "run/weights"), ("lesioned", "lesioned")] {
+            let output = format!("{name}-{steps}.npy");
+            run(
+                folder,
+                &format!(
+                    "restore b.npy --weights {weights}.safetensors --steps {steps} --device cpu -o {output} -q"
+                ),
+            );
+        }
+        let frames =
+            |name: &str| std::fs::read(folder.join(format!("{name}-{steps}.npy"))).unwrap();
+        assert_eq!(frames("whole") == frames("lesioned"), steps == 1, "{steps} steps");
     }
 }
 

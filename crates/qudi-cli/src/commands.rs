@@ -35,6 +35,7 @@ pub(crate) mod demo {
 }
 
 pub(crate) mod eval {
+    mod appearance;
     pub(crate) mod args;
     mod capture;
     mod clip;

@@ -1,11 +1,15 @@
 //! How close an estimate is to the truth.
 
 mod chi_square;
+mod detail;
+mod gmsd;
 mod psnr;
 mod ssim;
 mod statistics;
 
 pub use chi_square::Consistency;
+pub use detail::{Detail, detail};
+pub use gmsd::gmsd;
 pub use psnr::{best_gain, gain_aligned_psnr, psnr};
 pub use ssim::{gaussian_ssim, ssim};
 pub use statistics::Statistics;

@@ -1,8 +1,8 @@
 # /// script
 # requires-python = ">=3.10"
-# dependencies = ["numpy", "scikit-image"]
+# dependencies = ["numpy", "scikit-image", "scipy"]
 # ///
-"""PSNR and SSIM of scikit-image on small images, for crates/qudi-core/tests/metrics.rs.
+"""PSNR and SSIM of scikit-image, and GMSD by SciPy, on small images, for crates/qudi-core/tests/metrics.rs.
 
     python tests/golden/generate/metrics.py tests/golden/metrics
 """
@@ -12,7 +12,23 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import convolve2d
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+
+
+def gmsd(truth: np.ndarray, estimate: np.ndarray) -> float:
+    """As the authors' MATLAB program (Xue et al. 2014), for images of 8 bits."""
+    prewitt = np.array([[1, 0, -1]] * 3) / 3
+
+    def gradients(image: np.ndarray) -> np.ndarray:
+        # conv2(..., 'same') with a kernel of 2 x 2 looks at the next row and column.
+        half = convolve2d(255 * image, np.full((2, 2), 0.25), "full")[1:, 1:][::2, ::2]
+        return np.hypot(convolve2d(half, prewitt, "same"), convolve2d(half, prewitt.T, "same"))
+
+    a, b = gradients(truth), gradients(estimate)
+    return ((2 * a * b + 170) / (a * a + b * b + 170)).std(ddof=1)
+
 
 out = Path(sys.argv[1])
 out.mkdir(parents=True, exist_ok=True)
@@ -36,5 +52,6 @@ for name, sigma, gain in (("fine", 0.02, 1.0), ("rough", 0.2, 0.8), ("wild", 0.6
         "ssim_g": structural_similarity(
             t, e, data_range=1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
         ),
+        "gmsd": gmsd(t, e),
     }
 (out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n")

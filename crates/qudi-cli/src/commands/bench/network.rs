@@ -215,7 +215,7 @@ fn describe(
     device: &Opened,
 ) -> String {
     let mut text = format!(
-        "{:<8}{:>12}{:>13}{:>9}{:>10}{:>10}{:>10}{:>11}\n",
+        "{:<12}{:>12}{:>13}{:>9}{:>10}{:>10}{:>10}{:>11}\n",
         "preset",
         "parameters",
         "GFLOP/frame",
@@ -230,13 +230,13 @@ fn describe(
         let peak = f.peak_mib.map_or("-".to_owned(), |mib| format!("{mib:.0}"));
         let _ = writeln!(
             text,
-            "{:<8}{:>12}{:>13.2}{:>9.3}{rate:>10.1}{:>10.2}{peak:>10}{:>11.3}",
+            "{:<12}{:>12}{:>13.2}{:>9.3}{rate:>10.1}{:>10.2}{peak:>10}{:>11.3}",
             f.preset, f.parameters, f.gflop_per_frame_step, f.step, f.restore, f.forward_backward
         );
     }
     text.push('\n');
     for f in all {
-        let _ = write!(text, "{:<8}ms: prepare {:.1}", f.preset, 1e3 * f.prepare);
+        let _ = write!(text, "{:<12}ms: prepare {:.1}", f.preset, 1e3 * f.prepare);
         for (block, seconds) in &f.blocks {
             let _ = write!(text, ", {block} {:.1}", 1e3 * seconds);
         }

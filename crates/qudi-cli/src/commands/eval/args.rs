@@ -79,6 +79,10 @@ pub(crate) struct Eval {
     /// (docs/training.md says how to get them)
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, conflicts_with = "capture")]
     pub(crate) backbones: Option<PathBuf>,
+    /// Measure how frames look as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, and detail beside the
+    /// truth's in the flattest and the most textured quarter
+    #[arg(long, conflicts_with = "capture")]
+    pub(crate) appearance: bool,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,

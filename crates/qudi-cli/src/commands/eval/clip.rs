@@ -125,6 +125,7 @@ impl Clip {
             motion,
             acquisition,
             perceptual: plan.perceptual.clone(),
+            appearance: plan.appearance,
         })
     }
 }

@@ -1,5 +1,6 @@
 //! One clip, exposed at one light level, scored for every method.
 
+use super::appearance::Appearance;
 use super::args::External;
 use super::html::Pictures;
 use super::perceptual::Perceptual;
@@ -72,6 +73,8 @@ pub(super) struct ExposedClip {
     pub(super) motion: Motion,
     pub(super) acquisition: Acquisition,
     pub(super) perceptual: Option<Rc<Perceptual>>,
+    /// Whether the looks of frames are measured.
+    pub(super) appearance: bool,
 }
 
 impl ExposedClip {
@@ -169,6 +172,7 @@ impl ExposedClip {
         let perceptual = self.perceptual.as_ref();
         let distances = perceptual.map(|p| p.distances(&aligned(image, truth), truth));
         let [lpips_alex, lpips_vgg] = distances.transpose()?.unwrap_or_default();
+        let appearance = self.appearance.then(|| Appearance::of(&aligned(image, truth), truth));
         Ok(FrameScore {
             psnr_a: Some(gain_aligned_psnr(image, truth)),
             psnr: Some(psnr(image, truth)),
@@ -176,6 +180,7 @@ impl ExposedClip {
             ssim_g: Some(gaussian_ssim(image, truth).ok_or_else(small)?),
             lpips_alex,
             lpips_vgg,
+            appearance: appearance.transpose()?,
             chi_square: None,
         })
     }

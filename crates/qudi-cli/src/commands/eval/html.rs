@@ -1,7 +1,7 @@
 //! The page of `qudi eval`: table, plot, and pictures side by side.
 
 use super::score::{Row, Score};
-use super::table::summary;
+use super::table::{appearance, summary};
 use crate::error::Result;
 use crate::report::html::{TableView, crop, crop_size, render};
 use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
@@ -33,6 +33,8 @@ struct Page<'a> {
     title: &'a str,
     about: &'a str,
     table: TableView,
+    /// How frames look, where that was measured.
+    appearance: Option<TableView>,
     plot: Option<Drawing>,
     has_truth: bool,
     clips: Vec<Clip>,
@@ -89,6 +91,7 @@ pub(crate) fn html(rows: &[Row], pictures: &[Pictures], about: &str) -> Result<S
             title: "Evaluation of methods",
             about,
             table: TableView::from(&summary(rows)),
+            appearance: appearance(rows).as_ref().map(TableView::from),
             plot: quality(rows).draw(),
             has_truth: pictures.iter().any(|clip| clip.truth.is_some()),
             clips: pictures.iter().map(clip).collect(),

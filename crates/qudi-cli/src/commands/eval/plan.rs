@@ -43,6 +43,8 @@ pub(super) struct Plan {
     pub(super) pictures: bool,
     /// LPIPS, if it is measured.
     pub(super) perceptual: Option<Rc<Perceptual>>,
+    /// Whether the looks of frames are measured.
+    pub(super) appearance: bool,
     /// How a capture is read.
     pub(super) read: ReadOptions,
     /// How many frames are summed, if that is said.
@@ -95,6 +97,7 @@ impl Plan {
             shard: args.shard,
             pictures: args.html.is_some(),
             perceptual,
+            appearance: args.appearance,
             read: args.reading.options(MaskChoice::Auto),
             sum: args.reading.sum(),
             overwrite,

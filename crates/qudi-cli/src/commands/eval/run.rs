@@ -7,7 +7,7 @@ use super::exposing::Exposing;
 use super::html::html;
 use super::plan::Plan;
 use super::score::{Figure, FlowKind, Row};
-use super::table::{frames, summary};
+use super::table::{appearance, frames, summary};
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
@@ -55,8 +55,12 @@ pub(crate) fn run(
     csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
     html_file.write(|| html(&rows, &pictures, &about))?;
     let table = summary(&rows);
-    markdown_file.write(|| Ok(markdown::table(&table)))?;
-    let text = format!("{}\n{about}\n", table.to_text());
+    markdown_file.write(|| {
+        let looks = appearance(&rows).map(|table| format!("\n{}", markdown::table(&table)));
+        Ok(markdown::table(&table) + &looks.unwrap_or_default())
+    })?;
+    let looks = appearance(&rows).map_or(String::new(), |table| format!("{}\n", table.to_text()));
+    let text = format!("{}\n{looks}{about}\n", table.to_text());
     report.result(&text, || document(settings, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
     match args.min_psnr {
@@ -179,6 +183,11 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
             "ssim_g": of(|f| f.ssim_g),
             "lpips_alex": of(|f| f.lpips_alex),
             "lpips_vgg": of(|f| f.lpips_vgg),
+            "gmsd": of(|f| f.appearance.map(|a| a.gmsd)),
+            "ssimulacra2": of(|f| f.appearance.map(|a| a.ssimulacra2)),
+            "butteraugli": of(|f| f.appearance.map(|a| a.butteraugli)),
+            "detail_flat": of(|f| f.appearance?.detail_flat),
+            "detail_textured": of(|f| f.appearance?.detail_textured),
             "chi_square": row.mean(|s| s.chi_square),
             "flicker": row.mean(|s| s.flicker),
             "flow": row.flow(),

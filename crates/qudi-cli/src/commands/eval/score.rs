@@ -1,5 +1,6 @@
 //! Figures of methods: of a frame, of a clip, of all clips. What needs a truth is absent without one.
 
+use super::appearance::Appearance;
 use qudi_core::Frame;
 use qudi_core::metrics::Statistics;
 use serde::Serialize;
@@ -19,6 +20,8 @@ pub(crate) struct FrameScore {
     pub(crate) lpips_alex: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) lpips_vgg: Option<f64>,
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub(crate) appearance: Option<Appearance>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) chi_square: Option<f64>,
 }

@@ -56,20 +56,56 @@ fn cells(row: &Row) -> Vec<Cell> {
     ]
 }
 
-/// One row for every method, light level, clip and frame; LPIPS where it was measured.
+/// How frames look, one row for every method and light level; none where it was not measured.
+pub(crate) fn appearance(rows: &[Row]) -> Option<Table> {
+    let figures: [(&str, &str, Figure, usize); 7] = [
+        ("lpips_alex", "lpips-alex", |f| f.lpips_alex, 3),
+        ("lpips_vgg", "lpips-vgg", |f| f.lpips_vgg, 3),
+        ("gmsd", "gmsd", |f| f.appearance.map(|a| a.gmsd), 4),
+        ("ssimulacra2", "ssimulacra2", |f| f.appearance.map(|a| a.ssimulacra2), 2),
+        ("butteraugli", "butteraugli", |f| f.appearance.map(|a| a.butteraugli), 2),
+        ("detail_flat", "detail flat", |f| f.appearance?.detail_flat, 2),
+        ("detail_textured", "detail textured", |f| f.appearance?.detail_textured, 2),
+    ];
+    rows.iter().find(|row| row.over_clips(|f| f.appearance.map(|a| a.gmsd)).is_some())?;
+    let names = [("method", "method"), ("ppp", "PPP")];
+    let names = names.into_iter().chain(figures.iter().map(|(key, name, ..)| (*key, *name)));
+    let mut table = Table::new(names.map(|(key, name)| Column::new(key, name)).collect());
+    table.rows = rows
+        .iter()
+        .map(|row| {
+            let mut cells =
+                vec![Cell::text(&row.method), Cell::Exact((row.ppp * 1e4).round() / 1e4)];
+            let figures = figures.iter();
+            cells.extend(figures.map(|(_, _, figure, digits)| {
+                Cell::number(row.over_clips(*figure).map(|s| s.mean), *digits)
+            }));
+            cells
+        })
+        .collect();
+    Some(table.without_unknown_columns())
+}
+
+/// One row for every method, light level, clip and frame; LPIPS and looks where they were measured.
 pub(crate) fn frames(rows: &[Row]) -> Table {
-    let figures: [(&str, Figure, usize); 7] = [
+    let figures: [(&str, Figure, usize); 12] = [
         ("psnr_a", |f| f.psnr_a, 2),
         ("psnr", |f| f.psnr, 2),
         ("ssim", |f| f.ssim, 3),
         ("ssim_g", |f| f.ssim_g, 3),
         ("lpips_alex", |f| f.lpips_alex, 4),
         ("lpips_vgg", |f| f.lpips_vgg, 4),
+        ("gmsd", |f| f.appearance.map(|a| a.gmsd), 4),
+        ("ssimulacra2", |f| f.appearance.map(|a| a.ssimulacra2), 2),
+        ("butteraugli", |f| f.appearance.map(|a| a.butteraugli), 3),
+        ("detail_flat", |f| f.appearance?.detail_flat, 3),
+        ("detail_textured", |f| f.appearance?.detail_textured, 3),
         ("chi_square", |f| f.chi_square, 3),
     ];
+    let always = ["psnr_a", "psnr", "ssim", "ssim_g", "chi_square"];
     let all = || rows.iter().flat_map(|row| &row.scores).flat_map(|score| &score.frames);
     let is_shown = |(key, figure, _): &(&str, Figure, usize)| {
-        !key.starts_with("lpips") || all().any(|frame| figure(frame).is_some())
+        always.contains(key) || all().any(|frame| figure(frame).is_some())
     };
     let figures: Vec<_> = figures.into_iter().filter(is_shown).collect();
     let keys = ["method", "ppp", "clip", "frame"].into_iter().chain(figures.iter().map(|f| f.0));

@@ -1,0 +1,98 @@
+//! Detail beside that of the truth: where nothing is, and where much is.
+
+use crate::frame::Frame;
+
+/// Side of the squares that are ranked by how much is in them.
+const SIDE: usize = 16;
+
+/// The energy of the gradients of an image over that of the truth: 1 where it has as much detail.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Detail {
+    /// In the quarter of the squares in which the truth has least: above 1 where grain was added.
+    pub flat: f64,
+    /// In the quarter in which it has most: below 1 where it was smoothed.
+    pub textured: f64,
+}
+
+/// The detail of an image beside that of the truth. `None` for frames of different sizes, with fewer than four squares of
+/// 16 x 16 pixels, or where the truth is constant in a quarter of them.
+pub fn detail(estimate: &Frame, truth: &Frame) -> Option<Detail> {
+    let squares = squares(truth);
+    if estimate.size != truth.size || squares.len() < 4 {
+        return None;
+    }
+    let mut ranked: Vec<_> = squares
+        .into_iter()
+        .map(|square| (energy(truth, square), energy(estimate, square)))
+        .collect();
+    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let quarter = ranked.len() / 4;
+    let ratio = |part: &[(f64, f64)]| {
+        let (truth, estimate) =
+            part.iter().fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
+        (truth > 0.0).then_some(estimate / truth)
+    };
+    let textured = &ranked[ranked.len() - quarter..];
+    Some(Detail { flat: ratio(&ranked[..quarter])?, textured: ratio(textured)? })
+}
+
+/// The upper left corners of whole squares.
+fn squares(frame: &Frame) -> Vec<[usize; 2]> {
+    let rows = (0..frame.size.height / SIDE).map(|row| row * SIDE);
+    let columns = 0..frame.size.width / SIDE;
+    rows.flat_map(|y| columns.clone().map(move |column| [y, column * SIDE])).collect()
+}
+
+/// The sum of squared differences of neighbours in a square.
+fn energy(frame: &Frame, [top, left]: [usize; 2]) -> f64 {
+    let width = frame.size.width;
+    let value = |y: usize, x: usize| f64::from(frame.data[(top + y) * width + left + x]);
+    let mut sum = 0.0;
+    for y in 0..SIDE {
+        for x in 0..SIDE {
+            if x + 1 < SIDE {
+                sum += (value(y, x + 1) - value(y, x)).powi(2);
+            }
+            if y + 1 < SIDE {
+                sum += (value(y + 1, x) - value(y, x)).powi(2);
+            }
+        }
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::Size;
+
+    /// Left half a slope, right half stripes.
+    fn scene(grain: f32, contrast: f32) -> Frame {
+        let size = Size { height: 32, width: 64 };
+        Frame::from_fn(size, |x, y| {
+            let grain = if (x + y) % 2 == 0 { grain } else { 0.0 };
+            if x < 32 {
+                0.01 * x as f32 + grain
+            } else {
+                0.5 + contrast * ((x / 2 % 2) as f32 - 0.5)
+            }
+        })
+    }
+
+    #[test]
+    fn grain_shows_in_flat_parts_and_smoothing_in_texture() {
+        let truth = scene(0.0, 0.4);
+        let same = detail(&truth, &truth);
+        assert_eq!(same, Some(Detail { flat: 1.0, textured: 1.0 }));
+        let Some(changed) = detail(&scene(0.02, 0.2), &truth) else { panic!("large enough") };
+        assert!(changed.flat > 4.0 && (changed.textured - 0.25).abs() < 1e-3, "{changed:?}");
+    }
+
+    #[test]
+    fn frames_that_cannot_be_ranked_have_no_detail() {
+        let small = Frame::from_fn(Size { height: 16, width: 48 }, |x, _| x as f32);
+        assert_eq!(detail(&small, &small), None);
+        let flat = Frame::from_fn(Size { height: 64, width: 64 }, |_, _| 0.5);
+        assert_eq!(detail(&flat, &flat), None);
+    }
+}
