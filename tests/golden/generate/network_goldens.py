@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Golden values of the network for the Rust tests, in tests/golden/network and, for single operations, tests/golden/kernels.
+"""Golden values of the network for the Rust tests, in tests/golden: network, kernels (single operations), sampling.
 
     python tests/golden/generate/network_goldens.py [FILE ...]
 
@@ -210,9 +210,11 @@ class File:
         self.tensors[name] = value.float().contiguous().clone()
 
     def save(self) -> None:
-        folder = OUT / ("kernels" if self.name in KERNELS else "network")
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{self.name}.safetensors"
+        folder = "kernels" if self.name in KERNELS else "network"
+        if self.name.startswith("sample_"):
+            folder = "sampling"
+        (OUT / folder).mkdir(parents=True, exist_ok=True)
+        path = OUT / folder / f"{self.name.removeprefix('sample_')}.safetensors"
         save_file(dict(sorted(self.tensors.items())), path, {"cases": json.dumps(self.cases)})
         errors = ", ".join(f"{kind} {e:.1e} ({where})" for kind, (e, where) in self.worst.items())
         path.chmod(0o644)

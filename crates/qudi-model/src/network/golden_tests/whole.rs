@@ -109,7 +109,7 @@ fn ten_sampling_steps_match_pytorch() {
         ("correction", Sampler::Ddim),
     ];
     for (name, sampler) in samplers {
-        let file = File::open(&format!("network/sample_{name}"));
+        let file = File::open(&format!("sampling/{name}"));
         let case = file.case("sample");
         let device = Device::flex();
         let config = config(&case);
