@@ -227,6 +227,8 @@ fn rejects_impossible_recipes_and_folders() {
         ("train tiny -o run --init none.safetensors", &["none.safetensors"]),
         ("train small -o run", &["--data"]),
         ("train small -o run --data .", &["cups"]),
+        // What a later stage lacks is said before any file is read.
+        ("train paper-mini -o run --data . --backbones .", &["vgg16"]),
         (
             "train tiny -o run --set train.loss.term=lpips-vgg --set train.loss.perceptual=0.3 --backbones .",
             &["vgg16"],

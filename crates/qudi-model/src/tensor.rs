@@ -1,6 +1,6 @@
 //! The only bridge between images in memory and tensors.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_core::{Error, Result, Size};
 
 /// Images as a tensor, `[images, 1, height, width]`. `values` holds whole images, row-major.
@@ -24,4 +24,14 @@ pub fn read<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>> {
     };
     let data = tensor.try_into_data().map_err(|e| failed(e.to_string()))?;
     data.try_into_vec::<f32>().map_err(|e| failed(e.to_string()))
+}
+
+/// The gradient for `x`, zero where there is none.
+pub fn gradient_of<const D: usize>(x: &Tensor<D>, gradients: &Gradients) -> Tensor<D> {
+    x.grad(gradients).unwrap_or_else(|| x.clone().inner().zeros_like())
+}
+
+/// The sum of `x` times the gradient for it: the gradient of that sum is what is left to do for `x`.
+pub fn product<const D: usize>(x: Tensor<D>, gradient: Tensor<D>) -> Tensor<1> {
+    (x * Tensor::from_inner(gradient)).sum()
 }

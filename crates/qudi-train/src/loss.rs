@@ -159,8 +159,8 @@ pub fn loss_terms(
         let (d, features) = predenoised.results();
         encoded = network.with_predenoised(encoded, d, features);
     }
-    let fused = network.fuse(&encoded, simulated.as_ref(), &state, None, &mut |_| ());
-    let (d, flows) = (fused.d().clone(), fused.flows().clone());
+    let (fused, flows) = network.fuse(&encoded, simulated.as_ref(), &state, None, &mut |_| ());
+    let d = fused.d().clone();
     let predicted =
         predenoised.is_some().then(|| Predicted::new(network, fused.clone(), conditioning.frames));
     let (x0, unit) = match &predicted {
@@ -197,14 +197,14 @@ pub fn loss_terms(
 /// that fit, the later ones draw one of them. Zero if there are no others.
 fn perceptual_loss(lpips: &Lpips, images: &Tensor<4>, example: &Example<'_>) -> Tensor<1> {
     let frames = example.conditioning.frames;
-    let starts = example.timesteps.iter().map(|&timestep| timestep == NUM_TIMESTEPS - 1);
-    let later: Vec<_> = (0..).zip(starts).filter(|(_, starts)| !starts).collect();
+    let timesteps = example.timesteps;
+    let later: Vec<_> =
+        (0..timesteps.len()).filter(|&n| timesteps[n] < NUM_TIMESTEPS - 1).collect();
     if later.is_empty() {
         return images.clone().mean() * 0.0;
     }
     let only = |images: &Tensor<4>| {
-        let burst =
-            |&(number, _): &(usize, bool)| images.clone().narrow(0, number * frames, frames);
+        let burst = |&number: &usize| images.clone().narrow(0, number * frames, frames);
         Tensor::cat(later.iter().map(burst).collect(), 0)
     };
     // Feature differences are small differences of large numbers.

@@ -1,12 +1,10 @@
 //! A step between fusion and U-Net: all that the U-Net goes on from, so that it can be computed part by part.
 
 use super::features::Pyramid;
-use super::flow::Flows;
 use super::normalized_input::NormalizedInput;
-use super::qudi::Qudi;
-use crate::config::UNetPrediction;
 use crate::diffusion::precondition::Preconditioned;
 use crate::diffusion::state::DiffusionState;
+use crate::tensor::{gradient_of, product};
 use burn::tensor::{Gradients, Tensor};
 
 /// What the U-Net goes on from.
@@ -18,14 +16,14 @@ pub struct Fused {
     pub(super) d: Tensor<4>,
     /// Sigma of their errors in [-1, 1].
     pub(super) sigma: Tensor<4>,
+    /// The state around these frames, where it is computed already.
+    pub(super) noisy: Option<Preconditioned>,
     pub(super) input: NormalizedInput,
     /// The encoded sensor, `[bursts, M]`.
     pub(super) sensor: Tensor<2>,
     pub(super) state: DiffusionState,
     /// Frames of a burst.
     pub(super) frames: usize,
-    /// The flows that were used.
-    pub(super) flows: Flows,
 }
 
 /// Gradients for what the U-Net goes on from.
@@ -39,26 +37,6 @@ pub struct FusedGradient {
     pub sensor: Tensor<2>,
 }
 
-impl Qudi {
-    /// The clean image in about [-1, 1], and the unit of a correction
-    /// ([`Prediction`](super::Prediction)).
-    ///
-    /// # Shapes
-    /// - results: `[images, 1, height, width]`
-    pub fn predict(&self, fused: &Fused) -> (Tensor<4>, Tensor<4>) {
-        let Fused { pyramid, d, sigma, input, sensor, state, frames, .. } = fused;
-        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma.clone(), state);
-        let images = self.predicts().images(&noisy, state, input);
-        let (pyramid, sensor) = (pyramid.clone(), sensor.clone());
-        let output = self.unet().forward(images, pyramid, &state.timesteps, sensor, *frames);
-        match self.predicts() {
-            UNetPrediction::X0 => (output, noisy.c_out),
-            UNetPrediction::Edm => (noisy.clone().prediction(output), noisy.c_out),
-            UNetPrediction::Correction => (noisy.mean + output * noisy.sigma.clone(), noisy.sigma),
-        }
-    }
-}
-
 impl Fused {
     /// The number of images.
     pub fn images(&self) -> usize {
@@ -70,9 +48,11 @@ impl Fused {
         &self.d
     }
 
-    /// The flows that were used.
-    pub fn flows(&self) -> &Flows {
-        &self.flows
+    /// The state around the pre-denoised frames.
+    pub(super) fn noisy(&self) -> Preconditioned {
+        let around =
+            || Preconditioned::new(self.d.clone() * 2.0 - 1.0, self.sigma.clone(), &self.state);
+        self.noisy.clone().unwrap_or_else(around)
     }
 
     /// The same outside autodiff.
@@ -103,13 +83,10 @@ impl Fused {
 
     /// The gradients of a [leaf](Self::into_leaf).
     pub fn gradient(&self, gradients: &Gradients) -> FusedGradient {
-        let of =
-            |x: &Tensor<4>| x.grad(gradients).unwrap_or_else(|| x.clone().inner().zeros_like());
-        let sensor = self.sensor.grad(gradients);
         FusedGradient {
-            pyramid: self.pyramid.each_ref().map(of),
-            d: of(&self.d),
-            sensor: sensor.unwrap_or_else(|| self.sensor.clone().inner().zeros_like()),
+            pyramid: self.pyramid.each_ref().map(|x| gradient_of(x, gradients)),
+            d: gradient_of(&self.d, gradients),
+            sensor: gradient_of(&self.sensor, gradients),
         }
     }
 
@@ -117,10 +94,10 @@ impl Fused {
     /// do for them.
     pub fn product(&self, gradient: &FusedGradient) -> Tensor<1> {
         let features = self.pyramid.iter().zip(&gradient.pyramid);
-        let sum = (self.sensor.clone() * Tensor::from_inner(gradient.sensor.clone())).sum();
-        features.fold(sum, |sum, (x, gradient)| {
-            sum + (x.clone() * Tensor::from_inner(gradient.clone())).sum()
-        })
+        features
+            .fold(product(self.sensor.clone(), gradient.sensor.clone()), |sum, (x, gradient)| {
+                sum + product(x.clone(), gradient.clone())
+            })
     }
 
     fn map(&self, f: &dyn Fn(Tensor<4>) -> Tensor<4>, sensor: Tensor<2>) -> Self {
@@ -128,6 +105,7 @@ impl Fused {
             pyramid: self.pyramid.clone().map(f),
             d: f(self.d.clone()),
             sigma: f(self.sigma.clone()),
+            noisy: None,
             input: self.input.map(f),
             sensor,
             state: DiffusionState {
@@ -136,7 +114,6 @@ impl Fused {
                 ..self.state.clone()
             },
             frames: self.frames,
-            flows: self.flows.clone(),
         }
     }
 }

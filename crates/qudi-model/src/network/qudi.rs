@@ -185,7 +185,9 @@ impl Qudi {
         state: &DiffusionState,
         flows: Option<Flows>,
     ) -> Prediction {
-        self.forward_observed(encoded, simulated, state, flows, &mut |_| ())
+        let (fused, flows) = self.fuse(encoded, simulated, state, flows, &mut |_| ());
+        let (x0, unit) = self.predict(&fused);
+        Prediction { x0, unit, d: fused.d, flows }
     }
 
     /// Pre-denoises frames alone, in image units, before any simulated measurement, with their predicted
@@ -285,22 +287,6 @@ impl Qudi {
         self.pre.forward(pre, input, both, flag)
     }
 
-    /// [`Self::forward`], which calls `done` with the name of every block that is done.
-    pub fn forward_observed(
-        &self,
-        encoded: &Encoded,
-        simulated: Option<&Simulated>,
-        state: &DiffusionState,
-        flows: Option<Flows>,
-        done: &mut dyn FnMut(&'static str),
-    ) -> Prediction {
-        let fused = self.fuse(encoded, simulated, state, flows, done);
-        let (x0, unit) = self.predict(&fused);
-        done("unet");
-        let Fused { d, flows, .. } = fused;
-        Prediction { x0, unit, d, flows }
-    }
-
     /// Computes all but the U-Net, and calls `done` with the name of every block that is done.
     pub fn fuse(
         &self,
@@ -309,7 +295,7 @@ impl Qudi {
         state: &DiffusionState,
         flows: Option<Flows>,
         done: &mut dyn FnMut(&'static str),
-    ) -> Fused {
+    ) -> (Fused, Flows) {
         let frames = encoded.frames;
         let u = encoded.u.clone();
         let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
@@ -321,12 +307,10 @@ impl Qudi {
         let input = encoded.input.clone();
         // A sigma spans twice as much in [-1, 1].
         let sigma = self.error_sigma(&features, &input) * 2.0;
+        let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma.clone(), state);
         let [image, previous] = match self.noisy {
             NoisyFeatures::Image => [state.x_t.clone(), state.previous()],
-            NoisyFeatures::Residual => {
-                let noisy = Preconditioned::new(d.clone() * 2.0 - 1.0, sigma.clone(), state);
-                [noisy.residual, noisy.previous]
-            }
+            NoisyFeatures::Residual => [noisy.residual.clone(), noisy.previous.clone()],
         };
         let high = self.high.forward(image, previous, frames);
         done("high");
@@ -334,16 +318,25 @@ impl Qudi {
         done("flow");
         let pyramid = self.fusion.forward(low, high, features, &flows, frames);
         done("fusion");
-        let (sensor, state) = (encoded.sensor.clone(), state.clone());
-        Fused { pyramid, d, sigma, input, sensor, state, frames, flows }
+        let (sensor, state, noisy) = (encoded.sensor.clone(), state.clone(), Some(noisy));
+        (Fused { pyramid, d, sigma, noisy, input, sensor, state, frames }, flows)
     }
 
-    pub(super) fn unet(&self) -> &UNet {
-        &self.unet
-    }
-
-    pub(super) fn predicts(&self) -> UNetPrediction {
-        self.predicts
+    /// The clean image, about in [-1, 1], and the unit of a correction ([`Prediction`]).
+    ///
+    /// # Shapes
+    /// - results: `[images, 1, height, width]`
+    pub fn predict(&self, fused: &Fused) -> (Tensor<4>, Tensor<4>) {
+        let Fused { pyramid, input, sensor, state, frames, .. } = fused;
+        let noisy = fused.noisy();
+        let images = self.predicts.images(&noisy, state, input);
+        let (pyramid, sensor) = (pyramid.clone(), sensor.clone());
+        let output = self.unet.forward(images, pyramid, &state.timesteps, sensor, *frames);
+        match self.predicts {
+            UNetPrediction::X0 => (output, noisy.c_out),
+            UNetPrediction::Edm => (noisy.clone().prediction(output), noisy.c_out),
+            UNetPrediction::Correction => (noisy.mean + output * noisy.sigma.clone(), noisy.sigma),
+        }
     }
 
     /// Whether the U-Net sees the frames of a burst together.

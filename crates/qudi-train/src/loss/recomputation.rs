@@ -3,9 +3,10 @@
 
 use crate::parameters::gradients;
 use burn::module::Module;
-use burn::tensor::{Gradients, Tensor};
+use burn::tensor::Tensor;
 use qudi_model::conditioning::Conditioning;
 use qudi_model::network::{Fused, FusedGradient, Qudi, Simulated};
+use qudi_model::tensor::{gradient_of, product};
 
 /// Pre-denoised frames that a loss was computed from, without what made them.
 #[derive(Clone, Debug)]
@@ -37,15 +38,6 @@ pub(super) struct Recomputation {
 /// A result of the forward pass that a gradient is wanted for.
 fn leaf(parts: Vec<Tensor<4>>) -> Tensor<4> {
     Tensor::from_inner(Tensor::cat(parts, 0)).require_grad()
-}
-
-fn gradient_of(x: &Tensor<4>, gradients: &Gradients) -> Tensor<4> {
-    x.grad(gradients).unwrap_or_else(|| x.clone().inner().zeros_like())
-}
-
-/// The sum of `x` times its gradient.
-fn product(x: Tensor<4>, gradient: Tensor<4>) -> Tensor<1> {
-    (x * Tensor::from_inner(gradient)).sum()
 }
 
 fn add(sum: Vec<Tensor<1>>, more: Vec<Tensor<1>>) -> Vec<Tensor<1>> {

@@ -189,7 +189,9 @@ fn step(network: &Qudi, inputs: &Inputs, device: &Device) -> Vec<(&'static str, 
     };
     let encoded = network.encode(conditioning);
     mark("prepare");
-    network.forward_observed(&encoded, Some(simulated), state, None, &mut mark);
+    let (fused, _) = network.fuse(&encoded, Some(simulated), state, None, &mut mark);
+    network.predict(&fused);
+    mark("unet");
     times
 }
 

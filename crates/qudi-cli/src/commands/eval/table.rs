@@ -30,6 +30,11 @@ pub(crate) fn summary(rows: &[Row]) -> Table {
     table.without_unknown_columns()
 }
 
+/// Estimated light levels have four significant decimals at most.
+fn light(row: &Row) -> Cell {
+    Cell::Exact((row.ppp * 1e4).round() / 1e4)
+}
+
 fn cells(row: &Row) -> Vec<Cell> {
     let mean = |statistics: Option<Statistics>, digits: usize| match statistics {
         Some(Statistics { mean: value, ci95: Some(ci95), .. }) => {
@@ -39,8 +44,7 @@ fn cells(row: &Row) -> Vec<Cell> {
     };
     vec![
         Cell::text(&row.method),
-        // Estimated light levels have four significant decimals at most.
-        Cell::Exact((row.ppp * 1e4).round() / 1e4),
+        light(row),
         mean(row.centre(|f| f.psnr_a), 2),
         mean(row.over_clips(|f| f.psnr_a), 2),
         Cell::number(row.over_frames(|f| f.psnr_a).map(|s| s.worst5), 2),
@@ -74,8 +78,7 @@ pub(crate) fn appearance(rows: &[Row]) -> Option<Table> {
     table.rows = rows
         .iter()
         .map(|row| {
-            let mut cells =
-                vec![Cell::text(&row.method), Cell::Exact((row.ppp * 1e4).round() / 1e4)];
+            let mut cells = vec![Cell::text(&row.method), light(row)];
             let figures = figures.iter();
             cells.extend(figures.map(|(_, _, figure, digits)| {
                 Cell::number(row.over_clips(*figure).map(|s| s.mean), *digits)

@@ -47,6 +47,17 @@ fn pack(plan: &Plan, report: &Report) -> Result<()> {
     report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}))
 }
 
+/// Checks that the weights of the perceptual term are there, and downloads them first if that was asked for.
+pub(super) fn find_backbones(plan: &Plan, report: &Report) -> Result<()> {
+    let term = plan.recipe.train.loss.term;
+    if let (true, Some(backbones)) = (plan.fetch, &plan.backbones) {
+        for path in fetch(term, backbones)? {
+            report.remark(&format!("{} is there", path.display()));
+        }
+    }
+    Ok(Lpips::find(term, plan.backbones.as_deref())?)
+}
+
 /// Trains to the end of the recipe.
 pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     let (folder, recipe) = (&plan.folder, &plan.recipe);
@@ -57,12 +68,7 @@ pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     }
     let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
     make_folder(folder, "the run's folder", "choose another with -o")?;
-    if let (true, Some(backbones)) = (plan.fetch, &plan.backbones) {
-        for path in fetch(recipe.train.loss.term, backbones)? {
-            report.remark(&format!("{} is there", path.display()));
-        }
-    }
-    Lpips::find(recipe.train.loss.term, plan.backbones.as_deref())?;
+    find_backbones(plan, report)?;
     let files = files(plan, report)?;
     let from = if plan.action == Action::Resume {
         From::State

@@ -3,7 +3,7 @@
 use super::data::{files, make_folder};
 use super::plan::{Action, Plan};
 use super::resume::check_recipe;
-use super::run::{check_folder, train};
+use super::run::{check_folder, find_backbones, train};
 use super::watch::write;
 use crate::error::{CliError, Result};
 use crate::report::Report;
@@ -34,6 +34,7 @@ pub(super) fn train_stages(
     for stage in stages.iter().filter(|stage| Run::exists(&stage.folder)) {
         check_recipe(&stage.folder, &stage.recipe)?;
     }
+    stages.iter().try_for_each(|stage| find_backbones(stage, report))?;
     make_folder(folder, "the run's folder", "choose another with -o")?;
     // A run whose files are not there leaves nothing behind.
     files(plan, report)?;
