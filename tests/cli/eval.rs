@@ -1,6 +1,6 @@
 //! `qudi eval`: the same photons for everyone, bars, exports.
 
-use crate::support::{listing, qudi, scratch};
+use crate::support::{listing, qudi, refused, run, scratch};
 use serde_json::Value;
 use std::path::Path;
 
@@ -230,4 +230,21 @@ fn parts_of_the_clips_give_the_figures_of_the_whole() {
     assert_eq!(parts.map(|part| part.len()), [1, 2]);
     let none = "eval clips --method average --shard 1/9";
     crate::support::refused(&folder, none, &["--shard"]);
+}
+
+#[test]
+fn appearance_is_measured_where_it_is_asked_for() {
+    let folder = scratch("eval-appearance");
+    let eval =
+        "eval scene:text --size 64x64 --frames 3 --ppp 5 --method average --force --csv f.csv";
+    let header = |args: &str| {
+        run(&folder, &format!("{eval}{args}"));
+        let csv = std::fs::read_to_string(folder.join("f.csv")).unwrap();
+        csv.lines().next().unwrap().to_owned()
+    };
+    let names = ["gmsd", "ssimulacra2", "butteraugli", "detail_flat", "detail_textured"];
+    let (without, with) = (header(""), header(" --appearance"));
+    assert!(names.iter().all(|name| with.contains(name) && !without.contains(name)), "{with}");
+    let small = eval.replace("64x64", "16x64");
+    refused(&folder, &format!("{small} --appearance"), &["--appearance", "32 x 32"]);
 }
