@@ -51,6 +51,17 @@ pub enum NoisyFeatures {
     Residual,
 }
 
+/// What the networks of the flow see of a frame and of its neighbour, warped along the flow so far.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FlowInputs {
+    /// Both images, as in the paper.
+    #[default]
+    Images,
+    /// The frame's detail and the difference of both images, in units of the contrast around.
+    Contrast,
+}
+
 /// What the output of the U-Net is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -195,6 +206,9 @@ pub struct FlowConfig {
     /// corrects the flow; without, SPyNet alone estimates it.
     #[serde(default = "yes", skip_serializing_if = "is_true")]
     pub registration: bool,
+    /// What the networks see of a frame and its neighbour.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub inputs: FlowInputs,
 }
 
 /// Sizes of the fusion.

@@ -177,8 +177,7 @@ pub fn loss_terms(
     };
     let perceptual = perceptual.map(|lpips| perceptual_loss(lpips, &image, example));
     let pre = pre_denoiser_loss(example, d, weights.form);
-    let flow =
-        (weights.flow > 0.0).then(|| flows.warping_error(truth.clone(), conditioning.frames));
+    let flow = (weights.flow > 0.0).then(|| flows.warping_error(truth, conditioning.frames));
     // The uncertainty is that of the frames before any simulated measurement.
     let uncertainty = network.predicts_uncertainty().then(|| network.predenoise(conditioning));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));
@@ -226,7 +225,7 @@ fn first_stage_terms(network: &Qudi, example: &Example<'_>, weights: LossWeights
     };
     let uncertainty = uncertainty_loss(&d, truth, sigma);
     let pre = pre_denoiser_loss(example, d, weights.form);
-    let flow = flows.map(|flows| flows.warping_error(truth.clone(), conditioning.frames));
+    let flow = flows.map(|flows| flows.warping_error(truth, conditioning.frames));
     let (total, prediction) = (pre.clone() * weights.pre, pre.zeros_like());
     let (perceptual, recomputation) = (None, None);
     let terms = LossTerms { total, prediction, pre, perceptual, flow, uncertainty, recomputation };

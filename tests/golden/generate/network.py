@@ -348,6 +348,7 @@ class Flow(nn.Module):
         flow = config["flow"]
         self.scale, self.pyramid = flow["scale"], flow["levels"]
         self.registration = flow.get("registration", True)
+        self.contrast = flow.get("inputs", "images") == "contrast"
         self.levels = nn.ModuleList(FlowLevel(flow["widths"]) for _ in range(flow["networks"]))
 
     def forward(self, d: Tensor, clean: Tensor, variance: Tensor, frames: int) -> Flows:
@@ -370,11 +371,18 @@ class Flow(nn.Module):
             if self.registration:
                 flow = flow + lucas_kanade(reference[:, 1:], neighbour[:, 1:], flow, prior)
             if j >= skipped:
-                images = (4 * (x - 0.5) for x in (reference[:, :1], warp(neighbour[:, :1], flow)))
+                images = self.images(reference[:, :1], warp(neighbour[:, :1], flow))
                 flow = flow + self.levels[j - skipped](torch.cat([*images, flow], 1)) / 10
         ahead, back = bursts(flow, 2 * (frames - 1)).chunk(2, 1)
         nothing = torch.zeros_like(ahead[:, :1])
         return torch.cat([ahead, nothing], 1).flatten(0, 1), torch.cat([nothing, back], 1).flatten(0, 1)
+
+    def images(self, reference: Tensor, warped: Tensor) -> tuple[Tensor, Tensor]:
+        if not self.contrast:
+            return 4 * (reference - 0.5), 4 * (warped - 0.5)
+        detail = reference - mean_around(reference, 2)
+        contrast = (mean_around(detail**2, 4) + 0.05**2).sqrt()
+        return detail / contrast, 2 * (warped - reference) / contrast
 
 
 class Cell(nn.Module):

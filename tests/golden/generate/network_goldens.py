@@ -404,15 +404,19 @@ def sensors(*deviations: list[float]) -> dict:
 
 def flow_file() -> File:
     file = File("flow", 128)
-    config = TINY
-    for levels, networks in ((2, 2), (3, 2)):
-        config = variant(config, flow={"levels": levels, "networks": networks})
+    contrast = {"registration": False, "inputs": "contrast"}
+    for case, flow in (
+        ("levels_2", {"levels": 2, "networks": 2}),
+        ("levels_3", {"levels": 3, "networks": 2}),
+        ("contrast", {"levels": 2, "networks": 2} | contrast),
+    ):
+        config = variant(TINY, flow=flow)
         module = network.Flow(config)
         run = lambda d, clean, variance: dict(zip(("to_next", "to_prev"), module(d, clean, variance, 4)))
         inputs = {"d": spread((8, 1, 32, 48), 0.45, 6.0), "clean": spread((8, 1, 32, 48), 0.5, 7.0)}
         inputs |= {"variance": spread((8, 1, 1, 1), 120.0, 30.0)}
         about = {"config": config, "frames": 4}
-        file.case(f"levels_{levels}", run, inputs, module, "flow", about, ("variance", "clean"))
+        file.case(case, run, inputs, module, "flow", about, ("variance", "clean"))
     return file
 
 

@@ -1,13 +1,16 @@
 //! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), alone or correcting what steps
 //! of Lucas and Kanade find on every level.
 
-use super::layers::resample::{avg_pool2, by_burst, rescale_flow, shrink, upsample2};
+use super::layers::resample::{avg_pool2, by_burst, mean_around, rescale_flow, shrink, upsample2};
 use super::layers::{Bias, Conv2d, FLOW_CORRECTION};
 use super::lucas_kanade::lucas_kanade;
-use crate::config::FlowConfig;
+use crate::config::{FlowConfig, FlowInputs};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
+
+/// Added to the contrast that images are divided by: what is flatter counts as flat.
+const LEAST_CONTRAST: f32 = 0.05;
 
 /// Flows of every frame to its neighbours, `[bursts * frames, 2, height / scale, width / scale]`, x before y,
 /// in cells of their grid; zero past the ends of a burst.
@@ -19,6 +22,8 @@ pub struct Flows {
     pub to_prev: Tensor<4>,
     /// Pixels of a side of a cell.
     pub scale: usize,
+    /// What the coarser levels of the pyramid found, finest first, where it was kept.
+    pub coarser: Vec<Flows>,
 }
 
 /// The network of one pyramid level.
@@ -39,6 +44,8 @@ pub struct Flow {
     registration: bool,
     /// Whether nothing moves.
     off: bool,
+    #[module(skip)]
+    inputs: FlowInputs,
 }
 
 impl FlowConfig {
@@ -54,6 +61,7 @@ impl FlowConfig {
             scale: self.scale,
             registration: self.registration,
             off,
+            inputs: self.inputs,
         }
     }
 }
@@ -76,7 +84,8 @@ impl Flow {
         let grid = [height / self.scale, width / self.scale];
         if frames < 2 || self.off {
             let none = Tensor::zeros([images, 2, grid[0], grid[1]], &d.device());
-            return Flows { to_next: none.clone(), to_prev: none, scale: self.scale };
+            let (to_next, coarser) = (none.clone(), Vec::new());
+            return Flows { to_next, to_prev: none, scale: self.scale, coarser };
         }
         // Both directions of every pair of neighbours at once; both kinds of image as channels.
         let images_of_both =
@@ -92,6 +101,7 @@ impl Flow {
         let (variance, _) = both(variance, frames);
         let [pairs, _, h, w] = pyramid[self.pyramid - 1].0.dims();
         let mut flow = Tensor::zeros([pairs, 2, h, w], &variance.device());
+        let mut found = Vec::with_capacity(self.pyramid);
         // Coarsest first.
         for (number, (reference, neighbour)) in pyramid.into_iter().enumerate().rev() {
             if number + 1 < self.pyramid {
@@ -104,28 +114,37 @@ impl Flow {
             }
             if let Some(at) = number.checked_sub(self.pyramid - self.levels.len()) {
                 let (i, j) = (kind(&reference, 0), kind(&neighbour, 0));
-                flow = self.levels[at].correct(i, j, flow);
+                flow = self.levels[at].correct(i, j, flow, self.inputs);
             }
+            found.push(Flows::of_pairs(flow.clone(), frames, self.scale << number));
         }
-        let pairs = images / frames * (frames - 1);
-        let part = |first| by_burst(flow.clone().narrow(0, first, pairs), frames - 1);
-        let pad = |flow: Tensor<5>, before: usize| {
-            let [bursts, _, _, h, w] = flow.dims();
-            let none = Tensor::zeros([bursts, 1, 2, h, w], &flow.device());
-            let list = if before == 1 { vec![none, flow] } else { vec![flow, none] };
-            Tensor::cat(list, 1).reshape([images, 2, h, w])
-        };
-        Flows { to_next: pad(part(0), 0), to_prev: pad(part(pairs), 1), scale: self.scale }
+        let finest = found.pop().expect("a level");
+        found.reverse();
+        Flows { coarser: found, ..finest }
     }
 }
 
 impl Level {
     /// The flow with what the network adds to it.
-    fn correct(&self, reference: Tensor<4>, neighbour: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
+    fn correct(
+        &self,
+        reference: Tensor<4>,
+        neighbour: Tensor<4>,
+        flow: Tensor<4>,
+        inputs: FlowInputs,
+    ) -> Tensor<4> {
         let warped = warp(neighbour, flow.clone());
-        // Stretched to the flow's own range.
-        let stretched = |image: Tensor<4>| (image - 0.5) * 4.0;
-        let mut inputs = vec![stretched(reference), stretched(warped), flow.clone()];
+        let [reference, warped] = match inputs {
+            // Stretched to the flow's own range.
+            FlowInputs::Images => [reference, warped].map(|image| (image - 0.5) * 4.0),
+            FlowInputs::Contrast => {
+                let detail = reference.clone() - mean_around(reference.clone(), 2);
+                let variance = mean_around(detail.clone().powi_scalar(2), 4);
+                let contrast = (variance + LEAST_CONTRAST * LEAST_CONTRAST).sqrt();
+                [detail / contrast.clone(), (warped - reference) * 2.0 / contrast]
+            }
+        };
+        let mut inputs = vec![reference, warped, flow.clone()];
         let (last, first) = self.layers.split_last().expect("five layers");
         for layer in first {
             inputs = vec![layer.relu(&inputs)];
@@ -135,12 +154,34 @@ impl Level {
 }
 
 impl Flows {
-    /// The mean absolute difference between warped neighbours and frames, `[1]`, on the grid of the flow.
+    /// The flows of [pairs](both) of bursts of `frames` frames.
+    fn of_pairs(flow: Tensor<4>, frames: usize, scale: usize) -> Self {
+        let pairs = flow.dims()[0] / 2;
+        let part = |first| by_burst(flow.clone().narrow(0, first, pairs), frames - 1);
+        let pad = |flow: Tensor<5>, before: usize| {
+            let [bursts, _, _, h, w] = flow.dims();
+            let none = Tensor::zeros([bursts, 1, 2, h, w], &flow.device());
+            let list = if before == 1 { vec![none, flow] } else { vec![flow, none] };
+            Tensor::cat(list, 1).reshape([bursts * frames, 2, h, w])
+        };
+        let (to_next, to_prev) = (pad(part(0), 0), pad(part(pairs), 1));
+        Self { to_next, to_prev, scale, coarser: Vec::new() }
+    }
+
+    /// The mean absolute difference between warped neighbours and frames, `[1]`, on the grid of every level that
+    /// was kept: the mean over levels.
     ///
     /// # Shapes
     /// - images, the true frames: `[bursts * frames, 1, height, width]`
-    pub fn warping_error(&self, images: Tensor<4>, frames: usize) -> Tensor<1> {
-        let images = shrink(images, self.scale);
+    pub fn warping_error(&self, images: &Tensor<4>, frames: usize) -> Tensor<1> {
+        let levels = self.coarser.iter();
+        let errors = levels.map(|level| level.own_warping_error(images, frames));
+        errors.fold(self.own_warping_error(images, frames), Tensor::add)
+            / (self.coarser.len() + 1) as f32
+    }
+
+    fn own_warping_error(&self, images: &Tensor<4>, frames: usize) -> Tensor<1> {
+        let images = shrink(images.clone(), self.scale);
         let one = |next: bool, flow: &Tensor<4>| {
             let warped = warp(shifted(images.clone(), frames, next), flow.clone());
             (warped - images.clone()).abs().mean()
@@ -148,11 +189,12 @@ impl Flows {
         (one(true, &self.to_next) + one(false, &self.to_prev)) * 0.5
     }
 
-    /// The same flows on a grid of another scale.
+    /// The same flows on a grid of another scale, without coarser levels.
     #[must_use]
     pub fn at(&self, scale: usize) -> Self {
         let to = |flow: &Tensor<4>| rescale_flow(flow.clone(), self.scale, scale);
-        Self { to_next: to(&self.to_next), to_prev: to(&self.to_prev), scale }
+        let (to_next, to_prev) = (to(&self.to_next), to(&self.to_prev));
+        Self { to_next, to_prev, scale, coarser: Vec::new() }
     }
 }
 
@@ -179,4 +221,32 @@ fn both(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
     let (early, late) = (part(0), part(1));
     let references = Tensor::cat(vec![early.clone(), late.clone()], 0);
     (references, Tensor::cat(vec![late, early], 0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::TensorData;
+
+    /// Two frames that differ by a checkerboard: on a coarser grid they are the same.
+    #[test]
+    fn warping_error_is_the_mean_over_levels() {
+        let device = Device::flex();
+        let value = |i: usize| {
+            let (frame, sign) = (i / 64, if (i / 8 + i) % 2 == 0 { 1.0 } else { -1.0 });
+            0.5 + 0.1 * frame as f32 * sign
+        };
+        let data = TensorData::new((0..128).map(value).collect::<Vec<_>>(), [2, 1, 8, 8]);
+        let images = Tensor::from_data(data, &device);
+        let still = |side: usize| {
+            let flow = Tensor::zeros([2, 2, side, side], &device);
+            Flows { to_next: flow.clone(), to_prev: flow, scale: 8 / side, coarser: Vec::new() }
+        };
+        let error = |flows: &Flows| flows.warping_error(&images, 2).into_scalar::<f32>();
+        // Half of the frames have no neighbour on that side.
+        assert!((error(&still(8)) - 0.05).abs() < 1e-6);
+        assert!(error(&still(4)) < 1e-6);
+        let levels = Flows { coarser: vec![still(4), still(2)], ..still(8) };
+        assert!((error(&levels) - 0.05 / 3.0).abs() < 1e-6);
+    }
 }

@@ -282,7 +282,8 @@ fn fusion_matches_pytorch() {
             let high = ["high_0", "high_1", "high_2"].map(input);
             let [g, to_next, to_prev] = ["g", "to_next", "to_prev"].map(input);
             let scale = sizes.flow.scale;
-            let flows = Flows { to_next: to_next.clone(), to_prev: to_prev.clone(), scale };
+            let (to_next_, coarser) = (to_next.clone(), Vec::new());
+            let flows = Flows { to_next: to_next_, to_prev: to_prev.clone(), scale, coarser };
             let frames = case.number("frames");
             let fused = fusion.forward(low.clone(), high.clone(), g.clone(), &flows, frames);
             let outputs = pyramid("fused", fused);
