@@ -248,3 +248,67 @@ fn appearance_is_measured_where_it_is_asked_for() {
     let small = eval.replace("64x64", "16x64");
     refused(&folder, &format!("{small} --appearance"), &["--appearance", "32 x 32"]);
 }
+
+/// Every number of steps has its row; what they add is measured against the fewest.
+#[test]
+fn numbers_of_steps_are_compared_in_one_run() {
+    let folder = scratch("eval-steps");
+    let scored = eval(
+        &folder,
+        "scene:text --size 64x64 --frames 4 --ppp 5 --method average,qudi --steps 2,0 --device cpu --appearance --html r.html --csv r.csv --markdown r.md",
+    );
+    let rows = scored["rows"].as_array().unwrap();
+    let steps: Vec<_> = rows.iter().map(|row| row["steps"].as_u64()).collect();
+    assert_eq!(steps, [None, Some(0), Some(2)]);
+    assert!(rows[..2].iter().all(|row| row["added_over_missed"].is_null()));
+    let added = rows[2]["added_over_missed"].as_array().unwrap();
+    assert_eq!(added.len(), 5);
+    assert!(
+        added.iter().all(|ratio| (0.001..10.0).contains(&ratio.as_f64().unwrap())),
+        "{added:?}"
+    );
+    // Two steps alone are no other two steps.
+    let alone = eval(
+        &folder,
+        "scene:text --size 64x64 --frames 4 --ppp 5 --method qudi --steps 2 --device cpu --appearance",
+    );
+    assert_eq!(alone["rows"][0]["psnr_a"], rows[2]["psnr_a"]);
+    assert!(alone["rows"][0]["steps"].is_null());
+    // The regression predicts its uncertainty; one sample does not.
+    let of = |row: &Value| row["error_over_sigma_textured"]["all"]["mean"].as_f64();
+    assert!(
+        of(&rows[1]).is_some_and(|ratio| (0.1..10.0).contains(&ratio)) && of(&rows[2]).is_none()
+    );
+    let read = |name: &str| std::fs::read_to_string(folder.join(name)).unwrap();
+    assert!(read("r.csv").starts_with("method,steps,ppp,clip,frame,"), "{}", read("r.csv"));
+    assert!(read("r.md").contains("What more steps added"));
+    let page = read("r.html");
+    assert!(page.contains("qudi, 2 steps") && page.contains("Perception against distortion"));
+    refused(
+        &folder,
+        "eval scene:text --size 64x64 --frames 4 --ppp 5 --method mle --steps 0,2",
+        &["--steps", "method qudi"],
+    );
+}
+
+#[test]
+fn clips_are_chosen_by_name() {
+    let folder = scratch("eval-clips");
+    std::fs::create_dir(folder.join("clips")).unwrap();
+    for (name, seed) in [("a", 1), ("b", 2), ("c", 3)] {
+        let args = format!(
+            "simulate scene:text --size 32x32 --frames 3 --ppp 3 -o x.npy --scene-seed {seed}"
+        );
+        run(&folder, &format!("{args} --truth clips/{name}.npy -q -f"));
+    }
+    let scored = eval(&folder, "clips --clips c,a --ppp 5 --method average");
+    assert_eq!(scored["clips"], serde_json::json!(["a", "c"]));
+    let all = eval(&folder, "clips --ppp 5 --method average");
+    let of = |scored: &Value, n: usize| scored["rows"][0]["clips"][n].clone();
+    let timeless = |mut score: Value| {
+        score.as_object_mut().unwrap().retain(|key, _| key == "clip" || key == "frames");
+        score
+    };
+    assert_eq!(timeless(of(&scored, 1)), timeless(of(&all, 2)), "the same photons");
+    refused(&folder, "eval clips --clips d --ppp 5", &["`d`", "--clips", "a, b, c"]);
+}

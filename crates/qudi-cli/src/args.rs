@@ -7,7 +7,7 @@ mod shard;
 mod sum;
 pub(crate) mod tiff_samples;
 
-pub(crate) use network::Network;
+pub(crate) use network::{Network, Steps};
 pub(crate) use reading::Reading;
 pub(crate) use shard::Shard;
 pub(crate) use sum::Sum;

@@ -1,15 +1,19 @@
 //! How close an estimate is to the truth.
 
+mod calibration;
 mod chi_square;
 mod detail;
 mod gmsd;
+mod octaves;
 mod psnr;
 mod ssim;
 mod statistics;
 
+pub use calibration::{Calibration, calibration};
 pub use chi_square::Consistency;
 pub use detail::{Detail, detail};
 pub use gmsd::gmsd;
+pub use octaves::{OCTAVES, octave_energies};
 pub use psnr::{best_gain, gain_aligned_psnr, psnr};
 pub use ssim::{gaussian_ssim, ssim};
 pub use statistics::Statistics;

@@ -148,8 +148,9 @@ def distance(a: Tensor, b: Tensor) -> float:
 
 class File:
     def __init__(self, name: str, limit: int | None = None):
-        """Gradients of more than `limit` values are cut (see above)."""
+        """Gradients of more than `limit` values are cut (see above). `folder` is where, if not by name."""
         self.name, self.limit = name, limit
+        self.folder: str | None = None
         self.tensors: Tensors = {}
         self.cases: dict[str, dict] = {}
         self.worst: dict[str, tuple[float, str]] = {"output": (0.0, "-"), "grad": (0.0, "-")}
@@ -213,6 +214,7 @@ class File:
         folder = "kernels" if self.name in KERNELS else "network"
         if self.name.startswith("sample_"):
             folder = "sampling"
+        folder = self.folder or folder
         (OUT / folder).mkdir(parents=True, exist_ok=True)
         path = OUT / folder / f"{self.name.removeprefix('sample_')}.safetensors"
         save_file(dict(sorted(self.tensors.items())), path, {"cases": json.dumps(self.cases)})

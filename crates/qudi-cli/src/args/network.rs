@@ -17,11 +17,6 @@ pub(crate) struct Network {
     /// Weights that `qudi train` wrote [default: those that come along]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) weights: Option<PathBuf>,
-    /// Reverse diffusion steps. With 0 the frames are a regression: fastest, and closest to the truth on
-    /// average. More steps draw sharper pictures, whose details are invented; the paper takes 10 [default:
-    /// what the weights say of themselves]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
-    steps: Option<usize>,
     /// Spacing of the timesteps of these steps [default: what the weights say of themselves, usually
     /// log-logistic]
     #[arg(long, value_name = "NAME")]
@@ -47,14 +42,14 @@ pub(crate) struct Network {
 }
 
 impl Network {
-    /// The options with their defaults filled in.
-    pub(crate) fn options(&self) -> NetworkOptions {
+    /// The options for a number of steps, with their defaults filled in.
+    pub(crate) fn options(&self, steps: Option<usize>) -> NetworkOptions {
         let first = |given: &[(bool, &'static str)]| {
             given.iter().find(|(given, _)| *given).map(|(_, flag)| *flag)
         };
         NetworkOptions {
             weights: Weights::of(self.weights.as_deref()),
-            steps: self.steps,
+            steps,
             spacing: self.spacing.map(SpacingName::spacing),
             sampler: self.sampler.map_or_else(Sampler::default, SamplerName::sampler),
             samples: self.samples.unwrap_or(1),
@@ -63,7 +58,7 @@ impl Network {
             precision: self.precision.map(PrecisionName::precision),
             result_flag: first(&[
                 (self.weights.is_some(), "--weights"),
-                (self.steps.is_some(), "--steps"),
+                (steps.is_some(), "--steps"),
                 (self.spacing.is_some(), "--spacing"),
                 (self.sampler.is_some(), "--sampler"),
                 (self.samples.is_some(), "--samples"),
@@ -78,6 +73,17 @@ impl Network {
             ]),
         }
     }
+}
+
+/// The number of diffusion steps, for the method `qudi`.
+#[derive(Clone, Copy, Debug, Default, ClapArgs)]
+#[command(next_help_heading = "Network (method qudi)")]
+pub(crate) struct Steps {
+    /// Reverse diffusion steps. With 0 the frames are a regression: fastest, and closest to the truth on
+    /// average. More steps draw sharper pictures, whose details are invented; the paper takes 10 [default:
+    /// what the weights say of themselves]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
+    pub(crate) steps: Option<usize>,
 }
 
 /// Precisions of products.

@@ -3,7 +3,7 @@
 use crate::frame::Frame;
 
 /// Side of the squares that are ranked by how much is in them.
-const SIDE: usize = 16;
+pub(super) const SIDE: usize = 16;
 
 /// The energy of the gradients of an image over that of the truth: 1 where it has as much detail.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,23 +17,26 @@ pub struct Detail {
 /// The detail of an image beside that of the truth. `None` for frames of different sizes, with fewer than four squares of
 /// 16 x 16 pixels, or where the truth is constant in a quarter of them.
 pub fn detail(estimate: &Frame, truth: &Frame) -> Option<Detail> {
-    let squares = squares(truth);
-    if estimate.size != truth.size || squares.len() < 4 {
+    if estimate.size != truth.size {
         return None;
     }
-    let mut ranked: Vec<_> = squares
-        .into_iter()
-        .map(|square| (energy(truth, square), energy(estimate, square)))
-        .collect();
-    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let quarter = ranked.len() / 4;
-    let ratio = |part: &[(f64, f64)]| {
-        let (truth, estimate) =
-            part.iter().fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
-        (truth > 0.0).then_some(estimate / truth)
+    let ratio = |squares: Vec<[usize; 2]>| {
+        let of = |frame| squares.iter().map(|&square| energy(frame, square)).sum::<f64>();
+        (of(truth) > 0.0).then(|| of(estimate) / of(truth))
     };
-    let textured = &ranked[ranked.len() - quarter..];
-    Some(Detail { flat: ratio(&ranked[..quarter])?, textured: ratio(textured)? })
+    let [flat, textured] = quarters(truth)?.map(ratio);
+    Some(Detail { flat: flat?, textured: textured? })
+}
+
+/// The upper left corners of the squares of 16 x 16 pixels in which there is least, and of those in which there is most: a
+/// quarter of all each. `None` of fewer than four squares.
+pub(super) fn quarters(truth: &Frame) -> Option<[Vec<[usize; 2]>; 2]> {
+    let mut ranked: Vec<_> =
+        squares(truth).into_iter().map(|square| (energy(truth, square), square)).collect();
+    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let (quarter, count) = (ranked.len() / 4, ranked.len());
+    let corners = |part: &[(f64, [usize; 2])]| part.iter().map(|(_, square)| *square).collect();
+    (quarter > 0).then(|| [corners(&ranked[..quarter]), corners(&ranked[count - quarter..])])
 }
 
 /// The upper left corners of whole squares.

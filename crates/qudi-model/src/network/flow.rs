@@ -233,7 +233,7 @@ mod tests {
     fn warping_error_is_the_mean_over_levels() {
         let device = Device::flex();
         let value = |i: usize| {
-            let (frame, sign) = (i / 64, if (i / 8 + i) % 2 == 0 { 1.0 } else { -1.0 });
+            let (frame, sign) = (i / 64, if (i / 8 + i).is_multiple_of(2) { 1.0 } else { -1.0 });
             0.5 + 0.1 * frame as f32 * sign
         };
         let data = TensorData::new((0..128).map(value).collect::<Vec<_>>(), [2, 1, 8, 8]);

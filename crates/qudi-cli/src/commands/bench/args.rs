@@ -1,6 +1,6 @@
 //! Options of `qudi bench`.
 
-use crate::args::{Network, number};
+use crate::args::{Network, Steps, number};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
 use std::path::PathBuf;
@@ -29,6 +29,8 @@ pub(crate) struct Bench {
     /// Instead of methods, measure networks of these sizes with random weights: tiny, small, paper-mini, base, paper
     #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
     pub(crate) preset: Vec<String>,
+    #[command(flatten)]
+    pub(crate) steps: Steps,
     #[command(flatten)]
     pub(crate) network: Network,
 }

@@ -56,7 +56,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         let help = "ask for at least 1 round of 3 frames";
         return Err(CliError::new("nothing to measure", "--rounds, --frames", help));
     }
-    let options = args.network.options();
+    let options = args.network.options(args.steps.steps);
     let device = device::open(&options.device)?;
     let (steps, sampling) = (options.steps()?, sample_options(&options, &device)?);
     let precision = sampling.precision;

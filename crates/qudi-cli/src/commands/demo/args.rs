@@ -1,6 +1,6 @@
 //! Options of `qudi demo`.
 
-use crate::args::{Network, number};
+use crate::args::{Network, Steps, number};
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
@@ -19,6 +19,8 @@ pub(crate) struct Demo {
     /// Seed of photons and noise
     #[arg(long, value_name = "N", default_value_t = 1, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: u64,
+    #[command(flatten)]
+    pub(crate) steps: Steps,
     #[command(flatten)]
     pub(crate) network: Network,
 }

@@ -93,7 +93,8 @@ pub(crate) fn run(
         ),
     ];
     if demo.network.weights.is_some() || network::built_in_knows(&acquisition)? {
-        let (restorer, how) = network::restorer(&demo.network.options(), &acquisition, SIZE)?;
+        let (restorer, how) =
+            network::restorer(&demo.network.options(demo.steps.steps), &acquisition, SIZE)?;
         methods.push(("QUDI", restorer, format!("the network{how}")));
     } else {
         report.remark(

@@ -40,6 +40,9 @@ pub(crate) struct Eval {
     /// Gain of a capture in DN per electron, for sensors whose gain follows the light
     #[arg(long, value_name = "DN/E-", allow_negative_numbers = true, requires = "capture", value_parser = number::real(number::GAIN))]
     pub(crate) gain: Option<f64>,
+    /// Only these clips of the folder, as those to choose settings on, or those to report on
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', conflicts_with = "capture")]
+    pub(crate) clips: Vec<String>,
     /// Frames of each clip, or of the capture, at most [default: 33]
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     pub(crate) frames: Option<u64>,
@@ -79,13 +82,18 @@ pub(crate) struct Eval {
     /// (docs/training.md says how to get them)
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, conflicts_with = "capture")]
     pub(crate) backbones: Option<PathBuf>,
-    /// Measure how frames look as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, and detail beside the
-    /// truth's in the flattest and the most textured quarter
+    /// Measure how frames look as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, detail beside the
+    /// truth's and errors beside their predicted uncertainty, in the flattest and the most textured quarter; and what
+    /// more --steps add, octave by octave, beside what is missing
     #[arg(long, conflicts_with = "capture")]
     pub(crate) appearance: bool,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,
+    /// Numbers of reverse diffusion steps of the method qudi, each evaluated for itself; 0 is a regression [default: what
+    /// the weights say of themselves]
+    #[arg(long, value_name = "N,...", value_delimiter = ',', help_heading = "Network (method qudi)", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
+    pub(crate) steps: Vec<usize>,
     #[command(flatten)]
     pub(crate) network: Network,
     #[command(flatten)]

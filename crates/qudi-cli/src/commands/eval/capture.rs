@@ -3,7 +3,7 @@
 use super::clip::stem;
 use super::exposing::{FRAMES, SEED};
 use super::html::Pictures;
-use super::plan::Plan;
+use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
 use crate::capture::acquisition::{LightOverrides, acquisition};
 use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_sensor};
@@ -66,11 +66,12 @@ pub(crate) fn evaluate_capture(
     let mut pictures = Pictures::new(clip.clone(), acquisition.ppp, counts, None);
     let mut rows = Vec::new();
     let mut bar = report.bar();
-    for (n, name) in plan.methods.iter().enumerate() {
-        bar.update("evaluating", n as u64, Some(plan.methods.len() as u64));
-        let score = score(name, &clip, &mut capture, frames, &acquisition, plan)?;
-        pictures.add(name, &score);
-        rows.push(Row { method: name.clone(), ppp: acquisition.ppp, scores: vec![score] });
+    for (n, contender) in plan.contenders.iter().enumerate() {
+        bar.update("evaluating", n as u64, Some(plan.contenders.len() as u64));
+        let score = score(contender, &clip, &mut capture, frames, &acquisition, plan)?;
+        let row = contender.row(acquisition.ppp);
+        pictures.add(&row.label(), &score);
+        rows.push(Row { scores: vec![score], ..row });
     }
     drop(bar);
     remarks(&capture, report);
@@ -97,7 +98,7 @@ pub(crate) fn evaluate_capture(
 }
 
 fn score(
-    name: &str,
+    contender: &Contender,
     clip: &str,
     capture: &mut Capture,
     frames: u64,
@@ -113,7 +114,7 @@ fn score(
     };
     let peak = PeakMemory::start();
     let start = Instant::now();
-    let (mut restorer, how) = method(name, capture, acquisition, &plan.network)?;
+    let (mut restorer, how) = method(&contender.method, capture, acquisition, &contender.network)?;
     let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(
@@ -131,6 +132,7 @@ fn score(
         chi_square: sink.consistency.chi_square(),
         flicker: None,
         flow: None,
+        added: None,
         seconds_per_frame: Some(seconds / frames as f64),
         peak_mib: peak.grown_mib(),
         frames: sink.frames,

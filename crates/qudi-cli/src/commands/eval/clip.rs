@@ -61,10 +61,32 @@ impl Clip {
         Ok(named.map(|(name, path)| Self::new(name, path.display().to_string())).collect())
     }
 
+    /// Those of `clips` that have one of these names, in the order of `clips`; all without names.
+    ///
+    /// # Errors
+    /// [`CliError`] if a name is that of no clip.
+    pub(crate) fn only(clips: Vec<Self>, names: &[String], data: &str) -> Result<Vec<Self>> {
+        if names.is_empty() {
+            return Ok(clips);
+        }
+        if let Some(name) = names.iter().find(|name| !clips.iter().any(|clip| &clip.name == *name))
+        {
+            let all: Vec<_> = clips.iter().map(|clip| clip.name.as_str()).collect();
+            let what = format!("no clip named `{name}` in {data}");
+            return Err(CliError::new(what, "--clips", format!("there are {}", all.join(", "))));
+        }
+        Ok(clips.into_iter().filter(|clip| names.contains(&clip.name)).collect())
+    }
+
     /// The clips' files and folders; none of a scene.
     pub(crate) fn places(data: &str) -> Result<Vec<PathBuf>> {
         let clips = if data.starts_with("scene:") { Vec::new() } else { Self::find(data)? };
         Ok(clips.into_iter().map(|clip| PathBuf::from(clip.place)).collect())
+    }
+
+    /// Its name.
+    pub(crate) fn name(&self) -> &str {
+        &self.name
     }
 
     fn new(name: String, place: String) -> Self {

@@ -4,15 +4,18 @@ use super::appearance::Appearance;
 use super::args::External;
 use super::html::Pictures;
 use super::perceptual::Perceptual;
-use super::plan::Plan;
-use super::score::{Cost, FlowKind, FrameScore, Score};
+use super::plan::{Contender, Plan};
+use super::score::{Added, Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
 use crate::methods::method;
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;
-use qudi_core::metrics::{Consistency, best_gain, gain_aligned_psnr, gaussian_ssim, psnr, ssim};
+use qudi_core::metrics::{
+    Consistency, OCTAVES, best_gain, calibration, gain_aligned_psnr, gaussian_ssim,
+    octave_energies, psnr, ssim,
+};
 use qudi_core::npy::read_clip;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::windows::Windows;
@@ -78,13 +81,21 @@ pub(super) struct ExposedClip {
 }
 
 impl ExposedClip {
-    pub(super) fn score_method(&self, name: &str, plan: &Plan) -> Result<Score> {
+    /// Scores a method, and gives the frames that it made. `fewest` are those of the fewest steps, if there are
+    /// any.
+    pub(super) fn score_method(
+        &self,
+        contender: &Contender,
+        plan: &Plan,
+        fewest: Option<&[Frame]>,
+    ) -> Result<(Score, Vec<Frame>)> {
         let sensor = &self.acquisition.sensor;
         let mut capture =
             Capture::in_memory(&self.name, self.size, self.photons.counts.clone(), sensor)?;
         let peak = PeakMemory::start();
         let start = Instant::now();
-        let (mut restorer, how) = method(name, &mut capture, &self.acquisition, &plan.network)?;
+        let Contender { method: name, network, .. } = contender;
+        let (mut restorer, how) = method(name, &mut capture, &self.acquisition, network)?;
         let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
@@ -98,15 +109,27 @@ impl ExposedClip {
             &mut |_, _| interrupt::check(),
         )?;
         let cost = Cost {
-            seconds_per_frame: start.elapsed().as_secs_f64() / sink.0.len() as f64,
+            seconds_per_frame: start.elapsed().as_secs_f64() / sink.frames.len() as f64,
             peak_mib: peak.grown_mib(),
         };
-        self.score(&sink.0, Some(cost), how)
+        let mut score = self.score(&sink.frames, Some(cost), how)?;
+        if self.appearance {
+            let pairs = sink.frames.iter().zip(&self.photons.truth).zip(&sink.sigmas);
+            for (score, ((image, truth), sigma)) in score.frames.iter_mut().zip(pairs) {
+                let gain = best_gain(image, truth);
+                let found = calibration(&scaled(image, gain), &times(sigma, gain), truth);
+                score.error_over_sigma = found.map(|found| found.all);
+                score.error_over_sigma_flat = found.map(|found| found.flat);
+                score.error_over_sigma_textured = found.map(|found| found.textured);
+            }
+            score.added = fewest.and_then(|fewest| self.added(&sink.frames, fewest));
+        }
+        Ok((score, sink.frames))
     }
 
     /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
     /// exposed anew with its own mean at `ppp`, and its middle frame scored.
-    pub(super) fn score_windows(&self, name: &str, plan: &Plan) -> Result<Score> {
+    pub(super) fn score_windows(&self, contender: &Contender) -> Result<Score> {
         const WINDOW: usize = 11;
         let truth = &self.photons.truth;
         if truth.len() < WINDOW {
@@ -137,7 +160,8 @@ impl ExposedClip {
             let peak = PeakMemory::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
-            let (mut restorer, chosen) = method(name, &mut capture, &acquisition, &plan.network)?;
+            let Contender { method: name, network, .. } = contender;
+            let (mut restorer, chosen) = method(name, &mut capture, &acquisition, network)?;
             how = chosen;
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
@@ -154,6 +178,7 @@ impl ExposedClip {
             chi_square: None,
             flicker: None,
             flow: None,
+            added: None,
             seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
             peak_mib: highest,
             picture,
@@ -181,7 +206,7 @@ impl ExposedClip {
             lpips_alex,
             lpips_vgg,
             appearance: appearance.transpose()?,
-            chi_square: None,
+            ..FrameScore::default()
         })
     }
 
@@ -236,6 +261,7 @@ impl ExposedClip {
                 Motion::True(_) => Some(FlowKind::True),
                 Motion::Estimated(_) => Some(FlowKind::Estimated),
             },
+            added: None,
             seconds_per_frame: cost.map(|cost| cost.seconds_per_frame),
             peak_mib: cost.and_then(|cost| cost.peak_mib),
             picture: aligned(
@@ -256,6 +282,22 @@ impl ExposedClip {
         let counts = Frame { size: self.size, data: counts.collect() };
         let truth = self.photons.truth[middle].clone();
         Pictures::new(self.name.clone(), self.ppp, counts, Some(truth))
+    }
+
+    /// What was added to the frames of the fewest steps, and what those missed.
+    fn added(&self, restored: &[Frame], fewest: &[Frame]) -> Option<Added> {
+        let (mut added, mut missed) = ([0.0; OCTAVES], [0.0; OCTAVES]);
+        for ((image, base), truth) in restored.iter().zip(fewest).zip(&self.photons.truth) {
+            let (image, base) = (aligned(image, truth), aligned(base, truth));
+            for (sum, other) in [(&mut added, &image), (&mut missed, truth)] {
+                let pairs = other.data.iter().zip(&base.data);
+                let data = pairs.map(|(a, b)| a - b).collect();
+                let energies = octave_energies(&Frame { size: self.size, data })?;
+                sum.iter_mut().zip(energies).for_each(|(sum, energy)| *sum += energy);
+            }
+        }
+        let root = |sums: [f64; OCTAVES]| sums.map(|sum| (sum / restored.len() as f64).sqrt());
+        Some(Added { added: root(added), missed: root(missed) })
     }
 
     fn flicker(&self, restored: &[Frame]) -> Option<f64> {
@@ -279,12 +321,22 @@ impl ExposedClip {
     }
 }
 
+/// What a method made.
 #[derive(Default)]
-struct Collected(Vec<Frame>);
+struct Collected {
+    frames: Vec<Frame>,
+    /// Their predicted sigma, where it predicts it.
+    sigmas: Vec<Frame>,
+}
 
 impl RestoreSink for Collected {
     fn frame(&mut self, _: u64, restored: &Frame, _: &[u16]) -> qudi_core::Result<()> {
-        self.0.push(restored.clone());
+        self.frames.push(restored.clone());
+        Ok(())
+    }
+
+    fn uncertainty(&mut self, _: u64, uncertainty: &Frame) -> qudi_core::Result<()> {
+        self.sigmas.push(uncertainty.clone());
         Ok(())
     }
 }
@@ -292,6 +344,12 @@ impl RestoreSink for Collected {
 /// A restored frame after the gain that brings it closest to the truth.
 fn aligned(image: &Frame, truth: &Frame) -> Frame {
     scaled(image, best_gain(image, truth))
+}
+
+/// A frame times a factor, nothing clipped.
+fn times(image: &Frame, factor: f64) -> Frame {
+    let data = image.data.iter().map(|v| v * factor as f32).collect();
+    Frame { size: image.size, data }
 }
 
 fn scaled(image: &Frame, gain: f64) -> Frame {

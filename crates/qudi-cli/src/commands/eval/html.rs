@@ -1,7 +1,7 @@
 //! The page of `qudi eval`: table, plot, and pictures side by side.
 
-use super::score::{Row, Score};
-use super::table::{appearance, summary};
+use super::score::{Figure, Row, Score};
+use super::table::{looks, summary};
 use crate::error::Result;
 use crate::report::html::{TableView, crop, crop_size, render};
 use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
@@ -34,10 +34,17 @@ struct Page<'a> {
     about: &'a str,
     table: TableView,
     /// How frames look, where that was measured.
-    appearance: Option<TableView>,
-    plot: Option<Drawing>,
+    looks: Vec<Looks>,
+    plots: Vec<Drawing>,
     has_truth: bool,
     clips: Vec<Clip>,
+}
+
+/// A table of looks.
+#[derive(Serialize)]
+struct Looks {
+    title: &'static str,
+    table: TableView,
 }
 
 /// Pictures of a clip, two of them under a slider.
@@ -91,8 +98,15 @@ pub(crate) fn html(rows: &[Row], pictures: &[Pictures], about: &str) -> Result<S
             title: "Evaluation of methods",
             about,
             table: TableView::from(&summary(rows)),
-            appearance: appearance(rows).as_ref().map(TableView::from),
-            plot: quality(rows).draw(),
+            looks: looks(rows)
+                .iter()
+                .map(|(title, table)| Looks { title, table: TableView::from(table) })
+                .collect(),
+            plots: [Some(quality(rows)), perception(rows)]
+                .into_iter()
+                .flatten()
+                .filter_map(|plot| plot.draw())
+                .collect(),
             has_truth: pictures.iter().any(|clip| clip.truth.is_some()),
             clips: pictures.iter().map(clip).collect(),
         },
@@ -105,9 +119,9 @@ fn quality(rows: &[Row]) -> Plot {
     for row in rows {
         let Some(psnr_a) = row.over_clips(|f| f.psnr_a) else { continue };
         let point = Point { x: row.ppp, y: psnr_a.mean, error: psnr_a.ci95.unwrap_or(0.0) };
-        match curves.iter_mut().find(|curve| curve.name == row.method) {
+        match curves.iter_mut().find(|curve| curve.name == row.label()) {
             Some(curve) => curve.points.push(point),
-            None => curves.push(Curve { name: row.method.clone(), points: vec![point] }),
+            None => curves.push(Curve { name: row.label(), points: vec![point] }),
         }
     }
     for curve in &mut curves {
@@ -125,6 +139,43 @@ fn quality(rows: &[Row]) -> Plot {
         y: Axis::linear("dB"),
         curves,
     }
+}
+
+/// How frames look against how close they are to the truth: the numbers of steps of a method as a curve, one for every
+/// light level (Blau and Michaeli 2018). None where looks were not measured.
+fn perception(rows: &[Row]) -> Option<Plot> {
+    let measures: [(&'static str, Figure); 3] = [
+        ("LPIPS (VGG)", |f| f.lpips_vgg),
+        ("LPIPS (Alex)", |f| f.lpips_alex),
+        ("GMSD", |f| f.appearance.map(|a| a.gmsd)),
+    ];
+    let is_known =
+        |(_, figure): &&(_, Figure)| rows.iter().any(|row| row.over_clips(*figure).is_some());
+    let (label, figure) = *measures.iter().find(is_known)?;
+    let mut curves: Vec<Curve> = Vec::new();
+    for row in rows {
+        let (Some(x), Some(y)) = (row.over_clips(|f| f.psnr_a), row.over_clips(figure)) else {
+            continue;
+        };
+        let point = Point { x: x.mean, y: y.mean, error: 0.0 };
+        let name = format!("{}, {} PPP", row.method, row.ppp);
+        match curves.iter_mut().find(|curve| curve.name == name) {
+            Some(curve) => curve.points.push(point),
+            None => curves.push(Curve { name, points: vec![point] }),
+        }
+    }
+    for curve in &mut curves {
+        curve.points.sort_by(|a, b| a.x.total_cmp(&b.x));
+    }
+    Some(Plot {
+        title: "Perception against distortion".to_owned(),
+        caption: "Means over clips; a curve joins the numbers of diffusion steps of a method, usually fewer to the \
+                  right. Lower looks more like the truth, further right is closer to it."
+            .to_owned(),
+        x: Axis::linear("PSNR after the best gain, dB"),
+        y: Axis::linear(label),
+        curves,
+    })
 }
 
 fn clip(clip: &Pictures) -> Clip {
@@ -182,6 +233,7 @@ mod tests {
             chi_square: None,
             flicker: None,
             flow: None,
+            added: None,
             seconds_per_frame: None,
             peak_mib: None,
             picture: Frame::filled(size, 0.5),
@@ -202,7 +254,8 @@ mod tests {
         for (clip, score) in clips.iter_mut().zip(&scores) {
             clip.add("mle", score);
         }
-        let rows = [Row { method: "mle".to_owned(), ppp: 3.25, scores: scores.to_vec() }];
+        let rows =
+            [Row { method: "mle".to_owned(), steps: None, ppp: 3.25, scores: scores.to_vec() }];
         let page = html(&rows, &clips, "about").unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("aspect-ratio:32/24") && page.contains("aspect-ratio:40/224"));
         assert!(page.contains("the middle 40 x 224 pixels"));

@@ -2,6 +2,7 @@
 
 use super::args::{Eval, External, Protocol};
 use super::perceptual::Perceptual;
+use super::score::Row;
 use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
 use crate::device;
@@ -14,13 +15,28 @@ use qudi_io::capture::{MaskChoice, ReadOptions};
 use std::path::PathBuf;
 use std::rc::Rc;
 
+/// A method and how it is asked.
+#[derive(Clone, Debug)]
+pub(super) struct Contender {
+    pub(super) method: String,
+    /// Its diffusion steps, where there are several numbers of them to compare.
+    pub(super) steps: Option<usize>,
+    pub(super) network: NetworkOptions,
+}
+
+impl Contender {
+    /// Its row at a light level, without scores.
+    pub(super) fn row(&self, ppp: f64) -> Row {
+        Row { method: self.method.clone(), steps: self.steps, ppp, scores: Vec::new() }
+    }
+}
+
 /// Everything that an evaluation is asked for.
 #[derive(Debug)]
 pub(super) struct Plan {
     /// The clip, the folder of clips, or the capture.
     pub(super) data: String,
-    pub(super) methods: Vec<String>,
-    pub(super) network: NetworkOptions,
+    pub(super) contenders: Vec<Contender>,
     /// Light levels; none for the usual ones of clips, or that of the capture.
     pub(super) ppp: Vec<f64>,
     /// What they count, for clips.
@@ -31,6 +47,8 @@ pub(super) struct Plan {
     /// Frames of each clip, or of the capture, at most.
     pub(super) frames: Option<u64>,
     pub(super) protocol: Protocol,
+    /// The clips of the folder that are wanted, by name; none for all.
+    pub(super) clips: Vec<String>,
     pub(super) seed: Option<u64>,
     /// The mean level that methods are given.
     pub(super) mean_level: Option<f64>,
@@ -66,7 +84,10 @@ impl Plan {
                 format!("there are {}", METHODS.join(", ")),
             ));
         }
-        let mut network = args.network.options();
+        let mut steps = args.steps.clone();
+        steps.sort_unstable();
+        steps.dedup();
+        let mut network = args.network.options(steps.first().copied());
         if args.backbones.is_some() {
             // LPIPS is computed there, too.
             network.device_flag = None;
@@ -81,14 +102,14 @@ impl Plan {
         };
         let plan = Self {
             data: args.data.clone(),
-            methods: args.method.clone(),
-            network,
+            contenders: contenders(&args.method, &network, &steps),
             ppp: args.ppp.clone(),
             ppp_def: args.ppp_def,
             sensor: args.sensor.clone(),
             gain: args.gain,
             frames: args.frames,
             protocol: args.protocol,
+            clips: args.clips.clone(),
             seed: args.seed,
             mean_level: args.mean_level,
             overlap: args.overlap,
@@ -167,4 +188,22 @@ impl Plan {
         }
         Ok(())
     }
+}
+
+/// Every method once, and the network once for every number of steps, fewest first.
+fn contenders(methods: &[String], network: &NetworkOptions, steps: &[usize]) -> Vec<Contender> {
+    let mut contenders = Vec::new();
+    for method in methods {
+        let plain = Contender { method: method.clone(), steps: None, network: network.clone() };
+        if method == "qudi" && steps.len() > 1 {
+            contenders.extend(steps.iter().map(|&steps| Contender {
+                steps: Some(steps),
+                network: NetworkOptions { steps: Some(steps), ..network.clone() },
+                ..plain.clone()
+            }));
+        } else {
+            contenders.push(plain);
+        }
+    }
+    contenders
 }

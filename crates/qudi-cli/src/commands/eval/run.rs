@@ -1,19 +1,20 @@
 //! `qudi eval`: methods against known truth on the same photons, or on a real capture without one.
 
-use super::args::{Eval, Protocol};
+use super::args::{Eval, External, Protocol};
 use super::capture::{Evaluation, evaluate_capture};
 use super::clip::Clip;
 use super::exposing::Exposing;
 use super::html::html;
 use super::plan::Plan;
-use super::score::{Figure, FlowKind, Row};
-use super::table::{appearance, frames, summary};
+use super::score::{Figure, FlowKind, LOOKS, Row};
+use super::table::{frames, looks, summary};
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::places::Places;
 use crate::report::{Output, Report, csv, markdown};
 use crate::settings::Settings;
+use qudi_core::Frame;
 use qudi_core::atomic_file::refuse_taken;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -56,11 +57,14 @@ pub(crate) fn run(
     html_file.write(|| html(&rows, &pictures, &about))?;
     let table = summary(&rows);
     markdown_file.write(|| {
-        let looks = appearance(&rows).map(|table| format!("\n{}", markdown::table(&table)));
-        Ok(markdown::table(&table) + &looks.unwrap_or_default())
+        let tables = looks(&rows).into_iter();
+        let looks =
+            tables.map(|(title, table)| format!("\n{title}:\n\n{}", markdown::table(&table)));
+        Ok(markdown::table(&table) + &looks.collect::<String>())
     })?;
-    let looks = appearance(&rows).map_or(String::new(), |table| format!("{}\n", table.to_text()));
-    let text = format!("{}\n{looks}{about}\n", table.to_text());
+    let tables = looks(&rows).into_iter();
+    let looks = tables.map(|(title, table)| format!("{title}\n{}\n", table.to_text()));
+    let text = format!("{}\n{}{about}\n", table.to_text(), looks.collect::<String>());
     report.result(&text, || document(settings, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
     match args.min_psnr {
@@ -68,7 +72,7 @@ pub(crate) fn run(
         Some(bar) => match rows.iter().find(|row| psnr_a(row).is_nan() || psnr_a(row) < bar) {
             Some(row) => Err(CliError::Missed(format!(
                 "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
-                row.method,
+                row.label(),
                 psnr_a(row),
                 row.ppp
             ))),
@@ -86,7 +90,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         [] => &set.unwrap_or(LEVELS.to_vec())[..],
         given => given,
     };
-    let mut clips = Clip::find(&plan.data)?;
+    let mut clips = Clip::only(Clip::find(&plan.data)?, &plan.clips, &plan.data)?;
     if let Some(shard) = plan.shard {
         let part = shard.range(clips.len() as u64);
         clips = clips.drain(part.start as usize..part.end as usize).collect();
@@ -99,16 +103,15 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         std::fs::create_dir_all(folder)
             .map_err(|e| qudi_core::Error::io("create the folder", folder, e))?;
     }
+    let names: Vec<String> = clips.iter().map(|clip| clip.name().to_owned()).collect();
     let mut rows: Vec<Row> = Vec::new();
-    let names: Vec<&String> =
-        plan.methods.iter().chain(plan.external.iter().map(|external| &external.name)).collect();
     for &ppp in levels {
-        rows.extend(names.iter().map(|&name| Row {
-            method: name.clone(),
-            ppp,
-            scores: Vec::new(),
-        }));
+        let own = plan.contenders.iter().map(|contender| contender.row(ppp));
+        let name = |external: &External| external.name.clone();
+        let row = |external| Row { method: name(external), steps: None, ppp, scores: Vec::new() };
+        rows.extend(own.chain(plan.external.iter().map(row)));
     }
+    let each = rows.len() / levels.len();
     let mut pictures = Vec::new();
     let mut bar = report.bar();
     let number = clips.len();
@@ -124,19 +127,29 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
             if plan.pictures {
                 pictures.push(exposed.pictures());
             }
-            for (k, name) in names.iter().enumerate() {
-                let external = k.checked_sub(plan.methods.len()).map(|k| &plan.external[k]);
-                let score = match (external, plan.protocol) {
-                    (Some(external), _) => exposed.score_external(external)?,
-                    (None, Protocol::Strict) => exposed.score_method(name, plan)?,
-                    (None, Protocol::Quiver) => exposed.score_windows(name, plan)?,
-                };
-                if plan.pictures
-                    && let Some(pictures) = pictures.last_mut()
-                {
-                    pictures.add(name, &score);
+            let mut scores = Vec::with_capacity(each);
+            let mut fewest: Option<Vec<Frame>> = None;
+            for contender in &plan.contenders {
+                scores.push(match plan.protocol {
+                    Protocol::Strict => {
+                        let (score, frames) =
+                            exposed.score_method(contender, plan, fewest.as_deref())?;
+                        if contender.steps.is_some() {
+                            fewest.get_or_insert(frames);
+                        }
+                        score
+                    }
+                    Protocol::Quiver => exposed.score_windows(contender)?,
+                });
+            }
+            for external in &plan.external {
+                scores.push(exposed.score_external(external)?);
+            }
+            for (row, score) in rows[j * each..].iter_mut().zip(scores) {
+                if let Some(pictures) = pictures.last_mut() {
+                    pictures.add(&row.label(), &score);
                 }
-                rows[j * names.len() + k].scores.push(score);
+                row.scores.push(score);
             }
         }
     }
@@ -150,14 +163,21 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     };
     let protocol = plan.protocol.name();
     let about = format!(
-        "{number} {}, {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before",
+        "{number} {} ({}), {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before{}",
         if number == 1 { "clip" } else { "clips" },
+        names.join(", "),
         exposing.sensor.name,
-        exposing.seed
+        exposing.seed,
+        if plan.appearance && plan.perceptual.is_none() {
+            "; LPIPS was not measured: --backbones names no weights"
+        } else {
+            ""
+        }
     );
     let settings = json!({
         "protocol": plan.protocol,
         "data": plan.data,
+        "clips": names,
         "sensor": exposing.sensor,
         "seed": exposing.seed,
         "exposure": plan.mean_level,
@@ -176,18 +196,13 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
         };
         let figures = json!({
             "method": row.method,
+            "steps": row.steps,
             "ppp": row.ppp,
             "psnr_a": of(|f| f.psnr_a),
             "psnr": of(|f| f.psnr),
             "ssim": of(|f| f.ssim),
             "ssim_g": of(|f| f.ssim_g),
-            "lpips_alex": of(|f| f.lpips_alex),
-            "lpips_vgg": of(|f| f.lpips_vgg),
-            "gmsd": of(|f| f.appearance.map(|a| a.gmsd)),
-            "ssimulacra2": of(|f| f.appearance.map(|a| a.ssimulacra2)),
-            "butteraugli": of(|f| f.appearance.map(|a| a.butteraugli)),
-            "detail_flat": of(|f| f.appearance?.detail_flat),
-            "detail_textured": of(|f| f.appearance?.detail_textured),
+            "added_over_missed": row.added(),
             "chi_square": row.mean(|s| s.chi_square),
             "flicker": row.mean(|s| s.flicker),
             "flow": row.flow(),
@@ -196,6 +211,7 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
             "clips": row.scores,
         });
         let Value::Object(mut figures) = figures else { return figures };
+        figures.extend(LOOKS.iter().map(|look| (look.key.to_owned(), json!(of(look.figure)))));
         figures.retain(|_, figure| !figure.is_null());
         Value::Object(figures)
     };

@@ -2,7 +2,7 @@
 
 use super::appearance::Appearance;
 use qudi_core::Frame;
-use qudi_core::metrics::Statistics;
+use qudi_core::metrics::{OCTAVES, Statistics};
 use serde::Serialize;
 
 /// Figures of one frame.
@@ -22,12 +22,56 @@ pub(crate) struct FrameScore {
     pub(crate) lpips_vgg: Option<f64>,
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub(crate) appearance: Option<Appearance>,
+    /// Root mean square of errors over that of their predicted sigma.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) error_over_sigma: Option<f64>,
+    /// The same in the flattest quarter.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) error_over_sigma_flat: Option<f64>,
+    /// The same in the most textured quarter.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) error_over_sigma_textured: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) chi_square: Option<f64>,
 }
 
 /// A figure of a frame.
 pub(crate) type Figure = fn(&FrameScore) -> Option<f64>;
+
+/// How a figure is called, and shown.
+pub(crate) struct Named {
+    pub(crate) key: &'static str,
+    pub(crate) title: &'static str,
+    pub(crate) figure: Figure,
+    /// Digits after the point in tables.
+    pub(crate) digits: usize,
+}
+
+const fn named(key: &'static str, title: &'static str, figure: Figure, digits: usize) -> Named {
+    Named { key, title, figure, digits }
+}
+
+/// How frames look, in the order in which it is shown.
+pub(crate) const LOOKS: [Named; 10] = [
+    named("lpips_alex", "lpips-alex", |f| f.lpips_alex, 3),
+    named("lpips_vgg", "lpips-vgg", |f| f.lpips_vgg, 3),
+    named("gmsd", "gmsd", |f| f.appearance.map(|a| a.gmsd), 4),
+    named("ssimulacra2", "ssimulacra2", |f| f.appearance.map(|a| a.ssimulacra2), 2),
+    named("butteraugli", "butteraugli", |f| f.appearance.map(|a| a.butteraugli), 2),
+    named("detail_flat", "detail flat", |f| f.appearance?.detail_flat, 2),
+    named("detail_textured", "detail textured", |f| f.appearance?.detail_textured, 2),
+    named("error_over_sigma", "error/sigma", |f| f.error_over_sigma, 2),
+    named("error_over_sigma_flat", "flat", |f| f.error_over_sigma_flat, 2),
+    named("error_over_sigma_textured", "textured", |f| f.error_over_sigma_textured, 2),
+];
+
+/// What a number of diffusion steps added to the result of the fewest ones, and what that one missed: root mean squares of
+/// a pixel in every octave, finest first.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub(crate) struct Added {
+    pub(crate) added: [f64; OCTAVES],
+    pub(crate) missed: [f64; OCTAVES],
+}
 
 /// What a method took.
 #[derive(Clone, Copy, Debug)]
@@ -59,6 +103,9 @@ pub(crate) struct Score {
     pub(crate) flicker: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) flow: Option<FlowKind>,
+    /// What its steps added, where fewer were evaluated beside them.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub(crate) added: Option<Added>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) seconds_per_frame: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -71,15 +118,31 @@ pub(crate) struct Score {
     pub(crate) how: String,
 }
 
+/// A method, and its steps where they are compared.
+pub(crate) fn label(method: &str, steps: Option<usize>) -> String {
+    match steps {
+        None => method.to_owned(),
+        Some(1) => format!("{method}, 1 step"),
+        Some(steps) => format!("{method}, {steps} steps"),
+    }
+}
+
 /// All scores of one method at one light level.
 pub(crate) struct Row {
     pub(crate) method: String,
+    /// Its diffusion steps, where several numbers of them are compared.
+    pub(crate) steps: Option<usize>,
     pub(crate) ppp: f64,
     /// One per clip.
     pub(crate) scores: Vec<Score>,
 }
 
 impl Row {
+    /// The method, and its steps where they are compared.
+    pub(crate) fn label(&self) -> String {
+        label(&self.method, self.steps)
+    }
+
     /// Statistics over clips of the mean over each clip's frames.
     pub(crate) fn over_clips(&self, figure: Figure) -> Option<Statistics> {
         let mean = |score: &Score| {
@@ -109,6 +172,16 @@ impl Row {
     /// The highest memory peak over clips, in MiB.
     pub(crate) fn peak_mib(&self) -> Option<f64> {
         self.scores.iter().filter_map(|score| score.peak_mib).reduce(f64::max)
+    }
+
+    /// Means over clips of what its steps added in every octave, over what the fewest ones missed there.
+    pub(crate) fn added(&self) -> Option<[f64; OCTAVES]> {
+        let all: Option<Vec<Added>> = self.scores.iter().map(|score| score.added).collect();
+        let all = all.filter(|all| !all.is_empty())?;
+        let sum = |of: fn(&Added) -> &[f64; OCTAVES], i: usize| -> f64 {
+            all.iter().map(|one| of(one)[i].powi(2)).sum()
+        };
+        Some(std::array::from_fn(|i| (sum(|a| &a.added, i) / sum(|a| &a.missed, i)).sqrt()))
     }
 
     /// The flow that flicker was measured along.

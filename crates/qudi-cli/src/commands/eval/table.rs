@@ -1,6 +1,6 @@
 //! The tables of `qudi eval`: figures of methods, and of every frame.
 
-use super::score::{Figure, FlowKind, Row};
+use super::score::{Figure, FlowKind, LOOKS, Named, Row};
 use crate::report::{Cell, Column, Table};
 use qudi_core::metrics::Statistics;
 
@@ -12,6 +12,7 @@ pub(crate) fn summary(rows: &[Row]) -> Table {
     };
     let mut table = Table::new(vec![
         Column::new("method", "method"),
+        Column::new("steps", "steps"),
         Column::new("ppp", "PPP"),
         Column::new("psnr_a_centre", "psnr-a centre"),
         Column::new("psnr_a", "psnr-a all"),
@@ -35,6 +36,11 @@ fn light(row: &Row) -> Cell {
     Cell::Exact((row.ppp * 1e4).round() / 1e4)
 }
 
+/// Diffusion steps, where several numbers of them are compared.
+fn steps(row: &Row) -> Cell {
+    row.steps.map_or(Cell::Unknown, |steps| Cell::Exact(steps as f64))
+}
+
 fn cells(row: &Row) -> Vec<Cell> {
     let mean = |statistics: Option<Statistics>, digits: usize| match statistics {
         Some(Statistics { mean: value, ci95: Some(ci95), .. }) => {
@@ -44,6 +50,7 @@ fn cells(row: &Row) -> Vec<Cell> {
     };
     vec![
         Cell::text(&row.method),
+        steps(row),
         light(row),
         mean(row.centre(|f| f.psnr_a), 2),
         mean(row.over_clips(|f| f.psnr_a), 2),
@@ -60,68 +67,71 @@ fn cells(row: &Row) -> Vec<Cell> {
     ]
 }
 
+/// Tables of looks with their titles, as far as they were measured.
+pub(crate) fn looks(rows: &[Row]) -> Vec<(&'static str, Table)> {
+    let added_title =
+        "What more steps added, over what the fewest missed (rms, by size of structure)";
+    let tables = [("How frames look", appearance(rows)), (added_title, added(rows))];
+    tables.into_iter().filter_map(|(title, table)| Some((title, table?))).collect()
+}
+
 /// How frames look, one row for every method and light level; none where it was not measured.
-pub(crate) fn appearance(rows: &[Row]) -> Option<Table> {
-    let figures: [(&str, &str, Figure, usize); 7] = [
-        ("lpips_alex", "lpips-alex", |f| f.lpips_alex, 3),
-        ("lpips_vgg", "lpips-vgg", |f| f.lpips_vgg, 3),
-        ("gmsd", "gmsd", |f| f.appearance.map(|a| a.gmsd), 4),
-        ("ssimulacra2", "ssimulacra2", |f| f.appearance.map(|a| a.ssimulacra2), 2),
-        ("butteraugli", "butteraugli", |f| f.appearance.map(|a| a.butteraugli), 2),
-        ("detail_flat", "detail flat", |f| f.appearance?.detail_flat, 2),
-        ("detail_textured", "detail textured", |f| f.appearance?.detail_textured, 2),
-    ];
+fn appearance(rows: &[Row]) -> Option<Table> {
     rows.iter().find(|row| row.over_clips(|f| f.appearance.map(|a| a.gmsd)).is_some())?;
-    let names = [("method", "method"), ("ppp", "PPP")];
-    let names = names.into_iter().chain(figures.iter().map(|(key, name, ..)| (*key, *name)));
-    let mut table = Table::new(names.map(|(key, name)| Column::new(key, name)).collect());
-    table.rows = rows
-        .iter()
-        .map(|row| {
-            let mut cells = vec![Cell::text(&row.method), light(row)];
-            let figures = figures.iter();
-            cells.extend(figures.map(|(_, _, figure, digits)| {
-                Cell::number(row.over_clips(*figure).map(|s| s.mean), *digits)
-            }));
-            cells
-        })
-        .collect();
+    let mut columns = ["method", "steps", "PPP"].map(|name| Column::new(name, name)).to_vec();
+    columns.extend(LOOKS.iter().map(|look| Column::new(look.key, look.title)));
+    let mut table = Table::new(columns);
+    let cells = |row: &Row| {
+        let mean =
+            |look: &Named| Cell::number(row.over_clips(look.figure).map(|s| s.mean), look.digits);
+        let first = [Cell::text(&row.method), steps(row), light(row)];
+        first.into_iter().chain(LOOKS.iter().map(mean)).collect()
+    };
+    table.rows = rows.iter().map(cells).collect();
     Some(table.without_unknown_columns())
 }
 
-/// One row for every method, light level, clip and frame; LPIPS and looks where they were measured.
+/// What more diffusion steps added to the result of the fewest, over what that one misses: in every octave, the ratio of
+/// root mean squares. None where it was not measured.
+fn added(rows: &[Row]) -> Option<Table> {
+    let octaves = ["2-4 pixels", "4-8", "8-16", "16-32", "coarser"];
+    let names = ["method", "steps", "PPP"].into_iter().chain(octaves);
+    let mut table = Table::new(names.map(|name| Column::new(name, name)).collect());
+    let cells = |row: &Row| {
+        let ratios = row.added()?.map(|ratio| Cell::number(Some(ratio), 3));
+        let first = [Cell::text(&row.method), steps(row), light(row)];
+        Some(first.into_iter().chain(ratios).collect())
+    };
+    table.rows = rows.iter().filter_map(cells).collect();
+    (!table.rows.is_empty()).then_some(table)
+}
+
+/// One row for every method, light level, clip and frame; steps where they are compared, looks where they were measured.
 pub(crate) fn frames(rows: &[Row]) -> Table {
-    let figures: [(&str, Figure, usize); 12] = [
+    let usual: [(&str, Figure, usize); 4] = [
         ("psnr_a", |f| f.psnr_a, 2),
         ("psnr", |f| f.psnr, 2),
         ("ssim", |f| f.ssim, 3),
         ("ssim_g", |f| f.ssim_g, 3),
-        ("lpips_alex", |f| f.lpips_alex, 4),
-        ("lpips_vgg", |f| f.lpips_vgg, 4),
-        ("gmsd", |f| f.appearance.map(|a| a.gmsd), 4),
-        ("ssimulacra2", |f| f.appearance.map(|a| a.ssimulacra2), 2),
-        ("butteraugli", |f| f.appearance.map(|a| a.butteraugli), 3),
-        ("detail_flat", |f| f.appearance?.detail_flat, 3),
-        ("detail_textured", |f| f.appearance?.detail_textured, 3),
-        ("chi_square", |f| f.chi_square, 3),
     ];
-    let always = ["psnr_a", "psnr", "ssim", "ssim_g", "chi_square"];
     let all = || rows.iter().flat_map(|row| &row.scores).flat_map(|score| &score.frames);
-    let is_shown = |(key, figure, _): &(&str, Figure, usize)| {
-        always.contains(key) || all().any(|frame| figure(frame).is_some())
-    };
-    let figures: Vec<_> = figures.into_iter().filter(is_shown).collect();
-    let keys = ["method", "ppp", "clip", "frame"].into_iter().chain(figures.iter().map(|f| f.0));
+    let is_known = |look: &&Named| all().any(|frame| (look.figure)(frame).is_some());
+    // One digit more than means have.
+    let looks = LOOKS.iter().filter(is_known).map(|look| (look.key, look.figure, look.digits + 1));
+    let chi_square: (&str, Figure, usize) = ("chi_square", |f| f.chi_square, 3);
+    let figures: Vec<_> = usual.into_iter().chain(looks).chain([chi_square]).collect();
+    let compares = rows.iter().any(|row| row.steps.is_some());
+    let first = ["method", "steps", "ppp", "clip", "frame"];
+    let first = first.into_iter().filter(|key| compares || *key != "steps");
+    let keys = first.chain(figures.iter().map(|f| f.0));
     let mut table = Table::new(keys.map(|key| Column::new(key, key)).collect());
     for row in rows {
         for score in &row.scores {
             for (n, frame) in score.frames.iter().enumerate() {
-                let mut cells = vec![
-                    Cell::text(&row.method),
-                    Cell::Exact(row.ppp),
-                    Cell::text(&score.clip),
-                    Cell::Exact(n as f64),
-                ];
+                let mut cells = vec![Cell::text(&row.method)];
+                cells.extend(compares.then(|| steps(row)));
+                let place = [Cell::Exact(row.ppp), Cell::text(&score.clip), Cell::Exact(n as f64)];
+                cells.extend(place);
                 let figures = figures.iter();
                 cells.extend(
                     figures.map(|(_, figure, digits)| Cell::number(figure(frame), *digits)),

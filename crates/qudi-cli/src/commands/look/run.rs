@@ -155,7 +155,7 @@ fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<F
 
 /// What `qudi restore` would do, and about how long that takes.
 fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(String, Value)> {
-    let usual = usual_method(&Network::default().options(), capture, acquisition)?;
+    let usual = usual_method(&Network::default().options(None), capture, acquisition)?;
     let cost = COSTS.iter().find(|(name, _)| *name == usual.name).map_or(2.0, |(_, cost)| *cost);
     let pictures = capture.frames();
     let total = seconds * cost * pictures as f64;

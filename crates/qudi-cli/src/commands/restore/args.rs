@@ -1,6 +1,6 @@
 //! Options of `qudi restore`.
 
-use crate::args::{Network, Reading, Shard, number};
+use crate::args::{Network, Reading, Shard, Steps, number};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use std::path::PathBuf;
 
@@ -80,6 +80,8 @@ pub(crate) struct Restore {
     /// --samples K
     #[arg(long, alias = "deviation", value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) uncertainty: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) steps: Steps,
     #[command(flatten)]
     pub(crate) network: Network,
     #[command(flatten)]

@@ -83,7 +83,7 @@ impl Plan {
                 "ask for it when all parts are done: the same command without --shard",
             ));
         }
-        let mut network = args.network.options();
+        let mut network = args.network.options(args.steps.steps);
         if let Some(method) = &args.method {
             network.check_methods(std::iter::once(method.as_str()))?;
         }
