@@ -13,7 +13,8 @@ frames of the pass backward in time, and frames and features of the passes forwa
 share. What is stored and what is read differs between training and evaluation:
 
 - read: the softmax over all entries; in evaluation over the 20 with the largest scores (`top`);
-- backward pass: keeps frames of whole multiples of 5; in evaluation frames 2, 7, 12 and so on, and the last;
+- backward pass: keeps frames of whole multiples of 5, so training needs 5 n + 1 frames; in evaluation frames 2, 7,
+  12 and so on, and the last;
 - in evaluation, after each entry of a frame only the last 5 n positions stay (`memory_length`), n those of the
   frame just stored. Positions of a frame are sorted by rows, frames by time.
 

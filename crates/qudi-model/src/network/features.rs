@@ -1,10 +1,10 @@
 //! Spatio-temporal features: 3-D convolutions over the frames, on three levels.
 
-use super::layers::resample::pixel_unshuffle;
-use super::layers::{Bias, Conv3d};
 use crate::config::FeaturesConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_layers::resample::pixel_unshuffle;
+use qudi_layers::{Bias, Conv3d};
 
 /// Features on levels 0, 1 and 2: `[images, channels, h / 2^k, w / 2^k]`.
 pub type Pyramid = [Tensor<4>; 3];

@@ -1,13 +1,14 @@
 //! Optical flow between neighbouring frames: SPyNet (Ranjan and Black 2017), alone or correcting what steps
 //! of Lucas and Kanade find on every level.
 
-use super::layers::resample::{avg_pool2, by_burst, mean_around, rescale_flow, shrink, upsample2};
-use super::layers::{Bias, Conv2d, FLOW_CORRECTION};
+use super::layers::FLOW_CORRECTION;
 use super::lucas_kanade::lucas_kanade;
 use crate::config::{FlowConfig, FlowInputs};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
+use qudi_layers::resample::{avg_pool2, by_burst, mean_around, rescale_flow, shrink, upsample2};
+use qudi_layers::{Bias, Conv2d};
 
 /// Added to the contrast that images are divided by: what is flatter counts as flat.
 const LEAST_CONTRAST: f32 = 0.05;

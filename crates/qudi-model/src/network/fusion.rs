@@ -2,13 +2,13 @@
 
 use super::features::Pyramid;
 use super::flow::{Flows, shifted};
-use super::layers::dense_block::DenseBlock;
-use super::layers::resample::{avg_pool2, by_burst};
-use super::layers::{Bias, Conv2d};
 use crate::config::{FeaturesConfig, FusionConfig};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
+use qudi_layers::DenseBlock;
+use qudi_layers::resample::{avg_pool2, by_burst};
+use qudi_layers::{Bias, Conv2d};
 
 /// The recurrent cell; its weights serve both directions.
 #[derive(Module, Debug)]

@@ -5,8 +5,7 @@ mod whole;
 
 use super::flow::Flows;
 use super::layers::attention::Attention;
-use super::layers::dense_block::DenseBlock;
-use super::layers::{embedding, resample};
+use super::layers::embedding;
 use super::normalized_input::NormalizedInput;
 use super::unet::ResidualBlock;
 use super::{Pyramid, former_name, init_parameters};
@@ -18,6 +17,8 @@ use crate::diffusion::state::DiffusionState;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Gradients, Tensor};
+use qudi_layers::DenseBlock;
+use qudi_layers::resample;
 
 fn devices() -> [Device; 2] {
     #[allow(deprecated)] // asked for by name

@@ -1,8 +1,8 @@
 //! Registration that needs no training: steps of Lucas and Kanade (1981) under a prior.
 
-use super::layers::resample::{differences, mean_around};
 use burn::tensor::Tensor;
 use qudi_kernels::warp;
+use qudi_layers::resample::{differences, mean_around};
 
 /// Weight of the prior, in variances of a pixel's noise: where that hides what moves, a motion stays as it
 /// was. Found on the validation clips (docs/notes/network/start.md).

@@ -3,11 +3,11 @@
 //! A layer that sees all neighbours at once can only add them up; whether one of them shows the same thing is
 //! a question to each of them.
 
-use super::layers::{Bias, Conv2d};
 use crate::config::PreConfig;
 use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
+use qudi_layers::{Bias, Conv2d};
 
 /// The planes of a frame that decide together with a neighbour's two.
 const FRAME_PLANES: usize = 5;

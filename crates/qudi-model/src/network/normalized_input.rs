@@ -1,9 +1,9 @@
 //! The pre-denoiser's inputs in numbers that mean the same in any light: sigmas of the merged frame's noise.
 
 use super::layers::CORRECTION;
-use super::layers::resample::mean_around;
 use crate::conditioning::{AlignedTensors, Conditioning};
 use burn::tensor::Tensor;
+use qudi_layers::resample::mean_around;
 
 /// The least sigma in image units: what is known better needs no correction.
 const MIN_SIGMA: f32 = 1e-3;

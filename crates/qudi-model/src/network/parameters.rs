@@ -1,7 +1,5 @@
-//! Parameters by name: initial values, and values from elsewhere.
+//! Names of parameters, former and present, and their initial values.
 
-use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
-use burn::tensor::{Tensor, TensorData};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
@@ -20,62 +18,6 @@ pub fn former_name(name: &str) -> String {
         found.map_or(part, |(_, former)| *former).to_owned()
     };
     name.split('.').map(former).collect::<Vec<_>>().join(".")
-}
-
-/// Gives every parameter of `module` the values that `values` has for its name and shape.
-pub fn init_parameters<M: Module>(module: M, values: impl FnMut(&str, &[usize]) -> Vec<f32>) -> M {
-    module.map(&mut Initialize { path: Vec::new(), values })
-}
-
-/// Lists the names and shapes of all parameters, in the order of the network.
-pub fn parameter_shapes<M: Module>(module: &M) -> Vec<(String, Vec<usize>)> {
-    let mut names = Names::default();
-    module.visit(&mut names);
-    names.list
-}
-
-struct Initialize<F> {
-    path: Vec<String>,
-    values: F,
-}
-
-impl<F: FnMut(&str, &[usize]) -> Vec<f32>> ModuleMapper for Initialize<F> {
-    fn enter_module(&mut self, name: &str, _container: &str) {
-        self.path.push(name.into());
-    }
-
-    fn exit_module(&mut self, _name: &str, _container: &str) {
-        self.path.pop();
-    }
-
-    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
-        let shape = param.lazy_shape();
-        let values = (self.values)(&self.path.join("."), shape.as_slice());
-        let data = TensorData::new(values, shape);
-        let mut initialized = Param::from_tensor(Tensor::from_data(data, &param.lazy_device()));
-        initialized.id = param.id; // optimizers know parameters by it
-        initialized
-    }
-}
-
-#[derive(Default)]
-struct Names {
-    path: Vec<String>,
-    list: Vec<(String, Vec<usize>)>,
-}
-
-impl ModuleVisitor for Names {
-    fn enter_module(&mut self, name: &str, _container: &str) {
-        self.path.push(name.into());
-    }
-
-    fn exit_module(&mut self, _name: &str, _container: &str) {
-        self.path.pop();
-    }
-
-    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        self.list.push((self.path.join("."), param.lazy_shape().to_vec()));
-    }
 }
 
 /// The last layers of residual branches, which start at zero.

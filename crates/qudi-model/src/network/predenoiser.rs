@@ -1,15 +1,15 @@
 //! The pre-denoiser: a residual dense network (Zhang et al. 2018) that corrects the reference estimate frame
 //! by frame.
 
-use super::layers::dense_block::DenseBlock;
-use super::layers::resample::{pixel_shuffle, pixel_unshuffle};
-use super::layers::{Bias, Conv2d};
 use super::neighbour_weighting::NeighbourWeighting;
 use super::normalized_input::NormalizedInput;
 use crate::conditioning::AlignedTensors;
 use crate::config::{PreConfig, ReferenceKind};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_layers::DenseBlock;
+use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
+use qudi_layers::{Bias, Conv2d};
 
 /// The planes that the images of an aligned frame become.
 const IMAGE_PLANES: usize = 4;

@@ -6,7 +6,7 @@ use super::fused::Fused;
 use super::fusion::Fusion;
 use super::layers::CORRECTION;
 use super::normalized_input::NormalizedInput;
-use super::parameters::{init_parameters, initial_values};
+use super::parameters::initial_values;
 use super::predenoiser::PreDenoiser;
 use super::uncertainty::UncertaintyHead;
 use super::unet::UNet;
@@ -16,6 +16,7 @@ use crate::diffusion::precondition::Preconditioned;
 use crate::diffusion::state::{DiffusionState, per_image};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_layers::init_parameters;
 
 /// The simulated measurement of the previous estimate.
 ///

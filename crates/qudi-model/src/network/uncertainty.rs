@@ -1,12 +1,13 @@
 //! The predicted uncertainty of the pre-denoised frames: sigma of a normal law that fits their errors pixel
 //! by pixel (Nix and Weigend 1994; Kendall and Gal 2017, section 2.2). It changes no frame.
 
-use super::layers::resample::pixel_shuffle;
-use super::layers::{Bias, CORRECTION, Conv2d};
+use super::layers::CORRECTION;
 use super::normalized_input::NormalizedInput;
 use crate::config::PreConfig;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_layers::resample::pixel_shuffle;
+use qudi_layers::{Bias, Conv2d};
 
 /// The range of the logarithm of how much smaller or larger than usual errors can be.
 const LOG_RANGE: [f32; 2] = [-5.0, 3.0];

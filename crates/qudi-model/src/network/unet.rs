@@ -3,8 +3,6 @@
 use super::features::Pyramid;
 use super::layers::attention::Attention;
 use super::layers::embedding::sinusoids;
-use super::layers::resample::{pixel_shuffle, pixel_unshuffle, repeat};
-use super::layers::{Bias, Conv2d, GroupNorm, Linear};
 use super::normalized_input::NormalizedInput;
 use crate::conditioning::SENSOR_NUMBERS;
 use crate::config::{FusionConfig, UNetConfig, UNetPrediction};
@@ -13,6 +11,8 @@ use crate::diffusion::state::DiffusionState;
 use burn::module::Module;
 use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor, TensorData};
+use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle, repeat};
+use qudi_layers::{Bias, Conv2d, GroupNorm, Linear};
 
 /// Two convolutions with norms, modulated by the embedding (FiLM, Perez et al. 2018).
 #[derive(Module, Debug)]

@@ -1,10 +1,10 @@
 //! Self-attention over the cells of a frame, or over the frames of a cell.
 
-use super::{Bias, Conv2d, GroupNorm};
 use burn::module::Module;
 use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::attention;
+use qudi_layers::{Bias, Conv2d, GroupNorm};
 
 /// Self-attention with a residual.
 #[derive(Module, Debug)]

@@ -5,7 +5,7 @@ use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::{AvgPoolOptions, PadMode};
 
 /// `[bursts * frames, c, h, w]` as `[bursts, frames, c, h, w]`.
-pub(in crate::network) fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
+pub fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
     let [images, c, h, w] = x.dims();
     x.reshape([images / frames, frames, c, h, w])
 }
@@ -30,7 +30,7 @@ pub fn pixel_unshuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
 }
 
 /// The inverse of [`pixel_unshuffle`].
-pub(in crate::network) fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
+pub fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
     }
@@ -54,7 +54,7 @@ pub fn avg_pool2(x: Tensor<4>) -> Tensor<4> {
 }
 
 /// Means of `scale` x `scale` pixels, `scale` a power of two.
-pub(in crate::network) fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
+pub fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
     for _ in 0..scale.ilog2() {
         x = avg_pool2(x);
     }
@@ -63,7 +63,7 @@ pub(in crate::network) fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
 
 /// Twice the size, bilinear with half-pixel centres, edges repeated. Composed: Burn's own has no gradient
 /// on GPUs.
-pub(in crate::network) fn upsample2(x: Tensor<4>) -> Tensor<4> {
+pub fn upsample2(x: Tensor<4>) -> Tensor<4> {
     upsample2_axis(upsample2_axis(x, 2), 3)
 }
 
@@ -81,7 +81,7 @@ fn upsample2_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
 }
 
 /// Each pixel twice in both directions.
-pub(in crate::network) fn repeat(x: Tensor<4>) -> Tensor<4> {
+pub fn repeat(x: Tensor<4>) -> Tensor<4> {
     let [images, channels, height, width] = x.dims();
     x.reshape([images, channels, height, 1, width, 1]).repeat(&[1, 1, 1, 2, 1, 2]).reshape([
         images,
@@ -92,7 +92,7 @@ pub(in crate::network) fn repeat(x: Tensor<4>) -> Tensor<4> {
 }
 
 /// A flow of one scale on another; both powers of two.
-pub(in crate::network) fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
+pub fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
     let mut scale = from;
     while scale > to {
         flow = upsample2(flow) * 2.0;
@@ -106,7 +106,7 @@ pub(in crate::network) fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usi
 }
 
 /// Means over squares of `2 * radius + 1` pixels; edges repeated. `radius` is 2 or 4.
-pub(in crate::network) fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
+pub fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
     mean_axis(mean_axis(x, 2, radius), 3, radius)
 }
 
@@ -129,7 +129,7 @@ fn mean_axis(x: Tensor<4>, axis: usize, radius: usize) -> Tensor<4> {
 }
 
 /// Half of what the pixel after has more than the one before, along rows and along columns; edges repeated.
-pub(in crate::network) fn differences(x: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
+pub fn differences(x: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let along = |axis: usize| {
         let size = x.dims()[axis];
         let mut pads = [(0, 0); 4];

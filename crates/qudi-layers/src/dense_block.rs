@@ -9,13 +9,14 @@ const LAYERS: usize = 3;
 
 /// Layers that each see all layers before, and a residual.
 #[derive(Module, Debug)]
-pub(in crate::network) struct DenseBlock {
+pub struct DenseBlock {
     layers: Vec<Conv2d>,
     fuse: Conv2d,
 }
 
 impl DenseBlock {
-    pub(in crate::network) fn zeros(width: usize, growth: usize, device: &Device) -> Self {
+    /// The block, all weights zero.
+    pub fn zeros(width: usize, growth: usize, device: &Device) -> Self {
         let layer = |l| Conv2d::zeros([width + l * growth, growth], 3, Bias::Yes, device);
         let all = width + LAYERS * growth;
         Self {
@@ -24,8 +25,11 @@ impl DenseBlock {
         }
     }
 
-    /// The result has the shape of `x`, `[images, width, h, w]`.
-    pub(in crate::network) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+    /// What the layers add to `x`, and `x`.
+    ///
+    /// # Shapes
+    /// - x, result: `[images, width, height, width]`
+    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let mut parts = vec![x.clone()];
         for layer in &self.layers {
             parts.push(layer.relu(&parts));

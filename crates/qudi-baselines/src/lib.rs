@@ -1,0 +1,12 @@
+//! The learned methods of the paper's table, written from their papers.
+//!
+//! Parameters have the names of the authors' files, so that these can be read.
+#![warn(missing_docs)]
+
+#[cfg(test)]
+#[path = "../../../tests/golden/cases.rs"]
+mod cases;
+
+pub mod emvd;
+#[cfg(test)]
+mod golden_tests;

@@ -1,0 +1,149 @@
+//! Convolutions of frames, and over frames.
+
+use super::parameters::zeros;
+use burn::module::{Module, Param};
+use burn::tensor::{Device, Tensor};
+use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
+
+/// A convolution of frames one by one.
+#[derive(Module, Debug)]
+pub struct Conv2d {
+    /// `[outputs, inputs, rows, columns]`
+    weight: Param<Tensor<4>>,
+    /// `[outputs]`
+    bias: Option<Param<Tensor<1>>>,
+}
+
+/// A convolution over the frames of bursts.
+#[derive(Module, Debug)]
+pub struct Conv3d {
+    /// `[outputs, inputs, frames, rows, columns]`
+    weight: Param<Tensor<5>>,
+    /// `[outputs]`
+    bias: Option<Param<Tensor<1>>>,
+}
+
+/// Whether a layer has a bias.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Bias {
+    /// It has.
+    Yes,
+    /// It has none.
+    No,
+}
+
+/// One value for every output of a weight.
+fn bias_or_zeros<const D: usize>(bias: Option<&Param<Tensor<1>>>, weight: &Tensor<D>) -> Tensor<1> {
+    bias.map_or_else(|| Tensor::zeros([weight.dims()[0]], &weight.device()), Param::val)
+}
+
+impl Conv2d {
+    /// A layer of zeros; [`init_parameters`](crate::init_parameters) gives weights their values by name.
+    pub fn zeros(
+        [inputs, outputs]: [usize; 2],
+        kernel: usize,
+        bias: Bias,
+        device: &Device,
+    ) -> Self {
+        Self {
+            weight: zeros([outputs, inputs, kernel, kernel], device),
+            bias: (bias == Bias::Yes).then(|| zeros([outputs], device)),
+        }
+    }
+
+    /// Inserts `more` inputs of zero weight after the first `at` ones.
+    #[must_use]
+    pub fn with_zero_inputs(self, at: usize, more: usize) -> Self {
+        if more == 0 {
+            return self;
+        }
+        let weight = self.weight.val();
+        let [outputs, inputs, rows, columns] = weight.dims();
+        let zeros = Tensor::zeros([outputs, more, rows, columns], &weight.device());
+        let mut parts = vec![weight.clone().narrow(1, 0, at), zeros];
+        if at < inputs {
+            parts.push(weight.narrow(1, at, inputs - at));
+        }
+        Self { weight: Param::from_tensor(Tensor::cat(parts, 1)), ..self }
+    }
+
+    /// The weights, `[outputs, inputs, rows, columns]`.
+    pub fn weight(&self) -> Tensor<4> {
+        self.weight.val()
+    }
+
+    /// The number of inputs.
+    pub fn inputs(&self) -> usize {
+        self.weight.lazy_shape().as_slice()[1]
+    }
+
+    /// The sum alone. `inputs` are joined by channel, `[images, channels, height, width]`.
+    pub fn linear(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        self.call(inputs, Options::default())
+    }
+
+    /// The sum and an addend.
+    pub fn add(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
+        self.call(inputs, Options { addend: Some(addend), ..Options::default() })
+    }
+
+    /// The sum and an addend, then ReLU.
+    pub fn add_relu(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
+        let activation = Activation::Relu;
+        self.call(inputs, Options { addend: Some(addend), activation, ..Options::default() })
+    }
+
+    /// The sum, then ReLU.
+    pub fn relu(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        self.call(inputs, Options { activation: Activation::Relu, ..Options::default() })
+    }
+
+    /// The sum at every second row and column.
+    pub fn stride2(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        self.call(inputs, Options { stride: 2, ..Options::default() })
+    }
+
+    fn call(&self, inputs: &[Tensor<4>], options: Options) -> Tensor<4> {
+        let weight = self.weight.val();
+        let bias = bias_or_zeros(self.bias.as_ref(), &weight);
+        conv_2d(inputs, weight, bias, options)
+    }
+}
+
+impl Conv3d {
+    /// A layer of zeros with kernel 5 x 5 x 5.
+    pub fn zeros([inputs, outputs]: [usize; 2], bias: Bias, device: &Device) -> Self {
+        Self {
+            weight: zeros([outputs, inputs, 5, 5, 5], device),
+            bias: (bias == Bias::Yes).then(|| zeros([outputs], device)),
+        }
+    }
+
+    /// The sum. `x`: `[bursts * frames, channels, height, width]`.
+    pub fn linear(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.call(x, frames, Options::default())
+    }
+
+    /// The sum and an addend, then ReLU.
+    pub fn add_relu(&self, x: Tensor<4>, frames: usize, addend: Tensor<4>) -> Tensor<4> {
+        let activation = Activation::Relu;
+        self.call(x, frames, Options { addend: Some(addend), activation, ..Options::default() })
+    }
+
+    /// The sum, then ReLU.
+    pub fn relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.call(x, frames, Options { activation: Activation::Relu, ..Options::default() })
+    }
+
+    /// The sum at every second row and column, then ReLU.
+    pub fn stride2_relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        let activation = Activation::Relu;
+        self.call(x, frames, Options { stride: 2, activation, ..Options::default() })
+    }
+
+    fn call(&self, x: Tensor<4>, frames: usize, options: Options) -> Tensor<4> {
+        let weight = self.weight.val();
+        let bias = bias_or_zeros(self.bias.as_ref(), &weight);
+        conv_3d(&[x], weight, bias, frames, options)
+    }
+}

@@ -1,0 +1,30 @@
+//! A matrix and a bias.
+
+use super::parameters::zeros;
+use burn::module::{Module, Param};
+use burn::tensor::{Device, Tensor};
+
+/// A matrix and a bias.
+#[derive(Module, Debug)]
+pub struct Linear {
+    /// `[outputs, inputs]`
+    weight: Param<Tensor<2>>,
+    /// `[outputs]`
+    bias: Param<Tensor<1>>,
+}
+
+impl Linear {
+    /// A layer of zeros.
+    pub fn zeros([inputs, outputs]: [usize; 2], device: &Device) -> Self {
+        Self { weight: zeros([outputs, inputs], device), bias: zeros([outputs], device) }
+    }
+
+    /// The product and the bias.
+    ///
+    /// # Shapes
+    /// - x: `[rows, inputs]`
+    /// - result: `[rows, outputs]`
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        x.matmul(self.weight.val().transpose()) + self.bias.val().unsqueeze()
+    }
+}
