@@ -122,6 +122,12 @@ impl Case<'_> {
         Tensor::from_data(TensorData::new(parameter(name, &shape), shape), device)
     }
 
+    /// The shape of a parameter.
+    pub fn parameter_shape(&self, name: &str) -> Vec<usize> {
+        let shape = self.case["parameters"][name].as_array().unwrap();
+        shape.iter().map(|side| side.as_u64().unwrap() as usize).collect()
+    }
+
     /// Names of all parameters.
     pub fn parameters(&self) -> Vec<&str> {
         self.case["parameters"].as_object().unwrap().keys().map(String::as_str).collect()

@@ -3,6 +3,8 @@
 
 use crate::cases::{Case, File, parameter};
 use crate::emvd::{self, Emvd};
+use crate::spk2imgnet::{self, Spk2ImgNet};
+use crate::student_teacher::{self, KernelPrediction};
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Gradients, Tensor};
 use qudi_layers::{init_parameters, parameter_shapes};
@@ -13,21 +15,29 @@ fn devices() -> [Device; 2] {
     [Device::flex().autodiff(), ndarray.autodiff()]
 }
 
-/// The module with the reference's weights. Both have the same parameters.
-fn weighted<M: Module>(module: M, case: &Case<'_>) -> M {
-    let mut ours: Vec<_> = parameter_shapes(&module).into_iter().map(|(name, _)| name).collect();
-    let mut theirs = case.parameters();
+/// The module with the reference's weights, whose names follow from ours. Both have the same parameters.
+fn weighted<M: Module>(module: M, case: &Case<'_>, prefix: &str, name: Name) -> M {
+    let full = |ours: &str| format!("{prefix}{}", name(ours));
+    let shapes = parameter_shapes(&module).into_iter();
+    let mut ours: Vec<_> = shapes.map(|(ours, shape)| (full(&ours), shape)).collect();
+    let theirs = case.parameters().into_iter().filter(|name| name.starts_with(prefix));
+    let mut theirs: Vec<_> =
+        theirs.map(|name| (name.to_owned(), case.parameter_shape(name))).collect();
     ours.sort();
-    theirs.sort_unstable();
+    theirs.sort();
     assert_eq!(ours, theirs);
-    init_parameters(module, parameter)
+    init_parameters(module, |name, shape| parameter(&full(name), shape))
 }
+
+/// From our name of a parameter to the reference's.
+type Name = fn(&str) -> String;
 
 /// Checks the gradients of all parameters.
 struct Gradient<'a> {
     case: &'a Case<'a>,
     gradients: &'a Gradients,
     path: Vec<String>,
+    name: &'a dyn Fn(&str) -> String,
 }
 
 impl ModuleVisitor for Gradient<'_> {
@@ -42,21 +52,17 @@ impl ModuleVisitor for Gradient<'_> {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         let value = param.val();
         let gradient = value.grad(self.gradients).unwrap_or_else(|| value.inner().zeros_like());
-        self.case.check_gradient(&self.path.join("."), gradient);
+        self.case.check_gradient(&(self.name)(&self.path.join(".")), gradient);
     }
 }
 
-fn check_gradients<M: Module>(
+fn check_parameters<M: Module>(
     case: &Case<'_>,
-    loss: Tensor<1>,
+    gradients: &Gradients,
     module: &M,
-    inputs: &[(&str, &Tensor<4>)],
+    name: &dyn Fn(&str) -> String,
 ) {
-    let gradients = loss.backward();
-    for (name, input) in inputs {
-        case.check_gradient(name, input.grad(&gradients).unwrap());
-    }
-    module.visit(&mut Gradient { case, gradients: &gradients, path: Vec::new() });
+    module.visit(&mut Gradient { case, gradients, path: Vec::new(), name });
 }
 
 fn frame(x: &Tensor<5>, number: usize) -> Tensor<4> {
@@ -70,7 +76,7 @@ fn emvd_matches_pytorch() {
     for device in devices() {
         let network = |case: &Case<'_>| {
             let width = case.about["config"]["width"].as_u64().unwrap() as usize;
-            weighted(Emvd::zeros(width, &device), case)
+            weighted(Emvd::zeros(width, &device), case, "", str::to_owned)
         };
         let case = file.case("step");
         let emvd = network(&case);
@@ -84,8 +90,11 @@ fn emvd_matches_pytorch() {
             ("omega", step.omega),
             ("refine", step.refine),
         ];
-        let loss = sum(&case, &outputs);
-        check_gradients(&case, loss, &emvd, &[("previous", &previous), ("current", &current)]);
+        let gradients = sum(&case, &outputs).backward();
+        for (name, input) in [("previous", &previous), ("current", &current)] {
+            case.check_gradient(name, input.grad(&gradients).unwrap());
+        }
+        check_parameters(&case, &gradients, &emvd, &str::to_owned);
 
         for name in ["sequence", "loss"] {
             let case = file.case(name);
@@ -112,7 +121,7 @@ fn emvd_matches_pytorch() {
             };
             let gradients = loss.backward();
             case.check_gradient("x", x.grad(&gradients).unwrap());
-            emvd.visit(&mut Gradient { case: &case, gradients: &gradients, path: Vec::new() });
+            check_parameters(&case, &gradients, &emvd, &str::to_owned);
         }
     }
 }
@@ -124,4 +133,89 @@ fn sum(case: &Case<'_>, outputs: &[(&str, Tensor<4>)]) -> Tensor<1> {
         (output.clone() * case.cotangent(name, &output.device())).sum()
     });
     parts.reduce(Tensor::add).unwrap()
+}
+
+fn size(case: &Case<'_>, key: &str) -> usize {
+    case.about["config"][key].as_u64().unwrap() as usize
+}
+
+#[test]
+fn spk2imgnet_matches_pytorch() {
+    let file = File::open("learned/spk2imgnet");
+    for device in devices() {
+        for name in ["forward", "loss"] {
+            let case = file.case(name);
+            let sizes = spk2imgnet::Sizes {
+                features: size(&case, "features"),
+                stem: size(&case, "stem"),
+                blocks: size(&case, "blocks"),
+                groups: 8,
+            };
+            let network = Spk2ImgNet::zeros(sizes, &device);
+            let network = weighted(network, &case, "", Spk2ImgNet::authors_name);
+            let x: Tensor<4> = case.input("x", &device).require_grad();
+            let (image, estimates) = network.forward(x.clone());
+            let loss = if name == "loss" {
+                let loss = spk2imgnet::loss(image, estimates, case.input("truth", &device));
+                case.check_output("loss", loss.clone());
+                loss
+            } else {
+                let names: Vec<_> = (0..5).map(|block| format!("estimate_{block}")).collect();
+                let each = names.iter().enumerate();
+                let each = each.map(|(n, name)| (name.as_str(), frame(&estimates, n)));
+                let outputs: Vec<_> = each.chain([("y", image)]).collect();
+                sum(&case, &outputs)
+            };
+            let gradients = loss.backward();
+            case.check_gradient("x", x.grad(&gradients).unwrap());
+            check_parameters(&case, &gradients, &network, &Spk2ImgNet::authors_name);
+        }
+    }
+}
+
+#[test]
+fn student_teacher_matches_pytorch() {
+    let file = File::open("learned/student_teacher");
+    for device in devices() {
+        let network = |case: &Case<'_>, prefix: &str| {
+            let sizes = student_teacher::Sizes {
+                frames: size(case, "frames"),
+                features: size(case, "features"),
+                kernel: size(case, "kernel"),
+            };
+            let network = KernelPrediction::zeros(sizes, &device);
+            weighted(network, case, prefix, KernelPrediction::file_name)
+        };
+        let case = file.case("student");
+        let student = network(&case, "");
+        let x: Tensor<4> = case.input("x", &device).require_grad();
+        let restored = student.forward(x.clone());
+        let outputs = [
+            ("image", restored.image),
+            ("frames", restored.frames),
+            ("extracted", restored.extracted),
+            ("bottom", restored.bottom),
+        ];
+        let gradients = sum(&case, &outputs).backward();
+        case.check_gradient("x", x.grad(&gradients).unwrap());
+        check_parameters(&case, &gradients, &student, &KernelPrediction::file_name);
+
+        let case = file.case("loss");
+        let [student, motion, denoising] =
+            ["student.", "motion.", "denoising."].map(|prefix| network(&case, prefix));
+        let input = |name: &str| -> Tensor<4> { case.input(name, &device) };
+        let noisy = input("noisy").require_grad();
+        let teachers = [motion.forward(input("clean")), denoising.forward(input("still"))];
+        let loss = student_teacher::student_loss(
+            &student.forward(noisy.clone()),
+            teachers.each_ref(),
+            &input("truth"),
+            case.number("iteration") as u64,
+        );
+        case.check_output("loss", loss.clone());
+        let gradients = loss.backward();
+        case.check_gradient("noisy", noisy.grad(&gradients).unwrap());
+        let name = |ours: &str| format!("student.{}", KernelPrediction::file_name(ours));
+        check_parameters(&case, &gradients, &student, &name);
+    }
 }

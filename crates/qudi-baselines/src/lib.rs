@@ -10,3 +10,6 @@ mod cases;
 pub mod emvd;
 #[cfg(test)]
 mod golden_tests;
+pub mod parts;
+pub mod spk2imgnet;
+pub mod student_teacher;

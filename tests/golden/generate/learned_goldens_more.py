@@ -78,8 +78,9 @@ class LearnedFile(File):
         self.folder = "learned"
 
 
-def image(*shape: int) -> dict:
-    return spread(shape, 0.5, 0.5)
+def image(*shape: int, scale: float = 0.5) -> dict:
+    """The scale of some is chosen such that few values are near kinks of activations and of warps."""
+    return spread(shape, 0.5, scale)
 
 
 def feature(*shape: int) -> dict:
@@ -104,16 +105,16 @@ QUIVER = {"features": 16, "blocks": 2, "past": 2, "future": 1}
 IMAGES = ("clean", "full", "half", "quarter")
 
 
-def quiver_file(name: str, shape: tuple[int, ...], training: bool = False) -> File:
+def quiver_file(name: str, shape: tuple[int, ...], scale: float, training: bool = False) -> File:
     file = LearnedFile(name)
     net = quiver.Quiver(**QUIVER)
     run = lambda x: dict(zip(IMAGES, net(x)))
     about = {"config": {"network": "quiver"} | QUIVER}
     if not training:
-        file.case("forward", run, {"x": image(*shape)}, net, about=about)
+        file.case("forward", run, {"x": image(*shape, scale=scale)}, net, about=about)
         return file
     loss = lambda y, values: quiver.loss(tuple(y.values()), values["truth"], QUIVER["past"], QUIVER["future"])
-    inputs = {"x": image(*shape), "truth": image(*shape)}
+    inputs = {"x": image(*shape, scale=scale), "truth": image(*shape)}
     file.case("loss", run, inputs, net, "", about, ("truth",), only(loss))
     return file
 
@@ -141,11 +142,11 @@ def rvrt_file(training: bool = False) -> File:
     about = {"config": {"network": "rvrt"} | sizes}
     run = lambda x: {"y": net(x)}
     if not training:
-        # Quarters of 4 rows (less than a window) and 10 columns (more than one).
-        file.case("forward", run, {"x": image(1, 6, 1, 16, 40)}, net, about=about)
+        # Quarters of 4 rows (less than a window) and 9 columns (more than one).
+        file.case("forward", run, {"x": image(1, 6, 1, 16, 36)}, net, about=about)
         return file
     loss = only(lambda outputs, values: rvrt.loss(outputs["y"], values["truth"]))
-    inputs = {"x": image(2, 4, 3, 16, 20), "truth": image(2, 4, 3, 16, 20)}
+    inputs = {"x": image(2, 4, 3, 16, 20, scale=0.475), "truth": image(2, 4, 3, 16, 20)}
     file.case("loss", run, inputs, net, "", about, ("truth",), loss)
     return file
 
@@ -260,6 +261,15 @@ def block_file() -> File:
     about = {"operation": "features at three scales", "features": 4}
     file.case("features", run, {"x": image(2, 3, 1, 8, 12)}, extractor, about=about)
 
+    # Values at which another form of GELU shows.
+    wide = {"x": spread((2, 6, 4, 5), 0.0, 3.0)}
+    dense = quiver.DenseBlock(6, 4)
+    about = {"operation": "residual dense block with GELU", "width": 6, "growth": 4}
+    file.case("dense", lambda x: {"y": dense(x)}, wide, dense, about=about)
+    gated = quiver.GatedFusion(3)
+    about = {"operation": "gated layers on channels", "features": 3}
+    file.case("gated", lambda x: {"y": gated(x)}, wide, gated, about=about)
+
     merge = quiver.Merge(3, 4)
     about = {"operation": "maps of frames to one, attention between channels", "frames": 3, "width": 4}
     file.case("merge", lambda x: {"y": merge(x)}, {"x": feature(2, 12, 4, 5)}, merge, about=about)
@@ -275,9 +285,9 @@ def block_file() -> File:
 FILES: dict[str, Callable[[], File]] = {
     "parts": part_file,
     "blocks": block_file,
-    "quiver": lambda: quiver_file("quiver", (2, 4, 1, 8, 12)),
-    "quiver_loss": lambda: quiver_file("quiver_loss", (1, 4, 1, 12, 16), True),
-    "quiver_long": lambda: quiver_file("quiver_long", (1, 6, 1, 8, 12)),
+    "quiver": lambda: quiver_file("quiver", (2, 4, 1, 8, 12), 0.493),
+    "quiver_loss": lambda: quiver_file("quiver_loss", (1, 4, 1, 12, 16), 0.496, True),
+    "quiver_long": lambda: quiver_file("quiver_long", (1, 6, 1, 8, 12), 0.429),
     "flornn": flornn_file,
     "rvrt": rvrt_file,
     "rvrt_loss": lambda: rvrt_file(True),

@@ -1,0 +1,48 @@
+//! Modulated deformable convolution (Zhu et al., "Deformable ConvNets v2", CVPR 2019).
+
+use super::warp_zeros;
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// Taps of a kernel of 3 x 3.
+const TAPS: usize = 9;
+
+/// A convolution of 3 x 3 whose taps look elsewhere, and count as much as a mask says; zeros outside.
+///
+/// # Shapes
+/// - x: `[images, channels, height, width]`
+/// - offset: `[images, groups * 18, height, width]`: y before x for every tap of every group of channels, in pixels
+/// - mask: `[images, groups * 9, height, width]`
+/// - weight: `[outputs, channels, 3, 3]`
+/// - bias: `[outputs]`
+/// - result: `[images, outputs, height, width]`
+pub fn deform_conv(
+    x: Tensor<4>,
+    offset: Tensor<4>,
+    mask: Tensor<4>,
+    weight: Tensor<4>,
+    bias: Tensor<1>,
+) -> Tensor<4> {
+    let [images, channels, height, width] = x.dims();
+    let groups = mask.dims()[1] / TAPS;
+    let (all, own, pixels) = (images * groups, channels / groups, height * width);
+    let x = x.reshape([all, own, height, width]);
+    let offset: Tensor<5> = offset.reshape([all, TAPS, 2, height, width]);
+    let mask = mask.reshape([all, TAPS, height, width]);
+    let taps = (0..TAPS).map(|tap| {
+        let from = offset.clone().narrow(1, tap, 1).reshape([all, 2, height, width]);
+        let place = [(tap % 3) as f32 - 1.0, (tap / 3) as f32 - 1.0];
+        let flow = from.flip([1]) + constant(place, &x.device());
+        warp_zeros(x.clone(), flow) * mask.clone().narrow(1, tap, 1)
+    });
+    let columns: Tensor<5> = Tensor::stack(taps.collect(), 2);
+    let columns: Tensor<3> = columns.reshape([images, channels * TAPS, pixels]);
+    let outputs = bias.dims()[0];
+    let weight: Tensor<3> = weight.reshape([1, outputs, channels * TAPS]);
+    weight.matmul(columns).reshape([images, outputs, height, width])
+        + bias.reshape([1, outputs, 1, 1])
+}
+
+/// The same flow everywhere, `[1, 2, 1, 1]`.
+fn constant(flow: [f32; 2], device: &Device) -> Tensor<4> {
+    Tensor::from_data(TensorData::new(flow.to_vec(), [1, 2, 1, 1]), device)
+}

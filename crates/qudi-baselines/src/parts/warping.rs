@@ -1,0 +1,20 @@
+//! Warping where nothing is beyond the borders.
+
+use burn::tensor::Tensor;
+use burn::tensor::ops::PadMode;
+use qudi_kernels::warp;
+
+/// What `x` looks like at `(column + flow_x, row + flow_y)`: bilinear, zero outside (`grid_sample` with `align_corners`
+/// and padding of zeros).
+///
+/// # Shapes
+/// - x, result: `[images, channels, height, width]`
+/// - flow: `[images, 2, height, width]`, x before y, in pixels
+pub fn warp_zeros(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
+    let [_, _, height, width] = x.dims();
+    let around = [(0, 0), (0, 0), (1, 1), (1, 1)];
+    // A border of zeros, to which all coordinates beyond it are clamped.
+    let padded = x.pad(around, PadMode::Constant(0.0));
+    let flow = flow.pad(around, PadMode::Constant(0.0));
+    warp(padded, flow).narrow(2, 1, height).narrow(3, 1, width)
+}

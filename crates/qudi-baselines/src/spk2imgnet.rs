@@ -1,0 +1,179 @@
+//! Spk2ImgNet: learning to reconstruct dynamic scenes from continuous spike streams (Zhao et al., CVPR 2021), in the size in
+//! which it was compared with: ten frames in five blocks of two.
+
+mod align;
+mod extractor;
+
+use align::Align;
+use burn::module::{Module, Param};
+use burn::tensor::activation::{prelu, sigmoid};
+use burn::tensor::{Device, Tensor};
+use extractor::Extractor;
+use qudi_layers::resample::by_burst;
+use qudi_layers::{Bias, Conv2d, zeros};
+
+/// Frames that it sees.
+pub const FRAMES: usize = 10;
+
+/// The frame that it restores.
+pub const RESTORED: usize = 5;
+
+/// Frames have sides that are multiples of this.
+pub const MULTIPLE: usize = 4;
+
+/// What the network was trained to give is this times the image.
+pub const SCALE: f32 = 0.6;
+
+/// Frames of a block, and blocks.
+const BLOCK: usize = 2;
+const BLOCKS: usize = FRAMES / BLOCK;
+
+/// The block that the others are aligned with.
+const KEY: usize = 2;
+
+/// Sizes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sizes {
+    /// Channels of features.
+    pub features: usize,
+    /// Channels of each of the four stems.
+    pub stem: usize,
+    /// Residual blocks.
+    pub blocks: usize,
+    /// Groups of channels that deformable convolutions take from places of their own.
+    pub groups: usize,
+}
+
+/// The published sizes.
+pub const PUBLISHED: Sizes = Sizes { features: 64, stem: 16, blocks: 10, groups: 8 };
+
+/// The network.
+#[derive(Module, Debug)]
+pub struct Spk2ImgNet {
+    extractor: Extractor,
+    masks: Vec<Mask>,
+    rec_conv0: Conv2d,
+    rec_conv1: Conv2d,
+    rec_conv2: Conv2d,
+    pcd_align: Align,
+}
+
+/// How far the aligned features of a block count.
+#[derive(Module, Debug)]
+struct Mask {
+    conv0: Conv2d,
+    conv1: Conv2d,
+    conv2: Conv2d,
+    prelu0: Slope,
+    prelu1: Slope,
+}
+
+/// The slope of what is negative.
+#[derive(Module, Debug)]
+struct Slope {
+    /// `[1]`
+    weight: Param<Tensor<1>>,
+}
+
+/// A convolution of 3 x 3.
+fn conv(sizes: [usize; 2], device: &Device) -> Conv2d {
+    Conv2d::zeros(sizes, 3, Bias::Yes, device)
+}
+
+impl Spk2ImgNet {
+    /// The network, all weights zero.
+    pub fn zeros(sizes: Sizes, device: &Device) -> Self {
+        let Sizes { features, groups, .. } = sizes;
+        Self {
+            extractor: Extractor::zeros(sizes, device),
+            masks: (1..BLOCKS).map(|_| Mask::zeros(features, device)).collect(),
+            rec_conv0: conv([BLOCKS * features, 3 * features], device),
+            rec_conv1: conv([3 * features, features], device),
+            rec_conv2: conv([features, 1], device),
+            pcd_align: Align::zeros(features, groups, device),
+        }
+    }
+
+    /// The name of a parameter in the authors' files.
+    pub fn authors_name(name: &str) -> String {
+        let name = match name.strip_prefix("masks.") {
+            // The key block has none.
+            Some(rest) if rest.starts_with(['2', '3']) => {
+                format!("mask{}{}", if rest.starts_with('2') { 3 } else { 4 }, &rest[1..])
+            }
+            Some(rest) => format!("mask{rest}"),
+            None => name.to_owned(),
+        };
+        Align::authors_name(&Extractor::authors_name(&name))
+    }
+
+    /// The image at frame 5 times [`SCALE`], and four estimates of it for every block of frames.
+    ///
+    /// # Shapes
+    /// - frames: `[images, 10, height, width]`, sides multiples of 4
+    /// - results: `[images, 1, height, width]`, `[images, 5, 4, height, width]`
+    pub fn forward(&self, frames: Tensor<4>) -> (Tensor<4>, Tensor<5>) {
+        let [images, _, height, width] = frames.dims();
+        let blocks = frames.reshape([images * BLOCKS, BLOCK, height, width]);
+        let (estimates, features) = self.extractor.forward(blocks);
+        let levels = self.pcd_align.levels(features.clone());
+        // All neighbours at once, one block after the other.
+        let neighbours: Vec<usize> = (0..BLOCKS).filter(|&block| block != KEY).collect();
+        let block = |x: &Tensor<4>, number: usize| {
+            let [_, c, h, w] = x.dims();
+            by_burst(x.clone(), BLOCKS).narrow(1, number, 1).reshape([images, c, h, w])
+        };
+        let of = |x: &Tensor<4>, numbers: &[usize]| {
+            Tensor::cat(numbers.iter().map(|&number| block(x, number)).collect(), 0)
+        };
+        let aligned = self.pcd_align.forward(
+            levels.each_ref().map(|level| of(level, &neighbours)),
+            levels.each_ref().map(|level| of(level, &[KEY; BLOCKS - 1])),
+        );
+        let key = block(&features, KEY);
+        let masked = self.masks.iter().enumerate().map(|(number, mask)| {
+            let aligned = aligned.clone().narrow(0, number * images, images);
+            mask.forward(&aligned, &key) * aligned
+        });
+        let mut joined: Vec<_> = masked.collect();
+        joined.insert(KEY, key.clone());
+        let image = self.rec_conv1.relu(&[self.rec_conv0.relu(&joined)]);
+        (self.rec_conv2.linear(&[image]), by_burst(estimates, BLOCKS))
+    }
+}
+
+impl Mask {
+    fn zeros(features: usize, device: &Device) -> Self {
+        let same = || conv([features, features], device);
+        Self {
+            conv0: conv([2 * features, features], device),
+            conv1: same(),
+            conv2: same(),
+            prelu0: Slope { weight: zeros([1], device) },
+            prelu1: Slope { weight: zeros([1], device) },
+        }
+    }
+
+    fn forward(&self, aligned: &Tensor<4>, key: &Tensor<4>) -> Tensor<4> {
+        let sloped = |x, slope: &Slope| prelu(x, slope.weight.val());
+        let x = self.conv0.linear(&[aligned.clone(), key.clone()]);
+        let x = self.conv1.linear(&[sloped(x, &self.prelu0)]);
+        sigmoid(self.conv2.linear(&[sloped(x, &self.prelu1)]))
+    }
+}
+
+/// The loss of training: the mean absolute error of the image, and a fiftieth of those of the estimates, `[1]`.
+///
+/// # Shapes
+/// - image: `[images, 1, height, width]`
+/// - estimates: `[images, 5, 4, height, width]`
+/// - truth: `[images, 10, height, width]`
+pub fn loss(image: Tensor<4>, estimates: Tensor<5>, truth: Tensor<4>) -> Tensor<1> {
+    let [images, _, height, width] = truth.dims();
+    let main = (image / SCALE - truth.clone().narrow(1, RESTORED, 1)).abs().mean();
+    // The second frame of every block.
+    let blocks: Tensor<5> = truth.reshape([images, BLOCKS, BLOCK, height, width]);
+    let difference = estimates / SCALE - blocks.narrow(2, 1, 1);
+    let each = (BLOCKS * 4) as f32;
+    main + difference.abs().mean() * (0.02 * each)
+}
