@@ -141,6 +141,15 @@ impl Case<'_> {
         Tensor::from_data(TensorData::new(values, shape), device)
     }
 
+    /// The same, flattened.
+    pub fn flat_cotangent(&self, output: &str, device: &Device) -> Tensor<1> {
+        let shape = self.case["outputs"][output].as_array().unwrap();
+        let count = shape.iter().map(|side| side.as_u64().unwrap() as usize).product();
+        let values = uniform(&format!("cotangent.{output}"), count);
+        let values: Vec<f32> = values.iter().map(|&value| value as f32).collect();
+        Tensor::from_data(TensorData::new(values, [count]), device)
+    }
+
     pub fn expected(&self, name: &str) -> Option<Vec<f32>> {
         let tensor = self.tensors.tensor(&format!("{}/{name}", self.name)).ok()?;
         let bytes = tensor.data().chunks_exact(4);

@@ -3,6 +3,7 @@
 
 use crate::cases::{Case, File, parameter};
 use crate::emvd::{self, Emvd};
+use crate::quiver::{self, Quiver};
 use crate::spk2imgnet::{self, Spk2ImgNet};
 use crate::student_teacher::{self, KernelPrediction};
 use burn::module::{Module, ModuleVisitor, Param};
@@ -26,7 +27,23 @@ fn weighted<M: Module>(module: M, case: &Case<'_>, prefix: &str, name: Name) -> 
     ours.sort();
     theirs.sort();
     assert_eq!(ours, theirs);
-    init_parameters(module, |name, shape| parameter(&full(name), shape))
+    init_parameters(module, |name, shape| reference_parameter(&full(name), shape))
+}
+
+/// A parameter of the reference: flows of some tenths of a pixel to some pixels need larger weights, and smaller ones.
+fn reference_parameter(name: &str, shape: &[usize]) -> Vec<f32> {
+    let is_flow = name.starts_with("pwcnet.") && shape.len() > 1;
+    let last_of_flow = !name.starts_with("pwcnet.netExtractor.")
+        && (name.ends_with("netSix.0.weight") || name.ends_with("netMain.12.weight"));
+    let factors = [
+        (name.ends_with("basic_module.8.weight"), 2.0),
+        (name.ends_with("conv_offset.6.weight") || name.ends_with("conv_offset.10.weight"), 0.125),
+        (is_flow, 1.5),
+        (last_of_flow, 0.125),
+    ];
+    let factor: f32 =
+        factors.iter().filter(|(holds, _)| *holds).map(|(_, factor)| factor).product();
+    parameter(name, shape).into_iter().map(|value| value * factor).collect()
 }
 
 /// From our name of a parameter to the reference's.
@@ -129,8 +146,9 @@ fn emvd_matches_pytorch() {
 /// Checks outputs, and gives the sum whose gradients the file holds.
 fn sum(case: &Case<'_>, outputs: &[(&str, Tensor<4>)]) -> Tensor<1> {
     let parts = outputs.iter().map(|(name, output)| {
-        case.check_output(name, output.clone());
-        (output.clone() * case.cotangent(name, &output.device())).sum()
+        let flat: Tensor<1> = output.clone().flatten(0, 3);
+        case.check_output(name, flat.clone());
+        (flat * case.flat_cotangent(name, &output.device())).sum()
     });
     parts.reduce(Tensor::add).unwrap()
 }
@@ -217,5 +235,42 @@ fn student_teacher_matches_pytorch() {
         case.check_gradient("noisy", noisy.grad(&gradients).unwrap());
         let name = |ours: &str| format!("student.{}", KernelPrediction::file_name(ours));
         check_parameters(&case, &gradients, &student, &name);
+    }
+}
+
+#[test]
+fn quiver_matches_pytorch() {
+    for name in ["quiver", "quiver_long", "quiver_loss"] {
+        let file = File::open(&format!("learned/{name}"));
+        for case in file.cases() {
+            // Half a minute on ndarray.
+            let device = Device::flex().autodiff();
+            let sizes = quiver::Sizes {
+                features: size(&case, "features"),
+                blocks: size(&case, "blocks"),
+                past: size(&case, "past"),
+                future: size(&case, "future"),
+            };
+            let network = Quiver::zeros(sizes, &device);
+            let network = weighted(network, &case, "", Quiver::authors_name);
+            let x: Tensor<5> = case.input("x", &device).require_grad();
+            let [bursts, frames, _, height, width] = x.dims();
+            let folded = |x: &Tensor<5>| x.clone().reshape([bursts * frames, 1, height, width]);
+            let restored = network.forward(folded(&x), frames);
+            let loss = if name == "quiver_loss" {
+                let truth: Tensor<5> = case.input("truth", &device);
+                let loss = network.loss(restored, &folded(&truth), frames);
+                case.check_output("loss", loss.clone());
+                loss
+            } else {
+                let quiver::Restored { predenoised, full, half, quarter } = restored;
+                let outputs =
+                    [("clean", predenoised), ("full", full), ("half", half), ("quarter", quarter)];
+                sum(&case, &outputs)
+            };
+            let gradients = loss.backward();
+            case.check_gradient("x", x.grad(&gradients).unwrap());
+            check_parameters(&case, &gradients, &network, &Quiver::authors_name);
+        }
     }
 }

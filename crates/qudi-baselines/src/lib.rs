@@ -11,5 +11,6 @@ pub mod emvd;
 #[cfg(test)]
 mod golden_tests;
 pub mod parts;
+pub mod quiver;
 pub mod spk2imgnet;
 pub mod student_teacher;

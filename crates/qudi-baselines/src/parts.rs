@@ -1,9 +1,55 @@
 //! Pieces that several networks are made of.
 
+mod conv_transpose;
 mod deformable;
+mod depthwise;
+mod losses;
 mod names;
+mod resize;
+mod spynet;
 mod warping;
 
+pub use conv_transpose::ConvTranspose;
 pub use deformable::deform_conv;
-pub use names::renamed;
+pub use depthwise::Depthwise;
+pub use losses::{charbonnier, gradient_loss};
+pub use names::{every_second, renamed};
+pub use resize::{Corners, resize};
+pub use spynet::SpyNet;
 pub use warping::warp_zeros;
+
+use burn::tensor::Tensor;
+use qudi_layers::resample::by_burst;
+
+/// Frame `number` of every burst.
+///
+/// # Shapes
+/// - x: `[bursts * frames, channels, height, width]`
+/// - result: `[bursts, channels, height, width]`
+pub fn frame(x: &Tensor<4>, frames: usize, number: usize) -> Tensor<4> {
+    let [images, channels, height, width] = x.dims();
+    let one = by_burst(x.clone(), frames).narrow(1, number, 1);
+    one.reshape([images / frames, channels, height, width])
+}
+
+/// Some frames in a row of every burst.
+///
+/// # Shapes
+/// - x: `[bursts * frames, channels, height, width]`
+/// - result: `[bursts * count, channels, height, width]`
+pub fn frames_from(x: &Tensor<4>, frames: usize, first: usize, count: usize) -> Tensor<4> {
+    let [images, channels, height, width] = x.dims();
+    let some = by_burst(x.clone(), frames).narrow(1, first, count);
+    some.reshape([images / frames * count, channels, height, width])
+}
+
+/// The reverse of [`frame`]: bursts of these frames.
+///
+/// # Shapes
+/// - frames: `[bursts, channels, height, width]` each
+/// - result: `[bursts * frames, channels, height, width]`
+pub fn bursts_of(frames: Vec<Tensor<4>>) -> Tensor<4> {
+    let count = frames.len();
+    let [bursts, channels, height, width] = frames[0].dims();
+    Tensor::stack::<5>(frames, 1).reshape([bursts * count, channels, height, width])
+}

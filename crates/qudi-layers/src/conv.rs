@@ -135,6 +135,11 @@ impl Conv3d {
         self.call(x, frames, Options { activation: Activation::Relu, ..Options::default() })
     }
 
+    /// The sum at every second row and column.
+    pub fn stride2(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.call(x, frames, Options { stride: 2, ..Options::default() })
+    }
+
     /// The sum at every second row and column, then ReLU.
     pub fn stride2_relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         let activation = Activation::Relu;

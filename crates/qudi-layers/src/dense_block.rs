@@ -2,6 +2,7 @@
 
 use super::{Bias, Conv2d};
 use burn::module::Module;
+use burn::tensor::activation::gelu;
 use burn::tensor::{Device, Tensor};
 
 /// Dense layers of a block.
@@ -30,9 +31,25 @@ impl DenseBlock {
     /// # Shapes
     /// - x, result: `[images, width, height, width]`
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        self.through(x, |layer, parts| layer.relu(parts))
+    }
+
+    /// The same with GELU after each layer in place of ReLU.
+    ///
+    /// # Shapes
+    /// - x, result: `[images, width, height, width]`
+    pub fn forward_gelu(&self, x: Tensor<4>) -> Tensor<4> {
+        self.through(x, |layer, parts| gelu(layer.linear(parts)))
+    }
+
+    fn through(
+        &self,
+        x: Tensor<4>,
+        layer: impl Fn(&Conv2d, &[Tensor<4>]) -> Tensor<4>,
+    ) -> Tensor<4> {
         let mut parts = vec![x.clone()];
-        for layer in &self.layers {
-            parts.push(layer.relu(&parts));
+        for weights in &self.layers {
+            parts.push(layer(weights, &parts));
         }
         self.fuse.add(&parts, x)
     }

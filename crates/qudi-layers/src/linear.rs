@@ -3,6 +3,7 @@
 use super::parameters::zeros;
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
+use qudi_kernels::conv::{Options, conv_2d};
 
 /// A matrix and a bias.
 #[derive(Module, Debug)]
@@ -17,6 +18,18 @@ impl Linear {
     /// A layer of zeros.
     pub fn zeros([inputs, outputs]: [usize; 2], device: &Device) -> Self {
         Self { weight: zeros([outputs, inputs], device), bias: zeros([outputs], device) }
+    }
+
+    /// The same for every pixel, on its channels.
+    ///
+    /// # Shapes
+    /// - x: `[images, inputs, height, width]`
+    /// - result: `[images, outputs, height, width]`
+    pub fn on_channels(&self, x: Tensor<4>) -> Tensor<4> {
+        let weight = self.weight.val();
+        let [outputs, inputs] = weight.dims();
+        let weight = weight.reshape([outputs, inputs, 1, 1]);
+        conv_2d(&[x], weight, self.bias.val(), Options::default())
     }
 
     /// The product and the bias.

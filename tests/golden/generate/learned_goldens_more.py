@@ -6,17 +6,24 @@
 
     python tests/golden/generate/learned_goldens_more.py [FILE ...]
 
-The format is that of network_goldens.py, but for cut gradients: after norm and product come the first FIRST values.
-Parameters carry the names of the authors' weight files, in PyTorch's layout, 3-D convolutions of RVRT as such. Some
-are `uniform.parameter(name)` times a power of two (FACTORS, by the end of the name): flows are then some tenths of a
-pixel to some pixels. All weights of `pwcnet` that have more than one dimension are times 3/2 first (in float32), as
-leaky ReLUs halve the variance. Buffers (means, deviations, places in windows) are those of the networks, PWC-Net has
-no gradients, and of parameters that serve several times (`predenoise.rdbs`) the file knows the first name alone.
+Files are as in `network_goldens.py`, with gradients of more than 64 values cut. The networks are those of
+`quiver.py`, `flornn.py` and `rvrt.py`; `about.config` has `network` and sizes that are arguments there, others are
+as published. Parameters have the names of weight files, without a prefix, and PyTorch's layout: 3-D convolutions
+of RVRT have weights of five dimensions. Some are `uniform.parameter(full name)` times a power of two, by the end of
+the name (FACTORS; not those of `pwcnet.netExtractor.`), so that flows are some tenths of a pixel to some pixels. In
+`pwcnet.` weights of more than one dimension are multiplied by 1.5 as well, as leaky ReLUs halve the variance. All
+factors are applied in float32.
 
-`quiver`, `quiver_loss`, `quiver_long` (more frames than a window), `flornn` (with and without loss), `rvrt`,
-`rvrt_loss`: whole networks, `about.config` their sizes. `loss` is that of training, of the outputs and `truth`.
+Means and deviations are those of the networks, not made up. PWC-Net has no gradients. Of the dense blocks of
+QUIVER's `predenoise`, which are one, the files know `rdbs.0` alone.
 
-`parts`: operations and blocks, `about.operation` names them.
+`loss` is a case of the training loss of the outputs and `truth`, its only output, of shape [1].
+
+- `quiver`, `quiver_loss`, `quiver_long` (more frames than a window): `clean` are the pre-denoised frames.
+- `flornn`: `flow` is that of images `a` to images `b`.
+- `rvrt`, `rvrt_loss` (with three channels).
+- `parts`: operations, which `about.operation` names. Flows of `splat`, `warp_masked` and `warp_pwc` have no gradient.
+- `blocks`: parts of networks with parameters of their own.
 """
 
 import sys
@@ -32,7 +39,7 @@ import torch.nn.functional as F
 import warping
 from network_goldens import File, Tensors, kinks, spread
 from torch import Tensor, nn
-from uniform import parameter, uniform
+from uniform import parameter
 
 FACTORS = {
     "basic_module.8.weight": 2,
@@ -59,10 +66,12 @@ bilinear = warping.bilinear
 
 
 def watched(x: Tensor, columns: Tensor, rows: Tensor, padding: str = "zeros") -> Tensor:
-    """How near is the nearest coordinate, that has a gradient, to a whole number?"""
+    """How near is the nearest coordinate, of those that have a gradient, to a whole number?"""
     beyond = 1 if padding == "zeros" else 0
-    for at, size in ((columns, x.shape[3]), (rows, x.shape[2])):
+    for at, cell, size in zip((columns, rows), warping.cells(x), (x.shape[3], x.shape[2])):
         at = at.detach().double()
+        if at.shape[1:] == x.shape[2:]:
+            kinks.reach = max(kinks.reach, (at - cell).abs().max().item())
         bends = (at > -0.5 - beyond) & (at < size - 0.5 + beyond) & (at != at.round())
         if columns.requires_grad and bends.any():
             kinks.nearest = min(kinks.nearest, (at - at.round()).abs()[bends].min().item())

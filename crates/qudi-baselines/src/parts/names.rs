@@ -4,3 +4,13 @@
 pub fn renamed(name: &str, pairs: &[(&str, &str)]) -> String {
     pairs.iter().fold(name.to_owned(), |name, (ours, theirs)| name.replace(ours, theirs))
 }
+
+/// A name in which the number after `list` is doubled: files count the activations between layers, too.
+pub fn every_second(name: &str, list: &str) -> String {
+    let Some((before, after)) = name.split_once(list) else { return name.to_owned() };
+    let (number, rest) = after.split_once('.').unwrap_or((after, ""));
+    match number.parse::<usize>() {
+        Ok(number) => format!("{before}{list}{}.{rest}", 2 * number),
+        Err(_) => name.to_owned(),
+    }
+}
