@@ -128,6 +128,11 @@ impl Case<'_> {
         shape.iter().map(|side| side.as_u64().unwrap() as usize).collect()
     }
 
+    /// Whether the file has the gradient of an input or of a parameter.
+    pub fn has_gradient(&self, name: &str) -> bool {
+        ["grad", "cut"].iter().any(|kind| self.expected(&format!("{kind}.{name}")).is_some())
+    }
+
     /// Names of all parameters.
     pub fn parameters(&self) -> Vec<&str> {
         self.case["parameters"].as_object().unwrap().keys().map(String::as_str).collect()

@@ -1,9 +1,13 @@
 //! Every network against PyTorch, forward and backward.
 #![allow(clippy::unwrap_used)]
 
-use crate::cases::{Case, File, parameter};
+use crate::cases::{Case, File, parameter, uniform};
 use crate::emvd::{self, Emvd};
+use crate::flornn::{self, FloRnn};
+use crate::memdeblur::{self, MemDeblur};
+use crate::parts::{bursts_of, charbonnier, frame as frame_of};
 use crate::quiver::{self, Quiver};
+use crate::rvrt::{self, Rvrt};
 use crate::spk2imgnet::{self, Spk2ImgNet};
 use crate::student_teacher::{self, KernelPrediction};
 use burn::module::{Module, ModuleVisitor, Param};
@@ -22,16 +26,37 @@ fn weighted<M: Module>(module: M, case: &Case<'_>, prefix: &str, name: Name) -> 
     let shapes = parameter_shapes(&module).into_iter();
     let mut ours: Vec<_> = shapes.map(|(ours, shape)| (full(&ours), shape)).collect();
     let theirs = case.parameters().into_iter().filter(|name| name.starts_with(prefix));
-    let mut theirs: Vec<_> =
-        theirs.map(|name| (name.to_owned(), case.parameter_shape(name))).collect();
+    let squeezed = |mut shape: Vec<usize>| {
+        // Convolutions of one frame each.
+        if shape.len() == 5 && shape[2] == 1 {
+            shape.remove(2);
+        }
+        shape
+    };
+    let theirs = theirs.map(|name| (name.to_owned(), squeezed(case.parameter_shape(name))));
+    let mut theirs: Vec<_> = theirs.chain(buffers(case)).collect();
     ours.sort();
     theirs.sort();
     assert_eq!(ours, theirs);
     init_parameters(module, |name, shape| reference_parameter(&full(name), shape))
 }
 
+/// Statistics that layers keep.
+fn buffers(case: &Case<'_>) -> Vec<(String, Vec<usize>)> {
+    let all = case.about["buffers"].as_object().into_iter().flatten();
+    let shape = |shape: &serde_json::Value| {
+        shape.as_array().unwrap().iter().map(|side| side.as_u64().unwrap() as usize).collect()
+    };
+    all.map(|(name, about)| (name.clone(), shape(about))).collect()
+}
+
 /// A parameter of the reference: flows of some tenths of a pixel to some pixels need larger weights, and smaller ones.
 fn reference_parameter(name: &str, shape: &[usize]) -> Vec<f32> {
+    if name.ends_with(".running_mean") || name.ends_with(".running_var") {
+        let (offset, scale) = if name.ends_with("mean") { (0.0, 0.1) } else { (1.0, 0.5) };
+        let values = uniform(name, shape.iter().product());
+        return values.into_iter().map(|value| (offset + scale * value) as f32).collect();
+    }
     let is_flow = name.starts_with("pwcnet.") && shape.len() > 1;
     let last_of_flow = !name.starts_with("pwcnet.netExtractor.")
         && (name.ends_with("netSix.0.weight") || name.ends_with("netMain.12.weight"));
@@ -55,6 +80,8 @@ struct Gradient<'a> {
     gradients: &'a Gradients,
     path: Vec<String>,
     name: &'a dyn Fn(&str) -> String,
+    /// Parameters of which the file has no gradient.
+    without: Vec<String>,
 }
 
 impl ModuleVisitor for Gradient<'_> {
@@ -67,19 +94,34 @@ impl ModuleVisitor for Gradient<'_> {
     }
 
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let name = (self.name)(&self.path.join("."));
+        if !self.case.has_gradient(&name) {
+            self.without.push(name);
+            return;
+        }
         let value = param.val();
         let gradient = value.grad(self.gradients).unwrap_or_else(|| value.inner().zeros_like());
-        self.case.check_gradient(&(self.name)(&self.path.join(".")), gradient);
+        self.case.check_gradient(&name, gradient);
     }
 }
 
+/// Checks the gradients that the file has; `without` says which parameters have none.
 fn check_parameters<M: Module>(
     case: &Case<'_>,
     gradients: &Gradients,
     module: &M,
     name: &dyn Fn(&str) -> String,
+    without: fn(&str) -> bool,
 ) {
-    module.visit(&mut Gradient { case, gradients, path: Vec::new(), name });
+    let mut checked = Gradient { case, gradients, path: Vec::new(), name, without: Vec::new() };
+    module.visit(&mut checked);
+    let unexpected: Vec<_> = checked.without.iter().filter(|name| !without(name)).collect();
+    assert!(unexpected.is_empty(), "no gradients of {unexpected:?}");
+}
+
+/// All parameters have gradients.
+fn none(_: &str) -> bool {
+    false
 }
 
 fn frame(x: &Tensor<5>, number: usize) -> Tensor<4> {
@@ -111,7 +153,7 @@ fn emvd_matches_pytorch() {
         for (name, input) in [("previous", &previous), ("current", &current)] {
             case.check_gradient(name, input.grad(&gradients).unwrap());
         }
-        check_parameters(&case, &gradients, &emvd, &str::to_owned);
+        check_parameters(&case, &gradients, &emvd, &str::to_owned, none);
 
         for name in ["sequence", "loss"] {
             let case = file.case(name);
@@ -138,7 +180,7 @@ fn emvd_matches_pytorch() {
             };
             let gradients = loss.backward();
             case.check_gradient("x", x.grad(&gradients).unwrap());
-            check_parameters(&case, &gradients, &emvd, &str::to_owned);
+            check_parameters(&case, &gradients, &emvd, &str::to_owned, none);
         }
     }
 }
@@ -186,7 +228,7 @@ fn spk2imgnet_matches_pytorch() {
             };
             let gradients = loss.backward();
             case.check_gradient("x", x.grad(&gradients).unwrap());
-            check_parameters(&case, &gradients, &network, &Spk2ImgNet::authors_name);
+            check_parameters(&case, &gradients, &network, &Spk2ImgNet::authors_name, none);
         }
     }
 }
@@ -216,7 +258,7 @@ fn student_teacher_matches_pytorch() {
         ];
         let gradients = sum(&case, &outputs).backward();
         case.check_gradient("x", x.grad(&gradients).unwrap());
-        check_parameters(&case, &gradients, &student, &KernelPrediction::file_name);
+        check_parameters(&case, &gradients, &student, &KernelPrediction::file_name, none);
 
         let case = file.case("loss");
         let [student, motion, denoising] =
@@ -234,7 +276,7 @@ fn student_teacher_matches_pytorch() {
         let gradients = loss.backward();
         case.check_gradient("noisy", noisy.grad(&gradients).unwrap());
         let name = |ours: &str| format!("student.{}", KernelPrediction::file_name(ours));
-        check_parameters(&case, &gradients, &student, &name);
+        check_parameters(&case, &gradients, &student, &name, none);
     }
 }
 
@@ -254,8 +296,7 @@ fn quiver_matches_pytorch() {
             let network = Quiver::zeros(sizes, &device);
             let network = weighted(network, &case, "", Quiver::authors_name);
             let x: Tensor<5> = case.input("x", &device).require_grad();
-            let [bursts, frames, _, height, width] = x.dims();
-            let folded = |x: &Tensor<5>| x.clone().reshape([bursts * frames, 1, height, width]);
+            let frames = x.dims()[1];
             let restored = network.forward(folded(&x), frames);
             let loss = if name == "quiver_loss" {
                 let truth: Tensor<5> = case.input("truth", &device);
@@ -270,7 +311,129 @@ fn quiver_matches_pytorch() {
             };
             let gradients = loss.backward();
             case.check_gradient("x", x.grad(&gradients).unwrap());
-            check_parameters(&case, &gradients, &network, &Quiver::authors_name);
+            check_parameters(&case, &gradients, &network, &Quiver::authors_name, none);
         }
     }
+}
+
+#[test]
+fn rvrt_matches_pytorch() {
+    for name in ["rvrt", "rvrt_loss"] {
+        let file = File::open(&format!("learned/{name}"));
+        for case in file.cases() {
+            // Minutes on ndarray.
+            let device = Device::flex().autodiff();
+            let sizes = rvrt::Sizes {
+                channels: size(&case, "channels"),
+                features: size(&case, "features"),
+                blocks: size(&case, "blocks"),
+            };
+            let network = weighted(Rvrt::zeros(sizes, &device), &case, "", Rvrt::authors_name);
+            let x: Tensor<5> = case.input("x", &device).require_grad();
+            let frames = x.dims()[1];
+            let image = network.forward(folded(&x), frames);
+            let loss = if name == "rvrt_loss" {
+                let truth: Tensor<5> = case.input("truth", &device);
+                let loss = charbonnier(image, folded(&truth));
+                case.check_output("loss", loss.clone());
+                loss
+            } else {
+                sum(&case, &[("y", image)])
+            };
+            let gradients = loss.backward();
+            case.check_gradient("x", x.grad(&gradients).unwrap());
+            check_parameters(&case, &gradients, &network, &Rvrt::authors_name, none);
+        }
+    }
+}
+
+#[test]
+fn flornn_matches_pytorch() {
+    let file = File::open("learned/flornn");
+    let device = Device::flex().autodiff();
+    let is_flow = |name: &str| name.starts_with("pwcnet.");
+    for case in file.cases() {
+        let sizes = flornn::Sizes {
+            channels: size(&case, "channels"),
+            features: size(&case, "features"),
+            blocks: size(&case, "blocks"),
+            ahead: size(&case, "forward_count"),
+            border: case.about["config"]["border_ratio"].as_f64().unwrap(),
+        };
+        let network = FloRnn::zeros(sizes, &device);
+        if case.name == "flow" {
+            let network = init_parameters(network, |name, shape| {
+                reference_parameter(&FloRnn::authors_name(name), shape)
+            });
+            let [a, b] = ["a", "b"].map(|name| case.input::<4>(name, &device));
+            case.check_output("flow", network.flow(&a, &b));
+            continue;
+        }
+        let network = weighted(network, &case, "", FloRnn::authors_name);
+        let x: Tensor<5> = case.input("x", &device).require_grad();
+        let frames = x.dims()[1];
+        let images = network.forward(folded(&x), frames);
+        let loss = if case.name == "loss" {
+            let truth: Tensor<5> = case.input("truth", &device);
+            let loss = flornn::loss(&images, &folded(&truth), frames);
+            case.check_output("loss", loss.clone());
+            loss
+        } else {
+            sum(&case, &[("y", images)])
+        };
+        let gradients = loss.backward();
+        case.check_gradient("x", x.grad(&gradients).unwrap());
+        check_parameters(&case, &gradients, &network, &FloRnn::authors_name, is_flow);
+    }
+}
+
+#[test]
+fn memdeblur_matches_pytorch() {
+    // Of these there is no gradient: nothing depends on them.
+    let without = |name: &str| {
+        let unused = ["conv_hr.", "conv_last.", "memory.key_proj.key_proj.bias"];
+        unused.iter().any(|unused| name.starts_with(unused)) || name.contains(".running_")
+    };
+    let device = Device::flex().autodiff();
+    for (name, case) in [("memdeblur", "evaluation"), ("memdeblur_training", "training")] {
+        let file = File::open(&format!("learned/{name}"));
+        let case = file.case(case);
+        let sizes = memdeblur::Sizes {
+            channels: size(&case, "channels"),
+            features: size(&case, "features"),
+            forward_blocks: size(&case, "forward_blocks"),
+            backward_blocks: size(&case, "backward_blocks"),
+            memory_blocks: size(&case, "memory_blocks"),
+            bottlenecks: size(&case, "bottlenecks"),
+            top: size(&case, "top"),
+        };
+        let network = MemDeblur::zeros(sizes, &device);
+        let network = weighted(network, &case, "", MemDeblur::authors_name);
+        let x: Tensor<5> = case.input("x", &device).require_grad();
+        let frames = x.dims()[1];
+        let loss = if name == "memdeblur" {
+            let outputs = network.forward(&folded(&x), frames, memdeblur::Mode::Use);
+            let shown = outputs.map(|images| {
+                let [a, b] = [5, 10].map(|number| frame_of(&images, frames, number));
+                bursts_of(vec![a, b])
+            });
+            let [quarter, half, full] = shown;
+            sum(&case, &[("quarter", quarter), ("half", half), ("full", full)])
+        } else {
+            let truth: Tensor<5> = case.input("truth", &device);
+            let outputs = network.forward(&folded(&x), frames, memdeblur::Mode::Training);
+            let loss = memdeblur::loss(outputs, &folded(&truth));
+            case.check_output("loss", loss.clone());
+            loss
+        };
+        let gradients = loss.backward();
+        case.check_gradient("x", x.grad(&gradients).unwrap());
+        check_parameters(&case, &gradients, &network, &MemDeblur::authors_name, without);
+    }
+}
+
+/// Frames in the order of bursts.
+fn folded(x: &Tensor<5>) -> Tensor<4> {
+    let [bursts, frames, channels, height, width] = x.dims();
+    x.clone().reshape([bursts * frames, channels, height, width])
 }

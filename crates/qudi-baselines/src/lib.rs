@@ -8,9 +8,12 @@
 mod cases;
 
 pub mod emvd;
+pub mod flornn;
 #[cfg(test)]
 mod golden_tests;
+pub mod memdeblur;
 pub mod parts;
 pub mod quiver;
+pub mod rvrt;
 pub mod spk2imgnet;
 pub mod student_teacher;

@@ -3,6 +3,7 @@
 mod conv_transpose;
 mod deformable;
 mod depthwise;
+mod layer_norm;
 mod losses;
 mod names;
 mod resize;
@@ -10,13 +11,14 @@ mod spynet;
 mod warping;
 
 pub use conv_transpose::ConvTranspose;
-pub use deformable::deform_conv;
+pub use deformable::{deform_conv, deform_samples};
 pub use depthwise::Depthwise;
+pub use layer_norm::LayerNorm;
 pub use losses::{charbonnier, gradient_loss};
 pub use names::{every_second, renamed};
-pub use resize::{Corners, resize};
+pub use resize::{Corners, quarter, resize};
 pub use spynet::SpyNet;
-pub use warping::warp_zeros;
+pub use warping::{masked_warp, warp_zeros};
 
 use burn::tensor::Tensor;
 use qudi_layers::resample::by_burst;

@@ -31,7 +31,7 @@ impl DenseBlock {
     /// # Shapes
     /// - x, result: `[images, width, height, width]`
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        self.through(x, |layer, parts| layer.relu(parts))
+        self.through(x, Conv2d::relu)
     }
 
     /// The same with GELU after each layer in place of ReLU.

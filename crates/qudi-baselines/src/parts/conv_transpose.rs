@@ -1,4 +1,4 @@
-//! The transposed convolution that doubles the size.
+//! Transposed convolutions that double the size.
 
 use burn::module::{Module, Param};
 use burn::tensor::module::conv_transpose2d;
@@ -6,19 +6,22 @@ use burn::tensor::ops::ConvTransposeOptions;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::zeros;
 
-/// A transposed convolution of 3 x 3 and stride 2.
+/// A transposed convolution of stride 2, of 3 x 3 or 4 x 4.
 #[derive(Module, Debug)]
 pub struct ConvTranspose {
-    /// `[inputs, outputs, 3, 3]`
+    /// `[inputs, outputs, kernel, kernel]`
     weight: Param<Tensor<4>>,
     /// `[outputs]`
     bias: Param<Tensor<1>>,
 }
 
 impl ConvTranspose {
-    /// The layer, all weights zero.
-    pub fn zeros([inputs, outputs]: [usize; 2], device: &Device) -> Self {
-        Self { weight: zeros([inputs, outputs, 3, 3], device), bias: zeros([outputs], device) }
+    /// The layer, all weights zero. The kernel is 3 or 4.
+    pub fn zeros([inputs, outputs]: [usize; 2], kernel: usize, device: &Device) -> Self {
+        Self {
+            weight: zeros([inputs, outputs, kernel, kernel], device),
+            bias: zeros([outputs], device),
+        }
     }
 
     /// Twice the size.
@@ -27,7 +30,10 @@ impl ConvTranspose {
     /// - x: `[images, inputs, height, width]`
     /// - result: `[images, outputs, 2 * height, 2 * width]`
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let options = ConvTransposeOptions::new([2, 2], [1, 1], [1, 1], [1, 1], 1);
-        conv_transpose2d(x, self.weight.val(), Some(self.bias.val()), options)
+        let weight = self.weight.val();
+        // A kernel of 3 lacks a row and a column.
+        let more = 4 - weight.dims()[2];
+        let options = ConvTransposeOptions::new([2, 2], [1, 1], [more, more], [1, 1], 1);
+        conv_transpose2d(x, weight, Some(self.bias.val()), options)
     }
 }

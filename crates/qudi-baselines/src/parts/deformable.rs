@@ -24,22 +24,39 @@ pub fn deform_conv(
 ) -> Tensor<4> {
     let [images, channels, height, width] = x.dims();
     let groups = mask.dims()[1] / TAPS;
-    let (all, own, pixels) = (images * groups, channels / groups, height * width);
-    let x = x.reshape([all, own, height, width]);
-    let offset: Tensor<5> = offset.reshape([all, TAPS, 2, height, width]);
-    let mask = mask.reshape([all, TAPS, height, width]);
-    let taps = (0..TAPS).map(|tap| {
-        let from = offset.clone().narrow(1, tap, 1).reshape([all, 2, height, width]);
-        let place = [(tap % 3) as f32 - 1.0, (tap / 3) as f32 - 1.0];
-        let flow = from.flip([1]) + constant(place, &x.device());
-        warp_zeros(x.clone(), flow) * mask.clone().narrow(1, tap, 1)
-    });
-    let columns: Tensor<5> = Tensor::stack(taps.collect(), 2);
+    let pixels = height * width;
+    let samples: Tensor<5> = deform_samples(x, offset, groups).reshape([
+        images,
+        groups,
+        channels / groups,
+        TAPS,
+        pixels,
+    ]);
+    let columns = samples * mask.reshape([images, groups, 1, TAPS, pixels]);
     let columns: Tensor<3> = columns.reshape([images, channels * TAPS, pixels]);
     let outputs = bias.dims()[0];
     let weight: Tensor<3> = weight.reshape([1, outputs, channels * TAPS]);
     weight.matmul(columns).reshape([images, outputs, height, width])
         + bias.reshape([1, outputs, 1, 1])
+}
+
+/// What the taps of such a convolution see.
+///
+/// # Shapes
+/// - x, offset: as of [`deform_conv`]
+/// - result: `[images, channels, 9, height * width]`
+pub fn deform_samples(x: Tensor<4>, offset: Tensor<4>, groups: usize) -> Tensor<4> {
+    let [images, channels, height, width] = x.dims();
+    let (all, own) = (images * groups, channels / groups);
+    let x = x.reshape([all, own, height, width]);
+    let offset: Tensor<5> = offset.reshape([all, TAPS, 2, height, width]);
+    let taps = (0..TAPS).map(|tap| {
+        let from = offset.clone().narrow(1, tap, 1).reshape([all, 2, height, width]);
+        let place = [(tap % 3) as f32 - 1.0, (tap / 3) as f32 - 1.0];
+        warp_zeros(x.clone(), from.flip([1]) + constant(place, &x.device()))
+    });
+    let samples: Tensor<5> = Tensor::stack(taps.collect(), 2);
+    samples.reshape([images, channels, TAPS, height * width])
 }
 
 /// The same flow everywhere, `[1, 2, 1, 1]`.

@@ -99,8 +99,13 @@ impl SpyNet {
 
     /// The coarsest first.
     fn pyramid(&self, image: Tensor<4>) -> Vec<Tensor<4>> {
-        let channel = |&[mean, deviation]: &[f32; 2]| (image.clone() - mean) / deviation;
-        let mut images = vec![Tensor::cat(self.channels.iter().map(channel).collect(), 1)];
+        // An image of one channel serves for all.
+        let last = image.dims()[1] - 1;
+        let channel = |(number, &[mean, deviation]): (usize, &[f32; 2])| {
+            (image.clone().narrow(1, number.min(last), 1) - mean) / deviation
+        };
+        let channels = self.channels.iter().enumerate();
+        let mut images = vec![Tensor::cat(channels.map(channel).collect(), 1)];
         for _ in 1..self.levels.len() {
             let coarser = avg_pool2(images[images.len() - 1].clone());
             images.push(coarser);

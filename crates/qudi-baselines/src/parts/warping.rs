@@ -18,3 +18,14 @@ pub fn warp_zeros(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     let flow = flow.pad(around, PadMode::Constant(0.0));
     warp(padded, flow).narrow(2, 1, height).narrow(3, 1, width)
 }
+
+/// The same, and zero wherever any part comes from outside.
+///
+/// # Shapes
+/// - as of [`warp_zeros`]
+pub fn masked_warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
+    const WHOLE: f32 = 0.9999;
+    let ones = x.clone().narrow(1, 0, 1).ones_like();
+    let inside = warp_zeros(ones, flow.clone()).greater_equal_elem(WHOLE).float();
+    warp_zeros(x, flow) * inside
+}

@@ -52,13 +52,13 @@ impl Reconstructor {
             flast0: conv([8 * n, 8 * n], 3),
             flast2: conv([8 * n, 6 * n], 3),
             flast4: conv([6 * n, 4 * n], 3),
-            flast6: ConvTranspose::zeros([4 * n, 4 * n], device),
+            flast6: ConvTranspose::zeros([4 * n, 4 * n], 3, device),
             out0: conv([8 * n, 6 * n], 3),
             out2: conv([6 * n, 4 * n], 3),
             out4: conv([4 * n, 2 * n], 3),
             out6: conv([2 * n, n], 3),
             out7: conv([n, 1], 3),
-            upconv_out: ConvTranspose::zeros([1, 1], device),
+            upconv_out: ConvTranspose::zeros([1, 1], 3, device),
         }
     }
 

@@ -1,0 +1,190 @@
+//! FloRNN: unidirectional video denoising by mimicking backward recurrent modules with look-ahead forward ones (Li et al.,
+//! ECCV 2022), in the form in which it was compared with: frames as three equal channels, no noise map.
+
+mod pwcnet;
+mod splat;
+
+use crate::parts::{Corners, bursts_of, frame, masked_warp, renamed, resize};
+use burn::module::Module;
+use burn::tensor::activation::relu;
+use burn::tensor::ops::PadMode;
+use burn::tensor::{Device, Tensor, TensorData};
+use pwcnet::PwcNet;
+use qudi_layers::{Bias, Conv2d};
+
+pub use pwcnet::correlation;
+pub use splat::splat_average;
+
+/// Images that flow is found in have sides that are multiples of this.
+const FLOW_MULTIPLE: usize = 64;
+
+/// Sizes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sizes {
+    /// Channels of images.
+    pub channels: usize,
+    /// Channels of features.
+    pub features: usize,
+    /// Residual blocks of a recurrence.
+    pub blocks: usize,
+    /// Frames that it looks ahead.
+    pub ahead: usize,
+    /// The strip around images that the look ahead may leave them by, in parts of their sides.
+    pub border: f64,
+}
+
+/// The sizes of the authors of QUIVER.
+pub const PUBLISHED: Sizes = Sizes { channels: 3, features: 64, blocks: 15, ahead: 9, border: 0.1 };
+
+/// The network.
+#[derive(Module, Debug)]
+pub struct FloRnn {
+    pwcnet: PwcNet,
+    forward_rnn: Recurrence,
+    backward_rnn: Recurrence,
+    d: Output,
+    features: usize,
+    ahead: usize,
+    border: f64,
+}
+
+#[derive(Module, Debug)]
+struct Recurrence {
+    first_conv: Conv2d,
+    resblocks: Vec<Residual>,
+}
+
+/// Two convolutions and a residual.
+#[derive(Module, Debug)]
+struct Residual {
+    conv1: Conv2d,
+    conv2: Conv2d,
+}
+
+/// From two states to the image.
+#[derive(Module, Debug)]
+struct Output {
+    first: Conv2d,
+    second: Conv2d,
+}
+
+impl FloRnn {
+    /// The network, all weights zero.
+    pub fn zeros(sizes: Sizes, device: &Device) -> Self {
+        let Sizes { channels, features, blocks, ahead, border } = sizes;
+        let conv = |sizes| Conv2d::zeros(sizes, 3, Bias::No, device);
+        let same = || conv([features, features]);
+        let recurrence = || Recurrence {
+            first_conv: conv([2 * channels + features, features]),
+            resblocks: (0..blocks).map(|_| Residual { conv1: same(), conv2: same() }).collect(),
+        };
+        Self {
+            pwcnet: PwcNet::zeros(device),
+            forward_rnn: recurrence(),
+            backward_rnn: recurrence(),
+            d: Output {
+                first: conv([2 * features, 2 * features]),
+                second: conv([2 * features, channels]),
+            },
+            features,
+            ahead,
+            border,
+        }
+    }
+
+    /// The name of a parameter in the authors' files.
+    pub fn authors_name(name: &str) -> String {
+        let name = match name.strip_prefix("d.") {
+            Some(rest) => {
+                format!("d.{}", renamed(rest, &[("first.", "convs.0."), ("second.", "convs.2.")]))
+            }
+            None => name.to_owned(),
+        };
+        PwcNet::authors_name(&name)
+    }
+
+    /// The flow from `from` to `to`, without gradient: `warp(to, flow)` resembles `from`.
+    ///
+    /// # Shapes
+    /// - from, to: `[images, 3, height, width]`
+    /// - result: `[images, 2, height, width]`, x before y, in pixels
+    pub fn flow(&self, from: &Tensor<4>, to: &Tensor<4>) -> Tensor<4> {
+        let [_, _, height, width] = from.dims();
+        let size = [height, width];
+        let padded = size.map(|side| side.next_multiple_of(FLOW_MULTIPLE));
+        let prepared = |image: &Tensor<4>| resize(image.clone().detach(), padded, Corners::Edges);
+        let flow = self.pwcnet.forward(prepared(from), prepared(to)).detach();
+        let factor = |axis: usize| pwcnet::UNIT * size[axis] as f32 / padded[axis] as f32;
+        let factors = TensorData::new(vec![factor(1), factor(0)], [1, 2, 1, 1]);
+        resize(flow, size, Corners::Edges) * Tensor::from_data(factors, &from.device())
+    }
+
+    /// Restores every frame of bursts. Training knows the second frame alone.
+    ///
+    /// # Shapes
+    /// - x, result: `[bursts * frames, channels, height, width]`; more frames than it looks ahead
+    pub fn forward(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        let [images, _, height, width] = x.dims();
+        let strip = [height, width].map(|side| (self.border * side as f64) as usize);
+        let around = [(0, 0), (0, 0), (strip[0], strip[0]), (strip[1], strip[1])];
+        let expand = |image: Tensor<4>| image.pad(around, PadMode::Constant(0.0));
+        let crop = |image: Tensor<4>| image.narrow(2, strip[0], height).narrow(3, strip[1], width);
+        // Reflected at the last frame.
+        let order = (0..frames).chain((0..self.ahead).map(|i| frames - 2 - i));
+        let video: Vec<_> = order.map(|t| frame(&x, frames, t)).collect();
+        let ones = Tensor::ones([1, 1, height, width], &x.device());
+        let outside = expand(ones).neg() + 1.0;
+        let state = Tensor::zeros([images / frames, self.features, height, width], &x.device());
+        let mut backward = self.backward_rnn.forward(&video[0], state.clone());
+        let mut forward = self.forward_rnn.forward(&video[0], state);
+        let mut queue: Vec<(Tensor<4>, Tensor<4>)> = Vec::new();
+        let mut outputs = Vec::with_capacity(frames);
+        for i in 1..frames + self.ahead {
+            let flow = expand(self.flow(&video[i - 1], &video[i]));
+            let splatted = splat_average(expand(backward), flow.clone());
+            queue.push((splatted.clone(), flow));
+            backward = self.backward_rnn.forward(&video[i], crop(splatted));
+            if i < self.ahead {
+                continue;
+            }
+            let mimicked = queue.iter().rev().fold(backward.clone(), |state, (around, flow)| {
+                let whole = around.clone() * outside.clone() + expand(state);
+                crop(masked_warp(whole, flow.clone()))
+            });
+            outputs.push(self.d.forward(forward.clone(), mimicked));
+            let next = i - self.ahead + 1;
+            if next < frames {
+                let flow = self.flow(&video[next], &video[next - 1]);
+                forward = self.forward_rnn.forward(&video[next], masked_warp(forward, flow));
+            }
+            queue.remove(0);
+        }
+        bursts_of(outputs)
+    }
+}
+
+impl Recurrence {
+    /// The next state; the noise map is zero.
+    fn forward(&self, image: &Tensor<4>, state: Tensor<4>) -> Tensor<4> {
+        let x = self.first_conv.linear(&[image.clone(), image.zeros_like(), state]);
+        self.resblocks
+            .iter()
+            .fold(x, |x, block| block.conv2.add(&[block.conv1.relu(&[x.clone()])], x))
+    }
+}
+
+impl Output {
+    fn forward(&self, forward: Tensor<4>, backward: Tensor<4>) -> Tensor<4> {
+        self.second.linear(&[relu(self.first.linear(&[forward, backward]))])
+    }
+}
+
+/// The loss of training, `[1]`: half the sum of squared errors of the second frame, over bursts.
+///
+/// # Shapes
+/// - x, truth: `[bursts * frames, channels, height, width]`
+pub fn loss(x: &Tensor<4>, truth: &Tensor<4>, frames: usize) -> Tensor<1> {
+    let error = frame(x, frames, 1) - frame(truth, frames, 1);
+    let bursts = error.dims()[0];
+    error.powi_scalar(2).sum() / (2 * bursts) as f32
+}
