@@ -11,6 +11,7 @@ use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor, TensorData};
 use pwcnet::PwcNet;
 use qudi_layers::{Bias, Conv2d};
+use std::slice::from_ref;
 
 pub use pwcnet::correlation;
 pub use splat::splat_average;
@@ -43,6 +44,7 @@ pub struct FloRnn {
     forward_rnn: Recurrence,
     backward_rnn: Recurrence,
     d: Output,
+    channels: usize,
     features: usize,
     ahead: usize,
     border: f64,
@@ -86,10 +88,21 @@ impl FloRnn {
                 first: conv([2 * features, 2 * features]),
                 second: conv([2 * features, channels]),
             },
+            channels,
             features,
             ahead,
             border,
         }
+    }
+
+    /// Frames that it looks ahead.
+    pub fn ahead(&self) -> usize {
+        self.ahead
+    }
+
+    /// Channels of images.
+    pub fn channels(&self) -> usize {
+        self.channels
     }
 
     /// The name of a parameter in the authors' files.
@@ -169,7 +182,7 @@ impl Recurrence {
         let x = self.first_conv.linear(&[image.clone(), image.zeros_like(), state]);
         self.resblocks
             .iter()
-            .fold(x, |x, block| block.conv2.add(&[block.conv1.relu(&[x.clone()])], x))
+            .fold(x, |x, block| block.conv2.add(&[block.conv1.relu(from_ref(&x))], x))
     }
 }
 

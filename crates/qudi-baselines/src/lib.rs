@@ -11,9 +11,11 @@ pub mod emvd;
 pub mod flornn;
 #[cfg(test)]
 mod golden_tests;
+pub mod import;
 pub mod memdeblur;
 pub mod parts;
 pub mod quiver;
+pub mod restorer;
 pub mod rvrt;
 pub mod spk2imgnet;
 pub mod student_teacher;

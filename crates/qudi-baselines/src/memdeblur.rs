@@ -80,6 +80,7 @@ pub struct MemDeblur {
     /// Likewise.
     conv_last: Conv2d,
     memory: Memory,
+    channels: usize,
     features: usize,
     top: usize,
 }
@@ -143,9 +144,15 @@ impl MemDeblur {
             conv_hr: conv([features, features], 3),
             conv_last: conv([features, channels], 3),
             memory: Memory::zeros(own, sizes, device),
+            channels,
             features,
             top: sizes.top,
         }
+    }
+
+    /// Channels of images.
+    pub fn channels(&self) -> usize {
+        self.channels
     }
 
     /// The name of a parameter, or of a running statistic, in the authors' files.

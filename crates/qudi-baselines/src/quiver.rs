@@ -93,6 +93,11 @@ impl Quiver {
         }
     }
 
+    /// Frames before and after the one that is restored.
+    pub fn reach(&self) -> (usize, usize) {
+        (self.past, self.future)
+    }
+
     /// The name of a parameter in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let name = SpyNet::authors_name(name);

@@ -1,5 +1,9 @@
-//! Layers that several networks are made of, and their parameters by name.
+//! Layers that several networks are made of, and their parameters by name, in the program and in files.
 #![warn(missing_docs)]
+
+#[cfg(test)]
+#[path = "../../../tests/golden/cases.rs"]
+mod cases;
 
 mod conv;
 mod dense_block;
@@ -7,9 +11,11 @@ mod group_norm;
 mod linear;
 mod parameters;
 pub mod resample;
+mod state_dict;
 
 pub use conv::{Bias, Conv2d, Conv3d};
 pub use dense_block::DenseBlock;
 pub use group_norm::GroupNorm;
 pub use linear::Linear;
 pub use parameters::{init_parameters, parameter_shapes, zeros};
+pub use state_dict::StateDict;

@@ -5,6 +5,7 @@ use burn::module::Module;
 use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, DenseBlock};
+use std::slice::from_ref;
 
 /// A dense block, then half the size and four times the channels.
 #[derive(Module, Debug)]
@@ -65,6 +66,6 @@ impl Residuals {
             Some(entry) => leaky_relu(entry.linear(inputs), 0.1),
             None => inputs[0].clone(),
         };
-        self.blocks.iter().fold(x, |x, block| block.conv2.add(&[block.conv1.relu(&[x.clone()])], x))
+        self.blocks.iter().fold(x, |x, block| block.conv2.add(&[block.conv1.relu(from_ref(&x))], x))
     }
 }

@@ -11,6 +11,7 @@ use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::pixel_shuffle;
 use qudi_layers::{Bias, Conv2d, zeros};
+use std::slice::from_ref;
 
 /// Added to variances.
 const EPSILON: f32 = 1e-5;
@@ -139,7 +140,7 @@ impl Decoder {
     pub(super) fn forward(&self, x: Tensor<4>, [height, width]: [usize; 2]) -> Tensor<4> {
         let z = self.forward_resblocks.forward(&[x]);
         let [_, _, h, w] = z.dims();
-        let drawn = pixel_shuffle(self.upsample.linear(&[z.clone()]), 4);
+        let drawn = pixel_shuffle(self.upsample.linear(from_ref(&z)), 4);
         let image = drawn + resize(z, [4 * h, 4 * w], Corners::Edges);
         image.narrow(2, 0, height).narrow(3, 0, width)
     }
@@ -163,7 +164,7 @@ impl Bottleneck {
     }
 
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let y = relu(self.bn1.forward(self.conv1.linear(&[x.clone()])));
+        let y = relu(self.bn1.forward(self.conv1.linear(from_ref(&x))));
         let y = relu(self.bn2.forward(self.conv2.linear(&[y])));
         let y = self.bn3.forward(self.conv3.linear(&[y]));
         let x = match &self.downsample {

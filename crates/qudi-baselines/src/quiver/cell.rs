@@ -5,12 +5,14 @@ use crate::parts::renamed;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, DenseBlock};
+use std::slice::from_ref;
 
 /// Maps of a frame at three scales, the finest first.
 pub(super) type Maps = [Tensor<4>; 3];
 
 /// The cell.
 #[derive(Module, Debug)]
+#[allow(clippy::struct_field_names)] // as in the authors' files
 pub(super) struct Cell {
     f_b01: Conv2d,
     f_b01_fuse: Conv2d,
@@ -97,14 +99,14 @@ impl Cell {
     ) -> (Maps, Tensor<4>) {
         let mut next = || fused.next().expect("three scales");
         let [half, quarter] = smaller(x);
-        let h1 = self.f_b01_fuse.linear(&[self.f_b01.linear(&[x.clone()]), next()]);
+        let h1 = self.f_b01_fuse.linear(&[self.f_b01.linear(from_ref(x)), next()]);
         let h2 = self.f_b1.forward(h1.clone());
         let h3 = Tensor::cat(vec![h2.clone(), self.f_b02.linear(&[half]), next()], 1);
         let h3 = self.f_b2.forward(h3);
         let h3 = Tensor::cat(vec![h3, self.f_b03.linear(&[quarter]), next(), state], 1);
         let h3 = self.f_r0.shrink.linear(&[self.f_r0.rdb.forward_gelu(h3)]);
         let h3 = self.f_r1.forward(h3);
-        let state = self.f_h1.forward_gelu(self.f_h0.linear(&[h3.clone()]));
+        let state = self.f_h1.forward_gelu(self.f_h0.linear(from_ref(&h3)));
         ([h1, h2, h3], self.f_h2.linear(&[state]))
     }
 }

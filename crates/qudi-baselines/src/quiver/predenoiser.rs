@@ -3,6 +3,7 @@
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, DenseBlock};
+use std::slice::from_ref;
 
 /// Channels that each layer of the dense block adds.
 const GROWTH: usize = 64;
@@ -35,8 +36,8 @@ impl PreDenoiser {
     }
 
     pub(super) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let shallow = self.sfe1.linear(&[x.clone()]);
-        let mut f = self.sfe2.linear(&[shallow.clone()]);
+        let shallow = self.sfe1.linear(from_ref(&x));
+        let mut f = self.sfe2.linear(from_ref(&shallow));
         let mut outputs = Vec::with_capacity(BLOCKS);
         for _ in 0..BLOCKS {
             f = self.rdb.forward(f);

@@ -5,6 +5,7 @@ use burn::module::Module;
 use burn::tensor::activation::{gelu, relu, sigmoid};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d};
+use std::slice::from_ref;
 
 /// How many times fewer channels the attention has inside.
 const REDUCTION: usize = 16;
@@ -110,7 +111,7 @@ impl Reconstructor {
 
 impl ChannelBlock {
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let y = self.body2.linear(&[gelu(self.body0.linear(&[x.clone()]))]);
+        let y = self.body2.linear(&[gelu(self.body0.linear(from_ref(&x)))]);
         let mean = y.clone().mean_dim(2).mean_dim(3);
         let weight = sigmoid(self.ca2.linear(&[relu(self.ca0.linear(&[mean]))]));
         y * weight + x

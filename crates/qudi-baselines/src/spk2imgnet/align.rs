@@ -8,12 +8,14 @@ use burn::tensor::activation::{leaky_relu, sigmoid};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::upsample2;
 use qudi_layers::{Conv2d, zeros};
+use std::slice::from_ref;
 
 /// Features on three levels, the finest first.
 pub(super) type Levels = [Tensor<4>; 3];
 
 /// Features of two levels below the first, and the cascade.
 #[derive(Module, Debug)]
+#[allow(clippy::struct_field_names)] // as in the authors' files
 pub(super) struct Align {
     fea_l2_conv1: Conv2d,
     fea_l2_conv2: Conv2d,
@@ -97,7 +99,7 @@ impl Align {
     /// Features on all levels.
     pub(super) fn levels(&self, features: Tensor<4>) -> Levels {
         let below = |x: &Tensor<4>, first: &Conv2d, second: &Conv2d| {
-            leaky(second.linear(&[leaky(first.stride2(&[x.clone()]))]))
+            leaky(second.linear(&[leaky(first.stride2(from_ref(x)))]))
         };
         let middle = below(&features, &self.fea_l2_conv1, &self.fea_l2_conv2);
         let coarse = below(&middle, &self.fea_l3_conv1, &self.fea_l3_conv2);

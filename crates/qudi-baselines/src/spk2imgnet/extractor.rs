@@ -6,6 +6,7 @@ use burn::module::Module;
 use burn::tensor::activation::{relu, sigmoid};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::Conv2d;
+use std::slice::from_ref;
 
 /// Stems, each of which estimates the image.
 const STEMS: usize = 4;
@@ -68,13 +69,13 @@ impl Extractor {
     pub(super) fn forward(&self, blocks: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
         let stems = self.conv0.iter().zip(&self.conv1);
         let estimate =
-            |(first, second): (&Conv2d, &Conv2d)| second.linear(&[first.relu(&[blocks.clone()])]);
+            |(first, second): (&Conv2d, &Conv2d)| second.linear(&[first.relu(from_ref(&blocks))]);
         let estimates = Tensor::cat(stems.map(estimate).collect(), 1);
-        let weight = self.ca.first.relu(&[estimates.clone()]);
+        let weight = self.ca.first.relu(from_ref(&estimates));
         let weight = sigmoid(self.ca.second.linear(&[weight]));
         let features = self.conv.relu(&[weight * estimates.clone()]);
         let deep = self.net.iter().fold(features.clone(), |x, block| {
-            let inner = block.conv2.relu(&[block.conv1.relu(&[x.clone()])]);
+            let inner = block.conv2.relu(&[block.conv1.relu(from_ref(&x))]);
             relu(block.conv3.add(&[inner], x))
         });
         (estimates, features + deep)

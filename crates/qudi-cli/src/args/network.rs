@@ -4,19 +4,21 @@ use super::number;
 use crate::methods::options::NetworkOptions;
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
+use qudi_baselines::import::Method;
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use qudi_model::restorer::TILE;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// The network, for the method `qudi`.
 #[derive(Clone, Debug, Default, ClapArgs)]
 #[command(next_help_heading = "Network (method qudi)")]
 pub(crate) struct Network {
-    /// Weights that `qudi train` wrote [default: those that come along]
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
-    pub(crate) weights: Option<PathBuf>,
+    /// Weights that `qudi train` wrote [default: those that come along]; for learned methods of others METHOD=FILE, as in
+    /// emvd=emvd.pth,quiver=quiver.pth
+    #[arg(long, value_name = "[METHOD=]FILE,...", value_delimiter = ',', value_hint = ValueHint::FilePath)]
+    weights: Vec<WeightsOf>,
     /// Spacing of the timesteps of these steps [default: what the weights say of themselves, usually
     /// log-logistic]
     #[arg(long, value_name = "NAME")]
@@ -42,13 +44,28 @@ pub(crate) struct Network {
 }
 
 impl Network {
+    /// The weights of the method `qudi`, if they are named.
+    pub(crate) fn own_weights(&self) -> Option<&Path> {
+        self.weights.iter().find(|weights| weights.method.is_none()).map(|w| w.file.as_path())
+    }
+
+    /// All files of weights.
+    pub(crate) fn weight_files(&self) -> impl Iterator<Item = &PathBuf> {
+        self.weights.iter().map(|weights| &weights.file)
+    }
+
     /// The options for a number of steps, with their defaults filled in.
     pub(crate) fn options(&self, steps: Option<usize>) -> NetworkOptions {
         let first = |given: &[(bool, &'static str)]| {
             given.iter().find(|(given, _)| *given).map(|(_, flag)| *flag)
         };
         NetworkOptions {
-            weights: Weights::of(self.weights.as_deref()),
+            weights: Weights::of(self.own_weights()),
+            learned: self
+                .weights
+                .iter()
+                .filter_map(|weights| Some((weights.method?, weights.file.clone())))
+                .collect(),
             steps,
             spacing: self.spacing.map(SpacingName::spacing),
             sampler: self.sampler.map_or_else(Sampler::default, SamplerName::sampler),
@@ -57,7 +74,7 @@ impl Network {
             tile: self.tile.unwrap_or(TILE),
             precision: self.precision.map(PrecisionName::precision),
             result_flag: first(&[
-                (self.weights.is_some(), "--weights"),
+                (self.own_weights().is_some(), "--weights"),
                 (steps.is_some(), "--steps"),
                 (self.spacing.is_some(), "--spacing"),
                 (self.sampler.is_some(), "--sampler"),
@@ -72,6 +89,29 @@ impl Network {
                 (self.samples.is_some_and(|samples| samples > 1), "--samples"),
             ]),
         }
+    }
+}
+
+/// Weights, and the learned method that they are of; none for `qudi`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct WeightsOf {
+    method: Option<Method>,
+    file: PathBuf,
+}
+
+impl std::str::FromStr for WeightsOf {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let method = text.split_once('=').and_then(|(name, _)| Method::by_name(name));
+        let file = match method {
+            Some(method) => &text[method.name().len() + 1..],
+            None => text,
+        };
+        if file.is_empty() {
+            return Err("no file is named".to_owned());
+        }
+        Ok(Self { method, file: file.into() })
     }
 }
 

@@ -3,9 +3,11 @@
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::weights::Weights;
+use qudi_baselines::import::Method;
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
+use std::path::{Path, PathBuf};
 
 /// The method that these options belong to.
 const METHOD: &str = "qudi";
@@ -15,6 +17,8 @@ const METHOD: &str = "qudi";
 pub(crate) struct NetworkOptions {
     /// The weights.
     pub(crate) weights: Weights,
+    /// Files of weights of the learned methods of others.
+    pub(crate) learned: Vec<(Method, PathBuf)>,
     /// Reverse steps; none for those that the weights were made for.
     pub(crate) steps: Option<usize>,
     /// The spacing of their timesteps; none for that which the weights were made for.
@@ -99,10 +103,38 @@ impl NetworkOptions {
         &self,
         mut methods: impl Iterator<Item = &'a str>,
     ) -> Result<()> {
-        match self.result_flag.or(self.device_flag) {
-            Some(flag) if !methods.any(|method| method == METHOD) => Err(other_method(flag)),
+        let methods: Vec<&str> = methods.by_ref().collect();
+        if let Some((unused, _)) =
+            self.learned.iter().find(|(method, _)| !methods.contains(&method.name()))
+        {
+            let what = format!("weights of `{}`, which is not asked for", unused.name());
+            let help = format!("leave them out, or use --method {}", unused.name());
+            return Err(CliError::new(what, "--weights", help));
+        }
+        let is_own = methods.contains(&METHOD);
+        let is_learned = |method: &&str| Method::by_name(method).is_some();
+        match (self.result_flag, self.device_flag) {
+            (Some(flag), _) if !is_own => Err(other_method(flag)),
+            (None, Some(flag)) if !is_own && !methods.iter().any(is_learned) => {
+                Err(other_method(flag))
+            }
             _ => Ok(()),
         }
+    }
+
+    /// The file of a learned method's weights.
+    pub(crate) fn weights_of(&self, method: Method) -> Result<&Path> {
+        let found = self.learned.iter().find(|(of, _)| *of == method);
+        found.map(|(_, file)| file.as_path()).ok_or_else(|| {
+            let name = method.name();
+            CliError::new(
+                format!("method `{name}` has no weights here"),
+                "--weights",
+                format!(
+                    "name a file of its authors, as in --weights {name}=FILE (docs/methods.md)"
+                ),
+            )
+        })
     }
 
     /// Refuses options that are about diffusion steps where there are none.

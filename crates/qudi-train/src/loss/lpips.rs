@@ -10,15 +10,14 @@ mod fetch;
 #[cfg(test)]
 mod golden_tests;
 mod gray;
-mod state_dict;
 mod weight_files;
 
 use backbone::{Backbone, Weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::nearest::nearest;
 use qudi_core::{Error, Result, Size};
+use qudi_layers::StateDict;
 use serde::{Deserialize, Serialize};
-use state_dict::StateDict;
 use std::path::{Path, PathBuf};
 
 pub(crate) use backbone::Net;

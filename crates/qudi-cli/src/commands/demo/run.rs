@@ -60,7 +60,7 @@ pub(crate) fn run(
     }
     Places::default()
         .reads([&demo.sensor])
-        .reads(&demo.network.weights)
+        .reads(demo.network.weight_files())
         .writes([&path, &page])
         .check()?;
     let overwrite =
@@ -92,7 +92,7 @@ pub(crate) fn run(
             how("a burst merged twice, the second time along better motion"),
         ),
     ];
-    if demo.network.weights.is_some() || network::built_in_knows(&acquisition)? {
+    if demo.network.own_weights().is_some() || network::built_in_knows(&acquisition)? {
         let (restorer, how) =
             network::restorer(&demo.network.options(demo.steps.steps), &acquisition, SIZE)?;
         methods.push(("QUDI", restorer, format!("the network{how}")));

@@ -37,7 +37,7 @@ pub(crate) fn run(
         .reads(clips)
         .reads(external)
         .reads(args.sensor.as_deref())
-        .reads(&args.network.weights)
+        .reads(args.network.weight_files())
         .reads(&args.backbones)
         .writes(outputs.into_iter().flatten())
         .check()?;

@@ -9,6 +9,7 @@ use crate::report::Report;
 use crate::settings::Settings;
 use crate::weights::Weights;
 use burn::tensor::Device;
+use qudi_baselines::import::{Contents, describe};
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
@@ -41,9 +42,12 @@ pub(crate) fn run(
     let transforms = path.file_name().is_some_and(|name| name == "transforms.json");
     match extension.as_deref() {
         Some("toml") => sensor(subject, settings, report),
-        Some("safetensors") if path.is_file() => {
+        Some("safetensors" | "pth" | "pt") if path.is_file() => {
             settings.refuse(&["sensor."], "for weights")?;
-            weights(&Weights::File(path.to_owned()), report)
+            match describe(path)? {
+                Some(contents) => learned(&contents, path, report),
+                None => weights(&Weights::File(path.to_owned()), report),
+            }
         }
         Some("json") if path.is_file() && !transforms => {
             settings.refuse(&["sensor."], "for records: name the burst")?;
@@ -122,6 +126,27 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
     line("licence", d.licence.clone());
     line("sha-256", weights.sha256()?);
     report.result(&text, || json!(weights.describe().ok()))
+}
+
+/// A weight file of a learned method of others.
+fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
+    let Contents { method, sizes, parameters } = contents;
+    let sha256 = Weights::File(path.to_owned()).sha256()?;
+    let mut text = String::new();
+    let name = method.name();
+    let lines = [
+        ("network", format!("{name}, {parameters} parameters")),
+        ("sizes", sizes.clone()),
+        ("use", format!("--method {name} --weights {name}={}", path.display())),
+        ("sha-256", sha256.clone()),
+    ];
+    for (key, value) in &lines {
+        let _ = writeln!(text, "{key:<12}{value}");
+    }
+    report.result(
+        &text,
+        || json!({"method": name, "parameters": parameters, "sizes": sizes, "sha256": sha256}),
+    )
 }
 
 fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {

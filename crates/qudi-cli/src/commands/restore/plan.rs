@@ -68,7 +68,7 @@ impl Plan {
             .reads_burst(&args.capture)
             .reads(args.reading.files())
             .reads(args.sensor.as_deref())
-            .reads(&args.network.weights)
+            .reads(args.network.weight_files())
             .reads(&global.config)
             .writes([&args.output])
             .writes(beside.into_iter().flatten())

@@ -2,20 +2,26 @@
 //!
 //! Files come from elsewhere. The reader executes nothing, bounds what it builds, and reads a tensor's bytes
 //! only after its type and shape are known to be those of the network.
+//!
+//! The tensors of a checkpoint that holds more than them lie below `state_dict.`, and names of networks that several
+//! devices trained begin with `module.`; neither belongs to the names here.
 
+use burn::tensor::{bf16, f16};
 use pytorch_reader::{DType, PytorchReader};
 use qudi_core::regular_file::read_limited;
 use qudi_core::{Error, Result};
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
 
-/// Longest SafeTensors file: VGG16 up to its last used layer has 59 MB.
-const LONGEST: u64 = 100 << 20;
+/// Longest SafeTensors file: the largest network, QUIVER with 64 features, has 630 MB.
+const LONGEST: u64 = 1 << 30;
 
 /// An open file of weights.
-pub(super) struct StateDict {
+pub struct StateDict {
     path: PathBuf,
     reader: Reader,
+    /// What stands before the names.
+    prefix: &'static str,
 }
 
 enum Reader {
@@ -28,14 +34,14 @@ impl StateDict {
     ///
     /// # Errors
     /// [`Error`] if the file cannot be read, or is no dictionary of tensors.
-    pub(super) fn open(path: &Path) -> Result<Self> {
+    pub fn open(path: &Path) -> Result<Self> {
         if path.extension().is_some_and(|extension| extension == "safetensors") {
             let bytes = read_limited(path, LONGEST, "read the weights")?;
             SafeTensors::deserialize(&bytes).map_err(|e| {
                 let help = "convert the weights again, or copy the whole file";
                 Error::data(format!("not a whole SafeTensors file: {e}"), path, help)
             })?;
-            return Ok(Self { path: path.to_owned(), reader: Reader::SafeTensors(bytes) });
+            return Ok(Self::new(path, Reader::SafeTensors(bytes)));
         }
         // The reader names no file where one is missing.
         std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
@@ -44,46 +50,102 @@ impl StateDict {
                 "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
             Error::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
-        Ok(Self { path: path.to_owned(), reader: Reader::Pytorch(reader) })
+        Ok(Self::new(path, Reader::Pytorch(reader)))
+    }
+
+    fn new(path: &Path, reader: Reader) -> Self {
+        let mut file = Self { path: path.to_owned(), reader, prefix: "" };
+        let names = file.all_names();
+        let prefixes = ["state_dict.module.", "state_dict.", "module."];
+        let is_there = |prefix: &&str| names.iter().any(|name| name.starts_with(*prefix));
+        file.prefix = prefixes.into_iter().find(is_there).unwrap_or("");
+        file
+    }
+
+    /// Where the file is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The names of all tensors, sorted.
+    pub fn names(&self) -> Vec<String> {
+        let names = self.all_names().into_iter();
+        let own = names.filter_map(|name| name.strip_prefix(self.prefix).map(str::to_owned));
+        let mut own: Vec<String> = own.collect();
+        own.sort();
+        own
+    }
+
+    fn all_names(&self) -> Vec<String> {
+        match &self.reader {
+            Reader::Pytorch(reader) => reader.keys(),
+            Reader::SafeTensors(bytes) => match SafeTensors::deserialize(bytes) {
+                Ok(tensors) => tensors.names().into_iter().map(ToString::to_string).collect(),
+                Err(_) => Vec::new(),
+            },
+        }
+    }
+
+    /// The shape of a tensor, if there is one of this name.
+    pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
+        let name = format!("{}{name}", self.prefix);
+        match &self.reader {
+            Reader::Pytorch(reader) => reader.get(&name).map(|tensor| tensor.shape().to_vec()),
+            Reader::SafeTensors(bytes) => {
+                let tensors = SafeTensors::deserialize(bytes).ok()?;
+                tensors.tensor(&name).ok().map(|tensor| tensor.shape().to_vec())
+            }
+        }
     }
 
     /// The values of one tensor, row-major.
     ///
     /// # Errors
-    /// [`Error::Data`] if there is no such tensor of finite 32-bit floats of this shape.
-    pub(super) fn read(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
+    /// [`Error::Data`] if there is no such tensor of finite floats of this shape.
+    pub fn read(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
+        let full = format!("{}{name}", self.prefix);
         let wrong = |what: String| {
             let help = "these are weights of another network, or the file is damaged";
             Error::data(what, &self.path, help)
         };
         let missing = || wrong(format!("`{name}` is missing"));
-        let check = |found: &[usize], kind: &dyn std::fmt::Debug, is_f32: bool| {
+        let check = |found: &[usize], kind: &dyn std::fmt::Debug, floats: Option<Floats>| {
             if found != shape {
                 return Err(wrong(format!("`{name}` is {found:?}, expected {shape:?}")));
             }
-            if !is_f32 {
-                let what = format!("`{name}` has numbers of type {kind:?}, expected F32");
-                return Err(wrong(what));
-            }
-            Ok(())
+            floats.ok_or_else(|| {
+                wrong(format!("`{name}` has numbers of type {kind:?}, expected floats"))
+            })
         };
-        let bytes = match &self.reader {
+        let (bytes, floats) = match &self.reader {
             Reader::Pytorch(reader) => {
-                let tensor = reader.get(name).ok_or_else(missing)?;
-                check(tensor.shape(), &tensor.dtype(), tensor.dtype() == DType::F32)?;
-                tensor
+                let tensor = reader.get(&full).ok_or_else(missing)?;
+                let floats = match tensor.dtype() {
+                    DType::F32 => Some(Floats::F32),
+                    DType::F16 => Some(Floats::F16),
+                    DType::BF16 => Some(Floats::Bf16),
+                    _ => None,
+                };
+                let floats = check(tensor.shape(), &tensor.dtype(), floats)?;
+                let bytes = tensor
                     .read()
-                    .map_err(|e| wrong(format!("the values of `{name}` cannot be read: {e}")))?
+                    .map_err(|e| wrong(format!("the values of `{name}` cannot be read: {e}")))?;
+                (bytes, floats)
             }
             Reader::SafeTensors(bytes) => {
                 let tensors = SafeTensors::deserialize(bytes).map_err(|e| wrong(e.to_string()))?;
-                let tensor = tensors.tensor(name).map_err(|_| missing())?;
-                check(tensor.shape(), &tensor.dtype(), tensor.dtype() == Dtype::F32)?;
-                tensor.data().to_vec()
+                let tensor = tensors.tensor(&full).map_err(|_| missing())?;
+                let floats = match tensor.dtype() {
+                    Dtype::F32 => Some(Floats::F32),
+                    Dtype::F16 => Some(Floats::F16),
+                    Dtype::BF16 => Some(Floats::Bf16),
+                    _ => None,
+                };
+                let floats = check(tensor.shape(), &tensor.dtype(), floats)?;
+                (tensor.data().to_vec(), floats)
             }
         };
-        let words = bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
-        let values: Vec<f32> = words.map(f32::from_le_bytes).collect();
+        let values = floats.values(&bytes);
         if values.len() != shape.iter().product::<usize>() {
             return Err(wrong(format!(
                 "`{name}` has {} values, not those of its shape",
@@ -94,6 +156,34 @@ impl StateDict {
             return Err(wrong(format!("`{name}` holds values that are not finite")));
         }
         Ok(values)
+    }
+}
+
+/// Floats that files hold.
+#[derive(Clone, Copy)]
+enum Floats {
+    F32,
+    F16,
+    Bf16,
+}
+
+impl Floats {
+    fn values(self, bytes: &[u8]) -> Vec<f32> {
+        let halves = || bytes.chunks_exact(2).map(|b| [b[0], b[1]]);
+        match self {
+            Self::F32 => {
+                let words = bytes.chunks_exact(4).map(|b| [b[0], b[1], b[2], b[3]]);
+                words.map(f32::from_le_bytes).collect()
+            }
+            Self::F16 => halves().map(|b| f16::from_le_bytes(b).to_f32()).collect(),
+            Self::Bf16 => halves().map(|b| bf16::from_le_bytes(b).to_f32()).collect(),
+        }
+    }
+}
+
+impl std::fmt::Debug for StateDict {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("StateDict").field("path", &self.path).finish_non_exhaustive()
     }
 }
 
@@ -124,13 +214,16 @@ mod tests {
             let both = expected("both", 10);
             assert_eq!(file.read("both.last", &[6]).unwrap(), both[4..]);
             assert_eq!(file.read("both.first", &[4]).unwrap(), both[..4]);
+            let half = file.read("half", &[4]).unwrap();
+            for (half, exact) in half.into_iter().zip(expected("half", 4)) {
+                assert!((half - exact).abs() < 1e-3);
+            }
             let turned = expected("turned", 6);
             let rows = [0, 2, 4, 1, 3, 5].map(|place| turned[place]);
             assert_eq!(file.read("turned", &[2, 3]).unwrap(), rows);
             for (tensor, shape, reason) in [
                 ("missing", &[1][..], "missing"),
                 ("a.weight", &[3, 2], "expected [3, 2]"),
-                ("half", &[4], "expected F32"),
                 ("bad", &[2], "not finite"),
             ] {
                 let error = file.read(tensor, shape).unwrap_err().to_string();

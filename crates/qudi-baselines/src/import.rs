@@ -1,0 +1,407 @@
+//! The authors' files: which network they are of, in which size, and its weights.
+
+use crate::emvd::Emvd;
+use crate::flornn::{self, FloRnn};
+use crate::memdeblur::{self, MemDeblur};
+use crate::quiver::{self, Quiver};
+use crate::rvrt::{self, Rvrt};
+use crate::spk2imgnet::{self, Spk2ImgNet};
+use crate::student_teacher::{self, KernelPrediction};
+use burn::module::Module;
+use burn::tensor::Device;
+use qudi_core::{Error, Result};
+use qudi_layers::{StateDict, init_parameters, parameter_shapes};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Most channels, blocks or frames that a file may ask for.
+const MOST: usize = 4096;
+
+/// A learned method.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Method {
+    /// [`Quiver`]
+    Quiver,
+    /// [`Emvd`]
+    Emvd,
+    /// [`FloRnn`]
+    FloRnn,
+    /// [`Spk2ImgNet`]
+    Spk2ImgNet,
+    /// [`MemDeblur`]
+    MemDeblur,
+    /// [`Rvrt`]
+    Rvrt,
+    /// [`KernelPrediction`]
+    StudentTeacher,
+}
+
+/// All methods.
+pub const METHODS: [Method; 7] = [
+    Method::Quiver,
+    Method::Emvd,
+    Method::FloRnn,
+    Method::Spk2ImgNet,
+    Method::MemDeblur,
+    Method::Rvrt,
+    Method::StudentTeacher,
+];
+
+/// A network with weights.
+#[derive(Debug)]
+#[allow(clippy::large_enum_variant)] // one at a time
+pub enum Network {
+    /// QUIVER.
+    Quiver(Quiver),
+    /// EMVD.
+    Emvd(Emvd),
+    /// FloRNN.
+    FloRnn(FloRnn),
+    /// Spk2ImgNet.
+    Spk2ImgNet(Spk2ImgNet),
+    /// MemDeblur.
+    MemDeblur(MemDeblur),
+    /// RVRT, and the channels of its images.
+    Rvrt(Rvrt, usize),
+    /// A student of two teachers, and its frames.
+    StudentTeacher(KernelPrediction, usize),
+}
+
+/// What a file holds.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Contents {
+    /// The network.
+    pub method: Method,
+    /// Its sizes, in words.
+    pub sizes: String,
+    /// The number of its parameters.
+    pub parameters: usize,
+}
+
+impl Method {
+    /// The name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Quiver => "quiver",
+            Self::Emvd => "emvd",
+            Self::FloRnn => "flornn",
+            Self::Spk2ImgNet => "spk2imgnet",
+            Self::MemDeblur => "memdeblur",
+            Self::Rvrt => "rvrt",
+            Self::StudentTeacher => "student-teacher",
+        }
+    }
+
+    /// The method of this name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        METHODS.into_iter().find(|method| method.name() == name)
+    }
+
+    /// A parameter that no other network has.
+    fn mark(self) -> &'static str {
+        match self {
+            Self::Quiver => "predenoise.sfe1.weight",
+            Self::Emvd => "vd.fusion.net1.weight",
+            Self::FloRnn => "forward_rnn.first_conv.weight",
+            Self::Spk2ImgNet => "extractor.conv0_0.weight",
+            Self::MemDeblur => "memory.key_proj.key_proj.weight",
+            Self::Rvrt => "reconstruction.main.1.weight",
+            Self::StudentTeacher => "kernels.weight",
+        }
+    }
+
+    /// The method whose weights a file holds, if it is one of these.
+    fn of(file: &StateDict) -> Option<Self> {
+        METHODS.into_iter().find(|method| file.shape(method.mark()).is_some())
+    }
+}
+
+/// What the file at `path` holds; none if it is no file of a learned method.
+///
+/// # Errors
+/// [`Error`] if it cannot be read, or its network lacks parameters or has too many.
+pub fn describe(path: &Path) -> Result<Option<Contents>> {
+    let file = StateDict::open(path)?;
+    let Some(method) = Method::of(&file) else { return Ok(None) };
+    let sizes = Sizes::of(&file, method)?;
+    let parameters = sizes.count(&file)?;
+    Ok(Some(Contents { method, sizes: sizes.to_string(), parameters }))
+}
+
+/// Loads the network of a method from a file of its authors, or of ours.
+///
+/// # Errors
+/// [`Error`] if the file cannot be read, or does not hold this network, to the last key.
+pub fn load(path: &Path, method: Method, device: &Device) -> Result<Network> {
+    let file = StateDict::open(path)?;
+    let found = Method::of(&file);
+    if found != Some(method) {
+        let what = match found {
+            Some(found) => format!("weights of {}, not of {}", found.name(), method.name()),
+            None => format!("no weights of {}: `{}` is missing", method.name(), method.mark()),
+        };
+        return Err(Error::data(what, path, "name a file that was saved for this method"));
+    }
+    Sizes::of(&file, method)?.load(&file, device)
+}
+
+/// Sizes of a network.
+#[derive(Clone, Copy, Debug)]
+enum Sizes {
+    Quiver(quiver::Sizes),
+    Emvd(usize),
+    FloRnn(flornn::Sizes),
+    Spk2ImgNet(spk2imgnet::Sizes),
+    MemDeblur(memdeblur::Sizes),
+    Rvrt(rvrt::Sizes),
+    StudentTeacher(student_teacher::Sizes),
+}
+
+impl Sizes {
+    /// The sizes that follow from the shapes of a file.
+    fn of(file: &StateDict, method: Method) -> Result<Self> {
+        let side = |name: &str, axis: usize| {
+            let side = file.shape(name).and_then(|shape| shape.get(axis).copied());
+            let help = "these are weights of another network, or the file is damaged";
+            match side {
+                Some(side) if (1..=MOST).contains(&side) => Ok(side),
+                Some(side) => {
+                    Err(Error::data(format!("`{name}` has a side of {side}"), file.path(), help))
+                }
+                None => Err(Error::data(format!("`{name}` is missing"), file.path(), help)),
+            }
+        };
+        let names = file.names();
+        // Blocks are numbered from 0.
+        let count = |list: &str| {
+            let number = |name: &String| {
+                let rest = name.strip_prefix(list)?.strip_prefix('.')?;
+                rest.split('.').next()?.parse::<usize>().ok()
+            };
+            names.iter().filter_map(number).max().map_or(0, |most| most.min(MOST) + 1)
+        };
+        Ok(match method {
+            Method::Quiver => {
+                let features = side("predenoise.sfe1.weight", 0)?;
+                let frames = side("spatial_att.conv.weight", 0)? / (4 * features).max(1);
+                let past = frames.saturating_sub(1).div_ceil(2);
+                Self::Quiver(quiver::Sizes {
+                    features,
+                    blocks: 1 + count("forward_cell.F_R.1.RDBs"),
+                    past,
+                    future: frames.saturating_sub(1 + past),
+                })
+            }
+            Method::Emvd => Self::Emvd(side("vd.fusion.net1.weight", 0)?),
+            Method::FloRnn => Self::FloRnn(flornn::Sizes {
+                channels: side("d.convs.2.weight", 0)?,
+                features: side("forward_rnn.first_conv.weight", 0)?,
+                blocks: count("forward_rnn.resblocks"),
+                ..flornn::PUBLISHED
+            }),
+            Method::Spk2ImgNet => Self::Spk2ImgNet(spk2imgnet::Sizes {
+                features: side("extractor.conv.weight", 0)?,
+                stem: side("extractor.conv0_0.weight", 0)?,
+                blocks: count("extractor.net"),
+                groups: side("pcd_align.pcd_align.cas_dcnpack.conv_offset_mask.weight", 0)? / 27,
+            }),
+            Method::MemDeblur => Self::MemDeblur(memdeblur::Sizes {
+                channels: side("downsampling.0.weight", 0)?,
+                features: side("fusion.weight", 0)?,
+                forward_blocks: count("forward_resblocks.main.0"),
+                backward_blocks: count("backward_resblocks.main.2"),
+                memory_blocks: count("memory.key_encoder.forward_resblocks.main.2"),
+                bottlenecks: count("memory.key_encoder.layer1"),
+                ..memdeblur::PUBLISHED
+            }),
+            Method::Rvrt => Self::Rvrt(rvrt::Sizes {
+                channels: side("conv_last.weight", 0)?,
+                features: side("feat_extract.3.weight", 0)?,
+                blocks: count("backbone.backward_1.main.5"),
+            }),
+            Method::StudentTeacher => {
+                let frames = side("extractor.0.weight", 1)?;
+                Self::StudentTeacher(student_teacher::Sizes {
+                    frames,
+                    features: side("extractor.0.weight", 0)?,
+                    kernel: (side("kernels.weight", 0)? / frames).isqrt(),
+                })
+            }
+        })
+    }
+
+    fn load(self, file: &StateDict, device: &Device) -> Result<Network> {
+        Ok(match self {
+            Self::Quiver(sizes) => {
+                let network = Quiver::zeros(sizes, device);
+                Network::Quiver(filled(network, file, Quiver::authors_name)?)
+            }
+            Self::Emvd(width) => {
+                Network::Emvd(filled(Emvd::zeros(width, device), file, str::to_owned)?)
+            }
+            Self::FloRnn(sizes) => {
+                let network = FloRnn::zeros(sizes, device);
+                Network::FloRnn(filled(network, file, FloRnn::authors_name)?)
+            }
+            Self::Spk2ImgNet(sizes) => {
+                let network = Spk2ImgNet::zeros(sizes, device);
+                Network::Spk2ImgNet(filled(network, file, Spk2ImgNet::authors_name)?)
+            }
+            Self::MemDeblur(sizes) => {
+                let network = MemDeblur::zeros(sizes, device);
+                Network::MemDeblur(filled(network, file, MemDeblur::authors_name)?)
+            }
+            Self::Rvrt(sizes) => {
+                let network = Rvrt::zeros(sizes, device);
+                let network = filled(network, file, Rvrt::authors_name)?;
+                Network::Rvrt(network, sizes.channels)
+            }
+            Self::StudentTeacher(sizes) => {
+                let network = KernelPrediction::zeros(sizes, device);
+                let network = filled(network, file, KernelPrediction::file_name)?;
+                Network::StudentTeacher(network, sizes.frames)
+            }
+        })
+    }
+
+    /// The number of parameters, after all keys have been compared.
+    fn count(self, file: &StateDict) -> Result<usize> {
+        let device = Device::flex();
+        match self {
+            Self::Quiver(sizes) => {
+                count(&Quiver::zeros(sizes, &device), file, Quiver::authors_name)
+            }
+            Self::Emvd(width) => count(&Emvd::zeros(width, &device), file, str::to_owned),
+            Self::FloRnn(sizes) => {
+                count(&FloRnn::zeros(sizes, &device), file, FloRnn::authors_name)
+            }
+            Self::Spk2ImgNet(sizes) => {
+                count(&Spk2ImgNet::zeros(sizes, &device), file, Spk2ImgNet::authors_name)
+            }
+            Self::MemDeblur(sizes) => {
+                count(&MemDeblur::zeros(sizes, &device), file, MemDeblur::authors_name)
+            }
+            Self::Rvrt(sizes) => count(&Rvrt::zeros(sizes, &device), file, Rvrt::authors_name),
+            Self::StudentTeacher(sizes) => {
+                count(&KernelPrediction::zeros(sizes, &device), file, KernelPrediction::file_name)
+            }
+        }
+    }
+}
+
+impl std::fmt::Display for Sizes {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Quiver(s) => {
+                let frames = s.past + 1 + s.future;
+                write!(f, "{} features, {} blocks, {frames} frames", s.features, s.blocks)
+            }
+            Self::Emvd(width) => write!(f, "{width} channels"),
+            Self::FloRnn(s) => write!(f, "{} features, {} blocks", s.features, s.blocks),
+            Self::Spk2ImgNet(s) => {
+                write!(
+                    f,
+                    "{} features, {} blocks, {} frames",
+                    s.features,
+                    s.blocks,
+                    spk2imgnet::FRAMES
+                )
+            }
+            Self::MemDeblur(s) => write!(f, "{} features, {} blocks", s.features, s.forward_blocks),
+            Self::Rvrt(s) => {
+                write!(f, "{} features, {} blocks, {} channels", s.features, s.blocks, s.channels)
+            }
+            Self::StudentTeacher(s) => write!(
+                f,
+                "{} features, kernels of {} x {}, {} frames",
+                s.features, s.kernel, s.kernel, s.frames
+            ),
+        }
+    }
+}
+
+/// Keys that files have beside parameters: constants, and what the same tensor is called elsewhere.
+fn is_beside(name: &str) -> bool {
+    let repeated = (1..5).any(|k| name.starts_with(&format!("predenoise.rdbs.{k}.")));
+    let constant = ["num_batches_tracked", "relative_position_index"];
+    let mean = ["spynet.mean", "spynet.std"].contains(&name);
+    repeated || mean || constant.iter().any(|constant| name.ends_with(constant))
+}
+
+/// The names of all parameters in the file, with their shapes here and there, after comparing them all.
+fn compared<M: Module>(
+    network: &M,
+    file: &StateDict,
+    name: fn(&str) -> String,
+) -> Result<BTreeMap<String, (String, Vec<usize>)>> {
+    let (mut missing, mut different) = (Vec::new(), Vec::new());
+    let mut names = BTreeMap::new();
+    for (ours, shape) in parameter_shapes(network) {
+        let theirs = name(&ours);
+        match file.shape(&theirs) {
+            None => missing.push(theirs),
+            Some(found) if squeezed(&found) != shape => {
+                different.push(format!("{theirs} is {found:?} instead of {shape:?}"));
+            }
+            Some(found) => {
+                names.insert(ours, (theirs, found));
+            }
+        }
+    }
+    let known: std::collections::BTreeSet<&String> =
+        names.values().map(|(theirs, _)| theirs).collect();
+    let surplus: Vec<String> = file
+        .names()
+        .into_iter()
+        .filter(|name| !known.contains(name) && !is_beside(name))
+        .filter(|name| {
+            !missing.contains(name) && !different.iter().any(|d| d.starts_with(name.as_str()))
+        })
+        .collect();
+    if missing.is_empty() && different.is_empty() && surplus.is_empty() {
+        return Ok(names);
+    }
+    let lists = [("missing", missing), ("surplus", surplus), ("of another shape", different)];
+    let told = lists.into_iter().filter(|(_, list)| !list.is_empty());
+    let told = told.map(|(what, list)| format!("{} {what}: {}", list.len(), list.join(", ")));
+    let what = format!("keys do not fit the network; {}", told.collect::<Vec<_>>().join("; "));
+    Err(Error::data(what, file.path(), "name a file of this network, whole and unchanged"))
+}
+
+/// A shape without the axis of one frame that some convolutions have.
+fn squeezed(shape: &[usize]) -> Vec<usize> {
+    let mut shape = shape.to_vec();
+    if shape.len() == 5 && shape[2] == 1 {
+        shape.remove(2);
+    }
+    shape
+}
+
+fn count<M: Module>(network: &M, file: &StateDict, name: fn(&str) -> String) -> Result<usize> {
+    compared(network, file, name)?;
+    let is_learnt = |name: &str| !name.contains(".running_");
+    let shapes = parameter_shapes(network).into_iter();
+    Ok(shapes.filter(|(name, _)| is_learnt(name)).map(|(_, s)| s.iter().product::<usize>()).sum())
+}
+
+/// The network with the values of a file.
+fn filled<M: Module>(network: M, file: &StateDict, name: fn(&str) -> String) -> Result<M> {
+    let names = compared(&network, file, name)?;
+    let mut values = BTreeMap::new();
+    for (ours, (theirs, shape)) in &names {
+        values.insert(ours.clone(), file.read(theirs, shape)?);
+    }
+    // The one dense block of QUIVER's pre-denoiser stands in its files five times.
+    for (theirs, shape) in names.values() {
+        let Some(rest) = theirs.strip_prefix("predenoise.rdbs.0.") else { continue };
+        let first = file.read(theirs, shape)?;
+        for k in 1..5 {
+            let again = format!("predenoise.rdbs.{k}.{rest}");
+            if file.shape(&again).is_some() && file.read(&again, shape)? != first {
+                let what = format!("`{again}` is not the same as `{theirs}`");
+                return Err(Error::data(what, file.path(), "this is another network than QUIVER"));
+            }
+        }
+    }
+    Ok(init_parameters(network, |name, _| values.remove(name).unwrap_or_default()))
+}

@@ -1,0 +1,171 @@
+//! The learned methods as restorers of video: every frame of a window.
+
+use crate::import::{Method, Network, load};
+use crate::{emvd, memdeblur, quiver, rvrt, spk2imgnet, student_teacher};
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_core::progress::progress;
+use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
+use qudi_core::{Error, Frame, Result, Size};
+use std::path::Path;
+
+/// Frames of a window.
+const WINDOW: usize = 11;
+
+/// Frames before the first one that EMVD goes on from: its protocol scores the last of eleven.
+const HISTORY: usize = 10;
+
+/// A learned method with weights, as its authors used it: counts over full scale in, images out. They learnt the brightness
+/// of their own light; the image is not scaled to that of this acquisition.
+#[derive(Debug)]
+pub struct LearnedRestorer {
+    method: Method,
+    network: Network,
+    device: Device,
+}
+
+impl LearnedRestorer {
+    /// Loads the weights of a method onto `device`.
+    ///
+    /// # Errors
+    /// [`Error`] if the file does not hold them.
+    pub fn load(path: &Path, method: Method, device: &Device) -> Result<Self> {
+        let network = load(path, method, device)?;
+        Ok(Self { method, network, device: device.clone() })
+    }
+
+    /// Sides of images are multiples of this.
+    fn multiple(&self) -> usize {
+        match self.network {
+            Network::Quiver(_) => quiver::MULTIPLE,
+            Network::Emvd(_) => emvd::MULTIPLE,
+            Network::FloRnn(_) => 1,
+            Network::Spk2ImgNet(_) => spk2imgnet::MULTIPLE,
+            Network::MemDeblur(_) => memdeblur::MULTIPLE,
+            Network::Rvrt(..) => rvrt::MULTIPLE,
+            Network::StudentTeacher(..) => student_teacher::MULTIPLE,
+        }
+    }
+
+    /// The restored frames, `[1, 1, height, width]` each, of as many.
+    fn images(&self, frames: &[Tensor<4>]) -> Result<Vec<Tensor<4>>> {
+        let count = frames.len();
+        // Mirrored at the first and the last frame.
+        let around = |before: usize, after: usize| {
+            let place = |i: usize| mirrored(i as i64 - before as i64, count);
+            (0..before + count + after).map(|i| frames[place(i)].clone()).collect::<Vec<_>>()
+        };
+        let copies = |frames: Vec<Tensor<4>>, channels: usize| {
+            Tensor::cat(frames, 0).repeat(&[1, channels, 1, 1])
+        };
+        // Copies of one picture are averaged.
+        let split = |images: Tensor<4>, first: usize| {
+            let images = images.mean_dim(1);
+            (0..count).map(|i| images.clone().narrow(0, first + i, 1)).collect::<Vec<_>>()
+        };
+        Ok(match &self.network {
+            Network::Quiver(network) => {
+                let (past, future) = network.reach();
+                let all = around(past, future);
+                let frames = all.len();
+                split(network.forward(Tensor::cat(all, 0), frames).full, 0)
+            }
+            Network::Emvd(network) => {
+                let restored = network.restore(around(HISTORY, 0));
+                restored.into_iter().skip(HISTORY).collect()
+            }
+            Network::FloRnn(network) => {
+                let (before, after) = (1, network.ahead() + 1);
+                let all = around(before, after);
+                let (frames, channels) = (all.len(), network.channels());
+                split(network.forward(copies(all, channels), frames), before)
+            }
+            Network::Spk2ImgNet(network) => {
+                let (before, after) =
+                    (spk2imgnet::RESTORED, spk2imgnet::FRAMES - spk2imgnet::RESTORED);
+                self.sliding(&around(before, after - 1), spk2imgnet::FRAMES, |window| {
+                    network.forward(window).0 / spk2imgnet::SCALE
+                })?
+            }
+            Network::MemDeblur(network) => {
+                let images = copies(frames.to_vec(), network.channels());
+                let [_, _, full] = network.forward(&images, count, memdeblur::Mode::Use);
+                split(full, 0)
+            }
+            Network::Rvrt(network, channels) => {
+                // An even number of frames.
+                let all = around(0, count % rvrt::CLIP);
+                let frames = all.len();
+                split(network.forward(copies(all, *channels), frames), 0)
+            }
+            Network::StudentTeacher(network, length) => {
+                let before = length / 2;
+                self.sliding(&around(before, length - 1 - before), *length, |window| {
+                    network.forward(window).image
+                })?
+            }
+        })
+    }
+
+    /// One image of every window of frames, which are the channels of one input.
+    fn sliding(
+        &self,
+        frames: &[Tensor<4>],
+        length: usize,
+        restore: impl Fn(Tensor<4>) -> Tensor<4>,
+    ) -> Result<Vec<Tensor<4>>> {
+        let windows = frames.windows(length);
+        let total = windows.len();
+        let mut images = Vec::with_capacity(total);
+        for (done, window) in windows.enumerate() {
+            progress(self.method.name(), done, total)?;
+            images.push(restore(Tensor::cat(window.to_vec(), 1)));
+        }
+        Ok(images)
+    }
+}
+
+impl Restorer for LearnedRestorer {
+    fn name(&self) -> &'static str {
+        self.method.name()
+    }
+
+    fn window(&self) -> usize {
+        WINDOW
+    }
+
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        progress(self.method.name(), 0, burst.frames.len())?;
+        let multiple = self.multiple();
+        let Size { height, width } = burst.size;
+        let [h, w] = [height, width].map(|side| side.next_multiple_of(multiple));
+        let full = f32::from(acquisition.sensor.max_count());
+        let plane = |counts: &Vec<u16>| {
+            let value = |y: usize, x: usize| f32::from(counts[y * width + x]) / full;
+            let rows = (0..h).flat_map(|y| (0..w).map(move |x| (y, x)));
+            let values = rows.map(|(y, x)| value(y.min(height - 1), x.min(width - 1)));
+            let data = TensorData::new(values.collect::<Vec<f32>>(), [1, 1, h, w]);
+            Tensor::from_data(data, &self.device)
+        };
+        let frames: Vec<Tensor<4>> = burst.frames.iter().map(plane).collect();
+        let images = self.images(&frames)?.into_iter().map(|image| {
+            let image = image.narrow(2, 0, height).narrow(3, 0, width).clamp(0.0, 1.0);
+            let data = image.into_data().try_to_vec::<f32>();
+            let data = data.map_err(|e| {
+                Error::request(
+                    format!("the device failed: {e:?}"),
+                    self.method.name(),
+                    "use --device cpu",
+                )
+            })?;
+            Ok(Frame { size: burst.size, data })
+        });
+        Ok(Restored { frames: images.collect::<Result<_>>()?, std: None })
+    }
+}
+
+/// The frame at a place, mirrored at both ends: the ends themselves are not repeated.
+fn mirrored(place: i64, count: usize) -> usize {
+    let period = (2 * count as i64 - 2).max(1);
+    let place = place.rem_euclid(period);
+    (if place < count as i64 { place } else { period - place }) as usize
+}
