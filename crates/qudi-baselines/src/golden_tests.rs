@@ -214,7 +214,7 @@ fn spk2imgnet_matches_pytorch() {
             let network = Spk2ImgNet::zeros(sizes, &device);
             let network = weighted(network, &case, "", Spk2ImgNet::authors_name);
             let x: Tensor<4> = case.input("x", &device).require_grad();
-            let (image, estimates) = network.forward(x.clone());
+            let (image, estimates) = network.forward(&x);
             let loss = if name == "loss" {
                 let loss = spk2imgnet::loss(image, estimates, case.input("truth", &device));
                 case.check_output("loss", loss.clone());

@@ -45,6 +45,15 @@ pub fn frames_from(x: &Tensor<4>, frames: usize, first: usize, count: usize) -> 
     some.reshape([images / frames * count, channels, height, width])
 }
 
+/// What `f` makes of every image by itself: of all at once it would take more memory.
+///
+/// # Shapes
+/// - x: `[images, channels, height, width]`
+pub fn one_by_one(x: &Tensor<4>, f: impl Fn(Tensor<4>) -> Tensor<4>) -> Tensor<4> {
+    let images = x.dims()[0];
+    Tensor::cat((0..images).map(|number| f(x.clone().narrow(0, number, 1))).collect(), 0)
+}
+
 /// The reverse of [`frame`]: bursts of these frames.
 ///
 /// # Shapes

@@ -6,7 +6,9 @@ mod merge;
 mod predenoiser;
 mod reconstructor;
 
-use crate::parts::{SpyNet, bursts_of, every_second, frame, frames_from, gradient_loss, renamed};
+use crate::parts::{
+    SpyNet, bursts_of, every_second, frame, frames_from, gradient_loss, one_by_one, renamed,
+};
 use alignment::{Alignment, Extractor, GatedFusion};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -135,7 +137,7 @@ impl Quiver {
     pub fn forward(&self, x: Tensor<4>, frames: usize) -> Restored {
         let [images, _, height, width] = x.dims();
         let bursts = images / frames;
-        let predenoised = self.predenoise.forward(x.clone());
+        let predenoised = one_by_one(&x, |image| self.predenoise.forward(image));
         // From every frame but the first to the one before.
         let pairs = frames - 1;
         let later = frames_from(&predenoised, frames, 1, pairs);

@@ -1,11 +1,13 @@
 //! The learned methods as restorers of video: every frame of a window.
 
 use crate::import::{Method, Network, load};
+use crate::spk2imgnet::{Block, Spk2ImgNet};
 use crate::{emvd, memdeblur, quiver, rvrt, spk2imgnet, student_teacher};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Frame, Result, Size};
+use std::collections::VecDeque;
 use std::path::Path;
 
 /// Frames of a window.
@@ -80,11 +82,8 @@ impl LearnedRestorer {
                 split(network.forward(copies(all, channels), frames), before)
             }
             Network::Spk2ImgNet(network) => {
-                let (before, after) =
-                    (spk2imgnet::RESTORED, spk2imgnet::FRAMES - spk2imgnet::RESTORED);
-                self.sliding(&around(before, after - 1), spk2imgnet::FRAMES, |window| {
-                    network.forward(window).0 / spk2imgnet::SCALE
-                })?
+                let before = spk2imgnet::RESTORED;
+                self.by_blocks(network, &around(before, spk2imgnet::FRAMES - 1 - before))?
             }
             Network::MemDeblur(network) => {
                 let images = copies(frames.to_vec(), network.channels());
@@ -104,6 +103,26 @@ impl LearnedRestorer {
                 })?
             }
         })
+    }
+
+    /// One image of every window of frames; every block of frames is looked at once.
+    fn by_blocks(&self, network: &Spk2ImgNet, frames: &[Tensor<4>]) -> Result<Vec<Tensor<4>>> {
+        let total = frames.len() - spk2imgnet::FRAMES + 1;
+        let mut blocks: VecDeque<Block> = VecDeque::new();
+        let mut images = Vec::with_capacity(total);
+        for first in 0..total {
+            progress(self.method.name(), first, total)?;
+            while first + blocks.len() < (first + spk2imgnet::FRAMES - 1).min(frames.len() - 1) {
+                let start = first + blocks.len();
+                let pair = frames[start..start + spk2imgnet::BLOCK].to_vec();
+                blocks.push_back(network.block(Tensor::cat(pair, 1)));
+            }
+            let window: [&Block; spk2imgnet::BLOCKS] =
+                std::array::from_fn(|number| &blocks[number * spk2imgnet::BLOCK]);
+            images.push(network.image(window) / spk2imgnet::SCALE);
+            blocks.pop_front();
+        }
+        Ok(images)
     }
 
     /// One image of every window of frames, which are the channels of one input.

@@ -4,12 +4,11 @@
 mod align;
 mod extractor;
 
-use align::Align;
+use align::{Align, Levels};
 use burn::module::{Module, Param};
 use burn::tensor::activation::{prelu, sigmoid};
 use burn::tensor::{Device, Tensor};
 use extractor::Extractor;
-use qudi_layers::resample::by_burst;
 use qudi_layers::{Bias, Conv2d, zeros};
 
 /// Frames that it sees.
@@ -24,9 +23,10 @@ pub const MULTIPLE: usize = 4;
 /// What the network was trained to give is this times the image.
 pub const SCALE: f32 = 0.6;
 
-/// Frames of a block, and blocks.
-const BLOCK: usize = 2;
-const BLOCKS: usize = FRAMES / BLOCK;
+/// Frames of a block.
+pub const BLOCK: usize = 2;
+/// Blocks.
+pub const BLOCKS: usize = FRAMES / BLOCK;
 
 /// The block that the others are aligned with.
 const KEY: usize = 2;
@@ -56,6 +56,13 @@ pub struct Spk2ImgNet {
     rec_conv1: Conv2d,
     rec_conv2: Conv2d,
     pcd_align: Align,
+}
+
+/// What is known of a block of frames by itself: windows that share it need it once.
+#[derive(Clone, Debug)]
+pub struct Block {
+    estimates: Tensor<4>,
+    levels: Levels,
 }
 
 /// How far the aligned features of a block count.
@@ -112,33 +119,48 @@ impl Spk2ImgNet {
     /// # Shapes
     /// - frames: `[images, 10, height, width]`, sides multiples of 4
     /// - results: `[images, 1, height, width]`, `[images, 5, 4, height, width]`
-    pub fn forward(&self, frames: Tensor<4>) -> (Tensor<4>, Tensor<5>) {
-        let [images, _, height, width] = frames.dims();
-        let blocks = frames.reshape([images * BLOCKS, BLOCK, height, width]);
-        let (estimates, features) = self.extractor.forward(blocks);
-        let levels = self.pcd_align.levels(features.clone());
-        // All neighbours at once, one block after the other.
-        let neighbours: Vec<usize> = (0..BLOCKS).filter(|&block| block != KEY).collect();
-        let block = |x: &Tensor<4>, number: usize| {
-            let [_, c, h, w] = x.dims();
-            by_burst(x.clone(), BLOCKS).narrow(1, number, 1).reshape([images, c, h, w])
+    pub fn forward(&self, frames: &Tensor<4>) -> (Tensor<4>, Tensor<5>) {
+        let pair = |number: usize| frames.clone().narrow(1, number * BLOCK, BLOCK);
+        let blocks: [Block; BLOCKS] = std::array::from_fn(|number| self.block(pair(number)));
+        let estimates = blocks.iter().map(|block| block.estimates.clone()).collect();
+        (self.image(blocks.each_ref()), Tensor::stack(estimates, 1))
+    }
+
+    /// What is known of a block of frames by itself.
+    ///
+    /// # Shapes
+    /// - frames: `[images, 2, height, width]`
+    pub fn block(&self, frames: Tensor<4>) -> Block {
+        let (estimates, features) = self.extractor.forward(frames);
+        Block { estimates, levels: self.pcd_align.levels(features) }
+    }
+
+    /// The image at frame 5, times [`SCALE`], of five blocks in a row.
+    ///
+    /// # Shapes
+    /// - result: `[images, 1, height, width]`
+    pub fn image(&self, blocks: [&Block; BLOCKS]) -> Tensor<4> {
+        // All neighbours at once.
+        let neighbours: Vec<&Block> =
+            (0..BLOCKS).filter(|&block| block != KEY).map(|block| blocks[block]).collect();
+        let of = |blocks: &[&Block], level: usize| {
+            Tensor::cat(blocks.iter().map(|block| block.levels[level].clone()).collect(), 0)
         };
-        let of = |x: &Tensor<4>, numbers: &[usize]| {
-            Tensor::cat(numbers.iter().map(|&number| block(x, number)).collect(), 0)
-        };
+        let keys = [blocks[KEY]; BLOCKS - 1];
         let aligned = self.pcd_align.forward(
-            levels.each_ref().map(|level| of(level, &neighbours)),
-            levels.each_ref().map(|level| of(level, &[KEY; BLOCKS - 1])),
+            [0, 1, 2].map(|level| of(&neighbours, level)),
+            [0, 1, 2].map(|level| of(&keys, level)),
         );
-        let key = block(&features, KEY);
+        let key = &blocks[KEY].levels[0];
+        let images = key.dims()[0];
         let masked = self.masks.iter().enumerate().map(|(number, mask)| {
             let aligned = aligned.clone().narrow(0, number * images, images);
-            mask.forward(&aligned, &key) * aligned
+            mask.forward(&aligned, key) * aligned
         });
         let mut joined: Vec<_> = masked.collect();
         joined.insert(KEY, key.clone());
         let image = self.rec_conv1.relu(&[self.rec_conv0.relu(&joined)]);
-        (self.rec_conv2.linear(&[image]), by_burst(estimates, BLOCKS))
+        self.rec_conv2.linear(&[image])
     }
 }
 

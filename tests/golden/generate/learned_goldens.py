@@ -40,7 +40,7 @@ import numpy as np
 import spk2imgnet
 import student_teacher
 import torch
-from network_goldens import File, Tensors, kinks, spread
+from network_goldens import OUT, File, Tensors, fill, kinks, spread
 from torch import Tensor, nn
 from uniform import uniform
 
@@ -218,10 +218,27 @@ FILES: dict[str, Callable[[], File]] = {
 }
 
 
+def weight_files() -> None:
+    """EMVD's weights as they are found: in a checkpoint, of several devices, in half precision, turned, with code."""
+    net = emvd.Emvd(width=4)
+    fill(net, "", torch.float32)
+    state = net.state_dict()
+    folder = OUT / "learned"
+    torch.save({"iter": 300, "best_psnr": 20.0, "state_dict": state, "optimizer": {"state": {}}}, folder / "wrapped.pth")
+    torch.save({f"module.{name}": value for name, value in state.items()}, folder / "module.pth")
+    torch.save({name: value.half() for name, value in state.items()}, folder / "half.pth")
+    turned = {name: value.transpose(0, 1).contiguous().transpose(0, 1) for name, value in state.items() if value.dim() > 1}
+    torch.save(state | turned, folder / "turned.pth", _use_new_zipfile_serialization=False)
+    for path in folder.glob("*.pth"):
+        path.chmod(0o644)
+
+
 def main() -> None:
     torch.set_num_threads(1)
     for name in sys.argv[1:] or FILES:
         FILES[name]().save()
+    if not sys.argv[1:]:
+        weight_files()
 
 
 if __name__ == "__main__":

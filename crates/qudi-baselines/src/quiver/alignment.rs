@@ -77,7 +77,13 @@ impl Alignment {
         let before = frames_from(&x, frames, 0, frames - 1);
         let after = frames_from(&x, frames, 1, frames - 1);
         let warped = warp_zeros(before.clone(), flow.clone());
-        let aligned = by_burst(self.align(before, [warped, after], flow.clone()), frames - 1);
+        // One pair by itself: the taps of all would fill the memory.
+        let one = |x: &Tensor<4>, number: usize| x.clone().narrow(0, number, 1);
+        let pairs = (0..before.dims()[0]).map(|number| {
+            let [x, warped, after, flow] = [&before, &warped, &after, flow].map(|x| one(x, number));
+            self.align(x, [warped, after], flow)
+        });
+        let aligned = by_burst(Tensor::cat(pairs.collect(), 0), frames - 1);
         let first = aligned.clone().narrow(1, 0, 1).zeros_like();
         Tensor::cat(vec![first, aligned], 1).reshape([images, channels, height, width])
     }
