@@ -312,3 +312,64 @@ fn clips_are_chosen_by_name() {
     assert_eq!(timeless(of(&scored, 1)), timeless(of(&all, 2)), "the same photons");
     refused(&folder, "eval clips --clips d --ppp 5", &["`d`", "--clips", "a, b, c"]);
 }
+
+/// Weights of a small EMVD, as its authors' keys name them.
+fn emvd_weights(folder: &Path) {
+    use qudi_baselines::emvd::Emvd;
+    use safetensors::tensor::{Dtype, TensorView};
+    let network = Emvd::zeros(4, &burn::tensor::Device::flex());
+    let tensors: Vec<_> = qudi_layers::parameter_shapes(&network)
+        .into_iter()
+        .map(|(name, shape)| {
+            let count: usize = shape.iter().product();
+            let value = |i: usize| 0.4 * (((i * 37 + name.len()) % 17) as f32 / 17.0 - 0.4);
+            let bytes: Vec<u8> = (0..count).flat_map(|i| value(i).to_le_bytes()).collect();
+            (name, shape, bytes)
+        })
+        .collect();
+    let views = tensors.iter().map(|(name, shape, bytes)| {
+        (name, TensorView::new(Dtype::F32, shape.clone(), bytes).unwrap())
+    });
+    let file = folder.join("emvd.safetensors");
+    safetensors::serialize_to_file(views.collect::<Vec<_>>(), None, &file).unwrap();
+}
+
+#[test]
+fn learned_methods_run_with_the_weights_that_are_named() {
+    let folder = scratch("eval-learned");
+    emvd_weights(&folder);
+    let clip = "scene:text --size 32x48 --frames 4 --ppp 3.25";
+    let weights = "--weights emvd=emvd.safetensors";
+    let scored = eval(&folder, &format!("{clip} --method emvd,average {weights}"));
+    let [emvd, average] = [0, 1].map(|row| scored["rows"][row]["psnr_a"]["all"]["mean"].as_f64());
+    assert!(emvd.is_some_and(f64::is_finite) && emvd != average, "{emvd:?} {average:?}");
+    let table =
+        run(&folder, &format!("eval {clip} --table1 {weights} --device cpu --markdown t.md"));
+    for part in ["20.02", "no weights: --weights quiver=FILE", "I2-2000FPS"] {
+        assert!(table.contains(part), "{part}: {table}");
+    }
+    assert!(!table.contains("no weights: --weights emvd"), "{table}");
+    assert!(
+        std::fs::read_to_string(folder.join("t.md")).unwrap().contains("| emvd | 3.25 | 20.02")
+    );
+    let info = run(&folder, "info emvd.safetensors");
+    assert!(info.contains("emvd") && info.contains("4 channels"), "{info}");
+    run(&folder, "simulate scene:text --size 32x48 --frames 4 --ppp 3 -o b.npy -q");
+    run(&folder, &format!("restore b.npy --method emvd {weights} -o r.npy -q"));
+    for (args, words) in [
+        ("restore b.npy --method emvd -o x.npy", &["emvd", "--weights emvd=FILE"][..]),
+        ("restore b.npy --method rvrt --weights rvrt=emvd.safetensors -o x.npy", &["not of rvrt"]),
+        ("restore b.npy --method mle --weights emvd=emvd.safetensors -o x.npy", &["not asked for"]),
+        (
+            "restore b.npy --method emvd --steps 3 --weights emvd=emvd.safetensors -o x.npy",
+            &["--steps"],
+        ),
+        ("restore b.npy --weights rvrt= -o x.npy", &[]),
+    ] {
+        if words.is_empty() {
+            assert!(!qudi(&folder).args(args.split(' ')).output().unwrap().status.success());
+        } else {
+            refused(&folder, args, words);
+        }
+    }
+}

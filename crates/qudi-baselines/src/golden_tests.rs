@@ -1,6 +1,8 @@
 //! Every network against PyTorch, forward and backward.
 #![allow(clippy::unwrap_used)]
 
+mod pieces;
+
 use crate::cases::{Case, File, parameter, uniform};
 use crate::emvd::{self, Emvd};
 use crate::flornn::{self, FloRnn};

@@ -1,10 +1,10 @@
 //! QUIVER: quanta video restoration (Chennuri et al., ECCV 2024).
 
-mod alignment;
+pub(crate) mod alignment;
 mod cell;
 mod merge;
 mod predenoiser;
-mod reconstructor;
+pub(crate) mod reconstructor;
 
 use crate::parts::{
     SpyNet, bursts_of, every_second, frame, frames_from, gradient_loss, one_by_one, renamed,

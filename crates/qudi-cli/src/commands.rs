@@ -47,6 +47,7 @@ pub(crate) mod eval {
     pub(crate) mod run;
     mod score;
     mod table;
+    mod table1;
 }
 
 pub(crate) mod info {

@@ -37,7 +37,7 @@ pub(super) struct Alignment {
 
 /// Gated layers on channels.
 #[derive(Module, Debug)]
-pub(super) struct GatedFusion {
+pub(crate) struct GatedFusion {
     fc11: Linear,
     fc12: Linear,
     fc2: Linear,
@@ -103,7 +103,7 @@ impl Alignment {
 }
 
 impl GatedFusion {
-    pub(super) fn zeros(features: usize, device: &Device) -> Self {
+    pub(crate) fn zeros(features: usize, device: &Device) -> Self {
         let double = 2 * features;
         Self {
             fc11: Linear::zeros([double, double], device),
@@ -112,7 +112,7 @@ impl GatedFusion {
         }
     }
 
-    pub(super) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+    pub(crate) fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         let gate = gelu(self.fc11.on_channels(x.clone()));
         self.fc2.on_channels(gate * self.fc12.on_channels(x))
     }

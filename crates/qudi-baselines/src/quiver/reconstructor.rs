@@ -12,7 +12,7 @@ const REDUCTION: usize = 16;
 
 /// The reconstruction of one scale.
 #[derive(Module, Debug)]
-pub(super) struct Reconstructor {
+pub(crate) struct Reconstructor {
     conv1x1: Conv2d,
     cab: ChannelBlock,
     flast0: Conv2d,
@@ -37,7 +37,7 @@ struct ChannelBlock {
 }
 
 impl Reconstructor {
-    pub(super) fn zeros(features: usize, device: &Device) -> Self {
+    pub(crate) fn zeros(features: usize, device: &Device) -> Self {
         let n = features;
         let conv = |sizes, kernel| Conv2d::zeros(sizes, kernel, Bias::Yes, device);
         let plain = |sizes| Conv2d::zeros(sizes, 1, Bias::No, device);
@@ -63,7 +63,7 @@ impl Reconstructor {
         }
     }
 
-    pub(super) fn authors_name(name: &str) -> String {
+    pub(crate) fn authors_name(name: &str) -> String {
         if !name.starts_with("recons") {
             return name.to_owned();
         }
@@ -81,7 +81,7 @@ impl Reconstructor {
     }
 
     /// The image, and what the next finer scale goes on from: features and image at twice the size.
-    pub(super) fn forward(
+    pub(crate) fn forward(
         &self,
         h: Tensor<4>,
         f: Tensor<4>,
@@ -95,7 +95,7 @@ impl Reconstructor {
     }
 
     /// The image alone, and the features that it was made of.
-    pub(super) fn image(
+    pub(crate) fn image(
         &self,
         h: Tensor<4>,
         f: Tensor<4>,

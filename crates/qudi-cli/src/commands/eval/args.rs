@@ -27,6 +27,9 @@ pub(crate) struct Eval {
     /// Methods to compare
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
     pub(crate) method: Vec<String>,
+    /// Compare all methods of the paper's table 1 that need no weights or whose --weights are named, beside its figures
+    #[arg(long, conflicts_with_all = ["method", "capture"])]
+    pub(crate) table1: bool,
     /// Incident photons per pixel and frame [default: 3.25,9.75,26; of a capture: from its record, or
     /// estimated]
     #[arg(long, value_name = "PPP,...", value_delimiter = ',', allow_negative_numbers = true, value_parser = number::real(number::PPP))]

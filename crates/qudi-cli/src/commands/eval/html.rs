@@ -1,8 +1,9 @@
 //! The page of `qudi eval`: table, plot, and pictures side by side.
 
 use super::score::{Figure, Row, Score};
-use super::table::{looks, summary};
+use super::table::summary;
 use crate::error::Result;
+use crate::report::Table;
 use crate::report::html::{TableView, crop, crop_size, render};
 use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
 use qudi_core::Frame;
@@ -91,14 +92,19 @@ impl Pictures {
 }
 
 /// The whole page.
-pub(crate) fn html(rows: &[Row], pictures: &[Pictures], about: &str) -> Result<String> {
+pub(crate) fn html(
+    rows: &[Row],
+    further: &[(&'static str, Table)],
+    pictures: &[Pictures],
+    about: &str,
+) -> Result<String> {
     render(
         "eval.html",
         Page {
             title: "Evaluation of methods",
             about,
             table: TableView::from(&summary(rows)),
-            looks: looks(rows)
+            looks: further
                 .iter()
                 .map(|(title, table)| Looks { title, table: TableView::from(table) })
                 .collect(),
@@ -256,7 +262,7 @@ mod tests {
         }
         let rows =
             [Row { method: "mle".to_owned(), steps: None, ppp: 3.25, scores: scores.to_vec() }];
-        let page = html(&rows, &clips, "about").unwrap_or_else(|e| panic!("{e:?}"));
+        let page = html(&rows, &[], &clips, "about").unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("aspect-ratio:32/24") && page.contains("aspect-ratio:40/224"));
         assert!(page.contains("the middle 40 x 224 pixels"));
     }
@@ -266,7 +272,7 @@ mod tests {
         let size = Size { height: 24, width: 32 };
         let mut clip = pictures("<dog>", size);
         clip.add("qudi", &score("<dog>", size, " (diffusion in 4 steps) on cpu"));
-        let page = html(&[], &[clip], "about").unwrap_or_else(|e| panic!("{e:?}"));
+        let page = html(&[], &[], &[clip], "about").unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("qudi (diffusion in 4 steps) on cpu: PSNR 25.00 dB"), "{page}");
         assert!(page.contains("<b>&lt;dog&gt;</b>"), "names are no markup");
     }

@@ -3,6 +3,7 @@
 use super::args::{Eval, External, Protocol};
 use super::perceptual::Perceptual;
 use super::score::Row;
+use super::table1;
 use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
 use crate::device;
@@ -92,7 +93,8 @@ impl Plan {
             // LPIPS is computed there, too.
             network.device_flag = None;
         }
-        network.check_methods(args.method.iter().map(String::as_str))?;
+        let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
+        network.check_methods(methods.iter().map(String::as_str))?;
         let perceptual = match &args.backbones {
             None => None,
             Some(folder) => {
@@ -102,7 +104,7 @@ impl Plan {
         };
         let plan = Self {
             data: args.data.clone(),
-            contenders: contenders(&args.method, &network, &steps),
+            contenders: contenders(&methods, &network, &steps),
             ppp: args.ppp.clone(),
             ppp_def: args.ppp_def,
             sensor: args.sensor.clone(),

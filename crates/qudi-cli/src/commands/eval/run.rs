@@ -8,6 +8,7 @@ use super::html::html;
 use super::plan::Plan;
 use super::score::{Figure, FlowKind, LOOKS, Row};
 use super::table::{frames, looks, summary};
+use super::table1;
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
@@ -54,17 +55,22 @@ pub(crate) fn run(
         evaluate_clips(&plan, settings, report)?
     };
     csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
-    html_file.write(|| html(&rows, &pictures, &about))?;
+    let mut further = looks(&rows);
+    let mut about = about;
+    if args.table1 {
+        further.insert(0, ("The paper's table 1, and the same methods here", table1::table(&rows)));
+        about = format!("{about}\n{}", table1::REASONS);
+    }
+    html_file.write(|| html(&rows, &further, &pictures, &about))?;
     let table = summary(&rows);
     markdown_file.write(|| {
-        let tables = looks(&rows).into_iter();
-        let looks =
-            tables.map(|(title, table)| format!("\n{title}:\n\n{}", markdown::table(&table)));
-        Ok(markdown::table(&table) + &looks.collect::<String>())
+        let further = further.iter();
+        let further =
+            further.map(|(title, table)| format!("\n{title}:\n\n{}", markdown::table(table)));
+        Ok(markdown::table(&table) + &further.collect::<String>())
     })?;
-    let tables = looks(&rows).into_iter();
-    let looks = tables.map(|(title, table)| format!("{title}\n{}\n", table.to_text()));
-    let text = format!("{}\n{}{about}\n", table.to_text(), looks.collect::<String>());
+    let shown = further.iter().map(|(title, table)| format!("{title}\n{}\n", table.to_text()));
+    let text = format!("{}\n{}{about}\n", table.to_text(), shown.collect::<String>());
     report.result(&text, || document(settings, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
     match args.min_psnr {
