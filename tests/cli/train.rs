@@ -301,4 +301,8 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     let learns = format!("train tiny -o other {QUICK} --set");
     refused(&folder, &format!("{learns} train.learns=[\"unet\"]"), &["train.learns"]);
     refused(&folder, &format!("{learns} train.learns=[\"eyes\"]"), &["eyes"]);
+    // Nothing moves, and nothing else is to learn.
+    let still =
+        "network.ablate=[\"flow\"] --set train.learns=[\"flow\"] --set train.loss.prediction=0";
+    refused(&folder, &format!("{learns} {still} --set train.loss.pre=0"), &["train.learns"]);
 }

@@ -97,7 +97,7 @@ fn save(path: &Path, tensors: &BTreeMap<String, Vec<usize>>) {
     let values = tensors.iter().map(|(name, shape)| {
         let mut values = parameter(name, shape);
         if name.ends_with(".running_var") {
-            values.iter_mut().for_each(|value| *value = 1.0 + value.abs());
+            values = values.into_iter().map(|value| 1.0 + value.abs()).collect();
         }
         let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         (name.clone(), shape.clone(), bytes)

@@ -9,7 +9,7 @@ use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
 use qudi_kernels::ComputePrecision;
-use qudi_model::config::{NetworkConfig, PRESETS};
+use qudi_model::config::{NetworkConfig, PRESETS, Part};
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -276,9 +276,12 @@ impl Recipe {
                 "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
             ),
         ];
+        let has_flow = !network.ablates(Part::Flow);
         let named = stage::have_good_names(&self.stage);
         let stages = ("stage", named, "must have names of a-z, 0-9 and -, each its own");
-        for (key, good, problem) in rules.into_iter().chain(stage::rules(train)).chain([stages]) {
+        for (key, good, problem) in
+            rules.into_iter().chain(stage::rules(train, has_flow)).chain([stages])
+        {
             if !good {
                 let what = format!("{key} {problem}");
                 return Err(Error::request(what, key, "correct the recipe"));

@@ -267,6 +267,8 @@ impl Trainer {
     fn options(&self) -> (LossWeights, LoopOptions) {
         let LossConfig { form, prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
         let network = &self.recipe.network;
+        // Where nothing moves, there is nothing to learn of it.
+        let flow = if network.ablates(Part::Flow) { 0.0 } else { flow };
         let loop_options = LoopOptions {
             forward_model: !network.ablates(Part::ForwardModel),
             self_conditioning: !network.ablates(Part::SelfConditioning),

@@ -12,6 +12,8 @@ use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
 use qudi_layers::{DenseBlock, init_parameters};
 
+type Warp = fn(Tensor<4>, Tensor<4>) -> Tensor<4>;
+type Loss = fn(Tensor<4>, Tensor<4>) -> Tensor<1>;
 type Inputs<'a> = [(&'a str, &'a Tensor<4>)];
 
 /// Checks an output, and the gradients of inputs.
@@ -36,7 +38,7 @@ fn operations_match_pytorch() {
         let y = deform_conv(x.clone(), offset.clone(), mask.clone(), weight, bias);
         check(&case, y, &[("x", &x), ("offset", &offset), ("mask", &mask)]);
 
-        let warps: [(&str, fn(Tensor<4>, Tensor<4>) -> Tensor<4>, bool); 4] = [
+        let warps: [(&str, Warp, bool); 4] = [
             ("warp_zeros", warp_zeros, true),
             ("warp_border", warp, true),
             ("warp_masked", masked_warp, false),
@@ -46,7 +48,7 @@ fn operations_match_pytorch() {
             let (x, flow) = (input(name, "x"), input(name, "flow"));
             let inputs: &Inputs<'_> = &[("x", &x), ("flow", &flow)];
             let y = warp(x.clone(), flow.clone());
-            check(&file.case(name), y, &inputs[..1 + usize::from(moves)]);
+            check(&file.case(name), y, &inputs[..=usize::from(moves)]);
         }
 
         let (first, second) = (input("correlation", "first"), input("correlation", "second"));
@@ -68,7 +70,7 @@ fn operations_match_pytorch() {
         let x = input("bicubic", "x");
         check(&file.case("bicubic"), quarter(x.clone()), &[("x", &x)]);
 
-        let losses: [(&str, fn(Tensor<4>, Tensor<4>) -> Tensor<1>); 2] =
+        let losses: [(&str, Loss); 2] =
             [("gradient_loss", gradient_loss), ("charbonnier", charbonnier)];
         for (name, loss) in losses {
             let case = file.case(name);

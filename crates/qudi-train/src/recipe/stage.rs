@@ -75,16 +75,21 @@ impl Recipe {
     }
 }
 
-/// What a training must keep to about the parts that learn: key, whether it does, and what it must do.
-pub(super) fn rules(train: &TrainConfig) -> [(&'static str, bool, &'static str); 4] {
+/// What a training must keep to about the parts that learn, if the network `has_flow`: key, whether it does, and what it
+/// must do.
+pub(super) fn rules(
+    train: &TrainConfig,
+    has_flow: bool,
+) -> [(&'static str, bool, &'static str); 4] {
     let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
     let (loss, checkpointing) = (&train.loss, train.gradient_checkpointing);
     let alone = loss.prediction == 0.0 && loss.term == PerceptualKind::None;
     let taught = [LearningPart::Pre, LearningPart::Uncertainty, LearningPart::Flow];
+    let is_taught = |part: &LearningPart| has_flow || *part != LearningPart::Flow;
     [
         (
             "train.learns",
-            !alone || taught.into_iter().any(learns),
+            !alone || taught.into_iter().filter(is_taught).any(learns),
             "must name a part that the loss teaches: pre, uncertainty or flow where prediction has no weight",
         ),
         (
