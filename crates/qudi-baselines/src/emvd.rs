@@ -1,5 +1,5 @@
-//! EMVD: efficient multi-stage video denoising with recurrent spatio-temporal fusion (Maggioni et al., CVPR 2021), in the
-//! form in which it was compared with: frames as four equal channels, three levels of wavelets.
+//! EMVD: efficient multi-stage video denoising with recurrent spatio-temporal fusion (Maggioni et al., CVPR 2021),
+//! in the form in which it was compared with: frames as four equal channels, three levels of wavelets.
 
 mod transform;
 
@@ -166,8 +166,8 @@ impl Stage {
         }
     }
 
-    /// `before` and `now` are wavelets of this level, `[images, 16, h, w]`; `coarser` the weight and the denoised image
-    /// of the level below, the image on this level's grid.
+    /// `before` and `now` are wavelets of this level, `[images, 16, h, w]`; `coarser` the weight and the denoised
+    /// image of the level below, the image on this level's grid.
     fn forward(
         &self,
         before: &Tensor<4>,

@@ -1,5 +1,5 @@
-//! FloRNN: unidirectional video denoising by mimicking backward recurrent modules with look-ahead forward ones (Li et al.,
-//! ECCV 2022), in the form in which it was compared with: frames as three equal channels, no noise map.
+//! FloRNN: unidirectional video denoising by mimicking backward recurrent modules with look-ahead forward ones (Li
+//! et al., ECCV 2022), in the form in which it was compared with: frames as three equal channels, no noise map.
 
 mod pwcnet;
 mod splat;

@@ -52,7 +52,8 @@ fn buffers(case: &Case<'_>) -> Vec<(String, Vec<usize>)> {
     all.map(|(name, about)| (name.clone(), shape(about))).collect()
 }
 
-/// A parameter of the reference: flows of some tenths of a pixel to some pixels need larger weights, and smaller ones.
+/// A parameter of the reference: flows of some tenths of a pixel to some pixels need larger weights, and smaller
+/// ones.
 fn reference_parameter(name: &str, shape: &[usize]) -> Vec<f32> {
     if name.ends_with(".running_mean") || name.ends_with(".running_var") {
         let (offset, scale) = if name.ends_with("mean") { (0.0, 0.1) } else { (1.0, 0.5) };

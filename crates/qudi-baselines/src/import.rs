@@ -11,11 +11,14 @@ use burn::module::Module;
 use burn::tensor::Device;
 use qudi_core::{Error, Result};
 use qudi_layers::{StateDict, init_parameters, parameter_shapes};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Most channels, blocks or frames that a file may ask for.
 const MOST: usize = 4096;
+
+/// Keys of a kind that a message lists.
+const SHOWN: usize = 20;
 
 /// A learned method.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -116,15 +119,16 @@ impl Method {
     }
 }
 
-/// What the file at `path` holds; none if it is no file of a learned method.
+/// What the file at `path` holds; none if it is no file of a learned method. `device` is for networks without
+/// weights.
 ///
 /// # Errors
 /// [`Error`] if it cannot be read, or its network lacks parameters or has too many.
-pub fn describe(path: &Path) -> Result<Option<Contents>> {
+pub fn describe(path: &Path, device: &Device) -> Result<Option<Contents>> {
     let file = StateDict::open(path)?;
     let Some(method) = Method::of(&file) else { return Ok(None) };
     let sizes = Sizes::of(&file, method)?;
-    let parameters = sizes.count(&file)?;
+    let parameters = sizes.count(&file, device)?;
     Ok(Some(Contents { method, sizes: sizes.to_string(), parameters }))
 }
 
@@ -180,7 +184,7 @@ impl Sizes {
             };
             names.iter().filter_map(number).max().map_or(0, |most| most.min(MOST) + 1)
         };
-        Ok(match method {
+        let sizes = match method {
             Method::Quiver => {
                 let features = side("predenoise.sfe1.weight", 0)?;
                 let frames = side("spatial_att.conv.weight", 0)? / (4 * features).max(1);
@@ -227,7 +231,34 @@ impl Sizes {
                     kernel: (side("kernels.weight", 0)? / frames).isqrt(),
                 })
             }
-        })
+        };
+        sizes.checked(file)
+    }
+
+    /// Refuses sizes that a network cannot have.
+    fn checked(self, file: &StateDict) -> Result<Self> {
+        let problem = match self {
+            Self::Quiver(s) if !s.features.is_multiple_of(16) || s.blocks < 2 => {
+                "QUIVER has features in multiples of 16, and two blocks or more"
+            }
+            Self::Quiver(s) if s.past == 0 || s.future == 0 => {
+                "QUIVER sees frames before and after the one that it restores"
+            }
+            Self::FloRnn(s) if s.channels != 3 => "FloRNN has images of three channels",
+            Self::Spk2ImgNet(s) if s.groups == 0 || !s.features.is_multiple_of(s.groups) => {
+                "groups of Spk2ImgNet divide its features"
+            }
+            Self::MemDeblur(s) if !s.features.is_multiple_of(8) || s.bottlenecks == 0 => {
+                "MemDeblur has features in multiples of 8, and a bottleneck or more"
+            }
+            Self::Rvrt(s) if !s.features.is_multiple_of(12) || ![1, 3].contains(&s.channels) => {
+                "RVRT has features in multiples of 12, and images of one or three channels"
+            }
+            Self::StudentTeacher(s) if s.kernel.is_multiple_of(2) => "kernels have odd sides",
+            _ => return Ok(self),
+        };
+        let help = "this network cannot be of these sizes: name another file";
+        Err(Error::data(format!("{problem}; the file has {self}"), file.path(), help))
     }
 
     fn load(self, file: &StateDict, device: &Device) -> Result<Network> {
@@ -265,25 +296,20 @@ impl Sizes {
     }
 
     /// The number of parameters, after all keys have been compared.
-    fn count(self, file: &StateDict) -> Result<usize> {
-        let device = Device::flex();
+    fn count(self, file: &StateDict, device: &Device) -> Result<usize> {
         match self {
-            Self::Quiver(sizes) => {
-                count(&Quiver::zeros(sizes, &device), file, Quiver::authors_name)
-            }
-            Self::Emvd(width) => count(&Emvd::zeros(width, &device), file, str::to_owned),
-            Self::FloRnn(sizes) => {
-                count(&FloRnn::zeros(sizes, &device), file, FloRnn::authors_name)
-            }
+            Self::Quiver(sizes) => count(&Quiver::zeros(sizes, device), file, Quiver::authors_name),
+            Self::Emvd(width) => count(&Emvd::zeros(width, device), file, str::to_owned),
+            Self::FloRnn(sizes) => count(&FloRnn::zeros(sizes, device), file, FloRnn::authors_name),
             Self::Spk2ImgNet(sizes) => {
-                count(&Spk2ImgNet::zeros(sizes, &device), file, Spk2ImgNet::authors_name)
+                count(&Spk2ImgNet::zeros(sizes, device), file, Spk2ImgNet::authors_name)
             }
             Self::MemDeblur(sizes) => {
-                count(&MemDeblur::zeros(sizes, &device), file, MemDeblur::authors_name)
+                count(&MemDeblur::zeros(sizes, device), file, MemDeblur::authors_name)
             }
-            Self::Rvrt(sizes) => count(&Rvrt::zeros(sizes, &device), file, Rvrt::authors_name),
+            Self::Rvrt(sizes) => count(&Rvrt::zeros(sizes, device), file, Rvrt::authors_name),
             Self::StudentTeacher(sizes) => {
-                count(&KernelPrediction::zeros(sizes, &device), file, KernelPrediction::file_name)
+                count(&KernelPrediction::zeros(sizes, device), file, KernelPrediction::file_name)
             }
         }
     }
@@ -334,7 +360,7 @@ fn compared<M: Module>(
     file: &StateDict,
     name: fn(&str) -> String,
 ) -> Result<BTreeMap<String, (String, Vec<usize>)>> {
-    let (mut missing, mut different) = (Vec::new(), Vec::new());
+    let (mut missing, mut different, mut odd) = (Vec::new(), Vec::new(), Vec::new());
     let mut names = BTreeMap::new();
     for (ours, shape) in parameter_shapes(network) {
         let theirs = name(&ours);
@@ -342,28 +368,33 @@ fn compared<M: Module>(
             None => missing.push(theirs),
             Some(found) if squeezed(&found) != shape => {
                 different.push(format!("{theirs} is {found:?} instead of {shape:?}"));
+                odd.push(theirs);
             }
             Some(found) => {
                 names.insert(ours, (theirs, found));
             }
         }
     }
-    let known: std::collections::BTreeSet<&String> =
-        names.values().map(|(theirs, _)| theirs).collect();
+    let theirs = |list: &[String], name: &str| list.iter().any(|other| other == name);
+    let known: BTreeSet<&String> = names.values().map(|(theirs, _)| theirs).collect();
+    let of_another_shape: BTreeSet<&String> = odd.iter().collect();
     let surplus: Vec<String> = file
         .names()
         .into_iter()
-        .filter(|name| !known.contains(name) && !is_beside(name))
-        .filter(|name| {
-            !missing.contains(name) && !different.iter().any(|d| d.starts_with(name.as_str()))
-        })
+        .filter(|name| !known.contains(name) && !of_another_shape.contains(name))
+        .filter(|name| !is_beside(name) && !theirs(&missing, name))
         .collect();
     if missing.is_empty() && different.is_empty() && surplus.is_empty() {
         return Ok(names);
     }
     let lists = [("missing", missing), ("surplus", surplus), ("of another shape", different)];
     let told = lists.into_iter().filter(|(_, list)| !list.is_empty());
-    let told = told.map(|(what, list)| format!("{} {what}: {}", list.len(), list.join(", ")));
+    let shown = |list: &[String]| {
+        let more = list.len().saturating_sub(SHOWN);
+        let first = list[..list.len() - more].join(", ");
+        if more > 0 { format!("{first} and {more} more") } else { first }
+    };
+    let told = told.map(|(what, list)| format!("{} {what}: {}", list.len(), shown(&list)));
     let what = format!("keys do not fit the network; {}", told.collect::<Vec<_>>().join("; "));
     Err(Error::data(what, file.path(), "name a file of this network, whole and unchanged"))
 }
@@ -387,6 +418,13 @@ fn count<M: Module>(network: &M, file: &StateDict, name: fn(&str) -> String) -> 
 /// The network with the values of a file.
 fn filled<M: Module>(network: M, file: &StateDict, name: fn(&str) -> String) -> Result<M> {
     let names = compared(&network, file, name)?;
+    // A view of one number may claim any shape: values take no more than the file has.
+    let claimed: u64 =
+        names.values().map(|(_, shape)| 2 * shape.iter().product::<usize>() as u64).sum();
+    if claimed > file.length() {
+        let what = format!("tensors of {claimed} bytes or more in a file of {}", file.length());
+        return Err(Error::data(what, file.path(), "name a file that holds all its values"));
+    }
     let mut values = BTreeMap::new();
     for (ours, (theirs, shape)) in &names {
         values.insert(ours.clone(), file.read(theirs, shape)?);

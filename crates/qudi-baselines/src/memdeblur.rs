@@ -1,5 +1,5 @@
-//! MemDeblur: multi-scale memory-based video deblurring (Ji and Yao, CVPR 2022), in the form in which it was compared with:
-//! frames as three equal channels.
+//! MemDeblur: multi-scale memory-based video deblurring (Ji and Yao, CVPR 2022), in the form in which it was
+//! compared with: frames as three equal channels.
 
 mod bank;
 mod blocks;
@@ -187,8 +187,8 @@ impl MemDeblur {
         encoder::authors_name(&Residuals::authors_name(&name))
     }
 
-    /// Restores every frame of bursts at a quarter, at half and at the full size: `[bursts * frames, channels, h, w]` with
-    /// sides rounded up to multiples of 4.
+    /// Restores every frame of bursts at a quarter, at half and at the full size: `[bursts * frames, channels, h,
+    /// w]` with sides rounded up to multiples of 4.
     ///
     /// # Shapes
     /// - x: `[bursts * frames, channels, height, width]`, sides multiples of 4

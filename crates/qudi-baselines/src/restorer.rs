@@ -10,14 +10,15 @@ use qudi_core::{Error, Frame, Result, Size};
 use std::collections::VecDeque;
 use std::path::Path;
 
-/// Frames of a window.
+/// Frames of a window, and of one of EMVD, whose recurrence starts anew with every window.
 const WINDOW: usize = 11;
+const LONG_WINDOW: usize = 64;
 
 /// Frames before the first one that EMVD goes on from: its protocol scores the last of eleven.
 const HISTORY: usize = 10;
 
-/// A learned method with weights, as its authors used it: counts over full scale in, images out. They learnt the brightness
-/// of their own light; the image is not scaled to that of this acquisition.
+/// A learned method with weights, as its authors used it: counts over full scale in, images out. They learnt the
+/// brightness of their own light; the image is not scaled to that of this acquisition.
 #[derive(Debug)]
 pub struct LearnedRestorer {
     method: Method,
@@ -149,7 +150,7 @@ impl Restorer for LearnedRestorer {
     }
 
     fn window(&self) -> usize {
-        WINDOW
+        if self.method == Method::Emvd { LONG_WINDOW } else { WINDOW }
     }
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {

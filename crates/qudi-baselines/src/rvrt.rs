@@ -1,5 +1,5 @@
-//! RVRT: recurrent video restoration transformer with guided deformable attention (Liang et al., NeurIPS 2022), in the size
-//! in which it was compared with.
+//! RVRT: recurrent video restoration transformer with guided deformable attention (Liang et al., NeurIPS 2022), in
+//! the size in which it was compared with.
 
 mod guided;
 mod swin;
@@ -67,8 +67,8 @@ struct Extractor {
     stage: Stage,
 }
 
-/// The flows of two frames to two others, each `[bursts * 2, 2, h, w]`: to the frame of the same place in the clip before, and
-/// to the other one.
+/// The flows of two frames to two others, each `[bursts * 2, 2, h, w]`: to the frame of the same place in the clip
+/// before, and to the other one.
 type Pair = [Tensor<4>; 2];
 
 impl Rvrt {

@@ -1,5 +1,5 @@
-//! Spk2ImgNet: learning to reconstruct dynamic scenes from continuous spike streams (Zhao et al., CVPR 2021), in the size in
-//! which it was compared with: ten frames in five blocks of two.
+//! Spk2ImgNet: learning to reconstruct dynamic scenes from continuous spike streams (Zhao et al., CVPR 2021), in
+//! the size in which it was compared with: ten frames in five blocks of two.
 
 mod align;
 mod extractor;

@@ -1,9 +1,9 @@
 //! A student and two teachers, after "Dynamic low-light imaging with quanta image sensors" (Chi et al., ECCV 2020).
 //!
-//! The authors' program and sizes are not public. This is a network in their spirit: features, and a U-Net that predicts a
-//! kernel for every pixel of every frame (Mildenhall et al., "Burst denoising with kernel prediction networks", CVPR
-//! 2018). The student learns from noisy bursts of moving scenes, and resembles two teachers: one of motion without
-//! noise, one of noise without motion.
+//! The authors' program and sizes are not public. This is a network in their spirit: features, and a U-Net that
+//! predicts a kernel for every pixel of every frame (Mildenhall et al., "Burst denoising with kernel prediction
+//! networks", CVPR 2018). The student learns from noisy bursts of moving scenes, and resembles two teachers: one of
+//! motion without noise, one of noise without motion.
 
 use crate::parts::renamed;
 use burn::module::Module;
@@ -146,8 +146,8 @@ fn filtered(burst: Tensor<4>, kernels: Tensor<4>, side: usize) -> Tensor<4> {
     (1..side * side).fold(tap(0), |sum, k| sum + tap(k))
 }
 
-/// The loss of a teacher at a step, from 0: the mean squared error of the image, and less and less that of every filtered
-/// frame.
+/// The loss of a teacher at a step, from 0: the mean squared error of the image, and less and less that of every
+/// filtered frame.
 pub fn reconstruction_loss(restored: &Restored, truth: &Tensor<4>, step: u64) -> Tensor<1> {
     let error = |images: &Tensor<4>| (images.clone() - truth.clone()).powi_scalar(2).mean();
     let weight = AUXILIARY * DECAY.powi(i32::try_from(step).unwrap_or(i32::MAX));

@@ -44,27 +44,27 @@ fn files_are_read_as_they_are_found() {
     let network = init_parameters(Emvd::zeros(4, &device), parameter);
     let expected = image(&network);
     for (name, most) in [("wrapped", 0.0), ("module", 0.0), ("turned", 0.0), ("half", 0.01)] {
-        let path = golden(&format!("learned/{name}.pth"));
+        let path = golden(&format!("learned/files/{name}.pth"));
         let Network::Emvd(loaded) = load(&path, Method::Emvd, &device).unwrap() else {
             panic!("{name}: another network");
         };
         for (value, expected) in image(&loaded).into_iter().zip(&expected) {
             assert!((value - expected).abs() <= most, "{name}: {value} for {expected}");
         }
-        let contents = describe(&path).unwrap().unwrap();
+        let contents = describe(&path, &Device::flex()).unwrap().unwrap();
         assert_eq!((contents.method, contents.sizes.as_str()), (Method::Emvd, "4 channels"));
         let shapes = parameter_shapes(&network).into_iter();
         let count: usize = shapes.map(|(_, shape)| shape.iter().product::<usize>()).sum();
         assert_eq!(contents.parameters, count);
     }
-    let other = load(&golden("learned/wrapped.pth"), Method::Rvrt, &device).unwrap_err();
+    let other = load(&golden("learned/files/wrapped.pth"), Method::Rvrt, &device).unwrap_err();
     assert!(other.to_string().contains("weights of emvd, not of rvrt"), "{other}");
 }
 
 #[test]
 fn code_in_a_file_is_not_run() {
     let path = golden("perceptual/code.pth");
-    assert!(describe(&path).map_or(true, |contents| contents.is_none()));
+    assert!(describe(&path, &Device::flex()).map_or(true, |contents| contents.is_none()));
     assert!(load(&path, Method::Emvd, &Device::flex()).is_err());
 }
 
@@ -74,7 +74,7 @@ fn damaged_files_are_refused_without_panic() {
     let path = folder.path().join("w.pth");
     let mut refused = 0;
     for name in ["wrapped", "turned"] {
-        let whole = std::fs::read(golden(&format!("learned/{name}.pth"))).unwrap();
+        let whole = std::fs::read(golden(&format!("learned/files/{name}.pth"))).unwrap();
         for n in 0..150 {
             let mut bytes = whole.clone();
             if n % 3 == 0 {
@@ -86,7 +86,7 @@ fn damaged_files_are_refused_without_panic() {
             }
             std::fs::write(&path, &bytes).unwrap();
             refused += usize::from(load(&path, Method::Emvd, &Device::flex()).is_err());
-            let _ = describe(&path);
+            let _ = describe(&path, &Device::flex());
         }
     }
     assert!(refused > 100, "{refused}");
@@ -185,7 +185,7 @@ fn every_method_restores_every_frame() {
     let acquisition = Acquisition::new(Sensor::load("qudi-paper").unwrap(), 3.25, 0.45).unwrap();
     for method in METHODS {
         save(&path, &smallest(method));
-        assert_eq!(describe(&path).unwrap().unwrap().method, method);
+        assert_eq!(describe(&path, &Device::flex()).unwrap().unwrap().method, method);
         let mut restorer = LearnedRestorer::load(&path, method, &Device::flex()).unwrap();
         let mut results = Vec::new();
         for count in [1, 13] {

@@ -97,6 +97,7 @@ pub(crate) fn usual_method(
     capture: &Capture,
     acquisition: &Acquisition,
 ) -> Result<UsualMethod> {
+    options.check_weights(&[])?;
     let long_enough = capture.length().is_none_or(|frames| frames >= MIN_FRAMES as u64);
     let other = |name, reason| Ok(UsualMethod { name, reason: Some(reason) });
     if options.result_flag.is_some() {

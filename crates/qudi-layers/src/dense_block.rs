@@ -29,7 +29,7 @@ impl DenseBlock {
     /// What the layers add to `x`, and `x`.
     ///
     /// # Shapes
-    /// - x, result: `[images, width, height, width]`
+    /// - x, result: `[images, channels, height, width]`
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
         self.through(x, Conv2d::relu)
     }
@@ -37,7 +37,7 @@ impl DenseBlock {
     /// The same with GELU after each layer in place of ReLU.
     ///
     /// # Shapes
-    /// - x, result: `[images, width, height, width]`
+    /// - x, result: `[images, channels, height, width]`
     pub fn forward_gelu(&self, x: Tensor<4>) -> Tensor<4> {
         self.through(x, |layer, parts| gelu(layer.linear(parts)))
     }

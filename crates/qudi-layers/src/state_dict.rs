@@ -3,18 +3,23 @@
 //! Files come from elsewhere. The reader executes nothing, bounds what it builds, and reads a tensor's bytes
 //! only after its type and shape are known to be those of the network.
 //!
-//! The tensors of a checkpoint that holds more than them lie below `state_dict.`, and names of networks that several
-//! devices trained begin with `module.`; neither belongs to the names here.
+//! The tensors of a checkpoint that holds more than them lie below `state_dict.`, `params.` or `model.`, and
+//! names of networks that several devices trained begin with `module.`; none of these belongs to the names here.
 
 use burn::tensor::{bf16, f16};
 use pytorch_reader::{DType, PytorchReader};
 use qudi_core::regular_file::read_limited;
 use qudi_core::{Error, Result};
 use safetensors::tensor::{Dtype, SafeTensors};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Longest SafeTensors file: the largest network, QUIVER with 64 features, has 630 MB.
 const LONGEST: u64 = 1 << 30;
+
+/// What may stand before the names in a checkpoint.
+const PREFIXES: [&str; 6] =
+    ["state_dict.module.", "state_dict.", "module.", "params_ema.", "params.", "model."];
 
 /// An open file of weights.
 pub struct StateDict {
@@ -22,6 +27,10 @@ pub struct StateDict {
     reader: Reader,
     /// What stands before the names.
     prefix: &'static str,
+    /// Shapes by name.
+    shapes: BTreeMap<String, Vec<usize>>,
+    /// Bytes of the file.
+    length: u64,
 }
 
 enum Reader {
@@ -41,25 +50,41 @@ impl StateDict {
                 let help = "convert the weights again, or copy the whole file";
                 Error::data(format!("not a whole SafeTensors file: {e}"), path, help)
             })?;
-            return Ok(Self::new(path, Reader::SafeTensors(bytes)));
+            let length = bytes.len() as u64;
+            return Ok(Self::new(path, Reader::SafeTensors(bytes), length));
         }
         // The reader names no file where one is missing.
-        std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
+        let about = std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
         let reader = PytorchReader::new(path).map_err(|e| {
             let help =
                 "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
             Error::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
-        Ok(Self::new(path, Reader::Pytorch(reader)))
+        Ok(Self::new(path, Reader::Pytorch(reader), about.len()))
     }
 
-    fn new(path: &Path, reader: Reader) -> Self {
-        let mut file = Self { path: path.to_owned(), reader, prefix: "" };
-        let names = file.all_names();
-        let prefixes = ["state_dict.module.", "state_dict.", "module."];
-        let is_there = |prefix: &&str| names.iter().any(|name| name.starts_with(*prefix));
-        file.prefix = prefixes.into_iter().find(is_there).unwrap_or("");
-        file
+    fn new(path: &Path, reader: Reader, length: u64) -> Self {
+        let all: BTreeMap<String, Vec<usize>> = match &reader {
+            Reader::Pytorch(reader) => {
+                let tensors = reader.tensors().iter();
+                tensors.map(|(name, tensor)| (name.clone(), tensor.shape().to_vec())).collect()
+            }
+            Reader::SafeTensors(bytes) => match SafeTensors::deserialize(bytes) {
+                Ok(tensors) => tensors
+                    .tensors()
+                    .into_iter()
+                    .map(|(name, tensor)| (name, tensor.shape().to_vec()))
+                    .collect(),
+                Err(_) => BTreeMap::new(),
+            },
+        };
+        let is_there = |prefix: &&str| all.keys().any(|name| name.starts_with(*prefix));
+        let prefix = PREFIXES.into_iter().find(is_there).unwrap_or("");
+        let own = all
+            .into_iter()
+            .filter_map(|(name, shape)| Some((name.strip_prefix(prefix)?.to_owned(), shape)));
+        let shapes = own.collect();
+        Self { path: path.to_owned(), reader, prefix, shapes, length }
     }
 
     /// Where the file is.
@@ -67,35 +92,19 @@ impl StateDict {
         &self.path
     }
 
-    /// The names of all tensors, sorted.
-    pub fn names(&self) -> Vec<String> {
-        let names = self.all_names().into_iter();
-        let own = names.filter_map(|name| name.strip_prefix(self.prefix).map(str::to_owned));
-        let mut own: Vec<String> = own.collect();
-        own.sort();
-        own
+    /// Bytes of the file.
+    pub fn length(&self) -> u64 {
+        self.length
     }
 
-    fn all_names(&self) -> Vec<String> {
-        match &self.reader {
-            Reader::Pytorch(reader) => reader.keys(),
-            Reader::SafeTensors(bytes) => match SafeTensors::deserialize(bytes) {
-                Ok(tensors) => tensors.names().into_iter().map(ToString::to_string).collect(),
-                Err(_) => Vec::new(),
-            },
-        }
+    /// The names of all tensors, sorted.
+    pub fn names(&self) -> Vec<String> {
+        self.shapes.keys().cloned().collect()
     }
 
     /// The shape of a tensor, if there is one of this name.
     pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
-        let name = format!("{}{name}", self.prefix);
-        match &self.reader {
-            Reader::Pytorch(reader) => reader.get(&name).map(|tensor| tensor.shape().to_vec()),
-            Reader::SafeTensors(bytes) => {
-                let tensors = SafeTensors::deserialize(bytes).ok()?;
-                tensors.tensor(&name).ok().map(|tensor| tensor.shape().to_vec())
-            }
-        }
+        self.shapes.get(name).cloned()
     }
 
     /// The values of one tensor, row-major.
@@ -114,7 +123,9 @@ impl StateDict {
                 return Err(wrong(format!("`{name}` is {found:?}, expected {shape:?}")));
             }
             floats.ok_or_else(|| {
-                wrong(format!("`{name}` has numbers of type {kind:?}, expected floats"))
+                wrong(format!(
+                    "`{name}` has numbers of type {kind:?}, expected floats of 32 or 16 bits"
+                ))
             })
         };
         let (bytes, floats) = match &self.reader {

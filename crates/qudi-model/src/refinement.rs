@@ -94,8 +94,8 @@ pub(crate) struct PredenoisedFrames {
     pub(crate) noise_sigmas: Vec<Frame>,
 }
 
-/// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and its uncertainty if
-/// predicted.
+/// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and its
+/// uncertainty if predicted.
 pub(crate) fn predenoise_frames(
     stage: &'static str,
     burst: &AlignedBurst<'_>,

@@ -48,8 +48,8 @@ pub enum LossForm {
     Edm,
 }
 
-/// The form of the loss, and the weight of each term. That of the predicted uncertainty is 1, for nothing else learns from
-/// it.
+/// The form of the loss, and the weight of each term. That of the predicted uncertainty is 1, for nothing else
+/// learns from it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossWeights {
     /// How the errors of images count.

@@ -229,8 +229,8 @@ fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
     with_gradients(output, &[x])
 }
 
-/// A network of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the loss's gradient for the
-/// noisy image.
+/// A network of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the
+/// loss's gradient for the noisy image.
 fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
     let mut config = NetworkConfig::preset("tiny")?;

@@ -3,8 +3,8 @@
 
 use burn::tensor::{IndexingUpdateOp, Tensor};
 
-/// Every pixel spread over the four around `(column + flow_x, row + flow_y)`, and averages of what arrives; zero where
-/// nothing does. The flow has no gradient.
+/// Every pixel spread over the four around `(column + flow_x, row + flow_y)`, and averages of what arrives; zero
+/// where nothing does. The flow has no gradient.
 ///
 /// # Shapes
 /// - x, result: `[images, channels, height, width]`

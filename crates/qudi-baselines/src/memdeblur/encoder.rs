@@ -1,5 +1,5 @@
-//! Keys and values of frames, and what is read from memory: the beginning of ResNet-50 (He et al., CVPR 2016) after residual
-//! blocks.
+//! Keys and values of frames, and what is read from memory: the beginning of ResNet-50 (He et al., CVPR 2016) after
+//! residual blocks.
 
 use super::Sizes;
 use super::blocks::Residuals;

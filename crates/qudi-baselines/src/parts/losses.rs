@@ -7,7 +7,8 @@ pub fn charbonnier<const D: usize>(x: Tensor<D>, truth: Tensor<D>) -> Tensor<1> 
     ((x - truth).powi_scalar(2) + 1e-6).sqrt().mean()
 }
 
-/// The mean absolute error, and half of that of the derivatives by Sobel along rows and columns, borders left out, `[1]`.
+/// The mean absolute error, and half of that of the derivatives by Sobel along rows and columns, borders left out,
+/// `[1]`.
 ///
 /// # Shapes
 /// - x, truth: `[images, 1, height, width]`

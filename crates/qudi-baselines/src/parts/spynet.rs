@@ -27,7 +27,8 @@ pub struct SpyNet {
 }
 
 impl SpyNet {
-    /// The network, all weights zero. Every channel of the images inside is the image less a mean, over a standard deviation.
+    /// The network, all weights zero. Every channel of the images inside is the image less a mean, over a standard
+    /// deviation.
     pub fn zeros(
         levels: usize,
         widths: [usize; 4],
@@ -59,8 +60,8 @@ impl SpyNet {
         parts.join(".")
     }
 
-    /// The flow from `reference` to `supporting` at the size of the images over each of `scales`, powers of two from 1 on:
-    /// `warp(supporting, flow)` resembles `reference`.
+    /// The flow from `reference` to `supporting` at the size of the images over each of `scales`, powers of two
+    /// from 1 on: `warp(supporting, flow)` resembles `reference`.
     ///
     /// # Shapes
     /// - reference, supporting: `[images, 1, height, width]`

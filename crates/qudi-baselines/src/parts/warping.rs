@@ -4,8 +4,8 @@ use burn::tensor::Tensor;
 use burn::tensor::ops::PadMode;
 use qudi_kernels::warp;
 
-/// What `x` looks like at `(column + flow_x, row + flow_y)`: bilinear, zero outside (`grid_sample` with `align_corners`
-/// and padding of zeros).
+/// What `x` looks like at `(column + flow_x, row + flow_y)`: bilinear, zero outside (`grid_sample` with
+/// `align_corners` and padding of zeros).
 ///
 /// # Shapes
 /// - x, result: `[images, channels, height, width]`

@@ -76,8 +76,8 @@ impl GuidedAttention {
     }
 }
 
-/// Every pixel attends to what the taps see in both frames of the clip before: first in that of the same place, then in the
-/// other.
+/// Every pixel attends to what the taps see in both frames of the clip before: first in that of the same place,
+/// then in the other.
 fn attend(q: Tensor<4>, kv: &Tensor<4>, offsets: &Pair) -> Tensor<4> {
     let [images, channels, height, width] = q.dims();
     let (size, pixels) = (channels / HEADS, height * width);

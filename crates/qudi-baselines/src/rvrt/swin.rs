@@ -98,6 +98,8 @@ impl Stage {
         name.to_owned()
     }
 
+    /// Features of frames that attend to each other in windows.
+    ///
     /// # Shapes
     /// - x: `[bursts * frames, inputs, height, width]`
     /// - result: `[bursts * frames, width, height, width]`

@@ -61,8 +61,8 @@ impl Windows {
         x.narrow(2, 0, self.size[1]).narrow(3, 0, self.size[2])
     }
 
-    /// From `[bursts * frames, channels, height, width]` to `[windows, channels, cells]`: cells frame by frame, row by
-    /// row.
+    /// From `[bursts * frames, channels, height, width]` to `[windows, channels, cells]`: cells frame by frame, row
+    /// by row.
     pub(super) fn split(&self, x: Tensor<4>) -> Tensor<3> {
         let [images, channels, height, width] = x.dims();
         let [frames, wh, ww] = self.window;
@@ -125,8 +125,8 @@ impl Windows {
         (scores + mask).reshape([count, heads, cells, cells])
     }
 
-    /// For every pair of cells, the row of the table of biases, `[cells * cells]`. Smaller windows take the rows of the
-    /// first cells of the full one, whatever these stand for: as in the authors' program.
+    /// For every pair of cells, the row of the table of biases, `[cells * cells]`. Smaller windows take the rows of
+    /// the first cells of the full one, whatever these stand for: as in the authors' program.
     pub(super) fn offsets(&self, device: &Device) -> Tensor<1, Int> {
         let span = (2 * SIDE - 1) as i64;
         let place = |cell: usize| {

@@ -1,5 +1,5 @@
-//! Alignment of features by deformable convolutions on three levels, each refining the one below (Wang et al., "EDVR",
-//! CVPR workshops 2019).
+//! Alignment of features by deformable convolutions on three levels, each refining the one below (Wang et al.,
+//! "EDVR", CVPR workshops 2019).
 
 use super::conv;
 use crate::parts::{deform_conv, renamed};

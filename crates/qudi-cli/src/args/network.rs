@@ -4,7 +4,7 @@ use super::number;
 use crate::methods::options::NetworkOptions;
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
-use qudi_baselines::import::Method;
+use qudi_baselines::import::{METHODS, Method};
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
@@ -15,8 +15,8 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, Default, ClapArgs)]
 #[command(next_help_heading = "Network (method qudi)")]
 pub(crate) struct Network {
-    /// Weights that `qudi train` wrote [default: those that come along]; for learned methods of others METHOD=FILE, as in
-    /// emvd=emvd.pth,quiver=quiver.pth
+    /// Weights that `qudi train` wrote [default: those that come along]; for learned methods of others
+    /// METHOD=FILE, as in emvd=emvd.pth,quiver=quiver.pth (no commas in names)
     #[arg(long, value_name = "[METHOD=]FILE,...", value_delimiter = ',', value_hint = ValueHint::FilePath)]
     weights: Vec<WeightsOf>,
     /// Spacing of the timesteps of these steps [default: what the weights say of themselves, usually
@@ -61,6 +61,7 @@ impl Network {
         };
         NetworkOptions {
             weights: Weights::of(self.own_weights()),
+            own_files: self.weights.iter().filter(|weights| weights.method.is_none()).count(),
             learned: self
                 .weights
                 .iter()
@@ -103,7 +104,13 @@ impl std::str::FromStr for WeightsOf {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let method = text.split_once('=').and_then(|(name, _)| Method::by_name(name));
+        let name = text.split_once('=').map(|(name, _)| name);
+        let method = name.and_then(Method::by_name);
+        let is_name = |name: &str| name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-');
+        if method.is_none() && name.is_some_and(is_name) && !Path::new(text).exists() {
+            let all = METHODS.map(Method::name).join(", ");
+            return Err(format!("no learned method has this name; there are {all}"));
+        }
         let file = match method {
             Some(method) => &text[method.name().len() + 1..],
             None => text,

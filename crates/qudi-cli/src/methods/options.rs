@@ -17,6 +17,8 @@ const METHOD: &str = "qudi";
 pub(crate) struct NetworkOptions {
     /// The weights.
     pub(crate) weights: Weights,
+    /// How many files of weights are named for this network.
+    pub(crate) own_files: usize,
     /// Files of weights of the learned methods of others.
     pub(crate) learned: Vec<(Method, PathBuf)>,
     /// Reverse steps; none for those that the weights were made for.
@@ -104,13 +106,7 @@ impl NetworkOptions {
         mut methods: impl Iterator<Item = &'a str>,
     ) -> Result<()> {
         let methods: Vec<&str> = methods.by_ref().collect();
-        if let Some((unused, _)) =
-            self.learned.iter().find(|(method, _)| !methods.contains(&method.name()))
-        {
-            let what = format!("weights of `{}`, which is not asked for", unused.name());
-            let help = format!("leave them out, or use --method {}", unused.name());
-            return Err(CliError::new(what, "--weights", help));
-        }
+        self.check_weights(&methods)?;
         let is_own = methods.contains(&METHOD);
         let is_learned = |method: &&str| Method::by_name(method).is_some();
         match (self.result_flag, self.device_flag) {
@@ -120,6 +116,27 @@ impl NetworkOptions {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Refuses weights of learned methods that are not among `methods`, and two files for one of them.
+    pub(crate) fn check_weights(&self, methods: &[&str]) -> Result<()> {
+        if self.own_files > 1 {
+            let help = "name one, or METHOD=FILE for those of other methods";
+            return Err(CliError::new("several files of weights for `qudi`", "--weights", help));
+        }
+        for (number, (method, _)) in self.learned.iter().enumerate() {
+            let name = method.name();
+            if self.learned[..number].iter().any(|(other, _)| other == method) {
+                let what = format!("two files of weights for `{name}`");
+                return Err(CliError::new(what, "--weights", "name one for each method"));
+            }
+            if !methods.contains(&name) {
+                let what = format!("weights of `{name}`, which is not asked for");
+                let help = format!("leave them out, or use --method {name}");
+                return Err(CliError::new(what, "--weights", help));
+            }
+        }
+        Ok(())
     }
 
     /// The file of a learned method's weights.

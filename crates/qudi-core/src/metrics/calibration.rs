@@ -15,8 +15,8 @@ pub struct Calibration {
     pub textured: f64,
 }
 
-/// How well `sigma` predicts the errors of an image. `None` for frames of different sizes or of fewer than four squares,
-/// or where sigma is zero.
+/// How well `sigma` predicts the errors of an image. `None` for frames of different sizes or of fewer than four
+/// squares, or where sigma is zero.
 pub fn calibration(image: &Frame, sigma: &Frame, truth: &Frame) -> Option<Calibration> {
     if image.size != truth.size || sigma.size != truth.size {
         return None;

@@ -14,8 +14,8 @@ pub struct Detail {
     pub textured: f64,
 }
 
-/// The detail of an image beside that of the truth. `None` for frames of different sizes, with fewer than four squares of
-/// 16 x 16 pixels, or where the truth is constant in a quarter of them.
+/// The detail of an image beside that of the truth. `None` for frames of different sizes, with fewer than four
+/// squares of 16 x 16 pixels, or where the truth is constant in a quarter of them.
 pub fn detail(estimate: &Frame, truth: &Frame) -> Option<Detail> {
     if estimate.size != truth.size {
         return None;
@@ -28,8 +28,8 @@ pub fn detail(estimate: &Frame, truth: &Frame) -> Option<Detail> {
     Some(Detail { flat: flat?, textured: textured? })
 }
 
-/// The upper left corners of the squares of 16 x 16 pixels in which there is least, and of those in which there is most: a
-/// quarter of all each. `None` of fewer than four squares.
+/// The upper left corners of the squares of 16 x 16 pixels in which there is least, and of those in which there is
+/// most: a quarter of all each. `None` of fewer than four squares.
 pub(super) fn quarters(truth: &Frame) -> Option<[Vec<[usize; 2]>; 2]> {
     let mut ranked: Vec<_> =
         squares(truth).into_iter().map(|square| (energy(truth, square), square)).collect();

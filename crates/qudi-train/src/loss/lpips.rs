@@ -214,7 +214,8 @@ fn unit(x: Tensor<4>) -> Tensor<4> {
 }
 
 /// Downloads the weights of a kind into `folder` with the `curl` program, and checks their hashes. Files that
-/// are there already are checked and kept; converted ones (docs/training.md) are enough. Gives the paths: none for [`PerceptualKind::None`].
+/// are there already are checked and kept; converted ones (docs/training.md) are enough. Gives the paths: none for
+/// [`PerceptualKind::None`].
 ///
 /// # Errors
 /// [`Error`] if curl is missing or fails, or a file is not the published one.

@@ -1,5 +1,5 @@
-//! Gradient checkpointing (Chen et al. 2016) of pre-denoiser and U-Net, whose activations take most of the memory: the
-//! forward pass keeps their results alone, and the backward pass computes them again, image by image.
+//! Gradient checkpointing (Chen et al. 2016) of pre-denoiser and U-Net, whose activations take most of the memory:
+//! the forward pass keeps their results alone, and the backward pass computes them again, image by image.
 
 use crate::parameters::gradients;
 use burn::module::Module;

@@ -75,8 +75,8 @@ impl Recipe {
     }
 }
 
-/// What a training must keep to about the parts that learn, if the network `has_flow`: key, whether it does, and what it
-/// must do.
+/// What a training must keep to about the parts that learn, if the network `has_flow`: key, whether it does, and
+/// what it must do.
 pub(super) fn rules(
     train: &TrainConfig,
     has_flow: bool,

@@ -57,6 +57,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         return Err(CliError::new("nothing to measure", "--rounds, --frames", help));
     }
     let options = args.network.options(args.steps.steps);
+    options.check_weights(&[])?;
     let device = device::open(&options.device)?;
     let (steps, sampling) = (options.steps()?, sample_options(&options, &device)?);
     let precision = sampling.precision;

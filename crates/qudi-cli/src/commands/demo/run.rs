@@ -92,6 +92,7 @@ pub(crate) fn run(
             how("a burst merged twice, the second time along better motion"),
         ),
     ];
+    demo.network.options(None).check_weights(&[])?;
     if demo.network.own_weights().is_some() || network::built_in_knows(&acquisition)? {
         let (restorer, how) =
             network::restorer(&demo.network.options(demo.steps.steps), &acquisition, SIZE)?;

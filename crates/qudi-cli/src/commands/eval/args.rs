@@ -27,7 +27,8 @@ pub(crate) struct Eval {
     /// Methods to compare
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
     pub(crate) method: Vec<String>,
-    /// Compare all methods of the paper's table 1 that need no weights or whose --weights are named, beside its figures
+    /// Compare all methods of the paper's table 1 that need no weights or whose --weights are named, beside its
+    /// figures
     #[arg(long, conflicts_with_all = ["method", "capture"])]
     pub(crate) table1: bool,
     /// Incident photons per pixel and frame [default: 3.25,9.75,26; of a capture: from its record, or
@@ -85,16 +86,16 @@ pub(crate) struct Eval {
     /// (docs/training.md says how to get them)
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, conflicts_with = "capture")]
     pub(crate) backbones: Option<PathBuf>,
-    /// Measure how frames look as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, detail beside the
-    /// truth's and errors beside their predicted uncertainty, in the flattest and the most textured quarter; and what
-    /// more --steps add, octave by octave, beside what is missing
+    /// Measure how frames look as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, detail beside
+    /// the truth's, in the flattest and the most textured quarter; under the strict protocol also errors
+    /// beside their predicted uncertainty, and what more --steps add, octave by octave, beside what is missing
     #[arg(long, conflicts_with = "capture")]
     pub(crate) appearance: bool,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,
-    /// Numbers of reverse diffusion steps of the method qudi, each evaluated for itself; 0 is a regression [default: what
-    /// the weights say of themselves]
+    /// Numbers of reverse diffusion steps of the method qudi, each evaluated for itself; 0 is a regression
+    /// [default: what the weights say of themselves]
     #[arg(long, value_name = "N,...", value_delimiter = ',', help_heading = "Network (method qudi)", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
     pub(crate) steps: Vec<usize>,
     #[command(flatten)]

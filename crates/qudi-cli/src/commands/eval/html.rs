@@ -147,8 +147,8 @@ fn quality(rows: &[Row]) -> Plot {
     }
 }
 
-/// How frames look against how close they are to the truth: the numbers of steps of a method as a curve, one for every
-/// light level (Blau and Michaeli 2018). None where looks were not measured.
+/// How frames look against how close they are to the truth: the numbers of steps of a method as a curve, one for
+/// every light level (Blau and Michaeli 2018). None where looks were not measured.
 fn perception(rows: &[Row]) -> Option<Plot> {
     let measures: [(&'static str, Figure); 3] = [
         ("LPIPS (VGG)", |f| f.lpips_vgg),

@@ -95,6 +95,14 @@ impl Plan {
         }
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
         network.check_methods(methods.iter().map(String::as_str))?;
+        let contenders = contenders(&methods, &network, &steps);
+        let mut own = contenders.iter().filter(|contender| contender.method == "qudi");
+        own.try_for_each(|contender| contender.network.check_steps())?;
+        if args.table1 && args.protocol == Protocol::Quiver {
+            let help = "leave one of them out";
+            let what = "the table compares all methods on the same photons";
+            return Err(CliError::new(what, "--table1, --protocol quiver", help));
+        }
         let perceptual = match &args.backbones {
             None => None,
             Some(folder) => {
@@ -104,7 +112,7 @@ impl Plan {
         };
         let plan = Self {
             data: args.data.clone(),
-            contenders: contenders(&methods, &network, &steps),
+            contenders,
             ppp: args.ppp.clone(),
             ppp_def: args.ppp_def,
             sensor: args.sensor.clone(),
@@ -131,6 +139,12 @@ impl Plan {
             plan.check_clips()?;
         }
         Ok(plan)
+    }
+
+    /// Whether light and sensor are those of the paper's table.
+    pub(super) fn has_light_of_paper(&self) -> bool {
+        let incident = self.ppp_def.is_none_or(|definition| definition == PppDefinition::Incident);
+        incident && self.sensor.as_deref().is_none_or(|sensor| sensor == "qudi-paper")
     }
 
     /// Refuses what needs a truth.

@@ -58,7 +58,13 @@ pub(crate) fn run(
     let mut further = looks(&rows);
     let mut about = about;
     if args.table1 {
-        further.insert(0, ("The paper's table 1, and the same methods here", table1::table(&rows)));
+        further.insert(
+            0,
+            (
+                "The paper's table 1, and the same methods here",
+                table1::table(&rows, plan.has_light_of_paper()),
+            ),
+        );
         about = format!("{about}\n{}", table1::REASONS);
     }
     html_file.write(|| html(&rows, &further, &pictures, &about))?;

@@ -65,8 +65,8 @@ pub(crate) const LOOKS: [Named; 10] = [
     named("error_over_sigma_textured", "textured", |f| f.error_over_sigma_textured, 2),
 ];
 
-/// What a number of diffusion steps added to the result of the fewest ones, and what that one missed: root mean squares of
-/// a pixel in every octave, finest first.
+/// What a number of diffusion steps added to the result of the fewest ones, and what that one missed: root mean
+/// squares of a pixel in every octave, finest first.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(crate) struct Added {
     pub(crate) added: [f64; OCTAVES],

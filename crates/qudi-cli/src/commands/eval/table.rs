@@ -91,8 +91,8 @@ fn appearance(rows: &[Row]) -> Option<Table> {
     Some(table.without_unknown_columns())
 }
 
-/// What more diffusion steps added to the result of the fewest, over what that one misses: in every octave, the ratio of
-/// root mean squares. None where it was not measured.
+/// What more diffusion steps added to the result of the fewest, over what that one misses: in every octave, the
+/// ratio of root mean squares. None where it was not measured.
 fn added(rows: &[Row]) -> Option<Table> {
     let octaves = ["2-4 pixels", "4-8", "8-16", "16-32", "coarser"];
     let names = ["method", "steps", "PPP"].into_iter().chain(octaves);
@@ -106,7 +106,8 @@ fn added(rows: &[Row]) -> Option<Table> {
     (!table.rows.is_empty()).then_some(table)
 }
 
-/// One row for every method, light level, clip and frame; steps where they are compared, looks where they were measured.
+/// One row for every method, light level, clip and frame; steps where they are compared, looks where they were
+/// measured.
 pub(crate) fn frames(rows: &[Row]) -> Table {
     let usual: [(&str, Figure, usize); 4] = [
         ("psnr_a", |f| f.psnr_a, 2),

@@ -1,6 +1,6 @@
 //! The paper's table 1 beside what was measured here.
 
-use super::score::Row;
+use super::score::{Figure, Row};
 use crate::methods::options::NetworkOptions;
 use crate::report::{Cell, Column, Table};
 use qudi_baselines::import::Method;
@@ -24,11 +24,12 @@ const PAPER: [(&str, [[f64; 2]; 3]); 11] = [
 ];
 
 /// Why the figures differ.
-pub(super) const REASONS: &str = "The paper's figures are not these ones: it scored 31 clips of I2-2000FPS, plain PSNR \
-     and SSIM, where nobody says how brightness was found; psnr is plain here, psnr-a is after the best gain. Here every \
-     frame counts, and all methods get the same photons; the public programs score one frame each, not the same, and draw \
-     new noise for every window. Weights of others were trained for one light level and one gain. qudi here is not the \
-     authors' network.";
+pub(super) const REASONS: &str = "The paper's figures are not these ones: it scored 31 clips of \
+    I2-2000FPS, plain PSNR and SSIM, where nobody says how brightness was found; psnr is plain here, \
+    psnr-a is after the best gain. Here every frame counts, and all methods get the same photons; \
+    the public programs score one frame each, not the same, and draw new noise for every window. \
+    Weights of others were trained for one light level and one gain. qudi here is not the authors' \
+    network.";
 
 /// The methods of the table that can run: those without weights, and those whose weights are named.
 pub(super) fn methods(network: &NetworkOptions) -> Vec<String> {
@@ -40,10 +41,11 @@ pub(super) fn methods(network: &NetworkOptions) -> Vec<String> {
     names.map(str::to_owned).collect()
 }
 
-/// The table; methods without weights say so.
-pub(super) fn table(rows: &[Row]) -> Table {
+/// The table; methods without weights say so. The paper's figures stand there if the light is the paper's.
+pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
     let mut table = Table::new(vec![
         Column::new("method", "method"),
+        Column::new("steps", "steps"),
         Column::new("ppp", "PPP"),
         Column::new("paper_psnr", "paper: PSNR"),
         Column::new("paper_ssim", "SSIM"),
@@ -57,32 +59,39 @@ pub(super) fn table(rows: &[Row]) -> Table {
     let mut levels: Vec<f64> = rows.iter().map(|row| row.ppp).collect();
     levels.dedup();
     for ppp in levels {
-        let level = LEVELS.iter().position(|level| *level == ppp);
+        let level = LEVELS.iter().position(|level| *level == ppp).filter(|_| has_light_of_paper);
         for (method, paper) in &PAPER {
             let of_paper = |axis: usize, digits: usize| {
                 Cell::number(level.map(|level| paper[level][axis]), digits)
             };
-            let mine = |row: &&Row| row.method == *method && row.ppp == ppp;
-            let row = rows.iter().find(mine);
-            let mean = |figure: super::score::Figure, digits: usize| {
-                Cell::number(row.and_then(|row| row.over_clips(figure)).map(|s| s.mean), digits)
-            };
-            let note = match row {
-                Some(_) => Cell::Unknown,
-                None => Cell::text(format!("no weights: --weights {method}=FILE")),
-            };
-            table.rows.push(vec![
-                Cell::text(*method),
-                Cell::Exact(ppp),
-                of_paper(0, 2),
-                of_paper(1, 3),
-                mean(|f| f.psnr, 2),
-                mean(|f| f.psnr_a, 2),
-                mean(|f| f.ssim, 3),
-                mean(|f| f.lpips_alex, 3),
-                mean(|f| f.lpips_vgg, 3),
-                note,
-            ]);
+            let mine = rows.iter().filter(|row| row.method == *method && row.ppp == ppp);
+            let mut mine: Vec<Option<&Row>> = mine.map(Some).collect();
+            if mine.is_empty() {
+                mine.push(None);
+            }
+            for row in mine {
+                let mean = |figure: Figure, digits: usize| {
+                    Cell::number(row.and_then(|row| row.over_clips(figure)).map(|s| s.mean), digits)
+                };
+                let note = match row {
+                    Some(_) => Cell::Unknown,
+                    None => Cell::text(format!("no weights: --weights {method}=FILE")),
+                };
+                let steps = row.and_then(|row| row.steps);
+                table.rows.push(vec![
+                    Cell::text(*method),
+                    steps.map_or(Cell::Unknown, |steps| Cell::Exact(steps as f64)),
+                    Cell::Exact(ppp),
+                    of_paper(0, 2),
+                    of_paper(1, 3),
+                    mean(|f| f.psnr, 2),
+                    mean(|f| f.psnr_a, 2),
+                    mean(|f| f.ssim, 3),
+                    mean(|f| f.lpips_alex, 3),
+                    mean(|f| f.lpips_vgg, 3),
+                    note,
+                ]);
+            }
         }
     }
     table.without_unknown_columns()

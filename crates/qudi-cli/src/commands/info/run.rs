@@ -9,7 +9,7 @@ use crate::report::Report;
 use crate::settings::Settings;
 use crate::weights::Weights;
 use burn::tensor::Device;
-use qudi_baselines::import::{Contents, describe};
+use qudi_baselines::import::{Contents, METHODS, Method, describe};
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
@@ -44,9 +44,16 @@ pub(crate) fn run(
         Some("toml") => sensor(subject, settings, report),
         Some("safetensors" | "pth" | "pt") if path.is_file() => {
             settings.refuse(&["sensor."], "for weights")?;
-            match describe(path)? {
+            match describe(path, &Device::flex())? {
                 Some(contents) => learned(&contents, path, report),
-                None => weights(&Weights::File(path.to_owned()), report),
+                None if extension.as_deref() == Some("safetensors") => {
+                    weights(&Weights::File(path.to_owned()), report)
+                }
+                None => Err(CliError::new(
+                    "weights of no network that is known here",
+                    path.display(),
+                    format!("known are {}", METHODS.map(Method::name).join(", ")),
+                )),
             }
         }
         Some("json") if path.is_file() && !transforms => {

@@ -17,6 +17,8 @@ use crate::methods::options::{NetworkOptions, other_method};
 use crate::methods::{method, usual_method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
+use crate::weights::Weights;
+use qudi_baselines::import::Method;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::windows::Windows;
@@ -63,7 +65,7 @@ pub(crate) fn run(
     }
     let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(0);
     let part = part.start..part.end.min(frames);
-    let is_network = !job.settings["network"].is_null();
+    let is_network = job.restorer.name() == "qudi";
     let mode = is_network.then(|| plan.network.mode()).transpose()?;
     let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
     job.warnings.extend(chi_square);
@@ -260,7 +262,7 @@ impl Job {
         });
         let (capture, acquisition) = (&mut self.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
-        let restorer_is_network = restorer.name() == "qudi";
+        let is_network = restorer.name() == "qudi" || Method::by_name(restorer.name()).is_some();
         let schedule = &self.schedule;
         let run = || {
             observed(observer, || {
@@ -268,7 +270,7 @@ impl Job {
                 run_method(restorer, capture, schedule, wanted, acquisition, &mut sink, on)
             })
         };
-        if restorer_is_network {
+        if is_network {
             // Devices report too little memory and broken drivers by panicking.
             let run = device::guarded(&network.device, run);
             return Ok(run.map_err(|problem| device_failed(&problem, network))??);
@@ -311,6 +313,10 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
 
 /// The settings of the network that frames depend on, where it makes them.
 fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Value>> {
+    if let Some(learned) = Method::by_name(method) {
+        let file = Weights::File(options.weights_of(learned)?.to_owned());
+        return Ok(Some(json!({"weights": file.to_string(), "weights_sha256": file.sha256()?})));
+    }
     if method != "qudi" {
         return Ok(None);
     }

@@ -63,7 +63,8 @@ pub(super) fn converted(net: Net) -> &'static str {
     }
 }
 
-/// The paths of backbone and heads, which may be one file: in `folder`, if one is given, or else where Burn keeps them.
+/// The paths of backbone and heads, which may be one file: in `folder`, if one is given, or else where Burn keeps
+/// them.
 ///
 /// # Errors
 /// [`Error::Request`] that names the missing files, where they were looked for, and how to get them.

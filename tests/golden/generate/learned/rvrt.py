@@ -11,7 +11,7 @@ Z. Liu, Y. Lin, Y. Cao, H. Hu, Y. Wei, Z. Zhang, S. Lin, B. Guo, ICCV 2021.
 Keys of `state_dict()` are those of the authors' weight files. Images are [B, T, C, H, W] in [0, 1], T even, H and W
 multiples of 4. Blocks take [B, D, H, W, C] (D: frames) where it says so.
 
-    python tests/golden/generate/rvrt.py    counts the parameters
+    python tests/golden/generate/learned/rvrt.py    counts the parameters
 """
 
 import math

@@ -10,7 +10,7 @@ I. Gyongy, S. H. Chan, ECCV 2024.
 Keys of `state_dict()` are those of the authors' weight files. Images are [B, T, 1, H, W] in [0, 1], H and W
 multiples of 4.
 
-    python tests/golden/generate/quiver.py    counts the parameters
+    python tests/golden/generate/learned/quiver.py    counts the parameters
 """
 
 import torch

@@ -11,7 +11,7 @@ M.-Y. Liu, J. Kautz, CVPR 2018. "Softmax Splatting for Video Frame Interpolation
 Keys of `state_dict()` are those of the authors' weight files. Images are [B, T, C, H, W] in [0, 1]. Sides are at
 least 1 / `border_ratio` pixels, and frames more than `forward_count`.
 
-    python tests/golden/generate/flornn.py    counts the parameters
+    python tests/golden/generate/learned/flornn.py    counts the parameters
 """
 
 import torch

@@ -4,7 +4,7 @@
 # ///
 """Golden values of QUIVER, FloRNN and RVRT for the Rust tests, in tests/golden/learned.
 
-    python tests/golden/generate/learned_goldens_more.py [FILE ...]
+    python tests/golden/generate/learned/more_goldens.py [FILE ...]
 
 Files are as in `network_goldens.py`, with gradients of more than 64 values cut. The networks are those of
 `quiver.py`, `flornn.py` and `rvrt.py`; `about.config` has `network` and sizes that are arguments there, others are
@@ -28,6 +28,9 @@ QUIVER's `predenoise`, which are one, the files know `rdbs.0` alone.
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import flornn
 import network_goldens

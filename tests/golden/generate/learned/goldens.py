@@ -4,7 +4,7 @@
 # ///
 """Golden values of learned baselines for the Rust tests, in tests/golden/learned.
 
-    python tests/golden/generate/learned_goldens.py [FILE ...]
+    python tests/golden/generate/learned/goldens.py [FILE ...]
 
 Files are as in `network_goldens.py`, with gradients of more than 64 values cut. The networks are those of
 `emvd.py`, `spk2imgnet.py`, `memdeblur.py` and `student_teacher.py`; `about.config` has `network` and the sizes that
@@ -33,6 +33,9 @@ biases of convolutions before batch normalisations.
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import emvd
 import memdeblur
@@ -223,7 +226,7 @@ def weight_files() -> None:
     net = emvd.Emvd(width=4)
     fill(net, "", torch.float32)
     state = net.state_dict()
-    folder = OUT / "learned"
+    folder = OUT / "learned/files"
     torch.save({"iter": 300, "best_psnr": 20.0, "state_dict": state, "optimizer": {"state": {}}}, folder / "wrapped.pth")
     torch.save({f"module.{name}": value for name, value in state.items()}, folder / "module.pth")
     torch.save({name: value.half() for name, value in state.items()}, folder / "half.pth")
