@@ -388,14 +388,14 @@ fn compared<M: Module>(
         return Ok(names);
     }
     let lists = [("missing", missing), ("surplus", surplus), ("of another shape", different)];
-    let told = lists.into_iter().filter(|(_, list)| !list.is_empty());
+    let faults = lists.into_iter().filter(|(_, list)| !list.is_empty());
     let shown = |list: &[String]| {
         let more = list.len().saturating_sub(SHOWN);
         let first = list[..list.len() - more].join(", ");
         if more > 0 { format!("{first} and {more} more") } else { first }
     };
-    let told = told.map(|(what, list)| format!("{} {what}: {}", list.len(), shown(&list)));
-    let what = format!("keys do not fit the network; {}", told.collect::<Vec<_>>().join("; "));
+    let faults = faults.map(|(what, list)| format!("{} {what}: {}", list.len(), shown(&list)));
+    let what = format!("keys do not fit the network; {}", faults.collect::<Vec<_>>().join("; "));
     Err(Error::data(what, file.path(), "name a file of this network, whole and unchanged"))
 }
 

@@ -25,7 +25,7 @@ const EVERY_BACK: usize = 5;
 const FIRST_BACK: usize = 2;
 
 /// Frames whose positions stay in a memory in use.
-const KEPT: usize = 5;
+const STORED: usize = 5;
 
 /// Sizes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -194,13 +194,13 @@ impl MemDeblur {
     /// - x: `[bursts * frames, channels, height, width]`, sides multiples of 4
     pub fn forward(&self, x: &Tensor<4>, frames: usize, mode: Mode) -> [Tensor<4>; 3] {
         let views: Vec<View> = (0..frames).map(|i| self.view(frame(x, frames, i))).collect();
-        let (top, kept) = match mode {
+        let (top, stored) = match mode {
             Mode::Training => (usize::MAX, usize::MAX),
-            Mode::Use => (self.top, KEPT),
+            Mode::Use => (self.top, STORED),
         };
-        let mut back = Bank::new(top, kept);
+        let mut back = Bank::new(top, stored);
         let future = self.backward(&views, &mut back, mode);
-        let mut ahead = Bank::new(top, kept);
+        let mut ahead = Bank::new(top, stored);
         let mut coarser: Option<Vec<Tensor<4>>> = None;
         PASSES.map(|pass| {
             let outputs = self.pass(pass, &views, &future, &back, &mut ahead, coarser.as_deref());

@@ -9,7 +9,7 @@ pub(super) struct Bank {
     /// Entries that are read, the most alike ones.
     top: usize,
     /// Frames whose positions stay.
-    kept: usize,
+    frames: usize,
     /// `[images, size, positions]`
     keys: Option<Tensor<3>>,
     /// The same, of another size.
@@ -17,14 +17,14 @@ pub(super) struct Bank {
 }
 
 impl Bank {
-    pub(super) fn new(top: usize, kept: usize) -> Self {
-        Self { top, kept, keys: None, values: Vec::new() }
+    pub(super) fn new(top: usize, frames: usize) -> Self {
+        Self { top, frames, keys: None, values: Vec::new() }
     }
 
     /// Adds the positions of a frame; only those of the last frames of its size stay.
     pub(super) fn store(&mut self, key: Tensor<4>, values: Vec<Tensor<4>>) {
         let [_, _, height, width] = key.dims();
-        let most = self.kept.saturating_mul(height * width);
+        let most = self.frames.saturating_mul(height * width);
         let flat = |x: Tensor<4>| -> Tensor<3> {
             let [images, size, height, width] = x.dims();
             x.reshape([images, size, height * width])
