@@ -4,14 +4,13 @@
 mod pwcnet;
 mod splat;
 
-use crate::parts::{Corners, bursts_of, frame, masked_warp, renamed, resize};
+use crate::parts::{Corners, Residual, bursts_of, frame, masked_warp, renamed, resize, same_flow};
 use burn::module::Module;
 use burn::tensor::activation::relu;
 use burn::tensor::ops::PadMode;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use pwcnet::PwcNet;
 use qudi_layers::{Bias, Conv2d};
-use std::slice::from_ref;
 
 pub use pwcnet::correlation;
 pub use splat::splat_average;
@@ -56,13 +55,6 @@ struct Recurrence {
     resblocks: Vec<Residual>,
 }
 
-/// Two convolutions and a residual.
-#[derive(Module, Debug)]
-struct Residual {
-    conv1: Conv2d,
-    conv2: Conv2d,
-}
-
 /// From two states to the image.
 #[derive(Module, Debug)]
 struct Output {
@@ -75,10 +67,9 @@ impl FloRnn {
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { channels, features, blocks, ahead, border } = sizes;
         let conv = |sizes| Conv2d::zeros(sizes, 3, Bias::No, device);
-        let same = || conv([features, features]);
         let recurrence = || Recurrence {
             first_conv: conv([2 * channels + features, features]),
-            resblocks: (0..blocks).map(|_| Residual { conv1: same(), conv2: same() }).collect(),
+            resblocks: (0..blocks).map(|_| Residual::zeros(features, Bias::No, device)).collect(),
         };
         Self {
             pwcnet: PwcNet::zeros(device),
@@ -128,8 +119,7 @@ impl FloRnn {
         let prepared = |image: &Tensor<4>| resize(image.clone().detach(), padded, Corners::Edges);
         let flow = self.pwcnet.forward(prepared(from), prepared(to)).detach();
         let factor = |axis: usize| pwcnet::UNIT * size[axis] as f32 / padded[axis] as f32;
-        let factors = TensorData::new(vec![factor(1), factor(0)], [1, 2, 1, 1]);
-        resize(flow, size, Corners::Edges) * Tensor::from_data(factors, &from.device())
+        resize(flow, size, Corners::Edges) * same_flow([factor(1), factor(0)], &from.device())
     }
 
     /// Restores every frame of bursts. Training knows the second frame alone.
@@ -180,9 +170,7 @@ impl Recurrence {
     /// The next state; the noise map is zero.
     fn forward(&self, image: &Tensor<4>, state: Tensor<4>) -> Tensor<4> {
         let x = self.first_conv.linear(&[image.clone(), image.zeros_like(), state]);
-        self.resblocks
-            .iter()
-            .fold(x, |x, block| block.conv2.add(&[block.conv1.relu(from_ref(&x))], x))
+        self.resblocks.iter().fold(x, |x, block| block.forward(x))
     }
 }
 

@@ -51,7 +51,7 @@ pub const METHODS: [Method; 7] = [
 ];
 
 /// A network with weights.
-#[derive(Debug)]
+#[derive(Module, Debug)]
 #[allow(clippy::large_enum_variant)] // one at a time
 pub enum Network {
     /// QUIVER.
@@ -64,10 +64,10 @@ pub enum Network {
     Spk2ImgNet(Spk2ImgNet),
     /// MemDeblur.
     MemDeblur(MemDeblur),
-    /// RVRT, and the channels of its images.
-    Rvrt(Rvrt, usize),
-    /// A student of two teachers, and its frames.
-    StudentTeacher(KernelPrediction, usize),
+    /// RVRT.
+    Rvrt(Rvrt),
+    /// A student of two teachers.
+    StudentTeacher(KernelPrediction),
 }
 
 /// What a file holds.
@@ -128,11 +128,11 @@ pub fn describe(path: &Path, device: &Device) -> Result<Option<Contents>> {
     let file = StateDict::open(path)?;
     let Some(method) = Method::of(&file) else { return Ok(None) };
     let sizes = Sizes::of(&file, method)?;
-    let parameters = sizes.count(&file, device)?;
+    let parameters = count(&sizes.network(device), &file)?;
     Ok(Some(Contents { method, sizes: sizes.to_string(), parameters }))
 }
 
-/// Loads the network of a method from a file of its authors, or of ours.
+/// Loads the network of a method from a file of its authors, or from one with the same keys.
 ///
 /// # Errors
 /// [`Error`] if the file cannot be read, or does not hold this network, to the last key.
@@ -146,7 +146,7 @@ pub fn load(path: &Path, method: Method, device: &Device) -> Result<Network> {
         };
         return Err(Error::data(what, path, "name a file that was saved for this method"));
     }
-    Sizes::of(&file, method)?.load(&file, device)
+    filled(Sizes::of(&file, method)?.network(device), &file)
 }
 
 /// Sizes of a network.
@@ -261,56 +261,34 @@ impl Sizes {
         Err(Error::data(format!("{problem}; the file has {self}"), file.path(), help))
     }
 
-    fn load(self, file: &StateDict, device: &Device) -> Result<Network> {
-        Ok(match self {
-            Self::Quiver(sizes) => {
-                let network = Quiver::zeros(sizes, device);
-                Network::Quiver(filled(network, file, Quiver::authors_name)?)
-            }
-            Self::Emvd(width) => {
-                Network::Emvd(filled(Emvd::zeros(width, device), file, str::to_owned)?)
-            }
-            Self::FloRnn(sizes) => {
-                let network = FloRnn::zeros(sizes, device);
-                Network::FloRnn(filled(network, file, FloRnn::authors_name)?)
-            }
-            Self::Spk2ImgNet(sizes) => {
-                let network = Spk2ImgNet::zeros(sizes, device);
-                Network::Spk2ImgNet(filled(network, file, Spk2ImgNet::authors_name)?)
-            }
-            Self::MemDeblur(sizes) => {
-                let network = MemDeblur::zeros(sizes, device);
-                Network::MemDeblur(filled(network, file, MemDeblur::authors_name)?)
-            }
-            Self::Rvrt(sizes) => {
-                let network = Rvrt::zeros(sizes, device);
-                let network = filled(network, file, Rvrt::authors_name)?;
-                Network::Rvrt(network, sizes.channels)
-            }
-            Self::StudentTeacher(sizes) => {
-                let network = KernelPrediction::zeros(sizes, device);
-                let network = filled(network, file, KernelPrediction::file_name)?;
-                Network::StudentTeacher(network, sizes.frames)
-            }
-        })
-    }
-
-    /// The number of parameters, after all keys have been compared.
-    fn count(self, file: &StateDict, device: &Device) -> Result<usize> {
+    /// The network of these sizes, without weights.
+    fn network(self, device: &Device) -> Network {
         match self {
-            Self::Quiver(sizes) => count(&Quiver::zeros(sizes, device), file, Quiver::authors_name),
-            Self::Emvd(width) => count(&Emvd::zeros(width, device), file, str::to_owned),
-            Self::FloRnn(sizes) => count(&FloRnn::zeros(sizes, device), file, FloRnn::authors_name),
-            Self::Spk2ImgNet(sizes) => {
-                count(&Spk2ImgNet::zeros(sizes, device), file, Spk2ImgNet::authors_name)
-            }
-            Self::MemDeblur(sizes) => {
-                count(&MemDeblur::zeros(sizes, device), file, MemDeblur::authors_name)
-            }
-            Self::Rvrt(sizes) => count(&Rvrt::zeros(sizes, device), file, Rvrt::authors_name),
+            Self::Quiver(sizes) => Network::Quiver(Quiver::zeros(sizes, device)),
+            Self::Emvd(width) => Network::Emvd(Emvd::zeros(width, device)),
+            Self::FloRnn(sizes) => Network::FloRnn(FloRnn::zeros(sizes, device)),
+            Self::Spk2ImgNet(sizes) => Network::Spk2ImgNet(Spk2ImgNet::zeros(sizes, device)),
+            Self::MemDeblur(sizes) => Network::MemDeblur(MemDeblur::zeros(sizes, device)),
+            Self::Rvrt(sizes) => Network::Rvrt(Rvrt::zeros(sizes, device)),
             Self::StudentTeacher(sizes) => {
-                count(&KernelPrediction::zeros(sizes, device), file, KernelPrediction::file_name)
+                Network::StudentTeacher(KernelPrediction::zeros(sizes, device))
             }
+        }
+    }
+}
+
+impl Network {
+    /// The name in files of one of our parameters, which begins with the name of the variant.
+    fn file_name(&self, ours: &str) -> String {
+        let own = ours.split_once('.').map_or(ours, |(_, own)| own);
+        match self {
+            Self::Quiver(_) => Quiver::authors_name(own),
+            Self::Emvd(_) => own.to_owned(),
+            Self::FloRnn(_) => FloRnn::authors_name(own),
+            Self::Spk2ImgNet(_) => Spk2ImgNet::authors_name(own),
+            Self::MemDeblur(_) => MemDeblur::authors_name(own),
+            Self::Rvrt(_) => Rvrt::authors_name(own),
+            Self::StudentTeacher(_) => KernelPrediction::file_name(own),
         }
     }
 }
@@ -355,35 +333,24 @@ fn is_beside(name: &str) -> bool {
 }
 
 /// The names of all parameters in the file, with their shapes here and there, after comparing them all.
-fn compared<M: Module>(
-    network: &M,
-    file: &StateDict,
-    name: fn(&str) -> String,
-) -> Result<BTreeMap<String, (String, Vec<usize>)>> {
-    let (mut missing, mut different, mut odd) = (Vec::new(), Vec::new(), Vec::new());
-    let mut names = BTreeMap::new();
+fn compared(network: &Network, file: &StateDict) -> Result<BTreeMap<String, (String, Vec<usize>)>> {
+    let (mut missing, mut different) = (Vec::new(), Vec::new());
+    let (mut names, mut expected) = (BTreeMap::new(), BTreeSet::new());
     for (ours, shape) in parameter_shapes(network) {
-        let theirs = name(&ours);
+        let theirs = network.file_name(&ours);
+        expected.insert(theirs.clone());
         match file.shape(&theirs) {
             None => missing.push(theirs),
             Some(found) if squeezed(&found) != shape => {
                 different.push(format!("{theirs} is {found:?} instead of {shape:?}"));
-                odd.push(theirs);
             }
             Some(found) => {
                 names.insert(ours, (theirs, found));
             }
         }
     }
-    let theirs = |list: &[String], name: &str| list.iter().any(|other| other == name);
-    let known: BTreeSet<&String> = names.values().map(|(theirs, _)| theirs).collect();
-    let of_another_shape: BTreeSet<&String> = odd.iter().collect();
-    let surplus: Vec<String> = file
-        .names()
-        .into_iter()
-        .filter(|name| !known.contains(name) && !of_another_shape.contains(name))
-        .filter(|name| !is_beside(name) && !theirs(&missing, name))
-        .collect();
+    let is_surplus = |name: &String| !expected.contains(name) && !is_beside(name);
+    let surplus: Vec<String> = file.names().into_iter().filter(is_surplus).collect();
     if missing.is_empty() && different.is_empty() && surplus.is_empty() {
         return Ok(names);
     }
@@ -408,16 +375,17 @@ fn squeezed(shape: &[usize]) -> Vec<usize> {
     shape
 }
 
-fn count<M: Module>(network: &M, file: &StateDict, name: fn(&str) -> String) -> Result<usize> {
-    compared(network, file, name)?;
+/// The number of parameters, after all keys have been compared.
+fn count(network: &Network, file: &StateDict) -> Result<usize> {
+    compared(network, file)?;
     let is_learnt = |name: &str| !name.contains(".running_");
     let shapes = parameter_shapes(network).into_iter();
     Ok(shapes.filter(|(name, _)| is_learnt(name)).map(|(_, s)| s.iter().product::<usize>()).sum())
 }
 
 /// The network with the values of a file.
-fn filled<M: Module>(network: M, file: &StateDict, name: fn(&str) -> String) -> Result<M> {
-    let names = compared(&network, file, name)?;
+fn filled(network: Network, file: &StateDict) -> Result<Network> {
+    let names = compared(&network, file)?;
     // A view of one number may claim any shape: values take no more than the file has.
     let claimed: u64 =
         names.values().map(|(_, shape)| 2 * shape.iter().product::<usize>() as u64).sum();
@@ -427,19 +395,22 @@ fn filled<M: Module>(network: M, file: &StateDict, name: fn(&str) -> String) -> 
     }
     let mut values = BTreeMap::new();
     for (ours, (theirs, shape)) in &names {
-        values.insert(ours.clone(), file.read(theirs, shape)?);
-    }
-    // The one dense block of QUIVER's pre-denoiser stands in its files five times.
-    for (theirs, shape) in names.values() {
-        let Some(rest) = theirs.strip_prefix("predenoise.rdbs.0.") else { continue };
-        let first = file.read(theirs, shape)?;
-        for k in 1..5 {
-            let again = format!("predenoise.rdbs.{k}.{rest}");
-            if file.shape(&again).is_some() && file.read(&again, shape)? != first {
-                let what = format!("`{again}` is not the same as `{theirs}`");
-                return Err(Error::data(what, file.path(), "this is another network than QUIVER"));
-            }
-        }
+        let read = file.read(theirs, shape)?;
+        check_repeated(&read, theirs, shape, file)?;
+        values.insert(ours.clone(), read);
     }
     Ok(init_parameters(network, |name, _| values.remove(name).unwrap_or_default()))
+}
+
+/// The one dense block of QUIVER's pre-denoiser stands in its files five times: refuses files where these differ.
+fn check_repeated(first: &[f32], theirs: &str, shape: &[usize], file: &StateDict) -> Result<()> {
+    let Some(rest) = theirs.strip_prefix("predenoise.rdbs.0.") else { return Ok(()) };
+    for k in 1..5 {
+        let again = format!("predenoise.rdbs.{k}.{rest}");
+        if file.shape(&again).is_some() && file.read(&again, shape)? != first {
+            let what = format!("`{again}` is not the same as `{theirs}`");
+            return Err(Error::data(what, file.path(), "this is another network than QUIVER"));
+        }
+    }
+    Ok(())
 }

@@ -5,11 +5,13 @@ mod bank;
 mod blocks;
 mod encoder;
 
-use crate::parts::{ConvTranspose, Corners, bursts_of, charbonnier, frame, renamed, resize};
+use crate::parts::{
+    ConvTranspose, Corners, bursts_of, charbonnier, dense_blocks_renamed, frame, leaky, renamed,
+    resize,
+};
 use bank::Bank;
 use blocks::{Down, Residuals};
 use burn::module::Module;
-use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
 use encoder::Memory;
 use qudi_layers::{Bias, Conv2d};
@@ -166,17 +168,9 @@ impl MemDeblur {
                 ("upsampling.first.", "upsampling.0."),
                 ("upsampling.second.", "upsampling.2."),
                 ("upsampling.third.", "upsampling.4."),
-                (".rdb.layers.", ".rdb.dense_layers."),
-                (".rdb.fuse.", ".rdb.conv1x1."),
             ],
         );
-        let name = match name.split_once("dense_layers.") {
-            Some((before, after)) => {
-                let (number, rest) = after.split_once('.').unwrap_or((after, ""));
-                format!("{before}dense_layers.{number}.conv.{rest}")
-            }
-            None => name,
-        };
+        let name = dense_blocks_renamed(&name);
         let name = match name.strip_prefix("forward_input_convs.") {
             Some(rest) => {
                 let (number, rest) = rest.split_once('.').unwrap_or((rest, ""));
@@ -290,10 +284,10 @@ impl MemDeblur {
                     inputs.push(memory.decoder_mem.forward(images, [h, w]));
                 }
             }
-            let input = leaky_relu(self.forward_input_convs[number].linear(&inputs), 0.1);
+            let input = leaky(self.forward_input_convs[number].linear(&inputs));
             let state = self.forward_resblocks.forward(&[input]);
             let later = resize(future[i].clone(), [h, w], Corners::Edges);
-            let fused = leaky_relu(self.fusion.linear(&[later, state.clone()]), 0.1);
+            let fused = leaky(self.fusion.linear(&[later, state.clone()]));
             let output = self.upsampling.forward(fused) + image.clone();
             if i % every == 0 {
                 let drawn = self.downsampling.forward(output.clone());
@@ -316,8 +310,8 @@ impl Downsampling {
 
 impl Upsampling {
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let x = leaky_relu(self.first.forward(x), 0.1);
-        self.third.linear(&[leaky_relu(self.second.forward(x), 0.1)])
+        let x = leaky(self.first.forward(x));
+        self.third.linear(&[leaky(self.second.forward(x))])
     }
 }
 

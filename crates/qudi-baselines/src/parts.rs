@@ -1,24 +1,28 @@
 //! Pieces that several networks are made of.
 
+mod activation;
 mod conv_transpose;
 mod deformable;
 mod depthwise;
 mod layer_norm;
 mod losses;
 mod names;
+mod residual;
 mod resize;
 mod spynet;
 mod warping;
 
+pub use activation::{leaky, leaky_layers};
 pub use conv_transpose::ConvTranspose;
 pub use deformable::{deform_conv, deform_samples};
 pub use depthwise::Depthwise;
 pub use layer_norm::LayerNorm;
 pub use losses::{charbonnier, gradient_loss};
-pub use names::{every_second, renamed};
+pub use names::{dense_blocks_renamed, every_second, renamed};
+pub use residual::Residual;
 pub use resize::{Corners, quarter, resize};
 pub use spynet::SpyNet;
-pub use warping::{masked_warp, warp_zeros};
+pub use warping::{masked_warp, same_flow, warp_zeros};
 
 use burn::tensor::Tensor;
 use qudi_layers::resample::by_burst;

@@ -7,7 +7,8 @@ mod predenoiser;
 pub(crate) mod reconstructor;
 
 use crate::parts::{
-    SpyNet, bursts_of, every_second, frame, frames_from, gradient_loss, one_by_one, renamed,
+    SpyNet, bursts_of, dense_blocks_renamed, every_second, frame, frames_from, gradient_loss,
+    one_by_one, renamed,
 };
 use alignment::{Alignment, Extractor, GatedFusion};
 use burn::module::Module;
@@ -103,18 +104,10 @@ impl Quiver {
     /// The name of a parameter in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let name = SpyNet::authors_name(name);
-        let name = if name.starts_with("spynet.") {
-            name
-        } else {
-            renamed(&name, &[(".fuse.", ".conv1x1.")])
-        };
-        let name = match name.split_once(".layers.") {
-            Some((before, after)) => {
-                let (number, rest) = after.split_once('.').unwrap_or((after, ""));
-                format!("{before}.dense_layers.{number}.conv.{rest}")
-            }
-            None => name,
-        };
+        if name.starts_with("spynet.") {
+            return name;
+        }
+        let name = dense_blocks_renamed(&name);
         let name = renamed(
             &name,
             &[

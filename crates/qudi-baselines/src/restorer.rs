@@ -44,8 +44,8 @@ impl LearnedRestorer {
             Network::FloRnn(_) => 1,
             Network::Spk2ImgNet(_) => spk2imgnet::MULTIPLE,
             Network::MemDeblur(_) => memdeblur::MULTIPLE,
-            Network::Rvrt(..) => rvrt::MULTIPLE,
-            Network::StudentTeacher(..) => student_teacher::MULTIPLE,
+            Network::Rvrt(_) => rvrt::MULTIPLE,
+            Network::StudentTeacher(_) => student_teacher::MULTIPLE,
         }
     }
 
@@ -91,15 +91,16 @@ impl LearnedRestorer {
                 let [_, _, full] = network.forward(&images, count, memdeblur::Mode::Use);
                 split(full, 0)
             }
-            Network::Rvrt(network, channels) => {
+            Network::Rvrt(network) => {
                 // An even number of frames.
                 let all = around(0, count % rvrt::CLIP);
                 let frames = all.len();
-                split(network.forward(copies(all, *channels), frames), 0)
+                split(network.forward(copies(all, network.channels()), frames), 0)
             }
-            Network::StudentTeacher(network, length) => {
+            Network::StudentTeacher(network) => {
+                let length = network.frames();
                 let before = length / 2;
-                self.sliding(&around(before, length - 1 - before), *length, |window| {
+                self.sliding(&around(before, length - 1 - before), length, |window| {
                     network.forward(window).image
                 })?
             }

@@ -6,10 +6,9 @@ mod swin;
 mod window;
 
 use crate::parts::{
-    SpyNet, bursts_of, every_second, frame, frames_from, quarter, renamed, warp_zeros,
+    SpyNet, bursts_of, every_second, frame, frames_from, leaky, quarter, renamed, warp_zeros,
 };
 use burn::module::Module;
-use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
 use guided::GuidedAttention;
 use qudi_layers::resample::{by_burst, pixel_shuffle};
@@ -57,6 +56,7 @@ pub struct Rvrt {
     conv_before_upsampler: Conv2d,
     upsampler: Vec<Conv2d>,
     conv_last: Conv2d,
+    channels: usize,
 }
 
 /// Features at a quarter of the size.
@@ -95,7 +95,13 @@ impl Rvrt {
             conv_before_upsampler: conv([features, MIDDLE], 1),
             upsampler: [4, 4, 1].map(|more| conv([MIDDLE, more * MIDDLE], 3)).into(),
             conv_last: conv([MIDDLE, channels], 3),
+            channels,
         }
+    }
+
+    /// Channels of images.
+    pub fn channels(&self) -> usize {
+        self.channels
     }
 
     /// The name of a parameter in the authors' files. Their convolutions have a third axis of one frame.
@@ -211,9 +217,9 @@ impl Rvrt {
     }
 
     fn upsample(&self, x: Tensor<4>) -> Tensor<4> {
-        let mut x = leaky_relu(self.conv_before_upsampler.linear(&[x]), 0.1);
+        let mut x = leaky(self.conv_before_upsampler.linear(&[x]));
         for conv in &self.upsampler[..2] {
-            x = leaky_relu(pixel_shuffle(conv.linear(&[x]), 2), 0.1);
+            x = leaky(pixel_shuffle(conv.linear(&[x]), 2));
         }
         self.conv_last.linear(&[self.upsampler[2].linear(&[x])])
     }
@@ -221,8 +227,8 @@ impl Rvrt {
 
 impl Extractor {
     fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let x = leaky_relu(self.first.stride2(&[x]), 0.1);
-        self.stage.forward(leaky_relu(self.second.stride2(&[x]), 0.1), 1)
+        let x = leaky(self.first.stride2(&[x]));
+        self.stage.forward(leaky(self.second.stride2(&[x])), 1)
     }
 }
 

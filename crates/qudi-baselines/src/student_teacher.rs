@@ -49,6 +49,7 @@ pub struct KernelPrediction {
     kernels: Conv2d,
     /// Side of the kernels.
     kernel: usize,
+    frames: usize,
 }
 
 /// Two convolutions.
@@ -94,7 +95,13 @@ impl KernelPrediction {
             up: (0..LEVELS - 1).rev().map(up).collect(),
             kernels: conv([features, frames * kernel * kernel]),
             kernel,
+            frames,
         }
+    }
+
+    /// Frames of a burst.
+    pub fn frames(&self) -> usize {
+        self.frames
     }
 
     /// The name of a parameter in files.

@@ -1,11 +1,10 @@
 //! Flow from warped features and their correlation (Sun et al., "PWC-Net", CVPR 2018).
 
-use crate::parts::{ConvTranspose, renamed, warp_zeros};
+use crate::parts::{ConvTranspose, leaky, renamed, same_flow, warp_zeros};
 use burn::module::{Module, Param};
-use burn::tensor::activation::leaky_relu;
 use burn::tensor::module::conv2d;
 use burn::tensor::ops::{ConvOptions, PadMode};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, zeros};
 
 /// What flow is counted in, in pixels of the full size.
@@ -65,10 +64,6 @@ struct Dilated {
     /// `[outputs]`
     bias: Param<Tensor<1>>,
     apart: usize,
-}
-
-fn leaky(x: Tensor<4>) -> Tensor<4> {
-    leaky_relu(x, 0.1)
 }
 
 impl PwcNet {
@@ -237,8 +232,7 @@ fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     const WHOLE: f32 = 0.999;
     let [_, _, height, width] = x.dims();
     let factor = |side: usize| side as f32 / (side - 1) as f32;
-    let factors = TensorData::new(vec![factor(width), factor(height)], [1, 2, 1, 1]);
-    let flow = flow * Tensor::from_data(factors, &x.device());
+    let flow = flow * same_flow([factor(width), factor(height)], &x.device());
     let ones = x.clone().narrow(1, 0, 1).ones_like();
     let inside = warp_zeros(ones, flow.clone()).greater_elem(WHOLE).float();
     warp_zeros(x, flow) * inside

@@ -4,7 +4,8 @@ use super::{check_parameters, devices, none, sum};
 use crate::cases::{Case, File, parameter};
 use crate::flornn::{correlation, splat_average};
 use crate::parts::{
-    Corners, charbonnier, deform_conv, gradient_loss, masked_warp, quarter, resize, warp_zeros,
+    Corners, charbonnier, deform_conv, dense_blocks_renamed, gradient_loss, masked_warp, quarter,
+    resize, warp_zeros,
 };
 use crate::quiver::alignment::GatedFusion;
 use crate::quiver::reconstructor::Reconstructor;
@@ -90,19 +91,12 @@ fn blocks_with_gelu_match_pytorch() {
     let wide = |case: &Case<'_>| -> Tensor<4> { case.input("x", &device).require_grad() };
 
     let case = file.case("dense");
-    let name = |ours: &str| {
-        let ours = ours.replace("fuse.", "conv1x1.").replace("layers.", "dense_layers.");
-        match ours.strip_prefix("dense_layers.") {
-            Some(rest) => format!("dense_layers.{}.conv.{}", &rest[..1], &rest[2..]),
-            None => ours,
-        }
-    };
     let dense = DenseBlock::zeros(6, 4, &device);
-    let dense = init_parameters(dense, |ours, shape| parameter(&name(ours), shape));
+    let dense = init_parameters(dense, |ours, shape| parameter(&dense_blocks_renamed(ours), shape));
     let x = wide(&case);
     let gradients = sum(&case, &[("y", dense.forward_gelu(x.clone()))]).backward();
     case.check_gradient("x", x.grad(&gradients).unwrap());
-    check_parameters(&case, &gradients, &dense, &name, none);
+    check_parameters(&case, &gradients, &dense, &dense_blocks_renamed, none);
 
     let case = file.case("gated");
     let gated = init_parameters(GatedFusion::zeros(3, &device), parameter);

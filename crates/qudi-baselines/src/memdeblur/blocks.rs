@@ -1,11 +1,9 @@
 //! Residual blocks, and dense blocks that halve the size.
 
-use crate::parts::renamed;
+use crate::parts::{Residual, leaky, renamed};
 use burn::module::Module;
-use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, DenseBlock};
-use std::slice::from_ref;
 
 /// A dense block, then half the size and four times the channels.
 #[derive(Module, Debug)]
@@ -19,13 +17,6 @@ pub(super) struct Down {
 pub(super) struct Residuals {
     entry: Option<Conv2d>,
     blocks: Vec<Residual>,
-}
-
-/// Two convolutions and a residual.
-#[derive(Module, Debug)]
-struct Residual {
-    conv1: Conv2d,
-    conv2: Conv2d,
 }
 
 impl Down {
@@ -49,7 +40,7 @@ impl Residuals {
         device: &Device,
     ) -> Self {
         let conv = |inputs| Conv2d::zeros([inputs, features], 3, Bias::Yes, device);
-        let block = |_| Residual { conv1: conv(features), conv2: conv(features) };
+        let block = |_| Residual::zeros(features, Bias::Yes, device);
         Self { entry: inputs.map(conv), blocks: (0..blocks).map(block).collect() }
     }
 
@@ -63,9 +54,9 @@ impl Residuals {
 
     pub(super) fn forward(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         let x = match &self.entry {
-            Some(entry) => leaky_relu(entry.linear(inputs), 0.1),
+            Some(entry) => leaky(entry.linear(inputs)),
             None => inputs[0].clone(),
         };
-        self.blocks.iter().fold(x, |x, block| block.conv2.add(&[block.conv1.relu(from_ref(&x))], x))
+        self.blocks.iter().fold(x, |x, block| block.forward(x))
     }
 }

@@ -1,7 +1,7 @@
 //! Modulated deformable convolution (Zhu et al., "Deformable ConvNets v2", CVPR 2019).
 
-use super::warp_zeros;
-use burn::tensor::{Device, Tensor, TensorData};
+use super::{same_flow, warp_zeros};
+use burn::tensor::Tensor;
 
 /// Taps of a kernel of 3 x 3.
 const TAPS: usize = 9;
@@ -53,13 +53,8 @@ pub fn deform_samples(x: Tensor<4>, offset: Tensor<4>, groups: usize) -> Tensor<
     let taps = (0..TAPS).map(|tap| {
         let from = offset.clone().narrow(1, tap, 1).reshape([all, 2, height, width]);
         let place = [(tap % 3) as f32 - 1.0, (tap / 3) as f32 - 1.0];
-        warp_zeros(x.clone(), from.flip([1]) + constant(place, &x.device()))
+        warp_zeros(x.clone(), from.flip([1]) + same_flow(place, &x.device()))
     });
     let samples: Tensor<5> = Tensor::stack(taps.collect(), 2);
     samples.reshape([images, channels, TAPS, height * width])
-}
-
-/// The same flow everywhere, `[1, 2, 1, 1]`.
-fn constant(flow: [f32; 2], device: &Device) -> Tensor<4> {
-    Tensor::from_data(TensorData::new(flow.to_vec(), [1, 2, 1, 1]), device)
 }

@@ -14,3 +14,19 @@ pub fn every_second(name: &str, list: &str) -> String {
         Err(_) => name.to_owned(),
     }
 }
+
+/// A name in which dense blocks have the authors' names of their layers.
+pub fn dense_blocks_renamed(name: &str) -> String {
+    let mut theirs = Vec::new();
+    let mut parts = name.split('.');
+    while let Some(part) = parts.next() {
+        match part {
+            "fuse" => theirs.push("conv1x1"),
+            "layers" => {
+                theirs.extend(["dense_layers"].into_iter().chain(parts.next()).chain(["conv"]));
+            }
+            other => theirs.push(other),
+        }
+    }
+    theirs.join(".")
+}

@@ -1,26 +1,21 @@
 //! Flow in a pyramid (Ranjan and Black, "Optical flow estimation using a spatial pyramid network", CVPR 2017).
 
 use super::resize::{Corners, resize};
+use super::same_flow;
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
+use qudi_layers::Layers;
 use qudi_layers::resample::avg_pool2;
-use qudi_layers::{Bias, Conv2d};
 
 /// Sides of images inside are multiples of this.
 const MULTIPLE: usize = 32;
-
-/// The network of a level.
-#[derive(Module, Debug)]
-struct Level {
-    layers: Vec<Conv2d>,
-}
 
 /// The flow network.
 #[derive(Module, Debug)]
 pub struct SpyNet {
     /// The coarsest first.
-    levels: Vec<Level>,
+    levels: Vec<Layers>,
     /// Mean and standard deviation of every channel that images are made into.
     #[module(skip)]
     channels: Vec<[f32; 2]>,
@@ -37,9 +32,7 @@ impl SpyNet {
     ) -> Self {
         let [a, b, c, d] = widths;
         let sizes = [[2 * channels.len() + 2, a], [a, b], [b, c], [c, d], [d, 2]];
-        let level = |_| Level {
-            layers: sizes.map(|sizes| Conv2d::zeros(sizes, 7, Bias::Yes, device)).into(),
-        };
+        let level = |_| Layers::zeros(&sizes, 7, device);
         Self { levels: (0..levels).map(level).collect(), channels }
     }
 
@@ -91,8 +84,7 @@ impl SpyNet {
         let scaled = |(flow, &scale): (Tensor<4>, &usize)| {
             let size = [height / scale, width / scale];
             let factor = |axis: usize| size[axis] as f32 / (padded[axis] / scale) as f32;
-            let factors = TensorData::new(vec![factor(1), factor(0)], [1, 2, 1, 1]);
-            let factors = Tensor::from_data(factors, &flow.device());
+            let factors = same_flow([factor(1), factor(0)], &flow.device());
             resize(flow, size, Corners::Edges) * factors
         };
         finest_first.zip(scales).map(scaled).collect()
@@ -113,15 +105,5 @@ impl SpyNet {
         }
         images.reverse();
         images
-    }
-}
-
-impl Level {
-    fn forward(&self, mut inputs: Vec<Tensor<4>>) -> Tensor<4> {
-        let (last, first) = self.layers.split_last().expect("five layers");
-        for layer in first {
-            inputs = vec![layer.relu(&inputs)];
-        }
-        last.linear(&inputs)
     }
 }

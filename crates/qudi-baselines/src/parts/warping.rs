@@ -1,7 +1,7 @@
 //! Warping where nothing is beyond the borders.
 
-use burn::tensor::Tensor;
 use burn::tensor::ops::PadMode;
+use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::warp;
 
 /// What `x` looks like at `(column + flow_x, row + flow_y)`: bilinear, zero outside (`grid_sample` with
@@ -28,4 +28,9 @@ pub fn masked_warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     let ones = x.clone().narrow(1, 0, 1).ones_like();
     let inside = warp_zeros(ones, flow.clone()).greater_equal_elem(WHOLE).float();
     warp_zeros(x, flow) * inside
+}
+
+/// One flow, or one factor of flows, for all pixels, `[1, 2, 1, 1]`: x before y.
+pub fn same_flow(flow: [f32; 2], device: &Device) -> Tensor<4> {
+    Tensor::from_data(TensorData::new(flow.to_vec(), [1, 2, 1, 1]), device)
 }

@@ -1,9 +1,9 @@
 //! Features over frames, aligned from every frame to the next, and the fusion of two kinds of them.
 
 use super::fourth;
-use crate::parts::{deform_conv, frames_from, warp_zeros};
+use crate::parts::{deform_conv, frames_from, leaky_layers, warp_zeros};
 use burn::module::{Module, Param};
-use burn::tensor::activation::{gelu, leaky_relu, sigmoid, tanh};
+use burn::tensor::activation::{gelu, sigmoid, tanh};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::{avg_pool2, by_burst};
 use qudi_layers::{Bias, Conv2d, Conv3d, Linear, zeros};
@@ -89,10 +89,7 @@ impl Alignment {
     }
 
     fn align(&self, x: Tensor<4>, [warped, current]: [Tensor<4>; 2], flow: Tensor<4>) -> Tensor<4> {
-        let (last, first) = self.conv_offset.split_last().expect("four layers");
-        let start = vec![warped, current, flow.clone()];
-        let z = first.iter().fold(start, |z, layer| vec![leaky_relu(layer.linear(&z), 0.1)]);
-        let z = last.linear(&z);
+        let z = leaky_layers(&self.conv_offset, vec![warped, current, flow.clone()]);
         let (offsets, masks) = (2 * TAPS * GROUPS, TAPS * GROUPS);
         // Offsets are y before x, flow is x before y.
         let around = flow.flip([1]).repeat(&[1, TAPS * GROUPS, 1, 1]);

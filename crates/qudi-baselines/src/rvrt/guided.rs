@@ -2,9 +2,9 @@
 
 use super::swin::Mlp;
 use super::{CLIP, Pair, turned};
-use crate::parts::deform_samples;
+use crate::parts::{deform_samples, leaky_layers};
 use burn::module::Module;
-use burn::tensor::activation::{leaky_relu, softmax, tanh};
+use burn::tensor::activation::{softmax, tanh};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, Linear};
 
@@ -58,10 +58,8 @@ impl GuidedAttention {
         flows: Pair,
     ) -> (Tensor<4>, Pair) {
         let [warped_same, warped_other] = warped;
-        let (last, first) = self.conv_offset.split_last().expect("six layers");
         let start = vec![q.clone(), warped_same, warped_other, flows[0].clone(), flows[1].clone()];
-        let z = first.iter().fold(start, |z, layer| vec![leaky_relu(layer.linear(&z), 0.1)]);
-        let changes = tanh(last.linear(&z)) * REACH;
+        let changes = tanh(leaky_layers(&self.conv_offset, start)) * REACH;
         let half = 2 * TAPS * GROUPS;
         let offsets = [0, 1].map(|n: usize| {
             // Offsets are y before x, flow is x before y.

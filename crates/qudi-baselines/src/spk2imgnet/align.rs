@@ -2,9 +2,9 @@
 //! "EDVR", CVPR workshops 2019).
 
 use super::conv;
-use crate::parts::{deform_conv, renamed};
+use crate::parts::{deform_conv, leaky, renamed};
 use burn::module::{Module, Param};
-use burn::tensor::activation::{leaky_relu, sigmoid};
+use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::upsample2;
 use qudi_layers::{Conv2d, zeros};
@@ -50,10 +50,6 @@ struct Deformable {
     /// `[outputs]`
     bias: Param<Tensor<1>>,
     conv_offset_mask: Conv2d,
-}
-
-fn leaky(x: Tensor<4>) -> Tensor<4> {
-    leaky_relu(x, 0.1)
 }
 
 impl Align {

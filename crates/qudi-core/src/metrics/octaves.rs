@@ -2,7 +2,7 @@
 
 use crate::frame::Frame;
 
-/// Octaves that are told apart: structure of about 2 to 4 pixels, 4 to 8, 8 to 16, 16 to 32, and coarser.
+/// Octaves: structure of about 2 to 4 pixels, 4 to 8, 8 to 16, 16 to 32, and coarser.
 pub const OCTAVES: usize = 5;
 
 /// The energy per pixel of an image in each octave, finest first: what means of squares of 1, 2, 4, 8 and 16 pixels

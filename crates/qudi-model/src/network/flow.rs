@@ -7,8 +7,8 @@ use crate::config::{FlowConfig, FlowInputs};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
+use qudi_layers::Layers;
 use qudi_layers::resample::{avg_pool2, by_burst, mean_around, rescale_flow, shrink, upsample2};
-use qudi_layers::{Bias, Conv2d};
 
 /// Added to the contrast that images are divided by: what is flatter counts as flat.
 const LEAST_CONTRAST: f32 = 0.05;
@@ -27,17 +27,11 @@ pub struct Flows {
     pub coarser: Vec<Flows>,
 }
 
-/// The network of one pyramid level.
-#[derive(Module, Debug)]
-struct Level {
-    layers: Vec<Conv2d>,
-}
-
 /// The flow network.
 #[derive(Module, Debug)]
 pub struct Flow {
     /// Finest first.
-    levels: Vec<Level>,
+    levels: Vec<Layers>,
     /// Levels of the pyramid; the finest may have no network.
     pyramid: usize,
     scale: usize,
@@ -54,8 +48,7 @@ impl FlowConfig {
     pub fn init(&self, off: bool, device: &Device) -> Flow {
         let [a, b, c, d] = self.widths;
         let sizes = [[4, a], [a, b], [b, c], [c, d], [d, 2]];
-        let layer = |sizes| Conv2d::zeros(sizes, 7, Bias::Yes, device);
-        let level = |_| Level { layers: sizes.map(layer).into() };
+        let level = |_| Layers::zeros(&sizes, 7, device);
         Flow {
             levels: (0..self.networks).map(level).collect(),
             pyramid: self.levels,
@@ -115,7 +108,7 @@ impl Flow {
             }
             if let Some(at) = number.checked_sub(self.pyramid - self.levels.len()) {
                 let (i, j) = (kind(&reference, 0), kind(&neighbour, 0));
-                flow = self.levels[at].correct(i, j, flow, self.inputs);
+                flow = self.corrected(&self.levels[at], i, j, flow);
             }
             found.push(Flows::of_pairs(flow.clone(), frames, self.scale << number));
         }
@@ -123,19 +116,17 @@ impl Flow {
         found.reverse();
         Flows { coarser: found, ..finest }
     }
-}
 
-impl Level {
-    /// The flow with what the network adds to it.
-    fn correct(
+    /// The flow with what the network of a level adds to it.
+    fn corrected(
         &self,
+        level: &Layers,
         reference: Tensor<4>,
         neighbour: Tensor<4>,
         flow: Tensor<4>,
-        inputs: FlowInputs,
     ) -> Tensor<4> {
         let warped = warp(neighbour, flow.clone());
-        let [reference, warped] = match inputs {
+        let [reference, warped] = match self.inputs {
             // Stretched to the flow's own range.
             FlowInputs::Images => [reference, warped].map(|image| (image - 0.5) * 4.0),
             FlowInputs::Contrast => {
@@ -145,12 +136,7 @@ impl Level {
                 [detail / contrast.clone(), (warped - reference) * 2.0 / contrast]
             }
         };
-        let mut inputs = vec![reference, warped, flow.clone()];
-        let (last, first) = self.layers.split_last().expect("five layers");
-        for layer in first {
-            inputs = vec![layer.relu(&inputs)];
-        }
-        flow + last.linear(&inputs) * FLOW_CORRECTION
+        flow.clone() + level.forward(vec![reference, warped, flow]) * FLOW_CORRECTION
     }
 }
 

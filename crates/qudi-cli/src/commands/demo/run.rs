@@ -92,10 +92,10 @@ pub(crate) fn run(
             how("a burst merged twice, the second time along better motion"),
         ),
     ];
-    demo.network.options(None).check_weights(&[])?;
+    let options = demo.network.options(demo.steps.steps);
+    options.check_weights(&[])?;
     if demo.network.own_weights().is_some() || network::built_in_knows(&acquisition)? {
-        let (restorer, how) =
-            network::restorer(&demo.network.options(demo.steps.steps), &acquisition, SIZE)?;
+        let (restorer, how) = network::restorer(&options, &acquisition, SIZE)?;
         methods.push(("QUDI", restorer, format!("the network{how}")));
     } else {
         report.remark(

@@ -353,6 +353,7 @@ fn times(image: &Frame, factor: f64) -> Frame {
 }
 
 fn scaled(image: &Frame, gain: f64) -> Frame {
-    let data = image.data.iter().map(|v| (v * gain as f32).clamp(0.0, 1.0)).collect();
-    Frame { size: image.size, data }
+    let mut frame = times(image, gain);
+    frame.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+    frame
 }

@@ -20,9 +20,6 @@ use qudi_core::atomic_file::refuse_taken;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
-/// Light levels of clips unless said otherwise: those of the paper's table.
-const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
-
 pub(crate) fn run(
     args: &Eval,
     settings: &Settings,
@@ -99,7 +96,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     let exposing = Exposing::new(plan, settings)?;
     let set = settings.given("simulate.ppp")?.map(|ppp: f64| vec![ppp]);
     let levels = match &plan.ppp[..] {
-        [] => &set.unwrap_or(LEVELS.to_vec())[..],
+        [] => &set.unwrap_or(table1::LEVELS.to_vec())[..],
         given => given,
     };
     let mut clips = Clip::only(Clip::find(&plan.data)?, &plan.clips, &plan.data)?;

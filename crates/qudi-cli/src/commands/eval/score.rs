@@ -118,15 +118,6 @@ pub(crate) struct Score {
     pub(crate) how: String,
 }
 
-/// A method, and its steps where they are compared.
-pub(crate) fn label(method: &str, steps: Option<usize>) -> String {
-    match steps {
-        None => method.to_owned(),
-        Some(1) => format!("{method}, 1 step"),
-        Some(steps) => format!("{method}, {steps} steps"),
-    }
-}
-
 /// All scores of one method at one light level.
 pub(crate) struct Row {
     pub(crate) method: String,
@@ -140,7 +131,12 @@ pub(crate) struct Row {
 impl Row {
     /// The method, and its steps where they are compared.
     pub(crate) fn label(&self) -> String {
-        label(&self.method, self.steps)
+        let method = &self.method;
+        match self.steps {
+            None => method.clone(),
+            Some(1) => format!("{method}, 1 step"),
+            Some(steps) => format!("{method}, {steps} steps"),
+        }
     }
 
     /// Statistics over clips of the mean over each clip's frames.

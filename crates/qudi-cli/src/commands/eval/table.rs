@@ -37,7 +37,7 @@ fn light(row: &Row) -> Cell {
 }
 
 /// Diffusion steps, where several numbers of them are compared.
-fn steps(row: &Row) -> Cell {
+pub(super) fn steps(row: &Row) -> Cell {
     row.steps.map_or(Cell::Unknown, |steps| Cell::Exact(steps as f64))
 }
 

@@ -1,12 +1,13 @@
 //! The paper's table 1 beside what was measured here.
 
 use super::score::{Figure, Row};
+use super::table::steps;
 use crate::methods::options::NetworkOptions;
 use crate::report::{Cell, Column, Table};
 use qudi_baselines::import::Method;
 
-/// Light levels of the table.
-const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
+/// Light levels of the table, and of clips unless said otherwise.
+pub(super) const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
 
 /// PSNR in dB and SSIM at the three levels (Quanta Diffusion, table 1).
 const PAPER: [(&str, [[f64; 2]; 3]); 11] = [
@@ -77,10 +78,9 @@ pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
                     Some(_) => Cell::Unknown,
                     None => Cell::text(format!("no weights: --weights {method}=FILE")),
                 };
-                let steps = row.and_then(|row| row.steps);
                 table.rows.push(vec![
                     Cell::text(*method),
-                    steps.map_or(Cell::Unknown, |steps| Cell::Exact(steps as f64)),
+                    row.map_or(Cell::Unknown, steps),
                     Cell::Exact(ppp),
                     of_paper(0, 2),
                     of_paper(1, 3),
