@@ -3,7 +3,7 @@
 use super::burst_cache::BurstSampler;
 use super::burst_cache::burst::ConditionedBurst;
 use super::recipe::{Recipe, TrainConfig};
-use crate::loss::Example;
+use crate::loss::{Example, NoiseOn, second_of_two};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
@@ -66,13 +66,13 @@ impl Batch {
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
-            let TrainConfig { timesteps, noise_start_fraction, .. } = recipe.train;
+            let TrainConfig { timesteps, noise_start_fraction, noise_on, .. } = recipe.train;
             let at_start = random.random::<f64>() < noise_start_fraction;
             let quantile = random.random();
-            batch.timesteps.push(if at_start {
-                NUM_TIMESTEPS - 1
-            } else {
-                timesteps.timestep(quantile)
+            batch.timesteps.push(match noise_on {
+                _ if at_start => NUM_TIMESTEPS - 1,
+                NoiseOn::Truth => timesteps.timestep(quantile),
+                NoiseOn::Estimate => second_of_two(recipe.default_spacing()),
             });
             batch.acquisitions.push(drawn.acquisition);
         }

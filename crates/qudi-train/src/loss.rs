@@ -12,6 +12,7 @@ mod self_conditioning;
 mod timesteps;
 
 use crate::parameters::gradients;
+use burn::module::Module;
 use burn::tensor::Tensor;
 use gaussian_nll::uncertainty_loss;
 use lpips::Lpips;
@@ -29,7 +30,8 @@ use serde::{Deserialize, Serialize};
 pub use gaussian_nll::gaussian_nll;
 pub use reconstruction::reconstruction;
 pub use self_conditioning::{LoopOptions, SelfConditioning};
-pub use timesteps::TimestepLaw;
+pub(crate) use timesteps::second_of_two;
+pub use timesteps::{NoiseOn, TimestepLaw};
 
 /// The least unit that a pixel's error is counted in, in [-1, 1]: half a step of 8 bits.
 const LEAST_UNIT: f32 = 0.004;
@@ -151,8 +153,17 @@ pub fn loss_terms(
         return Ok(first_stage_terms(network, example, weights));
     }
     let Example { conditioning, truth, .. } = example;
-    let (state, simulated) = network_inputs(network, example, self_conditioning, options)?;
+    let fixed = options.pre_is_fixed.then(|| {
+        let valid = network.valid();
+        valid.predenoise_simulated(&conditioning.inner(), None)
+    });
+    let (state, simulated) =
+        network_inputs(network, example, fixed.as_ref(), self_conditioning, options)?;
     let mut encoded = network.encode(conditioning);
+    if let Some((d, features)) = fixed {
+        let [d, features] = [d, features].map(Tensor::from_inner);
+        encoded = network.with_predenoised(encoded, d, features);
+    }
     let predenoised =
         options.recomputes.then(|| PreDenoised::new(network, conditioning, simulated.as_ref()));
     if let Some(predenoised) = &predenoised {
@@ -179,7 +190,8 @@ pub fn loss_terms(
     let pre = pre_denoiser_loss(example, d, weights.form);
     let flow = (weights.flow > 0.0).then(|| flows.warping_error(truth, conditioning.frames));
     // The uncertainty is that of the frames before any simulated measurement.
-    let uncertainty = network.predicts_uncertainty().then(|| network.predenoise(conditioning));
+    let learns = network.predicts_uncertainty() && !options.pre_is_fixed;
+    let uncertainty = learns.then(|| network.predenoise(conditioning));
     let uncertainty = uncertainty.and_then(|(d, sigma)| uncertainty_loss(&d, truth, sigma));
     let total = prediction.clone() * weights.prediction + pre.clone() * weights.pre;
     let terms =

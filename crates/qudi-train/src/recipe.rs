@@ -4,7 +4,7 @@ mod stage;
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 use crate::loss::lpips::PerceptualKind;
-use crate::loss::{LossForm, TimestepLaw};
+use crate::loss::{LossForm, NoiseOn, TimestepLaw};
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
@@ -74,6 +74,9 @@ pub struct TrainConfig {
     /// Law of the timesteps that the network learns at.
     #[serde(default, skip_serializing_if = "is_default")]
     pub timesteps: TimestepLaw,
+    /// What the noise of the noisy images is added to.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub noise_on: NoiseOn,
     /// Fraction of the samples at the noisiest timestep, where sampling begins.
     #[serde(alias = "start")]
     pub noise_start_fraction: f64,
@@ -277,10 +280,14 @@ impl Recipe {
             ),
         ];
         let has_flow = !network.ablates(Part::Flow);
+        let noise_rules = stage::noise_rules(&self);
         let named = stage::have_good_names(&self.stage);
         let stages = ("stage", named, "must have names of a-z, 0-9 and -, each its own");
-        for (key, good, problem) in
-            rules.into_iter().chain(stage::rules(train, has_flow)).chain([stages])
+        for (key, good, problem) in rules
+            .into_iter()
+            .chain(stage::rules(train, has_flow))
+            .chain(noise_rules)
+            .chain([stages])
         {
             if !good {
                 let what = format!("{key} {problem}");

@@ -4,7 +4,7 @@
 use super::optimizer::Adam;
 use super::parameters::with_parameters;
 use super::recipe::Recipe;
-use super::trainer::Trainer;
+use super::trainer::{Trainer, is_pre_fixed};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::{Error, Result};
 use qudi_model::network::{former_name, parameter_shapes};
@@ -132,6 +132,7 @@ impl Trainer {
         };
         let [weights, average, mean, square] = LISTS.map(list);
         trainer.network = with_parameters(trainer.network, weights?);
+        trainer.pre_is_fixed = is_pre_fixed(&trainer.network, &recipe.train.learns)?;
         trainer.ema.average = average?;
         trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
         Ok(trainer)

@@ -7,11 +7,12 @@ use super::parameters::{parameters, with_frozen, with_parameters};
 use super::prefetch::Prefetcher;
 use super::recipe::{LearningPart, LossConfig, Recipe};
 use crate::loss::lpips::Lpips;
-use crate::loss::{LoopOptions, LossTerms, LossWeights, SelfConditioning, loss_terms};
+use crate::loss::{LoopOptions, LossTerms, LossWeights, NoiseOn, SelfConditioning, loss_terms};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
 use qudi_kernels::{ComputePrecision, with_precision};
+use qudi_model::checkpoint::ModelKind;
 use qudi_model::config::Part;
 use qudi_model::network::{Qudi, parameter_shapes};
 use qudi_model::tensor::read;
@@ -74,6 +75,8 @@ pub struct Trainer {
     perceptual: Vec<Lpips>,
     /// Whether each parameter learns.
     learns: Vec<bool>,
+    /// Whether frames are pre-denoised once for all passes ([`LoopOptions::pre_is_fixed`]).
+    pub(super) pre_is_fixed: bool,
 }
 
 /// The gradients and losses of one batch, and the seconds that they took.
@@ -109,6 +112,7 @@ impl Trainer {
             learner = with_parameters(learner, parameters(&network));
         }
         let learns = learning(&learner, &recipe.train.learns);
+        let pre_is_fixed = is_pre_fixed(&learner, &recipe.train.learns)?;
         learner = with_frozen(learner, &learns);
         let start = parameters(&learner);
         let (_, side) = recipe.sample_size();
@@ -127,6 +131,7 @@ impl Trainer {
             devices,
             perceptual,
             learns,
+            pre_is_fixed,
         })
     }
 
@@ -237,8 +242,8 @@ impl Trainer {
         let mut random = ChaCha8Rng::seed_from_u64(self.recipe.train.seed);
         random.set_stream(batch.number);
         let (weights, loop_options) = self.options();
-        // Half of all batches start from nothing, as sampling does.
-        let from_nothing = random.next_u64() & 1 == 0;
+        // Half of all batches start from nothing, as sampling does; but for its second step.
+        let from_nothing = random.next_u64() & 1 == 0 && loop_options.noise_on == NoiseOn::Truth;
         let self_conditioning = if from_nothing || loop_options.needs_no_estimate() {
             SelfConditioning::Off
         } else {
@@ -273,6 +278,8 @@ impl Trainer {
             forward_model: !network.ablates(Part::ForwardModel),
             self_conditioning: !network.ablates(Part::SelfConditioning),
             recomputes: self.recipe.train.gradient_checkpointing,
+            pre_is_fixed: self.pre_is_fixed,
+            noise_on: self.recipe.train.noise_on,
         };
         (LossWeights { form, prediction, pre, perceptual, flow }, loop_options)
     }
@@ -299,6 +306,16 @@ fn learning(network: &Qudi, parts: &[LearningPart]) -> Vec<bool> {
         chosen && !name.starts_with("stages.")
     };
     parameter_shapes(network).iter().map(|(name, _)| learns(name)).collect()
+}
+
+/// Whether pre-denoised frames are the same in all passes: neither they nor their uncertainty learn, and they depend on
+/// no simulated measurement.
+pub(super) fn is_pre_fixed(network: &Qudi, parts: &[LearningPart]) -> Result<bool> {
+    let learns = |part| parts.is_empty() || parts.contains(&part);
+    if learns(LearningPart::Pre) || learns(LearningPart::Uncertainty) {
+        return Ok(false);
+    }
+    Ok(ModelKind::of(network)? != ModelKind::Diffusion)
 }
 
 impl LossValues {

@@ -358,6 +358,27 @@ fn checkpointing_without_a_prediction_is_refused() {
     assert!(Recipe::load("tiny", &changes[..1]).unwrap().train.gradient_checkpointing);
 }
 
+/// Weights that learn on their own estimates are made for two steps.
+#[test]
+fn estimates_are_learnt_on_for_two_steps_alone() {
+    let load = |more: &[(&str, &str)]| {
+        let changes = [("train.noise_on", "estimate")].iter().chain(more);
+        let changes: Vec<_> =
+            changes.map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
+        Recipe::load("tiny", &changes)
+    };
+    let two = [("validation.steps", "2"), ("train.timesteps", "log-logistic")];
+    assert!(load(&two).is_ok());
+    for (more, word) in [
+        (vec![two[1]], "validation.steps is 2"),
+        (vec![two[0], ("train.timesteps", "uniform")], "train.timesteps"),
+        (vec![two[0], two[1], ("train.loss.prediction", "0")], "prediction has a weight"),
+    ] {
+        let error = load(&more).unwrap_err().to_string();
+        assert!(error.contains(word), "{more:?}: {error}");
+    }
+}
+
 /// Recipes with the former names of keys equal today's.
 #[test]
 fn reads_recipes_with_former_key_names() {

@@ -1,7 +1,7 @@
 //! The inputs of a training pass: the noisy images, and what the step before would have left.
 
 use super::Example;
-use super::timesteps::previous_timestep;
+use super::timesteps::{NoiseOn, previous_timestep};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use qudi_core::{Error, Result, Size};
@@ -23,15 +23,26 @@ pub struct LoopOptions {
     pub self_conditioning: bool,
     /// Whether pre-denoiser and U-Net are computed again for their gradients, image by image.
     pub recomputes: bool,
+    /// Whether pre-denoiser and uncertainty do not learn, and see no simulated measurement: frames are pre-denoised
+    /// once, without gradient, and the uncertainty has no loss.
+    pub pre_is_fixed: bool,
+    /// What the noise of the noisy images is added to; the estimate only where there is one.
+    pub noise_on: NoiseOn,
 }
 
 impl LoopOptions {
     /// The network is given both, and nothing is computed again.
-    pub const ALL: Self = Self { forward_model: true, self_conditioning: true, recomputes: false };
+    pub const ALL: Self = Self {
+        forward_model: true,
+        self_conditioning: true,
+        recomputes: false,
+        pre_is_fixed: false,
+        noise_on: NoiseOn::Truth,
+    };
 
     /// Whether a first pass would be in vain.
     pub(crate) fn needs_no_estimate(self) -> bool {
-        !self.forward_model && !self.self_conditioning
+        !self.forward_model && !self.self_conditioning && self.noise_on == NoiseOn::Truth
     }
 }
 
@@ -46,33 +57,54 @@ pub enum SelfConditioning {
     On(u64),
 }
 
-/// The network's inputs at an example's timesteps.
+/// Frames that are pre-denoised once, and their features, outside autodiff.
+pub(super) type Fixed = (Tensor<4>, Tensor<4>);
+
+/// The network's inputs at an example's timesteps. `fixed` are the pre-denoised frames where they are the same in all
+/// passes.
 pub(super) fn network_inputs(
     network: &Qudi,
     example: &Example<'_>,
+    fixed: Option<&Fixed>,
     self_conditioning: SelfConditioning,
     options: LoopOptions,
 ) -> Result<(DiffusionState, Option<Simulated>)> {
     let timesteps = example.timesteps;
+    let truth = example.truth.clone() * 2.0 - 1.0;
     let (x0_prev, has_previous, simulated) = match self_conditioning {
         // Where sampling begins, nothing comes before.
         SelfConditioning::On(seed) if timesteps.iter().any(|&t| t < NUM_TIMESTEPS - 1) => {
-            let (x0_prev, simulated) = first_estimate(network, example, seed)?;
+            let (x_t, previous) = match options.noise_on {
+                NoiseOn::Truth => {
+                    let previous: Vec<usize> =
+                        timesteps.iter().map(|&t| previous_timestep(t)).collect();
+                    (noisy_images(example, truth.clone(), &previous), previous)
+                }
+                // Two steps begin with noise alone.
+                NoiseOn::Estimate => {
+                    (example.noise.clone(), vec![NUM_TIMESTEPS - 1; timesteps.len()])
+                }
+            };
+            let (x0_prev, simulated) =
+                first_estimate(network, example, fixed, (x_t, previous), seed)?;
             let has_previous =
                 simulated.exists.iter().map(|&exists| exists && options.self_conditioning);
             (x0_prev, has_previous.collect(), Some(simulated).filter(|_| options.forward_model))
         }
         _ => (example.truth.zeros_like(), vec![false; timesteps.len()], None),
     };
-    let (x_t, timesteps) = (noisy_images(example, timesteps), timesteps.to_vec());
+    let clean = match options.noise_on {
+        NoiseOn::Truth => truth,
+        NoiseOn::Estimate => x0_prev.clone(),
+    };
+    let (x_t, timesteps) = (noisy_images(example, clean, timesteps), timesteps.to_vec());
     let state = DiffusionState { x_t, x0_prev, has_previous, timesteps };
     Ok((state, simulated))
 }
 
-/// The true images in [-1, 1] with the example's noise of these timesteps, one per burst.
-fn noisy_images(example: &Example<'_>, timesteps: &[usize]) -> Tensor<4> {
+/// Clean images in [-1, 1] with the example's noise of these timesteps, one per burst.
+fn noisy_images(example: &Example<'_>, clean: Tensor<4>, timesteps: &[usize]) -> Tensor<4> {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    let clean = example.truth.clone() * 2.0 - 1.0;
     let level = |f: fn(f64) -> f64| {
         let values = timesteps.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32).collect();
         per_image(values, clean.dims()[0], &clean.device()).expand(clean.dims())
@@ -81,22 +113,27 @@ fn noisy_images(example: &Example<'_>, timesteps: &[usize]) -> Tensor<4> {
     clean * signal + example.noise.clone() * noise
 }
 
-/// The network's own estimate at the timesteps before the example's, without gradient, and its simulated
-/// measurement. Bursts at the noisiest timestep have neither: there sampling starts.
+/// The network's own estimate from the noisier images `x_t` of the timesteps `previous`, without gradient, and its
+/// simulated measurement. Bursts at the noisiest timestep have neither: there sampling starts.
 fn first_estimate(
     network: &Qudi,
     example: &Example<'_>,
+    fixed: Option<&Fixed>,
+    (x_t, previous): (Tensor<4>, Vec<usize>),
     seed: u64,
 ) -> Result<(Tensor<4>, Simulated)> {
     let device = example.truth.device();
     let conditioning = example.conditioning.inner();
     let network = network.valid();
-    let previous: Vec<usize> = example.timesteps.iter().map(|&t| previous_timestep(t)).collect();
-    let x_t = noisy_images(example, &previous).inner();
+    let x_t = x_t.inner();
     let has_previous = vec![false; previous.len()];
     let x0_prev = x_t.zeros_like();
     let state = DiffusionState { x_t, x0_prev, has_previous, timesteps: previous };
-    let prediction = network.forward(&network.encode(&conditioning), None, &state, None);
+    let mut encoded = network.encode(&conditioning);
+    if let Some((d, features)) = fixed.cloned() {
+        encoded = network.with_predenoised(encoded, d, features);
+    }
+    let prediction = network.forward(&encoded, None, &state, None);
     let [_, _, height, width] = example.truth.dims();
     let size = Size { height, width };
     let mut x0 = read(prediction.x0.clamp(-1.0, 1.0))?;

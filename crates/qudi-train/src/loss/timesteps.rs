@@ -1,7 +1,9 @@
 //! The timesteps that the network learns at.
 
 use qudi_model::diffusion::schedule::NoiseSchedule;
-use qudi_model::diffusion::timesteps::{NUM_TIMESTEPS, log_logistic_timestep};
+use qudi_model::diffusion::timesteps::{
+    NUM_TIMESTEPS, TimestepSpacing, log_logistic_timestep, sampling_timesteps,
+};
 use serde::{Deserialize, Serialize};
 
 /// The law of the timesteps that the network learns at.
@@ -27,6 +29,24 @@ impl TimestepLaw {
     }
 }
 
+/// What the noise of the noisy images is added to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum NoiseOn {
+    /// The true images (Ho et al. 2020, algorithm 1): the network learns the mean of what noise leaves open.
+    #[default]
+    Truth,
+    /// The network's own first estimate, as in the second of two steps of sampling: it learns to draw what the
+    /// loss asks for from what it is given when it is used, which shows nothing of the truth.
+    Estimate,
+}
+
+/// The timestep of the second of two steps of sampling.
+pub(crate) fn second_of_two(spacing: TimestepSpacing) -> usize {
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+    sampling_timesteps(&schedule, 2, spacing).into_iter().flatten().last().unwrap_or_default()
+}
+
 /// The timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale of their
 /// roots.
 pub(super) fn previous_timestep(timestep: usize) -> usize {
@@ -44,5 +64,11 @@ mod tests {
         let timestep = |quantile| TimestepLaw::Uniform.timestep(quantile);
         assert_eq!([0.0, 0.25, 0.5, 0.9999].map(timestep), [0, 250, 500, 999]);
         assert!(TimestepLaw::LogLogistic.timestep(0.5) < 100);
+    }
+
+    #[test]
+    fn second_of_two_steps_depends_on_their_spacing() {
+        let spacings = [TimestepSpacing::Linear, TimestepSpacing::LogLogistic];
+        assert_eq!(spacings.map(second_of_two), [499, 44]);
     }
 }

@@ -1,6 +1,7 @@
 //! Stages of a recipe: trainings one after the other, each from the weights of the one before.
 
-use super::{Recipe, TrainConfig};
+use super::{Recipe, TrainConfig, is_default};
+use crate::loss::NoiseOn;
 use crate::loss::lpips::PerceptualKind;
 use qudi_core::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -73,6 +74,25 @@ impl Recipe {
         }
         Ok(stages)
     }
+}
+
+/// What a training must keep to about the noisy images, and the timesteps of them: as [`rules`].
+pub(super) fn noise_rules(recipe: &Recipe) -> [(&'static str, bool, &'static str); 2] {
+    let train = &recipe.train;
+    let on_truth = train.noise_on == NoiseOn::Truth;
+    let steps = recipe.validation.as_ref().is_none_or(|validation| validation.steps == 2);
+    [
+        (
+            "train.noise_on",
+            on_truth || (steps && train.loss.prediction > 0.0),
+            "must be \"truth\" unless the prediction has a weight and validation.steps is 2",
+        ),
+        (
+            "train.timesteps",
+            on_truth || is_default(&train.timesteps),
+            "has no use where train.noise_on is \"estimate\": the timestep is that of the second of two steps",
+        ),
+    ]
 }
 
 /// What a training must keep to about the parts that learn, if the network `has_flow`: key, whether it does, and
