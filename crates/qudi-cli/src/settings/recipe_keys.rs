@@ -1,8 +1,7 @@
 //! The keys of recipes, found by serializing the recipes that come along.
 
 use super::flatten;
-use qudi_model::config::PRESETS;
-use qudi_train::Recipe;
+use qudi_train::{Recipe, recipe_names};
 use serde_json::Value;
 use std::sync::OnceLock;
 
@@ -28,7 +27,7 @@ pub(super) fn names() -> &'static [String] {
     static NAMES: OnceLock<Vec<String>> = OnceLock::new();
     NAMES.get_or_init(|| {
         let mut names = Vec::new();
-        for (preset, _) in PRESETS {
+        for preset in recipe_names() {
             names.extend(of_preset(preset).into_iter().map(|(key, _)| key));
         }
         names.sort();
@@ -46,7 +45,7 @@ pub(super) fn is_known(key: &str, value: &Value) -> bool {
     }
     // A key that no recipe writes, since it is optional or has another name by now.
     let change = [(key.to_owned(), super::toml_text(value))];
-    PRESETS.iter().any(|(preset, _)| Recipe::load(preset, &change).is_ok())
+    recipe_names().any(|preset| Recipe::load(preset, &change).is_ok())
 }
 
 /// The key with every number of a list as `0`.

@@ -1,5 +1,6 @@
 //! Stages of a recipe: trainings one after the other, each from the weights of the one before.
 
+use super::keys::{modern_key, set};
 use super::{Recipe, TrainConfig};
 use crate::loss::lpips::PerceptualKind;
 use qudi_core::{Error, Result};
@@ -63,7 +64,7 @@ impl Recipe {
             let fault = |what: String| Error::request(what, &place, "correct the recipe");
             let mut document = document.clone();
             for (key, value) in &stage.changes {
-                super::set(&mut document, &super::modern_key(key), value.clone())
+                set(&mut document, &modern_key(key), value.clone())
                     .map_err(|error| fault(error.to_string()))?;
             }
             let recipe: Self = document
@@ -82,7 +83,7 @@ pub(super) fn rules(
     has_flow: bool,
 ) -> [(&'static str, bool, &'static str); 4] {
     let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
-    let (loss, checkpointing) = (&train.loss, train.gradient_checkpointing);
+    let (loss, checkpointing) = (train.loss(), train.gradient_checkpointing);
     let alone = loss.prediction == 0.0 && loss.term == PerceptualKind::None;
     let taught = [LearningPart::Pre, LearningPart::Uncertainty, LearningPart::Flow];
     let is_taught = |part: &LearningPart| has_flow || *part != LearningPart::Flow;
