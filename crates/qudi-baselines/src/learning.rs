@@ -31,7 +31,7 @@ pub struct Baseline {
 pub struct Bursts {
     /// What the sensor counted.
     pub counts: Tensor<4>,
-    /// What it would have counted without noise and saturation.
+    /// What it would have counted on average, without saturation.
     pub truth: Tensor<4>,
     /// Counts of the frame that a student restores, as often as there are frames; for networks with teachers.
     pub still: Option<Tensor<4>>,

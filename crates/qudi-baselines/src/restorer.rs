@@ -1,6 +1,6 @@
 //! The learned methods as restorers of video: every frame of a window.
 
-use crate::brightness::counts_per_unit;
+use crate::brightness::ExpectedCounts;
 use crate::import::{Loaded, Method, Network, load};
 use crate::sizes::Sizes;
 use crate::spk2imgnet::{Block, Spk2ImgNet};
@@ -179,21 +179,24 @@ impl Restorer for LearnedRestorer {
             Tensor::from_data(data, &self.device)
         };
         let frames: Vec<Tensor<4>> = burst.frames.iter().map(plane).collect();
-        let gain = match self.brightness {
-            Brightness::OfAuthors => 1.0,
-            Brightness::OfCounts => 1.0 / counts_per_unit(acquisition),
+        let expected = match self.brightness {
+            Brightness::OfAuthors => None,
+            Brightness::OfCounts => Some(ExpectedCounts::of(acquisition)),
         };
         let images = self.images(&frames)?.into_iter().map(|image| {
-            let image = image.narrow(2, 0, height).narrow(3, 0, width) * gain;
-            let image = image.clamp(0.0, 1.0);
+            let image = image.narrow(2, 0, height).narrow(3, 0, width);
             let data = image.into_data().try_to_vec::<f32>();
-            let data = data.map_err(|e| {
+            let mut data = data.map_err(|e| {
                 Error::request(
                     format!("the device failed: {e:?}"),
                     self.method().name(),
                     "use --device cpu",
                 )
             })?;
+            for value in &mut data {
+                let image = expected.map_or(*value, |expected| expected.image(*value));
+                *value = image.clamp(0.0, 1.0);
+            }
             Ok(Frame { size: burst.size, data })
         });
         Ok(Restored { frames: images.collect::<Result<_>>()?, std: None })

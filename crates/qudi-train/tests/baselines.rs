@@ -126,12 +126,12 @@ fn every_method_learns_and_restores() {
         let [read, own]: [_; 2] = [&mut read as &mut dyn Restorer, own.as_mut()]
             .map(|restorer| restorer.restore(burst, &acquisition).unwrap().frames);
         assert_eq!(read, own, "{name}: other weights were read than written");
-        // Twice the mean level, and the same counts: a picture of twice the brightness.
-        let bright = Acquisition { mean_level: 0.9, ..acquisition.clone() };
+        // Half the mean level, and the same counts: a picture of half the brightness.
+        let dim = Acquisition { mean_level: 0.225, ..acquisition.clone() };
         let mut restorer = LearnedRestorer::load(&path, method, &Device::flex()).unwrap();
-        let bright = restorer.restore(burst, &bright).unwrap().frames;
-        for (a, b) in read[2].data.iter().zip(&bright[2].data) {
-            assert!((2.0 * a - b).abs() < 1e-5 || *b == 1.0, "{name}: {a} and {b}");
+        let dim = restorer.restore(burst, &dim).unwrap().frames;
+        for (a, b) in read[2].data.iter().zip(&dim[2].data) {
+            assert!((a / 2.0 - b).abs() < 1e-5 || *a == 1.0, "{name}: {a} and {b}");
         }
         // Going on from the file: the same network, whose teachers start anew.
         let again = <Baseline as Learner>::load(&path, &recipe, &Device::flex()).unwrap();
@@ -147,19 +147,22 @@ fn every_method_learns_and_restores() {
 /// The loss falls within some tens of steps.
 #[test]
 fn losses_fall() {
-    for (method, steps, least) in [(Method::Emvd, 40, 0.8), (Method::StudentTeacher, 40, 0.8)] {
+    for (method, size, least) in [
+        (Method::Emvd, ("network.width", "4"), 0.6),
+        (Method::StudentTeacher, ("network.features", "4"), 0.8),
+    ] {
         let changes = [
-            ("train.lr", "4e-3"),
-            ("train.min_lr", "1e-3"),
-            ("train.steps", "40"),
-            ("train.batch", "2"),
-            ("data.crop", "32"),
+            size,
+            ("train.lr", "1e-2"),
+            ("train.steps", "60"),
+            // The same two bursts again and again: what is learnt shows sooner than what samples differ in.
+            ("train.crops", "{ bursts = 2, cached_frames = 5, frames = 5, side = 32 }"),
         ];
-        let (_, reports) = trained(&recipe(method, &changes), steps);
+        let (_, reports) = trained(&recipe(method, &changes), 60);
         let mean = |part: &[StepReport]| {
             part.iter().map(|report| report.loss.term("image")).sum::<f64>() / part.len() as f64
         };
-        let (first, last) = (mean(&reports[..10]), mean(&reports[steps - 10..]));
+        let (first, last) = (mean(&reports[..2]), mean(&reports[50..]));
         assert!(last < least * first, "{}: from {first} to {last}", method.name());
     }
 }

@@ -5,7 +5,7 @@ use crate::burst_cache::burst::ConditionedBurst;
 use crate::dataset::Sample;
 use crate::recipe::Recipe;
 use burn::tensor::Device;
-use qudi_baselines::brightness::{BRIGHTEST, counts_per_unit};
+use qudi_baselines::brightness::ExpectedCounts;
 use qudi_baselines::learning::{Baseline, Bursts};
 use qudi_core::{Camera, Light, Result, Size};
 use qudi_model::tensor::to_tensor;
@@ -47,9 +47,9 @@ impl CountBatch {
                 counts.iter().map(|&count| f32::from(count) / full).collect()
             };
             batch.counts.extend(sample.counts.iter().flat_map(over_full));
-            let scale = counts_per_unit(&sample.acquisition);
+            let expected = ExpectedCounts::of(&sample.acquisition);
             let truth = sample.truth.iter().flat_map(|frame| &frame.data);
-            batch.truth.extend(truth.map(|value| (scale * value).min(BRIGHTEST)));
+            batch.truth.extend(truth.map(|&value| expected.target(value)));
             if let Some(still) = &mut batch.still {
                 still.extend(held_still(&sample)?.iter().flat_map(over_full));
             }
