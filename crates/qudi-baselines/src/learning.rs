@@ -5,7 +5,7 @@ mod losses;
 
 use crate::import::{Method, Network};
 use crate::sizes::Sizes;
-use crate::student_teacher::KernelPrediction;
+use crate::student_teacher::{ANNEALING, KernelPrediction};
 use burn::module::{Module, list_param_ids};
 use burn::tensor::{Device, Tensor};
 use initial::initial_values;
@@ -19,7 +19,7 @@ const TEACHERS: [&str; 2] = ["motion", "denoising"];
 #[derive(Module, Debug)]
 pub struct Baseline {
     network: Network,
-    /// The teachers of a student: of motion without noise, and of noise without motion. They learn beside it.
+    /// The teachers of a student: of motion without noise, and of noise without motion. They learn at the same time.
     teachers: Vec<KernelPrediction>,
 }
 
@@ -92,9 +92,11 @@ impl Baseline {
         sizes.method() == Method::StudentTeacher
     }
 
-    /// The losses of bursts at a step, from 0. The network and they are on an autodiff device; bursts have a number of
-    /// frames that its sizes allow.
-    pub fn losses(&self, bursts: &Bursts, step: u64) -> Losses {
+    /// The losses of bursts at a step, from 0, of so many `steps`. The network and they are on an autodiff device;
+    /// bursts have a number of frames that its sizes allow.
+    pub fn losses(&self, bursts: &Bursts, step: u64, steps: u64) -> Losses {
+        let shrunk = ANNEALING.max(steps) as f64 / steps.max(1) as f64;
+        let step = (step as f64 * shrunk) as u64;
         let (terms, moved) = losses::losses(&self.network, &self.teachers, bursts, step);
         let places = list_param_ids(self).into_iter().enumerate();
         let moved = places.filter_map(|(place, id)| Some((place, moved.get(&id)?.clone())));

@@ -7,7 +7,6 @@
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 
-pub mod brightness;
 pub mod emvd;
 pub mod flornn;
 #[cfg(test)]

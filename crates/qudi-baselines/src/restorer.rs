@@ -1,6 +1,7 @@
 //! The learned methods as restorers of video: every frame of a window.
 
-use crate::brightness::ExpectedCounts;
+mod brightness;
+
 use crate::import::{Loaded, Method, Network, load};
 use crate::sizes::Sizes;
 use crate::spk2imgnet::{Block, Spk2ImgNet};
@@ -11,6 +12,8 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Frame, Result, Size};
 use std::collections::VecDeque;
 use std::path::Path;
+
+pub use brightness::ExpectedCounts;
 
 /// Frames of a window, and of one of EMVD, whose recurrence starts anew with every window.
 const WINDOW: usize = 11;

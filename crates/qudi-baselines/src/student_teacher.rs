@@ -26,6 +26,9 @@ pub const MULTIPLE: usize = 1 << (LEVELS - 1);
 const AUXILIARY: f64 = 100.0;
 const DECAY: f64 = 0.9998;
 
+/// Steps until that weight is 0.03. Shorter trainings take them in fewer steps, or it would rule them to the end.
+pub const ANNEALING: u64 = 40_000;
+
 /// The weight of the distance from a teacher.
 const MATCH: f32 = 0.1;
 
@@ -155,8 +158,8 @@ fn filtered(burst: Tensor<4>, kernels: Tensor<4>, side: usize) -> Tensor<4> {
     (1..side * side).fold(tap(0), |sum, k| sum + tap(k))
 }
 
-/// The terms of the reconstruction's loss at a step, from 0, `[1]` each: the mean squared error of the image, and, less
-/// and less, that of every filtered frame.
+/// The terms of the reconstruction's loss at a step, from 0, `[1]` each: the mean squared error of the image, and,
+/// less and less, that of every filtered frame.
 ///
 /// # Shapes
 /// - truth: `[bursts, 1, height, width]`

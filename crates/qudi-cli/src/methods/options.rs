@@ -149,7 +149,7 @@ impl NetworkOptions {
                 format!("method `{name}` has no weights here"),
                 "--weights",
                 format!(
-                    "name a file of its authors, as in --weights {name}=FILE (docs/methods.md)"
+                    "name a file of its authors, or of `qudi train {name}`, as in --weights {name}=FILE (docs/methods.md)"
                 ),
             )
         })

@@ -22,6 +22,22 @@ pub(super) fn of_preset(name: &str) -> Vec<(String, Value)> {
     leaves
 }
 
+/// Recipes of learned methods of others by name, with the sizes of their networks.
+pub(super) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
+    let sizes = |name: &'static str| {
+        let keys = of_preset(name).into_iter();
+        let own = keys.filter_map(|(key, value)| {
+            let key = key.strip_prefix("network.")?;
+            Some((key.to_owned(), value))
+        });
+        let mut own: Vec<_> = own.collect();
+        let at = own.iter().position(|(key, _)| key == "method")?;
+        own.remove(at);
+        Some((name, own))
+    };
+    recipe_names().filter_map(sizes).collect()
+}
+
 /// All keys of all recipes that come along, numbers of lists as `0`.
 pub(super) fn names() -> &'static [String] {
     static NAMES: OnceLock<Vec<String>> = OnceLock::new();

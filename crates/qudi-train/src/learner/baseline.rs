@@ -44,7 +44,9 @@ impl Learner for Baseline {
     }
 
     fn loss<'a>(&'a self, batch: &'a CountBatch, context: &Context<'a>) -> Result<Loss<'a>> {
-        let Losses { terms, statistics } = self.losses(&batch.on(context.device), context.step);
+        let bursts = batch.on(context.device);
+        let Losses { terms, statistics } =
+            self.losses(&bursts, context.step, context.recipe.train.steps);
         let total = Tensor::cat(terms.iter().map(|(_, term)| term.clone()).collect(), 0).sum();
         let of_total = total.clone();
         Ok(Loss {

@@ -5,8 +5,8 @@ use crate::burst_cache::burst::ConditionedBurst;
 use crate::dataset::Sample;
 use crate::recipe::Recipe;
 use burn::tensor::Device;
-use qudi_baselines::brightness::ExpectedCounts;
 use qudi_baselines::learning::{Baseline, Bursts};
+use qudi_baselines::restorer::ExpectedCounts;
 use qudi_core::{Camera, Light, Result, Size};
 use qudi_model::tensor::to_tensor;
 

@@ -2,8 +2,8 @@
 //!
 //! Their authors trained each network at one light level, where one gain and one dark level lead from counts to
 //! images. At several light levels there is none: the light of a burst, and the mean level of its scene, do not show
-//! in counts over full scale. What counts do show is what they would be on average. That is the target here, and
-//! restoring, which knows sensor, light and mean level of the acquisition, goes back from it to the units of the image.
+//! in counts over full scale. What counts do show is what they are on average. That is the target here, and
+//! restoring, which knows sensor, light and mean level of the acquisition, goes back to the units of the image.
 
 use qudi_core::restorer::Acquisition;
 
