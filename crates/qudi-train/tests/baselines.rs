@@ -196,6 +196,22 @@ fn resumed_run_equals_undisturbed_run() {
     }
 }
 
+/// Two devices with a batch each give what one device with both gives: gradients, and statistics of batches.
+#[test]
+fn weights_do_not_depend_on_the_number_of_devices() {
+    let changes = [("data.crop", "16"), ("train.batch", "1"), ("train.accumulate", "2")];
+    let recipe = recipe(Method::MemDeblur, &changes);
+    let of = |devices: &[Device]| {
+        let dataset = Dataset::new(&recipe.data, None).unwrap();
+        let bursts = BurstSampler::new(&recipe, dataset, Vec::new());
+        let mut prefetcher = Prefetcher::new(&recipe, &bursts, 0, 1).unwrap();
+        let mut trainer = Trainer::<Baseline>::new(&recipe, None, devices, None).unwrap();
+        let total = trainer.step(&mut prefetcher).unwrap().loss.total;
+        (total, weights(&trainer.averaged()))
+    };
+    assert!(of(&[Device::flex()]) == of(&[Device::flex(), Device::flex()]), "weights differ");
+}
+
 /// Statistics of batches reach the weights, though no gradient moves them.
 #[test]
 fn running_statistics_move() {
