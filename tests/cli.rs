@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 #[path = "cli/bad_input.rs"]
 mod bad_input;
+#[path = "cli/baselines.rs"]
+mod baselines;
 #[path = "cli/eval.rs"]
 mod eval;
 #[path = "cli/field.rs"]

@@ -7,6 +7,7 @@ use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d};
+use serde::{Deserialize, Serialize};
 use transform::{Inverse, Wavelet};
 
 /// Channels of a frame.
@@ -17,6 +18,14 @@ pub const WIDTH: usize = 16;
 
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 8;
+
+/// Sizes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sizes {
+    /// Channels of the layers inside.
+    pub width: usize,
+}
 
 /// Shot and read noise of raw frames of 12 bits, `a x + b`: constants of the published network.
 const SHOT: f32 = 1.0 / 3855.0;
@@ -135,15 +144,29 @@ impl Emvd {
     /// # Shapes
     /// - frames, results: `[images, 1, height, width]` each
     pub fn restore(&self, frames: Vec<Tensor<4>>) -> Vec<Tensor<4>> {
+        // The copies are one picture.
+        self.refined(frames).map(|image| image.mean_dim(1)).collect()
+    }
+
+    /// The mean absolute error of every frame's four copies, `[1]`.
+    ///
+    /// # Shapes
+    /// - frames, truth: `[images, 1, height, width]` each
+    pub fn error(&self, frames: Vec<Tensor<4>>, truth: &[Tensor<4>]) -> Tensor<1> {
+        let errors = self.refined(frames).zip(truth);
+        let errors = errors.map(|(image, truth)| (image - truth.clone()).abs().mean());
+        Tensor::cat(errors.collect(), 0).mean()
+    }
+
+    /// The results, frame after frame, of four copies each.
+    fn refined(&self, frames: Vec<Tensor<4>>) -> impl Iterator<Item = Tensor<4>> {
         let mut fused: Option<Tensor<4>> = None;
-        let restore = |frame: Tensor<4>| {
+        frames.into_iter().map(move |frame| {
             let current = frame.repeat(&[1, CHANNELS, 1, 1]);
             let step = self.step(fused.take().unwrap_or_else(|| current.clone()), current);
             fused = Some(step.fusion);
-            // The copies are one picture.
-            step.refine.mean_dim(1)
-        };
-        frames.into_iter().map(restore).collect()
+            step.refine
+        })
     }
 
     /// How far the transforms are from their inverses, `[1]`: what training adds to the error of the frames.

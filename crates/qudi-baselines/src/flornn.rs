@@ -11,6 +11,8 @@ use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor};
 use pwcnet::PwcNet;
 use qudi_layers::{Bias, Conv2d};
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
 
 pub use pwcnet::correlation;
 pub use splat::splat_average;
@@ -19,27 +21,48 @@ pub use splat::splat_average;
 const FLOW_MULTIPLE: usize = 64;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of images.
+    #[serde(skip, default = "published_channels")]
     pub channels: usize,
     /// Channels of features.
     pub features: usize,
     /// Residual blocks of a recurrence.
     pub blocks: usize,
     /// Frames that it looks ahead.
+    #[serde(skip, default = "published_ahead")]
     pub ahead: usize,
     /// The strip around images that the look ahead may leave them by, in parts of their sides.
+    #[serde(skip, default = "published_border")]
     pub border: f64,
+    /// Whether it has PWC-Net, and follows motion. Its authors took weights that others had trained, on other
+    /// images; networks that are trained here have none.
+    #[serde(skip)]
+    pub flow: bool,
 }
 
 /// The sizes of the authors of QUIVER.
-pub const PUBLISHED: Sizes = Sizes { channels: 3, features: 64, blocks: 15, ahead: 9, border: 0.1 };
+pub const PUBLISHED: Sizes =
+    Sizes { channels: 3, features: 64, blocks: 15, ahead: 9, border: 0.1, flow: true };
+
+fn published_channels() -> usize {
+    PUBLISHED.channels
+}
+
+fn published_ahead() -> usize {
+    PUBLISHED.ahead
+}
+
+fn published_border() -> f64 {
+    PUBLISHED.border
+}
 
 /// The network.
 #[derive(Module, Debug)]
 pub struct FloRnn {
-    pwcnet: PwcNet,
+    pwcnet: Option<PwcNet>,
     forward_rnn: Recurrence,
     backward_rnn: Recurrence,
     d: Output,
@@ -65,14 +88,14 @@ struct Output {
 impl FloRnn {
     /// The network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
-        let Sizes { channels, features, blocks, ahead, border } = sizes;
+        let Sizes { channels, features, blocks, ahead, border, flow } = sizes;
         let conv = |sizes| Conv2d::zeros(sizes, 3, Bias::No, device);
         let recurrence = || Recurrence {
             first_conv: conv([2 * channels + features, features]),
             resblocks: (0..blocks).map(|_| Residual::zeros(features, Bias::No, device)).collect(),
         };
         Self {
-            pwcnet: PwcNet::zeros(device),
+            pwcnet: flow.then(|| PwcNet::zeros(device)),
             forward_rnn: recurrence(),
             backward_rnn: recurrence(),
             d: Output {
@@ -107,19 +130,22 @@ impl FloRnn {
         PwcNet::authors_name(&name)
     }
 
-    /// The flow from `from` to `to`, without gradient: `warp(to, flow)` resembles `from`.
+    /// The flow from `from` to `to`, without gradient: `warp(to, flow)` resembles `from`. None of a network without
+    /// PWC-Net.
     ///
     /// # Shapes
     /// - from, to: `[images, 3, height, width]`
     /// - result: `[images, 2, height, width]`, x before y, in pixels
-    pub fn flow(&self, from: &Tensor<4>, to: &Tensor<4>) -> Tensor<4> {
+    pub fn flow(&self, from: &Tensor<4>, to: &Tensor<4>) -> Option<Tensor<4>> {
+        let pwcnet = self.pwcnet.as_ref()?;
         let [_, _, height, width] = from.dims();
         let size = [height, width];
         let padded = size.map(|side| side.next_multiple_of(FLOW_MULTIPLE));
         let prepared = |image: &Tensor<4>| resize(image.clone().detach(), padded, Corners::Edges);
-        let flow = self.pwcnet.forward(prepared(from), prepared(to)).detach();
+        let flow = pwcnet.forward(prepared(from), prepared(to)).detach();
         let factor = |axis: usize| pwcnet::UNIT * size[axis] as f32 / padded[axis] as f32;
-        resize(flow, size, Corners::Edges) * same_flow([factor(1), factor(0)], &from.device())
+        let scale = same_flow([factor(1), factor(0)], &from.device());
+        Some(resize(flow, size, Corners::Edges) * scale)
     }
 
     /// Restores every frame of bursts. Training knows the second frame alone.
@@ -127,6 +153,20 @@ impl FloRnn {
     /// # Shapes
     /// - x, result: `[bursts * frames, channels, height, width]`; more frames than it looks ahead
     pub fn forward(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
+        self.first_frames(&x, frames, frames)
+    }
+
+    /// Restores the second frame of bursts, which training learns from, and the first on the way.
+    ///
+    /// # Shapes
+    /// - x: `[bursts * frames, channels, height, width]`; at least two frames more than it looks ahead
+    /// - result: `[bursts * 2, channels, height, width]`
+    pub fn forward_to_second(&self, x: &Tensor<4>, frames: usize) -> Tensor<4> {
+        self.first_frames(x, frames, 2)
+    }
+
+    /// Restores the first `count` frames of bursts.
+    fn first_frames(&self, x: &Tensor<4>, frames: usize, count: usize) -> Tensor<4> {
         let [images, _, height, width] = x.dims();
         let strip = [height, width].map(|side| (self.border * side as f64) as usize);
         let around = [(0, 0), (0, 0), (strip[0], strip[0]), (strip[1], strip[1])];
@@ -134,19 +174,21 @@ impl FloRnn {
         let crop = |image: Tensor<4>| image.narrow(2, strip[0], height).narrow(3, strip[1], width);
         // Reflected at the last frame.
         let order = (0..frames).chain((0..self.ahead).map(|i| frames - 2 - i));
-        let video: Vec<_> = order.map(|t| frame(&x, frames, t)).collect();
+        let video: Vec<_> = order.map(|t| frame(x, frames, t)).collect();
         let ones = Tensor::ones([1, 1, height, width], &x.device());
         let outside = expand(ones).neg() + 1.0;
         let state = Tensor::zeros([images / frames, self.features, height, width], &x.device());
         let mut backward = self.backward_rnn.forward(&video[0], state.clone());
         let mut forward = self.forward_rnn.forward(&video[0], state);
-        let mut queue: Vec<(Tensor<4>, Tensor<4>)> = Vec::new();
-        let mut outputs = Vec::with_capacity(frames);
-        for i in 1..frames + self.ahead {
-            let flow = expand(self.flow(&video[i - 1], &video[i]));
-            let splatted = splat_average(expand(backward), flow.clone());
-            queue.push((splatted.clone(), flow));
-            backward = self.backward_rnn.forward(&video[i], crop(splatted));
+        let mut queue: VecDeque<(Tensor<4>, Tensor<4>)> = VecDeque::new();
+        let mut outputs = Vec::with_capacity(count);
+        for i in 1..count + self.ahead {
+            if let Some(flow) = self.flow(&video[i - 1], &video[i]).map(expand) {
+                let splatted = splat_average(expand(backward), flow.clone());
+                queue.push_back((splatted.clone(), flow));
+                backward = crop(splatted);
+            }
+            backward = self.backward_rnn.forward(&video[i], backward);
             if i < self.ahead {
                 continue;
             }
@@ -156,11 +198,13 @@ impl FloRnn {
             });
             outputs.push(self.d.forward(forward.clone(), mimicked));
             let next = i - self.ahead + 1;
-            if next < frames {
-                let flow = self.flow(&video[next], &video[next - 1]);
-                forward = self.forward_rnn.forward(&video[next], masked_warp(forward, flow));
+            if next < count {
+                if let Some(flow) = self.flow(&video[next], &video[next - 1]) {
+                    forward = masked_warp(forward, flow);
+                }
+                forward = self.forward_rnn.forward(&video[next], forward);
             }
-            queue.remove(0);
+            queue.pop_front();
         }
         bursts_of(outputs)
     }
@@ -183,9 +227,9 @@ impl Output {
 /// The loss of training, `[1]`: half the sum of squared errors of the second frame, over bursts.
 ///
 /// # Shapes
-/// - x, truth: `[bursts * frames, channels, height, width]`
-pub fn loss(x: &Tensor<4>, truth: &Tensor<4>, frames: usize) -> Tensor<1> {
-    let error = frame(x, frames, 1) - frame(truth, frames, 1);
+/// - x, truth: `[bursts, channels, height, width]`: second frames
+pub fn loss(x: Tensor<4>, truth: Tensor<4>) -> Tensor<1> {
+    let error = x - truth;
     let bursts = error.dims()[0];
     error.powi_scalar(2).sum() / (2 * bursts) as f32
 }

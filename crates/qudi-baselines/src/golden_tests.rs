@@ -6,13 +6,13 @@ mod pieces;
 use crate::cases::{Case, File, parameter, uniform};
 use crate::emvd::{self, Emvd};
 use crate::flornn::{self, FloRnn};
-use crate::memdeblur::{self, MemDeblur};
+use crate::memdeblur::{self, BatchStatistics, MemDeblur};
 use crate::parts::{bursts_of, charbonnier, frame as frame_of};
 use crate::quiver::{self, Quiver};
 use crate::rvrt::{self, Rvrt};
 use crate::spk2imgnet::{self, Spk2ImgNet};
 use crate::student_teacher::{self, KernelPrediction};
-use burn::module::{Module, ModuleVisitor, Param};
+use burn::module::{Module, ModuleVisitor, Param, list_param_ids};
 use burn::tensor::{Device, Gradients, Tensor};
 use qudi_layers::{init_parameters, parameter_shapes};
 
@@ -219,7 +219,9 @@ fn spk2imgnet_matches_pytorch() {
             let x: Tensor<4> = case.input("x", &device).require_grad();
             let (image, estimates) = network.forward(&x);
             let loss = if name == "loss" {
-                let loss = spk2imgnet::loss(image, estimates, case.input("truth", &device));
+                let [main, each] =
+                    spk2imgnet::losses(image, estimates, case.input("truth", &device));
+                let loss = main + each;
                 case.check_output("loss", loss.clone());
                 loss
             } else {
@@ -269,12 +271,11 @@ fn student_teacher_matches_pytorch() {
         let input = |name: &str| -> Tensor<4> { case.input(name, &device) };
         let noisy = input("noisy").require_grad();
         let teachers = [motion.forward(input("clean")), denoising.forward(input("still"))];
-        let loss = student_teacher::student_loss(
-            &student.forward(noisy.clone()),
-            teachers.each_ref(),
-            &input("truth"),
-            case.number("iteration") as u64,
-        );
+        let restored = student.forward(noisy.clone());
+        let step = case.number("iteration") as u64;
+        let [image, frames] =
+            student_teacher::reconstruction_losses(&restored, &input("truth"), step);
+        let loss = image + frames + student_teacher::matching_loss(&restored, teachers.each_ref());
         case.check_output("loss", loss.clone());
         let gradients = loss.backward();
         case.check_gradient("noisy", noisy.grad(&gradients).unwrap());
@@ -303,7 +304,8 @@ fn quiver_matches_pytorch() {
             let restored = network.forward(folded(&x), frames);
             let loss = if name == "quiver_loss" {
                 let truth: Tensor<5> = case.input("truth", &device);
-                let loss = network.loss(restored, &folded(&truth), frames);
+                let [full, half, quarter, pre] = network.losses(restored, &folded(&truth), frames);
+                let loss = full + half + quarter + pre;
                 case.check_output("loss", loss.clone());
                 loss
             } else {
@@ -362,6 +364,7 @@ fn flornn_matches_pytorch() {
             blocks: size(&case, "blocks"),
             ahead: size(&case, "forward_count"),
             border: case.about["config"]["border_ratio"].as_f64().unwrap(),
+            flow: true,
         };
         let network = FloRnn::zeros(sizes, &device);
         if case.name == "flow" {
@@ -369,7 +372,7 @@ fn flornn_matches_pytorch() {
                 reference_parameter(&FloRnn::authors_name(name), shape)
             });
             let [a, b] = ["a", "b"].map(|name| case.input::<4>(name, &device));
-            case.check_output("flow", network.flow(&a, &b));
+            case.check_output("flow", network.flow(&a, &b).unwrap());
             continue;
         }
         let network = weighted(network, &case, "", FloRnn::authors_name);
@@ -378,7 +381,8 @@ fn flornn_matches_pytorch() {
         let images = network.forward(folded(&x), frames);
         let loss = if case.name == "loss" {
             let truth: Tensor<5> = case.input("truth", &device);
-            let loss = flornn::loss(&images, &folded(&truth), frames);
+            let second = |images: &Tensor<4>| frame_of(images, frames, 1);
+            let loss = flornn::loss(second(&images), second(&folded(&truth)));
             case.check_output("loss", loss.clone());
             loss
         } else {
@@ -393,12 +397,22 @@ fn flornn_matches_pytorch() {
 #[test]
 fn memdeblur_matches_pytorch() {
     // Of these there is no gradient: nothing depends on them.
-    let without = |name: &str| {
+    fn without(name: &str) -> bool {
         let unused = ["conv_hr.", "conv_last.", "memory.key_proj.key_proj.bias"];
         unused.iter().any(|unused| name.starts_with(unused)) || name.contains(".running_")
-    };
+    }
+    // Of those before normalisations by statistics of batches, none but rounding.
+    fn without_of_batch(name: &str) -> bool {
+        let before = [".conv1.bias", ".conv2.bias", ".conv3.bias", ".downsample.0.bias"];
+        let encoder = name.contains("_encoder") && !name.contains("_resblocks");
+        without(name) || encoder && before.iter().any(|bias| name.ends_with(bias))
+    }
     let device = Device::flex().autodiff();
-    for (name, case) in [("memdeblur", "evaluation"), ("memdeblur_training", "training")] {
+    for (name, case) in [
+        ("memdeblur", "evaluation"),
+        ("memdeblur_training", "training"),
+        ("memdeblur_training", "training_batch"),
+    ] {
         let file = File::open(&format!("learned/{name}"));
         let case = file.case(case);
         let sizes = memdeblur::Sizes {
@@ -424,13 +438,28 @@ fn memdeblur_matches_pytorch() {
             sum(&case, &[("quarter", quarter), ("half", half), ("full", full)])
         } else {
             let truth: Tensor<5> = case.input("truth", &device);
-            let outputs = network.forward(&folded(&x), frames, memdeblur::Mode::Training);
-            let loss = memdeblur::loss(outputs, &folded(&truth));
+            let statistics = BatchStatistics::default();
+            let of_batch = (case.name == "training_batch").then_some(&statistics);
+            let mode = memdeblur::Mode::Training(of_batch);
+            let outputs = network.forward(&folded(&x), frames, mode);
+            let [quarter, half, full] = memdeblur::losses(outputs, &folded(&truth));
+            let loss = quarter + half + full;
             case.check_output("loss", loss.clone());
+            if of_batch.is_some() {
+                let moved = statistics.into_moved();
+                let names = parameter_shapes(&network).into_iter().map(|(name, _)| name);
+                let ids: Vec<_> = names.zip(list_param_ids(&network)).collect();
+                for (output, name) in [("mean", "running_mean"), ("variance", "running_var")] {
+                    let name = format!("memory.key_encoder.bn1.{name}");
+                    let (_, id) = ids.iter().find(|(ours, _)| *ours == name).unwrap();
+                    case.check_output(output, moved[id].clone());
+                }
+            }
             loss
         };
         let gradients = loss.backward();
         case.check_gradient("x", x.grad(&gradients).unwrap());
+        let without = if case.name == "training_batch" { without_of_batch } else { without };
         check_parameters(&case, &gradients, &network, &MemDeblur::authors_name, without);
     }
 }

@@ -1,21 +1,20 @@
 //! The authors' files: which network they are of, in which size, and its weights.
 
-use crate::emvd::Emvd;
+use crate::emvd::{self, Emvd};
 use crate::flornn::{self, FloRnn};
 use crate::memdeblur::{self, MemDeblur};
 use crate::quiver::{self, Quiver};
 use crate::rvrt::{self, Rvrt};
+use crate::sizes::{MOST, Sizes};
 use crate::spk2imgnet::{self, Spk2ImgNet};
 use crate::student_teacher::{self, KernelPrediction};
+use crate::weights::{self, Description};
 use burn::module::Module;
 use burn::tensor::Device;
 use qudi_core::{Error, Result};
 use qudi_layers::{StateDict, init_parameters, parameter_shapes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
-
-/// Most channels, blocks or frames that a file may ask for.
-const MOST: usize = 4096;
 
 /// Keys of a kind that a message lists.
 const SHOWN: usize = 20;
@@ -71,7 +70,7 @@ pub enum Network {
 }
 
 /// What a file holds.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Contents {
     /// The network.
     pub method: Method,
@@ -79,6 +78,19 @@ pub struct Contents {
     pub sizes: String,
     /// The number of its parameters.
     pub parameters: usize,
+    /// What a file says of itself that this program wrote.
+    pub description: Option<Description>,
+}
+
+/// A network out of a file.
+#[derive(Debug)]
+pub struct Loaded {
+    /// The network.
+    pub network: Network,
+    /// Its sizes.
+    pub sizes: Sizes,
+    /// What a file says of itself that this program wrote; none of those of authors.
+    pub description: Option<Description>,
 }
 
 impl Method {
@@ -127,16 +139,17 @@ impl Method {
 pub fn describe(path: &Path, device: &Device) -> Result<Option<Contents>> {
     let file = StateDict::open(path)?;
     let Some(method) = Method::of(&file) else { return Ok(None) };
-    let sizes = Sizes::of(&file, method)?;
+    let sizes = sizes_of(&file, method)?;
     let parameters = count(&sizes.network(device), &file)?;
-    Ok(Some(Contents { method, sizes: sizes.to_string(), parameters }))
+    let description = weights::description(&file)?;
+    Ok(Some(Contents { method, sizes: sizes.to_string(), parameters, description }))
 }
 
 /// Loads the network of a method from a file of its authors, or from one with the same keys.
 ///
 /// # Errors
 /// [`Error`] if the file cannot be read, or does not hold this network, to the last key.
-pub fn load(path: &Path, method: Method, device: &Device) -> Result<Network> {
+pub fn load(path: &Path, method: Method, device: &Device) -> Result<Loaded> {
     let file = StateDict::open(path)?;
     let found = Method::of(&file);
     if found != Some(method) {
@@ -146,140 +159,107 @@ pub fn load(path: &Path, method: Method, device: &Device) -> Result<Network> {
         };
         return Err(Error::data(what, path, "name a file that was saved for this method"));
     }
-    filled(Sizes::of(&file, method)?.network(device), &file)
+    let sizes = sizes_of(&file, method)?;
+    let description = weights::description(&file)?;
+    Ok(Loaded { network: filled(sizes.network(device), &file)?, sizes, description })
 }
 
-/// Sizes of a network.
-#[derive(Clone, Copy, Debug)]
-enum Sizes {
-    Quiver(quiver::Sizes),
-    Emvd(usize),
-    FloRnn(flornn::Sizes),
-    Spk2ImgNet(spk2imgnet::Sizes),
-    MemDeblur(memdeblur::Sizes),
-    Rvrt(rvrt::Sizes),
-    StudentTeacher(student_teacher::Sizes),
-}
-
-impl Sizes {
-    /// The sizes that follow from the shapes of a file.
-    fn of(file: &StateDict, method: Method) -> Result<Self> {
-        let side = |name: &str, axis: usize| {
-            let side = file.shape(name).and_then(|shape| shape.get(axis).copied());
-            let help = "these are weights of another network, or the file is damaged";
-            match side {
-                Some(side) if (1..=MOST).contains(&side) => Ok(side),
-                Some(side) => {
-                    Err(Error::data(format!("`{name}` has a side of {side}"), file.path(), help))
-                }
-                None => Err(Error::data(format!("`{name}` is missing"), file.path(), help)),
+/// The sizes that follow from the shapes of a file.
+fn sizes_of(file: &StateDict, method: Method) -> Result<Sizes> {
+    let side = |name: &str, axis: usize| {
+        let side = file.shape(name).and_then(|shape| shape.get(axis).copied());
+        let help = "these are weights of another network, or the file is damaged";
+        match side {
+            Some(side) if (1..=MOST).contains(&side) => Ok(side),
+            Some(side) => {
+                Err(Error::data(format!("`{name}` has a side of {side}"), file.path(), help))
             }
+            None => Err(Error::data(format!("`{name}` is missing"), file.path(), help)),
+        }
+    };
+    let names = file.names();
+    // Blocks are numbered from 0.
+    let count = |list: &str| {
+        let number = |name: &String| {
+            let rest = name.strip_prefix(list)?.strip_prefix('.')?;
+            rest.split('.').next()?.parse::<usize>().ok()
         };
-        let names = file.names();
-        // Blocks are numbered from 0.
-        let count = |list: &str| {
-            let number = |name: &String| {
-                let rest = name.strip_prefix(list)?.strip_prefix('.')?;
-                rest.split('.').next()?.parse::<usize>().ok()
-            };
-            names.iter().filter_map(number).max().map_or(0, |most| most.min(MOST) + 1)
-        };
-        let sizes = match method {
-            Method::Quiver => {
-                let features = side("predenoise.sfe1.weight", 0)?;
-                let frames = side("spatial_att.conv.weight", 0)? / (4 * features).max(1);
-                let past = frames.saturating_sub(1).div_ceil(2);
-                Self::Quiver(quiver::Sizes {
-                    features,
-                    blocks: 1 + count("forward_cell.F_R.1.RDBs"),
-                    past,
-                    future: frames.saturating_sub(1 + past),
-                })
-            }
-            Method::Emvd => Self::Emvd(side("vd.fusion.net1.weight", 0)?),
-            Method::FloRnn => Self::FloRnn(flornn::Sizes {
-                channels: side("d.convs.2.weight", 0)?,
-                features: side("forward_rnn.first_conv.weight", 0)?,
-                blocks: count("forward_rnn.resblocks"),
-                ..flornn::PUBLISHED
-            }),
-            Method::Spk2ImgNet => Self::Spk2ImgNet(spk2imgnet::Sizes {
-                features: side("extractor.conv.weight", 0)?,
-                stem: side("extractor.conv0_0.weight", 0)?,
-                blocks: count("extractor.net"),
-                groups: side("pcd_align.pcd_align.cas_dcnpack.conv_offset_mask.weight", 0)? / 27,
-            }),
-            Method::MemDeblur => Self::MemDeblur(memdeblur::Sizes {
-                channels: side("downsampling.0.weight", 0)?,
-                features: side("fusion.weight", 0)?,
-                forward_blocks: count("forward_resblocks.main.0"),
-                backward_blocks: count("backward_resblocks.main.2"),
-                memory_blocks: count("memory.key_encoder.forward_resblocks.main.2"),
-                bottlenecks: count("memory.key_encoder.layer1"),
-                ..memdeblur::PUBLISHED
-            }),
-            Method::Rvrt => Self::Rvrt(rvrt::Sizes {
-                channels: side("conv_last.weight", 0)?,
-                features: side("feat_extract.3.weight", 0)?,
-                blocks: count("backbone.backward_1.main.5"),
-            }),
-            Method::StudentTeacher => {
-                let frames = side("extractor.0.weight", 1)?;
-                Self::StudentTeacher(student_teacher::Sizes {
-                    frames,
-                    features: side("extractor.0.weight", 0)?,
-                    kernel: (side("kernels.weight", 0)? / frames).isqrt(),
-                })
-            }
-        };
-        sizes.checked(file)
-    }
-
-    /// Refuses sizes that a network cannot have.
-    fn checked(self, file: &StateDict) -> Result<Self> {
-        let problem = match self {
-            Self::Quiver(s) if !s.features.is_multiple_of(16) || s.blocks < 2 => {
-                "QUIVER has features in multiples of 16, and two blocks or more"
-            }
-            Self::Quiver(s) if s.past == 0 || s.future == 0 => {
-                "QUIVER sees frames before and after the one that it restores"
-            }
-            Self::FloRnn(s) if s.channels != 3 => "FloRNN has images of three channels",
-            Self::Spk2ImgNet(s) if s.groups == 0 || !s.features.is_multiple_of(s.groups) => {
-                "groups of Spk2ImgNet divide its features"
-            }
-            Self::MemDeblur(s) if !s.features.is_multiple_of(8) || s.bottlenecks == 0 => {
-                "MemDeblur has features in multiples of 8, and a bottleneck or more"
-            }
-            Self::Rvrt(s) if !s.features.is_multiple_of(12) || ![1, 3].contains(&s.channels) => {
-                "RVRT has features in multiples of 12, and images of one or three channels"
-            }
-            Self::StudentTeacher(s) if s.kernel.is_multiple_of(2) => "kernels have odd sides",
-            _ => return Ok(self),
-        };
-        let help = "this network cannot be of these sizes: name another file";
-        Err(Error::data(format!("{problem}; the file has {self}"), file.path(), help))
-    }
-
-    /// The network of these sizes, without weights.
-    fn network(self, device: &Device) -> Network {
-        match self {
-            Self::Quiver(sizes) => Network::Quiver(Quiver::zeros(sizes, device)),
-            Self::Emvd(width) => Network::Emvd(Emvd::zeros(width, device)),
-            Self::FloRnn(sizes) => Network::FloRnn(FloRnn::zeros(sizes, device)),
-            Self::Spk2ImgNet(sizes) => Network::Spk2ImgNet(Spk2ImgNet::zeros(sizes, device)),
-            Self::MemDeblur(sizes) => Network::MemDeblur(MemDeblur::zeros(sizes, device)),
-            Self::Rvrt(sizes) => Network::Rvrt(Rvrt::zeros(sizes, device)),
-            Self::StudentTeacher(sizes) => {
-                Network::StudentTeacher(KernelPrediction::zeros(sizes, device))
-            }
+        names.iter().filter_map(number).max().map_or(0, |most| most.min(MOST) + 1)
+    };
+    let sizes = match method {
+        Method::Quiver => {
+            let features = side("predenoise.sfe1.weight", 0)?;
+            let frames = side("spatial_att.conv.weight", 0)? / (4 * features).max(1);
+            let past = frames.saturating_sub(1).div_ceil(2);
+            Sizes::Quiver(quiver::Sizes {
+                features,
+                blocks: 1 + count("forward_cell.F_R.1.RDBs"),
+                past,
+                future: frames.saturating_sub(1 + past),
+            })
+        }
+        Method::Emvd => Sizes::Emvd(emvd::Sizes { width: side("vd.fusion.net1.weight", 0)? }),
+        Method::FloRnn => Sizes::FloRnn(flornn::Sizes {
+            channels: side("d.convs.2.weight", 0)?,
+            features: side("forward_rnn.first_conv.weight", 0)?,
+            blocks: count("forward_rnn.resblocks"),
+            flow: names.iter().any(|name| name.starts_with("pwcnet.")),
+            ..flornn::PUBLISHED
+        }),
+        Method::Spk2ImgNet => Sizes::Spk2ImgNet(spk2imgnet::Sizes {
+            features: side("extractor.conv.weight", 0)?,
+            stem: side("extractor.conv0_0.weight", 0)?,
+            blocks: count("extractor.net"),
+            groups: side("pcd_align.pcd_align.cas_dcnpack.conv_offset_mask.weight", 0)? / 27,
+        }),
+        Method::MemDeblur => Sizes::MemDeblur(memdeblur::Sizes {
+            channels: side("downsampling.0.weight", 0)?,
+            features: side("fusion.weight", 0)?,
+            forward_blocks: count("forward_resblocks.main.0"),
+            backward_blocks: count("backward_resblocks.main.2"),
+            memory_blocks: count("memory.key_encoder.forward_resblocks.main.2"),
+            bottlenecks: count("memory.key_encoder.layer1"),
+            ..memdeblur::PUBLISHED
+        }),
+        Method::Rvrt => Sizes::Rvrt(rvrt::Sizes {
+            channels: side("conv_last.weight", 0)?,
+            features: side("feat_extract.3.weight", 0)?,
+            blocks: count("backbone.backward_1.main.5"),
+        }),
+        Method::StudentTeacher => {
+            let frames = side("extractor.0.weight", 1)?;
+            Sizes::StudentTeacher(student_teacher::Sizes {
+                frames,
+                features: side("extractor.0.weight", 0)?,
+                kernel: (side("kernels.weight", 0)? / frames).isqrt(),
+            })
+        }
+    };
+    match sizes.problem() {
+        None => Ok(sizes),
+        Some(problem) => {
+            let help = "this network cannot be of these sizes: name another file";
+            Err(Error::data(format!("{problem}; the file has {sizes}"), file.path(), help))
         }
     }
 }
 
 impl Network {
+    /// The method that it is of.
+    pub fn method(&self) -> Method {
+        match self {
+            Self::Quiver(_) => Method::Quiver,
+            Self::Emvd(_) => Method::Emvd,
+            Self::FloRnn(_) => Method::FloRnn,
+            Self::Spk2ImgNet(_) => Method::Spk2ImgNet,
+            Self::MemDeblur(_) => Method::MemDeblur,
+            Self::Rvrt(_) => Method::Rvrt,
+            Self::StudentTeacher(_) => Method::StudentTeacher,
+        }
+    }
+
     /// The name in files of one of our parameters, which begins with the name of the variant.
-    fn file_name(&self, ours: &str) -> String {
+    pub(crate) fn file_name(&self, ours: &str) -> String {
         let own = ours.split_once('.').map_or(ours, |(_, own)| own);
         match self {
             Self::Quiver(_) => Quiver::authors_name(own),
@@ -289,37 +269,6 @@ impl Network {
             Self::MemDeblur(_) => MemDeblur::authors_name(own),
             Self::Rvrt(_) => Rvrt::authors_name(own),
             Self::StudentTeacher(_) => KernelPrediction::file_name(own),
-        }
-    }
-}
-
-impl std::fmt::Display for Sizes {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Quiver(s) => {
-                let frames = s.past + 1 + s.future;
-                write!(f, "{} features, {} blocks, {frames} frames", s.features, s.blocks)
-            }
-            Self::Emvd(width) => write!(f, "{width} channels"),
-            Self::FloRnn(s) => write!(f, "{} features, {} blocks", s.features, s.blocks),
-            Self::Spk2ImgNet(s) => {
-                write!(
-                    f,
-                    "{} features, {} blocks, {} frames",
-                    s.features,
-                    s.blocks,
-                    spk2imgnet::FRAMES
-                )
-            }
-            Self::MemDeblur(s) => write!(f, "{} features, {} blocks", s.features, s.forward_blocks),
-            Self::Rvrt(s) => {
-                write!(f, "{} features, {} blocks, {} channels", s.features, s.blocks, s.channels)
-            }
-            Self::StudentTeacher(s) => write!(
-                f,
-                "{} features, kernels of {} x {}, {} frames",
-                s.features, s.kernel, s.kernel, s.frames
-            ),
         }
     }
 }

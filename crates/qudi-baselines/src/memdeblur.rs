@@ -2,6 +2,7 @@
 //! compared with: frames as three equal channels.
 
 mod bank;
+mod batch_norm;
 mod blocks;
 mod encoder;
 
@@ -15,6 +16,9 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use encoder::Memory;
 use qudi_layers::{Bias, Conv2d};
+use serde::{Deserialize, Serialize};
+
+pub use batch_norm::BatchStatistics;
 
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 4;
@@ -23,16 +27,18 @@ pub const MULTIPLE: usize = 4;
 const PASSES: [(usize, usize); 3] = [(4, 1), (2, 2), (1, 5)];
 
 /// Every how many frames the pass backward stores, and the first of them in use.
-const EVERY_BACK: usize = 5;
+pub const EVERY_BACK: usize = 5;
 const FIRST_BACK: usize = 2;
 
 /// Frames whose positions stay in a memory in use.
 const STORED: usize = 5;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of images.
+    #[serde(skip, default = "published_channels")]
     pub channels: usize,
     /// Channels of features.
     pub features: usize,
@@ -45,6 +51,7 @@ pub struct Sizes {
     /// Bottlenecks of encoders.
     pub bottlenecks: usize,
     /// Entries that are read in use.
+    #[serde(skip, default = "published_top")]
     pub top: usize,
 }
 
@@ -59,13 +66,31 @@ pub const PUBLISHED: Sizes = Sizes {
     top: 20,
 };
 
-/// How memories work.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mode {
-    /// As in training: everything stays, and everything is read.
-    Training,
-    /// As in use: the last frames stay, and the most alike entries are read.
+fn published_channels() -> usize {
+    PUBLISHED.channels
+}
+
+fn published_top() -> usize {
+    PUBLISHED.top
+}
+
+/// How memories and normalisations work.
+#[derive(Clone, Copy, Debug)]
+pub enum Mode<'a> {
+    /// As in training: everything stays in memories, and everything is read. Normalisations take the statistics of
+    /// the batch, and move these; the running ones where none are given.
+    Training(Option<&'a BatchStatistics>),
+    /// As in use: the last frames stay, and the most alike entries are read. Normalisations take running statistics.
     Use,
+}
+
+impl<'a> Mode<'a> {
+    fn statistics(self) -> Option<&'a BatchStatistics> {
+        match self {
+            Self::Training(statistics) => statistics,
+            Self::Use => None,
+        }
+    }
 }
 
 /// The network.
@@ -186,10 +211,11 @@ impl MemDeblur {
     ///
     /// # Shapes
     /// - x: `[bursts * frames, channels, height, width]`, sides multiples of 4
-    pub fn forward(&self, x: &Tensor<4>, frames: usize, mode: Mode) -> [Tensor<4>; 3] {
-        let views: Vec<View> = (0..frames).map(|i| self.view(frame(x, frames, i))).collect();
+    pub fn forward(&self, x: &Tensor<4>, frames: usize, mode: Mode<'_>) -> [Tensor<4>; 3] {
+        let views = (0..frames).map(|i| self.view(frame(x, frames, i), mode));
+        let views: Vec<View> = views.collect();
         let (top, stored) = match mode {
-            Mode::Training => (usize::MAX, usize::MAX),
+            Mode::Training(_) => (usize::MAX, usize::MAX),
             Mode::Use => (self.top, STORED),
         };
         let mut back = Bank::new(top, stored);
@@ -197,20 +223,21 @@ impl MemDeblur {
         let mut ahead = Bank::new(top, stored);
         let mut coarser: Option<Vec<Tensor<4>>> = None;
         PASSES.map(|pass| {
-            let outputs = self.pass(pass, &views, &future, &back, &mut ahead, coarser.as_deref());
+            let banks = (&back, &mut ahead);
+            let outputs = self.pass(pass, &views, &future, banks, coarser.as_deref(), mode);
             coarser = Some(outputs.clone());
             bursts_of(outputs)
         })
     }
 
-    fn view(&self, image: Tensor<4>) -> View {
+    fn view(&self, image: Tensor<4>, mode: Mode<'_>) -> View {
         let own = self.downsampling.forward(image.clone());
-        let key = self.memory.key(own.clone());
+        let key = self.memory.key(own.clone(), mode.statistics());
         View { image, own, key }
     }
 
     /// The state at every frame of the pass from the last frame to the first.
-    fn backward(&self, views: &[View], back: &mut Bank, mode: Mode) -> Vec<Tensor<4>> {
+    fn backward(&self, views: &[View], back: &mut Bank, mode: Mode<'_>) -> Vec<Tensor<4>> {
         let last = views.len() - 1;
         let mut states: Vec<Tensor<4>> = Vec::with_capacity(views.len());
         for (i, view) in views.iter().enumerate().rev() {
@@ -227,12 +254,12 @@ impl MemDeblur {
             }
             let state = self.backward_resblocks.forward(&inputs);
             let stores = match mode {
-                Mode::Training => i % EVERY_BACK == 0,
+                Mode::Training(_) => i % EVERY_BACK == 0,
                 Mode::Use => i % EVERY_BACK == FIRST_BACK || i == last,
             };
             if stores {
-                let value =
-                    self.memory.value_encoder_feat.forward(&[view.own.clone(), state.clone()]);
+                let inputs = [view.own.clone(), state.clone()];
+                let value = self.memory.value_encoder_feat.forward(&inputs, mode.statistics());
                 back.store(view.key.clone(), vec![value]);
             }
             states.push(state);
@@ -241,15 +268,15 @@ impl MemDeblur {
         states
     }
 
-    /// The frames of the pass at one scale, from the first to the last.
+    /// The frames of the pass at one scale, from the first to the last. The first bank is that of the pass backward.
     fn pass(
         &self,
         (scale, every): (usize, usize),
         views: &[View],
         future: &[Tensor<4>],
-        back: &Bank,
-        ahead: &mut Bank,
+        (back, ahead): (&Bank, &mut Bank),
         coarser: Option<&[Tensor<4>]>,
+        mode: Mode<'_>,
     ) -> Vec<Tensor<4>> {
         let number = PASSES.iter().position(|pass| pass.0 == scale).expect("a scale");
         let memory = &self.memory;
@@ -262,7 +289,7 @@ impl MemDeblur {
             } else {
                 let [_, _, height, width] = full.image.dims();
                 let size = [height, width].map(|side| (side / scale).next_multiple_of(MULTIPLE));
-                smaller = self.view(resize(full.image.clone(), size, Corners::Edges));
+                smaller = self.view(resize(full.image.clone(), size, Corners::Edges), mode);
                 &smaller
             };
             let [_, channels, h, w] = own.dims();
@@ -291,8 +318,10 @@ impl MemDeblur {
             let output = self.upsampling.forward(fused) + image.clone();
             if i % every == 0 {
                 let drawn = self.downsampling.forward(output.clone());
-                let images = memory.value_encoder_mem.forward(&[own.clone(), drawn]);
-                let features = memory.value_encoder_feat.forward(&[own.clone(), state.clone()]);
+                let statistics = mode.statistics();
+                let images = memory.value_encoder_mem.forward(&[own.clone(), drawn], statistics);
+                let inputs = [own.clone(), state.clone()];
+                let features = memory.value_encoder_feat.forward(&inputs, statistics);
                 ahead.store(key.clone(), vec![images, features]);
             }
             before = Some((own.clone(), state));
@@ -321,16 +350,14 @@ fn nothing(like: &Tensor<4>, channels: usize) -> Tensor<4> {
     Tensor::zeros([images, channels, height, width], &like.device())
 }
 
-/// The loss of training: Charbonnier's at all three scales, `[1]`.
+/// The loss of training: Charbonnier's at all three scales, the coarsest first, `[1]` each.
 ///
 /// # Shapes
 /// - truth: `[bursts * frames, channels, height, width]`
-pub fn loss(outputs: [Tensor<4>; 3], truth: &Tensor<4>) -> Tensor<1> {
-    let losses = outputs.map(|output| {
+pub fn losses(outputs: [Tensor<4>; 3], truth: &Tensor<4>) -> [Tensor<1>; 3] {
+    outputs.map(|output| {
         let [_, _, height, width] = output.dims();
         let truth = resize(truth.clone(), [height, width], Corners::Edges);
         charbonnier(output, truth)
-    });
-    let [quarter, half, full] = losses;
-    quarter + half + full
+    })
 }

@@ -18,12 +18,14 @@ use merge::Merge;
 use predenoiser::PreDenoiser;
 use qudi_layers::resample::avg_pool2;
 use reconstructor::Reconstructor;
+use serde::{Deserialize, Serialize};
 
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 4;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of features, a multiple of 16.
     pub features: usize,
@@ -173,18 +175,21 @@ impl Quiver {
         Restored { predenoised, full, half, quarter }
     }
 
-    /// The loss of training, `[1]`.
+    /// The terms of the training's loss, `[1]` each, with their weights: of the result, at half and at a quarter of
+    /// the size, and of the frames denoised by themselves.
     ///
     /// # Shapes
     /// - truth: `[bursts * frames, 1, height, width]`
-    pub fn loss(&self, restored: Restored, truth: &Tensor<4>, frames: usize) -> Tensor<1> {
+    pub fn losses(&self, restored: Restored, truth: &Tensor<4>, frames: usize) -> [Tensor<1>; 4] {
         let Restored { predenoised, full, half, quarter } = restored;
         let count = frames - self.past - self.future;
         let wanted = frames_from(truth, frames, self.past, count);
-        gradient_loss(predenoised, truth.clone()) * 0.2
-            + gradient_loss(full, wanted.clone()) * 0.85
-            + gradient_loss(half, avg_pool2(wanted.clone())) * 0.1
-            + gradient_loss(quarter, fourth(wanted)) * 0.05
+        [
+            gradient_loss(full, wanted.clone()) * 0.85,
+            gradient_loss(half, avg_pool2(wanted.clone())) * 0.1,
+            gradient_loss(quarter, fourth(wanted)) * 0.05,
+            gradient_loss(predenoised, truth.clone()) * 0.2,
+        ]
     }
 }
 

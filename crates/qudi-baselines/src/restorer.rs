@@ -1,14 +1,19 @@
 //! The learned methods as restorers of video: every frame of a window.
 
-use crate::import::{Method, Network, load};
+mod brightness;
+
+use crate::import::{Loaded, Method, Network, load};
+use crate::sizes::Sizes;
 use crate::spk2imgnet::{Block, Spk2ImgNet};
-use crate::{emvd, memdeblur, quiver, rvrt, spk2imgnet, student_teacher};
+use crate::{memdeblur, rvrt, spk2imgnet};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Frame, Result, Size};
 use std::collections::VecDeque;
 use std::path::Path;
+
+pub use brightness::ExpectedCounts;
 
 /// Frames of a window, and of one of EMVD, whose recurrence starts anew with every window.
 const WINDOW: usize = 11;
@@ -17,13 +22,24 @@ const LONG_WINDOW: usize = 64;
 /// Frames before the first one that EMVD goes on from: its protocol scores the last of eleven.
 const HISTORY: usize = 10;
 
-/// A learned method with weights, as its authors used it: counts over full scale in, images out. They learnt the
-/// brightness of their own light; the image is not scaled to that of this acquisition.
+/// A learned method with weights, as its authors used it: counts over full scale in, images out. Weights of authors
+/// know the brightness of their own light, and the image is not scaled to that of this acquisition. Weights that were
+/// trained here give images in the units of counts, and the acquisition says what these are.
 #[derive(Debug)]
 pub struct LearnedRestorer {
-    method: Method,
     network: Network,
+    sizes: Sizes,
+    brightness: Brightness,
     device: Device,
+}
+
+/// The units of the images that a network gives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Brightness {
+    /// Those of images at the light that its authors trained it for.
+    OfAuthors,
+    /// Those of counts over full scale.
+    OfCounts,
 }
 
 impl LearnedRestorer {
@@ -32,21 +48,19 @@ impl LearnedRestorer {
     /// # Errors
     /// [`Error`] if the file does not hold them.
     pub fn load(path: &Path, method: Method, device: &Device) -> Result<Self> {
-        let network = load(path, method, device)?;
-        Ok(Self { method, network, device: device.clone() })
+        let Loaded { network, sizes, description } = load(path, method, device)?;
+        let of_authors = description.is_none();
+        let brightness = if of_authors { Brightness::OfAuthors } else { Brightness::OfCounts };
+        Ok(Self::new(network, sizes, brightness, device))
     }
 
-    /// Sides of images are multiples of this.
-    fn multiple(&self) -> usize {
-        match self.network {
-            Network::Quiver(_) => quiver::MULTIPLE,
-            Network::Emvd(_) => emvd::MULTIPLE,
-            Network::FloRnn(_) => 1,
-            Network::Spk2ImgNet(_) => spk2imgnet::MULTIPLE,
-            Network::MemDeblur(_) => memdeblur::MULTIPLE,
-            Network::Rvrt(_) => rvrt::MULTIPLE,
-            Network::StudentTeacher(_) => student_teacher::MULTIPLE,
-        }
+    /// The restorer of a network of these sizes on `device`.
+    pub fn new(network: Network, sizes: Sizes, brightness: Brightness, device: &Device) -> Self {
+        Self { network, sizes, brightness, device: device.clone() }
+    }
+
+    fn method(&self) -> Method {
+        self.sizes.method()
     }
 
     /// The restored frames, `[1, 1, height, width]` each, of as many.
@@ -113,7 +127,7 @@ impl LearnedRestorer {
         let mut blocks: VecDeque<Block> = VecDeque::new();
         let mut images = Vec::with_capacity(total);
         for first in 0..total {
-            progress(self.method.name(), first, total)?;
+            progress(self.method().name(), first, total)?;
             while first + blocks.len() < (first + spk2imgnet::FRAMES - 1).min(frames.len() - 1) {
                 let start = first + blocks.len();
                 let pair = frames[start..start + spk2imgnet::BLOCK].to_vec();
@@ -138,7 +152,7 @@ impl LearnedRestorer {
         let total = windows.len();
         let mut images = Vec::with_capacity(total);
         for (done, window) in windows.enumerate() {
-            progress(self.method.name(), done, total)?;
+            progress(self.method().name(), done, total)?;
             images.push(restore(Tensor::cat(window.to_vec(), 1)));
         }
         Ok(images)
@@ -147,16 +161,16 @@ impl LearnedRestorer {
 
 impl Restorer for LearnedRestorer {
     fn name(&self) -> &'static str {
-        self.method.name()
+        self.method().name()
     }
 
     fn window(&self) -> usize {
-        if self.method == Method::Emvd { LONG_WINDOW } else { WINDOW }
+        if self.method() == Method::Emvd { LONG_WINDOW } else { WINDOW }
     }
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        progress(self.method.name(), 0, burst.frames.len())?;
-        let multiple = self.multiple();
+        progress(self.method().name(), 0, burst.frames.len())?;
+        let multiple = self.sizes.multiple();
         let Size { height, width } = burst.size;
         let [h, w] = [height, width].map(|side| side.next_multiple_of(multiple));
         let full = f32::from(acquisition.sensor.max_count());
@@ -168,16 +182,24 @@ impl Restorer for LearnedRestorer {
             Tensor::from_data(data, &self.device)
         };
         let frames: Vec<Tensor<4>> = burst.frames.iter().map(plane).collect();
+        let expected = match self.brightness {
+            Brightness::OfAuthors => None,
+            Brightness::OfCounts => Some(ExpectedCounts::of(acquisition)),
+        };
         let images = self.images(&frames)?.into_iter().map(|image| {
-            let image = image.narrow(2, 0, height).narrow(3, 0, width).clamp(0.0, 1.0);
+            let image = image.narrow(2, 0, height).narrow(3, 0, width);
             let data = image.into_data().try_to_vec::<f32>();
-            let data = data.map_err(|e| {
+            let mut data = data.map_err(|e| {
                 Error::request(
                     format!("the device failed: {e:?}"),
-                    self.method.name(),
+                    self.method().name(),
                     "use --device cpu",
                 )
             })?;
+            for value in &mut data {
+                let image = expected.map_or(*value, |expected| expected.image(*value));
+                *value = image.clamp(0.0, 1.0);
+            }
             Ok(Frame { size: burst.size, data })
         });
         Ok(Restored { frames: images.collect::<Result<_>>()?, std: None })

@@ -13,6 +13,7 @@ use burn::tensor::{Device, Tensor};
 use guided::GuidedAttention;
 use qudi_layers::resample::{by_burst, pixel_shuffle};
 use qudi_layers::{Bias, Conv2d};
+use serde::{Deserialize, Serialize};
 use swin::{Stage, StageSizes};
 
 /// Frames have sides that are multiples of this.
@@ -32,9 +33,11 @@ const PROPAGATIONS: [(&str, bool); 4] =
 const MIDDLE: usize = 64;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Sizes {
-    /// Channels of images: 1 or 3.
+    /// Channels of images: 1 or 3; 1 of networks that are trained here.
+    #[serde(skip, default = "published_channels")]
     pub channels: usize,
     /// Channels of features, a multiple of 12.
     pub features: usize,
@@ -44,6 +47,10 @@ pub struct Sizes {
 
 /// The sizes of the authors of QUIVER, for gray images.
 pub const PUBLISHED: Sizes = Sizes { channels: 1, features: 144, blocks: 2 };
+
+fn published_channels() -> usize {
+    PUBLISHED.channels
+}
 
 /// The network.
 #[derive(Module, Debug)]

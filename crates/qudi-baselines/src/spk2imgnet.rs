@@ -10,6 +10,7 @@ use burn::tensor::activation::{prelu, sigmoid};
 use burn::tensor::{Device, Tensor};
 use extractor::Extractor;
 use qudi_layers::{Bias, Conv2d, zeros};
+use serde::{Deserialize, Serialize};
 
 /// Frames that it sees.
 pub const FRAMES: usize = 10;
@@ -32,7 +33,8 @@ pub const BLOCKS: usize = FRAMES / BLOCK;
 const KEY: usize = 2;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of features.
     pub features: usize,
@@ -184,18 +186,19 @@ impl Mask {
     }
 }
 
-/// The loss of training: the mean absolute error of the image, and a fiftieth of those of the estimates, `[1]`.
+/// The terms of the training's loss, `[1]` each: the mean absolute error of the image, and a fiftieth of those of the
+/// estimates.
 ///
 /// # Shapes
 /// - image: `[images, 1, height, width]`
 /// - estimates: `[images, 5, 4, height, width]`
 /// - truth: `[images, 10, height, width]`
-pub fn loss(image: Tensor<4>, estimates: Tensor<5>, truth: Tensor<4>) -> Tensor<1> {
+pub fn losses(image: Tensor<4>, estimates: Tensor<5>, truth: Tensor<4>) -> [Tensor<1>; 2] {
     let [images, _, height, width] = truth.dims();
     let main = (image / SCALE - truth.clone().narrow(1, RESTORED, 1)).abs().mean();
     // The second frame of every block.
     let blocks: Tensor<5> = truth.reshape([images, BLOCKS, BLOCK, height, width]);
     let difference = estimates / SCALE - blocks.narrow(2, 1, 1);
     let each = (BLOCKS * 4) as f32;
-    main + difference.abs().mean() * (0.02 * each)
+    [main, difference.abs().mean() * (0.02 * each)]
 }

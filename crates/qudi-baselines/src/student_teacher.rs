@@ -11,6 +11,7 @@ use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::{avg_pool2, repeat};
 use qudi_layers::{Bias, Conv2d};
+use serde::{Deserialize, Serialize};
 
 /// Levels of the U-Net.
 const LEVELS: usize = 4;
@@ -25,11 +26,15 @@ pub const MULTIPLE: usize = 1 << (LEVELS - 1);
 const AUXILIARY: f64 = 100.0;
 const DECAY: f64 = 0.9998;
 
+/// Steps until that weight is 0.03. Shorter trainings take them in fewer steps, or it would rule them to the end.
+pub const ANNEALING: u64 = 40_000;
+
 /// The weight of the distance from a teacher.
 const MATCH: f32 = 0.1;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Frames of a burst.
     pub frames: usize,
@@ -153,28 +158,24 @@ fn filtered(burst: Tensor<4>, kernels: Tensor<4>, side: usize) -> Tensor<4> {
     (1..side * side).fold(tap(0), |sum, k| sum + tap(k))
 }
 
-/// The loss of a teacher at a step, from 0: the mean squared error of the image, and less and less that of every
-/// filtered frame.
-pub fn reconstruction_loss(restored: &Restored, truth: &Tensor<4>, step: u64) -> Tensor<1> {
+/// The terms of the reconstruction's loss at a step, from 0, `[1]` each: the mean squared error of the image, and,
+/// less and less, that of every filtered frame.
+///
+/// # Shapes
+/// - truth: `[bursts, 1, height, width]`
+pub fn reconstruction_losses(restored: &Restored, truth: &Tensor<4>, step: u64) -> [Tensor<1>; 2] {
     let error = |images: &Tensor<4>| (images.clone() - truth.clone()).powi_scalar(2).mean();
     let weight = AUXILIARY * DECAY.powi(i32::try_from(step).unwrap_or(i32::MAX));
-    error(&restored.image) + error(&restored.frames) * weight
+    [error(&restored.image), error(&restored.frames) * weight]
 }
 
-/// The loss of the student: reconstruction, and the distance of its features from those of both teachers, which learn
-/// nothing from it.
-pub fn student_loss(
-    student: &Restored,
-    teachers: [&Restored; 2],
-    truth: &Tensor<4>,
-    step: u64,
-) -> Tensor<1> {
+/// The distance of the student's features from those of both teachers, `[1]`; these learn nothing from it.
+pub fn matching_loss(student: &Restored, teachers: [&Restored; 2]) -> Tensor<1> {
     let distance =
         |a: &Tensor<4>, b: &Tensor<4>| (a.clone() - b.clone().detach()).powi_scalar(2).mean();
-    let matched = teachers.map(|teacher| {
+    let [motion, denoising] = teachers.map(|teacher| {
         distance(&student.extracted, &teacher.extracted)
             + distance(&student.bottom, &teacher.bottom)
     });
-    let [motion, denoising] = matched;
-    reconstruction_loss(student, truth, step) + (motion + denoising) * MATCH
+    (motion + denoising) * MATCH
 }

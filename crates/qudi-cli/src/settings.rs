@@ -270,6 +270,11 @@ pub(crate) fn shown_recipe() -> (&'static str, Vec<(String, Value)>) {
     (recipe_keys::SHOWN, recipe_keys::of_preset(recipe_keys::SHOWN))
 }
 
+/// Recipes of learned methods of others by name, with the sizes of their networks.
+pub(crate) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
+    recipe_keys::baseline_sizes()
+}
+
 /// The environment variable that sets a key.
 fn variable(key: &str) -> String {
     format!("QUDI_{}", key.replace('.', "_").to_uppercase())

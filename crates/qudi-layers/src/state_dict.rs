@@ -97,6 +97,13 @@ impl StateDict {
         self.length
     }
 
+    /// What a SafeTensors file says under a key of its metadata.
+    pub fn metadata(&self, key: &str) -> Option<String> {
+        let Reader::SafeTensors(bytes) = &self.reader else { return None };
+        let (_, header) = SafeTensors::read_metadata(bytes).ok()?;
+        header.metadata().as_ref()?.get(key).cloned()
+    }
+
     /// The names of all tensors, sorted.
     pub fn names(&self) -> Vec<String> {
         self.shapes.keys().cloned().collect()

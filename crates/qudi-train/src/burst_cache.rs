@@ -14,7 +14,7 @@ use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Frame, Result, Size};
 use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
-use qudi_model::config::{Part, ReferenceKind};
+use qudi_model::config::ReferenceKind;
 use qudi_model::refinement::RefinementStage;
 use qudi_model::tensor::read as read_tensor;
 use rand::{Rng, RngExt};
@@ -205,15 +205,16 @@ impl BurstCache {
                 "add train.crops, or leave the folder of bursts out",
             ));
         };
+        let neighbours = recipe.network.aligned_neighbours();
         let key = CacheKey {
             program: env!("CARGO_PKG_VERSION").to_owned(),
             data: recipe.data.clone(),
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,
-            reference: recipe.network.reference,
-            neighbours: recipe.network.pre.neighbours,
-            alignments: recipe.network.pre.aligned_neighbours().alignments.count(),
-            mean_level: !recipe.network.ablates(Part::MeanLevel),
+            reference: recipe.network.reference(),
+            neighbours: neighbours.neighbours,
+            alignments: neighbours.alignments.count(),
+            mean_level: recipe.network.sees_mean_level(),
             stages: stages.iter().map(sha256).collect::<Result<_>>()?,
         };
         Ok(Self {
@@ -225,8 +226,7 @@ impl BurstCache {
                 recipe.data.crop,
                 recipe.data.crop,
             ],
-            neighbours: (recipe.network.reference != ReferenceKind::None)
-                .then(|| recipe.network.pre.aligned_neighbours()),
+            neighbours: (recipe.network.reference() != ReferenceKind::None).then_some(neighbours),
         })
     }
 

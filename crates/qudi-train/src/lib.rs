@@ -1,8 +1,8 @@
 //! Training of the network: data, loss, loop, state, validation.
 //!
-//! A [`Recipe`] holds everything that decides the result. A [`Prefetcher`] draws batches on threads of its
-//! own, the [`Trainer`] takes a step with each, and a [`Run`] does so in a folder from which it can be
-//! resumed.
+//! A [`Recipe`] holds everything that decides the result, and a [`Learner`] is a network that it can be for. A
+//! [`Prefetcher`] draws batches on threads of its own, the [`Trainer`] takes a step with each, and a [`Run`] does so in
+//! a folder from which it can be resumed.
 
 #![warn(missing_docs)]
 
@@ -10,10 +10,10 @@
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 
-mod batch;
 mod burst_cache;
 pub mod dataset;
 mod ema;
+mod learner;
 pub mod loss;
 mod optimizer;
 mod parameters;
@@ -25,14 +25,15 @@ mod state;
 mod trainer;
 mod validate;
 
-pub use batch::Batch;
 pub use burst_cache::{BurstSampler, Files, draw_bursts};
+pub use learner::{Batch, Context, CountBatch, Learner, Loss, Origin};
 pub use optimizer::{Adam, learning_rate};
 pub use parameters::{gradients, parameters, with_parameters};
 pub use prefetch::Prefetcher;
 pub use recipe::{
-    CropsConfig, LearningPart, LossConfig, Recipe, StageConfig, TrainConfig, ValidationConfig,
+    CropsConfig, LearningPart, LossConfig, NetworkRecipe, Recipe, StageConfig, TrainConfig,
+    ValidationConfig, recipe_names,
 };
-pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
+pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS, run_exists, steps_taken};
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};

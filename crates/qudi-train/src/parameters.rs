@@ -2,7 +2,6 @@
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor};
-use qudi_model::network::Qudi;
 
 /// The values of all parameters, `[values]` each, outside autodiff.
 pub fn parameters<M: Module>(network: &M) -> Vec<Tensor<1>> {
@@ -12,7 +11,7 @@ pub fn parameters<M: Module>(network: &M) -> Vec<Tensor<1>> {
 }
 
 /// The gradients for all parameters, `[values]` each; zero for parameters that the loss does not depend on.
-pub fn gradients(network: &Qudi, gradients: &Gradients) -> Vec<Tensor<1>> {
+pub fn gradients<M: Module>(network: &M, gradients: &Gradients) -> Vec<Tensor<1>> {
     let mut collect = Collect { gradients: Some(gradients), list: Vec::new() };
     network.visit(&mut collect);
     collect.list
@@ -20,12 +19,12 @@ pub fn gradients(network: &Qudi, gradients: &Gradients) -> Vec<Tensor<1>> {
 
 /// The network with other values, in the order and with the sizes of [`parameters`].
 #[must_use]
-pub fn with_parameters(network: Qudi, values: Vec<Tensor<1>>) -> Qudi {
+pub fn with_parameters<M: Module>(network: M, values: Vec<Tensor<1>>) -> M {
     network.map(&mut Replace { values: values.into_iter() })
 }
 
 /// The network with gradients for those parameters alone that learn, in the order of [`parameters`].
-pub(super) fn with_frozen(network: Qudi, learns: &[bool]) -> Qudi {
+pub(super) fn with_frozen<M: Module>(network: M, learns: &[bool]) -> M {
     network.map(&mut Freeze { learns: learns.iter() })
 }
 

@@ -1,7 +1,7 @@
 //! Batches drawn ahead on threads of their own.
 
-use super::batch::Batch;
 use super::burst_cache::BurstSampler;
+use super::learner::Learner;
 use super::recipe::Recipe;
 use qudi_core::{Error, Result};
 use std::sync::mpsc::{Receiver, sync_channel};
@@ -9,14 +9,14 @@ use std::sync::mpsc::{Receiver, sync_channel};
 /// The number of batches that a thread keeps ready.
 const AHEAD: usize = 2;
 
-/// Gives batches in order; they do not depend on the number of threads.
+/// Gives the batches of a network in order; they do not depend on the number of threads.
 #[derive(Debug)]
-pub struct Prefetcher {
-    workers: Vec<Receiver<Result<Batch>>>,
+pub struct Prefetcher<L: Learner> {
+    workers: Vec<Receiver<Result<L::Batch>>>,
     next: u64,
 }
 
-impl Prefetcher {
+impl<L: Learner> Prefetcher<L> {
     /// Starts `workers` threads that draw batches from number `first` on.
     ///
     /// # Errors
@@ -29,7 +29,7 @@ impl Prefetcher {
             let work = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.
                 let mut number = first + worker;
-                while sender.send(Batch::draw(&recipe, &mut bursts, number)).is_ok() {
+                while sender.send(L::draw(&recipe, &mut bursts, number)).is_ok() {
                     number += count;
                 }
             };
@@ -46,7 +46,7 @@ impl Prefetcher {
     ///
     /// # Errors
     /// [`Error`] if it could not be drawn.
-    pub fn next_batch(&mut self) -> Result<Batch> {
+    pub fn next_batch(&mut self) -> Result<L::Batch> {
         let at = (self.next % self.workers.len() as u64) as usize;
         self.next += 1;
         self.workers[at].recv().unwrap_or_else(|_| {

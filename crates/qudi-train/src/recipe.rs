@@ -1,5 +1,8 @@
 //! Recipes: everything that decides what a training gives, in one TOML document.
 
+mod keys;
+mod network;
+mod rules;
 mod stage;
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
@@ -9,19 +12,21 @@ use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
 use qudi_kernels::ComputePrecision;
-use qudi_model::config::{NetworkConfig, PRESETS, Part};
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
+use keys::{modern_key, modernize, set, value};
+
+pub use network::{NetworkRecipe, recipe_names};
 pub use stage::{LearningPart, StageConfig};
 
 /// A recipe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
-    /// Sizes of the network.
-    pub network: NetworkConfig,
+    /// The network, with its sizes.
+    pub network: NetworkRecipe,
     /// What it learns from.
     pub data: DataConfig,
     /// How it learns.
@@ -77,15 +82,35 @@ pub struct TrainConfig {
     /// What the noise of the noisy images is added to.
     #[serde(default, skip_serializing_if = "is_default")]
     pub noise_on: NoiseOn,
-    /// Fraction of the samples at the noisiest timestep, where sampling begins.
-    #[serde(alias = "start")]
-    pub noise_start_fraction: f64,
+    /// Fraction of the samples at the noisiest timestep, where sampling begins; not of learned baselines.
+    #[serde(default, alias = "start", skip_serializing_if = "Option::is_none")]
+    pub noise_start_fraction: Option<f64>,
     /// Steps between checkpoints.
     pub checkpoint: u64,
-    /// The loss.
-    pub loss: LossConfig,
+    /// The loss; learned baselines have their authors'.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub loss: Option<LossConfig>,
     /// Licence of the weights, an SPDX expression.
     pub licence: String,
+}
+
+impl TrainConfig {
+    /// The loss; of learned baselines, whose loss has no weights to choose, all weights are 0.
+    pub fn loss(&self) -> LossConfig {
+        self.loss.unwrap_or(LossConfig {
+            form: LossForm::default(),
+            prediction: 0.0,
+            pre: 0.0,
+            perceptual: 0.0,
+            term: PerceptualKind::None,
+            flow: 0.0,
+        })
+    }
+
+    /// Fraction of the samples at the noisiest timestep.
+    pub(super) fn noise_start_fraction(&self) -> f64 {
+        self.noise_start_fraction.unwrap_or(0.0)
+    }
 }
 
 /// What samples are cut from: reference estimates of whole bursts, which take long to compute and see no
@@ -139,8 +164,9 @@ pub struct ValidationConfig {
     pub sensor: String,
     /// Photons per pixel and frame.
     pub ppp: Vec<f64>,
-    /// Reverse steps; 0 judges the pre-denoiser.
-    pub steps: usize,
+    /// Reverse steps; 0 judges the pre-denoiser. Learned baselines have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steps: Option<usize>,
     /// Spacing of their timesteps, which the weights keep for restoring.
     #[serde(default, skip_serializing_if = "is_default")]
     pub spacing: TimestepSpacing,
@@ -161,9 +187,8 @@ impl Recipe {
     /// # Errors
     /// [`Error`] if there is none, or a key is unknown or wrong.
     pub fn load(name: &str, changes: &[(String, String)]) -> Result<Self> {
-        let preset = PRESETS.iter().find(|preset| preset.0 == name);
-        let text = match preset {
-            Some((_, text)) => (*text).to_owned(),
+        let text = match network::preset(name) {
+            Some(text) => text.to_owned(),
             None => read(name)?,
         };
         Self::parse(&text, name, changes)
@@ -206,10 +231,10 @@ impl Recipe {
 
     /// Reverse diffusion steps that the weights are made for: none where nothing but regression learns.
     pub(super) fn default_steps(&self) -> usize {
-        if self.train.loss.prediction == 0.0 {
+        if self.train.loss().prediction == 0.0 {
             return 0;
         }
-        self.validation.as_ref().map_or(1, |validation| validation.steps)
+        self.validation.as_ref().map_or(1, |validation| validation.steps.unwrap_or(0))
     }
 
     /// Spacing of the timesteps that the weights are made for.
@@ -219,98 +244,8 @@ impl Recipe {
 
     /// Whether only the pre-denoiser learns: frame by frame.
     pub(super) fn learns_frames(&self) -> bool {
-        let loss = &self.train.loss;
+        let loss = self.train.loss();
         loss.prediction == 0.0 && loss.flow == 0.0 && loss.term == PerceptualKind::None
-    }
-
-    fn checked(self) -> Result<Self> {
-        let network = self.network.clone().checked()?;
-        let data = self.data.clone().checked()?;
-        let multiple = network.multiple();
-        let train = &self.train;
-        let share = |v: f64| (0.0..1.0).contains(&v);
-        let weight = |v: f32| v.is_finite() && v >= 0.0;
-        let (frames, side) = self.sample_size();
-        let fewest = if self.learns_frames() { 1 } else { 3 };
-        let rules = [
-            (
-                if train.crops.is_some() { "train.crops.side" } else { "data.crop" },
-                side.is_multiple_of(multiple) && side > 0,
-                "must be a multiple of the network's coarsest cell",
-            ),
-            (
-                "train.crops",
-                (fewest..=data.frames).contains(&frames)
-                    && train
-                        .crops
-                        .is_none_or(|crops| (frames..=data.frames).contains(&crops.cached_frames))
-                    && side <= data.crop
-                    && train.crops.is_none_or(|crops| (1..=1 << 20).contains(&crops.bursts)),
-                "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
-            ),
-            ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
-            ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),
-            ("train.accumulate", (1..=4096).contains(&train.accumulate), "must be from 1 to 4096"),
-            ("train.lr", train.lr > 0.0 && train.lr <= 1.0, "must be above 0, at most 1"),
-            (
-                "train.min_lr",
-                train.min_lr >= 0.0 && train.min_lr <= train.lr,
-                "must be from 0 to train.lr",
-            ),
-            ("train.clip", train.clip > 0.0, "must be above 0"),
-            ("train.ema", share(train.ema), "must be from 0 to below 1"),
-            (
-                "train.noise_start_fraction",
-                (0.0..=1.0).contains(&train.noise_start_fraction),
-                "must be from 0 to 1",
-            ),
-            ("train.checkpoint", train.checkpoint > 0, "must be at least 1"),
-            (
-                "train.loss",
-                weight(train.loss.prediction)
-                    && weight(train.loss.flow)
-                    && weight(train.loss.pre)
-                    && weight(train.loss.perceptual),
-                "must have weights of 0 or more",
-            ),
-            (
-                "train.loss.term",
-                (train.loss.term == PerceptualKind::None) == (train.loss.perceptual == 0.0),
-                "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
-            ),
-        ];
-        let has_flow = !network.ablates(Part::Flow);
-        let noise_rules = stage::noise_rules(&self);
-        let named = stage::have_good_names(&self.stage);
-        let stages = ("stage", named, "must have names of a-z, 0-9 and -, each its own");
-        for (key, good, problem) in rules
-            .into_iter()
-            .chain(stage::rules(train, has_flow))
-            .chain(noise_rules)
-            .chain([stages])
-        {
-            if !good {
-                let what = format!("{key} {problem}");
-                return Err(Error::request(what, key, "correct the recipe"));
-            }
-        }
-        if let Some(validation) = &self.validation {
-            let good = (3..=1000).contains(&validation.frames)
-                && (16..=4096).contains(&validation.crop)
-                && !validation.ppp.is_empty()
-                && validation.ppp.iter().all(|&ppp| ppp > 0.0 && ppp < 1e6)
-                && validation.every > 0
-                && !validation.from.is_empty();
-            if !good {
-                return Err(Error::request(
-                    "the validation cannot be done: it wants clips, 3 frames, 16 pixels, light",
-                    "validation",
-                    "correct the recipe",
-                ));
-            }
-        }
-        self.stages()?;
-        Ok(Self { network, data, ..self })
     }
 
     /// The validation clips as a source of a pack; none if there are none with files.
@@ -346,7 +281,7 @@ fn read(name: &str) -> Result<String> {
     let path = Path::new(name);
     let failed = |e: std::io::Error| match e.kind() {
         std::io::ErrorKind::NotFound => {
-            let names: Vec<_> = PRESETS.iter().map(|preset| preset.0).collect();
+            let names: Vec<_> = recipe_names().collect();
             let what = format!("`{name}` is no recipe");
             Error::request(what, name, format!("name a .toml file, or one of {}", names.join(", ")))
         }
@@ -354,88 +289,4 @@ fn read(name: &str) -> Result<String> {
     };
     std::fs::metadata(path).map_err(failed)?;
     read_text(path, TEXT_BYTES, "read the recipe")
-}
-
-/// Former names of keys and their names now; both are read (`#[serde(alias)]` on the fields).
-const RENAMED: &[(&str, &str)] = &[
-    ("network.without", "network.ablate"),
-    ("network.pre.motions", "network.pre.alignments"),
-    ("network.pre.trust", "network.pre.weight_channels"),
-    ("network.pre.rounds", "network.pre.stages"),
-    ("network.pre.error", "network.pre.uncertainty"),
-    ("data.source.rest", "data.source.static_fraction"),
-    ("data.source.shrink", "data.source.max_downscale"),
-    ("train.rate", "train.lr"),
-    ("train.floor", "train.min_lr"),
-    ("train.start", "train.noise_start_fraction"),
-    ("train.parts", "train.crops"),
-    ("train.crops.kept", "train.crops.cached_frames"),
-];
-
-/// Gives the keys of a table, and of the tables in it, their names of now. `path` is the table's place in the
-/// recipe, without the numbers of list elements.
-fn modernize(table: &mut toml::Table, path: &str) {
-    for (old, new) in RENAMED {
-        let names = old.rsplit_once('.').zip(new.rsplit_once('.'));
-        if let Some(((place, old), (_, new))) = names
-            && place == path
-            && !table.contains_key(new)
-            && let Some(value) = table.remove(old)
-        {
-            table.insert(new.to_owned(), value);
-        }
-    }
-    for (key, value) in table.iter_mut() {
-        let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-        let tables = match value {
-            toml::Value::Array(list) => list.as_mut_slice(),
-            value => std::slice::from_mut(value),
-        };
-        tables.iter_mut().filter_map(toml::Value::as_table_mut).for_each(|t| modernize(t, &path));
-    }
-}
-
-/// A dotted key by its name of now: `train.rate` is `train.lr`.
-fn modern_key(key: &str) -> String {
-    let mut modern: Vec<&str> = key.split('.').collect();
-    for end in 1..=modern.len() {
-        let is_name = |part: &&str| part.parse::<usize>().is_err();
-        let path: Vec<_> = modern[..end].iter().copied().filter(is_name).collect();
-        let path = path.join(".");
-        let renamed = RENAMED.iter().find(|(old, _)| *old == path);
-        if let Some((_, name)) = renamed.and_then(|(_, new)| new.rsplit_once('.')) {
-            modern[end - 1] = name;
-        }
-    }
-    modern.join(".")
-}
-
-/// A value of TOML, or a word as text.
-fn value(text: &str) -> toml::Value {
-    let value = format!("v = {text}").parse::<toml::Table>().ok();
-    let value = value.and_then(|mut table| table.remove("v"));
-    value.unwrap_or_else(|| toml::Value::String(text.to_owned()))
-}
-
-/// Sets a key below tables; numbers name the elements of a list, as in `data.source.0.weight`.
-fn set(document: &mut toml::Table, key: &str, value: toml::Value) -> Result<()> {
-    let unknown = || {
-        let help = "name keys of the recipe, as in train.steps or data.source.0.weight";
-        Error::request(format!("`{key}` is no key of the recipe"), key, help)
-    };
-    let (path, last) = key.rsplit_once('.').ok_or_else(unknown)?;
-    let mut parts = path.split('.');
-    let first = parts.next().ok_or_else(unknown)?;
-    let mut at = document.get_mut(first).ok_or_else(unknown)?;
-    for part in parts {
-        at = match at {
-            toml::Value::Table(table) => table.get_mut(part),
-            toml::Value::Array(list) => part.parse().ok().and_then(|i: usize| list.get_mut(i)),
-            _ => None,
-        }
-        .ok_or_else(unknown)?;
-    }
-    // Unknown names are found when the recipe is read.
-    at.as_table_mut().ok_or_else(unknown)?.insert(last.to_owned(), value);
-    Ok(())
 }

@@ -1,6 +1,7 @@
 //! A training run in a folder: recipe, metrics, weights, state, pictures.
 
 use super::burst_cache::{BurstSampler, Files};
+use super::learner::{Learner, Origin};
 use super::prefetch::Prefetcher;
 use super::recipe::Recipe;
 use super::state;
@@ -10,11 +11,6 @@ use crate::dataset::Dataset;
 use burn::tensor::Device;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::{Error, Result};
-use qudi_model::checkpoint::{Description, Precision, save};
-use qudi_model::config::{NetworkConfig, PRESETS};
-use qudi_model::network::Qudi;
-use qudi_model::refinement::RefinementStage;
-use qudi_model::restorer::TILE;
 use serde::Serialize;
 use std::fs::OpenOptions;
 use std::io::Write;
@@ -41,10 +37,10 @@ pub enum Event<'a> {
 
 /// A run.
 #[derive(Debug)]
-pub struct Run {
+pub struct Run<L> {
     folder: PathBuf,
     recipe: Recipe,
-    trainer: Trainer,
+    trainer: Trainer<L>,
     bursts: BurstSampler,
     validator: Option<Validator>,
     device: Device,
@@ -53,11 +49,24 @@ pub struct Run {
 
 /// Where a run starts.
 #[derive(Debug)]
-pub enum From {
+pub enum From<L> {
     /// From initial weights, or those given.
-    Start(Option<Box<Qudi>>),
+    Start(Option<Box<L>>),
     /// From the state in its folder.
     State,
+}
+
+/// Whether a folder holds a state to go on from.
+pub fn run_exists(folder: &Path) -> bool {
+    state::exists(folder)
+}
+
+/// Steps taken by the state in a folder.
+///
+/// # Errors
+/// [`Error`] if there is none, or it is damaged.
+pub fn steps_taken(folder: &Path) -> Result<u64> {
+    state::steps_taken(folder)
 }
 
 /// One line of the metrics.
@@ -68,7 +77,7 @@ enum Line<'a> {
     Validation(&'a Validation),
 }
 
-impl Run {
+impl<L: Learner> Run<L> {
     /// Opens a run in `folder`, which exists.
     ///
     /// # Errors
@@ -76,7 +85,7 @@ impl Run {
     pub fn open(
         folder: &Path,
         recipe: &Recipe,
-        from: From,
+        from: From<L>,
         files: Files,
         devices: &[Device],
         backbones: Option<&Path>,
@@ -90,7 +99,7 @@ impl Run {
             From::State => Trainer::resume(folder, recipe, devices, backbones)?,
         };
         let dataset = Dataset::new(&recipe.data, files.pack)?;
-        let stages = RefinementStage::all(&trainer.averaged(), &recipe.network, TILE, &devices[0]);
+        let stages = trainer.averaged().refinement_stages(recipe, &devices[0])?;
         let mut bursts = BurstSampler::new(recipe, dataset, stages);
         if let Some(folder) = &files.bursts {
             bursts = bursts.with_cache(folder, recipe)?;
@@ -107,19 +116,6 @@ impl Run {
         run.write(RECIPE, run.recipe.text().as_bytes())?;
         run.trim_metrics()?;
         Ok(run)
-    }
-
-    /// Whether a folder holds a state to go on from.
-    pub fn exists(folder: &Path) -> bool {
-        state::exists(folder)
-    }
-
-    /// Steps taken by the state in a folder.
-    ///
-    /// # Errors
-    /// [`Error`] if there is none, or it is damaged.
-    pub fn steps_taken(folder: &Path) -> Result<u64> {
-        state::steps_taken(folder)
     }
 
     /// Steps taken, and in all.
@@ -140,7 +136,7 @@ impl Run {
     ) -> Result<()> {
         let train = self.recipe.train.clone();
         let mut prefetcher =
-            Prefetcher::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
+            Prefetcher::<L>::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
         let mut metrics = self.metrics()?;
         if self.trainer.step_number() == 0
             && let Some(validation) = self.validate(0)?
@@ -183,39 +179,13 @@ impl Run {
     /// Measures the averaged weights after `step` steps, if the recipe measures anything.
     fn validate(&self, step: u64) -> Result<Option<Validation>> {
         let Some(validator) = &self.validator else { return Ok(None) };
-        let (network, sizes) = (self.trainer.averaged(), &self.recipe.network);
-        validator.measure(&network, sizes, &self.device, step).map(Some)
+        let mut restorer = self.trainer.averaged().restorer(&self.recipe, &self.device)?;
+        validator.measure(restorer.as_mut(), step).map(Some)
     }
 
     fn save_weights(&self) -> Result<()> {
-        let recipe = &self.recipe;
-        let bounds = recipe.data.sensor.iter().map(|mix| mix.ppp.bounds());
-        let ppp = bounds.fold([f64::INFINITY, 0.0], |[low, high]: [f64; 2], [from, to]| {
-            [low.min(from), high.max(to)]
-        });
-        let is_preset = |name: &str| NetworkConfig::preset(name).is_ok_and(|n| n == recipe.network);
-        let preset = PRESETS.iter().find(|(name, _)| is_preset(name));
-        let sensor = |mix: &crate::dataset::SensorMix| match mix.frames_summed {
-            None => mix.name.clone(),
-            Some(frames) => format!("{} x {frames}", mix.name),
-        };
-        let description = Description {
-            program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
-            preset: preset.map(|(name, _)| (*name).to_owned()),
-            network: recipe.network.clone(),
-            window: recipe.data.frames.max(11),
-            sensors: recipe.data.sensor.iter().map(sensor).collect(),
-            ppp,
-            data: recipe.data.source.iter().map(|source| source.name.clone()).collect(),
-            steps: self.trainer.step_number(),
-            commit: self.commit.clone(),
-            licence: recipe.train.licence.clone(),
-            default_steps: Some(recipe.default_steps()),
-            spacing: Some(recipe.default_spacing()),
-            kind: None,
-        };
-        let path = self.folder.join(WEIGHTS);
-        save(&self.trainer.averaged(), &description, Precision::Single, &path, Overwrite::Yes)
+        let origin = Origin { steps: self.trainer.step_number(), commit: self.commit.clone() };
+        self.trainer.averaged().save(&self.recipe, &origin, &self.folder.join(WEIGHTS))
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {

@@ -1,13 +1,13 @@
 //! The state that a run resumes from: a folder of weights, their average, the optimizer's moments and
 //! counters, which is replaced whole or not at all.
 
+use super::learner::Learner;
 use super::optimizer::Adam;
 use super::parameters::with_parameters;
 use super::recipe::Recipe;
-use super::trainer::{Trainer, is_pre_fixed};
+use super::trainer::Trainer;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::{Error, Result};
-use qudi_model::network::{former_name, parameter_shapes};
 use qudi_model::tensor::read;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -32,7 +32,7 @@ fn names(run: &Path) -> [PathBuf; 3] {
     ["state", "state.new", "state.old"].map(|name| run.join(name))
 }
 
-impl Trainer {
+impl<L: Learner> Trainer<L> {
     /// Writes the state into the run's folder. At any moment one whole state lies there.
     ///
     /// # Errors
@@ -50,7 +50,7 @@ impl Trainer {
         std::fs::create_dir(&new).map_err(failed(&new))?;
         let weights = super::parameters::parameters(&self.network);
         let lists = [&weights, &self.ema.average, &self.adam.mean, &self.adam.square];
-        let names = parameter_shapes(&self.network);
+        let names = self.network.named_shapes();
         let mut tensors = Vec::new();
         for (prefix, list) in LISTS.iter().zip(lists) {
             for ((name, _), values) in names.iter().zip(list) {
@@ -112,11 +112,11 @@ impl Trainer {
         let bytes = open(&folder, TENSORS)?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
         let mut trainer = Self::new(recipe, None, devices, backbones)?;
-        let names = parameter_shapes(&trainer.network);
+        let names = trainer.network.named_shapes();
         let device = trainer.ema.average[0].device();
         let list = |prefix: &str| {
             let values = names.iter().map(|(name, shape)| {
-                let former = format!("{prefix}/{}", former_name(name));
+                let former = format!("{prefix}/{}", L::former_name(name));
                 let name = format!("{prefix}/{name}");
                 let tensor = tensors.tensor(&name).or_else(|_| tensors.tensor(&former));
                 let tensor = tensor.map_err(|e| damaged(e.to_string()))?;
@@ -132,7 +132,6 @@ impl Trainer {
         };
         let [weights, average, mean, square] = LISTS.map(list);
         trainer.network = with_parameters(trainer.network, weights?);
-        trainer.pre_is_fixed = is_pre_fixed(&trainer.network, &recipe.train.learns)?;
         trainer.ema.average = average?;
         trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
         Ok(trainer)

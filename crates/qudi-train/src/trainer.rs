@@ -1,47 +1,27 @@
 //! The network during training: its weights, their average, the optimizer's state.
 
-use super::batch::Batch;
+mod loss_values;
+
 use super::ema::Ema;
+use super::learner::{Context, Learner, Loss};
 use super::optimizer::{Adam, learning_rate};
 use super::parameters::{parameters, with_frozen, with_parameters};
 use super::prefetch::Prefetcher;
-use super::recipe::{LearningPart, LossConfig, Recipe};
+use super::recipe::Recipe;
 use crate::loss::lpips::Lpips;
-use crate::loss::{LoopOptions, LossTerms, LossWeights, NoiseOn, SelfConditioning, loss_terms};
-use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
 use qudi_kernels::{ComputePrecision, with_precision};
-use qudi_model::checkpoint::ModelKind;
-use qudi_model::config::Part;
-use qudi_model::network::{Qudi, parameter_shapes};
 use qudi_model::tensor::read;
-use rand::rngs::ChaCha8Rng;
-use rand::{Rng, SeedableRng};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;
 
-/// The terms of the loss, each the mean over a step.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct LossValues {
-    /// The weighted sum.
-    pub total: f64,
-    /// The term of the prediction.
-    pub prediction: f64,
-    /// The term of the pre-denoised frames.
-    pub pre: f64,
-    /// The perceptual term.
-    pub perceptual: f64,
-    /// The term of the flows.
-    pub flow: f64,
-    /// The term of the predicted uncertainty.
-    #[serde(rename = "error")]
-    pub uncertainty: f64,
-}
+pub use loss_values::LossValues;
 
 /// The result of a step.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StepReport {
     /// The number of steps taken, this one included.
     pub step: u64,
@@ -65,37 +45,37 @@ pub struct StepReport {
 
 /// Trains a network step by step on one or more devices.
 #[derive(Debug)]
-pub struct Trainer {
+pub struct Trainer<L> {
     recipe: Recipe,
     /// Devices with autodiff; the first one holds weights and optimizer.
     devices: Vec<Device>,
-    pub(super) network: Qudi,
+    pub(super) network: L,
     pub(super) ema: Ema,
     pub(super) adam: Adam,
     perceptual: Vec<Lpips>,
     /// Whether each parameter learns.
     learns: Vec<bool>,
-    /// Whether frames are pre-denoised once for all passes ([`LoopOptions::pre_is_fixed`]).
-    pub(super) pre_is_fixed: bool,
 }
 
 /// The gradients and losses of one batch, and the seconds that they took.
 struct Pass {
     gradients: Vec<Tensor<1>>,
+    statistics: Vec<(usize, Tensor<1>)>,
     loss: LossValues,
     forward_s: f64,
     backward_s: f64,
 }
 
-impl Trainer {
+impl<L: Learner> Trainer<L> {
     /// Starts from `network`, or from the recipe's initial weights. `devices` are without autodiff; batches
     /// go to them in turn. `backbones` is the folder of the perceptual term's weights.
     ///
     /// # Errors
-    /// [`Error`] if the perceptual term cannot be loaded, or a device lacks the numbers of `train.precision`.
+    /// [`Error`] if the recipe is for another network, the perceptual term cannot be loaded, or a device lacks the
+    /// numbers of `train.precision`.
     pub fn new(
         recipe: &Recipe,
-        network: Option<Qudi>,
+        network: Option<L>,
         devices: &[Device],
         backbones: Option<&Path>,
     ) -> Result<Self> {
@@ -107,18 +87,17 @@ impl Trainer {
         if let Some(device) = devices.iter().find(|device| !precision.is_supported(device)) {
             return Err(unsupported(precision, device));
         }
-        let mut learner = recipe.network.init(recipe.train.seed, main);
+        let mut learner = L::init(recipe, main)?;
         if let Some(network) = network {
             learner = with_parameters(learner, parameters(&network));
         }
-        let learns = learning(&learner, &recipe.train.learns);
-        let pre_is_fixed = is_pre_fixed(&learner, &recipe.train.learns)?;
+        let learns = learner.learns(recipe);
         learner = with_frozen(learner, &learns);
         let start = parameters(&learner);
         let (_, side) = recipe.sample_size();
         let mut perceptual = Vec::new();
         for device in &devices {
-            if let Some(lpips) = Lpips::load(recipe.train.loss.term, backbones, device)? {
+            if let Some(lpips) = Lpips::load(recipe.train.loss().term, backbones, device)? {
                 lpips.check(Size { height: side, width: side })?;
                 perceptual.push(lpips);
             }
@@ -131,7 +110,6 @@ impl Trainer {
             devices,
             perceptual,
             learns,
-            pre_is_fixed,
         })
     }
 
@@ -146,7 +124,7 @@ impl Trainer {
     }
 
     /// The network with averaged weights, for use.
-    pub fn averaged(&self) -> Qudi {
+    pub fn averaged(&self) -> L {
         with_parameters(self.network.valid(), self.ema.average.clone())
     }
 
@@ -154,7 +132,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`Error`] if the data or the device fails, or the loss is not finite.
-    pub fn step(&mut self, prefetcher: &mut Prefetcher) -> Result<StepReport> {
+    pub fn step(&mut self, prefetcher: &mut Prefetcher<L>) -> Result<StepReport> {
         let start = Instant::now();
         let count = self.recipe.train.accumulate;
         let batches = (0..count).map(|_| prefetcher.next_batch()).collect::<Result<Vec<_>>>()?;
@@ -164,9 +142,16 @@ impl Trainer {
         let mut sum: Option<Vec<Tensor<1>>> = None;
         let mut loss = LossValues::default();
         let (mut forward_s, mut backward_s) = (0.0, 0.0);
+        let mut statistics: BTreeMap<usize, Tensor<1>> = BTreeMap::new();
         // Summed in the order of the batches: which device had them makes no difference.
         for pass in passes {
-            loss.add(pass.loss, 1.0 / count as f64);
+            loss.add(&pass.loss, 1.0 / count as f64);
+            // All batches of a step start from the same statistics: what they make of them is averaged.
+            for (place, values) in pass.statistics {
+                let share = values / count as f32;
+                let sum = statistics.remove(&place).map_or(share.clone(), |sum| sum + share);
+                statistics.insert(place, sum);
+            }
             forward_s += pass.forward_s;
             backward_s += pass.backward_s;
             sum = Some(match sum {
@@ -181,7 +166,10 @@ impl Trainer {
         let taken = self.step_number();
         let lr = learning_rate(train, taken);
         let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
-        let moved = self.adam.step(parameters(&self.network), gradients, scale, lr);
+        let mut moved = self.adam.step(parameters(&self.network), gradients, scale, lr);
+        for (place, values) in statistics {
+            moved[place] = values;
+        }
         self.ema.update(&moved, &self.learns, taken);
         self.network = with_parameters(self.network.clone(), moved);
         let optimizer_s = start.elapsed().as_secs_f64();
@@ -198,7 +186,7 @@ impl Trainer {
     }
 
     /// Computes the gradients of all batches, in their order, on the first device.
-    fn passes(&self, batches: &[Batch]) -> Result<Vec<Pass>> {
+    fn passes(&self, batches: &[L::Batch]) -> Result<Vec<Pass>> {
         let main = self.devices[0].clone().inner();
         if self.devices.len() == 1 {
             return batches.iter().map(|batch| self.pass(&self.network, batch, 0)).collect();
@@ -211,8 +199,7 @@ impl Trainer {
                 move || -> Result<Vec<(usize, Pass)>> {
                     let inner = device.clone().inner();
                     let weights = weights.into_iter().map(|w| w.to_device(&inner)).collect();
-                    let network =
-                        with_parameters(self.recipe.network.uninitialized(device), weights);
+                    let network = with_parameters(L::uninitialized(&self.recipe, device)?, weights);
                     let network = with_frozen(network, &self.learns);
                     mine.map(|(at, batch)| Ok((at, self.pass(&network, batch, number)?))).collect()
                 }
@@ -229,59 +216,35 @@ impl Trainer {
         lists.sort_by_key(|(at, _)| *at);
         let home = |(_, mut pass): (usize, Pass)| {
             pass.gradients = pass.gradients.into_iter().map(|g| g.to_device(&main)).collect();
+            let statistics = pass.statistics.into_iter();
+            pass.statistics = statistics.map(|(at, s)| (at, s.to_device(&main))).collect();
             pass
         };
         Ok(lists.into_iter().map(home).collect())
     }
 
     /// Passes one batch through `network`, on device `number`.
-    fn pass(&self, network: &Qudi, batch: &Batch, number: usize) -> Result<Pass> {
+    fn pass(&self, network: &L, batch: &L::Batch, number: usize) -> Result<Pass> {
         let start = Instant::now();
-        let device = &self.devices[number];
-        let conditioning = batch.conditioning(device);
-        let mut random = ChaCha8Rng::seed_from_u64(self.recipe.train.seed);
-        random.set_stream(batch.number);
-        let (weights, loop_options) = self.options();
-        // Half of all batches start from nothing, as sampling does; but for its second step.
-        let from_nothing = random.next_u64() & 1 == 0 && loop_options.noise_on == NoiseOn::Truth;
-        let self_conditioning = if from_nothing || loop_options.needs_no_estimate() {
-            SelfConditioning::Off
-        } else {
-            SelfConditioning::On(random.next_u64())
-        };
-        let example = batch.example(&conditioning);
-        let perceptual = self.perceptual.get(number);
         let precision = self.recipe.train.precision;
-        let terms = with_precision(precision, || {
-            loss_terms(network, &example, self_conditioning, weights, loop_options, perceptual)
-        })?;
+        let context = Context {
+            recipe: &self.recipe,
+            device: &self.devices[number],
+            step: self.step_number(),
+            perceptual: self.perceptual.get(number),
+        };
+        let loss = with_precision(precision, || network.loss(batch, &context))?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let gradients = with_precision(precision, || terms.gradients(network, &conditioning));
+        let Loss { total, terms, gradients, statistics } = loss;
+        let gradients = with_precision(precision, gradients);
         // Reading waits for the device: all numbers at once, when there is nothing left to ask it for.
-        let loss = LossValues::read(terms)?;
-        self.check("prediction loss", loss.prediction)?;
-        self.check("pre-denoiser loss", loss.pre)?;
-        self.check("perceptual loss", loss.perceptual)?;
-        self.check("flow loss", loss.flow)?;
-        self.check("uncertainty loss", loss.uncertainty)?;
+        let loss = LossValues::read(&total, &terms)?;
+        for (name, value) in &loss.terms {
+            self.check(&format!("{name} loss"), *value)?;
+        }
         let backward_s = start.elapsed().as_secs_f64();
-        Ok(Pass { gradients, loss, forward_s, backward_s })
-    }
-
-    fn options(&self) -> (LossWeights, LoopOptions) {
-        let LossConfig { form, prediction, pre, perceptual, flow, .. } = self.recipe.train.loss;
-        let network = &self.recipe.network;
-        // Where nothing moves, there is nothing to learn of it.
-        let flow = if network.ablates(Part::Flow) { 0.0 } else { flow };
-        let loop_options = LoopOptions {
-            forward_model: !network.ablates(Part::ForwardModel),
-            self_conditioning: !network.ablates(Part::SelfConditioning),
-            recomputes: self.recipe.train.gradient_checkpointing,
-            pre_is_fixed: self.pre_is_fixed,
-            noise_on: self.recipe.train.noise_on,
-        };
-        (LossWeights { form, prediction, pre, perceptual, flow }, loop_options)
+        Ok(Pass { gradients, statistics, loss, forward_s, backward_s })
     }
 
     fn check(&self, what: &str, value: f64) -> Result<()> {
@@ -296,55 +259,6 @@ impl Trainer {
             what,
             "lower train.lr or train.clip, and resume from the checkpoint",
         ))
-    }
-}
-
-/// Whether each parameter of a network learns. Refinement stages never do.
-fn learning(network: &Qudi, parts: &[LearningPart]) -> Vec<bool> {
-    let learns = |name: &str| {
-        let chosen = parts.is_empty() || parts.iter().any(|part| part.has(name));
-        chosen && !name.starts_with("stages.")
-    };
-    parameter_shapes(network).iter().map(|(name, _)| learns(name)).collect()
-}
-
-/// Whether pre-denoised frames are the same in all passes: neither they nor their uncertainty learn, and they depend on
-/// no simulated measurement.
-pub(super) fn is_pre_fixed(network: &Qudi, parts: &[LearningPart]) -> Result<bool> {
-    let learns = |part| parts.is_empty() || parts.contains(&part);
-    if learns(LearningPart::Pre) || learns(LearningPart::Uncertainty) {
-        return Ok(false);
-    }
-    Ok(ModelKind::of(network)? != ModelKind::Diffusion)
-}
-
-impl LossValues {
-    /// Reads the terms from the device; those that are not there are zero.
-    fn read(terms: LossTerms) -> Result<Self> {
-        let LossTerms { total, prediction, pre, perceptual, flow, uncertainty, .. } = terms;
-        let nothing = pre.zeros_like();
-        let optional = |term: Option<Tensor<1>>| term.unwrap_or_else(|| nothing.clone());
-        let optional = [perceptual, flow, uncertainty].map(optional);
-        let all = Tensor::cat([total, prediction, pre].into_iter().chain(optional).collect(), 0);
-        let numbers = read(all.inner())?;
-        let number = |at: usize| f64::from(numbers[at]);
-        Ok(Self {
-            total: number(0),
-            prediction: number(1),
-            pre: number(2),
-            perceptual: number(3),
-            flow: number(4),
-            uncertainty: number(5),
-        })
-    }
-
-    fn add(&mut self, other: Self, share: f64) {
-        self.total += share * other.total;
-        self.prediction += share * other.prediction;
-        self.pre += share * other.pre;
-        self.perceptual += share * other.perceptual;
-        self.flow += share * other.flow;
-        self.uncertainty += share * other.uncertainty;
     }
 }
 

@@ -2,16 +2,11 @@
 
 use super::recipe::{Recipe, VALIDATION, ValidationConfig};
 use crate::dataset::Pack;
-use burn::tensor::Device;
 use qudi_core::fitting_mean_level;
 use qudi_core::metrics::{gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Error, Frame, Light, Result, Size, USUAL_MEAN_LEVEL};
-use qudi_model::checkpoint::ModelKind;
-use qudi_model::config::NetworkConfig;
-use qudi_model::network::Qudi;
-use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 use qudi_sim::scene::{Procedural, ProceduralScene};
 use serde::Serialize;
 
@@ -122,26 +117,11 @@ impl Validator {
         self.config.every
     }
 
-    /// Restores every clip at every light with `network`, which is on `device`.
+    /// Restores every clip at every light with `restorer`, after `step` steps.
     ///
     /// # Errors
     /// [`Error`] if the device fails.
-    pub fn measure(
-        &self,
-        network: &Qudi,
-        sizes: &NetworkConfig,
-        device: &Device,
-        step: u64,
-    ) -> Result<Validation> {
-        let ValidationConfig { steps, spacing, .. } = self.config;
-        let options = SampleOptions { steps, spacing, ..SampleOptions::default() };
-        let model = Model {
-            network: network.clone(),
-            config: sizes.clone(),
-            kind: ModelKind::of(network)?,
-            window: self.config.frames,
-        };
-        let mut restorer = QudiRestorer::new(model, options, device)?;
+    pub fn measure(&self, restorer: &mut dyn Restorer, step: u64) -> Result<Validation> {
         let mut clips = Vec::new();
         for &ppp in &self.config.ppp {
             for (number, (name, truth)) in self.clips.iter().enumerate() {

@@ -8,8 +8,8 @@ use qudi_model::checkpoint::load;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::{
-    Adam, Batch, BurstSampler, Event, Files, From, METRICS, Prefetcher, Recipe, Run, StepReport,
-    Trainer, WEIGHTS, parameters,
+    Adam, Batch, BurstSampler, Event, Files, From, Learner, METRICS, Prefetcher, Recipe, Run,
+    StepReport, Trainer, WEIGHTS, parameters,
 };
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -31,6 +31,10 @@ fn recipe(changes: &[(&str, &str)]) -> Recipe {
     Recipe::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny", &changes).unwrap()
 }
 
+fn init(recipe: &Recipe) -> Qudi {
+    Qudi::init(recipe, &Device::flex()).unwrap()
+}
+
 fn weights(network: &Qudi) -> Vec<f32> {
     let list = parameters(network).into_iter();
     list.flat_map(|v| v.into_data().try_into_vec::<f32>().unwrap()).collect()
@@ -44,11 +48,11 @@ fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Ve
     (weights(&trainer.averaged()), steps)
 }
 
-fn open(folder: &Path, recipe: &Recipe, from: From) -> Result<Run, Error> {
+fn open(folder: &Path, recipe: &Recipe, from: From<Qudi>) -> Result<Run<Qudi>, Error> {
     Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
 }
 
-fn learn(run: &mut Run, stop_after: u64) -> Result<(), Error> {
+fn learn(run: &mut Run<Qudi>, stop_after: u64) -> Result<(), Error> {
     run.learn(1, &mut |event| match event {
         Event::Step(report) if report.step == stop_after => ControlFlow::Break(()),
         _ => ControlFlow::Continue(()),
@@ -95,8 +99,8 @@ fn weights_do_not_depend_on_the_number_of_workers() {
     assert!(one == three, "weights differ");
     assert_eq!(steps.iter().map(|s| s.step).collect::<Vec<_>>(), [1, 2, 3]);
     assert!(steps.iter().all(|s| s.loss.total > 0.0 && s.norm > 0.0));
-    let loss = steps[0].loss;
-    let expected = loss.prediction + 0.2 * loss.pre + 30.0 * loss.flow;
+    let loss = &steps[0].loss;
+    let expected = loss.term("prediction") + 0.2 * loss.term("pre") + 30.0 * loss.term("flow");
     assert!((loss.total - expected).abs() < 1e-6 * loss.total);
 }
 
@@ -192,8 +196,7 @@ fn rejects_damaged_states() {
         assert!(error.to_string().contains("state"), "{error}");
     }
     std::fs::write(&path, &whole).unwrap();
-    let mut wider = recipe.clone();
-    wider.network.unet.width = 16;
+    let wider = crate::recipe(&[("network.unet.width", "16")]);
     assert!(open(folder.path(), &wider, From::State).unwrap_err().to_string().contains("size"));
     open(folder.path(), &recipe, From::State).unwrap();
 }
@@ -209,12 +212,16 @@ fn first_stage_trains_the_pre_denoiser_on_crops() {
         ),
         ("train.steps", "4"),
     ]);
-    let before = weights(&recipe.network.init(recipe.train.seed, &Device::flex()));
+    let before = weights(&init(&recipe));
     let (after, reports) = trained(&recipe, &[Device::flex()], 2);
     assert_eq!(after, trained(&recipe, &[Device::flex()], 1).0, "whoever draws the bursts");
-    assert!(reports.iter().all(|report| report.loss.pre > 0.0 && report.loss.flow == 0.0));
+    assert!(
+        reports
+            .iter()
+            .all(|report| report.loss.term("pre") > 0.0 && report.loss.term("flow") == 0.0)
+    );
     let count = |part: &str| {
-        let list = parameter_shapes(&recipe.network.init(1, &Device::flex()));
+        let list = parameter_shapes(&init(&recipe));
         let sizes = list.iter().filter(|(name, _)| name.starts_with(part));
         sizes.map(|(_, shape)| shape.iter().product::<usize>()).sum::<usize>()
     };
@@ -245,7 +252,7 @@ fn first_stage_trains_the_pre_denoiser_on_crops() {
 #[test]
 fn refinement_stages_keep_their_weights() {
     let recipe = recipe(&[("network.pre.stages", "2")]);
-    let start = recipe.network.init(1, &Device::flex());
+    let start = init(&recipe);
     let start = init_parameters(start, |_, shape| {
         let count = shape.iter().product::<usize>();
         (0..count).map(|i| 0.03 * ((i * 37 % 101) as f32 / 50.0 - 1.0)).collect()
@@ -278,7 +285,7 @@ fn refinement_stages_keep_their_weights() {
 fn nan_loss_stops_the_step_and_names_the_term() {
     let recipe = recipe(&[]);
     let bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
-    let broken = recipe.network.init(1, &Device::flex());
+    let broken = init(&recipe);
     let broken = init_parameters(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
     let mut prefetcher = Prefetcher::new(&recipe, &bursts, 0, 1).unwrap();
@@ -309,7 +316,7 @@ fn rejects_bf16_on_devices_without_it() {
     #[allow(deprecated)] // asked for by name
     let device = Device::ndarray();
     let recipe = recipe(&[("train.precision", "bf16")]);
-    let text = Trainer::new(&recipe, None, &[device], None).unwrap_err().to_string();
+    let text = Trainer::<Qudi>::new(&recipe, None, &[device], None).unwrap_err().to_string();
     assert!(text.contains("bf16"), "{text}");
 }
 

@@ -2,19 +2,17 @@
 //! residual blocks.
 
 use super::Sizes;
+use super::batch_norm::{BatchNorm, BatchStatistics};
 use super::blocks::Residuals;
 use crate::parts::{Corners, renamed, resize};
-use burn::module::{Module, Param};
+use burn::module::Module;
 use burn::tensor::activation::relu;
 use burn::tensor::module::max_pool2d;
 use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::pixel_shuffle;
-use qudi_layers::{Bias, Conv2d, zeros};
+use qudi_layers::{Bias, Conv2d};
 use std::slice::from_ref;
-
-/// Added to variances.
-const EPSILON: f32 = 1e-5;
 
 /// How much more channels a bottleneck gives than it has inside.
 const EXPANSION: usize = 4;
@@ -63,16 +61,6 @@ struct Shortcut {
     norm: BatchNorm,
 }
 
-/// Channels less their mean, over their standard deviation, as training left both.
-#[derive(Module, Debug)]
-struct BatchNorm {
-    /// `[channels]`, as all that follow.
-    weight: Param<Tensor<1>>,
-    bias: Param<Tensor<1>>,
-    running_mean: Param<Tensor<1>>,
-    running_var: Param<Tensor<1>>,
-}
-
 pub(super) fn authors_name(name: &str) -> String {
     let pairs = [
         ("memory.key_proj.", "memory.key_proj.key_proj."),
@@ -106,8 +94,9 @@ impl Memory {
         }
     }
 
-    pub(super) fn key(&self, own: Tensor<4>) -> Tensor<4> {
-        self.key_proj.linear(&[self.key_encoder.forward(&[own])])
+    /// `statistics` are those of batches, in training.
+    pub(super) fn key(&self, own: Tensor<4>, statistics: Option<&BatchStatistics>) -> Tensor<4> {
+        self.key_proj.linear(&[self.key_encoder.forward(&[own], statistics)])
     }
 }
 
@@ -126,12 +115,17 @@ impl Encoder {
         }
     }
 
-    pub(super) fn forward(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+    /// `statistics` are those of batches, in training.
+    pub(super) fn forward(
+        &self,
+        inputs: &[Tensor<4>],
+        statistics: Option<&BatchStatistics>,
+    ) -> Tensor<4> {
         let x = self.conv1.stride2(&[self.forward_resblocks.forward(inputs)]);
-        let x = relu(self.bn1.forward(x));
+        let x = relu(self.bn1.forward(x, statistics));
         let options = MaxPoolOptions::new([3, 3]).with_stride([2, 2]).with_padding([1, 1]);
         let x = max_pool2d(x, options);
-        self.layer1.iter().fold(x, |x, bottleneck| bottleneck.forward(x))
+        self.layer1.iter().fold(x, |x, bottleneck| bottleneck.forward(x, statistics))
     }
 }
 
@@ -163,28 +157,14 @@ impl Bottleneck {
         }
     }
 
-    fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let y = relu(self.bn1.forward(self.conv1.linear(from_ref(&x))));
-        let y = relu(self.bn2.forward(self.conv2.linear(&[y])));
-        let y = self.bn3.forward(self.conv3.linear(&[y]));
+    fn forward(&self, x: Tensor<4>, statistics: Option<&BatchStatistics>) -> Tensor<4> {
+        let y = relu(self.bn1.forward(self.conv1.linear(from_ref(&x)), statistics));
+        let y = relu(self.bn2.forward(self.conv2.linear(&[y]), statistics));
+        let y = self.bn3.forward(self.conv3.linear(&[y]), statistics);
         let x = match &self.downsample {
-            Some(shortcut) => shortcut.norm.forward(shortcut.conv.linear(&[x])),
+            Some(shortcut) => shortcut.norm.forward(shortcut.conv.linear(&[x]), statistics),
             None => x,
         };
         relu(y + x)
-    }
-}
-
-impl BatchNorm {
-    fn zeros(channels: usize, device: &Device) -> Self {
-        let values = || zeros([channels], device);
-        Self { weight: values(), bias: values(), running_mean: values(), running_var: values() }
-    }
-
-    fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let channels = x.dims()[1];
-        let of = |values: &Param<Tensor<1>>| values.val().reshape([1, channels, 1, 1]);
-        let (mean, variance) = (of(&self.running_mean).detach(), of(&self.running_var).detach());
-        (x - mean) / (variance + EPSILON).sqrt() * of(&self.weight) + of(&self.bias)
     }
 }

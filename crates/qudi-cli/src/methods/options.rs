@@ -3,7 +3,8 @@
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::weights::Weights;
-use qudi_baselines::import::Method;
+use burn::tensor::Device;
+use qudi_baselines::import::{Method, describe};
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
@@ -148,10 +149,21 @@ impl NetworkOptions {
                 format!("method `{name}` has no weights here"),
                 "--weights",
                 format!(
-                    "name a file of its authors, as in --weights {name}=FILE (docs/methods.md)"
+                    "name a file of its authors, or of `qudi train {name}`, as in --weights {name}=FILE (docs/methods.md)"
                 ),
             )
         })
+    }
+
+    /// What is known of the weights of a learned method that were trained here: their size, and the steps. None of
+    /// other methods, and of weights of others.
+    pub(crate) fn trained_here(&self, method: &str) -> Result<Option<String>> {
+        let Some(method) = Method::by_name(method) else { return Ok(None) };
+        let contents = describe(self.weights_of(method)?, &Device::flex())?;
+        Ok(contents.and_then(|contents| {
+            let steps = contents.description?.steps;
+            Some(format!("{}, {steps} steps", contents.sizes))
+        }))
     }
 
     /// Refuses options that are about diffusion steps where there are none.

@@ -1,8 +1,7 @@
 //! The keys of recipes, found by serializing the recipes that come along.
 
 use super::flatten;
-use qudi_model::config::PRESETS;
-use qudi_train::Recipe;
+use qudi_train::{Recipe, recipe_names};
 use serde_json::Value;
 use std::sync::OnceLock;
 
@@ -23,12 +22,28 @@ pub(super) fn of_preset(name: &str) -> Vec<(String, Value)> {
     leaves
 }
 
+/// Recipes of learned methods of others by name, with the sizes of their networks.
+pub(super) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
+    let sizes = |name: &'static str| {
+        let keys = of_preset(name).into_iter();
+        let own = keys.filter_map(|(key, value)| {
+            let key = key.strip_prefix("network.")?;
+            Some((key.to_owned(), value))
+        });
+        let mut own: Vec<_> = own.collect();
+        let at = own.iter().position(|(key, _)| key == "method")?;
+        own.remove(at);
+        Some((name, own))
+    };
+    recipe_names().filter_map(sizes).collect()
+}
+
 /// All keys of all recipes that come along, numbers of lists as `0`.
 pub(super) fn names() -> &'static [String] {
     static NAMES: OnceLock<Vec<String>> = OnceLock::new();
     NAMES.get_or_init(|| {
         let mut names = Vec::new();
-        for (preset, _) in PRESETS {
+        for preset in recipe_names() {
             names.extend(of_preset(preset).into_iter().map(|(key, _)| key));
         }
         names.sort();
@@ -46,7 +61,7 @@ pub(super) fn is_known(key: &str, value: &Value) -> bool {
     }
     // A key that no recipe writes, since it is optional or has another name by now.
     let change = [(key.to_owned(), super::toml_text(value))];
-    PRESETS.iter().any(|(preset, _)| Recipe::load(preset, &change).is_ok())
+    recipe_names().any(|preset| Recipe::load(preset, &change).is_ok())
 }
 
 /// The key with every number of a list as `0`.

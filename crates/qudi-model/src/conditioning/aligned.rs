@@ -18,6 +18,9 @@ pub struct AlignedNeighbours {
 }
 
 impl AlignedNeighbours {
+    /// None: of networks that see single frames.
+    pub const NONE: Self = Self { neighbours: 0, alignments: Alignments::Selected };
+
     /// The number of aligned frames `K`: every neighbour once for each of its alignments.
     pub fn count(self) -> usize {
         self.alignments.count() * self.neighbours

@@ -2,12 +2,10 @@
 
 use super::{BurstSampler, Files};
 use crate::dataset::Dataset;
+use crate::learner::Learner;
 use crate::recipe::Recipe;
 use burn::tensor::Device;
 use qudi_core::{Error, Result};
-use qudi_model::network::Qudi;
-use qudi_model::refinement::RefinementStage;
-use qudi_model::restorer::TILE;
 use std::ops::ControlFlow;
 
 /// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the refinement stages of
@@ -17,9 +15,9 @@ use std::ops::ControlFlow;
 /// # Errors
 /// [`Error`] if `files` name no folder for bursts, the data or the disk fail, or bursts of something else lie
 /// in the folder; [`Error::Interrupted`] if asked to stop.
-pub fn draw_bursts(
+pub fn draw_bursts<L: Learner>(
     recipe: &Recipe,
-    network: &Qudi,
+    network: &L,
     files: Files,
     device: &Device,
     workers: usize,
@@ -29,7 +27,7 @@ pub fn draw_bursts(
         return Err(Error::request("no folder for bursts", "bursts", "name one"));
     };
     let dataset = Dataset::new(&recipe.data, files.pack)?;
-    let stages = RefinementStage::all(network, &recipe.network, TILE, device);
+    let stages = network.refinement_stages(recipe, device)?;
     let bursts = BurstSampler::new(recipe, dataset, stages).with_cache(folder, recipe)?;
     bursts.draw_all(workers, on)
 }

@@ -7,7 +7,7 @@ use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Error, Result, Size, USUAL_MEAN_LEVEL};
 use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
-use qudi_model::config::{Part, ReferenceKind};
+use qudi_model::config::ReferenceKind;
 use qudi_model::refinement::{RefinementStage, align};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
@@ -45,9 +45,9 @@ impl BurstSampler {
             dataset,
             seed: recipe.train.seed,
             crop: recipe.data.crop,
-            neighbours: recipe.network.pre.aligned_neighbours(),
-            reference: recipe.network.reference,
-            mean_level: !recipe.network.ablates(Part::MeanLevel),
+            neighbours: recipe.network.aligned_neighbours(),
+            reference: recipe.network.reference(),
+            mean_level: recipe.network.sees_mean_level(),
             crops: recipe.train.crops.map(cells),
             stages,
             cache: None,
@@ -301,8 +301,9 @@ mod tests {
         }
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
-        let network = recipe.network.init(1, &device).with_stage_added(0);
-        let stages = RefinementStage::all(&network, &recipe.network, TILE, &device);
+        let config = recipe.network.qudi().unwrap_or_else(|e| panic!("{e}"));
+        let network = config.init(1, &device).with_stage_added(0);
+        let stages = RefinementStage::all(&network, config, TILE, &device);
         let refined = BurstSampler { stages, ..of(&recipe) };
         let mut refined =
             refined.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));

@@ -156,6 +156,26 @@ impl SensorMix {
 }
 
 impl DataConfig {
+    /// The sensors by name; sums of binary frames as `name x frames`.
+    pub(crate) fn sensor_names(&self) -> Vec<String> {
+        let name = |mix: &SensorMix| match mix.frames_summed {
+            None => mix.name.clone(),
+            Some(frames) => format!("{} x {frames}", mix.name),
+        };
+        self.sensor.iter().map(name).collect()
+    }
+
+    /// The least and most photons per pixel and frame of all sensors.
+    pub(crate) fn light(&self) -> [f64; 2] {
+        let bounds = self.sensor.iter().map(|mix| mix.ppp.bounds());
+        bounds.fold([f64::INFINITY, 0.0], |[low, high], [from, to]| [low.min(from), high.max(to)])
+    }
+
+    /// The names of all sources.
+    pub(crate) fn source_names(&self) -> Vec<String> {
+        self.source.iter().map(|source| source.name.clone()).collect()
+    }
+
     /// The configuration, if samples can be drawn from it.
     ///
     /// # Errors

@@ -16,6 +16,7 @@ use rayon::prelude::*;
 
 /// How a pass goes: which results of the previous step the network is given, and what is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(clippy::struct_excessive_bools, reason = "switches, each of its own")]
 pub struct LoopOptions {
     /// Whether it is given the previous estimate as the sensor would measure it.
     pub forward_model: bool,

@@ -1,5 +1,6 @@
 //! Stages of a recipe: trainings one after the other, each from the weights of the one before.
 
+use super::keys::{modern_key, set};
 use super::{Recipe, TrainConfig, is_default};
 use crate::loss::NoiseOn;
 use crate::loss::lpips::PerceptualKind;
@@ -64,7 +65,7 @@ impl Recipe {
             let fault = |what: String| Error::request(what, &place, "correct the recipe");
             let mut document = document.clone();
             for (key, value) in &stage.changes {
-                super::set(&mut document, &super::modern_key(key), value.clone())
+                set(&mut document, &modern_key(key), value.clone())
                     .map_err(|error| fault(error.to_string()))?;
             }
             let recipe: Self = document
@@ -80,11 +81,11 @@ impl Recipe {
 pub(super) fn noise_rules(recipe: &Recipe) -> [(&'static str, bool, &'static str); 2] {
     let train = &recipe.train;
     let on_truth = train.noise_on == NoiseOn::Truth;
-    let steps = recipe.validation.as_ref().is_none_or(|validation| validation.steps == 2);
+    let two = recipe.validation.as_ref().is_none_or(|validation| validation.steps == Some(2));
     [
         (
             "train.noise_on",
-            on_truth || (steps && train.loss.prediction > 0.0),
+            on_truth || (two && train.loss().prediction > 0.0),
             "must be \"truth\" unless the prediction has a weight and validation.steps is 2",
         ),
         (
@@ -102,7 +103,7 @@ pub(super) fn rules(
     has_flow: bool,
 ) -> [(&'static str, bool, &'static str); 4] {
     let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
-    let (loss, checkpointing) = (&train.loss, train.gradient_checkpointing);
+    let (loss, checkpointing) = (train.loss(), train.gradient_checkpointing);
     let alone = loss.prediction == 0.0 && loss.term == PerceptualKind::None;
     let taught = [LearningPart::Pre, LearningPart::Uncertainty, LearningPart::Flow];
     let is_taught = |part: &LearningPart| has_flow || *part != LearningPart::Flow;

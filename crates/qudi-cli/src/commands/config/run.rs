@@ -3,7 +3,7 @@
 use super::args::{Config, ConfigAction};
 use crate::error::Result;
 use crate::report::{Report, print};
-use crate::settings::{KEYS, Settings, shown_recipe, toml_text};
+use crate::settings::{KEYS, Settings, baseline_sizes, shown_recipe, toml_text};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -89,6 +89,18 @@ stands in [training](../docs/training.md).
     );
     for (key, value) in keys {
         let _ = writeln!(text, "| `{key}` | `{}` |", toml_text(&value));
+    }
+    text += "
+Recipes with `network.method` are for [learned methods of others](../docs/training.md#learned-methods-of-others), with
+other keys in `[network]`:
+
+| recipe | keys of `[network]` besides `method` |
+|---|---|
+";
+    for (recipe, sizes) in baseline_sizes() {
+        let sizes = sizes.iter().map(|(key, value)| format!("`{key} = {}`", toml_text(value)));
+        let sizes = sizes.collect::<Vec<_>>().join(", ");
+        let _ = writeln!(text, "| `baselines/{recipe}.toml` | {sizes} |");
     }
     text
 }

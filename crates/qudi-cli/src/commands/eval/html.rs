@@ -260,8 +260,7 @@ mod tests {
         for (clip, score) in clips.iter_mut().zip(&scores) {
             clip.add("mle", score);
         }
-        let rows =
-            [Row { method: "mle".to_owned(), steps: None, ppp: 3.25, scores: scores.to_vec() }];
+        let rows = [Row { scores: scores.to_vec(), ..Row::new("mle".to_owned(), 3.25) }];
         let page = html(&rows, &[], &clips, "about").unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("aspect-ratio:32/24") && page.contains("aspect-ratio:40/224"));
         assert!(page.contains("the middle 40 x 224 pixels"));

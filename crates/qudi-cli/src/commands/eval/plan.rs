@@ -20,6 +20,8 @@ use std::rc::Rc;
 #[derive(Clone, Debug)]
 pub(super) struct Contender {
     pub(super) method: String,
+    /// Its weights, if it is a learned method of others that was trained here.
+    pub(super) trained: Option<String>,
     /// Its diffusion steps, where there are several numbers of them to compare.
     pub(super) steps: Option<usize>,
     pub(super) network: NetworkOptions,
@@ -28,7 +30,8 @@ pub(super) struct Contender {
 impl Contender {
     /// Its row at a light level, without scores.
     pub(super) fn row(&self, ppp: f64) -> Row {
-        Row { method: self.method.clone(), steps: self.steps, ppp, scores: Vec::new() }
+        let (method, trained) = (self.method.clone(), self.trained.clone());
+        Row { method, trained, steps: self.steps, ppp, scores: Vec::new() }
     }
 }
 
@@ -95,7 +98,7 @@ impl Plan {
         }
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
         network.check_methods(methods.iter().map(String::as_str))?;
-        let contenders = contenders(&methods, &network, &steps);
+        let contenders = contenders(&methods, &network, &steps)?;
         let mut own = contenders.iter().filter(|contender| contender.method == "qudi");
         own.try_for_each(|contender| contender.network.check_steps())?;
         if args.table1 && args.protocol == Protocol::Quiver {
@@ -207,19 +210,25 @@ impl Plan {
 }
 
 /// Every method once, and the network once for every number of steps, fewest first.
-fn contenders(methods: &[String], network: &NetworkOptions, steps: &[usize]) -> Vec<Contender> {
+fn contenders(
+    methods: &[String],
+    network: &NetworkOptions,
+    steps: &[usize],
+) -> Result<Vec<Contender>> {
     let mut contenders = Vec::new();
     for method in methods {
-        let plain = Contender { method: method.clone(), steps: None, network: network.clone() };
+        let trained = network.trained_here(method)?;
+        let network = network.clone();
+        let plain = Contender { method: method.clone(), trained, steps: None, network };
         if method == "qudi" && steps.len() > 1 {
             contenders.extend(steps.iter().map(|&steps| Contender {
                 steps: Some(steps),
-                network: NetworkOptions { steps: Some(steps), ..network.clone() },
+                network: NetworkOptions { steps: Some(steps), ..plain.network.clone() },
                 ..plain.clone()
             }));
         } else {
             contenders.push(plain);
         }
     }
-    contenders
+    Ok(contenders)
 }

@@ -116,8 +116,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     let mut rows: Vec<Row> = Vec::new();
     for &ppp in levels {
         let own = plan.contenders.iter().map(|contender| contender.row(ppp));
-        let name = |external: &External| external.name.clone();
-        let row = |external| Row { method: name(external), steps: None, ppp, scores: Vec::new() };
+        let row = |external: &External| Row::new(external.name.clone(), ppp);
         rows.extend(own.chain(plan.external.iter().map(row)));
     }
     let each = rows.len() / levels.len();
@@ -205,6 +204,7 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
         };
         let figures = json!({
             "method": row.method,
+            "trained": row.trained,
             "steps": row.steps,
             "ppp": row.ppp,
             "psnr_a": of(|f| f.psnr_a),

@@ -121,6 +121,8 @@ pub(crate) struct Score {
 /// All scores of one method at one light level.
 pub(crate) struct Row {
     pub(crate) method: String,
+    /// Its weights, if it is a learned method of others that was trained here: their size, and the steps.
+    pub(crate) trained: Option<String>,
     /// Its diffusion steps, where several numbers of them are compared.
     pub(crate) steps: Option<usize>,
     pub(crate) ppp: f64,
@@ -129,6 +131,11 @@ pub(crate) struct Row {
 }
 
 impl Row {
+    /// The row of a method without weights of its own, without scores.
+    pub(crate) fn new(method: String, ppp: f64) -> Self {
+        Self { method, trained: None, steps: None, ppp, scores: Vec::new() }
+    }
+
     /// The method, and its steps where they are compared.
     pub(crate) fn label(&self) -> String {
         let method = &self.method;
@@ -136,6 +143,14 @@ impl Row {
             None => method.clone(),
             Some(1) => format!("{method}, 1 step"),
             Some(steps) => format!("{method}, {steps} steps"),
+        }
+    }
+
+    /// The method, and what its weights are if they were trained here.
+    pub(crate) fn name(&self) -> String {
+        match &self.trained {
+            Some(trained) => format!("{} (trained here: {trained})", self.method),
+            None => self.method.clone(),
         }
     }
 

@@ -49,7 +49,7 @@ fn cells(row: &Row) -> Vec<Cell> {
         other => Cell::number(other.map(|statistics| statistics.mean), digits),
     };
     vec![
-        Cell::text(&row.method),
+        Cell::text(row.name()),
         steps(row),
         light(row),
         mean(row.centre(|f| f.psnr_a), 2),
@@ -84,7 +84,7 @@ fn appearance(rows: &[Row]) -> Option<Table> {
     let cells = |row: &Row| {
         let mean =
             |look: &Named| Cell::number(row.over_clips(look.figure).map(|s| s.mean), look.digits);
-        let first = [Cell::text(&row.method), steps(row), light(row)];
+        let first = [Cell::text(row.name()), steps(row), light(row)];
         first.into_iter().chain(LOOKS.iter().map(mean)).collect()
     };
     table.rows = rows.iter().map(cells).collect();
@@ -99,7 +99,7 @@ fn added(rows: &[Row]) -> Option<Table> {
     let mut table = Table::new(names.map(|name| Column::new(name, name)).collect());
     let cells = |row: &Row| {
         let ratios = row.added()?.map(|ratio| Cell::number(Some(ratio), 3));
-        let first = [Cell::text(&row.method), steps(row), light(row)];
+        let first = [Cell::text(row.name()), steps(row), light(row)];
         Some(first.into_iter().chain(ratios).collect())
     };
     table.rows = rows.iter().filter_map(cells).collect();

@@ -75,7 +75,10 @@ pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
                     Cell::number(row.and_then(|row| row.over_clips(figure)).map(|s| s.mean), digits)
                 };
                 let note = match row {
-                    Some(_) => Cell::Unknown,
+                    Some(row) => match &row.trained {
+                        Some(trained) => Cell::text(format!("trained here: {trained}")),
+                        None => Cell::Unknown,
+                    },
                     None => Cell::text(format!("no weights: --weights {method}=FILE")),
                 };
                 table.rows.push(vec![

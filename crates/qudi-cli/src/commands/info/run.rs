@@ -137,23 +137,39 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
 
 /// A weight file of a learned method of others.
 fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
-    let Contents { method, sizes, parameters } = contents;
+    let Contents { method, sizes, parameters, description } = contents;
     let sha256 = Weights::File(path.to_owned()).sha256()?;
     let mut text = String::new();
     let name = method.name();
-    let lines = [
-        ("network", format!("{name}, {parameters} parameters")),
-        ("sizes", sizes.clone()),
+    let mut lines =
+        vec![("network", format!("{name}, {parameters} parameters")), ("sizes", sizes.clone())];
+    if let Some(d) = description {
+        let commit = d.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}"));
+        let [least, most] = d.ppp;
+        lines.extend([
+            ("bursts", format!("{} frames", d.frames)),
+            ("sensors", d.sensors.join(", ")),
+            ("light", format!("{least} to {most} photons per pixel and frame")),
+            ("trained", format!("{} steps on {}", d.steps, d.data.join(", "))),
+            ("made by", d.program.clone() + &commit),
+            ("licence", d.licence.clone()),
+        ]);
+    }
+    lines.extend([
         ("use", format!("--method {name} --weights {name}={}", path.display())),
         ("sha-256", sha256.clone()),
-    ];
+    ]);
     for (key, value) in &lines {
         let _ = writeln!(text, "{key:<12}{value}");
     }
-    report.result(
-        &text,
-        || json!({"method": name, "parameters": parameters, "sizes": sizes, "sha256": sha256}),
-    )
+    report.result(&text, || {
+        let mut document =
+            json!({"method": name, "parameters": parameters, "sizes": sizes, "sha256": sha256});
+        if let Some(description) = description {
+            document["trained"] = json!(description);
+        }
+        document
+    })
 }
 
 fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {

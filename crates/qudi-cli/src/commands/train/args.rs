@@ -12,7 +12,8 @@ use std::path::PathBuf;
 #[derive(Debug, ClapArgs)]
 #[expect(clippy::struct_excessive_bools, reason = "switches of a command line")]
 pub(crate) struct Train {
-    /// The recipe: tiny, small, paper-mini, base, paper, or a .toml file [default with --resume: the run's own]
+    /// The recipe: tiny, small, paper-mini, base, paper, a learned baseline (quiver, emvd, flornn, spk2imgnet,
+    /// memdeblur, rvrt, student-teacher), or a .toml file [default with --resume: the run's own]
     pub(crate) recipe: Option<String>,
     /// Folder of the run
     #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present_any = ["cache_only", "draw_only"])]

@@ -1,15 +1,12 @@
-//! What a run learns from: decoded files, cached bursts, initial weights.
+//! What a run learns from: decoded files, cached bursts.
 
 use super::plan::Plan;
-use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::Report;
 use qudi_core::atomic_file::Overwrite;
-use qudi_model::checkpoint::{Description, load};
-use qudi_model::network::Qudi;
+use qudi_train::Files;
 use qudi_train::dataset::{Pack, write_pack};
-use qudi_train::{Files, Recipe};
 use std::path::Path;
 
 /// The files that the recipe learns from, made first if they are not there.
@@ -56,29 +53,4 @@ pub(super) fn make_pack(plan: &Plan, overwrite: Overwrite, report: &Report) -> R
         interrupt::check()
     })?;
     Ok(())
-}
-
-/// The network that training starts from, out of a weight file.
-pub(super) fn initial(path: &Path, recipe: &Recipe, device: &Opened) -> Result<Box<Qudi>> {
-    let (mut network, Description { network: mut sizes, .. }) = load(path, &device.device)?;
-    let before = sizes.pre.aligned_neighbours();
-    // A pre-denoiser that sees more than a refinement stage does cannot become one.
-    let is_stage = before == sizes.pre.stage().aligned_neighbours();
-    if sizes.pre.stages + 1 == recipe.network.pre.stages && is_stage {
-        sizes.pre.stages += 1;
-        network = network.with_stage_added(sizes.pre.aligned_neighbours().count() - before.count());
-    }
-    if recipe.network.pre.uncertainty && !sizes.pre.uncertainty {
-        let fresh = recipe.network.init(recipe.train.seed, &device.device);
-        network = network.with_uncertainty_head_of(fresh);
-        sizes.pre.uncertainty = true;
-    }
-    if sizes != recipe.network {
-        return Err(CliError::new(
-            "these weights are for a network of other sizes than the recipe's",
-            path.display(),
-            "choose the recipe that they were trained with, its [network] table, or that with one more refinement stage or with an uncertainty head",
-        ));
-    }
-    Ok(Box::new(network))
 }

@@ -5,7 +5,7 @@ use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::settings::{Settings, toml_text};
 use qudi_core::atomic_file::Overwrite;
-use qudi_train::{RECIPE, Recipe};
+use qudi_train::{RECIPE, Recipe, recipe_names};
 use std::path::PathBuf;
 
 /// What is to be done.
@@ -85,10 +85,11 @@ fn recipe(args: &Train, settings: &Settings) -> Result<Recipe> {
         (Some(name), _) => name.clone(),
         (None, Some(own)) if args.resume => own.display().to_string(),
         _ => {
+            let names: Vec<_> = recipe_names().collect();
             return Err(CliError::new(
                 "no recipe",
                 "RECIPE",
-                "name one: tiny, small, paper-mini, base, paper, or a .toml file",
+                format!("name one: {}, or a .toml file", names.join(", ")),
             ));
         }
     };

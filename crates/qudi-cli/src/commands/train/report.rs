@@ -11,12 +11,22 @@ use serde_json::Value;
 const POINTS: usize = 120;
 
 /// Parts of the loss, by their keys in the metrics.
-const LOSSES: [(&str, &str); 5] = [
+const LOSSES: [(&str, &str); 14] = [
     ("total", "total"),
     ("prediction", "prediction"),
     ("pre", "pre-denoiser"),
     ("perceptual", "perceptual"),
     ("flow", "flow"),
+    // Of learned baselines.
+    ("image", "image"),
+    ("half", "half the size"),
+    ("quarter", "a quarter of the size"),
+    ("frames", "filtered frames"),
+    ("estimates", "estimates of blocks"),
+    ("transforms", "transforms"),
+    ("teachers", "distance from teachers"),
+    ("motion", "teacher of motion"),
+    ("denoising", "teacher of denoising"),
 ];
 
 /// Parts of a step whose time is measured, by their keys in the metrics.

@@ -1,7 +1,7 @@
 //! `qudi train`: a recipe and data in, weights out.
 
 use super::args::Train;
-use super::data::{files, initial, make_folder, make_pack};
+use super::data::{files, make_folder, make_pack};
 use super::environment::{ENVIRONMENT, environment};
 use super::plan::{Action, Plan};
 use super::resume::{check_pack, check_recipe};
@@ -13,10 +13,15 @@ use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::Report;
 use crate::settings::Settings;
+use qudi_baselines::learning::Baseline;
 use qudi_core::atomic_file::Overwrite;
+use qudi_model::network::Qudi;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::{Lpips, fetch};
-use qudi_train::{From, METRICS, RECIPE, Run, Validation, WEIGHTS, draw_bursts};
+use qudi_train::{
+    From, Learner, METRICS, NetworkRecipe, RECIPE, Run, Validation, WEIGHTS, draw_bursts,
+    run_exists,
+};
 use serde_json::json;
 
 pub(crate) fn run(
@@ -28,7 +33,10 @@ pub(crate) fn run(
     let plan = Plan::new(args, settings, global)?;
     match plan.action {
         Action::MakePack => pack(&plan, report),
-        Action::DrawBursts => draw(&plan, report),
+        Action::DrawBursts => match plan.recipe.network {
+            NetworkRecipe::Qudi(_) => draw::<Qudi>(&plan, report),
+            NetworkRecipe::Baseline(_) => draw::<Baseline>(&plan, report),
+        },
         Action::Start | Action::Resume => match plan.recipe.stages()? {
             stages if stages.is_empty() => train(&plan, report),
             stages => train_stages(&plan, stages, report),
@@ -49,7 +57,7 @@ fn pack(plan: &Plan, report: &Report) -> Result<()> {
 
 /// Checks that the weights of the perceptual term are there, and downloads them first if that was asked for.
 pub(super) fn find_backbones(plan: &Plan, report: &Report) -> Result<()> {
-    let term = plan.recipe.train.loss.term;
+    let term = plan.recipe.train.loss().term;
     if let (true, Some(backbones)) = (plan.fetch, &plan.backbones) {
         for path in fetch(term, backbones)? {
             report.remark(&format!("{} is there", path.display()));
@@ -60,6 +68,13 @@ pub(super) fn find_backbones(plan: &Plan, report: &Report) -> Result<()> {
 
 /// Trains to the end of the recipe.
 pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
+    match plan.recipe.network {
+        NetworkRecipe::Qudi(_) => train_network::<Qudi>(plan, report),
+        NetworkRecipe::Baseline(_) => train_network::<Baseline>(plan, report),
+    }
+}
+
+fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let (folder, recipe) = (&plan.folder, &plan.recipe);
     check_folder(plan)?;
     if plan.action == Action::Resume {
@@ -73,7 +88,8 @@ pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     let from = if plan.action == Action::Resume {
         From::State
     } else {
-        let init = plan.init.as_deref().map(|path| initial(path, recipe, &devices[0]));
+        let init = plan.init.as_deref();
+        let init = init.map(|path| L::load(path, recipe, &devices[0].device).map(Box::new));
         From::Start(init.transpose()?)
     };
     let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
@@ -114,7 +130,7 @@ pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
 }
 
 /// Draws all bursts of a recipe, for other programs, or before anything learns from them.
-fn draw(plan: &Plan, report: &Report) -> Result<()> {
+fn draw<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let opened = device::open(plan.devices.first().map_or("auto", String::as_str))?;
     let (folder, recipe) = (&plan.folder, &plan.recipe);
     if !recipe.stage.is_empty() {
@@ -126,8 +142,8 @@ fn draw(plan: &Plan, report: &Report) -> Result<()> {
     }
     let files = files(plan, report)?;
     let network = match &plan.init {
-        Some(path) => *initial(path, recipe, &opened)?,
-        None => recipe.network.init(recipe.train.seed, &opened.device),
+        Some(path) => L::load(path, recipe, &opened.device)?,
+        None => L::init(recipe, &opened.device)?,
     };
     let mut bar = report.bar();
     let mut bursts = 0;
@@ -157,7 +173,7 @@ fn draw(plan: &Plan, report: &Report) -> Result<()> {
 /// Refuses a folder without a state to resume from, or with a run that would be lost.
 pub(super) fn check_folder(plan: &Plan) -> Result<()> {
     let folder = &plan.folder;
-    let exists = Run::exists(folder);
+    let exists = run_exists(folder);
     let resume = plan.action == Action::Resume;
     if resume && !exists {
         return Err(CliError::new(

@@ -8,7 +8,7 @@ use super::watch::write;
 use crate::error::{CliError, Result};
 use crate::report::Report;
 use qudi_core::atomic_file::Overwrite;
-use qudi_train::{RECIPE, Recipe, Run, WEIGHTS};
+use qudi_train::{RECIPE, Recipe, WEIGHTS, run_exists, steps_taken};
 use serde_json::json;
 
 /// Trains all stages, or those that are left, and puts the last one's weights into the run's folder.
@@ -31,7 +31,7 @@ pub(super) fn train_stages(
         ));
     }
     // Before anything is written: a recipe that is refused must not become the run's.
-    for stage in stages.iter().filter(|stage| Run::exists(&stage.folder)) {
+    for stage in stages.iter().filter(|stage| run_exists(&stage.folder)) {
         check_recipe(&stage.folder, &stage.recipe)?;
     }
     stages.iter().try_for_each(|stage| find_backbones(stage, report))?;
@@ -44,8 +44,8 @@ pub(super) fn train_stages(
     for (number, stage) in stages.into_iter().enumerate() {
         let weights = stage.folder.join(WEIGHTS);
         let from = init.replace(weights);
-        let exists = Run::exists(&stage.folder);
-        if exists && Run::steps_taken(&stage.folder)? >= stage.recipe.train.steps {
+        let exists = run_exists(&stage.folder);
+        if exists && steps_taken(&stage.folder)? >= stage.recipe.train.steps {
             continue;
         }
         report.remark(&format!("stage {} of {count}: {}", number + 1, stage.folder.display()));

@@ -77,17 +77,12 @@ impl<'a> Watch<'a> {
         let rate = self.samples * self.taken as f64 / self.start.elapsed().as_secs_f64();
         let text = format!("loss {loss:.5} rate {:.1e} {rate:.2} samples/s", step.lr);
         self.bar.learning(text, step.step, self.steps);
-        let scalars = [
-            ("loss/total", step.loss.total),
-            ("loss/prediction", step.loss.prediction),
-            ("loss/pre", step.loss.pre),
-            ("loss/perceptual", step.loss.perceptual),
-            ("loss/flow", step.loss.flow),
-            ("loss/error", step.loss.uncertainty),
-            ("train/rate", step.lr),
-            ("train/norm", step.norm),
-        ];
-        self.events.scalars(step.step, &scalars.map(|(tag, value)| (tag.to_owned(), value)))
+        let scalar = |tag: &str, value: f64| (tag.to_owned(), value);
+        let mut scalars = vec![scalar("loss/total", step.loss.total)];
+        let terms = step.loss.terms.iter();
+        scalars.extend(terms.map(|(name, value)| (format!("loss/{name}"), *value)));
+        scalars.extend([scalar("train/rate", step.lr), scalar("train/norm", step.norm)]);
+        self.events.scalars(step.step, &scalars)
     }
 
     /// The last validation, or what went wrong while watching.

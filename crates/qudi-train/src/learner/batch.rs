@@ -1,9 +1,9 @@
 //! Samples as planes, noise and times, ready to go to a device.
 
-use super::burst_cache::BurstSampler;
-use super::burst_cache::burst::ConditionedBurst;
-use super::recipe::{Recipe, TrainConfig};
+use crate::burst_cache::BurstSampler;
+use crate::burst_cache::burst::ConditionedBurst;
 use crate::loss::{Example, NoiseOn, second_of_two};
+use crate::recipe::Recipe;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
@@ -16,7 +16,7 @@ use qudi_model::tensor::to_tensor;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
-/// The samples of one pass.
+/// The samples of one pass of the diffusion network.
 #[derive(Clone, Debug)]
 pub struct Batch {
     /// The number of the batch in its run.
@@ -66,10 +66,10 @@ impl Batch {
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
-            let TrainConfig { timesteps, noise_start_fraction, noise_on, .. } = recipe.train;
-            let at_start = random.random::<f64>() < noise_start_fraction;
+            let timesteps = recipe.train.timesteps;
+            let at_start = random.random::<f64>() < recipe.train.noise_start_fraction();
             let quantile = random.random();
-            batch.timesteps.push(match noise_on {
+            batch.timesteps.push(match recipe.train.noise_on {
                 _ if at_start => NUM_TIMESTEPS - 1,
                 NoiseOn::Truth => timesteps.timestep(quantile),
                 NoiseOn::Estimate => second_of_two(recipe.default_spacing()),

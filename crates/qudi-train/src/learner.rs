@@ -1,0 +1,140 @@
+//! What the trainer needs of a network, and the networks that have it.
+
+mod baseline;
+mod batch;
+mod bursts;
+mod qudi;
+
+use crate::burst_cache::BurstSampler;
+use crate::loss::lpips::Lpips;
+use crate::recipe::Recipe;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_core::Result;
+use qudi_core::restorer::Restorer;
+use qudi_layers::parameter_shapes;
+use qudi_model::refinement::RefinementStage;
+use std::fmt::{Debug, Formatter};
+use std::path::Path;
+
+pub use batch::Batch;
+pub use bursts::CountBatch;
+
+/// A network that can be trained by recipes for it.
+///
+/// # Errors
+/// Methods that take a recipe refuse one that is for another network.
+pub trait Learner: Module + Sync {
+    /// Samples that pass at once, as threads draw them.
+    type Batch: Send + Sync + 'static;
+
+    /// The network of a recipe without weights: it takes no memory yet.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the recipe is for another network.
+    fn uninitialized(recipe: &Recipe, device: &Device) -> Result<Self>;
+
+    /// The network of a recipe with the initial weights of its seed.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the recipe is for another network.
+    fn init(recipe: &Recipe, device: &Device) -> Result<Self>;
+
+    /// The network that the training of a recipe starts from, out of a file of weights.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the file does not hold a network that can become the recipe's.
+    fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self>;
+
+    /// Draws batch `number` of a recipe.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the data cannot be read.
+    fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Self::Batch>;
+
+    /// Computes the loss of a batch. The network is on `context.device`.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the device fails or a sensor is impossible.
+    fn loss<'a>(&'a self, batch: &'a Self::Batch, context: &Context<'a>) -> Result<Loss<'a>>;
+
+    /// The restorer of validations, by a network that is outside autodiff on `device`.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the network or the recipe cannot restore.
+    fn restorer(&self, recipe: &Recipe, device: &Device) -> Result<Box<dyn Restorer>>;
+
+    /// Writes the weights for use, with a description of their training.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the file cannot be written.
+    fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()>;
+
+    /// Names and shapes of all parameters in states, in the order of the network.
+    fn named_shapes(&self) -> Vec<(String, Vec<usize>)> {
+        parameter_shapes(self)
+    }
+
+    /// The name that an older state has for a parameter.
+    fn former_name(name: &str) -> String {
+        name.to_owned()
+    }
+
+    /// Whether each parameter learns.
+    fn learns(&self, _recipe: &Recipe) -> Vec<bool> {
+        vec![true; self.named_shapes().len()]
+    }
+
+    /// The refinement stages that samples are aligned with; none for most networks.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the recipe is for another network.
+    fn refinement_stages(
+        &self,
+        _recipe: &Recipe,
+        _device: &Device,
+    ) -> Result<Vec<RefinementStage>> {
+        Ok(Vec::new())
+    }
+}
+
+/// What the loss depends on besides network and batch.
+#[derive(Clone, Copy, Debug)]
+pub struct Context<'a> {
+    /// The recipe.
+    pub recipe: &'a Recipe,
+    /// The device, with autodiff.
+    pub device: &'a Device,
+    /// Steps taken before this one.
+    pub step: u64,
+    /// The perceptual term, if the recipe has one.
+    pub perceptual: Option<&'a Lpips>,
+}
+
+/// The loss of a batch.
+pub struct Loss<'a> {
+    /// The weighted sum, `[1]`.
+    pub total: Tensor<1>,
+    /// The terms by name, `[1]` each, as metrics call them.
+    pub terms: Vec<(&'static str, Tensor<1>)>,
+    /// Computes the gradients of the total for all parameters, in the order of the network, `[values]` each.
+    pub gradients: Box<dyn FnOnce() -> Vec<Tensor<1>> + 'a>,
+    /// Values of parameters after the step by their places in the network, `[values]` each: statistics that a network
+    /// keeps of what passes through it, and that no gradient moves.
+    pub statistics: Vec<(usize, Tensor<1>)>,
+}
+
+impl Debug for Loss<'_> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Loss").field("terms", &self.terms).finish_non_exhaustive()
+    }
+}
+
+/// Where weights come from, besides the recipe.
+#[derive(Clone, Debug)]
+pub struct Origin {
+    /// Steps taken.
+    pub steps: u64,
+    /// The commit of the program.
+    pub commit: Option<String>,
+}

@@ -1,0 +1,173 @@
+//! What recipes must keep to.
+
+use super::{NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage};
+use crate::loss::lpips::PerceptualKind;
+use qudi_baselines::sizes::Sizes;
+use qudi_core::{Error, Result};
+use qudi_model::config::{NetworkConfig, Part};
+
+/// A key, whether it is as it must be, and what it must be.
+type Rule<'a> = (&'a str, bool, &'a str);
+
+impl Recipe {
+    /// The recipe, if it can be trained.
+    pub(super) fn checked(self) -> Result<Self> {
+        let network = match self.network.clone() {
+            NetworkRecipe::Qudi(config) => NetworkRecipe::Qudi(config.checked()?),
+            baseline @ NetworkRecipe::Baseline(_) => baseline,
+        };
+        let data = self.data.clone().checked()?;
+        match &network {
+            NetworkRecipe::Qudi(config) => self.check_qudi(config)?,
+            NetworkRecipe::Baseline(sizes) => self.check_baseline(*sizes)?,
+        }
+        check(&self.common_rules())?;
+        check(&[(
+            "stage",
+            stage::have_good_names(&self.stage),
+            "must have names of a-z, 0-9 and -, each its own",
+        )])?;
+        if let Some(validation) = &self.validation {
+            check_validation(validation)?;
+        }
+        self.stages()?;
+        Ok(Self { network, data, ..self })
+    }
+
+    /// The rules of every network.
+    fn common_rules(&self) -> [Rule<'static>; 8] {
+        let train = &self.train;
+        [
+            ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
+            ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),
+            ("train.accumulate", (1..=4096).contains(&train.accumulate), "must be from 1 to 4096"),
+            ("train.lr", train.lr > 0.0 && train.lr <= 1.0, "must be above 0, at most 1"),
+            (
+                "train.min_lr",
+                train.min_lr >= 0.0 && train.min_lr <= train.lr,
+                "must be from 0 to train.lr",
+            ),
+            ("train.clip", train.clip > 0.0, "must be above 0"),
+            ("train.ema", (0.0..1.0).contains(&train.ema), "must be from 0 to below 1"),
+            ("train.checkpoint", train.checkpoint > 0, "must be at least 1"),
+        ]
+    }
+
+    /// The rule of samples, which have `fewest` frames and sides of multiples of a number.
+    fn sample_rules(&self, fewest: usize, multiple: usize) -> [Rule<'static>; 2] {
+        let train = &self.train;
+        let (frames, side) = self.sample_size();
+        [
+            (
+                if train.crops.is_some() { "train.crops.side" } else { "data.crop" },
+                side.is_multiple_of(multiple) && side > 0,
+                "must be a multiple of the network's coarsest cell",
+            ),
+            (
+                "train.crops",
+                (fewest..=self.data.frames).contains(&frames)
+                    && train.crops.is_none_or(|crops| {
+                        (frames..=self.data.frames).contains(&crops.cached_frames)
+                    })
+                    && side <= self.data.crop
+                    && train.crops.is_none_or(|crops| (1..=1 << 20).contains(&crops.bursts)),
+                "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
+            ),
+        ]
+    }
+
+    fn check_qudi(&self, network: &NetworkConfig) -> Result<()> {
+        let train = &self.train;
+        check(&[
+            ("train.loss", train.loss.is_some(), "is missing"),
+            ("train.noise_start_fraction", train.noise_start_fraction.is_some(), "is missing"),
+            (
+                "validation.steps",
+                self.validation.as_ref().is_none_or(|validation| validation.steps.is_some()),
+                "is missing",
+            ),
+        ])?;
+        check(&self.sample_rules(if self.learns_frames() { 1 } else { 3 }, network.multiple()))?;
+        let weight = |v: f32| v.is_finite() && v >= 0.0;
+        let loss = train.loss();
+        check(&[
+            (
+                "train.noise_start_fraction",
+                (0.0..=1.0).contains(&train.noise_start_fraction()),
+                "must be from 0 to 1",
+            ),
+            (
+                "train.loss",
+                [loss.prediction, loss.flow, loss.pre, loss.perceptual].into_iter().all(weight),
+                "must have weights of 0 or more",
+            ),
+            (
+                "train.loss.term",
+                (loss.term == PerceptualKind::None) == (loss.perceptual == 0.0),
+                "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
+            ),
+        ])?;
+        check(&stage::noise_rules(self))?;
+        check(&stage::rules(train, !network.ablates(Part::Flow)))
+    }
+
+    fn check_baseline(&self, sizes: Sizes) -> Result<()> {
+        let refused = |what: String, key: &str| {
+            Err(Error::request(what, key, "correct the recipe: see docs/training.md"))
+        };
+        if let Some(problem) = sizes.problem_of_recipe() {
+            return refused(format!("{problem}; the recipe has {sizes}"), "network");
+        }
+        let (frames, _) = self.sample_size();
+        let key = if self.train.crops.is_some() { "train.crops.frames" } else { "data.frames" };
+        if let Some(problem) = sizes.problem_of_bursts(frames) {
+            return refused(problem, key);
+        }
+        let TrainConfig { learns, timesteps, noise_on, noise_start_fraction, loss, .. } =
+            &self.train;
+        let validation = self.validation.as_ref();
+        let foreign = [
+            ("train.loss", loss.is_some()),
+            ("train.learns", !learns.is_empty()),
+            ("train.timesteps", !is_default(timesteps)),
+            ("train.noise_on", !is_default(noise_on)),
+            ("train.noise_start_fraction", noise_start_fraction.is_some()),
+            ("train.gradient_checkpointing", self.train.gradient_checkpointing),
+            ("validation.steps", validation.is_some_and(|v| v.steps.is_some())),
+            ("validation.spacing", validation.is_some_and(|v| !is_default(&v.spacing))),
+        ];
+        if let Some((key, _)) = foreign.iter().find(|(_, given)| *given) {
+            let method = sizes.method().name();
+            let what =
+                format!("{key} is for the diffusion network; {method} has the loss of its authors");
+            return refused(what, key);
+        }
+        check(&self.sample_rules(1, sizes.multiple()))
+    }
+}
+
+fn check(rules: &[Rule<'_>]) -> Result<()> {
+    match rules.iter().find(|(_, good, _)| !good) {
+        Some((key, _, problem)) => {
+            Err(Error::request(format!("{key} {problem}"), key, "correct the recipe"))
+        }
+        None => Ok(()),
+    }
+}
+
+fn check_validation(validation: &ValidationConfig) -> Result<()> {
+    let good = (3..=1000).contains(&validation.frames)
+        && (16..=4096).contains(&validation.crop)
+        && !validation.ppp.is_empty()
+        && validation.ppp.iter().all(|&ppp| ppp > 0.0 && ppp < 1e6)
+        && validation.every > 0
+        && !validation.from.is_empty();
+    if good {
+        return Ok(());
+    }
+    Err(Error::request(
+        "the validation cannot be done: it wants clips, 3 frames, 16 pixels, light",
+        "validation",
+        "correct the recipe",
+    ))
+}
