@@ -11,13 +11,14 @@ use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Frame, Result, Size};
 use std::collections::VecDeque;
+use std::ops::Range;
 use std::path::Path;
 
 pub use brightness::ExpectedCounts;
 
-/// Frames of a window, and of one of EMVD, whose recurrence starts anew with every window.
-const WINDOW: usize = 11;
-const LONG_WINDOW: usize = 64;
+/// Frames that are restored at once, and of EMVD, whose recurrence starts anew with every window.
+const FRAMES: usize = 11;
+const MANY_FRAMES: usize = 64;
 
 /// Frames before the first one that EMVD goes on from: its protocol scores the last of eleven.
 const HISTORY: usize = 10;
@@ -63,14 +64,33 @@ impl LearnedRestorer {
         self.sizes.method()
     }
 
-    /// The restored frames, `[1, 1, height, width]` each, of as many.
-    fn images(&self, frames: &[Tensor<4>]) -> Result<Vec<Tensor<4>>> {
-        let count = frames.len();
-        // Mirrored at the first and the last frame.
-        let around = |before: usize, after: usize| {
-            let place = |i: usize| mirrored(i as i64 - before as i64, count);
-            (0..before + count + after).map(|i| frames[place(i)].clone()).collect::<Vec<_>>()
-        };
+    /// The frames before and after a frame that the network sees to restore it; none of networks that see all
+    /// frames.
+    fn reach(&self) -> [usize; 2] {
+        match &self.network {
+            Network::Quiver(network) => network.reach().into(),
+            Network::Emvd(_) => [HISTORY, 0],
+            Network::FloRnn(network) => [1, network.ahead() + 1],
+            Network::Spk2ImgNet(_) => {
+                [spk2imgnet::RESTORED, spk2imgnet::FRAMES - 1 - spk2imgnet::RESTORED]
+            }
+            Network::MemDeblur(_) | Network::Rvrt(_) => [0, 0],
+            Network::StudentTeacher(network) => {
+                let length = network.frames();
+                [length / 2, length - 1 - length / 2]
+            }
+        }
+    }
+
+    /// The restored frames `wanted`, `[1, 1, height, width]` each, of all frames of a window.
+    fn images(&self, frames: &[Tensor<4>], wanted: Range<usize>) -> Result<Vec<Tensor<4>>> {
+        let count = wanted.len();
+        let [before, after] = self.reach();
+        // The wanted frames and those around them, mirrored at the first and the last frame of all.
+        let around: Vec<Tensor<4>> = (0..before + count + after)
+            .map(|i| (wanted.start + i) as i64 - before as i64)
+            .map(|place| frames[mirrored(place, frames.len())].clone())
+            .collect();
         let copies = |frames: Vec<Tensor<4>>, channels: usize| {
             Tensor::cat(frames, 0).repeat(&[1, channels, 1, 1])
         };
@@ -81,42 +101,30 @@ impl LearnedRestorer {
         };
         Ok(match &self.network {
             Network::Quiver(network) => {
-                let (past, future) = network.reach();
-                let all = around(past, future);
-                let frames = all.len();
-                split(network.forward(Tensor::cat(all, 0), frames).full, 0)
+                let frames = around.len();
+                split(network.forward(Tensor::cat(around, 0), frames).full, 0)
             }
-            Network::Emvd(network) => {
-                let restored = network.restore(around(HISTORY, 0));
-                restored.into_iter().skip(HISTORY).collect()
-            }
+            Network::Emvd(network) => network.restore(around).into_iter().skip(before).collect(),
             Network::FloRnn(network) => {
-                let (before, after) = (1, network.ahead() + 1);
-                let all = around(before, after);
-                let (frames, channels) = (all.len(), network.channels());
-                split(network.forward(copies(all, channels), frames), before)
+                let (frames, channels) = (around.len(), network.channels());
+                split(network.forward(copies(around, channels), frames), before)
             }
-            Network::Spk2ImgNet(network) => {
-                let before = spk2imgnet::RESTORED;
-                self.by_blocks(network, &around(before, spk2imgnet::FRAMES - 1 - before))?
-            }
+            Network::Spk2ImgNet(network) => self.by_blocks(network, &around)?,
             Network::MemDeblur(network) => {
                 let images = copies(frames.to_vec(), network.channels());
-                let [_, _, full] = network.forward(&images, count, memdeblur::Mode::Use);
-                split(full, 0)
+                let [_, _, full] = network.forward(&images, frames.len(), memdeblur::Mode::Use);
+                split(full, wanted.start)
             }
             Network::Rvrt(network) => {
                 // An even number of frames.
-                let all = around(0, count % rvrt::CLIP);
-                let frames = all.len();
-                split(network.forward(copies(all, network.channels()), frames), 0)
+                let even = frames.len().next_multiple_of(rvrt::CLIP) as i64;
+                let all = (0..even).map(|place| frames[mirrored(place, frames.len())].clone());
+                let all: Vec<_> = all.collect();
+                let count = all.len();
+                split(network.forward(copies(all, network.channels()), count), wanted.start)
             }
             Network::StudentTeacher(network) => {
-                let length = network.frames();
-                let before = length / 2;
-                self.sliding(&around(before, length - 1 - before), length, |window| {
-                    network.forward(window).image
-                })?
+                self.sliding(&around, network.frames(), |window| network.forward(window).image)?
             }
         })
     }
@@ -165,10 +173,28 @@ impl Restorer for LearnedRestorer {
     }
 
     fn window(&self) -> usize {
-        if self.method() == Method::Emvd { LONG_WINDOW } else { WINDOW }
+        let frames = if self.method() == Method::Emvd { MANY_FRAMES } else { FRAMES };
+        frames + self.context().iter().sum::<usize>()
+    }
+
+    fn context(&self) -> [usize; 2] {
+        self.reach()
     }
 
     fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let all: Vec<usize> = (0..burst.frames.len()).collect();
+        self.restore_frames(burst, acquisition, &all)
+    }
+
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        wanted: &[usize],
+    ) -> Result<Restored> {
+        let (Some(&first), Some(&last)) = (wanted.iter().min(), wanted.iter().max()) else {
+            return Ok(Restored { frames: Vec::new(), std: None });
+        };
         progress(self.method().name(), 0, burst.frames.len())?;
         let multiple = self.sizes.multiple();
         let Size { height, width } = burst.size;
@@ -186,8 +212,9 @@ impl Restorer for LearnedRestorer {
             Brightness::OfAuthors => None,
             Brightness::OfCounts => Some(ExpectedCounts::of(acquisition)),
         };
-        let images = self.images(&frames)?.into_iter().map(|image| {
-            let image = image.narrow(2, 0, height).narrow(3, 0, width);
+        let images = self.images(&frames, first..last + 1)?;
+        let images = wanted.iter().map(|number| {
+            let image = images[number - first].clone().narrow(2, 0, height).narrow(3, 0, width);
             let data = image.into_data().try_to_vec::<f32>();
             let mut data = data.map_err(|e| {
                 Error::request(

@@ -203,3 +203,35 @@ fn every_method_restores_every_frame() {
         assert!(differs, "{}", method.name());
     }
 }
+
+/// Some frames of a window are restored from the real frames around them, as with all others; but recurrences begin
+/// elsewhere.
+#[test]
+fn wanted_frames_equal_those_of_the_whole_window() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("w.safetensors");
+    let size = Size { height: 16, width: 20 };
+    let frames: Vec<Vec<u16>> = (0..21)
+        .map(|t| (0..size.pixels()).map(|i| ((i * 5 + i / 7 + t * t) % 8) as u16).collect())
+        .collect();
+    let acquisition = Acquisition::new(Sensor::load("qudi-paper").unwrap(), 3.25, 0.45).unwrap();
+    for method in METHODS {
+        save(&path, &smallest(method));
+        let mut restorer = LearnedRestorer::load(&path, method, &Device::flex()).unwrap();
+        let [before, after] = restorer.context();
+        assert!(restorer.window() > before + after, "{}", method.name());
+        let burst = BurstView { size, frames: &frames };
+        let all = restorer.restore(burst, &acquisition).unwrap().frames;
+        let wanted = [9, 12, 10];
+        let some = restorer.restore_frames(burst, &acquisition, &wanted).unwrap().frames;
+        assert_eq!(some.len(), 3, "{}", method.name());
+        let worst = wanted.iter().zip(&some).flat_map(|(&number, frame)| {
+            frame.data.iter().zip(&all[number].data).map(|(a, b)| (a - b).abs())
+        });
+        let worst = worst.fold(0.0, f32::max);
+        let recurrent = [Method::Quiver, Method::Emvd, Method::FloRnn].contains(&method);
+        assert!(recurrent || worst < 1e-6, "{}: {worst}", method.name());
+        let nothing = restorer.restore_frames(burst, &acquisition, &[]).unwrap();
+        assert!(nothing.frames.is_empty());
+    }
+}

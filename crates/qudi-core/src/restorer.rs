@@ -49,6 +49,12 @@ pub trait Restorer {
     /// The number of frames that it restores together; shorter captures come as one shorter window.
     fn window(&self) -> usize;
 
+    /// The frames at the beginning and at the end of a window that only help to restore those between, unless the
+    /// capture begins or ends there.
+    fn context(&self) -> [usize; 2] {
+        [0, 0]
+    }
+
     /// Restores every frame of `burst`.
     ///
     /// # Errors

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::frame::Frame;
+use crate::restorer::Restorer;
 use std::collections::VecDeque;
 use std::ops::Range;
 
@@ -14,6 +15,8 @@ pub struct Windows {
     frames: u64,
     length: u64,
     stride: u64,
+    /// Frames at the beginning and at the end of a window that come from the windows beside it.
+    context: [u64; 2],
 }
 
 impl Windows {
@@ -29,7 +32,20 @@ impl Windows {
                 "windows are longer than their overlap",
             ));
         }
-        Ok(Self { frames, length, stride: length - overlap })
+        Ok(Self { frames, length, stride: length - overlap, context: [0, 0] })
+    }
+
+    /// The windows in which `restorer` restores a capture of `frames` frames: of those that a window restores, each
+    /// shares `overlap` with the one before.
+    ///
+    /// # Errors
+    /// [`Error::Request`] if the overlap is no shorter than what a window restores.
+    pub fn of(restorer: &dyn Restorer, frames: u64, overlap: u64) -> Result<Self> {
+        let context = restorer.context().map(|frames| frames as u64);
+        let length = restorer.window() as u64;
+        let restored = length.saturating_sub(context[0] + context[1]);
+        let Self { stride, .. } = Self::new(frames, restored, overlap)?;
+        Ok(Self { frames, length, stride, context })
     }
 
     /// The same windows over another number of frames.
@@ -49,6 +65,14 @@ impl Windows {
         start..start + self.held()
     }
 
+    /// Frames that window `number` restores: all but those that the windows beside it restore.
+    pub fn restored(&self, number: u64) -> Range<u64> {
+        let Range { start, end } = self.range(number);
+        let first = if number == 0 { start } else { start + self.context[0] };
+        let last = number + 1 >= self.count();
+        first..if last { end } else { end - self.context[1] }
+    }
+
     /// One past the last frame of window `number`, if there are that many.
     pub fn nominal_end(&self, number: u64) -> u64 {
         number.saturating_mul(self.stride).saturating_add(self.length)
@@ -59,18 +83,18 @@ impl Windows {
         self.length.min(self.frames)
     }
 
-    /// The weight of window `number` at `frame`, which it shares with the window before: over an overlap of `n`
+    /// The weight of window `number` at `frame`, which it and the window before restore: over an overlap of `n`
     /// frames it grows linearly from `1 / (n + 1)` to `n / (n + 1)`.
     pub fn weight(&self, number: u64, frame: u64) -> f32 {
-        let range = self.range(number);
-        let before = self.range(number.saturating_sub(1));
+        let range = self.restored(number);
+        let before = self.restored(number.saturating_sub(1));
         let shared = before.end.saturating_sub(range.start);
         (frame - range.start + 1) as f32 / (shared + 1) as f32
     }
 
-    /// The first window that holds `frame`.
+    /// The first window that restores `frame`.
     pub fn first_with(&self, frame: u64) -> u64 {
-        (0..self.count()).find(|&n| self.range(n).end > frame).unwrap_or(0)
+        (0..self.count()).find(|&n| self.restored(n).end > frame).unwrap_or(0)
     }
 }
 
@@ -118,6 +142,7 @@ impl CrossFade {
 mod tests {
     use super::*;
     use crate::frame::Size;
+    use crate::restorer::{Acquisition, BurstView, Restored};
 
     #[test]
     fn windows_cover_every_frame_and_end_with_the_capture() {
@@ -138,6 +163,55 @@ mod tests {
             }
         }
         assert!(Windows::new(20, 3, 3).is_err());
+    }
+
+    /// Restores what it is given, if it sees some frames around.
+    struct Sees([usize; 2]);
+
+    impl Restorer for Sees {
+        fn name(&self) -> &'static str {
+            "sees"
+        }
+
+        fn window(&self) -> usize {
+            11 + self.0[0] + self.0[1]
+        }
+
+        fn context(&self) -> [usize; 2] {
+            self.0
+        }
+
+        fn restore(&mut self, burst: BurstView<'_>, _: &Acquisition) -> Result<Restored> {
+            let frames = vec![Frame::filled(burst.size, 0.0); burst.frames.len()];
+            Ok(Restored { frames, std: None })
+        }
+    }
+
+    #[test]
+    fn every_frame_is_restored_where_its_context_is_seen() {
+        for [before, after] in [[0, 0], [5, 5], [10, 0], [1, 7]] {
+            for frames in 1..90 {
+                let windows = Windows::of(&Sees([before, after]), frames, 3).unwrap();
+                let mut next = 0;
+                for n in 0..windows.count() {
+                    let (seen, restored) = (windows.range(n), windows.restored(n));
+                    assert!(
+                        restored.start <= next && restored.end > next,
+                        "{frames}: {restored:?}"
+                    );
+                    assert!(n == 0 || next >= restored.start + 3, "{frames}: {restored:?}");
+                    let first = restored.start.saturating_sub(before as u64);
+                    let last = (restored.end + after as u64).min(frames);
+                    assert!(
+                        seen.start <= first && seen.end >= last,
+                        "{frames}: {restored:?} {seen:?}"
+                    );
+                    next = restored.end;
+                }
+                assert_eq!(next, frames);
+            }
+        }
+        assert!(Windows::of(&Sees([5, 5]), 40, 11).is_err());
     }
 
     /// Windows whose pixels hold a value of their own: overlaps rise evenly from one to the next.

@@ -135,7 +135,7 @@ fn run_windows(
         // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
         // the next one is whole, or no more frames come.
         let windows = windows.over(capture.wait_for(windows.nominal_end(number + 1))?);
-        if number >= windows.count() || windows.range(number).start >= end {
+        if number >= windows.count() || windows.restored(number).start >= end {
             break;
         }
         let range = windows.range(number);
@@ -158,8 +158,9 @@ fn run_windows(
         }
         capture.discard_before(range.end);
         let acquisition = Acquisition { first_frame: range.start, ..acquisition.clone() };
-        let before = instants.pictures_before(range.start);
-        let here = before..instants.pictures_before(range.end);
+        let restored_here = windows.restored(number);
+        let before = instants.pictures_before(restored_here.start);
+        let here = before..instants.pictures_before(restored_here.end);
         let frames = here.map(|picture| (instants.frame_of(picture) - range.start) as usize);
         let frames: Vec<usize> = frames.collect();
         if !frames.is_empty() {
@@ -172,9 +173,9 @@ fn run_windows(
                 uncertainties.push(before, uncertainty, weight);
             }
         }
-        restored_until = range.end;
+        restored_until = restored_here.end;
         let last = number + 1 == windows.count();
-        let until = if last { range.end } else { windows.range(number + 1).start };
+        let until = if last { range.end } else { windows.restored(number + 1).start };
         let until = instants.pictures_before(until);
         while let Some((picture, image)) = fade.pop(until) {
             let wanted = pictures.contains(&picture);

@@ -115,7 +115,7 @@ fn score(
     let peak = PeakMemory::start();
     let start = Instant::now();
     let (mut restorer, how) = method(&contender.method, capture, acquisition, &contender.network)?;
-    let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
+    let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(
         restorer.as_mut(),

@@ -96,7 +96,7 @@ impl ExposedClip {
         let start = Instant::now();
         let Contender { method: name, network, .. } = contender;
         let (mut restorer, how) = method(name, &mut capture, &self.acquisition, network)?;
-        let windows = Windows::new(capture.frames(), restorer.window() as u64, plan.overlap)?;
+        let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
         run_method(

@@ -159,7 +159,7 @@ impl Job {
             None => restorer,
         };
         let overlap = plan.overlap * alignment.map_or(1, |alignment| alignment.count as u64);
-        let windows = Windows::new(capture.frames(), restorer.window() as u64, overlap)?;
+        let windows = Windows::of(restorer.as_ref(), capture.frames(), overlap)?;
         let instants = match (alignment, plan.every) {
             (Some(alignment), _) => alignment.instants(),
             (None, Some(every)) => Instants::every(every, &capture)?,
