@@ -40,6 +40,11 @@ pub(crate) fn is_method(name: &str) -> bool {
     METHODS.contains(&name) || name == FORMER_QBP_REFINED
 }
 
+/// Whether a method is a network, whose weights take time to read.
+pub(crate) fn is_network(name: &str) -> bool {
+    name == "qudi" || Method::by_name(name).is_some()
+}
+
 /// Windows of a clip that a method's settings are chosen on.
 const SAMPLES: u64 = 4;
 

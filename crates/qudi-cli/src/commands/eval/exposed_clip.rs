@@ -9,7 +9,7 @@ use super::score::{Added, Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
-use crate::methods::method;
+use crate::methods::{is_network, method};
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;
 use qudi_core::metrics::{
@@ -143,6 +143,8 @@ impl ExposedClip {
         let (mut frames, mut middles) = (Vec::new(), Vec::new());
         let (mut seconds, mut highest, mut how) = (0.0, None::<f64>, String::new());
         let windows = truth.len() - WINDOW + 1;
+        // Networks choose nothing for a window: their weights are read once.
+        let mut loaded = None;
         for first in 0..windows {
             if interrupt::check().is_break() {
                 return Err(CliError::Interrupted);
@@ -161,11 +163,15 @@ impl ExposedClip {
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
             let Contender { method: name, network, .. } = contender;
-            let (mut restorer, chosen) = method(name, &mut capture, &acquisition, network)?;
-            how = chosen;
+            let (mut restorer, chosen) = match loaded.take() {
+                Some(loaded) => loaded,
+                None => method(name, &mut capture, &acquisition, network)?,
+            };
+            how.clone_from(&chosen);
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();
+            loaded = is_network(name).then_some((restorer, chosen));
             highest = [highest, peak.grown_mib()].into_iter().flatten().reduce(f64::max);
             frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
             middles.push(restored);

@@ -14,7 +14,7 @@ use crate::error::Result;
 use crate::interrupt;
 use crate::methods::network::device_failed;
 use crate::methods::options::{NetworkOptions, other_method};
-use crate::methods::{method, usual_method};
+use crate::methods::{is_network, method, usual_method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
 use crate::weights::Weights;
@@ -262,7 +262,7 @@ impl Job {
         });
         let (capture, acquisition) = (&mut self.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
-        let is_network = restorer.name() == "qudi" || Method::by_name(restorer.name()).is_some();
+        let is_network = is_network(restorer.name());
         let schedule = &self.schedule;
         let run = || {
             observed(observer, || {
