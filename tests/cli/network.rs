@@ -201,6 +201,9 @@ fn published_weights_restore_what_trained_ones_do() {
     for (single, half) in frames("w.npy").iter().zip(frames("half.npy")) {
         assert!((single - half).abs() < 1e-3, "{single} {half}");
     }
+    run("publish w.safetensors -o two.safetensors --steps 2");
+    let said = run("info two.safetensors").get_output().stdout.clone();
+    assert!(String::from_utf8_lossy(&said).contains("2 steps by default"));
     refused(&folder, "publish w.safetensors -o half.safetensors", &["exists"]);
     refused(&folder, "publish w.safetensors -o half.bin", &[".safetensors"]);
 }

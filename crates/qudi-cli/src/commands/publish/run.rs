@@ -29,7 +29,8 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
     let device = Device::flex();
     let (network, mut description) = Weights::File(args.weights.clone()).load(&device)?;
     // Said from now on, whatever later versions take for granted.
-    description.default_steps = Some(description.reverse_steps());
+    let steps = args.steps.map_or_else(|| description.reverse_steps(), usize::from);
+    description.default_steps = Some(steps);
     save(&network, &description, Precision::Half, path, overwrite)?;
     let bytes = std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;
     let hash = sha256(&bytes);
