@@ -225,8 +225,9 @@ fn rejects_impossible_recipes_and_folders() {
         ("train tiny -o run --set train.steps", &["KEY=VALUE"]),
         ("train tiny -o run --device cuda:7", &["cuda:7"]),
         ("train tiny -o run --init none.safetensors", &["none.safetensors"]),
-        ("train small -o run", &["--data"]),
-        ("train small -o run --data .", &["cups"]),
+        ("train emvd -o run", &["--data"]),
+        ("train emvd -o run --data .", &["cups"]),
+        ("train small -o run --data . --backbones .", &["vgg16"]),
         // What a later stage lacks is said before any file is read.
         ("train paper-mini -o run --data . --backbones .", &["vgg16"]),
         (
