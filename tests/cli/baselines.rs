@@ -59,6 +59,7 @@ fn emvd_trains_resumes_restores_and_says_what_it_is() {
     let wide = "--set network.width=8";
     let wide = format!("train scenes.toml -o wide --init run/weights.safetensors {QUICK} {wide}");
     refused(&folder, &wide, &["4 channels", "8 channels"]);
+    refused(&folder, "publish run/weights.safetensors -o p.safetensors", &["emvd", "as they are"]);
     let other = format!("train tiny -o other --init run/weights.safetensors {QUICK}");
     refused(&folder, &other.replace("--set network.width=4 ", ""), &["another program"]);
     let crops = "--set train.crops={bursts=2,cached_frames=4,frames=4,side=16}";

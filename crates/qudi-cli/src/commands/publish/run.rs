@@ -7,6 +7,7 @@ use crate::places::Places;
 use crate::report::Report;
 use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
+use qudi_baselines::import::describe;
 use qudi_core::Error;
 use qudi_core::atomic_file::PendingFile;
 use qudi_model::checkpoint::{Precision, save};
@@ -27,6 +28,13 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
         .writes([path, &path.with_extension("sha256")])
         .check()?;
     let device = Device::flex();
+    if let Ok(Some(contents)) = describe(&args.weights, &device) {
+        return Err(CliError::new(
+            format!("weights of {}, a learned method of others", contents.method.name()),
+            args.weights.display(),
+            "publish them as they are: --weights METHOD=FILE reads them",
+        ));
+    }
     let (network, mut description) = Weights::File(args.weights.clone()).load(&device)?;
     // Said from now on, whatever later versions take for granted.
     let steps = args.steps.map_or_else(|| description.reverse_steps(), usize::from);
