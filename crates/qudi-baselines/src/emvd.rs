@@ -13,9 +13,6 @@ use transform::{Inverse, Wavelet};
 /// Channels of a frame.
 pub const CHANNELS: usize = 4;
 
-/// Channels of the layers inside, as published.
-pub const WIDTH: usize = 16;
-
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 8;
 

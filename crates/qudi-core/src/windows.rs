@@ -15,7 +15,7 @@ pub struct Windows {
     frames: u64,
     length: u64,
     stride: u64,
-    /// Frames at the beginning and at the end of a window that come from the windows beside it.
+    /// Frames at the beginning and at the end of a window that its neighbours restore.
     context: [u64; 2],
 }
 
@@ -65,7 +65,7 @@ impl Windows {
         start..start + self.held()
     }
 
-    /// Frames that window `number` restores: all but those that the windows beside it restore.
+    /// Frames that window `number` restores: all but its context, which its neighbours restore.
     pub fn restored(&self, number: u64) -> Range<u64> {
         let Range { start, end } = self.range(number);
         let first = if number == 0 { start } else { start + self.context[0] };

@@ -245,6 +245,7 @@ fn wrong_recipes_are_refused_by_key() {
             "train.loss",
         ),
         ("emvd", "train.noise_start_fraction", "0.3", "train.noise_start_fraction"),
+        ("emvd", "train.noise_on", "estimate", "train.noise_on"),
         ("emvd", "validation.steps", "1", "validation.steps"),
         ("quiver", "network.features", "24", "multiples of 16"),
         ("quiver", "network.future", "5", "as many frames"),

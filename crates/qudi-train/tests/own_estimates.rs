@@ -1,21 +1,20 @@
 //! Training on the network's own estimates sees what the second of two steps of sampling sees.
 #![allow(clippy::unwrap_used)]
 
+mod moving_disk;
+
 use burn::tensor::{Device, Tensor};
-use qudi_core::restorer::{Acquisition, BurstView, Restorer};
-use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Frame, Light, Size};
+use moving_disk::{Burst, burst, tiny};
+use qudi_core::Size;
+use qudi_core::restorer::{BurstView, Restorer};
 use qudi_model::checkpoint::ModelKind;
-use qudi_model::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
-use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::noise::Noise;
-use qudi_model::network::{Qudi, init_parameters};
-use qudi_model::refinement::align;
+use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 use qudi_model::tensor::to_tensor;
 use qudi_train::gradients;
 use qudi_train::loss::{
-    Example, LoopOptions, LossForm, LossTerms, LossWeights, NoiseOn, SelfConditioning, loss_terms,
+    LoopOptions, LossForm, LossTerms, LossWeights, NoiseOn, SelfConditioning, loss_terms,
     reconstruction,
 };
 
@@ -23,12 +22,11 @@ const SIZE: Size = Size { height: 32, width: 32 };
 const FRAMES: usize = 4;
 const SEED: u64 = 5;
 
-/// The timestep of the second of two steps, evenly spaced by the law of training.
-const TIMESTEP: usize = 44;
+/// Far enough from black and white that no prediction is clamped.
+const LEVELS: [f32; 2] = [0.3, 0.8];
 
-fn tiny() -> NetworkConfig {
-    NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap()
-}
+/// The timestep of the second of two steps, spaced by the law of training.
+const TIMESTEP: usize = 44;
 
 /// A network whose parameters are not zero, but for those that see simulated measurements, if it sees none.
 fn network(sees_simulated: bool, device: &Device) -> Qudi {
@@ -41,46 +39,12 @@ fn network(sees_simulated: bool, device: &Device) -> Qudi {
     })
 }
 
-/// Counts of a moving disk, its truth, and the light.
-fn burst() -> (Vec<Vec<u16>>, Vec<Frame>, Acquisition) {
-    let sensor = Sensor::load("qudi-paper").unwrap();
-    let light = Light { ppp: 3.25, mean_level: 0.45 };
-    let mut camera = Camera::new(&sensor, SIZE, light, 4).unwrap();
-    let scene = |t: usize| {
-        Frame::from_fn(SIZE, |x, y| {
-            let (dx, dy) = (x as f32 - 10.0 - t as f32, y as f32 - 14.0);
-            if dx * dx + dy * dy < 40.0 { 0.8 } else { 0.3 + 0.01 * y as f32 }
-        })
-    };
-    let truth: Vec<Frame> = (0..FRAMES).map(scene).collect();
-    let counts = (0..).zip(&truth).map(|(t, frame)| camera.expose(t, &[frame]).unwrap());
-    let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level).unwrap();
-    (counts.collect(), truth, acquisition.with_seed(SEED))
-}
-
 /// The loss on the network's own estimates, and the gradients of all parameters.
 fn terms(network: &Qudi, options: LoopOptions, device: &Device) -> (LossTerms, Vec<Tensor<1>>) {
-    let (counts, truth, acquisition) = burst();
-    let view = BurstView { size: SIZE, frames: &counts };
-    let aligned = align(view, &acquisition, &[]).unwrap();
-    let aligned = AlignedPlanes::new(&aligned, tiny().pre.aligned_neighbours(), 0..FRAMES);
-    let planes = CountPlanes::new(view, &acquisition);
-    let conditioning = Conditioning {
-        counts: to_tensor(planes.y, SIZE, device),
-        linear_estimate: to_tensor(planes.u, SIZE, device),
-        aligned: Some(aligned.into_tensors(SIZE, device)),
-        sensor: sensor_tensor(&acquisition, device),
-        frames: FRAMES,
-    };
+    let burst = burst(LEVELS, SIZE, FRAMES, device);
     let streams = Noise::new(SEED, 0);
     let noise = (0..FRAMES as u64).flat_map(|frame| streams.frame(frame, 0, SIZE.pixels()));
-    let example = Example {
-        conditioning: &conditioning,
-        truth: to_tensor(truth.into_iter().flat_map(|frame| frame.data).collect(), SIZE, device),
-        acquisitions: std::slice::from_ref(&acquisition),
-        noise: to_tensor(noise.collect(), SIZE, device),
-        timesteps: &[TIMESTEP],
-    };
+    let example = burst.example(to_tensor(noise.collect(), SIZE, device), &[TIMESTEP]);
     let photons = SelfConditioning::On(streams.photon_seed(2));
     let weights = LossWeights { form: LossForm::L2Tv, ..LossWeights::default() };
     let terms = loss_terms(network, &example, photons, weights, options, None).unwrap();
@@ -96,7 +60,8 @@ fn value(term: Tensor<1>) -> f32 {
 #[test]
 fn training_on_estimates_equals_sampling_in_two_steps() {
     let device = Device::flex();
-    let (counts, truth, acquisition) = burst();
+    let Burst { counts, truth, acquisition, .. } = burst(LEVELS, SIZE, FRAMES, &device);
+    let acquisition = acquisition.with_seed(SEED);
     let model = Model {
         network: network(true, &device),
         config: tiny(),
@@ -106,9 +71,8 @@ fn training_on_estimates_equals_sampling_in_two_steps() {
     let options = SampleOptions { steps: 2, ..SampleOptions::default() };
     let mut restorer = QudiRestorer::new(model, options, &device).unwrap();
     let restored = restorer.restore(BurstView { size: SIZE, frames: &counts }, &acquisition);
-    let [restored, truth] = [restored.unwrap().frames, truth].map(|frames| {
-        to_tensor(frames.into_iter().flat_map(|frame| frame.data).collect(), SIZE, &device)
-    });
+    let restored = restored.unwrap().frames.into_iter().flat_map(|frame| frame.data);
+    let restored = to_tensor(restored.collect(), SIZE, &device);
     let expected = value(reconstruction(restored, truth));
     let device = device.autodiff();
     let with = |noise_on| {
@@ -130,7 +94,7 @@ fn pre_denoising_once_changes_nothing_but_the_time() {
         let noise_on = NoiseOn::Estimate;
         let options = LoopOptions { pre_is_fixed, noise_on, ..LoopOptions::ALL };
         let (terms, gradients) = terms(&network, options, &device);
-        let names = qudi_model::network::parameter_shapes(&network).into_iter();
+        let names = parameter_shapes(&network).into_iter();
         let learning = names.zip(gradients).filter(|((name, _), _)| !name.starts_with("pre."));
         let lists = learning.map(|((name, _), list)| {
             (name, list.into_data().try_into_vec::<f32>().unwrap_or_default())

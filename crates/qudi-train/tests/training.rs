@@ -1,79 +1,27 @@
 //! The loss and its gradients: they reach every parameter, one burst can be overfitted, and backends agree.
 #![allow(clippy::unwrap_used)]
 
+mod moving_disk;
+
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Gradients, Tensor};
-use qudi_core::restorer::{Acquisition, BurstView};
-use qudi_core::sensor::Sensor;
-use qudi_core::{Camera, Frame, Light, Size};
-use qudi_model::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
-use qudi_model::config::NetworkConfig;
+use moving_disk::{Burst, tiny};
+use qudi_core::Size;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
-use qudi_model::refinement::align;
 use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::{
-    Example, LoopOptions, LossForm, LossTerms, LossWeights, SelfConditioning, TimestepLaw,
-    gaussian_nll, loss_terms, reconstruction,
+    LoopOptions, LossForm, LossTerms, LossWeights, SelfConditioning, TimestepLaw, gaussian_nll,
+    loss_terms, reconstruction,
 };
 use qudi_train::{Adam, gradients, parameters, with_parameters};
 use std::collections::HashMap;
 
-/// A burst of a moving disk, its truth and its light.
-struct Burst {
-    conditioning: Conditioning,
-    truth: Tensor<4>,
-    acquisition: Acquisition,
-    size: Size,
-}
-
-impl Burst {
-    fn example<'a>(&'a self, noise: Tensor<4>, timesteps: &'a [usize]) -> Example<'a> {
-        Example {
-            conditioning: &self.conditioning,
-            truth: self.truth.clone(),
-            acquisitions: std::slice::from_ref(&self.acquisition),
-            noise,
-            timesteps,
-        }
-    }
-}
-
-fn tiny() -> NetworkConfig {
-    NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap()
-}
-
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {
-    let sensor = Sensor::load("qudi-paper").unwrap();
-    let light = Light { ppp: 3.25, mean_level: 0.45 };
-    let mut camera = Camera::new(&sensor, size, light, 4).unwrap();
-    let scene = |t: usize| {
-        Frame::from_fn(size, |x, y| {
-            let (dx, dy) = (x as f32 - 10.0 - t as f32, y as f32 - 14.0);
-            if dx * dx + dy * dy < 40.0 { 0.9 } else { 0.2 + 0.01 * y as f32 }
-        })
-    };
-    let truth: Vec<Frame> = (0..frames).map(scene).collect();
-    let counts: Vec<Vec<u16>> =
-        truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
-    let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level).unwrap();
-    let view = BurstView { size, frames: &counts };
-    let aligned = align(view, &acquisition, &[]).unwrap();
-    let neighbours = tiny().pre.aligned_neighbours();
-    let aligned = AlignedPlanes::new(&aligned, neighbours, 0..view.frames.len());
-    let planes = CountPlanes::new(view, &acquisition);
-    let conditioning = Conditioning {
-        counts: to_tensor(planes.y, size, device),
-        linear_estimate: to_tensor(planes.u, size, device),
-        aligned: Some(aligned.into_tensors(size, device)),
-        sensor: sensor_tensor(&acquisition, device),
-        frames,
-    };
-    let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
-    Burst { conditioning, truth: to_tensor(truth, size, device), acquisition, size }
+    moving_disk::burst([0.2, 0.9], size, frames, device)
 }
 
 /// The loss of step `number`, at a time and with noise of its own.
