@@ -111,7 +111,7 @@ impl<'a> AlignedBurst<'a> {
                     f64::from(image) / units + self.acquisition.dark_of(i, self.ordinary_dark);
                 self.burst.moments.at(detections).0 as f32
             };
-            let means: Vec<f32> = frame.data.iter().enumerate().map(mean).collect();
+            let means: Vec<f32> = frame.data.par_iter().enumerate().map(mean).collect();
             padded(&means, frame.size, size)
         });
         let references = ReferenceFrames::new(&self.burst, mean_counts.collect(), REFERENCE_ERROR);
@@ -148,7 +148,7 @@ impl<'a> AlignedBurst<'a> {
         let noise = burst.blended(|i| [[merged.patch_noise[i]; SIDE]; SIDE]);
         let stabilized = vst.stabilized(&merged.counts);
         let here = burst.cropped(&references.frames[reference]);
-        let sigmas: Vec<f32> = here.data.iter().map(|&mean| self.count_sigma(mean)).collect();
+        let sigmas: Vec<f32> = here.data.par_iter().map(|&mean| self.count_sigma(mean)).collect();
         let standardized = |frame: Frame| {
             let values = frame.data.iter().zip(&here.data).zip(&sigmas);
             let values = values.map(|((value, here), sigma)| (value - here) / sigma);
@@ -231,7 +231,7 @@ impl<'a> AlignedBurst<'a> {
             let span = self.vst.invert(z + one) - self.vst.invert(z - one);
             (0.5 * span * units) as f32
         };
-        let pairs = means.data.iter().zip(&noise.data);
+        let pairs = means.data.par_iter().zip(&noise.data);
         Frame { size: means.size, data: pairs.map(sigma).collect() }
     }
 }

@@ -7,6 +7,7 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, CountMoments};
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
+use std::borrow::Borrow;
 
 /// The counts of a window, with hot pixels repaired and small frames padded to one patch.
 #[derive(Debug)]
@@ -38,13 +39,14 @@ impl PreparedBurst {
     }
 
     /// Blends overlapping patches into a frame of the window's size.
-    pub(crate) fn blended(&self, patch: impl Fn(usize) -> Patch) -> Frame {
+    pub(crate) fn blended<P: Borrow<Patch>>(&self, patch: impl Fn(usize) -> P) -> Frame {
         self.grid.blended(self.padded_size(), self.size, patch)
     }
 
     /// Crops a padded frame to the window's size.
     pub(crate) fn cropped(&self, frame: &Frame) -> Frame {
-        Frame::from_fn(self.size, |x, y| frame.row(y)[x])
+        let rows = (0..self.size.height).flat_map(|y| &frame.row(y)[..self.size.width]);
+        Frame { size: self.size, data: rows.copied().collect() }
     }
 
     /// Variance of the difference of two matched pixels of images whose errors are `error_variance` times the

@@ -19,6 +19,7 @@ use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
+use rayon::prelude::*;
 
 /// Constant of the Wiener filter where reference frames decide what fits, chosen on the validation clips.
 pub(crate) const WIENER_C: f32 = 0.7;
@@ -83,7 +84,7 @@ impl ReferenceEstimate {
         };
         let mean_counts = |z: &Frame| {
             let mean = |&z: &f32| vst.mean_count(f64::from(z)) as f32;
-            let means: Vec<f32> = z.data.iter().map(mean).collect();
+            let means: Vec<f32> = z.data.par_iter().map(mean).collect();
             padded(&means, view.size, burst.padded_size())
         };
 

@@ -82,7 +82,10 @@ impl Frame {
 
     /// A frame computed from pixel positions `(x, y)`.
     pub fn from_fn(size: Size, mut f: impl FnMut(usize, usize) -> f32) -> Self {
-        let data = (0..size.pixels()).map(|i| f(i % size.width, i / size.width)).collect();
+        let mut data = Vec::with_capacity(size.pixels());
+        for y in 0..size.height {
+            data.extend((0..size.width).map(|x| f(x, y)));
+        }
         Self { size, data }
     }
 

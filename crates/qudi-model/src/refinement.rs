@@ -95,7 +95,7 @@ pub(crate) struct PredenoisedFrames {
 }
 
 /// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and its
-/// uncertainty if predicted.
+/// uncertainty if predicted. While the network works on one frame, the next is aligned.
 pub(crate) fn predenoise_frames(
     stage: &'static str,
     burst: &AlignedBurst<'_>,
@@ -105,12 +105,21 @@ pub(crate) fn predenoise_frames(
     predenoise: impl Fn(&AlignedTensors) -> Vec<Tensor<4>>,
 ) -> Result<PredenoisedFrames> {
     let mut all = PredenoisedFrames::default();
-    for number in 0..burst.frame_count() {
-        progress(stage, number, burst.frame_count())?;
-        let frame = neighbours.frame(burst, number);
-        all.noise_sigmas.push(frame.noise_sigma.clone());
-        let planes = AlignedPlanes::from_frame(frame).map(|plane| tiling.padded(plane));
-        let mut images = tiling.predenoised(&planes, device, &predenoise)?.into_iter();
+    let count = burst.frame_count();
+    let mut upcoming = None;
+    for number in 0..count {
+        progress(stage, number, count)?;
+        let frame = upcoming.take().unwrap_or_else(|| neighbours.frame(burst, number));
+        // The network stays on this thread, which knows its precision.
+        let images = rayon::in_place_scope(|scope| {
+            if number + 1 < count {
+                scope.spawn(|_| upcoming = Some(neighbours.frame(burst, number + 1)));
+            }
+            all.noise_sigmas.push(frame.noise_sigma.clone());
+            let planes = AlignedPlanes::from_frame(frame).map(|plane| tiling.padded(plane));
+            tiling.predenoised(&planes, device, &predenoise)
+        })?;
+        let mut images = images.into_iter();
         all.frames.extend(images.next());
         all.uncertainty.extend(images.next());
     }

@@ -5,6 +5,7 @@ use super::bm3d::{SearchSettings, bm3d_with};
 use super::vst::VarianceStabilizer;
 use qudi_core::Frame;
 use qudi_core::restorer::Acquisition;
+use rayon::prelude::*;
 
 /// Denoises a stabilized frame by BM3D. The sigma of its noise is `scale` times that of the transform.
 pub(crate) fn denoise(
@@ -40,5 +41,5 @@ pub(crate) fn image(
         let detections = vst.invert(f64::from(z)) - acquisition.dark_of(i, ordinary);
         (detections.max(0.0) * units) as f32
     };
-    Frame { size: z.size, data: z.data.iter().enumerate().map(pixel).collect() }
+    Frame { size: z.size, data: z.data.par_iter().enumerate().map(pixel).collect() }
 }

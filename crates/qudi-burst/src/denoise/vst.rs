@@ -12,6 +12,7 @@
 
 use qudi_core::Frame;
 use qudi_core::sensor::{CountLaw, CountMoments, Response, Sensor};
+use rayon::prelude::*;
 
 /// How sums of counts are transformed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -126,8 +127,8 @@ impl VarianceStabilizer {
 
     /// The transform of a frame of mean counts.
     pub(crate) fn stabilized(&self, means: &Frame) -> Frame {
-        let z = means.data.iter().map(|&mean| self.transform(self.frames * f64::from(mean)) as f32);
-        Frame { size: means.size, data: z.collect() }
+        let z = |&mean: &f32| self.transform(self.frames * f64::from(mean)) as f32;
+        Frame { size: means.size, data: means.data.par_iter().map(z).collect() }
     }
 
     /// The detections per frame whose expected transform is `z`, between 0 and half a count short

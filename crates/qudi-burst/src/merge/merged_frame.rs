@@ -87,7 +87,7 @@ impl MergedFrame {
         patch: impl Fn(usize) -> (Patch, f32) + Send + Sync,
     ) -> Self {
         let patches: Vec<_> = (0..burst.grid.len()).into_par_iter().map(patch).collect();
-        let mut counts = burst.blended(|i| patches[i].0);
+        let mut counts = burst.blended(|i| &patches[i].0);
         counts.data.iter_mut().for_each(|count| *count = count.max(0.0));
         let patch_noise: Vec<f32> = patches.into_iter().map(|(_, noise)| noise).collect();
         let sum = patch_noise.iter().map(|&noise| f64::from(noise)).sum::<f64>();

@@ -147,22 +147,30 @@ pub(crate) fn centre(size: Size) -> [f32; 2] {
 fn mean_squares(values: &[f32], size: Size) -> Vec<f32> {
     let Size { height, width } = size;
     let near = |at: usize, length: usize| at.saturating_sub(RADIUS)..(at + RADIUS + 1).min(length);
-    let sum = |list: &mut dyn Iterator<Item = [f32; 2]>| {
-        list.fold([0.0f32; 2], |sum, more| [sum[0] + more[0], sum[1] + more[1]])
+    let add = |sums: &mut [[f32; 2]], values: &[[f32; 2]]| {
+        for (sum, value) in sums.iter_mut().zip(values) {
+            *sum = [sum[0] + value[0], sum[1] + value[1]];
+        }
     };
     let squares = values.iter().map(|v| if v.is_finite() { [v * v, 1.0] } else { [0.0; 2] });
     let squares: Vec<[f32; 2]> = squares.collect();
-    let rows = (0..values.len()).map(|i| {
-        let row = &squares[i / width * width..][..width];
-        sum(&mut row[near(i % width, width)].iter().copied())
-    });
-    let rows: Vec<[f32; 2]> = rows.collect();
-    let means = (0..values.len()).map(|i| {
-        let column = near(i / width, height).map(|y| rows[y * width + i % width]);
-        let [sum, count] = sum(&mut { column });
-        sum / count.max(1.0)
-    });
-    means.collect()
+    let mut rows = vec![[0.0; 2]; values.len()];
+    for (sums, squares) in rows.chunks_exact_mut(width).zip(squares.chunks_exact(width)) {
+        // From left to right: `shift` is how far right of the pixel the value lies.
+        for shift in (0..=2 * RADIUS).filter(|shift| shift.abs_diff(RADIUS) < width) {
+            let (skipped, from) = (RADIUS.saturating_sub(shift), shift.saturating_sub(RADIUS));
+            add(&mut sums[skipped..], &squares[from..]);
+        }
+    }
+    let mut means = Vec::with_capacity(values.len());
+    for y in 0..height {
+        let mut sums = vec![[0.0; 2]; width];
+        for y in near(y, height) {
+            add(&mut sums, &rows[y * width..][..width]);
+        }
+        means.extend(sums.iter().map(|[sum, count]| sum / count.max(1.0)));
+    }
+    means
 }
 
 /// Bilinear between pixels, no number outside.

@@ -3,6 +3,7 @@
 use crate::patch::{Patch, SIDE};
 use multiversion::multiversion;
 use qudi_core::{Frame, Size};
+use std::borrow::Borrow;
 
 /// Corners of square patches, the last ones at the borders.
 #[derive(Clone, Debug)]
@@ -40,7 +41,12 @@ impl Grid {
 
     /// The upper left part, of size `to`, of a frame of size `from` that overlapping patches make, each of
     /// which fades out towards its borders.
-    pub(crate) fn blended(&self, from: Size, to: Size, patch: impl Fn(usize) -> Patch) -> Frame {
+    pub(crate) fn blended<P: Borrow<Patch>>(
+        &self,
+        from: Size,
+        to: Size,
+        patch: impl Fn(usize) -> P,
+    ) -> Frame {
         let mut sum = Frame::filled(from, 0.0);
         let mut weights = sum.clone();
         let window: [f32; SIDE] = std::array::from_fn(|k| {
@@ -50,13 +56,18 @@ impl Grid {
             let [x, y] = self.corner(i);
             let at = y * from.width + x;
             add_weighted(
-                &patch(i),
+                patch(i).borrow(),
                 &window,
                 from.width,
                 [&mut sum.data[at..], &mut weights.data[at..]],
             );
         }
-        Frame::from_fn(to, |x, y| sum.row(y)[x] / weights.row(y)[x])
+        let mut data = Vec::with_capacity(to.pixels());
+        for y in 0..to.height {
+            let pixels = sum.row(y)[..to.width].iter().zip(weights.row(y));
+            data.extend(pixels.map(|(sum, weight)| sum / weight));
+        }
+        Frame { size: to, data }
     }
 
     /// The patch whose centre is nearest to `point`, and its neighbours left, right, above and below.
@@ -90,22 +101,31 @@ impl Grid {
         })
     }
 
-    /// Medians of both components over the 3 x 3 patches around patch `i`.
-    pub(crate) fn median_around(&self, flow: &[[f32; 2]], i: usize) -> [f32; 2] {
-        let mut near = [[0.0f32; 9]; 2];
-        let mut n = 0;
-        for patch in self.touching(i) {
-            for k in 0..2 {
-                near[k][n] = flow[patch][k];
+    /// Medians of both components over the 3 x 3 patches around every patch.
+    pub(crate) fn medians(&self, flow: &[[f32; 2]]) -> Vec<[f32; 2]> {
+        let (columns, rows) = (self.xs.len(), self.ys.len());
+        let mut medians = vec![[0.0; 2]; flow.len()];
+        for y in 0..rows {
+            let inner = y > 0 && y + 1 < rows && columns > 2;
+            if inner {
+                let row = |y: usize| flow[y * columns..][..columns].as_flattened();
+                let out = &mut medians[y * columns..][1..columns - 1];
+                medians_of_nine([y - 1, y, y + 1].map(row), out.as_flattened_mut());
             }
-            n += 1;
+            let border = if inner { columns - 1 } else { 1 };
+            for i in (0..columns).step_by(border).map(|x| y * columns + x) {
+                medians[i] = self.median_at_border(flow, i);
+            }
         }
-        near.map(|mut values| {
-            if n == values.len() {
-                return median_of_nine(values);
-            }
-            values[..n].sort_unstable_by(f32::total_cmp);
-            0.5 * (values[(n - 1) / 2] + values[n / 2])
+        medians
+    }
+
+    /// The medians where there are fewer patches around.
+    fn median_at_border(&self, flow: &[[f32; 2]], i: usize) -> [f32; 2] {
+        [0, 1].map(|component| {
+            let mut near: Vec<f32> = self.touching(i).map(|patch| flow[patch][component]).collect();
+            near.sort_unstable_by(f32::total_cmp);
+            0.5 * (near[(near.len() - 1) / 2] + near[near.len() / 2])
         })
     }
 }
@@ -129,9 +149,11 @@ fn add_weighted(
     }
 }
 
-/// The median, by exchanges that need no branches (Smith, "Implementing median
-/// filters in XC4000E FPGAs", XCELL 23, 1996).
-fn median_of_nine(mut v: [f32; 9]) -> f32 {
+/// Medians of 3 x 3 values, two columns apart in three rows; `out` is two columns shorter on each side. By
+/// exchanges that need no branches (Smith, "Implementing median filters in XC4000E FPGAs", XCELL 23, 1996).
+#[multiversion(targets("x86_64+avx2"))]
+fn medians_of_nine(rows: [&[f32]; 3], out: &mut [f32]) {
+    const LANES: usize = 8;
     const EXCHANGES: [[usize; 2]; 19] = [
         [1, 2],
         [4, 5],
@@ -153,26 +175,48 @@ fn median_of_nine(mut v: [f32; 9]) -> f32 {
         [6, 4],
         [4, 2],
     ];
-    for [a, b] in EXCHANGES {
-        (v[a], v[b]) = (v[a].min(v[b]), v[a].max(v[b]));
+    for (chunk, out) in out.chunks_mut(LANES).enumerate() {
+        let first = chunk * LANES;
+        let mut v = [[0.0f32; LANES]; 9];
+        for (k, v) in v.iter_mut().enumerate() {
+            let from = &rows[k / 3][first + 2 * (k % 3)..];
+            v[..out.len()].copy_from_slice(&from[..out.len()]);
+        }
+        for [a, b] in EXCHANGES {
+            for lane in 0..LANES {
+                let (low, high) = (v[a][lane].min(v[b][lane]), v[a][lane].max(v[b][lane]));
+                v[a][lane] = low;
+                v[b][lane] = high;
+            }
+        }
+        out.copy_from_slice(&v[4][..out.len()]);
     }
-    v[4]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// Inside and at the borders, of grids as narrow as they get.
     #[test]
     fn medians_are_the_middle_of_sorted_values() {
-        for seed in 0..500u32 {
-            let values: [f32; 9] = std::array::from_fn(|i| {
-                let mixed = (seed * 9 + i as u32 + 1).wrapping_mul(2_654_435_761) >> 24;
+        for (width, height) in [(16, 16), (24, 16), (32, 24), (120, 88), (168, 24)] {
+            let grid = Grid::half_overlapping(Size { height, width });
+            let value = |i: usize| {
+                let mixed = (i as u32 + 1).wrapping_mul(2_654_435_761) >> 24;
                 (mixed % 16) as f32 - 8.0
-            });
-            let mut sorted = values;
-            sorted.sort_unstable_by(f32::total_cmp);
-            assert_eq!(median_of_nine(values), sorted[4], "{values:?}");
+            };
+            let flow: Vec<[f32; 2]> =
+                (0..grid.len()).map(|i| [value(2 * i), value(2 * i + 1)]).collect();
+            for (i, median) in grid.medians(&flow).iter().enumerate() {
+                for component in 0..2 {
+                    let mut near: Vec<f32> =
+                        grid.touching(i).map(|patch| flow[patch][component]).collect();
+                    near.sort_unstable_by(f32::total_cmp);
+                    let middle = 0.5 * (near[(near.len() - 1) / 2] + near[near.len() / 2]);
+                    assert_eq!(median[component], middle, "patch {i} of {width} x {height}");
+                }
+            }
         }
     }
 }

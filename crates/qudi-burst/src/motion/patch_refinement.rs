@@ -119,9 +119,8 @@ fn regularize(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> 
     let mut flow: Vec<[f32; 2]> = refined.iter().map(|patch| patch.flow).collect();
     let ridge = variance / (NEIGHBOUR_SIGMA * NEIGHBOUR_SIGMA);
     for _ in 0..ITERATIONS {
-        let last = flow.clone();
-        for (i, patch) in refined.iter().enumerate() {
-            let median = grid.median_around(&last, i);
+        let medians = grid.medians(&flow);
+        for (i, (patch, median)) in refined.iter().zip(medians).enumerate() {
             let [xx, xy, yy] = patch.slopes;
             let away = [median[0] - patch.flow[0], median[1] - patch.flow[1]];
             let pull = [xx * away[0] + xy * away[1], xy * away[0] + yy * away[1]];

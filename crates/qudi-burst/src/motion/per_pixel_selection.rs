@@ -47,13 +47,9 @@ pub(crate) fn per_pixel_selection(
             let mut misfit = misfit(&here, &there);
             exclude_outside(burst, &mut misfit, i, d);
             let own = number == 0;
-            if !own {
-                misfit.iter_mut().flatten().for_each(|value| *value += reluctance);
-                let mut pairs = misfit.iter().flatten().zip(least.iter().flatten());
-                // Most motions fit no pixel better, and then nobody asks for their counts.
-                if !pairs.any(|(value, least)| value < least) {
-                    continue;
-                }
+            // Most motions fit no pixel better, and then nobody asks for their counts.
+            if !own && !fits_anywhere(&mut misfit, reluctance, &least) {
+                continue;
             }
             let counts = sample(&burst.frames[k], i, d);
             take_better(&misfit, &mut least, [&counts, &there], &mut best, own);
@@ -61,7 +57,21 @@ pub(crate) fn per_pixel_selection(
         best
     };
     let patches: Vec<[Patch; 2]> = (0..burst.grid.len()).into_par_iter().map(patch).collect();
-    [0, 1].map(|image| burst.blended(|i| patches[i][image]))
+    [0, 1].map(|image| burst.blended(|i| &patches[i][image]))
+}
+
+/// Adds the `reluctance` to a misfit, and finds out whether any pixel fits better than what did so far.
+#[multiversion(targets("x86_64+avx2"))]
+fn fits_anywhere(misfit: &mut Patch, reluctance: f32, least: &Patch) -> bool {
+    let mut lowest = [f32::INFINITY; SIDE];
+    for y in 0..SIDE {
+        for x in 0..SIDE {
+            misfit[y][x] += reluctance;
+            let better = misfit[y][x] < least[y][x];
+            lowest[x] = if better { -1.0 } else { lowest[x] };
+        }
+    }
+    lowest.iter().any(|&value| value < 0.0)
 }
 
 /// Takes what fits better, or all of it.

@@ -42,7 +42,8 @@ impl Tiles {
     /// Tile `number` of every image.
     pub(crate) fn crop(&self, number: usize, images: &[f32]) -> Vec<f32> {
         let [top, left] = self.corner(number);
-        let mut values = Vec::new();
+        let mut values =
+            Vec::with_capacity(images.len() / self.frame.pixels() * self.tile.pixels());
         for image in images.chunks_exact(self.frame.pixels()) {
             for row in top..top + self.tile.height {
                 let start = row * self.frame.width + left;

@@ -43,8 +43,9 @@ impl Tiling {
         let mut values = Vec::with_capacity(images.len() / from.pixels() * size.pixels());
         for image in images.chunks_exact(from.pixels()) {
             for y in 0..size.height {
-                let row = mirror(y, from.height) * from.width;
-                values.extend((0..size.width).map(|x| image[row + mirror(x, from.width)]));
+                let row = &image[mirror(y, from.height) * from.width..][..from.width];
+                values.extend_from_slice(row);
+                values.extend((from.width..size.width).map(|x| row[mirror(x, from.width)]));
             }
         }
         values
