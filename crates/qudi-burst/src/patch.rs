@@ -34,36 +34,58 @@ pub(crate) fn inside(start: f32, length: usize) -> Range<usize> {
 /// Samples the patch whose corner is at `corner` bilinearly; the image's borders are repeated.
 #[multiversion(targets("x86_64+avx2"))]
 pub(crate) fn bilinear(image: &Frame, corner: [f32; 2]) -> Patch {
-    bilinear_samples(image, corner)
-}
-
-/// [`bilinear`], compiled for the vector unit of its caller.
-#[inline(always)]
-pub(crate) fn bilinear_samples(image: &Frame, corner: [f32; 2]) -> Patch {
-    let (width, height) = (image.size.width as isize, image.size.height as isize);
-    let [x, y] = corner.map(|c| c.floor() as isize);
-    let [fx, fy] = corner.map(|c| c - c.floor());
-    let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-    let side = SIDE as isize;
+    let samples = BilinearSamples::new(image, corner);
     let mut patch = [[0.0; SIDE]; SIDE];
-    if x >= 0 && y >= 0 && x + side < width && y + side < height {
-        let row = |r: usize| &image.row(y as usize + r)[x as usize..][..=SIDE];
-        for (r, patch) in patch.iter_mut().enumerate() {
-            *patch = between(weights, row(r), row(r + 1));
-        }
-        return patch;
-    }
-    let row = |r: usize| -> [f32; SIDE + 1] {
-        let source = image.row((y + r as isize).clamp(0, height - 1) as usize);
-        std::array::from_fn(|c| source[(x + c as isize).clamp(0, width - 1) as usize])
-    };
-    let mut upper = row(0);
-    for (r, patch) in patch.iter_mut().enumerate() {
-        let lower = row(r + 1);
-        *patch = between(weights, &upper, &lower);
-        upper = lower;
+    for (r, row) in patch.iter_mut().enumerate() {
+        *row = samples.row(r);
     }
     patch
+}
+
+/// [`bilinear`] row by row, compiled for the vector unit of its caller.
+pub(crate) struct BilinearSamples<'a> {
+    image: &'a Frame,
+    /// The pixel before the corner.
+    corner: [isize; 2],
+    weights: [f32; 4],
+    /// Whether all columns lie in the image.
+    within: bool,
+}
+
+impl<'a> BilinearSamples<'a> {
+    #[inline(always)]
+    pub(crate) fn new(image: &'a Frame, corner: [f32; 2]) -> Self {
+        let [x, y] = [corner[0].floor(), corner[1].floor()];
+        let [fx, fy] = [corner[0] - x, corner[1] - y];
+        let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+        let corner = [x as isize, y as isize];
+        let within = corner[0] >= 0 && corner[0] + (SIDE as isize) < image.size.width as isize;
+        Self { image, corner, weights, within }
+    }
+
+    /// Row `r` of the patch.
+    #[inline(always)]
+    pub(crate) fn row(&self, r: usize) -> [f32; SIDE] {
+        let (upper, lower) = (self.source(r), self.source(r + 1));
+        if self.within {
+            let x = self.corner[0] as usize;
+            return between(self.weights, &upper[x..=x + SIDE], &lower[x..=x + SIDE]);
+        }
+        let (mut above, mut below) = ([0.0; SIDE + 1], [0.0; SIDE + 1]);
+        let last = upper.len() as isize - 1;
+        for c in 0..=SIDE {
+            let x = (self.corner[0] + c as isize).clamp(0, last) as usize;
+            (above[c], below[c]) = (upper[x], lower[x]);
+        }
+        between(self.weights, &above, &below)
+    }
+
+    /// The image's row that is nearest to row `r` of the patch.
+    #[inline(always)]
+    fn source(&self, r: usize) -> &'a [f32] {
+        let last = self.image.size.height as isize - 1;
+        self.image.row((self.corner[1] + r as isize).clamp(0, last) as usize)
+    }
 }
 
 /// A row between the pixels of two rows.

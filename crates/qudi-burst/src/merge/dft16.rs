@@ -20,14 +20,18 @@ static TWIDDLES: LazyLock<[(f32, f32); SIDE / 2]> = LazyLock::new(|| {
     })
 });
 
+impl Spectrum {
+    pub(crate) const ZERO: Self = Self { re: [[0.0; SIDE]; SIDE], im: [[0.0; SIDE]; SIDE] };
+}
+
 /// The transform, not normalised: white noise of variance v has `256 v` per coefficient.
 #[multiversion(targets("x86_64+avx2"))]
-pub(crate) fn forward(patch: &Patch) -> Spectrum {
-    let mut spectrum = Spectrum { re: *patch, im: [[0.0; SIDE]; SIDE] };
-    columns(&mut spectrum);
-    transpose(&mut spectrum);
-    columns(&mut spectrum);
-    spectrum
+pub(crate) fn forward(patch: &Patch, spectrum: &mut Spectrum) {
+    spectrum.re = *patch;
+    spectrum.im = [[0.0; SIDE]; SIDE];
+    columns(spectrum);
+    transpose(spectrum);
+    columns(spectrum);
 }
 
 /// The real part of the inverse, compiled for the vector unit of its caller.
@@ -93,7 +97,8 @@ mod tests {
     fn dft_matches_its_definition_and_inverts() {
         let patch: Patch =
             std::array::from_fn(|y| std::array::from_fn(|x| ((x * 5 + y * y * 3) % 17) as f32));
-        let spectrum = forward(&patch);
+        let mut spectrum = Spectrum::ZERO;
+        forward(&patch, &mut spectrum);
         for (u, v) in [(0, 0), (1, 0), (3, 7), (15, 9)] {
             let (mut re, mut im) = (0.0, 0.0);
             for (y, row) in patch.iter().enumerate() {

@@ -21,7 +21,7 @@ pub(crate) struct AlignedPatch {
 /// squared difference, in units of that which noise makes, at which a coefficient gets half its weight.
 /// Returns the patch and the variance of its noise, in units of the variance of one frame's counts.
 pub(crate) fn merge(patches: &[AlignedPatch], variance: f32, wiener_c: f32) -> (Patch, f32) {
-    let spectra: Vec<Spectrum> = patches.iter().map(|aligned| forward(&aligned.patch)).collect();
+    let spectra = spectra(patches.iter().map(|aligned| &aligned.patch));
     merge_spectra(patches, &spectra, &spectra, variance, wiener_c)
 }
 
@@ -33,9 +33,18 @@ pub(crate) fn merge_by_reference(
     variance: f32,
     wiener_c: f32,
 ) -> (Patch, f32) {
-    let spectra: Vec<Spectrum> = patches.iter().map(|aligned| forward(&aligned.patch)).collect();
-    let shown: Vec<Spectrum> = shown.iter().map(forward).collect();
+    let (spectra, shown) =
+        (spectra(patches.iter().map(|aligned| &aligned.patch)), spectra(shown.iter()));
     merge_spectra(patches, &spectra, &shown, variance, wiener_c)
+}
+
+/// The spectra of patches, computed where they stay: moving them would take as long as half a transform.
+fn spectra<'a>(patches: impl ExactSizeIterator<Item = &'a Patch>) -> Vec<Spectrum> {
+    let mut spectra = vec![Spectrum::ZERO; patches.len()];
+    for (patch, spectrum) in patches.zip(&mut spectra) {
+        forward(patch, spectrum);
+    }
+    spectra
 }
 
 /// Merges the `spectra` of `patches`. The robustness weight of each coefficient follows from how far

@@ -2,7 +2,7 @@
 //! registration technique", IJCAI 1981), and their regularization: flat patches move with their surroundings.
 
 use super::grid::Grid;
-use crate::patch::{Patch, SIDE, bilinear_samples};
+use crate::patch::{BilinearSamples, Patch, SIDE};
 use multiversion::multiversion;
 use qudi_core::Frame;
 
@@ -76,13 +76,18 @@ fn refine_patch(
     let solve = Damped::new([xx, xy, yy], variance / (STEP_SIGMA * STEP_SIGMA));
     let mut d = start;
     for _ in 0..STEPS {
-        let moved = bilinear_samples(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
-        let mut away = moved;
-        for (away, own) in away.iter_mut().flatten().zip(own.iter().flatten()) {
-            *away -= own;
+        let moved = BilinearSamples::new(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
+        // The sums of the slopes' products with the difference, sixteen at a time.
+        let (mut along_x, mut along_y) = ([0.0f32; SIDE], [0.0f32; SIDE]);
+        for r in 0..SIDE {
+            let row = moved.row(r);
+            for c in 0..SIDE {
+                let away = row[c] - own[r][c];
+                along_x[c] += slopes_x[r][c] * away;
+                along_y[c] += slopes_y[r][c] * away;
+            }
         }
-        let [bx, by] = [total_product(&slopes_x, &away), total_product(&slopes_y, &away)];
-        let step = solve.solve([bx, by]);
+        let step = solve.solve([along_x.iter().sum(), along_y.iter().sum()]);
         for k in 0..2 {
             let from_start = d[k] - step[k] - start[k];
             d[k] = start[k] + from_start.clamp(-LONGEST, LONGEST);
