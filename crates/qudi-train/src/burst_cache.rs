@@ -23,6 +23,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 
 pub use draw::draw_bursts;
 pub use sampler::BurstSampler;
@@ -61,6 +62,10 @@ fn compressed(z: f32) -> i8 {
 fn expanded(byte: i8) -> f32 {
     0.5 * (f32::from(byte) / STEPS).sinh()
 }
+
+/// [`expanded`] of every byte, by its bits.
+static EXPANDED: LazyLock<[f32; 256]> =
+    LazyLock::new(|| std::array::from_fn(|bits| expanded(bits as u8 as i8)));
 
 impl CachedBurst {
     pub(super) fn new(burst: ConditionedBurst) -> Self {
@@ -104,9 +109,10 @@ impl CachedBurst {
         let image = |plane: &Vec<f32>| -> Vec<f32> {
             range.clone().flat_map(|frame| picked(&plane[place(frame)], &places)).collect()
         };
+        let table = &*EXPANDED;
         let standardized = |plane: &Vec<i8>| -> Vec<f32> {
             let bytes = range.clone().flat_map(|frame| picked(&plane[place(frame)], &places));
-            bytes.map(expanded).collect()
+            bytes.map(|byte| table[usize::from(byte as u8)]).collect()
         };
         let mut counts_and_expected = self.standardized.iter().map(standardized);
         let neighbours = self.standardized.len() / 2;

@@ -106,39 +106,43 @@ pub(super) unsafe fn accumulate<S: Simd, P: Products<S>, const M: usize, const V
     *sums = acc;
 }
 
-/// `sums[m][k] += sum over the pixels p < length of dy[m][p] * x[offsets[k] + p]`, lane by lane.
+/// Sums over rows and their pixels `p < length` of `dy[m][p] * x[offsets[k] + p]`, lane by lane. Rows of `dy` are
+/// `length` values apart, those of `x` `step`.
 ///
 /// # Safety
-/// A value has `T`'s size. Each `dy` must be valid for `length` values and `x` for `length` values from each
-/// of the `offsets`; they fill whole vectors. The machine must have the instructions of `P`.
+/// A value has `T`'s size. Each `dy` must be valid for `rows * length` values and every row of `x` for `length` values
+/// from each of the `offsets`; they fill whole vectors. The machine must have the instructions of `P`.
 #[inline(always)]
 pub(super) unsafe fn correlate<S: Simd, P: Products<S>, T, const M: usize, const K: usize>(
     simd: S,
     dy: [*const T; M],
     x: *const T,
     offsets: [usize; K],
-    length: usize,
-    sums: &mut [[S::f32s; K]; M],
-) {
-    let mut acc = *sums;
-    let mut p = 0;
-    while p < length {
-        // SAFETY: the caller's promise; vectors are read unaligned.
-        unsafe {
-            let mut taps = [simd.splat_f32s(0.0); K];
-            for k in 0..K {
-                taps[k] = x.add(offsets[k] + p).cast::<S::f32s>().read_unaligned();
-            }
-            for m in 0..M {
-                let gradient = dy[m].add(p).cast::<S::f32s>().read_unaligned();
+    [rows, length, step]: [usize; 3],
+) -> [[S::f32s; K]; M] {
+    let mut sums = [[simd.splat_f32s(0.0); K]; M];
+    for row in 0..rows {
+        let mut p = 0;
+        while p < length {
+            // SAFETY: the caller's promise; vectors are read unaligned.
+            unsafe {
+                let mut taps = [simd.splat_f32s(0.0); K];
                 for k in 0..K {
-                    acc[m][k] = P::multiply_add(simd, gradient, taps[k], acc[m][k]);
+                    let from = x.add(offsets[k] + row * step + p);
+                    taps[k] = from.cast::<S::f32s>().read_unaligned();
+                }
+                for m in 0..M {
+                    let from = dy[m].add(row * length + p);
+                    let gradient = from.cast::<S::f32s>().read_unaligned();
+                    for k in 0..K {
+                        sums[m][k] = P::multiply_add(simd, gradient, taps[k], sums[m][k]);
+                    }
                 }
             }
+            p += size_of::<S::f32s>() / size_of::<T>();
         }
-        p += size_of::<S::f32s>() / size_of::<T>();
     }
-    *sums = acc;
+    sums
 }
 
 /// Writes the first `count` values of a run.

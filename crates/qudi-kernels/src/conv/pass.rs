@@ -153,9 +153,9 @@ impl Tiling {
         (at, size)
     }
 
-    /// Scratch values of a tile, with one spare row.
+    /// Scratch values of a tile.
     pub(super) fn scratch(&self) -> usize {
-        self.planes * self.plane() + self.row
+        self.planes * self.plane()
     }
 
     /// Scratch offsets of the taps of `planes` scratch planes, or of their groups, in the order of the weights.

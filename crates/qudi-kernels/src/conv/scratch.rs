@@ -1,8 +1,8 @@
 //! How values lie in scratch memory: as they are, or rounded to bfloat16.
 
-use super::source::copy_row;
 use crate::matrix_units::MatrixUnits;
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Simd, WithSimd};
+use std::ops::Range;
 
 /// What one place in scratch memory, 32 bits, holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -82,53 +82,115 @@ pub(super) fn pair(first: f32, second: f32) -> f32 {
 /// A row of a plane, and its mask.
 pub(super) type Row<'a> = (&'a [f32], Option<&'a [f32]>);
 
-/// Copies rows of input planes, `left` and `step` as in [`copy_row`], to a row of scratch. `spare` is as long
-/// as the row.
+/// Copies rows of input planes to a row of scratch: `to[i]` stands for the values at `left + i * step`, zero outside
+/// and where the mask is not positive. Compiled for the vector unit of its caller.
+#[inline(always)]
 pub(super) fn fill_row(
     format: Format,
     rows: [Option<Row<'_>>; 2],
     left: isize,
     step: usize,
     to: &mut [f32],
-    spare: &mut [f32],
 ) {
-    let copy = |row: Option<Row<'_>>, to: &mut [f32]| match row {
-        Some((from, mask)) => copy_row(from, mask, left, step, to),
-        None => to.fill(0.0),
+    let Some((values, _)) = rows[0].or(rows[1]) else {
+        to.fill(0.0);
+        return;
     };
-    copy(rows[0], to);
+    let inside = inside(values.len(), left, step, to.len());
+    to[..inside.start].fill(0.0);
+    to[inside.end..].fill(0.0);
+    if inside.is_empty() {
+        return;
+    }
+    let offset = (left + (inside.start * step) as isize) as usize;
+    let to = &mut to[inside];
     match format {
-        Format::Single => {}
-        Format::Rounded => round_all(to),
-        Format::Pairs | Format::Tiles(_) => {
-            let second = &mut spare[..to.len()];
-            copy(rows[1], second);
-            Arch::new().dispatch(PairRows { to, second });
+        Format::Single => {
+            if let Some(row) = rows[0] {
+                copy(row, offset, step, to);
+            }
+        }
+        Format::Rounded => {
+            if let Some(row) = rows[0] {
+                copy(row, offset, step, to);
+            }
+            round_all(to);
+        }
+        Format::Pairs | Format::Tiles(_) => join(rows, offset, step, to),
+    }
+}
+
+/// The places of a row of `length` scratch values whose sources lie in a row of `available` values.
+#[inline(always)]
+fn inside(available: usize, left: isize, step: usize, length: usize) -> Range<usize> {
+    let step = step as isize;
+    let place = |at: isize| ((at + step - 1).div_euclid(step).max(0) as usize).min(length);
+    let start = place(-left);
+    start..place(available as isize - left).max(start)
+}
+
+/// Copies a row from `offset` on.
+#[inline(always)]
+pub(super) fn copy((from, mask): Row<'_>, offset: usize, step: usize, to: &mut [f32]) {
+    let from = &from[offset..];
+    match mask {
+        None if step == 1 => to.copy_from_slice(&from[..to.len()]),
+        None => {
+            for (to, &from) in to.iter_mut().zip(from.iter().step_by(step)) {
+                *to = from;
+            }
+        }
+        // Only gradients are masked, and those are read one by one.
+        Some(mask) => {
+            debug_assert_eq!(step, 1);
+            for ((to, &from), &mask) in to.iter_mut().zip(from).zip(&mask[offset..]) {
+                *to = if mask > 0.0 { from } else { 0.0 };
+            }
+        }
+    }
+}
+
+/// Joins two rows to one of pairs; a missing one is zero.
+#[inline(always)]
+fn join(rows: [Option<Row<'_>>; 2], offset: usize, step: usize, to: &mut [f32]) {
+    match rows {
+        [Some((a, None)), Some((b, None))] if step == 1 => {
+            for ((to, &a), &b) in to.iter_mut().zip(&a[offset..]).zip(&b[offset..]) {
+                *to = pair(a, b);
+            }
+        }
+        [Some((a, Some(mask_a))), Some((b, Some(mask_b)))] => {
+            debug_assert_eq!(step, 1);
+            let masks = mask_a[offset..].iter().zip(&mask_b[offset..]);
+            let values = a[offset..].iter().zip(&b[offset..]);
+            for ((to, (&a, &b)), (&mask_a, &mask_b)) in to.iter_mut().zip(values).zip(masks) {
+                let (a, b) =
+                    (if mask_a > 0.0 { a } else { 0.0 }, if mask_b > 0.0 { b } else { 0.0 });
+                *to = pair(a, b);
+            }
+        }
+        [Some((a, None)), Some((b, None))] => {
+            let values = a[offset..].iter().step_by(step).zip(b[offset..].iter().step_by(step));
+            for (to, (&a, &b)) in to.iter_mut().zip(values) {
+                *to = pair(a, b);
+            }
+        }
+        [first, second] => {
+            let row = first.or(second).expect("the caller has one");
+            copy(row, offset, step, to);
+            let shift = if first.is_some() { 0 } else { 16 };
+            for to in to {
+                *to = f32::from_bits(upper(*to) << shift);
+            }
         }
     }
 }
 
 /// Rounds values in place.
+#[inline(always)]
 pub(super) fn round_all(values: &mut [f32]) {
     for value in values {
         *value = round(*value);
-    }
-}
-
-/// Joins two rows into one of pairs. A struct, since closures are not compiled for the vector unit.
-struct PairRows<'a> {
-    to: &'a mut [f32],
-    second: &'a [f32],
-}
-
-impl WithSimd for PairRows<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
-        for (to, &second) in self.to.iter_mut().zip(self.second) {
-            *to = pair(*to, second);
-        }
     }
 }
 

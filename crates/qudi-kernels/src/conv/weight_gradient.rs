@@ -8,7 +8,7 @@ use super::pairs::{PairWork, Pairs, with_pairs};
 use super::pass::{Pass, Tiling};
 use super::run::SCRATCH;
 use super::scratch::{Format, Narrow, round_all};
-use super::source::Source;
+use super::source::{Fill, Source};
 use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -81,7 +81,15 @@ pub(super) fn weight_gradient(
                 let mut first = 0;
                 while first < planes {
                     let end = (first + tiling.planes).min(planes);
-                    source.fill(image, first..end, pass, &tiling, at, taps);
+                    arch.dispatch(Fill {
+                        source,
+                        image,
+                        planes: first..end,
+                        pass,
+                        tiling: &tiling,
+                        at,
+                        scratch: &mut *taps,
+                    });
                     if halves {
                         arch.dispatch(Narrow { from: taps, to: narrow_taps });
                     } else if bf16 {
@@ -196,23 +204,13 @@ impl Tile<'_> {
                 let offsets: [usize; K] = std::array::from_fn(|j| {
                     self.offsets[(k + j).min(self.offsets.len() - 1)] as usize
                 });
-                let mut sums = [[simd.splat_f32s(0.0); K]; M];
-                for row in 0..self.rows {
-                    // SAFETY: rows of `dy` are `length` long, whole vectors; so much lies in scratch
-                    // after every tap of a row (`Pass::tiling`).
-                    unsafe {
-                        let dy = outputs.map(|start| dy.add(start + row * self.length));
-                        let x = taps.add(self.pass.stride * row * self.tiling.row);
-                        micro::correlate::<S, P, T, M, K>(
-                            simd,
-                            dy,
-                            x,
-                            offsets,
-                            self.length,
-                            &mut sums,
-                        );
-                    }
-                }
+                let sizes = [self.rows, self.length, self.pass.stride * self.tiling.row];
+                // SAFETY: rows of `dy` are `length` long, whole vectors; so much lies in scratch after every
+                // tap of a row (`Pass::tiling`).
+                let sums = unsafe {
+                    let dy = outputs.map(|start| dy.add(start));
+                    micro::correlate::<S, P, T, M, K>(simd, dy, taps, offsets, sizes)
+                };
                 for (i, sums) in sums.iter().enumerate().take(self.outputs - m) {
                     for (j, &sum) in sums.iter().enumerate().take(self.offsets.len() - k) {
                         let place = (m + i) * self.all + self.first + k + j;
