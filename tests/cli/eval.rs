@@ -356,8 +356,12 @@ fn learned_methods_run_with_the_weights_that_are_named() {
     assert!(info.contains("emvd") && info.contains("4 channels"), "{info}");
     run(&folder, "simulate scene:text --size 32x48 --frames 4 --ppp 3 -o b.npy -q");
     run(&folder, &format!("restore b.npy --method emvd {weights} -o r.npy -q"));
+    // Its weights come along; others do not.
+    run(&folder, "restore b.npy --method emvd -o built-in.npy -q");
+    let frames = ["r.npy", "built-in.npy"].map(|file| std::fs::read(folder.join(file)).unwrap());
+    assert_ne!(frames[0], frames[1]);
     for (args, words) in [
-        ("restore b.npy --method emvd -o x.npy", &["emvd", "--weights emvd=FILE"][..]),
+        ("restore b.npy --method quiver -o x.npy", &["quiver", "--weights quiver=FILE"][..]),
         ("restore b.npy --method rvrt --weights rvrt=emvd.safetensors -o x.npy", &["not of rvrt"]),
         ("restore b.npy --method mle --weights emvd=emvd.safetensors -o x.npy", &["not asked for"]),
         (

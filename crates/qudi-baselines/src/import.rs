@@ -137,11 +137,22 @@ impl Method {
 /// # Errors
 /// [`Error`] if it cannot be read, or its network lacks parameters or has too many.
 pub fn describe(path: &Path, device: &Device) -> Result<Option<Contents>> {
-    let file = StateDict::open(path)?;
-    let Some(method) = Method::of(&file) else { return Ok(None) };
-    let sizes = sizes_of(&file, method)?;
-    let parameters = count(&sizes.network(device), &file)?;
-    let description = weights::description(&file)?;
+    describe_file(&StateDict::open(path)?, device)
+}
+
+/// [`describe`] of a SafeTensors file in memory, which errors call `name`.
+///
+/// # Errors
+/// As [`describe`].
+pub fn describe_bytes(bytes: &[u8], name: &Path, device: &Device) -> Result<Option<Contents>> {
+    describe_file(&StateDict::of_bytes(bytes.to_vec(), name)?, device)
+}
+
+fn describe_file(file: &StateDict, device: &Device) -> Result<Option<Contents>> {
+    let Some(method) = Method::of(file) else { return Ok(None) };
+    let sizes = sizes_of(file, method)?;
+    let parameters = count(&sizes.network(device), file)?;
+    let description = weights::description(file)?;
     Ok(Some(Contents { method, sizes: sizes.to_string(), parameters, description }))
 }
 
@@ -150,18 +161,29 @@ pub fn describe(path: &Path, device: &Device) -> Result<Option<Contents>> {
 /// # Errors
 /// [`Error`] if the file cannot be read, or does not hold this network, to the last key.
 pub fn load(path: &Path, method: Method, device: &Device) -> Result<Loaded> {
-    let file = StateDict::open(path)?;
-    let found = Method::of(&file);
+    load_file(&StateDict::open(path)?, method, device)
+}
+
+/// [`load`] from a SafeTensors file in memory, which errors call `name`.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_bytes(bytes: &[u8], name: &Path, method: Method, device: &Device) -> Result<Loaded> {
+    load_file(&StateDict::of_bytes(bytes.to_vec(), name)?, method, device)
+}
+
+fn load_file(file: &StateDict, method: Method, device: &Device) -> Result<Loaded> {
+    let found = Method::of(file);
     if found != Some(method) {
         let what = match found {
             Some(found) => format!("weights of {}, not of {}", found.name(), method.name()),
             None => format!("no weights of {}: `{}` is missing", method.name(), method.mark()),
         };
-        return Err(Error::data(what, path, "name a file that was saved for this method"));
+        return Err(Error::data(what, file.path(), "name a file that was saved for this method"));
     }
-    let sizes = sizes_of(&file, method)?;
-    let description = weights::description(&file)?;
-    Ok(Loaded { network: filled(sizes.network(device), &file)?, sizes, description })
+    let sizes = sizes_of(file, method)?;
+    let description = weights::description(file)?;
+    Ok(Loaded { network: filled(sizes.network(device), file)?, sizes, description })
 }
 
 /// The sizes that follow from the shapes of a file.

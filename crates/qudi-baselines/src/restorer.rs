@@ -49,15 +49,25 @@ impl LearnedRestorer {
     /// # Errors
     /// [`Error`] if the file does not hold them.
     pub fn load(path: &Path, method: Method, device: &Device) -> Result<Self> {
-        let Loaded { network, sizes, description } = load(path, method, device)?;
+        Ok(Self::of(load(path, method, device)?, device))
+    }
+
+    /// The restorer of a loaded network, on the device that it was loaded onto.
+    pub fn of(loaded: Loaded, device: &Device) -> Self {
+        let Loaded { network, sizes, description } = loaded;
         let of_authors = description.is_none();
         let brightness = if of_authors { Brightness::OfAuthors } else { Brightness::OfCounts };
-        Ok(Self::new(network, sizes, brightness, device))
+        Self::new(network, sizes, brightness, device)
     }
 
     /// The restorer of a network of these sizes on `device`.
     pub fn new(network: Network, sizes: Sizes, brightness: Brightness, device: &Device) -> Self {
         Self { network, sizes, brightness, device: device.clone() }
+    }
+
+    /// Bytes that restoring frames of `size` takes on the processor at most, about.
+    pub fn memory(&self, size: Size) -> u64 {
+        self.sizes.memory(size)
     }
 
     fn method(&self) -> Method {

@@ -10,6 +10,7 @@ use crate::spk2imgnet::Spk2ImgNet;
 use crate::student_teacher::KernelPrediction;
 use crate::{emvd, flornn, memdeblur, quiver, rvrt, spk2imgnet, student_teacher};
 use burn::tensor::Device;
+use qudi_core::Size;
 use serde::{Deserialize, Serialize};
 
 /// Most channels, blocks or frames that a file or a recipe may ask for.
@@ -134,6 +135,34 @@ impl Sizes {
             Self::MemDeblur(_) => memdeblur::MULTIPLE,
             Self::Rvrt(_) => rvrt::MULTIPLE,
             Self::StudentTeacher(_) => student_teacher::MULTIPLE,
+        }
+    }
+
+    /// Bytes that restoring a window of frames of `size` takes on the processor at most, about: per pixel and feature
+    /// what the sizes of the authors took at 256 x 256 (docs/notes/engineering/learned-methods.md).
+    pub fn memory(self, size: Size) -> u64 {
+        let per_feature = match self {
+            Self::Quiver(_) => 1150,
+            Self::Emvd(_) => 72,
+            Self::FloRnn(_) => 176,
+            Self::Spk2ImgNet(_) => 650,
+            Self::MemDeblur(_) => 205,
+            Self::Rvrt(_) => 170,
+            Self::StudentTeacher(_) => 195,
+        };
+        (size.pixels() * self.features() * per_feature) as u64
+    }
+
+    /// The channels of the widest layers at full size.
+    fn features(self) -> usize {
+        match self {
+            Self::Quiver(s) => s.features,
+            Self::Emvd(s) => s.width,
+            Self::FloRnn(s) => s.features,
+            Self::Spk2ImgNet(s) => s.features,
+            Self::MemDeblur(s) => s.features,
+            Self::Rvrt(s) => s.features,
+            Self::StudentTeacher(s) => s.features,
         }
     }
 

@@ -4,7 +4,7 @@ use crate::error::{CliError, Result};
 use burn::tensor::Device;
 #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]
 use burn::tensor::DeviceType;
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// How names of other machines' devices begin.
 pub(crate) const REMOTE: &str = "ws://";
@@ -17,10 +17,17 @@ pub(crate) struct Listed {
 }
 
 /// A device to compute on.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Opened {
     pub(crate) name: String,
     pub(crate) device: Device,
+}
+
+impl Opened {
+    /// Whether it computes in the program's own memory.
+    pub(crate) fn is_processor(&self) -> bool {
+        matches!(self.name.as_str(), "cpu" | "flex" | "ndarray")
+    }
 }
 
 /// All devices: the CPU first, then the graphics cards of each backend that was compiled in.
@@ -55,14 +62,22 @@ fn feature_of(backend: &str) -> Option<&'static str> {
     features.iter().find(lacks).map(|(name, _)| *name)
 }
 
-/// Opens a device by name and computes something small on it.
+/// Opens a device by name and computes something small on it; once, however often it is asked for.
 pub(crate) fn open(name: &str) -> Result<Opened> {
+    static OPENED: Mutex<Vec<Opened>> = Mutex::new(Vec::new());
     let name = if name == "auto" { best() } else { name.to_owned() };
-    if name.starts_with(REMOTE) {
-        return open_remote(name);
+    let mut opened = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(device) = opened.iter().find(|device| device.name == name) {
+        return Ok(device.clone());
     }
+    let device = if name.starts_with(REMOTE) { open_remote(name) } else { open_local(&name) }?;
+    opened.push(device.clone());
+    Ok(device)
+}
+
+fn open_local(name: &str) -> Result<Opened> {
     let (backend, number) = match name.split_once(':') {
-        None => (name.as_str(), Some(0)),
+        None => (name, Some(0)),
         Some((backend, number)) => (backend, number.parse::<usize>().ok()),
     };
     let missing = || {
@@ -81,17 +96,17 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
     if !matches!(backend, "cpu" | "flex" | "ndarray") && !on_card() {
         return Err(missing());
     }
-    let opened = guarded(&name, || {
+    let opened = guarded(name, || {
         let device = create(backend, number)?;
         let two = burn::tensor::Tensor::<1>::ones([2], &device) + 1.0;
         (two.try_into_data().ok()?.try_to_vec::<f32>().ok()? == [2.0, 2.0]).then_some(device)
     });
     match opened {
-        Ok(Some(device)) => Ok(Opened { name: name.clone(), device }),
+        Ok(Some(device)) => Ok(Opened { name: name.to_owned(), device }),
         Ok(None) => Err(missing()),
         Err(problem) => Err(CliError::new(
             format!("the device cannot be used: {problem}"),
-            &name,
+            name,
             "check its driver with `qudi selftest`, or use --device cpu",
         )),
     }

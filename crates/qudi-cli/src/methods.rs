@@ -1,13 +1,12 @@
 //! Methods by name.
 
+pub(crate) mod learned;
 pub(crate) mod network;
 pub(crate) mod options;
 
-use crate::device;
 use crate::error::{CliError, Result};
 use options::NetworkOptions;
 use qudi_baselines::import::Method;
-use qudi_baselines::restorer::LearnedRestorer;
 use qudi_burst::{Average, Mle, PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_io::capture::Capture;
@@ -71,22 +70,15 @@ pub(crate) fn method(
         "qbp" => Ok((Box::new(Qbp::new(PostFilter::None)), String::new())),
         "qbp-bm3d" => Ok((Box::new(Qbp::new(PostFilter::Bm3d)), String::new())),
         "qbp-refined" | FORMER_QBP_REFINED => Ok((Box::new(QbpRefined), String::new())),
-        name if Method::by_name(name).is_some() => learned(name, options),
-        other => Err(CliError::new(
-            format!("no method named `{other}`"),
-            "--method",
-            format!("there are {}", METHODS.join(", ")),
-        )),
+        other => match Method::by_name(other) {
+            Some(method) => learned::restorer(method, options, capture.size()),
+            None => Err(CliError::new(
+                format!("no method named `{other}`"),
+                "--method",
+                format!("there are {}", METHODS.join(", ")),
+            )),
+        },
     }
-}
-
-/// A learned method of others.
-fn learned(name: &str, options: &NetworkOptions) -> Result<(Box<dyn Restorer>, String)> {
-    let method = Method::by_name(name).expect("checked by the caller");
-    let file = options.weights_of(method)?;
-    let device = device::open(&options.device)?;
-    let restorer = LearnedRestorer::load(file, method, &device.device)?;
-    Ok((Box::new(restorer), format!(" on {}", device.name)))
 }
 
 /// The method of those who name none.

@@ -45,13 +45,7 @@ impl StateDict {
     /// [`Error`] if the file cannot be read, or is no dictionary of tensors.
     pub fn open(path: &Path) -> Result<Self> {
         if path.extension().is_some_and(|extension| extension == "safetensors") {
-            let bytes = read_limited(path, LONGEST, "read the weights")?;
-            SafeTensors::deserialize(&bytes).map_err(|e| {
-                let help = "convert the weights again, or copy the whole file";
-                Error::data(format!("not a whole SafeTensors file: {e}"), path, help)
-            })?;
-            let length = bytes.len() as u64;
-            return Ok(Self::new(path, Reader::SafeTensors(bytes), length));
+            return Self::of_bytes(read_limited(path, LONGEST, "read the weights")?, path);
         }
         // The reader names no file where one is missing.
         let about = std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
@@ -61,6 +55,19 @@ impl StateDict {
             Error::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
         Ok(Self::new(path, Reader::Pytorch(reader), about.len()))
+    }
+
+    /// Reads the names of a SafeTensors file in memory; errors say that it is at `path`.
+    ///
+    /// # Errors
+    /// [`Error::Data`] if it is not whole.
+    pub fn of_bytes(bytes: Vec<u8>, path: &Path) -> Result<Self> {
+        SafeTensors::deserialize(&bytes).map_err(|e| {
+            let help = "convert the weights again, or copy the whole file";
+            Error::data(format!("not a whole SafeTensors file: {e}"), path, help)
+        })?;
+        let length = bytes.len() as u64;
+        Ok(Self::new(path, Reader::SafeTensors(bytes), length))
     }
 
     fn new(path: &Path, reader: Reader, length: u64) -> Self {

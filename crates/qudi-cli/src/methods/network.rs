@@ -24,7 +24,7 @@ pub(crate) fn restorer(
     options.check_steps()?;
     let (network, description) = options.weights.load(&device.device)?;
     check(&description, acquisition)?;
-    if matches!(device.name.as_str(), "cpu" | "ndarray") {
+    if device.is_processor() {
         check_memory(&description, options.tile, size, available_bytes())?;
     }
     let model = Model {

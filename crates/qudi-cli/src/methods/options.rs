@@ -2,13 +2,13 @@
 
 use crate::device::Opened;
 use crate::error::{CliError, Result};
+use crate::methods::learned::LearnedWeights;
 use crate::weights::Weights;
-use burn::tensor::Device;
-use qudi_baselines::import::{Method, describe};
+use qudi_baselines::import::Method;
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// The method that these options belong to.
 const METHOD: &str = "qudi";
@@ -140,10 +140,11 @@ impl NetworkOptions {
         Ok(())
     }
 
-    /// The file of a learned method's weights.
-    pub(crate) fn weights_of(&self, method: Method) -> Result<&Path> {
-        let found = self.learned.iter().find(|(of, _)| *of == method);
-        found.map(|(_, file)| file.as_path()).ok_or_else(|| {
+    /// A learned method's weights: those named, or those that come along.
+    pub(crate) fn weights_of(&self, method: Method) -> Result<LearnedWeights<'_>> {
+        let named = self.learned.iter().find(|(of, _)| *of == method);
+        let named = named.map(|(_, file)| LearnedWeights::File(file));
+        named.or_else(|| LearnedWeights::built_in(method)).ok_or_else(|| {
             let name = method.name();
             CliError::new(
                 format!("method `{name}` has no weights here"),
@@ -159,7 +160,7 @@ impl NetworkOptions {
     /// other methods, and of weights of others.
     pub(crate) fn trained_here(&self, method: &str) -> Result<Option<String>> {
         let Some(method) = Method::by_name(method) else { return Ok(None) };
-        let contents = describe(self.weights_of(method)?, &Device::flex())?;
+        let contents = self.weights_of(method)?.describe()?;
         Ok(contents.and_then(|contents| {
             let steps = contents.description?.steps;
             Some(format!("{}, {steps} steps", contents.sizes))

@@ -9,6 +9,7 @@
 use super::scratch::Format;
 use super::tiles;
 use pulp::{Arch, Simd, WithSimd};
+use std::hint::black_box;
 
 /// Channels and vectors of the kinds of blocks: 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512,
 /// NEON). Best first: the more channels, the fewer loads.
@@ -120,7 +121,9 @@ pub(super) unsafe fn correlate<S: Simd, P: Products<S>, T, const M: usize, const
     offsets: [usize; K],
     [rows, length, step]: [usize; 3],
 ) -> [[S::f32s; K]; M] {
-    let mut sums = [[simd.splat_f32s(0.0); K]; M];
+    // A zero that the compiler does not know: known ones are written to memory first, by a call.
+    let zero = simd.splat_f32s(black_box(0.0));
+    let mut sums = [[zero; K]; M];
     for row in 0..rows {
         let mut p = 0;
         while p < length {

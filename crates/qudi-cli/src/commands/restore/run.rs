@@ -17,7 +17,6 @@ use crate::methods::options::{NetworkOptions, other_method};
 use crate::methods::{is_network, method, usual_method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
-use crate::weights::Weights;
 use qudi_baselines::import::Method;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
@@ -314,8 +313,10 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
 /// The settings of the network that frames depend on, where it makes them.
 fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Value>> {
     if let Some(learned) = Method::by_name(method) {
-        let file = Weights::File(options.weights_of(learned)?.to_owned());
-        return Ok(Some(json!({"weights": file.to_string(), "weights_sha256": file.sha256()?})));
+        let weights = options.weights_of(learned)?;
+        return Ok(Some(
+            json!({"weights": weights.to_string(), "weights_sha256": weights.sha256()?}),
+        ));
     }
     if method != "qudi" {
         return Ok(None);
