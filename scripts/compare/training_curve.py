@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests/golden/generate"))
 import network  # noqa: E402
 
-# As in qudi-train: burst_cache.rs, loss/reconstruction.rs, ema.rs is not needed for the loss.
+# As in qudi-train: burst_cache.rs, loss/reconstruction.rs.
 STEPS_OF_A_BYTE, TOTAL_VARIATION, LEAST_ERROR = 32.0, 0.01, 1e-4
 
 

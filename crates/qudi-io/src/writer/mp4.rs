@@ -40,7 +40,11 @@ impl Mp4Writer {
         url.push(unfinished.path());
         let rate = fps.to_string();
         let shape = format!("{}x{}", size.width, size.height);
-        let spawned = Command::new("ffmpeg")
+        let mut command = Command::new("ffmpeg");
+        // Ctrl-C is for this program, which ends ffmpeg itself.
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        let spawned = command
             .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "gray"])
             .args(["-s", shape.as_str(), "-r", rate.as_str(), "-i", "-"])
             // Players want even sides and half-resolution colour.

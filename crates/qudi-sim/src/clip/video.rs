@@ -39,7 +39,11 @@ impl Video {
         // `file:` keeps ffmpeg from taking the name for a URL or an option.
         let mut url = std::ffi::OsString::from("file:");
         url.push(path);
-        let spawned = Command::new("ffmpeg")
+        let mut command = Command::new("ffmpeg");
+        // Ctrl-C is for this program, which ends ffmpeg itself.
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        let spawned = command
             .args(["-nostdin", "-v", "error", "-i"])
             .arg(url)
             .args([
