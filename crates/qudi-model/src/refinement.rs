@@ -95,7 +95,7 @@ pub(crate) struct PredenoisedFrames {
 }
 
 /// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and its
-/// uncertainty if predicted. While the network works on one frame, the next is aligned.
+/// uncertainty if predicted. While the network works on one frame, the next is aligned, if there are threads for it.
 pub(crate) fn predenoise_frames(
     stage: &'static str,
     burst: &AlignedBurst<'_>,
@@ -112,7 +112,7 @@ pub(crate) fn predenoise_frames(
         let frame = upcoming.take().unwrap_or_else(|| neighbours.frame(burst, number));
         // The network stays on this thread, which knows its precision.
         let images = rayon::in_place_scope(|scope| {
-            if number + 1 < count {
+            if number + 1 < count && rayon::current_num_threads() > 1 {
                 scope.spawn(|_| upcoming = Some(neighbours.frame(burst, number + 1)));
             }
             all.noise_sigmas.push(frame.noise_sigma.clone());
