@@ -19,7 +19,6 @@
 //! ```
 #![warn(missing_docs)]
 
-pub mod bad_pixels;
 mod camera;
 pub mod error;
 mod files;
@@ -44,4 +43,5 @@ pub use light::{
     Checksum, ClipStatistics, Light, PppDefinition, Spectrum, USUAL_MEAN_LEVEL, ppp_from_lux,
     resolve_light, sensor_lux,
 };
+pub use sensor::bad_pixels;
 pub use transfer::{Transfer, linear_to_srgb, srgb_to_linear};

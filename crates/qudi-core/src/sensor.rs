@@ -7,6 +7,7 @@
 //! frame, `frames_summed` of which make one count (Ma et al. 2020, section 3).
 //! `theta` is in photons per pixel and frame.
 
+pub mod bad_pixels;
 mod count_table;
 mod defects;
 mod document;
