@@ -48,6 +48,12 @@ pub(crate) fn available_bytes() -> Option<u64> {
     }
 }
 
+/// How a shortage is said: what is needed, about, and what is free.
+pub(crate) fn shortage(taker: &str, needed: u64, available: u64) -> String {
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    format!("{taker} about {:.1} GiB, {:.1} GiB are free", gib(needed), gib(available))
+}
+
 /// A field of /proc/self/status in MiB.
 fn field(name: &str) -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

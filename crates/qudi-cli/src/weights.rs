@@ -15,8 +15,8 @@ const BUILT_IN: &[u8] = include_bytes!("../weights/small.safetensors");
 /// Their SHA-256, so that nothing else is taken for them: not a link to large files, not a bad disk.
 const SHA256: &str = include_str!("../weights/small.sha256");
 
-/// What the default weights are called where a file would be named.
-const NAME: &str = "built in";
+/// What weights that come along are called where a file would be named.
+pub(crate) const NAME: &str = "built in";
 
 /// Where weights are.
 #[derive(Clone, Debug, PartialEq, Eq)]

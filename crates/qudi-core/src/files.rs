@@ -1,6 +1,9 @@
-//! Files of any kind: written whole or not at all, read within limits, NumPy arrays, names in natural order.
+//! Files of any kind: written whole or not at all, read within limits, NumPy arrays, names in natural order, ffmpeg.
 
 pub mod atomic_file;
+mod ffmpeg;
 pub mod natural_order;
 pub mod npy;
 pub mod regular_file;
+
+pub use ffmpeg::ffmpeg;

@@ -36,7 +36,7 @@ pub mod windows;
 
 pub use camera::{Camera, RollingShutter};
 pub use error::{Error, Result, nearest};
-pub use files::{atomic_file, natural_order, npy, regular_file};
+pub use files::{atomic_file, ffmpeg, natural_order, npy, regular_file};
 pub use frame::{Frame, Size};
 pub use light::mean_level::fitting_mean_level;
 pub use light::{

@@ -2,9 +2,9 @@
 
 use crate::device;
 use crate::error::{CliError, Result};
-use crate::memory::available_bytes;
+use crate::memory::{available_bytes, shortage};
 use crate::methods::options::NetworkOptions;
-use crate::weights::{Weights, sha256};
+use crate::weights::{NAME, Weights, sha256};
 use burn::tensor::Device;
 use qudi_baselines::import::{
     Contents, Loaded, Method, describe, describe_bytes, load, load_bytes,
@@ -17,9 +17,6 @@ use std::path::Path;
 
 /// EMVD as trained here (docs/notes/engineering/learned-methods.md).
 const EMVD: &[u8] = include_bytes!("../../weights/emvd.safetensors");
-
-/// What weights that come along are called where a file would be named.
-const NAME: &str = "built in";
 
 /// Where the weights of a learned method are.
 #[derive(Clone, Copy, Debug)]
@@ -90,12 +87,7 @@ fn check_memory(method: &str, needed: u64, size: Size, available: Option<u64>) -
     let Some(available) = available.filter(|&available| needed > available) else {
         return Ok(());
     };
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
-    let what = format!(
-        "{method} takes about {:.1} GiB for frames of {size}, {:.1} GiB are free",
-        gib(needed),
-        gib(available)
-    );
+    let what = shortage(&format!("for frames of {size} {method} takes"), needed, available);
     let part = (available as f64 / needed as f64).sqrt();
     let side = |length: usize| (length as f64 * part) as usize / 32 * 32;
     let (height, width) = (side(size.height), side(size.width));

@@ -3,7 +3,7 @@
 use super::options::NetworkOptions;
 use crate::device::{self, Opened};
 use crate::error::{CliError, Result};
-use crate::memory::available_bytes;
+use crate::memory::{available_bytes, shortage};
 use crate::weights::Weights;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, Restorer};
@@ -65,12 +65,7 @@ fn check_memory(
     let Some(available) = available.filter(|&available| needed(tile) > available) else {
         return Ok(());
     };
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
-    let what = format!(
-        "tiles of {tile} pixels take about {:.1} GiB, {:.1} GiB are free",
-        gib(needed(tile)),
-        gib(available)
-    );
+    let what = shortage(&format!("tiles of {tile} pixels take"), needed(tile), available);
     let smallest = 4 * network.multiple();
     let fitting = (smallest..tile).rev().find(|&tile| tile % 32 == 0 && needed(tile) <= available);
     let help = match fitting {

@@ -1,12 +1,13 @@
 //! MP4 through the `ffmpeg` program on PATH, for looking at: 8 bits, compressed.
 
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::ffmpeg;
 use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Stdio};
 use tempfile::NamedTempFile;
 
 /// A film being written.
@@ -40,11 +41,7 @@ impl Mp4Writer {
         url.push(unfinished.path());
         let rate = fps.to_string();
         let shape = format!("{}x{}", size.width, size.height);
-        let mut command = Command::new("ffmpeg");
-        // Ctrl-C is for this program, which ends ffmpeg itself.
-        #[cfg(unix)]
-        std::os::unix::process::CommandExt::process_group(&mut command, 0);
-        let spawned = command
+        let spawned = ffmpeg()
             .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "gray"])
             .args(["-s", shape.as_str(), "-r", rate.as_str(), "-i", "-"])
             // Players want even sides and half-resolution colour.

@@ -8,7 +8,7 @@ use super::micro::{self, KINDS, Products, Single};
 use super::pairs;
 use super::pass::{Pass, Tiling};
 use super::scratch::Format;
-use super::source::{Fill, Source};
+use super::source::Source;
 use super::tiles;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -154,15 +154,7 @@ pub(super) fn run(
             let mut first = 0;
             while first < planes {
                 let end = (first + tiling.planes).min(planes);
-                arch.dispatch(Fill {
-                    source,
-                    image,
-                    planes: first..end,
-                    pass,
-                    tiling: &tiling,
-                    at,
-                    scratch: &mut *scratch,
-                });
+                source.fill(image, first..end, pass, &tiling, at, scratch);
                 let tile = Tile {
                     scratch,
                     offsets: &offsets[..(end - first) / tiling.format.group() * pass.taps.len()],

@@ -2,7 +2,7 @@
 
 use super::pass::{Pass, Tiling};
 use super::scratch::{Format, Row, copy, fill_row};
-use pulp::{Simd, WithSimd};
+use pulp::{Arch, Simd, WithSimd};
 use std::ops::Range;
 
 /// Inputs joined by channel, `[images, channels, height, width]` each.
@@ -43,6 +43,20 @@ impl<'a> Source<'a> {
         None
     }
 
+    /// Copies what a tile of `pass` needs of the scratch planes `planes` of `image` to `scratch`, zeros around the
+    /// edges.
+    pub(super) fn fill(
+        self,
+        image: usize,
+        planes: Range<usize>,
+        pass: &Pass,
+        tiling: &Tiling,
+        at: [usize; 2],
+        scratch: &mut [f32],
+    ) {
+        Arch::new().dispatch(Fill { source: self, image, planes, pass, tiling, at, scratch });
+    }
+
     /// Copies a tile of every plane, rows of `length` values with zeros past the tile.
     pub(super) fn copy_tile(
         &self,
@@ -63,16 +77,15 @@ impl<'a> Source<'a> {
     }
 }
 
-/// Copies what a tile of `pass` needs of the scratch planes `planes` of an image to `scratch`, zeros around the
-/// edges. A struct, since closures are not compiled for the vector unit.
-pub(super) struct Fill<'a> {
-    pub(super) source: Source<'a>,
-    pub(super) image: usize,
-    pub(super) planes: Range<usize>,
-    pub(super) pass: &'a Pass,
-    pub(super) tiling: &'a Tiling,
-    pub(super) at: [usize; 2],
-    pub(super) scratch: &'a mut [f32],
+/// [`Source::fill`]. A struct, since closures are not compiled for the vector unit.
+struct Fill<'a> {
+    source: Source<'a>,
+    image: usize,
+    planes: Range<usize>,
+    pass: &'a Pass,
+    tiling: &'a Tiling,
+    at: [usize; 2],
+    scratch: &'a mut [f32],
 }
 
 impl WithSimd for Fill<'_> {

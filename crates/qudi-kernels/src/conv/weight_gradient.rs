@@ -8,7 +8,7 @@ use super::pairs::{PairWork, Pairs, with_pairs};
 use super::pass::{Pass, Tiling};
 use super::run::SCRATCH;
 use super::scratch::{Format, Narrow, round_all};
-use super::source::{Fill, Source};
+use super::source::Source;
 use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -81,15 +81,7 @@ pub(super) fn weight_gradient(
                 let mut first = 0;
                 while first < planes {
                     let end = (first + tiling.planes).min(planes);
-                    arch.dispatch(Fill {
-                        source,
-                        image,
-                        planes: first..end,
-                        pass,
-                        tiling: &tiling,
-                        at,
-                        scratch: &mut *taps,
-                    });
+                    source.fill(image, first..end, pass, &tiling, at, taps);
                     if halves {
                         arch.dispatch(Narrow { from: taps, to: narrow_taps });
                     } else if bf16 {

@@ -3,13 +3,14 @@
 use super::FrameReader;
 use super::ppm::PpmStream;
 use qudi_core::Transfer;
+use qudi_core::ffmpeg;
 use qudi_core::regular_file::open_regular;
 use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdout, Stdio};
 
 /// Frames of a video, decoded by `ffmpeg`.
 pub struct Video {
@@ -39,11 +40,7 @@ impl Video {
         // `file:` keeps ffmpeg from taking the name for a URL or an option.
         let mut url = std::ffi::OsString::from("file:");
         url.push(path);
-        let mut command = Command::new("ffmpeg");
-        // Ctrl-C is for this program, which ends ffmpeg itself.
-        #[cfg(unix)]
-        std::os::unix::process::CommandExt::process_group(&mut command, 0);
-        let spawned = command
+        let spawned = ffmpeg()
             .args(["-nostdin", "-v", "error", "-i"])
             .arg(url)
             .args([
