@@ -1,4 +1,4 @@
-//! The learned methods as restorers of video: every frame of a window.
+//! The learned methods as restorers of video: every frame of a window, tile by tile.
 
 mod brightness;
 
@@ -6,10 +6,12 @@ use crate::import::{Loaded, Method, Network, load};
 use crate::sizes::Sizes;
 use crate::spk2imgnet::{Block, Spk2ImgNet};
 use crate::{memdeblur, rvrt, spk2imgnet};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
-use qudi_core::{Error, Frame, Result, Size};
+use qudi_core::{Error, Result, Size};
+use qudi_layers::Tiling;
+use qudi_layers::tensor::to_tensor;
 use std::collections::VecDeque;
 use std::ops::Range;
 use std::path::Path;
@@ -19,6 +21,12 @@ pub use brightness::ExpectedCounts;
 /// Frames that are restored at once, and of EMVD, whose recurrence starts anew with every window.
 const FRAMES: usize = 11;
 const MANY_FRAMES: usize = 64;
+
+/// The default side of tiles, in pixels.
+pub const TILE: usize = 512;
+
+/// The side of the smallest tiles, in pixels: a multiple of what every network needs.
+pub const SMALLEST_TILE: usize = 64;
 
 /// Frames before the first one that EMVD goes on from: its protocol scores the last of eleven.
 const HISTORY: usize = 10;
@@ -31,6 +39,7 @@ pub struct LearnedRestorer {
     network: Network,
     sizes: Sizes,
     brightness: Brightness,
+    tile: usize,
     device: Device,
 }
 
@@ -62,10 +71,23 @@ impl LearnedRestorer {
 
     /// The restorer of a network of these sizes on `device`.
     pub fn new(network: Network, sizes: Sizes, brightness: Brightness, device: &Device) -> Self {
-        Self { network, sizes, brightness, device: device.clone() }
+        Self { network, sizes, brightness, tile: TILE, device: device.clone() }
     }
 
-    /// Bytes that restoring frames of `size` takes on the processor at most, about.
+    /// Restores in tiles of `tile` pixels instead of [`TILE`]: memory grows with their square.
+    ///
+    /// # Errors
+    /// [`Error`] if they are smaller than [`SMALLEST_TILE`].
+    pub fn with_tile(self, tile: usize) -> Result<Self> {
+        if tile < SMALLEST_TILE {
+            let what = format!("tiles of {tile} pixels");
+            let help = format!("{} needs at least {SMALLEST_TILE}", self.method().name());
+            return Err(Error::request(what, "tile", help));
+        }
+        Ok(Self { tile, ..self })
+    }
+
+    /// Bytes that restoring tiles of `size` takes on the processor at most, about.
     pub fn memory(&self, size: Size) -> u64 {
         self.sizes.memory(size)
     }
@@ -206,40 +228,30 @@ impl Restorer for LearnedRestorer {
             return Ok(Restored { frames: Vec::new(), std: None });
         };
         progress(self.method().name(), 0, burst.frames.len())?;
-        let multiple = self.sizes.multiple();
-        let Size { height, width } = burst.size;
-        let [h, w] = [height, width].map(|side| side.next_multiple_of(multiple));
+        let tiling = Tiling::new(burst.size, self.sizes.multiple(), self.tile);
         let full = f32::from(acquisition.sensor.max_count());
         let plane = |counts: &Vec<u16>| {
-            let value = |y: usize, x: usize| f32::from(counts[y * width + x]) / full;
-            let rows = (0..h).flat_map(|y| (0..w).map(move |x| (y, x)));
-            let values = rows.map(|(y, x)| value(y.min(height - 1), x.min(width - 1)));
-            let data = TensorData::new(values.collect::<Vec<f32>>(), [1, 1, h, w]);
-            Tensor::from_data(data, &self.device)
+            let values: Vec<f32> = counts.iter().map(|&count| f32::from(count) / full).collect();
+            tiling.padded(&values)
         };
-        let frames: Vec<Tensor<4>> = burst.frames.iter().map(plane).collect();
+        let planes: Vec<Vec<f32>> = burst.frames.iter().map(plane).collect();
+        let mut frames = tiling.joined(|tile| {
+            let part = |plane: &Vec<f32>| {
+                to_tensor(tiling.tiles.crop(tile, plane), tiling.tiles.tile, &self.device)
+            };
+            let frames: Vec<Tensor<4>> = planes.iter().map(part).collect();
+            let images = self.images(&frames, first..last + 1)?;
+            Ok(wanted.iter().map(|number| images[number - first].clone()).collect())
+        })?;
         let expected = match self.brightness {
             Brightness::OfAuthors => None,
             Brightness::OfCounts => Some(ExpectedCounts::of(acquisition)),
         };
-        let images = self.images(&frames, first..last + 1)?;
-        let images = wanted.iter().map(|number| {
-            let image = images[number - first].clone().narrow(2, 0, height).narrow(3, 0, width);
-            let data = image.into_data().try_to_vec::<f32>();
-            let mut data = data.map_err(|e| {
-                Error::request(
-                    format!("the device failed: {e:?}"),
-                    self.method().name(),
-                    "use --device cpu",
-                )
-            })?;
-            for value in &mut data {
-                let image = expected.map_or(*value, |expected| expected.image(*value));
-                *value = image.clamp(0.0, 1.0);
-            }
-            Ok(Frame { size: burst.size, data })
-        });
-        Ok(Restored { frames: images.collect::<Result<_>>()?, std: None })
+        for value in frames.iter_mut().flat_map(|frame| &mut frame.data) {
+            let image = expected.map_or(*value, |expected| expected.image(*value));
+            *value = image.clamp(0.0, 1.0);
+        }
+        Ok(Restored { frames, std: None })
     }
 }
 

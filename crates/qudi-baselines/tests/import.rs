@@ -17,6 +17,7 @@ use qudi_baselines::rvrt::{self, Rvrt};
 use qudi_baselines::spk2imgnet::{self, Spk2ImgNet};
 use qudi_baselines::student_teacher::{self, KernelPrediction};
 use qudi_core::Size;
+use qudi_core::metrics::psnr;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_layers::{init_parameters, parameter_shapes};
@@ -234,4 +235,30 @@ fn wanted_frames_equal_those_of_the_whole_window() {
         let nothing = restorer.restore_frames(burst, &acquisition, &[]).unwrap();
         assert!(nothing.frames.is_empty());
     }
+}
+
+/// Tiles that overlap join to nearly what the whole frame gives.
+#[test]
+fn tiles_restore_nearly_what_whole_frames_do() {
+    let size = Size { height: 40, width: 200 };
+    let frames: Vec<Vec<u16>> = (0..3)
+        .map(|t| (0..size.pixels()).map(|i| ((i * 5 + i / 7 + t * t) % 8) as u16).collect())
+        .collect();
+    let burst = BurstView { size, frames: &frames };
+    let acquisition = Acquisition::new(Sensor::load("qudi-paper").unwrap(), 3.25, 0.45).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("w.safetensors");
+    save(&path, &smallest(Method::Emvd));
+    let restore = |tile| {
+        let loaded = LearnedRestorer::load(&path, Method::Emvd, &Device::flex()).unwrap();
+        let mut restorer = loaded.with_tile(tile).unwrap();
+        restorer.restore(burst, &acquisition).unwrap().frames.remove(2)
+    };
+    let (whole, tiled) = (restore(512), restore(128));
+    let agreement = psnr(&whole, &tiled);
+    assert!(agreement > 40.0, "{agreement} dB");
+    assert_ne!(whole, tiled);
+    let smaller = LearnedRestorer::load(&path, Method::Emvd, &Device::flex()).unwrap();
+    let refused = smaller.with_tile(63).unwrap_err().to_string();
+    assert!(refused.contains("emvd needs at least 64"), "{refused}");
 }

@@ -1,5 +1,8 @@
 //! Memory of this process: what becomes of freed pages, and the peak, where the system tells (Linux).
 
+use crate::error::{CliError, Result};
+use qudi_core::Size;
+
 /// `mi_option_purge_delay` of mimalloc.h; the bindings name its neighbours 14 and 16 only.
 const PURGE_DELAY: i32 = 15;
 
@@ -48,6 +51,29 @@ pub(crate) fn available_bytes() -> Option<u64> {
     }
 }
 
+/// Refuses tiles that memory cannot hold, before the system ends the program for it. `sides` are those of the smallest
+/// tiles and of the tiles wanted, `needed` the bytes that one of a size takes.
+pub(crate) fn check_tiles(
+    sides: [usize; 2],
+    frame: Size,
+    available: Option<u64>,
+    needed: impl Fn(Size) -> u64,
+) -> Result<()> {
+    let [smallest, wanted] = sides;
+    let of_side =
+        |side: usize| needed(Size { height: frame.height.min(side), width: frame.width.min(side) });
+    let Some(available) = available.filter(|&available| of_side(wanted) > available) else {
+        return Ok(());
+    };
+    let what = shortage(&format!("tiles of {wanted} pixels take"), of_side(wanted), available);
+    let mut smaller = (smallest..wanted).rev();
+    let help = match smaller.find(|&side| side % 32 == 0 && of_side(side) <= available) {
+        Some(side) => format!("--tile {side} fits"),
+        None => "free some memory, or use smaller weights".to_owned(),
+    };
+    Err(CliError::new(what, "--tile", help))
+}
+
 /// How a shortage is said: what is needed, about, and what is free.
 pub(crate) fn shortage(taker: &str, needed: u64, available: u64) -> String {
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
@@ -69,4 +95,32 @@ pub(crate) fn keep_freed_pages() {
     // SAFETY: called at the start of `main`, before there are other threads; the value is in the option's
     // range.
     unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, KEEP) };
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tiles_that_do_not_fit_name_one_that_does() {
+        let frame = Size { height: 2000, width: 3000 };
+        let needed = |size: Size| 10_000 * size.pixels() as u64;
+        let check = |tile, frame, available| check_tiles([64, tile], frame, available, needed);
+        assert!(check(256, frame, Some(1 << 30)).is_ok());
+        assert!(check(4096, frame, None).is_ok());
+        let Err(CliError::Error { what, help: Some(help), .. }) = check(512, frame, Some(1 << 30))
+        else {
+            panic!("a tile of 512 in 1 GiB");
+        };
+        assert!(what.contains("2.4 GiB, 1.0 GiB are free"), "{what}");
+        assert_eq!(help, "--tile 320 fits");
+        assert!(check(320, frame, Some(1 << 30)).is_ok());
+        assert!(check(352, frame, Some(1 << 30)).is_err());
+        // The whole frame is smaller than the tile.
+        assert!(check(1024, Size { height: 128, width: 128 }, Some(1 << 30)).is_ok());
+        let Err(CliError::Error { help: Some(help), .. }) = check(512, frame, Some(1 << 20)) else {
+            panic!("a tile of 512 in 1 MiB");
+        };
+        assert!(help.starts_with("free some memory"), "{help}");
+    }
 }

@@ -5,7 +5,7 @@ pub(crate) mod network;
 pub(crate) mod options;
 
 use crate::error::{CliError, Result};
-use options::NetworkOptions;
+use options::{NetworkOptions, TILE_FLAG};
 use qudi_baselines::import::Method;
 use qudi_burst::{Average, Mle, PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
@@ -97,7 +97,7 @@ pub(crate) fn usual_method(
     options.check_weights(&[])?;
     let long_enough = capture.length().is_none_or(|frames| frames >= MIN_FRAMES as u64);
     let other = |name, reason| Ok(UsualMethod { name, reason: Some(reason) });
-    if options.result_flag.is_some() {
+    if options.own_flag.is_some() || options.network_flag == Some(TILE_FLAG) {
         return Ok(UsualMethod { name: "qudi", reason: None });
     }
     if acquisition.sensor.dark_per_frame().is_err() {

@@ -1,4 +1,4 @@
-//! Layers that several networks are made of, and their parameters by name, in the program and in files.
+//! What several networks are made of: layers, parameters by name, in the program and in files, and tiles of frames.
 #![warn(missing_docs)]
 
 #[cfg(test)]
@@ -13,6 +13,8 @@ mod linear;
 mod parameters;
 pub mod resample;
 mod state_dict;
+pub mod tensor;
+mod tiling;
 
 pub use conv::{Bias, Conv2d, Conv3d};
 pub use dense_block::DenseBlock;
@@ -21,3 +23,4 @@ pub use layers::Layers;
 pub use linear::Linear;
 pub use parameters::{init_parameters, parameter_shapes, zeros};
 pub use state_dict::StateDict;
+pub use tiling::{Tiles, Tiling};

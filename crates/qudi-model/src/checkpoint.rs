@@ -278,7 +278,7 @@ impl ModuleVisitor for Values {
     }
 
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-        match crate::tensor::read(param.val()) {
+        match qudi_layers::tensor::read(param.val()) {
             Ok(values) => {
                 let largest = self.precision.largest();
                 if self.broken.is_none()

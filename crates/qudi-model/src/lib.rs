@@ -19,6 +19,5 @@ pub mod diffusion;
 pub mod network;
 pub mod refinement;
 pub mod restorer;
-pub mod tensor;
 
 pub use qudi_kernels::{ComputePrecision, MatrixUnits, MatrixUnitsError, with_precision};

@@ -7,12 +7,12 @@
 use crate::conditioning::{AlignedNeighbours, AlignedPlanes, AlignedTensors, MAX_IMAGE};
 use crate::config::NetworkConfig;
 use crate::network::{PreDenoiser, Qudi};
-use crate::restorer::tiling::Tiling;
 use burn::tensor::{Device, Tensor};
 use qudi_burst::{AlignedBurst, ReferenceEstimate};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Frame, Result};
+use qudi_layers::Tiling;
 
 /// Sigma of the errors that a pre-denoised frame does not share with the next one, in units of the sigma of
 /// the merged frame's noise.
@@ -117,7 +117,10 @@ pub(crate) fn predenoise_frames(
             }
             all.noise_sigmas.push(frame.noise_sigma.clone());
             let planes = AlignedPlanes::from_frame(frame).map(|plane| tiling.padded(plane));
-            tiling.predenoised(&planes, device, &predenoise)
+            tiling.joined(|tile| {
+                let planes = planes.map(|plane| tiling.tiles.crop(tile, plane));
+                Ok(predenoise(&planes.into_tensors(tiling.tiles.tile, device)))
+            })
         })?;
         let mut images = images.into_iter();
         all.frames.extend(images.next());

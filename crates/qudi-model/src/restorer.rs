@@ -2,8 +2,6 @@
 
 mod diffusion;
 mod regression;
-mod tiles;
-pub(crate) mod tiling;
 
 use crate::checkpoint::ModelKind;
 use crate::config::NetworkConfig;

@@ -7,7 +7,7 @@
 
 use burn::tensor::Device;
 use qudi_core::npy::read_image;
-use qudi_model::tensor::{read, to_tensor};
+use qudi_layers::tensor::{read, to_tensor};
 use qudi_train::loss::lpips::{Lpips, PerceptualKind};
 use std::path::Path;
 

@@ -9,11 +9,11 @@ use qudi_core::Result;
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
+use qudi_layers::tensor::read;
 use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
 use qudi_model::config::{NetworkConfig, ReferenceKind};
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::network::Simulated;
-use qudi_model::tensor::read;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
 pub const TOLERANCE: f32 = 2e-3;

@@ -8,7 +8,7 @@ use super::recipe::Recipe;
 use super::trainer::Trainer;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::{Error, Result};
-use qudi_model::tensor::read;
+use qudi_layers::tensor::read;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::fs::File;

@@ -12,7 +12,7 @@ use crate::loss::lpips::Lpips;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
 use qudi_kernels::{ComputePrecision, with_precision};
-use qudi_model::tensor::read;
+use qudi_layers::tensor::read;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -7,11 +7,11 @@ use burn::tensor::{Device, Tensor};
 use moving_disk::{Burst, burst, tiny};
 use qudi_core::Size;
 use qudi_core::restorer::{BurstView, Restorer};
+use qudi_layers::tensor::to_tensor;
 use qudi_model::checkpoint::ModelKind;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
-use qudi_model::tensor::to_tensor;
 use qudi_train::gradients;
 use qudi_train::loss::{
     LoopOptions, LossForm, LossTerms, LossWeights, NoiseOn, SelfConditioning, loss_terms,

@@ -8,10 +8,10 @@ use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Gradients, Tensor};
 use moving_disk::{Burst, tiny};
 use qudi_core::Size;
+use qudi_layers::tensor::to_tensor;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
-use qudi_model::tensor::to_tensor;
 use qudi_model::{ComputePrecision, with_precision};
 use qudi_train::loss::{
     LoopOptions, LossForm, LossTerms, LossWeights, SelfConditioning, TimestepLaw, gaussian_nll,

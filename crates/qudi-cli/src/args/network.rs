@@ -1,7 +1,7 @@
 //! Options of commands that may run the network.
 
 use super::number;
-use crate::methods::options::NetworkOptions;
+use crate::methods::options::{DEVICE_FLAG, NetworkOptions, TILE_FLAG};
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_baselines::import::{METHODS, Method};
@@ -33,8 +33,7 @@ pub(crate) struct Network {
     /// --devices`) [default: auto]
     #[arg(long, value_name = "NAME")]
     device: Option<String>,
-    /// Side of the tiles that the network sees at once, in pixels: memory grows with its square [default:
-    /// 512]
+    /// Side of the tiles that a network sees at once, in pixels: memory grows with its square [default: 512]
     #[arg(long, value_name = "PIXELS", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1 << 16))]
     tile: Option<usize>,
     /// Numbers that its convolutions multiply; sums have 32 bits with each [default: bf16 on processors that
@@ -74,16 +73,18 @@ impl Network {
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),
             tile: self.tile.unwrap_or(TILE),
             precision: self.precision.map(PrecisionName::precision),
-            result_flag: first(&[
+            own_flag: first(&[
                 (self.own_weights().is_some(), "--weights"),
                 (steps.is_some(), "--steps"),
                 (self.spacing.is_some(), "--spacing"),
                 (self.sampler.is_some(), "--sampler"),
                 (self.samples.is_some(), "--samples"),
-                (self.tile.is_some(), "--tile"),
                 (self.precision.is_some(), "--precision"),
             ]),
-            device_flag: self.device.is_some().then_some("--device"),
+            network_flag: first(&[
+                (self.tile.is_some(), TILE_FLAG),
+                (self.device.is_some(), DEVICE_FLAG),
+            ]),
             diffusion_flag: first(&[
                 (self.spacing.is_some(), "--spacing"),
                 (self.sampler.is_some(), "--sampler"),

@@ -1,15 +1,15 @@
 //! The learned methods of others: their weights, and the memory that they take.
 
 use crate::device;
-use crate::error::{CliError, Result};
-use crate::memory::{available_bytes, shortage};
+use crate::error::Result;
+use crate::memory::{available_bytes, check_tiles};
 use crate::methods::options::NetworkOptions;
 use crate::weights::{NAME, Weights, sha256};
 use burn::tensor::Device;
 use qudi_baselines::import::{
     Contents, Loaded, Method, describe, describe_bytes, load, load_bytes,
 };
-use qudi_baselines::restorer::LearnedRestorer;
+use qudi_baselines::restorer::{LearnedRestorer, SMALLEST_TILE};
 use qudi_core::Size;
 use qudi_core::restorer::Restorer;
 use std::fmt;
@@ -76,27 +76,12 @@ pub(crate) fn restorer(
     let weights = options.weights_of(method)?;
     let device = device::open(&options.device)?;
     let restorer = LearnedRestorer::of(weights.load(method, &device.device)?, &device.device);
+    let restorer = restorer.with_tile(options.tile)?;
     if device.is_processor() {
-        check_memory(method.name(), restorer.memory(size), size, available_bytes())?;
+        let sides = [SMALLEST_TILE, options.tile];
+        check_tiles(sides, size, available_bytes(), |size| restorer.memory(size))?;
     }
     Ok((Box::new(restorer), format!(" on {}", device.name)))
-}
-
-/// Refuses frames that memory cannot hold, before the system ends the program for it.
-fn check_memory(method: &str, needed: u64, size: Size, available: Option<u64>) -> Result<()> {
-    let Some(available) = available.filter(|&available| needed > available) else {
-        return Ok(());
-    };
-    let what = shortage(&format!("for frames of {size} {method} takes"), needed, available);
-    let part = (available as f64 / needed as f64).sqrt();
-    let side = |length: usize| (length as f64 * part) as usize / 32 * 32;
-    let (height, width) = (side(size.height), side(size.width));
-    let help = if height.min(width) < 64 {
-        "free some memory, or use another method".to_owned()
-    } else {
-        format!("--crop 0:{height},0:{width} fits: restore the frames part by part")
-    };
-    Err(CliError::new(what, "memory", help))
 }
 
 #[cfg(test)]
@@ -114,17 +99,5 @@ mod tests {
             assert_eq!(description.licence, "MIT OR Apache-2.0");
             assert!(weights.load(method, &Device::flex()).is_ok());
         }
-    }
-
-    #[test]
-    fn frames_that_do_not_fit_name_a_part_that_does() {
-        let size = Size { height: 2000, width: 3000 };
-        let check = |available| check_memory("rvrt", 16 << 30, size, available);
-        assert!(check(None).is_ok() && check(Some(17 << 30)).is_ok());
-        let Err(CliError::Error { what, help: Some(help), .. }) = check(Some(4 << 30)) else {
-            panic!("16 GiB in 4");
-        };
-        assert!(what.contains("16.0 GiB") && what.contains("4.0 GiB are free"), "{what}");
-        assert!(help.starts_with("--crop 0:992,0:1472 "), "{help}");
     }
 }

@@ -3,7 +3,7 @@
 use super::options::NetworkOptions;
 use crate::device::{self, Opened};
 use crate::error::{CliError, Result};
-use crate::memory::{available_bytes, shortage};
+use crate::memory::{available_bytes, check_tiles};
 use crate::weights::Weights;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, Restorer};
@@ -25,7 +25,11 @@ pub(crate) fn restorer(
     let (network, description) = options.weights.load(&device.device)?;
     check(&description, acquisition)?;
     if device.is_processor() {
-        check_memory(&description, options.tile, size, available_bytes())?;
+        let network = &description.network;
+        let smallest = 4 * network.multiple();
+        check_tiles([smallest, options.tile], size, available_bytes(), |size| {
+            network.memory(size, description.window)
+        })?;
     }
     let model = Model {
         network,
@@ -47,32 +51,6 @@ pub(crate) fn sample_options(options: &NetworkOptions, device: &Opened) -> Resul
         tile: options.tile,
         precision: options.precision(device)?,
     })
-}
-
-/// Refuses tiles that memory cannot hold, before the system ends the program for it.
-fn check_memory(
-    description: &Description,
-    tile: usize,
-    size: Size,
-    available: Option<u64>,
-) -> Result<()> {
-    let network = &description.network;
-    let needed = |tile: usize| {
-        let side = |length: usize| length.min(tile);
-        let size = Size { height: side(size.height), width: side(size.width) };
-        network.memory(size, description.window)
-    };
-    let Some(available) = available.filter(|&available| needed(tile) > available) else {
-        return Ok(());
-    };
-    let what = shortage(&format!("tiles of {tile} pixels take"), needed(tile), available);
-    let smallest = 4 * network.multiple();
-    let fitting = (smallest..tile).rev().find(|&tile| tile % 32 == 0 && needed(tile) <= available);
-    let help = match fitting {
-        Some(fitting) => format!("--tile {fitting} fits"),
-        None => "free some memory, or use smaller weights".to_owned(),
-    };
-    Err(CliError::new(what, "--tile", help))
 }
 
 /// What went wrong on a device, with a way out; `problem` are its own words.
@@ -187,26 +165,6 @@ mod tests {
             spacing: None,
             kind: None,
         }
-    }
-
-    #[test]
-    fn tiles_that_do_not_fit_name_one_that_does() {
-        let about = description(&["qudi-paper"]);
-        let size = Size { height: 2000, width: 3000 };
-        let check = |tile, available| check_memory(&about, tile, size, Some(available));
-        assert!(check(512, 4 << 30).is_ok());
-        assert!(check_memory(&about, 4096, size, None).is_ok());
-        let Err(CliError::Error { what, help: Some(help), .. }) = check(1024, 1 << 30) else {
-            panic!("a tile of 1024 in 1 GiB");
-        };
-        assert!(what.contains("1.0 GiB are free"), "{what}");
-        let fitting = help.split_whitespace().nth(1).and_then(|tile| tile.parse().ok());
-        let fitting: usize = fitting.unwrap_or_else(|| panic!("{help}"));
-        assert!((192..512).contains(&fitting) && check(fitting, 1 << 30).is_ok(), "{help}");
-        assert!(check(fitting + 32, 1 << 30).is_err());
-        // The whole frame is smaller than the tile.
-        let small = Size { height: 128, width: 128 };
-        assert!(check_memory(&about, 1024, small, Some(1 << 30)).is_ok());
     }
 
     #[test]

@@ -1,10 +1,10 @@
 //! Which parts of a network have learnt: it decides how the network can restore.
 
 use crate::network::Qudi;
-use crate::tensor::read;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 use qudi_core::{Error, Result};
+use qudi_layers::tensor::read;
 use serde::{Deserialize, Serialize};
 
 /// Which parts of a network have learnt.

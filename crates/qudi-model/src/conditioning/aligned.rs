@@ -2,10 +2,10 @@
 //! neighbours.
 
 use super::MAX_IMAGE;
-use crate::tensor::to_tensor;
 use burn::tensor::{Device, Tensor};
 use qudi_burst::{AlignedBurst, AlignedFrame, Alignments};
 use qudi_core::Size;
+use qudi_layers::tensor::to_tensor;
 use std::ops::Range;
 
 /// The neighbours that are aligned with each frame.

@@ -74,8 +74,8 @@ impl Preconditioned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tensor::read;
     use burn::tensor::Device;
+    use qudi_layers::tensor::read;
 
     fn image(value: f32) -> Tensor<4> {
         Tensor::full([1, 1, 2, 2], value, &Device::flex())

@@ -4,8 +4,8 @@ use super::features::Pyramid;
 use super::normalized_input::NormalizedInput;
 use crate::diffusion::precondition::Preconditioned;
 use crate::diffusion::state::DiffusionState;
-use crate::tensor::{gradient_of, product};
 use burn::tensor::{Gradients, Tensor};
+use qudi_layers::tensor::{gradient_of, product};
 
 /// What the U-Net goes on from.
 #[derive(Clone, Debug)]

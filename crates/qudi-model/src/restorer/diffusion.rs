@@ -1,6 +1,5 @@
 //! Restoring by diffusion: reverse steps from noise, with the sensor's forward model between them.
 
-use super::tiling::Tiling;
 use super::{Model, SampleOptions};
 use crate::checkpoint::ModelKind;
 use crate::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
@@ -13,11 +12,12 @@ use crate::diffusion::state::DiffusionState;
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use crate::network::{Encoded, Flows, Qudi, Simulated};
 use crate::refinement::{RefinementStage, align};
-use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored};
+use qudi_layers::Tiling;
+use qudi_layers::tensor::{read, to_tensor};
 
 /// Restores windows by sampling.
 #[derive(Debug)]

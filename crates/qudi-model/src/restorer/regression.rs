@@ -1,18 +1,18 @@
 //! Restoring by regression: the pre-denoised frames, filtered over time.
 
 use super::Model;
-use super::tiling::Tiling;
 use crate::conditioning::{AlignedTensors, Conditioning, CountPlanes, sensor_tensor};
 use crate::config::{NetworkConfig, ReferenceKind};
 use crate::network::Qudi;
 use crate::refinement::{
     PredenoisedFrames, RefinementStage, align, filter_over_time, predenoise_frames,
 };
-use crate::tensor::to_tensor;
 use burn::tensor::Device;
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored};
 use qudi_core::{Frame, Result};
+use qudi_layers::Tiling;
+use qudi_layers::tensor::to_tensor;
 
 /// The largest standard deviation that a value in [0, 1] can have (Popoviciu 1935).
 const MAX_UNCERTAINTY: f32 = 0.5;
@@ -96,7 +96,7 @@ impl RegressionRestorer {
                     sensor: sensor.clone(),
                     frames: 1,
                 });
-                std::iter::once(d).chain(uncertainty).collect()
+                Ok(std::iter::once(d).chain(uncertainty).collect())
             };
             let mut images = tiling.joined(predenoise)?.into_iter();
             frames.extend(images.next());

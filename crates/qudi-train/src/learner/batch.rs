@@ -7,12 +7,12 @@ use crate::recipe::Recipe;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
+use qudi_layers::tensor::to_tensor;
 use qudi_model::conditioning::{
     AlignedPlanes, Conditioning, CountPlanes, SENSOR_NUMBERS, sensor_numbers,
 };
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
-use qudi_model::tensor::to_tensor;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 

@@ -8,7 +8,7 @@ use burn::tensor::Device;
 use qudi_baselines::learning::{Baseline, Bursts};
 use qudi_baselines::restorer::ExpectedCounts;
 use qudi_core::{Camera, Light, Result, Size};
-use qudi_model::tensor::to_tensor;
+use qudi_layers::tensor::to_tensor;
 
 /// Makes the photons of frames that are held still others than those of the moving scene.
 const STILL: u64 = 0x5EED_0057_1177;

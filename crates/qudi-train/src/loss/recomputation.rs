@@ -4,9 +4,9 @@
 use crate::parameters::gradients;
 use burn::module::Module;
 use burn::tensor::Tensor;
+use qudi_layers::tensor::{gradient_of, product};
 use qudi_model::conditioning::Conditioning;
 use qudi_model::network::{Fused, FusedGradient, Qudi, Simulated};
-use qudi_model::tensor::{gradient_of, product};
 
 /// Pre-denoised frames that a loss was computed from, without what made them.
 #[derive(Clone, Debug)]

@@ -5,13 +5,13 @@ use super::timesteps::{NoiseOn, previous_timestep};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use qudi_core::{Error, Result, Size};
+use qudi_layers::tensor::{read, to_tensor};
 use qudi_model::conditioning::CountPlanes;
 use qudi_model::diffusion::forward_model::ForwardModel;
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::{DiffusionState, per_image};
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::{Qudi, Simulated};
-use qudi_model::tensor::{read, to_tensor};
 use rayon::prelude::*;
 
 /// How a pass goes: which results of the previous step the network is given, and what is kept.

@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 use qudi_core::Result;
-use qudi_model::tensor::read;
+use qudi_layers::tensor::read;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
 /// The loss and its terms, each the mean over a step.

@@ -5,10 +5,10 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
+use qudi_layers::tensor::to_tensor;
 use qudi_model::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
 use qudi_model::config::NetworkConfig;
 use qudi_model::refinement::align;
-use qudi_model::tensor::to_tensor;
 use qudi_train::loss::Example;
 
 /// Counts of a disk that moves, their truth and their light.

@@ -3,7 +3,7 @@
 use crate::error::{CliError, Result};
 use burn::tensor::Device;
 use qudi_core::Frame;
-use qudi_model::tensor::{read, to_tensor};
+use qudi_layers::tensor::{read, to_tensor};
 use qudi_train::loss::lpips::{Lpips, PerceptualKind};
 use std::path::Path;
 

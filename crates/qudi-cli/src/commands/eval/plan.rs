@@ -8,7 +8,7 @@ use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
 use crate::device;
 use crate::error::{CliError, Result};
-use crate::methods::options::NetworkOptions;
+use crate::methods::options::{DEVICE_FLAG, NetworkOptions};
 use crate::methods::{METHODS, is_method};
 use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
@@ -94,7 +94,7 @@ impl Plan {
         let mut network = args.network.options(steps.first().copied());
         if args.backbones.is_some() {
             // LPIPS is computed there, too.
-            network.device_flag = None;
+            network.network_flag = network.network_flag.filter(|&flag| flag != DEVICE_FLAG);
         }
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
         network.check_methods(methods.iter().map(String::as_str))?;

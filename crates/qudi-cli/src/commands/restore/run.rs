@@ -314,9 +314,11 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
 fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Value>> {
     if let Some(learned) = Method::by_name(method) {
         let weights = options.weights_of(learned)?;
-        return Ok(Some(
-            json!({"weights": weights.to_string(), "weights_sha256": weights.sha256()?}),
-        ));
+        return Ok(Some(json!({
+            "weights": weights.to_string(),
+            "weights_sha256": weights.sha256()?,
+            "tile": options.tile,
+        })));
     }
     if method != "qudi" {
         return Ok(None);

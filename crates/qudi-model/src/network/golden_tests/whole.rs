@@ -9,10 +9,10 @@ use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::DiffusionState;
 use crate::diffusion::timesteps::{NUM_TIMESTEPS, TimestepSpacing};
 use crate::network::{Simulated, init_parameters};
-use crate::tensor::{read, to_tensor};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::Size;
 use qudi_core::restorer::Acquisition;
+use qudi_layers::tensor::{read, to_tensor};
 
 /// The squared error plus 0.01 of the total variation of the error, as the reference computes it.
 fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {

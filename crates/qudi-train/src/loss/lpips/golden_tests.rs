@@ -5,7 +5,7 @@ use super::{Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
 use crate::cases::uniform;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
-use qudi_model::tensor::{read, to_tensor};
+use qudi_layers::tensor::{read, to_tensor};
 use safetensors::SafeTensors;
 use std::sync::OnceLock;
 

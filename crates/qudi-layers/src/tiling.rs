@@ -1,27 +1,29 @@
 //! Images before and after the network: mirrored at their edges up to the size that it needs, and cut into
 //! tiles.
 
-use crate::conditioning::{AlignedPlanes, AlignedTensors};
-use crate::restorer::tiles::Tiles;
+mod tiles;
+
 use crate::tensor::read;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use qudi_core::{Frame, Result, Size};
+
+pub use tiles::Tiles;
 
 /// How images of one size are padded and cut into tiles.
 #[derive(Debug)]
-pub(crate) struct Tiling {
+pub struct Tiling {
     /// The size of the images.
     from: Size,
     /// The size of the padded images.
-    pub(crate) size: Size,
+    pub size: Size,
     /// The tiles of the padded images.
-    pub(crate) tiles: Tiles,
+    pub tiles: Tiles,
 }
 
 impl Tiling {
     /// The tiling of images of size `from`, for a network that needs multiples of `multiple`, in tiles of
     /// about `side` pixels.
-    pub(crate) fn new(from: Size, multiple: usize, side: usize) -> Self {
+    pub fn new(from: Size, multiple: usize, side: usize) -> Self {
         let size = Size {
             height: from.height.next_multiple_of(multiple),
             width: from.width.next_multiple_of(multiple),
@@ -32,7 +34,7 @@ impl Tiling {
     }
 
     /// Mirrors images at their lower and right edges.
-    pub(crate) fn padded(&self, images: &[f32]) -> Vec<f32> {
+    pub fn padded(&self, images: &[f32]) -> Vec<f32> {
         let Self { from, size, .. } = self;
         // 0 1 2 3 2 1 0 1 2 ...: the edge itself is not repeated.
         let mirror = |place: usize, length: usize| {
@@ -52,7 +54,7 @@ impl Tiling {
     }
 
     /// Crops padded images to frames of the original size.
-    pub(crate) fn frames(&self, images: &[f32]) -> Vec<Frame> {
+    pub fn frames(&self, images: &[f32]) -> Vec<Frame> {
         let cropped = |image: &[f32]| {
             let rows = image.chunks_exact(self.size.width).take(self.from.height);
             let values = rows.flat_map(|row| &row[..self.from.width]).copied();
@@ -61,26 +63,18 @@ impl Tiling {
         images.chunks_exact(self.size.pixels()).map(cropped).collect()
     }
 
-    /// Applies `predenoise` to the padded planes of a frame, tile by tile: one image or several, cropped.
-    pub(crate) fn predenoised(
-        &self,
-        planes: &AlignedPlanes,
-        device: &Device,
-        predenoise: impl Fn(&AlignedTensors) -> Vec<Tensor<4>>,
-    ) -> Result<Vec<Frame>> {
-        let tiles = &self.tiles;
-        self.joined(|number| {
-            let planes = planes.map(|plane| tiles.crop(number, plane));
-            predenoise(&planes.into_tensors(tiles.tile, device))
-        })
-    }
-
     /// Joins the tiles of an image or of several, which `of_tile` gives by their number, and crops them.
-    pub(crate) fn joined(&self, of_tile: impl Fn(usize) -> Vec<Tensor<4>>) -> Result<Vec<Frame>> {
+    ///
+    /// # Errors
+    /// Those of `of_tile`, and [`Error`](qudi_core::Error) if the device fails.
+    pub fn joined(
+        &self,
+        mut of_tile: impl FnMut(usize) -> Result<Vec<Tensor<4>>>,
+    ) -> Result<Vec<Frame>> {
         let tiles = &self.tiles;
         let mut images: Vec<Vec<f32>> = Vec::new();
         for number in 0..tiles.count() {
-            let parts = of_tile(number);
+            let parts = of_tile(number)?;
             images.resize(parts.len(), vec![0.0; self.size.pixels()]);
             for (part, image) in parts.into_iter().zip(&mut images) {
                 tiles.blend(number, &read(part)?, image);

@@ -4,10 +4,10 @@ use qudi_core::Size;
 
 /// Where tiles of one size lie on a frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Tiles {
+pub struct Tiles {
     frame: Size,
     /// Size of every tile.
-    pub(crate) tile: Size,
+    pub tile: Size,
     rows: Vec<usize>,
     columns: Vec<usize>,
 }
@@ -15,7 +15,7 @@ pub(crate) struct Tiles {
 impl Tiles {
     /// Tiles of `side` pixels (smaller where the frame is) that share at least `overlap`; frame, side and
     /// overlap are multiples of `multiple`, and so are all positions.
-    pub(crate) fn new(frame: Size, side: usize, overlap: usize, multiple: usize) -> Self {
+    pub fn new(frame: Size, side: usize, overlap: usize, multiple: usize) -> Self {
         let starts = |length: usize| {
             let side = side.min(length);
             let count = (length - side).div_ceil((side - overlap.min(side / 2)).max(1)) + 1;
@@ -30,7 +30,7 @@ impl Tiles {
     }
 
     /// Number of tiles.
-    pub(crate) fn count(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.rows.len() * self.columns.len()
     }
 
@@ -40,7 +40,7 @@ impl Tiles {
     }
 
     /// Tile `number` of every image.
-    pub(crate) fn crop(&self, number: usize, images: &[f32]) -> Vec<f32> {
+    pub fn crop(&self, number: usize, images: &[f32]) -> Vec<f32> {
         let [top, left] = self.corner(number);
         let mut values =
             Vec::with_capacity(images.len() / self.frame.pixels() * self.tile.pixels());
@@ -54,7 +54,7 @@ impl Tiles {
     }
 
     /// Adds tile `number` of every image to `images`, weighted so that all tiles together count once.
-    pub(crate) fn blend(&self, number: usize, tiles: &[f32], images: &mut [f32]) {
+    pub fn blend(&self, number: usize, tiles: &[f32], images: &mut [f32]) {
         let [top, left] = self.corner(number);
         let rows = shares(&self.rows, self.tile.height, number / self.columns.len());
         let columns = shares(&self.columns, self.tile.width, number % self.columns.len());

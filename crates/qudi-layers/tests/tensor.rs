@@ -3,7 +3,7 @@
 
 use burn::tensor::Device;
 use qudi_core::Size;
-use qudi_model::tensor::{read, to_tensor};
+use qudi_layers::tensor::{read, to_tensor};
 
 #[test]
 fn tensors_hold_images_unchanged() {
