@@ -54,6 +54,22 @@ fn emvd_trains_resumes_restores_and_says_what_it_is() {
     let table = run(&folder, &format!("{clip} --table1 {weights}"));
     assert!(table.contains("trained here: 4 channels, 4 steps"), "{table}");
 
+    // What they have not learnt: counts of one bit.
+    run(
+        &folder,
+        "simulate scene:text --size 32x32 --sensor swissspad2 --frames 5 --ppp 1 -o s.npy -q",
+    );
+    let other = ["swissspad2", "trained for qudi-paper"];
+    refused(&folder, &format!("restore s.npy --method emvd {weights} -o s"), &other);
+    let binary = "--sensor swissspad2";
+    refused(&folder, &format!("{clip} --method emvd {binary} {weights}"), &other);
+    let table = run(&folder, &format!("{clip} --table1 {binary} {weights}"));
+    let note = |method: &str| {
+        let mut lines = table.lines().filter(|line| line.trim_start().starts_with(method));
+        lines.any(|line| line.contains("the weights were trained for qudi-paper"))
+    };
+    assert!(note("emvd") && !note("qbp-bm3d"), "{table}");
+
     // From these weights, in stages, and on bursts that are drawn first.
     run(&folder, &format!("train scenes.toml -o again --init run/weights.safetensors {QUICK}"));
     let wide = "--set network.width=8";

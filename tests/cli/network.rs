@@ -3,6 +3,7 @@
 use crate::support::{listing, qudi, refused, run, scratch};
 use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
+use qudi_layers::Provenance;
 use qudi_model::checkpoint::{Description, Precision, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::init_parameters;
@@ -25,16 +26,18 @@ fn prepared(name: &str) -> PathBuf {
 fn weights(path: &Path, value: f32) {
     let network = NetworkConfig::preset("tiny").unwrap();
     let description = Description {
-        program: "qudi test".into(),
         preset: Some("tiny".into()),
         network: network.clone(),
         window: 11,
-        sensors: vec!["qudi-paper".into()],
-        ppp: [3.25, 26.0],
-        data: vec!["nothing".into()],
-        steps: 0,
-        commit: None,
-        licence: "MIT OR Apache-2.0".into(),
+        provenance: Provenance {
+            program: "qudi test".into(),
+            sensors: vec!["qudi-paper".into()],
+            ppp: [3.25, 26.0],
+            data: vec!["nothing".into()],
+            steps: 0,
+            commit: None,
+            licence: "MIT OR Apache-2.0".into(),
+        },
         default_steps: None,
         kind: None,
         spacing: None,

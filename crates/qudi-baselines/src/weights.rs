@@ -5,7 +5,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::{Error, Result};
-use qudi_layers::{StateDict, parameter_shapes};
+use qudi_layers::{Provenance, StateDict, parameter_shapes};
 use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -17,24 +17,13 @@ const KEY: &str = "qudi-baseline";
 /// What a file says about weights that were trained here.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Description {
-    /// The version of the program that wrote it.
-    pub program: String,
     /// The name of the method.
     pub method: String,
     /// The number of frames of a burst in training.
     pub frames: usize,
-    /// The sensors of the training data.
-    pub sensors: Vec<String>,
-    /// The least and most photons per pixel and frame of the training data.
-    pub ppp: [f64; 2],
-    /// The names of the training data.
-    pub data: Vec<String>,
-    /// Optimization steps.
-    pub steps: u64,
-    /// The commit of the program that trained it.
-    pub commit: Option<String>,
-    /// The licence of the weights.
-    pub licence: String,
+    /// What it was trained on.
+    #[serde(flatten)]
+    pub provenance: Provenance,
 }
 
 /// Writes a network's weights, whole or not at all.

@@ -3,6 +3,7 @@
 pub(crate) mod learned;
 pub(crate) mod network;
 pub(crate) mod options;
+pub(crate) mod trained;
 
 use crate::error::{CliError, Result};
 use options::{NetworkOptions, TILE_FLAG};
@@ -71,7 +72,7 @@ pub(crate) fn method(
         "qbp-bm3d" => Ok((Box::new(Qbp::new(PostFilter::Bm3d)), String::new())),
         "qbp-refined" | FORMER_QBP_REFINED => Ok((Box::new(QbpRefined), String::new())),
         other => match Method::by_name(other) {
-            Some(method) => learned::restorer(method, options, capture.size()),
+            Some(method) => learned::restorer(method, options, acquisition, capture.size()),
             None => Err(CliError::new(
                 format!("no method named `{other}`"),
                 "--method",
@@ -107,7 +108,7 @@ pub(crate) fn usual_method(
     if !long_enough {
         return other("qbp-refined", format!("fewer than {MIN_FRAMES} frames"));
     }
-    match network::unknown_to_built_in(acquisition)? {
+    match trained::unknown_to_built_in(acquisition)? {
         Some(reason) => other("qbp-refined", reason),
         None => Ok(UsualMethod { name: "qudi", reason: None }),
     }

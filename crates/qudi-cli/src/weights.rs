@@ -100,7 +100,7 @@ mod tests {
         assert!(description.network.parameters(&device) <= 3_000_000);
         assert!(BUILT_IN.len() <= 8 << 20, "{} bytes", BUILT_IN.len());
         // What was learnt from is under licences that let weights be published (docs/model-card.md).
-        assert_eq!(description.licence, "MIT OR Apache-2.0");
+        assert_eq!(description.provenance.licence, "MIT OR Apache-2.0");
         assert_eq!(description.preset.as_deref(), Some("small"));
     }
 }

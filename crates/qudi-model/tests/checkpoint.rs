@@ -3,6 +3,7 @@
 
 use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
+use qudi_layers::Provenance;
 use qudi_model::checkpoint::{Description, ModelKind, Precision, describe, load, load_bytes, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
@@ -10,17 +11,19 @@ use std::path::{Path, PathBuf};
 
 fn description() -> Description {
     Description {
-        program: "qudi test".into(),
         preset: Some("tiny".into()),
         network: NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
             .unwrap(),
         window: 11,
-        sensors: vec!["qudi-paper".into()],
-        ppp: [3.25, 26.0],
-        data: vec!["nothing".into()],
-        steps: 0,
-        commit: None,
-        licence: "MIT OR Apache-2.0".into(),
+        provenance: Provenance {
+            program: "qudi test".into(),
+            sensors: vec!["qudi-paper".into()],
+            ppp: [3.25, 26.0],
+            data: vec!["nothing".into()],
+            steps: 0,
+            commit: None,
+            licence: "MIT OR Apache-2.0".into(),
+        },
         default_steps: None,
         kind: None,
         spacing: None,

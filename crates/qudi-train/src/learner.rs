@@ -12,7 +12,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
 use qudi_core::restorer::Restorer;
-use qudi_layers::parameter_shapes;
+use qudi_layers::{Provenance, parameter_shapes};
 use qudi_model::refinement::RefinementStage;
 use std::fmt::{Debug, Formatter};
 use std::path::Path;
@@ -137,4 +137,17 @@ pub struct Origin {
     pub steps: u64,
     /// The commit of the program.
     pub commit: Option<String>,
+}
+
+/// What weights of a recipe say of their training.
+fn provenance(recipe: &Recipe, origin: &Origin) -> Provenance {
+    Provenance {
+        program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
+        sensors: recipe.data.sensor_names(),
+        ppp: recipe.data.light(),
+        data: recipe.data.source_names(),
+        steps: origin.steps,
+        commit: origin.commit.clone(),
+        licence: recipe.train.licence.clone(),
+    }
 }

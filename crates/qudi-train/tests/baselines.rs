@@ -118,8 +118,11 @@ fn every_method_learns_and_restores() {
         let origin = qudi_train::Origin { steps: 2, commit: Some("abc".to_owned()) };
         trainer.averaged().save(&recipe, &origin, &path).unwrap();
         let description = describe(&path, &Device::flex()).unwrap().unwrap().description.unwrap();
-        assert_eq!((description.method.as_str(), description.steps), (name, 2));
-        assert_eq!((description.ppp, description.sensors[0].as_str()), ([2.0, 30.0], "qudi-paper"));
+        assert_eq!((description.method.as_str(), description.provenance.steps), (name, 2));
+        assert_eq!(
+            (description.provenance.ppp, description.provenance.sensors[0].as_str()),
+            ([2.0, 30.0], "qudi-paper")
+        );
         let mut read = LearnedRestorer::load(&path, method, &Device::flex()).unwrap();
         let mut own = trainer.averaged().restorer(&recipe, &Device::flex()).unwrap();
         let burst = BurstView { size, frames: &frames };

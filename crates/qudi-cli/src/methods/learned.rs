@@ -4,6 +4,7 @@ use crate::device;
 use crate::error::Result;
 use crate::memory::{available_bytes, check_tiles};
 use crate::methods::options::NetworkOptions;
+use crate::methods::trained::check;
 use crate::weights::{NAME, Weights, sha256};
 use burn::tensor::Device;
 use qudi_baselines::import::{
@@ -11,7 +12,7 @@ use qudi_baselines::import::{
 };
 use qudi_baselines::restorer::{LearnedRestorer, SMALLEST_TILE};
 use qudi_core::Size;
-use qudi_core::restorer::Restorer;
+use qudi_core::restorer::{Acquisition, Restorer};
 use std::fmt;
 use std::path::Path;
 
@@ -71,11 +72,16 @@ impl fmt::Display for LearnedWeights<'_> {
 pub(crate) fn restorer(
     method: Method,
     options: &NetworkOptions,
+    acquisition: &Acquisition,
     size: Size,
 ) -> Result<(Box<dyn Restorer>, String)> {
     let weights = options.weights_of(method)?;
     let device = device::open(&options.device)?;
-    let restorer = LearnedRestorer::of(weights.load(method, &device.device)?, &device.device);
+    let loaded = weights.load(method, &device.device)?;
+    if let Some(description) = &loaded.description {
+        check(&description.provenance, acquisition)?;
+    }
+    let restorer = LearnedRestorer::of(loaded, &device.device);
     let restorer = restorer.with_tile(options.tile)?;
     if device.is_processor() {
         let sides = [SMALLEST_TILE, options.tile];
@@ -96,7 +102,7 @@ mod tests {
             let contents = contents.unwrap_or_else(|| panic!("{method:?}: no learned method"));
             assert_eq!(contents.method, method);
             let description = contents.description.unwrap_or_else(|| panic!("{method:?}"));
-            assert_eq!(description.licence, "MIT OR Apache-2.0");
+            assert_eq!(description.provenance.licence, "MIT OR Apache-2.0");
             assert!(weights.load(method, &Device::flex()).is_ok());
         }
     }

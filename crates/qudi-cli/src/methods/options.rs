@@ -166,7 +166,7 @@ impl NetworkOptions {
         let Some(method) = Method::by_name(method) else { return Ok(None) };
         let contents = self.weights_of(method)?.describe()?;
         Ok(contents.and_then(|contents| {
-            let steps = contents.description?.steps;
+            let steps = contents.description?.provenance.steps;
             Some(format!("{}, {steps} steps", contents.sizes))
         }))
     }

@@ -3,31 +3,21 @@
 use super::ModelKind;
 use crate::config::NetworkConfig;
 use crate::diffusion::timesteps::TimestepSpacing;
+use qudi_layers::Provenance;
 use serde::{Deserialize, Serialize};
 
 /// The description of a weight file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Description {
-    /// The version of the program that wrote it.
-    pub program: String,
     /// The name of the preset, if the sizes are those of one.
     pub preset: Option<String>,
     /// The sizes of the network.
     pub network: NetworkConfig,
     /// The number of frames of a window in training.
     pub window: usize,
-    /// The sensors of the training data.
-    pub sensors: Vec<String>,
-    /// The least and most photons per pixel and frame of the training data.
-    pub ppp: [f64; 2],
-    /// The names of the training data.
-    pub data: Vec<String>,
-    /// Optimization steps.
-    pub steps: u64,
-    /// The commit of the program that trained it.
-    pub commit: Option<String>,
-    /// The licence of the weights.
-    pub licence: String,
+    /// What it was trained on.
+    #[serde(flatten)]
+    pub provenance: Provenance,
     /// Reverse diffusion steps unless the user says otherwise; 0 for regression. Older files do not say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default_steps: Option<usize>,

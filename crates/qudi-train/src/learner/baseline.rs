@@ -1,6 +1,6 @@
 //! The learned methods of others as they learn here.
 
-use super::{Context, CountBatch, Learner, Loss, Origin};
+use super::{Context, CountBatch, Learner, Loss, Origin, provenance};
 use crate::burst_cache::BurstSampler;
 use crate::parameters::gradients;
 use crate::recipe::Recipe;
@@ -64,15 +64,9 @@ impl Learner for Baseline {
 
     fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()> {
         let description = Description {
-            program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
             method: recipe.network.baseline()?.method().name().to_owned(),
             frames: recipe.sample_size().0,
-            sensors: recipe.data.sensor_names(),
-            ppp: recipe.data.light(),
-            data: recipe.data.source_names(),
-            steps: origin.steps,
-            commit: origin.commit.clone(),
-            licence: recipe.train.licence.clone(),
+            provenance: provenance(recipe, origin),
         };
         save(self.network(), &description, path, Overwrite::Yes)
     }

@@ -1,6 +1,6 @@
 //! The diffusion network as it learns.
 
-use super::{Batch, Context, Learner, Loss, Origin};
+use super::{Batch, Context, Learner, Loss, Origin, provenance};
 use crate::burst_cache::BurstSampler;
 use crate::loss::{LoopOptions, LossWeights, NoiseOn, SelfConditioning, loss_terms};
 use crate::recipe::{LearningPart, LossConfig, Recipe};
@@ -112,16 +112,10 @@ impl Learner for Qudi {
         let is_preset = |name: &str| NetworkConfig::preset(name).is_ok_and(|n| n == *network);
         let preset = PRESETS.iter().find(|(name, _)| is_preset(name));
         let description = Description {
-            program: format!("qudi {}", env!("CARGO_PKG_VERSION")),
             preset: preset.map(|(name, _)| (*name).to_owned()),
             network: network.clone(),
             window: recipe.data.frames.max(11),
-            sensors: recipe.data.sensor_names(),
-            ppp: recipe.data.light(),
-            data: recipe.data.source_names(),
-            steps: origin.steps,
-            commit: origin.commit.clone(),
-            licence: recipe.train.licence.clone(),
+            provenance: provenance(recipe, origin),
             default_steps: Some(recipe.default_steps()),
             spacing: Some(recipe.default_spacing()),
             kind: None,

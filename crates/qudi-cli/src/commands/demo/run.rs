@@ -8,6 +8,7 @@ use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::network;
+use crate::methods::trained::built_in_knows;
 use crate::places::Places;
 use crate::report::{Bar, Cell, Column, Output, Report, Table, json};
 use crate::settings::Settings;
@@ -94,7 +95,7 @@ pub(crate) fn run(
     ];
     let options = demo.network.options(demo.steps.steps);
     options.check_weights(&[])?;
-    if demo.network.own_weights().is_some() || network::built_in_knows(&acquisition)? {
+    if demo.network.own_weights().is_some() || built_in_knows(&acquisition)? {
         let (restorer, how) = network::restorer(&options, &acquisition, SIZE)?;
         methods.push(("QUDI", restorer, format!("the network{how}")));
     } else {

@@ -31,7 +31,7 @@ impl Contender {
     /// Its row at a light level, without scores.
     pub(super) fn row(&self, ppp: f64) -> Row {
         let (method, trained) = (self.method.clone(), self.trained.clone());
-        Row { method, trained, steps: self.steps, ppp, scores: Vec::new() }
+        Row { trained, steps: self.steps, ..Row::new(method, ppp) }
     }
 }
 
@@ -67,6 +67,8 @@ pub(super) struct Plan {
     pub(super) perceptual: Option<Rc<Perceptual>>,
     /// Whether the looks of frames are measured.
     pub(super) appearance: bool,
+    /// Whether methods whose weights are not for this light and sensor are left out, with the reason.
+    pub(super) leaves_out: bool,
     /// How a capture is read.
     pub(super) read: ReadOptions,
     /// How many frames are summed, if that is said.
@@ -132,6 +134,7 @@ impl Plan {
             pictures: args.html.is_some(),
             perceptual,
             appearance: args.appearance,
+            leaves_out: args.table1,
             read: args.reading.options(MaskChoice::Auto),
             sum: args.reading.sum(),
             overwrite,

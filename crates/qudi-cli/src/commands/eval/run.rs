@@ -3,15 +3,17 @@
 use super::args::{Eval, External, Protocol};
 use super::capture::{Evaluation, evaluate_capture};
 use super::clip::Clip;
+use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
-use super::html::html;
+use super::html::{Pictures, html};
 use super::plan::Plan;
-use super::score::{Figure, FlowKind, LOOKS, Row};
+use super::score::{Figure, FlowKind, LOOKS, Row, Score};
 use super::table::{frames, looks, summary};
 use super::table1;
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
+use crate::methods::trained::refusal;
 use crate::places::Places;
 use crate::report::{Output, Report, csv, markdown};
 use crate::settings::Settings;
@@ -76,9 +78,11 @@ pub(crate) fn run(
     let text = format!("{}\n{}{about}\n", table.to_text(), shown.collect::<String>());
     report.result(&text, || document(settings, &rows))?;
     let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
+    // What is no number passes no bar.
+    let misses =
+        |row: &Row, bar: f64| row.refused.is_none() && (psnr_a(row).is_nan() || psnr_a(row) < bar);
     match args.min_psnr {
-        // What is no number passes no bar.
-        Some(bar) => match rows.iter().find(|row| psnr_a(row).is_nan() || psnr_a(row) < bar) {
+        Some(bar) => match rows.iter().find(|row| misses(row, bar)) {
             Some(row) => Err(CliError::Missed(format!(
                 "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
                 row.label(),
@@ -135,30 +139,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
             if plan.pictures {
                 pictures.push(exposed.pictures());
             }
-            let mut scores = Vec::with_capacity(each);
-            let mut fewest: Option<Vec<Frame>> = None;
-            for contender in &plan.contenders {
-                scores.push(match plan.protocol {
-                    Protocol::Strict => {
-                        let (score, frames) =
-                            exposed.score_method(contender, plan, fewest.as_deref())?;
-                        if contender.steps.is_some() {
-                            fewest.get_or_insert(frames);
-                        }
-                        score
-                    }
-                    Protocol::Quiver => exposed.score_windows(contender)?,
-                });
-            }
-            for external in &plan.external {
-                scores.push(exposed.score_external(external)?);
-            }
-            for (row, score) in rows[j * each..].iter_mut().zip(scores) {
-                if let Some(pictures) = pictures.last_mut() {
-                    pictures.add(&row.label(), &score);
-                }
-                row.scores.push(score);
-            }
+            score_all(plan, &exposed, &mut rows[j * each..][..each], pictures.last_mut())?;
         }
     }
     drop(bar);
@@ -194,6 +175,46 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     Ok(Evaluation { rows, pictures, about, settings })
 }
 
+/// Adds the scores of every method on a clip to the rows of its light level, and the pictures to the others of it.
+fn score_all(
+    plan: &Plan,
+    clip: &ExposedClip,
+    rows: &mut [Row],
+    mut pictures: Option<&mut Pictures>,
+) -> Result<()> {
+    let mut add = |row: &mut Row, score: Score| {
+        if let Some(pictures) = &mut pictures {
+            pictures.add(&row.label(), &score);
+        }
+        row.scores.push(score);
+    };
+    let mut fewest: Option<Vec<Frame>> = None;
+    let (own, others) = rows.split_at_mut(plan.contenders.len());
+    for (contender, row) in plan.contenders.iter().zip(own) {
+        if plan.leaves_out {
+            row.refused = refusal(&contender.method, &contender.network, &clip.acquisition)?;
+            if row.refused.is_some() {
+                continue;
+            }
+        }
+        let score = match plan.protocol {
+            Protocol::Strict => {
+                let (score, frames) = clip.score_method(contender, plan, fewest.as_deref())?;
+                if contender.steps.is_some() {
+                    fewest.get_or_insert(frames);
+                }
+                score
+            }
+            Protocol::Quiver => clip.score_windows(contender)?,
+        };
+        add(row, score);
+    }
+    for (external, row) in plan.external.iter().zip(others) {
+        add(row, clip.score_external(external)?);
+    }
+    Ok(())
+}
+
 /// What is not known is left out.
 fn document(mut settings: Value, rows: &[Row]) -> Value {
     let row = |row: &Row| {
@@ -207,6 +228,7 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
             "trained": row.trained,
             "steps": row.steps,
             "ppp": row.ppp,
+            "refused": row.refused,
             "psnr_a": of(|f| f.psnr_a),
             "psnr": of(|f| f.psnr),
             "ssim": of(|f| f.ssim),

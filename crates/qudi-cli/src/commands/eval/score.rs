@@ -126,6 +126,8 @@ pub(crate) struct Row {
     /// Its diffusion steps, where several numbers of them are compared.
     pub(crate) steps: Option<usize>,
     pub(crate) ppp: f64,
+    /// Why it was not run, if it was not.
+    pub(crate) refused: Option<String>,
     /// One per clip.
     pub(crate) scores: Vec<Score>,
 }
@@ -133,7 +135,7 @@ pub(crate) struct Row {
 impl Row {
     /// The row of a method without weights of its own, without scores.
     pub(crate) fn new(method: String, ppp: f64) -> Self {
-        Self { method, trained: None, steps: None, ppp, scores: Vec::new() }
+        Self { method, trained: None, steps: None, ppp, refused: None, scores: Vec::new() }
     }
 
     /// The method, and its steps where they are compared.

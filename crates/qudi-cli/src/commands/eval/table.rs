@@ -27,7 +27,7 @@ pub(crate) fn summary(rows: &[Row]) -> Table {
         Column::new("seconds_per_frame", "s/frame"),
         Column::new("peak_mib", "peak").with_unit("MiB"),
     ]);
-    table.rows = rows.iter().map(cells).collect();
+    table.rows = rows.iter().filter(|row| row.refused.is_none()).map(cells).collect();
     table.without_unknown_columns()
 }
 
@@ -87,7 +87,7 @@ fn appearance(rows: &[Row]) -> Option<Table> {
         let first = [Cell::text(row.name()), steps(row), light(row)];
         first.into_iter().chain(LOOKS.iter().map(mean)).collect()
     };
-    table.rows = rows.iter().map(cells).collect();
+    table.rows = rows.iter().filter(|row| row.refused.is_none()).map(cells).collect();
     Some(table.without_unknown_columns())
 }
 

@@ -42,7 +42,7 @@ pub(super) fn methods(network: &NetworkOptions) -> Vec<String> {
     names.map(str::to_owned).collect()
 }
 
-/// The table; methods without weights say so. The paper's figures stand there if the light is the paper's.
+/// The table; methods without weights for this light and sensor say so. The paper's figures stand there if the light is the paper's.
 pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
     let mut table = Table::new(vec![
         Column::new("method", "method"),
@@ -75,10 +75,11 @@ pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
                     Cell::number(row.and_then(|row| row.over_clips(figure)).map(|s| s.mean), digits)
                 };
                 let note = match row {
-                    Some(row) => match &row.trained {
-                        Some(trained) => Cell::text(format!("trained here: {trained}")),
-                        None => Cell::Unknown,
-                    },
+                    Some(Row { refused: Some(reason), .. }) => Cell::text(reason.clone()),
+                    Some(Row { trained: Some(trained), .. }) => {
+                        Cell::text(format!("trained here: {trained}"))
+                    }
+                    Some(_) => Cell::Unknown,
                     None => Cell::text(format!("no weights: --weights {method}=FILE")),
                 };
                 table.rows.push(vec![

@@ -13,6 +13,7 @@ use qudi_baselines::import::{Contents, METHODS, Method, describe};
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
+use qudi_layers::Provenance;
 use qudi_model::checkpoint::ModelKind;
 use serde_json::json;
 use std::fmt::Write;
@@ -111,58 +112,60 @@ fn sensors(report: &Report) -> Result<()> {
 /// A weight file, as it describes itself.
 fn weights(weights: &Weights, report: &Report) -> Result<()> {
     let d = weights.describe()?;
-    let mut text = String::new();
-    let mut line = |key: &str, value: String| {
-        let _ = writeln!(text, "{key:<12}{value}");
-    };
     let sizes = d.network.parameters(&Device::flex());
-    line("network", format!("{}, {sizes} parameters", d.preset.as_deref().unwrap_or("own sizes")));
-    line("window", format!("{} frames", d.window));
-    line("sensors", d.sensors.join(", "));
-    line("light", format!("{} to {} photons per pixel and frame", d.ppp[0], d.ppp[1]));
-    line("trained", format!("{} steps on {}", d.steps, d.data.join(", ")));
-    line(
-        "made by",
-        d.program.clone() + &d.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}")),
-    );
     let kind = match d.kind {
         Some(ModelKind::Regression) => "regression",
         _ => "diffusion, or regression with --steps 0",
     };
-    line("restores by", format!("{kind}; {} steps by default", d.reverse_steps()));
-    line("licence", d.licence.clone());
-    line("sha-256", weights.sha256()?);
-    report.result(&text, || json!(weights.describe().ok()))
+    let preset = d.preset.as_deref().unwrap_or("own sizes");
+    let mut lines = vec![
+        ("network", format!("{preset}, {sizes} parameters")),
+        ("window", format!("{} frames", d.window)),
+        ("restores by", format!("{kind}; {} steps by default", d.reverse_steps())),
+    ];
+    lines.extend(provenance(&d.provenance));
+    lines.push(("sha-256", weights.sha256()?));
+    report.result(&to_text(&lines), || json!(weights.describe().ok()))
+}
+
+/// What weights were trained on.
+fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
+    let commit = p.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}"));
+    let [least, most] = p.ppp;
+    [
+        ("sensors", p.sensors.join(", ")),
+        ("light", format!("{least} to {most} photons per pixel and frame")),
+        ("trained", format!("{} steps on {}", p.steps, p.data.join(", "))),
+        ("made by", p.program.clone() + &commit),
+        ("licence", p.licence.clone()),
+    ]
+}
+
+/// Lines of keys and values.
+fn to_text(lines: &[(&str, String)]) -> String {
+    let mut text = String::new();
+    for (key, value) in lines {
+        let _ = writeln!(text, "{key:<12}{value}");
+    }
+    text
 }
 
 /// A weight file of a learned method of others.
 fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
     let Contents { method, sizes, parameters, description } = contents;
     let sha256 = Weights::File(path.to_owned()).sha256()?;
-    let mut text = String::new();
     let name = method.name();
     let mut lines =
         vec![("network", format!("{name}, {parameters} parameters")), ("sizes", sizes.clone())];
     if let Some(d) = description {
-        let commit = d.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}"));
-        let [least, most] = d.ppp;
-        lines.extend([
-            ("bursts", format!("{} frames", d.frames)),
-            ("sensors", d.sensors.join(", ")),
-            ("light", format!("{least} to {most} photons per pixel and frame")),
-            ("trained", format!("{} steps on {}", d.steps, d.data.join(", "))),
-            ("made by", d.program.clone() + &commit),
-            ("licence", d.licence.clone()),
-        ]);
+        lines.push(("bursts", format!("{} frames", d.frames)));
+        lines.extend(provenance(&d.provenance));
     }
     lines.extend([
         ("use", format!("--method {name} --weights {name}={}", path.display())),
         ("sha-256", sha256.clone()),
     ]);
-    for (key, value) in &lines {
-        let _ = writeln!(text, "{key:<12}{value}");
-    }
-    report.result(&text, || {
+    report.result(&to_text(&lines), || {
         let mut document =
             json!({"method": name, "parameters": parameters, "sizes": sizes, "sha256": sha256});
         if let Some(description) = description {
