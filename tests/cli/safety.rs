@@ -126,7 +126,11 @@ fn rejects_flags_of_another_method() {
     let folder = prepared("safety-flags");
     for flag in ["--steps 3", "--tile 64", "--samples 2", "--device cpu", "--spacing linear"] {
         let name = flag.split(' ').next().unwrap();
-        let expected = [name, "is for method qudi"];
+        let whose = match name {
+            "--tile" | "--device" => "is for networks",
+            _ => "is for method qudi",
+        };
+        let expected = [name, whose];
         refused(&folder, &format!("restore b.npy --method average -o o {flag}"), &expected);
         refused(&folder, &format!("eval fr --method average,mle {flag}"), &expected);
         refused(&folder, &format!("bench --size 16x16 --method average {flag}"), &expected);

@@ -117,7 +117,8 @@ impl NetworkOptions {
         match (self.own_flag, self.network_flag) {
             (Some(flag), _) if !is_own => Err(other_method(flag)),
             (None, Some(flag)) if !is_own && !methods.iter().any(is_learned) => {
-                Err(other_method(flag))
+                let help = "leave it out, or use --method qudi";
+                Err(CliError::new(format!("{flag} is for networks"), flag, help))
             }
             _ => Ok(()),
         }
@@ -184,7 +185,7 @@ impl NetworkOptions {
     }
 }
 
-/// A flag of the network beside another method.
+/// A flag of the method `qudi` beside another method.
 pub(crate) fn other_method(flag: &str) -> CliError {
     CliError::new(
         format!("{flag} is for method {METHOD}"),
