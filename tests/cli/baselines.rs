@@ -54,6 +54,9 @@ fn emvd_trains_resumes_restores_and_says_what_it_is() {
     let table = run(&folder, &format!("{clip} --table1 {weights}"));
     assert!(table.contains("trained here: 4 channels, 4 steps"), "{table}");
 
+    let small = format!("restore b.npy --method emvd {weights} --tile 32 -o s");
+    refused(&folder, &small, &["tiles of 32 pixels", "emvd needs at least 64"]);
+
     // What they have not learnt: counts of one bit.
     run(
         &folder,

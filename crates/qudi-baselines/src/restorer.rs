@@ -10,8 +10,8 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Result, Size};
-use qudi_layers::Tiling;
 use qudi_layers::tensor::to_tensor;
+use qudi_layers::{TILE, Tiling, mirrored};
 use std::collections::VecDeque;
 use std::ops::Range;
 use std::path::Path;
@@ -21,9 +21,6 @@ pub use brightness::ExpectedCounts;
 /// Frames that are restored at once, and of EMVD, whose recurrence starts anew with every window.
 const FRAMES: usize = 11;
 const MANY_FRAMES: usize = 64;
-
-/// The default side of tiles, in pixels.
-pub const TILE: usize = 512;
 
 /// The side of the smallest tiles, in pixels: a multiple of what every network needs.
 pub const SMALLEST_TILE: usize = 64;
@@ -253,11 +250,4 @@ impl Restorer for LearnedRestorer {
         }
         Ok(Restored { frames, std: None })
     }
-}
-
-/// The frame at a place, mirrored at both ends: the ends themselves are not repeated.
-fn mirrored(place: i64, count: usize) -> usize {
-    let period = (2 * count as i64 - 2).max(1);
-    let place = place.rem_euclid(period);
-    (if place < count as i64 { place } else { period - place }) as usize
 }

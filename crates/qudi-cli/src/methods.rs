@@ -6,7 +6,7 @@ pub(crate) mod options;
 pub(crate) mod trained;
 
 use crate::error::{CliError, Result};
-use options::{NetworkOptions, TILE_FLAG};
+use options::NetworkOptions;
 use qudi_baselines::import::Method;
 use qudi_burst::{Average, Mle, PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
@@ -98,7 +98,7 @@ pub(crate) fn usual_method(
     options.check_weights(&[])?;
     let long_enough = capture.length().is_none_or(|frames| frames >= MIN_FRAMES as u64);
     let other = |name, reason| Ok(UsualMethod { name, reason: Some(reason) });
-    if options.own_flag.is_some() || options.network_flag == Some(TILE_FLAG) {
+    if options.own_flag.or(options.tile_flag).is_some() {
         return Ok(UsualMethod { name: "qudi", reason: None });
     }
     if acquisition.sensor.dark_per_frame().is_err() {

@@ -25,4 +25,4 @@ pub use linear::Linear;
 pub use parameters::{init_parameters, parameter_shapes, zeros};
 pub use provenance::Provenance;
 pub use state_dict::StateDict;
-pub use tiling::{Tiles, Tiling};
+pub use tiling::{TILE, Tiles, Tiling, mirrored};

@@ -9,6 +9,16 @@ use qudi_core::{Frame, Result, Size};
 
 pub use tiles::Tiles;
 
+/// The default side of tiles, in pixels.
+pub const TILE: usize = 512;
+
+/// The place in a row of `count` that a place beyond its ends is mirrored to: the ends themselves are not repeated.
+pub fn mirrored(place: i64, count: usize) -> usize {
+    let period = (2 * count as i64 - 2).max(1);
+    let place = place.rem_euclid(period);
+    (if place < count as i64 { place } else { period - place }) as usize
+}
+
 /// How images of one size are padded and cut into tiles.
 #[derive(Debug)]
 pub struct Tiling {
@@ -36,18 +46,13 @@ impl Tiling {
     /// Mirrors images at their lower and right edges.
     pub fn padded(&self, images: &[f32]) -> Vec<f32> {
         let Self { from, size, .. } = self;
-        // 0 1 2 3 2 1 0 1 2 ...: the edge itself is not repeated.
-        let mirror = |place: usize, length: usize| {
-            let period = (2 * length - 2).max(1);
-            let place = place % period;
-            if place < length { place } else { period - place }
-        };
         let mut values = Vec::with_capacity(images.len() / from.pixels() * size.pixels());
         for image in images.chunks_exact(from.pixels()) {
             for y in 0..size.height {
-                let row = &image[mirror(y, from.height) * from.width..][..from.width];
+                let row = &image[mirrored(y as i64, from.height) * from.width..][..from.width];
                 values.extend_from_slice(row);
-                values.extend((from.width..size.width).map(|x| row[mirror(x, from.width)]));
+                let beyond = from.width..size.width;
+                values.extend(beyond.map(|x| row[mirrored(x as i64, from.width)]));
             }
         }
         values

@@ -12,15 +12,13 @@ use burn::tensor::Device;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Result};
 use qudi_kernels::{ComputePrecision, with_precision};
+use qudi_layers::TILE;
 
 pub use diffusion::DiffusionRestorer;
 pub use regression::RegressionRestorer;
 
 /// The fewest frames of a window that the temporal fusion can use.
 pub const MIN_FRAMES: usize = 3;
-
-/// The default side of the tiles that networks see, in pixels.
-pub const TILE: usize = 512;
 
 /// How to sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,14 +1,14 @@
 //! Options of commands that may run the network.
 
 use super::number;
-use crate::methods::options::{DEVICE_FLAG, NetworkOptions, TILE_FLAG};
+use crate::methods::options::NetworkOptions;
 use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_baselines::import::{METHODS, Method};
+use qudi_layers::TILE;
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
-use qudi_model::restorer::TILE;
 use std::path::{Path, PathBuf};
 
 /// The network, for the method `qudi`.
@@ -81,10 +81,8 @@ impl Network {
                 (self.samples.is_some(), "--samples"),
                 (self.precision.is_some(), "--precision"),
             ]),
-            network_flag: first(&[
-                (self.tile.is_some(), TILE_FLAG),
-                (self.device.is_some(), DEVICE_FLAG),
-            ]),
+            tile_flag: self.tile.is_some().then_some("--tile"),
+            device_flag: self.device.is_some().then_some("--device"),
             diffusion_flag: first(&[
                 (self.spacing.is_some(), "--spacing"),
                 (self.sampler.is_some(), "--sampler"),

@@ -13,10 +13,6 @@ use std::path::PathBuf;
 /// The method that these options belong to.
 const METHOD: &str = "qudi";
 
-/// The flags that are about any network.
-pub(crate) const TILE_FLAG: &str = "--tile";
-pub(crate) const DEVICE_FLAG: &str = "--device";
-
 /// Options of the network.
 #[derive(Clone, Debug)]
 pub(crate) struct NetworkOptions {
@@ -42,8 +38,10 @@ pub(crate) struct NetworkOptions {
     pub(crate) precision: Option<ComputePrecision>,
     /// The first flag given that is about the method `qudi` alone.
     pub(crate) own_flag: Option<&'static str>,
-    /// The first flag given that is about any network.
-    pub(crate) network_flag: Option<&'static str>,
+    /// `--tile`, if given: for any network, as the next one.
+    pub(crate) tile_flag: Option<&'static str>,
+    /// `--device`, if given.
+    pub(crate) device_flag: Option<&'static str>,
     /// The first flag given that is about diffusion steps.
     pub(crate) diffusion_flag: Option<&'static str>,
 }
@@ -114,7 +112,7 @@ impl NetworkOptions {
         self.check_weights(&methods)?;
         let is_own = methods.contains(&METHOD);
         let is_learned = |method: &&str| Method::by_name(method).is_some();
-        match (self.own_flag, self.network_flag) {
+        match (self.own_flag, self.tile_flag.or(self.device_flag)) {
             (Some(flag), _) if !is_own => Err(other_method(flag)),
             (None, Some(flag)) if !is_own && !methods.iter().any(is_learned) => {
                 let help = "leave it out, or use --method qudi";

@@ -79,9 +79,14 @@ fn unknown(provenance: &Provenance, acquisition: &Acquisition, tolerated: f64) -
     })
 }
 
+/// Why weights are not for a capture: it is far outside what they were trained for.
+pub(crate) fn refusal(provenance: &Provenance, acquisition: &Acquisition) -> Option<String> {
+    unknown(provenance, acquisition, TOLERATED)
+}
+
 /// Refuses a capture far outside what the weights were trained for.
 pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Result<()> {
-    let Some(what) = unknown(provenance, acquisition, TOLERATED) else { return Ok(()) };
+    let Some(what) = refusal(provenance, acquisition) else { return Ok(()) };
     Err(CliError::new(
         what,
         "--weights",
@@ -89,21 +94,16 @@ pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Resul
     ))
 }
 
-/// Why the weights of a method are not for such a capture, if they are not; nothing is known of authors' weights.
-pub(crate) fn refusal(
-    method: &str,
-    options: &NetworkOptions,
-    acquisition: &Acquisition,
-) -> Result<Option<String>> {
-    let provenance = match Method::by_name(method) {
+/// What the weights of a method were trained on; nothing is known of authors' weights.
+pub(crate) fn provenance(method: &str, options: &NetworkOptions) -> Result<Option<Provenance>> {
+    Ok(match Method::by_name(method) {
         Some(method) => {
             let contents = options.weights_of(method)?.describe()?;
             contents.and_then(|contents| contents.description).map(|d| d.provenance)
         }
         None if method == "qudi" => Some(options.weights.describe()?.provenance),
         None => None,
-    };
-    Ok(provenance.and_then(|provenance| unknown(&provenance, acquisition, TOLERATED)))
+    })
 }
 
 #[cfg(test)]

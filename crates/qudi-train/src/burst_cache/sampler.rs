@@ -166,7 +166,7 @@ impl BurstSampler {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use qudi_model::restorer::TILE;
+    use qudi_layers::TILE;
 
     fn recipe(crops: &str) -> Recipe {
         let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.crops", crops)];

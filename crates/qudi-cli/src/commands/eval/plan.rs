@@ -8,11 +8,13 @@ use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
 use crate::device;
 use crate::error::{CliError, Result};
-use crate::methods::options::{DEVICE_FLAG, NetworkOptions};
+use crate::methods::options::NetworkOptions;
+use crate::methods::trained::provenance;
 use crate::methods::{METHODS, is_method};
 use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::capture::{MaskChoice, ReadOptions};
+use qudi_layers::Provenance;
 use std::path::PathBuf;
 use std::rc::Rc;
 
@@ -22,6 +24,8 @@ pub(super) struct Contender {
     pub(super) method: String,
     /// Its weights, if it is a learned method of others that was trained here.
     pub(super) trained: Option<String>,
+    /// What its weights were trained on, where it is left out of what they do not know.
+    pub(super) provenance: Option<Provenance>,
     /// Its diffusion steps, where there are several numbers of them to compare.
     pub(super) steps: Option<usize>,
     pub(super) network: NetworkOptions,
@@ -67,8 +71,6 @@ pub(super) struct Plan {
     pub(super) perceptual: Option<Rc<Perceptual>>,
     /// Whether the looks of frames are measured.
     pub(super) appearance: bool,
-    /// Whether methods whose weights are not for this light and sensor are left out, with the reason.
-    pub(super) leaves_out: bool,
     /// How a capture is read.
     pub(super) read: ReadOptions,
     /// How many frames are summed, if that is said.
@@ -96,11 +98,11 @@ impl Plan {
         let mut network = args.network.options(steps.first().copied());
         if args.backbones.is_some() {
             // LPIPS is computed there, too.
-            network.network_flag = network.network_flag.filter(|&flag| flag != DEVICE_FLAG);
+            network.device_flag = None;
         }
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
         network.check_methods(methods.iter().map(String::as_str))?;
-        let contenders = contenders(&methods, &network, &steps)?;
+        let contenders = contenders(&methods, &network, &steps, args.table1)?;
         let mut own = contenders.iter().filter(|contender| contender.method == "qudi");
         own.try_for_each(|contender| contender.network.check_steps())?;
         if args.table1 && args.protocol == Protocol::Quiver {
@@ -134,7 +136,6 @@ impl Plan {
             pictures: args.html.is_some(),
             perceptual,
             appearance: args.appearance,
-            leaves_out: args.table1,
             read: args.reading.options(MaskChoice::Auto),
             sum: args.reading.sum(),
             overwrite,
@@ -217,13 +218,15 @@ fn contenders(
     methods: &[String],
     network: &NetworkOptions,
     steps: &[usize],
+    leaves_out: bool,
 ) -> Result<Vec<Contender>> {
     let mut contenders = Vec::new();
     for method in methods {
         let trained = network.trained_here(method)?;
-        let network = network.clone();
-        let plain = Contender { method: method.clone(), trained, steps: None, network };
-        if method == "qudi" && steps.len() > 1 {
+        let provenance = if leaves_out { provenance(method, network)? } else { None };
+        let (method, network) = (method.clone(), network.clone());
+        let plain = Contender { method, trained, provenance, steps: None, network };
+        if plain.method == "qudi" && steps.len() > 1 {
             contenders.extend(steps.iter().map(|&steps| Contender {
                 steps: Some(steps),
                 network: NetworkOptions { steps: Some(steps), ..plain.network.clone() },

@@ -191,11 +191,10 @@ fn score_all(
     let mut fewest: Option<Vec<Frame>> = None;
     let (own, others) = rows.split_at_mut(plan.contenders.len());
     for (contender, row) in plan.contenders.iter().zip(own) {
-        if plan.leaves_out {
-            row.refused = refusal(&contender.method, &contender.network, &clip.acquisition)?;
-            if row.refused.is_some() {
-                continue;
-            }
+        let provenance = contender.provenance.as_ref();
+        row.refused = provenance.and_then(|provenance| refusal(provenance, &clip.acquisition));
+        if row.refused.is_some() {
+            continue;
         }
         let score = match plan.protocol {
             Protocol::Strict => {
