@@ -4,7 +4,7 @@
 mod pwcnet;
 mod splat;
 
-use crate::parts::{Corners, Residual, bursts_of, frame, masked_warp, renamed, resize, same_flow};
+use crate::parts::{Corners, Residual, masked_warp, renamed, resize, same_flow};
 use burn::module::Module;
 use burn::tensor::activation::relu;
 use burn::tensor::ops::PadMode;
@@ -12,7 +12,6 @@ use burn::tensor::{Device, Tensor};
 use pwcnet::PwcNet;
 use qudi_layers::{Bias, Conv2d};
 use serde::{Deserialize, Serialize};
-use std::collections::VecDeque;
 
 pub use pwcnet::correlation;
 pub use splat::splat_average;
@@ -109,11 +108,6 @@ impl FloRnn {
         }
     }
 
-    /// Frames that it looks ahead.
-    pub fn ahead(&self) -> usize {
-        self.ahead
-    }
-
     /// Channels of images.
     pub fn channels(&self) -> usize {
         self.channels
@@ -148,65 +142,54 @@ impl FloRnn {
         Some(resize(flow, size, Corners::Edges) * scale)
     }
 
-    /// Restores every frame of bursts. Training knows the second frame alone.
-    ///
-    /// # Shapes
-    /// - x, result: `[bursts * frames, channels, height, width]`; more frames than it looks ahead
-    pub fn forward(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
-        self.first_frames(&x, frames, frames)
+    /// The flows from each frame to the next; none of a network without PWC-Net.
+    pub fn flows(&self, frames: &[Tensor<4>]) -> Vec<Tensor<4>> {
+        frames.windows(2).filter_map(|pair| self.flow(&pair[0], &pair[1])).collect()
     }
 
-    /// Restores the second frame of bursts, which training learns from, and the first on the way.
-    ///
-    /// # Shapes
-    /// - x: `[bursts * frames, channels, height, width]`; at least two frames more than it looks ahead
-    /// - result: `[bursts * 2, channels, height, width]`
-    pub fn forward_to_second(&self, x: &Tensor<4>, frames: usize) -> Tensor<4> {
-        self.first_frames(x, frames, 2)
+    /// How many frames it sees to restore the second of them.
+    pub fn window(&self) -> usize {
+        self.ahead + 2
     }
 
-    /// Restores the first `count` frames of bursts.
-    fn first_frames(&self, x: &Tensor<4>, frames: usize, count: usize) -> Tensor<4> {
-        let [images, _, height, width] = x.dims();
+    /// Restores the second frame of a window.
+    ///
+    /// # Shapes
+    /// - window: [`window`](Self::window) frames, `[images, channels, height, width]` each
+    /// - flows: those from each frame to the next, as [`flow`](Self::flow) finds them; none of a network without
+    ///   PWC-Net
+    /// - result: `[images, channels, height, width]`
+    pub fn forward(&self, window: &[Tensor<4>], flows: &[Tensor<4>]) -> Tensor<4> {
+        let [images, _, height, width] = window[0].dims();
         let strip = [height, width].map(|side| (self.border * side as f64) as usize);
         let around = [(0, 0), (0, 0), (strip[0], strip[0]), (strip[1], strip[1])];
         let expand = |image: Tensor<4>| image.pad(around, PadMode::Constant(0.0));
         let crop = |image: Tensor<4>| image.narrow(2, strip[0], height).narrow(3, strip[1], width);
-        // Reflected at the last frame.
-        let order = (0..frames).chain((0..self.ahead).map(|i| frames - 2 - i));
-        let video: Vec<_> = order.map(|t| frame(x, frames, t)).collect();
-        let ones = Tensor::ones([1, 1, height, width], &x.device());
-        let outside = expand(ones).neg() + 1.0;
-        let state = Tensor::zeros([images / frames, self.features, height, width], &x.device());
-        let mut backward = self.backward_rnn.forward(&video[0], state.clone());
-        let mut forward = self.forward_rnn.forward(&video[0], state);
-        let mut queue: VecDeque<(Tensor<4>, Tensor<4>)> = VecDeque::new();
-        let mut outputs = Vec::with_capacity(count);
-        for i in 1..count + self.ahead {
-            if let Some(flow) = self.flow(&video[i - 1], &video[i]).map(expand) {
+        let device = window[0].device();
+        let state = Tensor::zeros([images, self.features, height, width], &device);
+        let mut backward = self.backward_rnn.forward(&window[0], state.clone());
+        let mut along = Vec::with_capacity(flows.len());
+        for (number, image) in window.iter().enumerate().skip(1) {
+            if let Some(flow) = flows.get(number - 1) {
+                let flow = expand(flow.clone());
                 let splatted = splat_average(expand(backward), flow.clone());
-                queue.push_back((splatted.clone(), flow));
-                backward = crop(splatted);
+                backward = crop(splatted.clone());
+                along.push((splatted, flow));
             }
-            backward = self.backward_rnn.forward(&video[i], backward);
-            if i < self.ahead {
-                continue;
-            }
-            let mimicked = queue.iter().rev().fold(backward.clone(), |state, (around, flow)| {
-                let whole = around.clone() * outside.clone() + expand(state);
-                crop(masked_warp(whole, flow.clone()))
-            });
-            outputs.push(self.d.forward(forward.clone(), mimicked));
-            let next = i - self.ahead + 1;
-            if next < count {
-                if let Some(flow) = self.flow(&video[next], &video[next - 1]) {
-                    forward = masked_warp(forward, flow);
-                }
-                forward = self.forward_rnn.forward(&video[next], forward);
-            }
-            queue.pop_front();
+            backward = self.backward_rnn.forward(image, backward);
         }
-        bursts_of(outputs)
+        // Back along the flow, from the last frame to the second.
+        let ones = Tensor::ones([1, 1, height, width], &device);
+        let outside = expand(ones).neg() + 1.0;
+        let mimicked = along.iter().skip(1).rev().fold(backward, |state, (around, flow)| {
+            let whole = around.clone() * outside.clone() + expand(state);
+            crop(masked_warp(whole, flow.clone()))
+        });
+        let mut forward = self.forward_rnn.forward(&window[0], state);
+        if let Some(flow) = self.flow(&window[1], &window[0]) {
+            forward = masked_warp(forward, flow);
+        }
+        self.d.forward(self.forward_rnn.forward(&window[1], forward), mimicked)
     }
 }
 

@@ -378,15 +378,15 @@ fn flornn_matches_pytorch() {
         let network = weighted(network, &case, "", FloRnn::authors_name);
         let x: Tensor<5> = case.input("x", &device).require_grad();
         let frames = x.dims()[1];
-        let images = network.forward(folded(&x), frames);
+        let window: Vec<_> = (0..frames).map(|t| frame_of(&folded(&x), frames, t)).collect();
+        let image = network.forward(&window, &network.flows(&window));
         let loss = if case.name == "loss" {
             let truth: Tensor<5> = case.input("truth", &device);
-            let second = |images: &Tensor<4>| frame_of(images, frames, 1);
-            let loss = flornn::loss(second(&images), second(&folded(&truth)));
+            let loss = flornn::loss(image, frame_of(&folded(&truth), frames, 1));
             case.check_output("loss", loss.clone());
             loss
         } else {
-            sum(&case, &[("y", images)])
+            sum(&case, &[("y", image)])
         };
         let gradients = loss.backward();
         case.check_gradient("x", x.grad(&gradients).unwrap());

@@ -2,6 +2,7 @@
 
 mod brightness;
 
+use crate::flornn::FloRnn;
 use crate::import::{Loaded, Method, Network, load};
 use crate::sizes::Sizes;
 use crate::spk2imgnet::{Block, Spk2ImgNet};
@@ -99,7 +100,7 @@ impl LearnedRestorer {
         match &self.network {
             Network::Quiver(network) => network.reach().into(),
             Network::Emvd(_) => [HISTORY, 0],
-            Network::FloRnn(network) => [1, network.ahead() + 1],
+            Network::FloRnn(network) => [1, network.window() - 2],
             Network::Spk2ImgNet(_) => {
                 [spk2imgnet::RESTORED, spk2imgnet::FRAMES - 1 - spk2imgnet::RESTORED]
             }
@@ -134,10 +135,7 @@ impl LearnedRestorer {
                 split(network.forward(Tensor::cat(around, 0), frames).full, 0)
             }
             Network::Emvd(network) => network.restore(around).into_iter().skip(before).collect(),
-            Network::FloRnn(network) => {
-                let (frames, channels) = (around.len(), network.channels());
-                split(network.forward(copies(around, channels), frames), before)
-            }
+            Network::FloRnn(network) => self.second_frames(network, &around)?,
             Network::Spk2ImgNet(network) => self.by_blocks(network, &around)?,
             Network::MemDeblur(network) => {
                 let images = copies(frames.to_vec(), network.channels());
@@ -174,6 +172,23 @@ impl LearnedRestorer {
                 std::array::from_fn(|number| &blocks[number * spk2imgnet::BLOCK]);
             images.push(network.image(window) / spk2imgnet::SCALE);
             blocks.pop_front();
+        }
+        Ok(images)
+    }
+
+    /// The second frame of every window of frames; the flow from a frame to the next is found once.
+    fn second_frames(&self, network: &FloRnn, frames: &[Tensor<4>]) -> Result<Vec<Tensor<4>>> {
+        let copies = |frame: &Tensor<4>| frame.clone().repeat(&[1, network.channels(), 1, 1]);
+        let frames: Vec<_> = frames.iter().map(copies).collect();
+        let windows = frames.windows(network.window());
+        let total = windows.len();
+        let mut flows = Vec::new();
+        let mut images = Vec::with_capacity(total);
+        for (done, window) in windows.enumerate() {
+            progress(self.method().name(), done, total)?;
+            flows.extend(network.flows(&window[flows.len()..]));
+            images.push(network.forward(window, &flows).mean_dim(1));
+            flows.drain(..flows.len().min(1));
         }
         Ok(images)
     }

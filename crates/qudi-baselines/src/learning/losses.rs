@@ -42,9 +42,11 @@ pub(super) fn losses(
         }
         Network::FloRnn(network) => {
             let channels = network.channels();
-            let images = network.forward_to_second(&copies(counts, channels), frames);
+            let window: Vec<_> =
+                (0..network.window()).map(|t| copies(&frame(counts, frames, t), channels)).collect();
+            let flows = network.flows(&window);
             let wanted = copies(&frame(truth, frames, 1), channels);
-            vec![("image", flornn::loss(frame(&images, 2, 1), wanted))]
+            vec![("image", flornn::loss(network.forward(&window, &flows), wanted))]
         }
         Network::Spk2ImgNet(network) => {
             let (image, estimates) = network.forward(&joined(counts));

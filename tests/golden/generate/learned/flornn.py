@@ -268,9 +268,9 @@ class FloRnn(nn.Module):
 # Training
 
 
-def loss(output: Tensor, truth: Tensor) -> Tensor:
+def loss(second: Tensor, truth: Tensor) -> Tensor:
     """Of the second frame alone."""
-    return ((output[:, 1:2] - truth[:, 1:2]) ** 2).sum() / (2 * output.shape[0])
+    return ((second - truth[:, 1]) ** 2).sum() / (2 * second.shape[0])
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ QUIVER's `predenoise`, which are one, the files know `rdbs.0` alone.
 `loss` is a case of the training loss of the outputs and `truth`, its only output, of shape [1].
 
 - `quiver`, `quiver_loss`, `quiver_long` (more frames than a window): `clean` are the pre-denoised frames.
-- `flornn`: `flow` is that of images `a` to images `b`.
+- `flornn`: `flow` is that of images `a` to images `b`; others give the second frame.
 - `rvrt`, `rvrt_loss` (with three channels).
 - `parts`: operations, which `about.operation` names. Flows of `splat`, `warp_masked` and `warp_pwc` have no gradient.
 - `blocks`: parts of networks with parameters of their own.
@@ -139,10 +139,10 @@ def flornn_file() -> File:
     pwcnet = nn.ModuleDict({"pwcnet": net.pwcnet})
     inputs = {"a": image(2, 3, 11, 23), "b": image(2, 3, 11, 23)}
     file.case("flow", lambda a, b: {"flow": net.flow(a, b)}, inputs, pwcnet, "", about, ("a", "b"))
-    run = lambda x: {"y": net(x)}
+    run = lambda x: {"y": net(x)[:, 1]}
     file.case("forward", run, {"x": image(1, 4, 3, 11, 23)}, net, about=about)
     loss = only(lambda outputs, values: flornn.loss(outputs["y"], values["truth"]))
-    inputs = {"x": image(2, 3, 3, 20, 12), "truth": image(2, 3, 3, 20, 12)}
+    inputs = {"x": image(2, 4, 3, 20, 12), "truth": image(2, 4, 3, 20, 12)}
     file.case("loss", run, inputs, net, "", about, ("truth",), loss)
     return file
 
