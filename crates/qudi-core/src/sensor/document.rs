@@ -21,7 +21,7 @@ impl Sensor {
     /// # Errors
     /// [`Error::Sensor`] for unknown keys, missing keys, wrong types and impossible values.
     pub fn from_document(document: Value, place: &str) -> Result<Self> {
-        let sensor: Self = serde_json::from_value(document).map_err(|e| Error::Sensor {
+        let sensor: Self = serde_path_to_error::deserialize(document).map_err(|e| Error::Sensor {
             what: e.to_string(),
             place: place.to_owned(),
             help: "`qudi info SENSOR` shows every key; `base = \"qudi-paper\"` fills in the rest"
