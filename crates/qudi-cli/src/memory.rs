@@ -16,15 +16,17 @@ pub(crate) struct PeakMemory {
 }
 
 impl PeakMemory {
-    /// Forgets the peak so far, and gives kept pages back first: they would hide what comes.
+    /// Forgets the peak so far, and gives kept pages back first, those of all threads: they would hide what comes.
     #[allow(unsafe_code)]
     pub(crate) fn start() -> Self {
+        // SAFETY: it frees what the calling thread keeps and nobody uses.
+        let collect = || unsafe { libmimalloc_sys::mi_collect(true) };
         // SAFETY: measurements start while no other thread works; both values are in the option's range.
-        unsafe {
-            libmimalloc_sys::mi_option_set(PURGE_DELAY, 0);
-            libmimalloc_sys::mi_collect(true);
-            libmimalloc_sys::mi_option_set(PURGE_DELAY, KEEP);
-        }
+        let set_delay = |delay| unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, delay) };
+        set_delay(0);
+        rayon::broadcast(|_| collect());
+        collect();
+        set_delay(KEEP);
         // 5 resets the peak (proc(5), clear_refs); elsewhere there is no such file.
         let reset = std::fs::write("/proc/self/clear_refs", "5").is_ok();
         Self { before: reset.then(|| field("VmRSS:")).flatten() }

@@ -27,7 +27,7 @@ struct Measured {
     seconds: f64,
     /// The fastest round.
     fastest: f64,
-    /// PeakMemory resident memory above what the process held before, in MiB, where the system tells.
+    /// Peak of resident memory above what the process held before, in MiB, where the system tells.
     peak_mib: Option<f64>,
 }
 

@@ -77,7 +77,7 @@ pub(crate) struct Added {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Cost {
     pub(crate) seconds_per_frame: f64,
-    /// PeakMemory resident memory above what was held before, where the system tells.
+    /// Peak of resident memory above what was held before, where the system tells.
     pub(crate) peak_mib: Option<f64>,
 }
 
