@@ -42,8 +42,9 @@ pub(super) fn losses(
         }
         Network::FloRnn(network) => {
             let channels = network.channels();
-            let window: Vec<_> =
-                (0..network.window()).map(|t| copies(&frame(counts, frames, t), channels)).collect();
+            let window: Vec<_> = (0..network.window())
+                .map(|t| copies(&frame(counts, frames, t), channels))
+                .collect();
             let flows = network.flows(&window);
             let wanted = copies(&frame(truth, frames, 1), channels);
             vec![("image", flornn::loss(network.forward(&window, &flows), wanted))]

@@ -21,12 +21,13 @@ impl Sensor {
     /// # Errors
     /// [`Error::Sensor`] for unknown keys, missing keys, wrong types and impossible values.
     pub fn from_document(document: Value, place: &str) -> Result<Self> {
-        let sensor: Self = serde_path_to_error::deserialize(document).map_err(|e| Error::Sensor {
+        let help = "`qudi info SENSOR` shows every key; `base = \"qudi-paper\"` fills in the rest";
+        let fault = |e: serde_path_to_error::Error<serde_json::Error>| Error::Sensor {
             what: e.to_string(),
             place: place.to_owned(),
-            help: "`qudi info SENSOR` shows every key; `base = \"qudi-paper\"` fills in the rest"
-                .to_owned(),
-        })?;
+            help: help.to_owned(),
+        };
+        let sensor: Self = serde_path_to_error::deserialize(document).map_err(fault)?;
         sensor.validate()?;
         Ok(sensor)
     }
