@@ -230,7 +230,7 @@ fn wanted_frames_equal_those_of_the_whole_window() {
             frame.data.iter().zip(&all[number].data).map(|(a, b)| (a - b).abs())
         });
         let worst = worst.fold(0.0, f32::max);
-        let recurrent = [Method::Quiver, Method::Emvd, Method::FloRnn].contains(&method);
+        let recurrent = [Method::Quiver, Method::Emvd].contains(&method);
         assert!(recurrent || worst < 1e-6, "{}: {worst}", method.name());
         let nothing = restorer.restore_frames(burst, &acquisition, &[]).unwrap();
         assert!(nothing.frames.is_empty());

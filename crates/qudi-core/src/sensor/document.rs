@@ -124,3 +124,22 @@ pub fn merge_documents(lower: &mut Value, upper: Value) {
         (lower, upper) => *lower = upper,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    #[test]
+    fn errors_name_the_key() {
+        let mut document = load_document("spad-qvga").unwrap();
+        document["rolling_shutter"] = Value::Bool(true);
+        let error = Sensor::from_document(document, "--set").unwrap_err().to_string();
+        assert!(error.contains("rolling_shutter: invalid type"), "{error}");
+        let mut document = load_document("spad-qvga").unwrap();
+        document["defects"]["bad_pixels"] = Value::from(1);
+        let error = Sensor::from_document(document, "--set").unwrap_err().to_string();
+        assert!(error.contains("defects.bad_pixels: "), "{error}");
+    }
+}
