@@ -3,10 +3,11 @@
 use assert_cmd::Command;
 use std::path::{Path, PathBuf};
 
-/// The program, run in a folder.
+/// The program, run in a folder; weights in the user's cache are not seen.
 pub(crate) fn qudi(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_qudi"));
     command.current_dir(folder).env("NO_COLOR", "1");
+    command.env("XDG_CACHE_HOME", Path::new(env!("CARGO_TARGET_TMPDIR")).join("no-cache"));
     command
 }
 

@@ -33,6 +33,8 @@ mod stock;
 mod tiles;
 #[cfg(feature = "flex")]
 mod weight_gradient;
+#[cfg(feature = "flex")]
+mod weight_tiles;
 
 pub use geometry::Geometry;
 

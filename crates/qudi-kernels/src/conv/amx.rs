@@ -2,7 +2,10 @@
 #![allow(unsafe_code)]
 
 use super::run::Tile;
-use super::tiles::{Block, MatrixUnit, Model, OUTPUTS, PIXELS, Row, SIDE, Sums, blocks};
+use super::tiles::{
+    Block, Correlation, MatrixUnit, Model, OUTPUTS, PIXELS, Row, SIDE, Sums, WeightSums, blocks,
+};
+use super::weight_tiles::Work;
 use std::arch::asm;
 
 /// Bytes from one row of a tile of weights to the next.
@@ -57,68 +60,166 @@ impl Drop for Amx {
     }
 }
 
+/// Loads 16 rows of 64 bytes, `stride` apart.
+macro_rules! load {
+    ($tile:literal, $from:expr, $stride:expr) => {
+        asm!(
+            concat!("tileloadd ", $tile, ", [{from} + {stride}*1]"),
+            from = in(reg) $from,
+            stride = in(reg) $stride,
+            options(nostack, readonly),
+        )
+    };
+}
+
+/// Writes them.
+macro_rules! store {
+    ($tile:literal, $to:expr, $stride:expr) => {
+        asm!(
+            concat!("tilestored [{to} + {stride}*1], ", $tile),
+            to = in(reg) $to,
+            stride = in(reg) $stride,
+            options(nostack),
+        )
+    };
+}
+
+/// Adds the products of two tiles to a third.
+macro_rules! add_product {
+    ($sums:literal, $a:literal, $b:literal) => {
+        asm!(concat!("tdpbf16ps ", $sums, ", ", $a, ", ", $b), options(nostack, nomem))
+    };
+}
+
+impl Amx {
+    /// [`MatrixUnit::multiply`] of `A` tiles of weights by `B` of pixels.
+    ///
+    /// # Safety
+    /// As there.
+    #[inline(always)]
+    unsafe fn multiply<const A: usize, const B: usize>(block: &Block<'_>, sums: &mut Sums) {
+        let plane = block.plane * size_of::<f32>();
+        let mut weights = block.weights;
+        // SAFETY: the caller's promise; the compiler uses no tiles, so they keep their contents between
+        // these blocks.
+        unsafe {
+            asm!("tilezero tmm0", "tilezero tmm1", options(nostack, nomem));
+            asm!("tilezero tmm2", "tilezero tmm3", options(nostack, nomem));
+            for &offset in block.offsets {
+                let pixels = block.pixels.add(offset as usize);
+                load!("tmm6", pixels, plane);
+                load!("tmm4", weights, WEIGHT_ROW);
+                add_product!("tmm0", "tmm4", "tmm6");
+                if B == 2 {
+                    load!("tmm7", pixels.add(SIDE), plane);
+                    add_product!("tmm1", "tmm4", "tmm7");
+                }
+                if A == 2 {
+                    load!("tmm5", weights.add(SIDE), WEIGHT_ROW);
+                    add_product!("tmm2", "tmm5", "tmm6");
+                }
+                if A == 2 && B == 2 {
+                    add_product!("tmm3", "tmm5", "tmm7");
+                }
+                weights = weights.add(A * SIDE);
+            }
+            let to = sums.0.as_mut_ptr().cast::<f32>();
+            store!("tmm0", to, SUM_ROW);
+            if B == 2 {
+                store!("tmm1", to.add(SIDE), SUM_ROW);
+            }
+            if A == 2 {
+                let to = to.add(OUTPUTS / 2 * PIXELS);
+                store!("tmm2", to, SUM_ROW);
+                if B == 2 {
+                    store!("tmm3", to.add(SIDE), SUM_ROW);
+                }
+            }
+        }
+    }
+
+    /// [`MatrixUnit::correlate`] of `A` tiles of planes by `B` of channels.
+    ///
+    /// # Safety
+    /// As there.
+    #[inline(always)]
+    unsafe fn correlate<const A: usize, const B: usize>(
+        what: &Correlation,
+        sums: [[*mut WeightSums; 2]; 2],
+    ) {
+        let row = size_of::<Row>();
+        let plane = what.plane * size_of::<u16>();
+        let mut gradients = what.gradients;
+        // SAFETY: the caller's promise; the compiler uses no tiles, so they keep their contents between
+        // these blocks.
+        unsafe {
+            load!("tmm0", sums[0][0], row);
+            if B == 2 {
+                load!("tmm1", sums[0][1], row);
+            }
+            if A == 2 {
+                load!("tmm2", sums[1][0], row);
+            }
+            if A == 2 && B == 2 {
+                load!("tmm3", sums[1][1], row);
+            }
+            for line in 0..what.lines {
+                for step in 0..what.steps {
+                    let at = line * what.line + step * 2 * SIDE;
+                    load!("tmm4", what.pixels[0].add(at), plane);
+                    load!("tmm6", gradients[0], row);
+                    add_product!("tmm0", "tmm4", "tmm6");
+                    if B == 2 {
+                        load!("tmm7", gradients[1], row);
+                        add_product!("tmm1", "tmm4", "tmm7");
+                    }
+                    if A == 2 {
+                        load!("tmm5", what.pixels[1].add(at), plane);
+                        add_product!("tmm2", "tmm5", "tmm6");
+                    }
+                    if A == 2 && B == 2 {
+                        add_product!("tmm3", "tmm5", "tmm7");
+                    }
+                    gradients = gradients.map(|rows| rows.add(SIDE));
+                }
+            }
+            store!("tmm0", sums[0][0], row);
+            if B == 2 {
+                store!("tmm1", sums[0][1], row);
+            }
+            if A == 2 {
+                store!("tmm2", sums[1][0], row);
+            }
+            if A == 2 && B == 2 {
+                store!("tmm3", sums[1][1], row);
+            }
+        }
+    }
+}
+
 impl MatrixUnit for Amx {
     #[inline(always)]
     unsafe fn multiply(&self, block: &Block<'_>, sums: &mut Sums) {
-        let stride = block.plane * size_of::<f32>();
-        let mut weights = block.weights;
-        // SAFETY: the caller promises what the loads read; the compiler uses no tiles, so they keep their
-        // contents between these blocks.
+        // SAFETY: the caller's promise.
         unsafe {
-            asm!("tilezero tmm0", "tilezero tmm1", options(nostack, nomem));
-            if block.tiles == 2 {
-                asm!("tilezero tmm2", "tilezero tmm3", options(nostack, nomem));
-                for &offset in block.offsets {
-                    asm!(
-                        "tileloadd tmm6, [{pixels} + {stride}*1]",
-                        "tileloadd tmm4, [{weights} + {row}*1]",
-                        "tdpbf16ps tmm0, tmm4, tmm6",
-                        "tileloadd tmm7, [{pixels} + {stride}*1 + 64]",
-                        "tdpbf16ps tmm1, tmm4, tmm7",
-                        "tileloadd tmm5, [{weights} + {row}*1 + 1024]",
-                        "tdpbf16ps tmm2, tmm5, tmm6",
-                        "tdpbf16ps tmm3, tmm5, tmm7",
-                        pixels = in(reg) block.pixels.add(offset as usize),
-                        stride = in(reg) stride,
-                        weights = in(reg) weights,
-                        row = in(reg) WEIGHT_ROW,
-                        options(nostack, readonly),
-                    );
-                    weights = weights.add(2 * SIDE);
-                }
-            } else {
-                for &offset in block.offsets {
-                    asm!(
-                        "tileloadd tmm4, [{weights} + {row}*1]",
-                        "tileloadd tmm6, [{pixels} + {stride}*1]",
-                        "tdpbf16ps tmm0, tmm4, tmm6",
-                        "tileloadd tmm7, [{pixels} + {stride}*1 + 64]",
-                        "tdpbf16ps tmm1, tmm4, tmm7",
-                        pixels = in(reg) block.pixels.add(offset as usize),
-                        stride = in(reg) stride,
-                        weights = in(reg) weights,
-                        row = in(reg) WEIGHT_ROW,
-                        options(nostack, readonly),
-                    );
-                    weights = weights.add(SIDE);
-                }
+            match block.tiles {
+                [1, 1] => Self::multiply::<1, 1>(block, sums),
+                [1, _] => Self::multiply::<1, 2>(block, sums),
+                [_, 1] => Self::multiply::<2, 1>(block, sums),
+                _ => Self::multiply::<2, 2>(block, sums),
             }
-            let to = sums.0.as_mut_ptr();
-            asm!(
-                "tilestored [{to} + {row}*1], tmm0",
-                "tilestored [{to} + {row}*1 + 64], tmm1",
-                to = in(reg) to,
-                row = in(reg) SUM_ROW,
-                options(nostack),
-            );
-            if block.tiles == 2 {
-                asm!(
-                    "tilestored [{to} + {row}*1], tmm2",
-                    "tilestored [{to} + {row}*1 + 64], tmm3",
-                    to = in(reg) to.add(OUTPUTS / 2),
-                    row = in(reg) SUM_ROW,
-                    options(nostack),
-                );
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn correlate(&self, what: &Correlation, sums: [[*mut WeightSums; 2]; 2]) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            match what.tiles {
+                [1, 1] => Self::correlate::<1, 1>(what, sums),
+                [1, _] => Self::correlate::<1, 2>(what, sums),
+                [_, 1] => Self::correlate::<2, 1>(what, sums),
+                _ => Self::correlate::<2, 2>(what, sums),
             }
         }
     }
@@ -135,6 +236,17 @@ pub(super) unsafe fn work(tile: &Tile<'_>, group: usize) {
     unsafe { blocks(&Amx::configured(group), tile, group) }
 }
 
+/// The products of a tile of the image for the gradient of weights.
+///
+/// # Safety
+/// The processor must have the unit, and the process the permission to use it.
+#[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512cd,avx2,fma")]
+#[cfg_attr(test, allow(dead_code))] // the model stands in
+pub(super) unsafe fn correlate(work: &Work<'_>, sums: &mut [WeightSums]) {
+    // SAFETY: the caller's promise.
+    unsafe { work.correlate(&Amx::configured(SIDE), sums) }
+}
+
 /// Whether the unit computes what its model does.
 pub(crate) fn agrees() -> bool {
     const GROUP: usize = 5;
@@ -146,10 +258,10 @@ pub(crate) fn agrees() -> bool {
     };
     let weight = |row: usize| Row(std::array::from_fn(|place| value(row * SIDE + place)));
     let weights: Vec<Row> = (0..4 * SIDE).map(weight).collect();
-    let pixels: Vec<f32> = (0..GROUP * PLANE + PLANE).map(|number| value(7 * number)).collect();
+    let pixels: Vec<f32> = (0..SIDE * PLANE + 2 * PLANE).map(|number| value(7 * number)).collect();
     let block = Block {
         weights: weights.as_ptr(),
-        tiles: 2,
+        tiles: [2, 2],
         pixels: pixels.as_ptr(),
         offsets: &[0, 3],
         group: GROUP,
@@ -161,5 +273,35 @@ pub(crate) fn agrees() -> bool {
         Amx::configured(GROUP).multiply(&block, &mut got);
         Model.multiply(&block, &mut expected);
     }
-    got.0 == expected.0
+    // The same pixels as planes of 16 bits, from an odd place on.
+    let (from, plane) = (3, 2 * PLANE);
+    let pixels: Vec<u16> = pixels.iter().flat_map(|two| halves(*two)).collect();
+    let zeros = || [const { Row([0.0; SIDE]) }; SIDE];
+    let [mut of_unit, mut of_model] = [0; 2].map(|_| [[zeros(), zeros()], [zeros(), zeros()]]);
+    let planes = [&pixels[from..], &pixels[from + 1..]].map(<[u16]>::as_ptr);
+    let gradients = [&weights[..], &weights[SIDE..]].map(<[Row]>::as_ptr);
+    let what = Correlation {
+        pixels: planes,
+        gradients,
+        tiles: [2, 2],
+        plane,
+        lines: 2,
+        steps: 1,
+        line: plane / 2,
+    };
+    let pointers = |row: &mut [WeightSums; 2]| row.each_mut().map(|sums| &raw mut *sums);
+    // SAFETY: as above.
+    unsafe {
+        let amx = Amx::configured(SIDE);
+        amx.correlate(&what, of_unit.each_mut().map(pointers));
+        Model.correlate(&what, of_model.each_mut().map(pointers));
+    }
+    let equal = |(a, b): (&WeightSums, &WeightSums)| a.iter().zip(b).all(|(a, b)| a.0 == b.0);
+    got.0 == expected.0 && of_unit.as_flattened().iter().zip(of_model.as_flattened()).all(equal)
+}
+
+/// The bits of both numbers of a pair.
+fn halves(two: f32) -> [u16; 2] {
+    let bits = two.to_bits();
+    [bits as u16, (bits >> 16) as u16]
 }

@@ -28,9 +28,10 @@ pub(super) struct Sums(pub(super) [[f32; PIXELS]; OUTPUTS]);
 /// What a block multiplies.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Block<'a> {
-    /// Tiles of weights, one or two (`tiles`) for every offset.
+    /// Tiles of weights, for every offset.
     pub(super) weights: *const Row,
-    pub(super) tiles: usize,
+    /// Tiles of weights and of pixels, one or two of each.
+    pub(super) tiles: [usize; 2],
     /// The block's first pixel in the first scratch plane.
     pub(super) pixels: *const f32,
     /// Where the first plane of a group lies for a tap, in places from `pixels`.
@@ -41,13 +42,42 @@ pub(super) struct Block<'a> {
     pub(super) plane: usize,
 }
 
+/// What adds up to a part of a gradient of weights: sixteen planes, seen from one tap, times sixteen channels of the
+/// gradient.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Correlation {
+    /// Every tile's first pixel in its first scratch plane.
+    pub(super) pixels: [*const u16; 2],
+    /// Every tile's first row of gradients.
+    pub(super) gradients: [*const Row; 2],
+    /// Tiles of planes and of gradients, one or two of each.
+    pub(super) tiles: [usize; 2],
+    /// Values from one scratch plane to the next.
+    pub(super) plane: usize,
+    /// Lines, products of 32 neighbouring pixels in each, and values from one line to the next in scratch memory.
+    pub(super) lines: usize,
+    pub(super) steps: usize,
+    pub(super) line: usize,
+}
+
+/// Sums of a tile of weights, `[plane][channel]`.
+pub(super) type WeightSums = [Row; SIDE];
+
 /// A matrix unit, or its model.
 pub(super) trait MatrixUnit {
-    /// The sums of a block; with one tile of weights those of the first 16 channels.
+    /// The sums of a block; with one tile of weights those of the first 16 channels, with one of pixels those of the
+    /// first 16 pixels.
     ///
     /// # Safety
-    /// The machine must have the unit. All tiles, 32 pixels wide, must be readable.
+    /// The machine must have the unit. All tiles must be readable.
     unsafe fn multiply(&self, block: &Block<'_>, sums: &mut Sums);
+
+    /// Adds to the sums of all tiles of planes by those of channels.
+    ///
+    /// # Safety
+    /// The machine must have the unit, configured for groups of [`SIDE`]. All tiles of pixels and gradients, and
+    /// as many sums, must be valid.
+    unsafe fn correlate(&self, what: &Correlation, sums: [[*mut WeightSums; 2]; 2]);
 }
 
 /// Weights as tiles, `[block][group][tap][tile of channels][channel][pair]`; the last block has one tile of
@@ -92,11 +122,12 @@ pub(super) unsafe fn blocks(unit: &impl MatrixUnit, tile: &Tile<'_>, group: usiz
         for row in 0..tile.size[0] {
             for column in (0..tile.size[1]).step_by(PIXELS) {
                 let base = tile.pass.stride * row * tile.tiling.row + column;
+                let count = PIXELS.min(tile.size[1] - column);
                 // SAFETY: a scratch row holds whole blocks past the tile's last column.
                 unsafe {
                     let block = Block {
                         weights: weights.as_ptr(),
-                        tiles,
+                        tiles: [tiles, count.div_ceil(SIDE)],
                         pixels: tile.scratch.as_ptr().add(base),
                         offsets: tile.offsets,
                         group,
@@ -104,7 +135,6 @@ pub(super) unsafe fn blocks(unit: &impl MatrixUnit, tile: &Tile<'_>, group: usiz
                     };
                     unit.multiply(&block, &mut sums);
                 }
-                let count = PIXELS.min(tile.size[1] - column);
                 for (m, sums) in sums.0.iter_mut().enumerate().take(tile.weights.outputs - first) {
                     tile.finish(first + m, row, column, &mut sums[..count]);
                 }
@@ -113,32 +143,58 @@ pub(super) unsafe fn blocks(unit: &impl MatrixUnit, tile: &Tile<'_>, group: usiz
     }
 }
 
+/// The two numbers of a pair.
+fn halves(bits: f32) -> [f32; 2] {
+    let bits = bits.to_bits();
+    [f32::from_bits(bits << 16), f32::from_bits(bits & 0xffff_0000)]
+}
+
 /// The unit's sums by plain loops: what tests on machines without it check the rest with.
 #[derive(Debug)]
 pub(super) struct Model;
 
 impl MatrixUnit for Model {
     unsafe fn multiply(&self, block: &Block<'_>, sums: &mut Sums) {
-        let halves = |bits: f32| {
-            let bits = bits.to_bits();
-            [f32::from_bits(bits << 16), f32::from_bits(bits & 0xffff_0000)]
-        };
-        for (channel, sums) in sums.0.iter_mut().enumerate().take(block.tiles * SIDE) {
-            sums.fill(0.0);
+        for (channel, sums) in sums.0.iter_mut().enumerate().take(block.tiles[0] * SIDE) {
+            sums[..block.tiles[1] * SIDE].fill(0.0);
             for (step, &offset) in block.offsets.iter().enumerate() {
                 for plane in 0..block.group {
                     // SAFETY: the caller's promise.
                     let weight = unsafe {
-                        (*block.weights.add(step * block.tiles * SIDE + channel)).0[plane]
+                        (*block.weights.add(step * block.tiles[0] * SIDE + channel)).0[plane]
                     };
                     let weight = halves(weight);
-                    for (pixel, sum) in sums.iter_mut().enumerate() {
+                    for (pixel, sum) in sums[..block.tiles[1] * SIDE].iter_mut().enumerate() {
                         // SAFETY: the caller's promise.
                         let value = unsafe {
                             *block.pixels.add(offset as usize + plane * block.plane + pixel)
                         };
                         let value = halves(value);
                         *sum += weight[0] * value[0] + weight[1] * value[1];
+                    }
+                }
+            }
+        }
+    }
+
+    unsafe fn correlate(&self, what: &Correlation, sums: [[*mut WeightSums; 2]; 2]) {
+        let value = |bits: u16| f32::from_bits(u32::from(bits) << 16);
+        for (p, &pixels) in what.pixels.iter().enumerate().take(what.tiles[0]) {
+            for (c, &gradients) in what.gradients.iter().enumerate().take(what.tiles[1]) {
+                // SAFETY: the caller's promise.
+                let sums = unsafe { &mut *sums[p][c] };
+                for pair in 0..what.lines * what.steps * SIDE {
+                    let (line, column) = (pair / (what.steps * SIDE), pair % (what.steps * SIDE));
+                    // SAFETY: as above.
+                    let gradients = unsafe { &(*gradients.add(pair)).0 };
+                    for (plane, sums) in sums.iter_mut().enumerate() {
+                        let place = plane * what.plane + line * what.line + 2 * column;
+                        // SAFETY: as above.
+                        let pixels = unsafe { [*pixels.add(place), *pixels.add(place + 1)] };
+                        for (sum, gradient) in sums.0.iter_mut().zip(gradients) {
+                            let [low, high] = halves(*gradient);
+                            *sum += value(pixels[0]) * low + value(pixels[1]) * high;
+                        }
                     }
                 }
             }
@@ -218,15 +274,24 @@ mod tests {
                     let output = native::forward(&geometry, &inputs, &weight, &bias);
                     let of_inputs =
                         native::input_gradients(&geometry, &weight, &gradient, Some(&gradient));
-                    (output, of_inputs)
+                    let of_weights = native::weight_gradients(
+                        &geometry,
+                        &inputs[..channels.len()],
+                        &gradient,
+                        Some(&gradient),
+                    );
+                    (output, of_inputs, of_weights)
                 };
                 with_matrix_units(units, run).expect("the model is there")
             };
-            let ((output, of_inputs), expected) = (run(MatrixUnits::Amx), run(MatrixUnits::F32));
+            let ((output, of_inputs, of_weights), expected) =
+                (run(MatrixUnits::Amx), run(MatrixUnits::F32));
             assert_close(&output, &expected.0, &geometry);
             for (got, expected) in of_inputs.iter().zip(&expected.1) {
                 assert_close(got, expected, &geometry);
             }
+            assert_close(&of_weights.weight, &expected.2.weight, &geometry);
+            assert_close(&of_weights.bias, &expected.2.bias, &geometry);
         }
     }
 }

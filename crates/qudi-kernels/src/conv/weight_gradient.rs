@@ -9,6 +9,7 @@ use super::pass::{Pass, Tiling};
 use super::run::SCRATCH;
 use super::scratch::{Format, Narrow, round_all};
 use super::source::Source;
+use super::weight_tiles;
 use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -17,7 +18,7 @@ use rayon::prelude::*;
 const TAPS: usize = 3;
 
 /// Partial sums: enough for many threads, and the same for any number of them.
-const PARTS: usize = 16;
+pub(super) const PARTS: usize = 16;
 
 /// Gradients of weights, `[outputs, planes, taps]`, and of the bias.
 #[derive(Debug)]
@@ -38,7 +39,9 @@ pub(super) fn weight_gradient(
     gradient: Source<'_>,
     bf16: bool,
 ) -> WeightGradient {
-    // Processors with tiles are Intel's, whose products of pairs do not pay (MatrixUnits).
+    if bf16 && MatrixUnits::current() == MatrixUnits::Amx {
+        return weight_tiles::weight_gradient(source, [planes, images, outputs], pass, gradient);
+    }
     let halves = bf16 && MatrixUnits::current() == MatrixUnits::Avx512Bf16;
     let run = if halves { HALVES } else { micro::longest_run(Format::Single) };
     let tiling = pass.tiling(Format::Single, planes, run);
