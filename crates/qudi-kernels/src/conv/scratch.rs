@@ -170,10 +170,8 @@ fn join(rows: [Option<Row<'_>>; 2], offset: usize, step: usize, to: &mut [f32]) 
             }
         }
         [Some((a, None)), Some((b, None))] => {
-            let values = a[offset..].iter().step_by(step).zip(b[offset..].iter().step_by(step));
-            for (to, (&a, &b)) in to.iter_mut().zip(values) {
-                *to = pair(a, b);
-            }
+            debug_assert_eq!(step, 2);
+            pairs_of_every_second(&a[offset..], &b[offset..], to);
         }
         [first, second] => {
             let row = first.or(second).expect("the caller has one");
@@ -184,6 +182,17 @@ fn join(rows: [Option<Row<'_>>; 2], offset: usize, step: usize, to: &mut [f32]) 
             }
         }
     }
+}
+
+/// Joins every second value of two rows. By twos, which become vectors; steps would not.
+#[inline(always)]
+fn pairs_of_every_second(a: &[f32], b: &[f32], to: &mut [f32]) {
+    let Some((last, to)) = to.split_last_mut() else { return };
+    let end = 2 * to.len();
+    for ((to, a), b) in to.iter_mut().zip(a.chunks_exact(2)).zip(b.chunks_exact(2)) {
+        *to = pair(a[0], b[0]);
+    }
+    *last = pair(a[end], b[end]);
 }
 
 /// Rounds values in place.

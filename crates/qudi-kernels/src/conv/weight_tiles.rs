@@ -18,7 +18,7 @@ use std::cell::RefCell;
 use std::ops::Range;
 
 thread_local! {
-    /// Turned gradients of a thread, kept between calls.
+    /// Turned gradients: memory that the next call on this thread uses again.
     static TURNED: RefCell<Vec<Row>> = const { RefCell::new(Vec::new()) };
 }
 
