@@ -275,7 +275,7 @@ pub(crate) fn agrees() -> bool {
     }
     // The same pixels as planes of 16 bits, from an odd place on.
     let (from, plane) = (3, 2 * PLANE);
-    let pixels: Vec<u16> = pixels.iter().flat_map(|two| halves(*two)).collect();
+    let pixels: &[u16] = pulp::bytemuck::cast_slice(&pixels);
     let zeros = || [const { Row([0.0; SIDE]) }; SIDE];
     let [mut of_unit, mut of_model] = [0; 2].map(|_| [[zeros(), zeros()], [zeros(), zeros()]]);
     let planes = [&pixels[from..], &pixels[from + 1..]].map(<[u16]>::as_ptr);
@@ -298,10 +298,4 @@ pub(crate) fn agrees() -> bool {
     }
     let equal = |(a, b): (&WeightSums, &WeightSums)| a.iter().zip(b).all(|(a, b)| a.0 == b.0);
     got.0 == expected.0 && of_unit.as_flattened().iter().zip(of_model.as_flattened()).all(equal)
-}
-
-/// The bits of both numbers of a pair.
-fn halves(two: f32) -> [u16; 2] {
-    let bits = two.to_bits();
-    [bits as u16, (bits >> 16) as u16]
 }
