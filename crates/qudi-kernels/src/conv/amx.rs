@@ -92,6 +92,57 @@ macro_rules! add_product {
 }
 
 impl Amx {
+    /// Adds the products of `A` tiles on the left by `B` on the right to the sums: tiles 0 and 1 for the first on the
+    /// left, 2 and 3 for the second. Rows lie so many bytes apart.
+    ///
+    /// # Safety
+    /// The unit must be configured, and the tiles readable.
+    #[inline(always)]
+    unsafe fn add_products<const A: usize, const B: usize, L, R>(
+        (left, left_row): ([*const L; 2], usize),
+        (right, right_row): ([*const R; 2], usize),
+    ) {
+        // SAFETY: the caller's promise; the compiler uses no tiles, so they keep their contents between
+        // these blocks.
+        unsafe {
+            load!("tmm6", right[0], right_row);
+            load!("tmm4", left[0], left_row);
+            add_product!("tmm0", "tmm4", "tmm6");
+            if B == 2 {
+                load!("tmm7", right[1], right_row);
+                add_product!("tmm1", "tmm4", "tmm7");
+            }
+            if A == 2 {
+                load!("tmm5", left[1], left_row);
+                add_product!("tmm2", "tmm5", "tmm6");
+            }
+            if A == 2 && B == 2 {
+                add_product!("tmm3", "tmm5", "tmm7");
+            }
+        }
+    }
+
+    /// Writes the sums.
+    ///
+    /// # Safety
+    /// The unit must be configured, and as many tiles writable.
+    #[inline(always)]
+    unsafe fn store<const A: usize, const B: usize, T>(to: [[*mut T; 2]; 2], row: usize) {
+        // SAFETY: as in `add_products`.
+        unsafe {
+            store!("tmm0", to[0][0], row);
+            if B == 2 {
+                store!("tmm1", to[0][1], row);
+            }
+            if A == 2 {
+                store!("tmm2", to[1][0], row);
+            }
+            if A == 2 && B == 2 {
+                store!("tmm3", to[1][1], row);
+            }
+        }
+    }
+
     /// [`MatrixUnit::multiply`] of `A` tiles of weights by `B` of pixels.
     ///
     /// # Safety
@@ -100,41 +151,21 @@ impl Amx {
     unsafe fn multiply<const A: usize, const B: usize>(block: &Block<'_>, sums: &mut Sums) {
         let plane = block.plane * size_of::<f32>();
         let mut weights = block.weights;
-        // SAFETY: the caller's promise; the compiler uses no tiles, so they keep their contents between
-        // these blocks.
+        // SAFETY: the caller's promise; sums are as large as four tiles.
         unsafe {
             asm!("tilezero tmm0", "tilezero tmm1", options(nostack, nomem));
             asm!("tilezero tmm2", "tilezero tmm3", options(nostack, nomem));
             for &offset in block.offsets {
                 let pixels = block.pixels.add(offset as usize);
-                load!("tmm6", pixels, plane);
-                load!("tmm4", weights, WEIGHT_ROW);
-                add_product!("tmm0", "tmm4", "tmm6");
-                if B == 2 {
-                    load!("tmm7", pixels.add(SIDE), plane);
-                    add_product!("tmm1", "tmm4", "tmm7");
-                }
-                if A == 2 {
-                    load!("tmm5", weights.add(SIDE), WEIGHT_ROW);
-                    add_product!("tmm2", "tmm5", "tmm6");
-                }
-                if A == 2 && B == 2 {
-                    add_product!("tmm3", "tmm5", "tmm7");
-                }
+                // Without a second tile, its place is not read.
+                let left = [weights, weights.wrapping_add(SIDE)];
+                let right = [pixels, pixels.wrapping_add(SIDE)];
+                Self::add_products::<A, B, _, _>((left, WEIGHT_ROW), (right, plane));
                 weights = weights.add(A * SIDE);
             }
             let to = sums.0.as_mut_ptr().cast::<f32>();
-            store!("tmm0", to, SUM_ROW);
-            if B == 2 {
-                store!("tmm1", to.add(SIDE), SUM_ROW);
-            }
-            if A == 2 {
-                let to = to.add(OUTPUTS / 2 * PIXELS);
-                store!("tmm2", to, SUM_ROW);
-                if B == 2 {
-                    store!("tmm3", to.add(SIDE), SUM_ROW);
-                }
-            }
+            let second = to.add(OUTPUTS / 2 * PIXELS);
+            Self::store::<A, B, _>([[to, to.add(SIDE)], [second, second.add(SIDE)]], SUM_ROW);
         }
     }
 
@@ -150,8 +181,7 @@ impl Amx {
         let row = size_of::<Row>();
         let plane = what.plane * size_of::<u16>();
         let mut gradients = what.gradients;
-        // SAFETY: the caller's promise; the compiler uses no tiles, so they keep their contents between
-        // these blocks.
+        // SAFETY: the caller's promise.
         unsafe {
             load!("tmm0", sums[0][0], row);
             if B == 2 {
@@ -166,33 +196,12 @@ impl Amx {
             for line in 0..what.lines {
                 for step in 0..what.steps {
                     let at = line * what.line + step * 2 * SIDE;
-                    load!("tmm4", what.pixels[0].add(at), plane);
-                    load!("tmm6", gradients[0], row);
-                    add_product!("tmm0", "tmm4", "tmm6");
-                    if B == 2 {
-                        load!("tmm7", gradients[1], row);
-                        add_product!("tmm1", "tmm4", "tmm7");
-                    }
-                    if A == 2 {
-                        load!("tmm5", what.pixels[1].add(at), plane);
-                        add_product!("tmm2", "tmm5", "tmm6");
-                    }
-                    if A == 2 && B == 2 {
-                        add_product!("tmm3", "tmm5", "tmm7");
-                    }
+                    let pixels = what.pixels.map(|pixels| pixels.add(at));
+                    Self::add_products::<A, B, _, _>((pixels, plane), (gradients, row));
                     gradients = gradients.map(|rows| rows.add(SIDE));
                 }
             }
-            store!("tmm0", sums[0][0], row);
-            if B == 2 {
-                store!("tmm1", sums[0][1], row);
-            }
-            if A == 2 {
-                store!("tmm2", sums[1][0], row);
-            }
-            if A == 2 && B == 2 {
-                store!("tmm3", sums[1][1], row);
-            }
+            Self::store::<A, B, _>(sums, row);
         }
     }
 }
