@@ -27,7 +27,7 @@ mod validate;
 
 pub use burst_cache::{BurstSampler, Files, draw_bursts};
 pub use learner::{Batch, Context, CountBatch, Learner, Loss, Origin};
-pub use optimizer::{Adam, learning_rate};
+pub use optimizer::{Optimizer, OptimizerKind, learning_rate};
 pub use parameters::{gradients, parameters, with_parameters};
 pub use prefetch::Prefetcher;
 pub use recipe::{

@@ -8,6 +8,7 @@ mod stage;
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
 use crate::loss::lpips::PerceptualKind;
 use crate::loss::{LossForm, NoiseOn, TimestepLaw};
+use crate::optimizer::OptimizerKind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
@@ -54,6 +55,9 @@ pub struct TrainConfig {
     pub crops: Option<CropsConfig>,
     /// Batches whose gradients make one step.
     pub accumulate: usize,
+    /// How weights move along gradients.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub optimizer: OptimizerKind,
     /// The learning rate after the warm-up.
     #[serde(alias = "rate")]
     pub lr: f64,

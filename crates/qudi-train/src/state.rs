@@ -2,7 +2,6 @@
 //! counters, which is replaced whole or not at all.
 
 use super::learner::Learner;
-use super::optimizer::Adam;
 use super::parameters::with_parameters;
 use super::recipe::Recipe;
 use super::trainer::Trainer;
@@ -49,7 +48,7 @@ impl<L: Learner> Trainer<L> {
         }
         std::fs::create_dir(&new).map_err(failed(&new))?;
         let weights = super::parameters::parameters(&self.network);
-        let lists = [&weights, &self.ema.average, &self.adam.mean, &self.adam.square];
+        let lists = [&weights, &self.ema.average, &self.optimizer.mean, &self.optimizer.square];
         let names = self.network.named_shapes();
         let mut tensors = Vec::new();
         for (prefix, list) in LISTS.iter().zip(lists) {
@@ -133,7 +132,8 @@ impl<L: Learner> Trainer<L> {
         let [weights, average, mean, square] = LISTS.map(list);
         trainer.network = with_parameters(trainer.network, weights?);
         trainer.ema.average = average?;
-        trainer.adam = Adam { mean: mean?, square: square?, steps: counters.step };
+        (trainer.optimizer.mean, trainer.optimizer.square) = (mean?, square?);
+        trainer.optimizer.steps = counters.step;
         Ok(trainer)
     }
 }

@@ -4,7 +4,7 @@ mod loss_values;
 
 use super::ema::Ema;
 use super::learner::{Context, Learner, Loss};
-use super::optimizer::{Adam, learning_rate};
+use super::optimizer::{Optimizer, learning_rate};
 use super::parameters::{parameters, with_frozen, with_parameters};
 use super::prefetch::Prefetcher;
 use super::recipe::Recipe;
@@ -51,7 +51,7 @@ pub struct Trainer<L> {
     devices: Vec<Device>,
     pub(super) network: L,
     pub(super) ema: Ema,
-    pub(super) adam: Adam,
+    pub(super) optimizer: Optimizer,
     perceptual: Vec<Lpips>,
     /// Whether each parameter learns.
     learns: Vec<bool>,
@@ -94,6 +94,8 @@ impl<L: Learner> Trainer<L> {
         let learns = learner.learns(recipe);
         learner = with_frozen(learner, &learns);
         let start = parameters(&learner);
+        let shapes = learner.named_shapes();
+        let shapes = shapes.iter().map(|(_, shape)| shape.as_slice());
         let (_, side) = recipe.sample_size();
         let mut perceptual = Vec::new();
         for device in &devices {
@@ -104,7 +106,7 @@ impl<L: Learner> Trainer<L> {
         }
         Ok(Self {
             recipe: recipe.clone(),
-            adam: Adam::new(&start),
+            optimizer: Optimizer::new(recipe.train.optimizer, &start, shapes),
             ema: Ema::new(start, recipe.train.ema),
             network: learner,
             devices,
@@ -115,7 +117,7 @@ impl<L: Learner> Trainer<L> {
 
     /// The number of steps taken.
     pub fn step_number(&self) -> u64 {
-        self.adam.steps
+        self.optimizer.steps
     }
 
     /// The number of batches used.
@@ -166,7 +168,7 @@ impl<L: Learner> Trainer<L> {
         let taken = self.step_number();
         let lr = learning_rate(train, taken);
         let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
-        let mut moved = self.adam.step(parameters(&self.network), gradients, scale, lr);
+        let mut moved = self.optimizer.step(parameters(&self.network), gradients, scale, lr);
         for (place, values) in statistics {
             moved[place] = values;
         }

@@ -2,14 +2,14 @@
 //! undisturbed one.
 #![allow(clippy::unwrap_used)]
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use qudi_core::Error;
 use qudi_model::checkpoint::load;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::{
-    Adam, Batch, BurstSampler, Event, Files, From, Learner, METRICS, Prefetcher, Recipe, Run,
-    StepReport, Trainer, WEIGHTS, parameters,
+    Batch, BurstSampler, Event, Files, From, Learner, METRICS, Prefetcher, Recipe, Run, StepReport,
+    Trainer, WEIGHTS, parameters,
 };
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -59,38 +59,6 @@ fn learn(run: &mut Run<Qudi>, stop_after: u64) -> Result<(), Error> {
     })
 }
 
-/// Adam of Burn's own, on the same gradients.
-#[test]
-fn adam_matches_burn() {
-    use burn::module::{Module, Param};
-    use burn::optim::{AdamConfig, GradientsParams};
-    #[derive(Module, Debug)]
-    struct Values {
-        values: Param<Tensor<1>>,
-    }
-    let device = Device::flex().autodiff();
-    let start: Vec<f32> = (0..50).map(|i| (i as f32 * 0.7).sin()).collect();
-    let target = Tensor::<1>::from_floats([0.3; 50], &device);
-    let mut module =
-        Values { values: Param::from_tensor(Tensor::<1>::from_floats(start.as_slice(), &device)) };
-    let mut theirs = AdamConfig::new().with_epsilon(1e-8).init();
-    let mut list = vec![Tensor::<1>::from_floats(start.as_slice(), &Device::flex())];
-    let mut ours = Adam::new(&list);
-    for step in 0..20 {
-        let rate = 0.05 / f64::from(step + 1);
-        let loss = (module.values.val() - target.clone()).powi_scalar(2).sum();
-        let gradients = GradientsParams::from_grads(loss.backward(), &module);
-        let gradient = (list[0].clone() - target.clone().inner()) * 2.0;
-        list = ours.step(list, vec![gradient * 4.0], 0.25, rate);
-        module = theirs.step(rate, module, gradients);
-    }
-    let theirs = module.values.val().into_data().try_into_vec::<f32>().unwrap();
-    let ours = list.remove(0).into_data().try_into_vec::<f32>().unwrap();
-    for (a, b) in ours.iter().zip(&theirs) {
-        assert!((a - b).abs() < 2e-6, "{a} {b}");
-    }
-}
-
 #[test]
 fn weights_do_not_depend_on_the_number_of_workers() {
     let recipe = recipe(&[]);
@@ -130,7 +98,7 @@ fn weights_do_not_depend_on_the_number_of_devices() {
 /// The second half after a stop, in another process as it were, gives the bits of an undisturbed run.
 #[test]
 fn resumed_run_equals_undisturbed_run() {
-    let recipe = recipe(&[]);
+    let recipe = recipe(&[("train.optimizer", "\"muon\"")]);
     let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     let mut run = open(folders[0].path(), &recipe, From::Start(None)).unwrap();
     learn(&mut run, u64::MAX).unwrap();

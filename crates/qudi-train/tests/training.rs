@@ -17,7 +17,7 @@ use qudi_train::loss::{
     LoopOptions, LossForm, LossTerms, LossWeights, SelfConditioning, TimestepLaw, gaussian_nll,
     loss_terms, reconstruction,
 };
-use qudi_train::{Adam, gradients, parameters, with_parameters};
+use qudi_train::{Optimizer, gradients, parameters, with_parameters};
 use std::collections::HashMap;
 
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {
@@ -250,7 +250,7 @@ fn bf16_gradients_match_f32() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 64, width: 64 }, 5, &device);
     let mut network = tiny().init(3, &device);
-    let mut optimizer = Adam::new(&parameters(&network));
+    let mut optimizer = Optimizer::adam(&parameters(&network));
     let of = |network: &Qudi, precision| {
         with_precision(precision, || {
             gradients(network, &loss(network, &burst, 10).total.backward())
@@ -277,7 +277,7 @@ fn overfits_a_single_burst() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 16, width: 16 }, 5, &device);
     let mut network = tiny().init(3, &device);
-    let mut optimizer = Adam::new(&parameters(&network));
+    let mut optimizer = Optimizer::adam(&parameters(&network));
     let (mut totals, mut predictions) = (Vec::new(), Vec::new());
     for number in 0..200u32 {
         let terms = loss(&network, &burst, u64::from(number));

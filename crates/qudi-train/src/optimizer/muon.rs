@@ -1,0 +1,49 @@
+//! Steps along orthogonal matrices (Muon; Jordan et al. 2024): every singular direction of a layer's weights moves by
+//! as much as every other, also those whose gradients are small.
+
+use burn::tensor::Tensor;
+
+/// The share of the running mean of gradients that a step keeps.
+pub(super) const MOMENTUM: f64 = 0.95;
+
+/// Coefficients of the Newton-Schulz iteration, and its number of rounds, by Jordan et al. 2024.
+const NEWTON_SCHULZ: [f64; 3] = [3.4445, -4.7750, 2.0315];
+const ROUNDS: usize = 5;
+
+/// The root mean square of a step at a learning rate of 1: about that of Adam's (Liu et al. 2025, section 2.2).
+const STEP: f64 = 0.2;
+
+/// Rows and columns of the weights of a layer as a matrix, outputs by inputs; nothing for biases and scales.
+pub(super) fn matrix(shape: &[usize]) -> Option<[usize; 2]> {
+    let (&rows, others) = shape.split_first()?;
+    let columns: usize = others.iter().product();
+    (rows > 1 && columns > 1).then_some([rows, columns])
+}
+
+/// The step at a learning rate of 1 for a matrix with these rows and columns.
+///
+/// # Shapes
+/// - momentum: `[rows * columns]`
+/// - output: the same
+pub(super) fn step(momentum: Tensor<1>, [rows, columns]: [usize; 2]) -> Tensor<1> {
+    let matrix = momentum.reshape([rows, columns]);
+    let is_tall = rows > columns;
+    let wide = if is_tall { matrix.transpose() } else { matrix };
+    let size = STEP * (rows.max(columns) as f64).sqrt();
+    let orthogonal = orthogonalized(wide) * size;
+    let matrix = if is_tall { orthogonal.transpose() } else { orthogonal };
+    matrix.reshape([rows * columns])
+}
+
+/// The matrix, `[rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay zeros.
+fn orthogonalized(matrix: Tensor<2>) -> Tensor<2> {
+    let norm = matrix.clone().powi_scalar(2).sum().sqrt().clamp_min(1e-30);
+    let mut x = matrix / norm.reshape([1, 1]);
+    let [a, b, c] = NEWTON_SCHULZ;
+    for _ in 0..ROUNDS {
+        let square = x.clone().matmul(x.clone().transpose());
+        let polynomial = square.clone() * b + square.clone().matmul(square) * c;
+        x = x.clone() * a + polynomial.matmul(x);
+    }
+    x
+}
