@@ -1,26 +1,28 @@
 #!/bin/sh
-# What each part of the method is worth: the tiny network on the small recipe's data, whole and with one part left out,
-# on identical photons for equally many steps. Prints gain-aligned PSNR on the validation clips at every light.
+# What each part of the method is worth: the last stage of `paper-mini` from one set of weights, whole and with one part
+# left out, on identical samples for equally many steps; then one, two and ten steps on clips, at three lights.
 #
-#     qudi train small --data DATA --pack PACK --cache-only
-#     scripts/ablation.sh PATH/TO/qudi PACK OUT [STEPS] [VARIANT...]
+#     scripts/ablation.sh PATH/TO/qudi DATA BACKBONES WEIGHTS CLIPS OUT STEPS [VARIANT...]
+#
+# BACKBONES are the weights of LPIPS, WEIGHTS those of the stage before (RUN/3-mean/weights.safetensors). Variants:
+# whole physics flow fusion self-conditioning lpips. `scripts/compare/paired.py OUT/whole.json OUT/flow.json` compares.
 set -eu
-qudi=$1 pack=$2 out=$3 steps=${4:-4000}
-[ $# -gt 4 ] && shift 4 || set -- whole physics flow self-conditioning exposure
-configs=$(dirname "$0")/../configs
-# Everything learns, not only the pre-denoiser.
-loss='{ prediction = 1.0, pre = 0.2, perceptual = 0.0, term = "none", flow = 30.0 }'
+qudi=$1 data=$2 backbones=$3 weights=$4 clips=$5 out=$6 steps=$7
+shift 7
+[ $# -gt 0 ] || set -- whole physics flow fusion self-conditioning lpips
+recipe=$(dirname "$0")/../configs/paper-mini.toml
 mkdir -p "$out"
-{ sed -n '/^\[network\]/,/^$/p' "$configs/tiny.toml"; sed -n '/^\[data\]/,$p' "$configs/small.toml"; } >"$out/recipe.toml"
+# What all stages have in common, and the last one.
+awk -v last="$(grep -c '^\[\[stage\]\]' "$recipe")" '/^\[\[stage\]\]/ { n++ } n == 0 || n == last' "$recipe" >"$out/recipe.toml"
 
 for part in "$@"; do
-    ablate="[]"
-    [ "$part" = whole ] || ablate="[\"$part\"]"
-    "$qudi" train "$out/recipe.toml" -o "$out/$part" --pack "$pack" --device cpu --json \
-        --set "network.ablate=$ablate" --set train.steps="$steps" --set train.lr=4e-3 \
-        --set train.crops='{ bursts = 300, cached_frames = 5, frames = 5, side = 96 }' --set train.batch=2 --set train.loss="$loss" \
-        --set validation.every="$steps" --set validation.steps=10 >"$out/$part.json"
-    printf '%s' "without $part:"
-    sed -n 's/.*"ppp": \([0-9.]*\).*/ \1 PPP/p; s/.*"psnr_a": \([0-9.]*\).*/ \1 dB/p' "$out/$part.json" | tr '\n' ' '
-    echo
+    case $part in
+    whole) set_part="network.ablate=[]" ;;
+    lpips) set_part='train.loss={ prediction = 1.0, pre = 0.2, perceptual = 0.0, term = "none", flow = 10.0 }' ;;
+    *) set_part="network.ablate=[\"$part\"]" ;;
+    esac
+    "$qudi" train "$out/recipe.toml" --init "$weights" --data "$data" --pack "$out/pack.zip" --backbones "$backbones" \
+        --device cpu,cpu -o "$out/$part" --set train.steps="$steps" --set validation.every="$steps" --set "$set_part"
+    "$qudi" eval "$clips" --frames 11 --seed 2 --ppp 3.25,9.75,26 --method qudi --steps 1,2,10 --spacing linear \
+        --weights "$(echo "$out/$part"/*/weights.safetensors)" --appearance --backbones "$backbones" --json >"$out/$part.json"
 done

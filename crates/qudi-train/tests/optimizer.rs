@@ -59,14 +59,18 @@ fn muon_matches_burn() {
     }
 }
 
-/// Biases have no orthogonal steps: they take Adam's; and a layer without gradient stays where it is.
+/// Biases have no orthogonal steps: they take Adam's; and a layer without gradient comes to rest, also where the mean of
+/// gradients that it had before is so small that its square is zero.
 #[test]
 fn muon_moves_matrices_alone() {
     let off = apart(OptimizerKind::Muon, AdamConfig::new().with_epsilon(1e-8).init(), [50]);
     assert!(off < 2e-6, "{off}");
     let list = vec![Tensor::<1>::ones([12], &Device::flex())];
     let mut optimizer = Optimizer::new(OptimizerKind::Muon, &list, [[3, 2, 2].as_slice()]);
-    let still = list.iter().map(Tensor::zeros_like).collect();
-    let moved = optimizer.step(list, still, 1.0, 0.1).remove(0).into_data();
-    assert_eq!(moved.try_into_vec::<f32>().unwrap(), [1.0; 12]);
+    for mean in [0.0, 1e-23] {
+        optimizer.mean = vec![Tensor::full([12], mean, &Device::flex())];
+        let still = list.iter().map(Tensor::zeros_like).collect();
+        let moved = optimizer.step(list.clone(), still, 1.0, 0.1).remove(0).into_data();
+        assert_eq!(moved.try_into_vec::<f32>().unwrap(), [1.0; 12]);
+    }
 }

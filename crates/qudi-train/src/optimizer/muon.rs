@@ -35,9 +35,13 @@ pub(super) fn step(momentum: Tensor<1>, [rows, columns]: [usize; 2]) -> Tensor<1
     matrix.reshape([rows * columns])
 }
 
+/// Norms below it count as it, so that a layer without gradient comes to rest. Gradients of a step have norms of at
+/// most 1; squares of much smaller numbers are none.
+const LEAST_NORM: f32 = 1e-7;
+
 /// The matrix, `[rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay zeros.
 fn orthogonalized(matrix: Tensor<2>) -> Tensor<2> {
-    let norm = matrix.clone().powi_scalar(2).sum().sqrt().clamp_min(1e-30);
+    let norm = matrix.clone().powi_scalar(2).sum().sqrt().clamp_min(LEAST_NORM);
     let mut x = matrix / norm.reshape([1, 1]);
     let [a, b, c] = NEWTON_SCHULZ;
     for _ in 0..ROUNDS {
