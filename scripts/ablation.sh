@@ -22,7 +22,8 @@ for part in "$@"; do
     *) set_part="network.ablate=[\"$part\"]" ;;
     esac
     "$qudi" train "$out/recipe.toml" --init "$weights" --data "$data" --pack "$out/pack.zip" --backbones "$backbones" \
-        --device cpu,cpu -o "$out/$part" --set train.steps="$steps" --set validation.every="$steps" --set "$set_part"
+        --device cpu,cpu -o "$out/$part" --set train.steps="$steps" --set validation.every="$steps" \
+        --set validation.ppp="[9.75]" --set validation.crop=128 --set "$set_part"
     "$qudi" eval "$clips" --frames 11 --seed 2 --ppp 3.25,9.75,26 --method qudi --steps 1,2,10 --spacing linear \
-        --weights "$(echo "$out/$part"/*/weights.safetensors)" --appearance --backbones "$backbones" --json >"$out/$part.json"
+        --weights "$out/$part/weights.safetensors" --appearance --backbones "$backbones" --json >"$out/$part.json"
 done

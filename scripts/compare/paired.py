@@ -17,9 +17,10 @@ QUANTILES = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23]
 
 
 def rows(path):
-    """The rows of a file, by method and light."""
+    """The rows of a file, by method, steps and light."""
     with open(path, encoding="utf-8") as file:
-        return {(row["method"], row["ppp"]): row for row in json.load(file)["rows"]}
+        listed = json.load(file)["rows"]
+    return {(row["method"], row.get("steps", ""), row["ppp"]): row for row in listed}
 
 
 def by_clip(row, measure):
@@ -45,7 +46,7 @@ def paired(first, other):
 
 def main(paths):
     first = rows(paths[0])
-    print("file", "method", "PPP", *MEASURES, sep=" | ")
+    print("file", "method", "steps", "PPP", *MEASURES, sep=" | ")
     for path in paths[1:]:
         for key, row in rows(path).items():
             cells = []
