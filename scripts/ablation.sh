@@ -13,7 +13,8 @@ shift 7
 recipe=$(dirname "$0")/../configs/paper-mini.toml
 mkdir -p "$out"
 # What all stages have in common, and the last one.
-awk -v last="$(grep -c '^\[\[stage\]\]' "$recipe")" '/^\[\[stage\]\]/ { n++ } n == 0 || n == last' "$recipe" >"$out/recipe.toml"
+last=$(grep -c "^\[\[stage\]\]" "$recipe")
+awk -v last="$last" "/^\\[\\[stage\\]\\]/ { n++ } n == 0 || n == last" "$recipe" >"$out/recipe.toml"
 
 for part in "$@"; do
     case $part in
