@@ -45,10 +45,14 @@ def paired(first, other):
 
 
 def main(paths):
+    if len(paths) < 2:
+        sys.exit(__doc__)
     first = rows(paths[0])
     print("file", "method", "steps", "PPP", *MEASURES, sep=" | ")
     for path in paths[1:]:
         for key, row in rows(path).items():
+            if key not in first:
+                sys.exit(f"{path}: {paths[0]} has no row of {key}; evaluate both with the same options")
             cells = []
             for measure in MEASURES:
                 ours, theirs = by_clip(first[key], measure), by_clip(row, measure)

@@ -35,8 +35,8 @@ pub(super) fn step(momentum: Tensor<1>, [rows, columns]: [usize; 2]) -> Tensor<1
     matrix.reshape([rows * columns])
 }
 
-/// Norms below it count as it, so that a layer without gradient comes to rest. Gradients of a step have norms of at
-/// most 1; squares of much smaller numbers are none.
+/// Norms below it count as it, so that a layer without gradient comes to rest: what is left of its mean shrinks until
+/// its squares are zero in 32 bits, and nothing may be divided by their sum.
 const LEAST_NORM: f32 = 1e-7;
 
 /// The matrix, `[rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay zeros.
