@@ -1,6 +1,6 @@
 #!/bin/sh
 # What each part of the method is worth: the last stage of `paper-mini` from one set of weights, whole and with one part
-# left out, on identical samples for equally many steps; then one, two and ten steps on clips, at three lights.
+# left out, on identical samples for equally many steps; then one and ten steps on clips, at two lights.
 #
 #     scripts/ablation.sh PATH/TO/qudi DATA BACKBONES WEIGHTS CLIPS OUT STEPS [VARIANT...]
 #
@@ -23,8 +23,8 @@ for part in "$@"; do
     *) set_part="network.ablate=[\"$part\"]" ;;
     esac
     "$qudi" train "$out/recipe.toml" --init "$weights" --data "$data" --pack "$out/pack.zip" --backbones "$backbones" \
-        --device cpu,cpu -o "$out/$part" --set train.steps="$steps" --set validation.every="$steps" \
-        --set validation.ppp="[9.75]" --set validation.crop=128 --set "$set_part"
-    "$qudi" eval "$clips" --frames 11 --seed 2 --ppp 3.25,9.75,26 --method qudi --steps 1,2,10 --spacing linear \
+        -o "$out/$part" --set train.steps="$steps" --set validation.every="$steps" --set validation.crop=64 \
+        --set "$set_part"
+    "$qudi" eval "$clips" --frames 5 --seed 1 --ppp 3.25,9.75 --method qudi --steps 1,10 --spacing linear \
         --weights "$out/$part/weights.safetensors" --appearance --backbones "$backbones" --json >"$out/$part.json"
 done

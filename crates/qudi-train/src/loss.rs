@@ -18,7 +18,6 @@ use gaussian_nll::uncertainty_loss;
 use lpips::Lpips;
 use qudi_core::Result;
 use qudi_core::restorer::Acquisition;
-use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_model::conditioning::Conditioning;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::Qudi;
@@ -159,17 +158,13 @@ pub fn loss_terms(
     });
     let (state, simulated) =
         network_inputs(network, example, fixed.as_ref(), self_conditioning, options)?;
-    let mut encoded = network.encode(conditioning);
-    if let Some((d, features)) = fixed {
-        let [d, features] = [d, features].map(Tensor::from_inner);
-        encoded = network.with_predenoised(encoded, d, features);
-    }
     let predenoised =
         options.recomputes.then(|| PreDenoised::new(network, conditioning, simulated.as_ref()));
-    if let Some(predenoised) = &predenoised {
-        let (d, features) = predenoised.results();
-        encoded = network.with_predenoised(encoded, d, features);
-    }
+    let fixed = fixed.map(|(d, features)| (Tensor::from_inner(d), Tensor::from_inner(features)));
+    let encoded = match predenoised.as_ref().map(PreDenoised::results).or(fixed) {
+        Some(frames) => network.encode_predenoised(conditioning, frames),
+        None => network.encode(conditioning),
+    };
     let (fused, flows) = network.fuse(&encoded, simulated.as_ref(), &state, None, &mut |_| ());
     let d = fused.d().clone();
     let predicted =
@@ -218,8 +213,7 @@ fn perceptual_loss(lpips: &Lpips, images: &Tensor<4>, example: &Example<'_>) -> 
         let burst = |&number: &usize| images.clone().narrow(0, number * frames, frames);
         Tensor::cat(later.iter().map(burst).collect(), 0)
     };
-    // Feature differences are small differences of large numbers.
-    with_precision(ComputePrecision::F32, || lpips.loss(only(images), only(&example.truth)))
+    lpips.loss(only(images), only(&example.truth))
 }
 
 /// Computes the terms of pre-denoiser and flow alone, or of the pre-denoiser alone where the flow has no

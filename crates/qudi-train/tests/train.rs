@@ -8,8 +8,8 @@ use qudi_model::checkpoint::load;
 use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::{
-    Batch, BurstSampler, Event, Files, From, Learner, METRICS, Prefetcher, Recipe, Run, StepReport,
-    Trainer, WEIGHTS, parameters,
+    Batch, BurstSampler, Event, Files, From, Learner, METRICS, Origin, Prefetcher, Recipe, Run,
+    StepReport, Trainer, WEIGHTS, parameters,
 };
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -333,9 +333,9 @@ fn checkpointing_without_a_prediction_is_refused() {
     assert!(Recipe::load("tiny", &changes[..1]).unwrap().train.gradient_checkpointing);
 }
 
-/// Weights that learn on their own estimates are made for two steps.
+/// Weights that learn on their own estimates are made for two steps, or for more at all timesteps.
 #[test]
-fn estimates_are_learnt_on_for_two_steps_alone() {
+fn estimates_are_learnt_on_for_two_steps_or_at_all_timesteps() {
     let load = |more: &[(&str, &str)]| {
         let changes = [("train.noise_on", "estimate")].iter().chain(more);
         let changes: Vec<_> =
@@ -344,14 +344,45 @@ fn estimates_are_learnt_on_for_two_steps_alone() {
     };
     let two = [("validation.steps", "2"), ("train.timesteps", "log-logistic")];
     assert!(load(&two).is_ok());
+    let (ten, uniform) = (("validation.steps", "10"), ("train.timesteps", "uniform"));
+    assert!(load(&[ten, uniform]).is_ok());
     for (more, word) in [
-        (vec![two[1]], "validation.steps is 2"),
-        (vec![two[0], ("train.timesteps", "uniform")], "train.timesteps"),
+        (vec![two[1]], "validation.steps is 2 or more"),
+        (vec![ten, two[1]], "train.timesteps"),
         (vec![two[0], two[1], ("train.loss.prediction", "0")], "prediction has a weight"),
     ] {
         let error = load(&more).unwrap_err().to_string();
         assert!(error.contains(word), "{more:?}: {error}");
     }
+}
+
+/// The weights of the whole network start one that leaves parts out, which learns as if it had been made so.
+#[test]
+fn whole_weights_start_a_network_without_a_part() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("whole.safetensors");
+    let whole = recipe(&[]);
+    init(&whole).save(&whole, &Origin { steps: 1, commit: None }, &path).unwrap();
+    let without = recipe(&[("network.ablate", "[\"flow\", \"fusion\"]")]);
+    let loaded = Qudi::load(&path, &without, &Device::flex()).unwrap();
+    let third_loss = |recipe: &Recipe, start: Option<Qudi>| {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = open(folder.path(), recipe, From::Start(start.map(Box::new))).unwrap();
+        let mut loss = 0.0;
+        let stopped = run.learn(1, &mut |event| match event {
+            // A new network's output layers are zero.
+            Event::Step(report) if report.step == 3 => {
+                loss = report.loss.term("prediction");
+                ControlFlow::Break(())
+            }
+            _ => ControlFlow::Continue(()),
+        });
+        assert!(matches!(stopped, Err(Error::Interrupted)));
+        loss
+    };
+    let expected = third_loss(&without, None);
+    assert_eq!(third_loss(&without, Some(loaded)), expected);
+    assert_ne!(third_loss(&whole, None), expected);
 }
 
 /// Recipes with the former names of keys equal today's.

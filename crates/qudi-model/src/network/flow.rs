@@ -38,7 +38,7 @@ pub struct Flow {
     /// Whether steps of Lucas and Kanade come before the network of a level.
     registration: bool,
     /// Whether nothing moves.
-    off: bool,
+    pub(super) off: bool,
     #[module(skip)]
     inputs: FlowInputs,
 }

@@ -27,7 +27,7 @@ pub struct Fusion {
     /// Scale of level 0.
     fold: usize,
     /// Whether no frame sees another (an ablation).
-    ablated: bool,
+    pub(super) ablated: bool,
 }
 
 impl FusionConfig {

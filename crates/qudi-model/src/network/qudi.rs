@@ -51,7 +51,7 @@ impl Simulated {
 /// A burst's conditioning as the network encodes it, the same in every reverse step.
 #[derive(Clone, Debug)]
 pub struct Encoded {
-    pre: Tensor<4>,
+    pre: EncodedPre,
     low: Tensor<4>,
     sensor: Tensor<2>,
     u: Tensor<4>,
@@ -59,9 +59,15 @@ pub struct Encoded {
     /// Variance of the noise of `u` at the mean light, `[images, 1, 1, 1]`.
     variance: Tensor<4>,
     frames: usize,
-    /// The pre-denoised frames and their features, where simulated measurements do not change them
-    /// ([`Qudi::predenoise_once`]).
-    predenoised: Option<(Tensor<4>, Tensor<4>)>,
+}
+
+/// What every step begins with.
+#[derive(Clone, Debug)]
+enum EncodedPre {
+    /// What the pre-denoiser makes of inputs that no step changes.
+    Inputs(Tensor<4>),
+    /// The pre-denoised frames and their features, where simulated measurements do not change them.
+    Frames(Tensor<4>, Tensor<4>),
 }
 
 /// The network's prediction.
@@ -135,17 +141,36 @@ impl NetworkConfig {
 impl Qudi {
     /// Encodes what does not depend on the step.
     pub fn encode(&self, conditioning: &Conditioning) -> Encoded {
-        let Conditioning { linear_estimate: u, sensor, frames, .. } = conditioning;
         let input = NormalizedInput::new(conditioning);
+        let pre = EncodedPre::Inputs(self.pre.encode(&input));
+        self.encode_with(conditioning, input, pre)
+    }
+
+    /// [`Self::encode`] with pre-denoised frames and their features, in place of those that the network would compute.
+    pub fn encode_predenoised(
+        &self,
+        conditioning: &Conditioning,
+        (d, features): (Tensor<4>, Tensor<4>),
+    ) -> Encoded {
+        let pre = EncodedPre::Frames(d, features);
+        self.encode_with(conditioning, NormalizedInput::new(conditioning), pre)
+    }
+
+    fn encode_with(
+        &self,
+        conditioning: &Conditioning,
+        input: NormalizedInput,
+        pre: EncodedPre,
+    ) -> Encoded {
+        let Conditioning { linear_estimate: u, sensor, frames, .. } = conditioning;
         Encoded {
-            pre: self.pre.encode(&input),
+            pre,
             low: self.low.encode(u.clone(), *frames),
             sensor: self.unet.encode(sensor.clone()),
             input,
             variance: conditioning.noise_variance(),
             u: u.clone(),
             frames: *frames,
-            predenoised: None,
         }
     }
 
@@ -153,15 +178,8 @@ impl Qudi {
     /// measurements.
     #[must_use]
     pub fn predenoise_once(&self, encoded: Encoded) -> Encoded {
-        let predenoised = self.predenoise_with(&encoded, None);
-        Encoded { predenoised: Some(predenoised), ..encoded }
-    }
-
-    /// The encoding with pre-denoised frames and their features, in place of those that the network would
-    /// compute.
-    #[must_use]
-    pub fn with_predenoised(&self, encoded: Encoded, d: Tensor<4>, features: Tensor<4>) -> Encoded {
-        Encoded { predenoised: Some((d, features)), ..encoded }
+        let (d, features) = self.predenoise_with(&encoded, None);
+        Encoded { pre: EncodedPre::Frames(d, features), ..encoded }
     }
 
     /// Pre-denoises frames and gives their features.
@@ -222,10 +240,20 @@ impl Qudi {
         Self { uncertainty: other.uncertainty, ..self }
     }
 
+    /// The same weights in a network that leaves out what `config` ablates, and nothing else: parts that are left out
+    /// have weights all the same.
+    #[must_use]
+    pub fn ablated(mut self, config: &NetworkConfig) -> Self {
+        self.flow.off = config.ablates(Part::Flow);
+        self.fusion.ablated = config.ablates(Part::Fusion);
+        self
+    }
+
     /// The pre-denoisers of the refinement stages, in their order.
     pub fn stages(&self) -> &[PreDenoiser] {
         &self.stages
     }
+
     /// Adds a refinement stage: the pre-denoiser becomes that stage, and a copy of it that sees `more`
     /// aligned neighbours, of zero weight at first, becomes the pre-denoiser.
     #[must_use]
@@ -264,7 +292,10 @@ impl Qudi {
         simulated: Option<&Simulated>,
     ) -> (Tensor<4>, Tensor<4>) {
         let Encoded { pre, input, frames, .. } = encoded;
-        self.predenoise_encoded(pre.clone(), input, simulated, *frames)
+        match pre.clone() {
+            EncodedPre::Inputs(pre) => self.predenoise_encoded(pre, input, simulated, *frames),
+            EncodedPre::Frames(d, features) => (d, features),
+        }
     }
 
     fn predenoise_encoded(
@@ -300,8 +331,7 @@ impl Qudi {
         let frames = encoded.frames;
         let u = encoded.u.clone();
         let u_sim = simulated.map_or_else(|| u.zeros_like(), |simulated| simulated.u.clone());
-        let (d, features) =
-            encoded.predenoised.clone().unwrap_or_else(|| self.predenoise_with(encoded, simulated));
+        let (d, features) = self.predenoise_with(encoded, simulated);
         done("pre");
         let low = self.low.forward(encoded.low.clone(), u_sim, d.clone(), frames);
         done("low");

@@ -2,7 +2,7 @@
 
 use crate::burst_cache::BurstSampler;
 use crate::burst_cache::burst::ConditionedBurst;
-use crate::loss::{Example, NoiseOn, second_of_two};
+use crate::loss::{Example, NoiseOn, TimestepLaw, second_of_two};
 use crate::recipe::Recipe;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
@@ -71,8 +71,10 @@ impl Batch {
             let quantile = random.random();
             batch.timesteps.push(match recipe.train.noise_on {
                 _ if at_start => NUM_TIMESTEPS - 1,
-                NoiseOn::Truth => timesteps.timestep(quantile),
-                NoiseOn::Estimate => second_of_two(recipe.default_spacing()),
+                NoiseOn::Estimate if timesteps == TimestepLaw::LogLogistic => {
+                    second_of_two(recipe.default_spacing())
+                }
+                _ => timesteps.timestep(quantile),
             });
             batch.acquisitions.push(drawn.acquisition);
         }

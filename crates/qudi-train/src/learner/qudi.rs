@@ -29,7 +29,8 @@ impl Learner for Qudi {
         Ok(recipe.network.qudi()?.init(recipe.train.seed, device))
     }
 
-    /// Of the same network, of one with one refinement stage less, or of one without an uncertainty head.
+    /// Of the same network, of one with one refinement stage less, without an uncertainty head, or that leaves other
+    /// parts out.
     fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self> {
         let wanted = recipe.network.qudi()?;
         let (mut network, Description { network: mut sizes, .. }) = load(path, device)?;
@@ -44,6 +45,10 @@ impl Learner for Qudi {
         if wanted.pre.uncertainty && !sizes.pre.uncertainty {
             network = network.with_uncertainty_head_of(Self::init(recipe, device)?);
             sizes.pre.uncertainty = true;
+        }
+        if sizes.ablate != wanted.ablate {
+            network = network.ablated(wanted);
+            sizes.ablate.clone_from(&wanted.ablate);
         }
         if sizes != *wanted {
             return Err(Error::data(

@@ -81,7 +81,7 @@ pub(super) fn network_inputs(
                         timesteps.iter().map(|&t| previous_timestep(t)).collect();
                     (noisy_images(example, truth.clone(), &previous), previous)
                 }
-                // Two steps begin with noise alone.
+                // Sampling begins with noise alone.
                 NoiseOn::Estimate => {
                     (example.noise.clone(), vec![NUM_TIMESTEPS - 1; timesteps.len()])
                 }
@@ -130,10 +130,10 @@ fn first_estimate(
     let has_previous = vec![false; previous.len()];
     let x0_prev = x_t.zeros_like();
     let state = DiffusionState { x_t, x0_prev, has_previous, timesteps: previous };
-    let mut encoded = network.encode(&conditioning);
-    if let Some((d, features)) = fixed.cloned() {
-        encoded = network.with_predenoised(encoded, d, features);
-    }
+    let encoded = match fixed.cloned() {
+        Some(fixed) => network.encode_predenoised(&conditioning, fixed),
+        None => network.encode(&conditioning),
+    };
     let prediction = network.forward(&encoded, None, &state, None);
     let [_, _, height, width] = example.truth.dims();
     let size = Size { height, width };

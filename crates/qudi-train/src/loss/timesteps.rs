@@ -36,8 +36,9 @@ pub enum NoiseOn {
     /// The true images (Ho et al. 2020, algorithm 1): the network learns the mean of what noise leaves open.
     #[default]
     Truth,
-    /// The network's own first estimate, as in the second of two steps of sampling: it learns to draw what the
-    /// loss asks for from what it is given when it is used, which shows nothing of the truth.
+    /// The network's own first estimate, as in later steps of sampling: it learns to draw what the loss asks for from
+    /// what it is given when it is used, which shows nothing of the truth. The timestep is that of the second of two
+    /// steps, or, with [`TimestepLaw::Uniform`], any.
     Estimate,
 }
 

@@ -81,17 +81,20 @@ impl Recipe {
 pub(super) fn noise_rules(recipe: &Recipe) -> [(&'static str, bool, &'static str); 2] {
     let train = &recipe.train;
     let on_truth = train.noise_on == NoiseOn::Truth;
-    let two = recipe.validation.as_ref().is_none_or(|validation| validation.steps == Some(2));
+    let steps = |fits: fn(usize) -> bool| {
+        recipe.validation.as_ref().is_none_or(|validation| validation.steps.is_some_and(fits))
+    };
+    let of_two = is_default(&train.timesteps);
     [
         (
             "train.noise_on",
-            on_truth || (two && train.loss().prediction > 0.0),
-            "must be \"truth\" unless the prediction has a weight and validation.steps is 2",
+            on_truth || (steps(|steps| steps >= 2) && train.loss().prediction > 0.0),
+            "must be \"truth\" unless the prediction has a weight and validation.steps is 2 or more",
         ),
         (
             "train.timesteps",
-            on_truth || is_default(&train.timesteps),
-            "has no use where train.noise_on is \"estimate\": the timestep is that of the second of two steps",
+            on_truth || !of_two || steps(|steps| steps == 2),
+            "must be \"uniform\" where train.noise_on is \"estimate\" and validation.steps is more than 2",
         ),
     ]
 }

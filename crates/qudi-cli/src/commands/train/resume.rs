@@ -69,5 +69,27 @@ fn difference(key: &str, was: &Value, is: &Value) -> Option<(String, String, Str
             difference(&below, &was, &is)
         });
     }
-    Some((key.to_owned(), was.to_string(), is.to_string()))
+    // Recipes leave out values that are defaults.
+    let shown = |value: &Value| match value {
+        Value::Null => "its default".to_owned(),
+        value => value.to_string(),
+    };
+    Some((key.to_owned(), shown(was), shown(is)))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn names_the_first_change_that_is_refused() {
+        let was = json!({"train": {"lr": 1e-3, "steps": 10}, "validation": {"every": 5}});
+        let longer = json!({"train": {"lr": 1e-3, "steps": 20}, "validation": {"every": 7}});
+        assert_eq!(difference("", &was, &longer), None);
+        let muon = json!({"train": {"lr": 1e-3, "optimizer": "muon", "steps": 20}});
+        let (key, from, to) = difference("", &was, &muon).unwrap();
+        assert_eq!([key, from, to], ["train.optimizer", "its default", "\"muon\""]);
+    }
 }

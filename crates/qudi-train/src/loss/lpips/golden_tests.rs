@@ -5,6 +5,7 @@ use super::{Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
 use crate::cases::uniform;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
+use qudi_kernels::{ComputePrecision, with_precision};
 use qudi_layers::tensor::{read, to_tensor};
 use safetensors::SafeTensors;
 use std::sync::OnceLock;
@@ -103,6 +104,25 @@ fn distances_and_gradients_match_reference() {
     for (name, _) in NETS {
         distances_agree(name, &lpips(name), &Device::flex());
         gradients_agree(name, &lpips(name), &Device::flex());
+    }
+}
+
+/// Training multiplies numbers of 16 bits here, too.
+#[test]
+fn gradients_in_sixteen_bits_point_the_same_way() {
+    let golden = Golden::open();
+    let device = Device::flex();
+    let (p, q) = (golden.image("p", &device), golden.image("q", &device));
+    for (name, _) in NETS {
+        let lpips = lpips(name);
+        let [exact, rounded] = [ComputePrecision::F32, ComputePrecision::Bf16]
+            .map(|precision| with_precision(precision, || gradient(&lpips, &p, &q)));
+        let product = |a: &[f32], b: &[f32]| -> f64 {
+            a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
+        };
+        let lengths = product(&exact, &exact) * product(&rounded, &rounded);
+        let cosine = product(&exact, &rounded) / lengths.sqrt();
+        assert!(cosine > 0.95 && cosine < 1.0 - 1e-9, "{name}: {cosine}");
     }
 }
 
