@@ -1,6 +1,6 @@
 #!/bin/sh
-# What each part of the method is worth: the stage `perception` of `paper-mini` from one set of weights, whole and with one part
-# left out, on identical samples for equally many steps; then one and ten steps on clips, at two lights.
+# What each part of the method is worth: the stage `perception` of `paper-mini` from one set of weights, whole and with
+# one part left out, on identical samples for equally many steps; then one and ten steps on clips, at two lights.
 #
 #     scripts/ablation.sh PATH/TO/qudi DATA BACKBONES WEIGHTS CLIPS OUT STEPS [VARIANT...]
 #
