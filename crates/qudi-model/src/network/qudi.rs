@@ -65,9 +65,9 @@ pub struct Encoded {
 #[derive(Clone, Debug)]
 enum EncodedPre {
     /// What the pre-denoiser makes of inputs that no step changes.
-    Inputs(Tensor<4>),
+    Inputs(Box<Tensor<4>>),
     /// The pre-denoised frames and their features, where simulated measurements do not change them.
-    Frames(Tensor<4>, Tensor<4>),
+    Frames(Box<(Tensor<4>, Tensor<4>)>),
 }
 
 /// The network's prediction.
@@ -142,7 +142,7 @@ impl Qudi {
     /// Encodes what does not depend on the step.
     pub fn encode(&self, conditioning: &Conditioning) -> Encoded {
         let input = NormalizedInput::new(conditioning);
-        let pre = EncodedPre::Inputs(self.pre.encode(&input));
+        let pre = EncodedPre::Inputs(Box::new(self.pre.encode(&input)));
         self.encode_with(conditioning, input, pre)
     }
 
@@ -150,9 +150,9 @@ impl Qudi {
     pub fn encode_predenoised(
         &self,
         conditioning: &Conditioning,
-        (d, features): (Tensor<4>, Tensor<4>),
+        frames: (Tensor<4>, Tensor<4>),
     ) -> Encoded {
-        let pre = EncodedPre::Frames(d, features);
+        let pre = EncodedPre::Frames(Box::new(frames));
         self.encode_with(conditioning, NormalizedInput::new(conditioning), pre)
     }
 
@@ -178,8 +178,8 @@ impl Qudi {
     /// measurements.
     #[must_use]
     pub fn predenoise_once(&self, encoded: Encoded) -> Encoded {
-        let (d, features) = self.predenoise_with(&encoded, None);
-        Encoded { pre: EncodedPre::Frames(d, features), ..encoded }
+        let frames = self.predenoise_with(&encoded, None);
+        Encoded { pre: EncodedPre::Frames(Box::new(frames)), ..encoded }
     }
 
     /// Pre-denoises frames and gives their features.
@@ -240,8 +240,8 @@ impl Qudi {
         Self { uncertainty: other.uncertainty, ..self }
     }
 
-    /// The same weights in a network that leaves out what `config` ablates, and nothing else: parts that are left out
-    /// have weights all the same.
+    /// The same weights in a network whose flow and fusion are left out where `config` says so. Parts that are left out
+    /// still have weights, so nothing is lost.
     #[must_use]
     pub fn ablated(mut self, config: &NetworkConfig) -> Self {
         self.flow.off = config.ablates(Part::Flow);
@@ -293,8 +293,8 @@ impl Qudi {
     ) -> (Tensor<4>, Tensor<4>) {
         let Encoded { pre, input, frames, .. } = encoded;
         match pre.clone() {
-            EncodedPre::Inputs(pre) => self.predenoise_encoded(pre, input, simulated, *frames),
-            EncodedPre::Frames(d, features) => (d, features),
+            EncodedPre::Inputs(pre) => self.predenoise_encoded(*pre, input, simulated, *frames),
+            EncodedPre::Frames(frames) => *frames,
         }
     }
 
