@@ -1,0 +1,95 @@
+# /// script
+# requires-python = ">=3.11"
+# dependencies = ["numpy"]
+# ///
+"""What texture that is right in all but its place is worth to LPIPS and the other measures of `qudi eval`.
+
+    python scripts/convert/lpips.py weights
+    python scripts/compare/texture.py path/to/qudi CLIPS weights --ppp 3.25
+
+CLIPS is a folder of clips. The regression restores them; to its frames are added
+
+- shares of the truth's own texture (what a Gaussian blur of one pixel takes away), moved by 16 pixels: as a perfect
+  sampler might draw it that knows the texture but not where its parts lie;
+- a share of the true error: a better estimate.
+
+Prints means over clips and frames, as JSON.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+KEYS = ("psnr_a", "ssim", "lpips_alex", "lpips_vgg", "gmsd", "ssimulacra2")
+MOVED = (16, 16)
+
+
+def blurred(frames: np.ndarray) -> np.ndarray:
+    """Frames after a Gaussian blur of one pixel."""
+    taps = np.exp(-0.5 * np.arange(-4.0, 5.0) ** 2)
+    for axis in (1, 2):
+        around = [(0, 0)] * 3
+        around[axis] = (4, 4)
+        padded = np.pad(frames, around, "reflect")
+        slices = (padded.take(range(i, i + frames.shape[axis]), axis) for i in range(9))
+        frames = sum(tap * part for tap, part in zip(taps / taps.sum(), slices))
+    return frames
+
+
+def variants(restored: np.ndarray, truth: np.ndarray) -> dict[str, np.ndarray]:
+    """The frames that are compared, by name."""
+    restored = restored * ((restored * truth).sum() / (restored**2).sum())
+    texture = truth - blurred(truth)
+    frames = {"regression": restored}
+    for share in (0.25, 0.5, 1.0):
+        frames[f"texture-{share}"] = restored + share * np.roll(texture, MOVED, (1, 2))
+    for share in (0.1, 0.25):
+        frames[f"error-{share}"] = restored + share * (truth - restored)
+    return frames
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("qudi", type=Path)
+    parser.add_argument("clips", type=Path)
+    parser.add_argument("backbones", type=Path)
+    parser.add_argument("--ppp", type=float, default=3.25)
+    parser.add_argument("--frames", default="11")
+    parser.add_argument("--seed", default="2")
+    args = parser.parse_args()
+    simulated = ["--frames", args.frames, "--ppp", str(args.ppp), "--seed", args.seed]
+    with tempfile.TemporaryDirectory() as scratch:
+        work = Path(scratch)
+        names: list[str] = []
+        for clip in sorted(path for path in args.clips.iterdir() if path.is_dir()):
+            counts, truth, restored = (work / f"{name}.npy" for name in ("counts", "truth", "restored"))
+            quiet = ["--force", "--quiet"]
+            subprocess.run(
+                [args.qudi, "simulate", clip, *simulated, "-o", counts, "--truth", truth, *quiet], check=True
+            )
+            subprocess.run([args.qudi, "restore", counts, "--steps", "0", "-o", restored, *quiet], check=True)
+            pair = (np.load(path).astype(np.float64) for path in (restored, truth))
+            for name, frames in variants(*pair).items():
+                (work / name).mkdir(exist_ok=True)
+                file = f"{clip.name}-ppp{args.ppp:g}".replace(".", "_") + ".npy"
+                np.save(work / name / file, frames.clip(0, 1).astype(np.float32))
+                names += [] if name in names else [name]
+        command = [args.qudi, "eval", args.clips, *simulated, "--method", "average", "--appearance", "--json"]
+        command += ["--backbones", args.backbones, "--device", "cpu"]
+        for name in names:
+            command += ["--external", f"{name}={work / name}"]
+        rows = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)["rows"]
+    means = {}
+    for row in rows:
+        scores = [frame for clip in row["clips"] for frame in clip["frames"]]
+        means[row["method"]] = {key: round(statistics.fmean(frame[key] for frame in scores), 4) for key in KEYS}
+    print(json.dumps({name: means[name] for name in names}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
