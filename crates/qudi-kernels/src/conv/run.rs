@@ -88,7 +88,7 @@ impl Packed {
         bf16: bool,
         outputs: usize,
         planes: usize,
-        weight: impl Fn(usize, usize, usize) -> f32,
+        weight: impl Fn(usize, usize, usize) -> f32 + Sync,
     ) -> Self {
         let format = Format::new(bf16, planes);
         let scratch_planes = format.scratch_planes(planes);
@@ -103,17 +103,19 @@ impl Packed {
         if let Format::Tiles(group) = format {
             tiles = tiles::packed(outputs, scratch_planes, group, taps, weight);
         } else {
-            let size = outputs.next_multiple_of(block.0) * scratch_planes * taps;
-            values.reserve_exact(size);
-            for first in (0..outputs).step_by(block.0) {
-                for plane in 0..scratch_planes {
-                    for tap in 0..taps {
-                        values.extend(
-                            (first..first + block.0).map(|output| weight(output, plane, tap)),
-                        );
+            let per_channel = scratch_planes * taps;
+            values = vec![0.0; outputs.next_multiple_of(block.0) * per_channel];
+            // A convolution of nothing has no weights.
+            let size = (block.0 * per_channel).max(1);
+            values.par_chunks_mut(size).enumerate().for_each(|(number, values)| {
+                let first = number * block.0;
+                for (at, values) in values.chunks_exact_mut(block.0).enumerate() {
+                    let (plane, tap) = (at / taps, at % taps);
+                    for (output, value) in (first..).zip(values) {
+                        *value = weight(output, plane, tap);
                     }
                 }
-            }
+            });
         }
         Self { values, tiles, block, outputs, planes: scratch_planes, tiling }
     }

@@ -7,6 +7,7 @@
 #![allow(unsafe_code)]
 
 use super::run::Tile;
+use rayon::prelude::*;
 
 /// Results of a block: two tiles of channels by two of pixels.
 pub(super) const OUTPUTS: usize = 2 * SIDE;
@@ -87,21 +88,25 @@ pub(super) fn packed(
     planes: usize,
     group: usize,
     taps: usize,
-    weight: impl Fn(usize, usize, usize) -> f32,
+    weight: impl Fn(usize, usize, usize) -> f32 + Sync,
 ) -> Vec<Row> {
-    let mut rows = Vec::with_capacity(outputs.next_multiple_of(SIDE) * planes / group * taps);
-    for first in (0..outputs).step_by(OUTPUTS) {
-        for start in (0..planes).step_by(group) {
-            for tap in 0..taps {
-                for channel in first..(first + OUTPUTS).min(outputs.next_multiple_of(SIDE)) {
-                    let pair = |number| {
-                        if number < group { weight(channel, start + number, tap) } else { 0.0 }
-                    };
-                    rows.push(Row(std::array::from_fn(pair)));
+    let rows_per_channel = planes / group * taps;
+    let mut rows =
+        vec![const { Row([0.0; SIDE]) }; outputs.next_multiple_of(SIDE) * rows_per_channel];
+    let size = (OUTPUTS * rows_per_channel).max(1);
+    rows.par_chunks_mut(size).enumerate().for_each(|(block, rows)| {
+        let channels = rows.len() / rows_per_channel;
+        for (number, rows) in rows.chunks_exact_mut(taps * channels).enumerate() {
+            for channel in 0..channels {
+                for pair in 0..group {
+                    for tap in 0..taps {
+                        rows[tap * channels + channel].0[pair] =
+                            weight(block * OUTPUTS + channel, number * group + pair, tap);
+                    }
                 }
             }
         }
-    }
+    });
     rows
 }
 
