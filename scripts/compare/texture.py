@@ -7,7 +7,7 @@
     python scripts/convert/lpips.py weights
     python scripts/compare/texture.py path/to/qudi CLIPS weights --ppp 3.25
 
-CLIPS is a folder of clips. The regression restores them; to its frames are added
+CLIPS is a folder of clips, each a folder of frames. The regression restores them; to its frames are added
 
 - shares of the truth's own texture (what a Gaussian blur of one pixel takes away), moved by 16 pixels: as a perfect
   sampler might draw it that knows the texture but not where its parts lie;
@@ -63,12 +63,12 @@ def main() -> None:
     parser.add_argument("--seed", default="2")
     args = parser.parse_args()
     simulated = ["--frames", args.frames, "--ppp", str(args.ppp), "--seed", args.seed]
+    quiet, light = ["--force", "--quiet"], f"{args.ppp:g}".replace(".", "_")
     with tempfile.TemporaryDirectory() as scratch:
         work = Path(scratch)
         names: list[str] = []
         for clip in sorted(path for path in args.clips.iterdir() if path.is_dir()):
             counts, truth, restored = (work / f"{name}.npy" for name in ("counts", "truth", "restored"))
-            quiet = ["--force", "--quiet"]
             subprocess.run(
                 [args.qudi, "simulate", clip, *simulated, "-o", counts, "--truth", truth, *quiet], check=True
             )
@@ -76,8 +76,7 @@ def main() -> None:
             pair = (np.load(path).astype(np.float64) for path in (restored, truth))
             for name, frames in variants(*pair).items():
                 (work / name).mkdir(exist_ok=True)
-                file = f"{clip.name}-ppp{args.ppp:g}".replace(".", "_") + ".npy"
-                np.save(work / name / file, frames.clip(0, 1).astype(np.float32))
+                np.save(work / name / f"{clip.name}-ppp{light}.npy", frames.clip(0, 1).astype(np.float32))
                 names += [] if name in names else [name]
         command = [args.qudi, "eval", args.clips, *simulated, "--method", "average", "--appearance", "--json"]
         command += ["--backbones", args.backbones, "--device", "cpu"]

@@ -93,6 +93,7 @@ pub(super) fn packed(
     let rows_per_channel = planes / group * taps;
     let mut rows =
         vec![const { Row([0.0; SIDE]) }; outputs.next_multiple_of(SIDE) * rows_per_channel];
+    // A convolution of nothing has no weights.
     let size = (OUTPUTS * rows_per_channel).max(1);
     rows.par_chunks_mut(size).enumerate().for_each(|(block, rows)| {
         let channels = rows.len() / rows_per_channel;
