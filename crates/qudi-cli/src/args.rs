@@ -25,8 +25,6 @@ use crate::commands::look::args::Look;
 use crate::commands::publish::args::Publish;
 use crate::commands::restore::args::Restore;
 use crate::commands::selftest::args::Selftest;
-#[cfg(feature = "remote")]
-use crate::commands::serve::args::Serve;
 use crate::commands::simulate::args::Simulate;
 use crate::commands::train::args::Train;
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
@@ -112,8 +110,6 @@ pub(crate) enum Command {
     Eval(Box<Eval>),
     Bench(Box<Bench>),
     Selftest(Selftest),
-    #[cfg(feature = "remote")]
-    Serve(Serve),
     Convert(Box<Convert>),
     Calibrate(Box<Calibrate>),
     Demo(Demo),
@@ -137,8 +133,6 @@ impl Command {
             Self::Eval(_) => "eval",
             Self::Bench(_) => "bench",
             Self::Selftest(_) => "selftest",
-            #[cfg(feature = "remote")]
-            Self::Serve(_) => "serve",
             Self::Convert(_) => "convert",
             Self::Calibrate(_) => "calibrate",
             Self::Demo(_) => "demo",

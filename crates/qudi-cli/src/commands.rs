@@ -3,7 +3,6 @@
 pub(crate) mod bench {
     pub(crate) mod args;
     mod burst;
-    mod network;
     pub(crate) mod run;
 }
 
@@ -84,13 +83,6 @@ pub(crate) mod restore {
 
 pub(crate) mod selftest {
     pub(crate) mod args;
-    pub(crate) mod run;
-}
-
-#[cfg(feature = "remote")]
-pub(crate) mod serve {
-    pub(crate) mod args;
-    pub(crate) mod remote;
     pub(crate) mod run;
 }
 
