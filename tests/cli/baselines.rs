@@ -81,7 +81,7 @@ fn emvd_trains_resumes_restores_and_says_what_it_is() {
     let other = format!("train tiny -o other --init run/weights.safetensors {QUICK}");
     refused(&folder, &other.replace("--set network.width=4 ", ""), &["another program"]);
     let crops = "--set train.crops={bursts=2,cached_frames=4,frames=4,side=16}";
-    run(&folder, &format!("train scenes.toml --bursts kept --draw-only {QUICK} {crops}"));
+    run(&folder, &format!("train scenes.toml --bursts kept --prepare {QUICK} {crops}"));
     assert_eq!(listing(&folder.join("kept")).len(), 2);
     let mut recipe = std::fs::read_to_string(folder.join("scenes.toml")).unwrap();
     recipe.push_str(

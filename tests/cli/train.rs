@@ -121,7 +121,7 @@ fn packs_train_without_the_files() {
     std::fs::write(folder.join("mine.toml"), recipe).unwrap();
     run(
         &folder,
-        "train mine.toml --data data --pack p.zip --cache-only -q --set data.crop=32 --set data.frames=3",
+        "train mine.toml --data data --pack p.zip --prepare -q --set data.crop=32 --set data.frames=3",
     );
     std::fs::remove_dir_all(folder.join("data")).unwrap();
     run(&folder, &format!("train mine.toml --pack p.zip -o run {QUICK}"));
@@ -195,7 +195,7 @@ fn runs_resume_and_are_never_lost() {
 fn draws_all_bursts_before_training() {
     let folder = with_reference_recipe("train-draw");
     let parts = format!("{QUICK} --set train.crops={{bursts=5,cached_frames=3,frames=3,side=16}}");
-    run(&folder, &format!("train reference.toml --bursts kept --draw-only --workers 2 {parts}"));
+    run(&folder, &format!("train reference.toml --bursts kept --prepare --workers 2 {parts}"));
     let names: Vec<_> = (0..5).map(|number| format!("1-{number:06}.safetensors")).collect();
     assert_eq!(listing(&folder.join("kept")), names);
     // What is there stays; what is missing comes back as it was.
@@ -204,13 +204,13 @@ fn draws_all_bursts_before_training() {
     let written = |number: usize| std::fs::metadata(path(number)).unwrap().modified().unwrap();
     let at = written(4);
     std::fs::remove_file(path(3)).unwrap();
-    run(&folder, &format!("train reference.toml --bursts kept --draw-only {parts}"));
+    run(&folder, &format!("train reference.toml --bursts kept --prepare {parts}"));
     assert!(std::fs::read(path(3)).unwrap() == before && written(4) == at);
     run(&folder, &format!("train reference.toml --bursts kept -o run {parts}"));
     assert!(std::fs::read(path(4)).unwrap() == kept);
-    refused(&folder, "train reference.toml --bursts kept --draw-only", &["train.crops"]);
+    refused(&folder, "train reference.toml --bursts kept --prepare", &["train.crops"]);
     let other =
-        format!("train reference.toml --bursts kept --draw-only {parts} --set data.crop=40");
+        format!("train reference.toml --bursts kept --prepare {parts} --set data.crop=40");
     refused(&folder, &other, &["drawn with other"]);
 }
 
@@ -287,7 +287,8 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     run(&folder, "train -o run --resume --device cpu -q");
     assert!(whole == read("run/weights.safetensors"));
     refused(&folder, &format!("train stages.toml -o run {QUICK}"), &["--resume", "--force"]);
-    refused(&folder, "train stages.toml --bursts b --draw-only", &["--draw-only"]);
+    refused(&folder, "train stages.toml --bursts b --prepare", &["--prepare", "each stage draws its own"]);
+    refused(&folder, "train stages.toml --prepare", &["nothing to prepare", "--pack"]);
     let changed = "train -o run --resume --device cpu -q --set train.lr=2e-3";
     refused(&folder, changed, &["train.lr"]);
     // A run that starts anew, and stops at once, must not find the stages of the one before.
