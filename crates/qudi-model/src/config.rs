@@ -255,7 +255,6 @@ pub const PRESETS: &[(&str, &str)] = &[
     ("tiny", include_str!("../../../configs/tiny.toml")),
     ("small", include_str!("../../../configs/small.toml")),
     ("paper-mini", include_str!("../../../configs/paper-mini.toml")),
-    ("base", include_str!("../../../configs/base.toml")),
     ("paper", include_str!("../../../configs/paper.toml")),
 ];
 
