@@ -209,19 +209,3 @@ fn parameter_names_are_unique() {
     let count: usize = list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
     assert_eq!(count, 182_440); // tests/golden/generate/network.py info tiny
 }
-
-/// A file that version 0.1 wrote before parameters and sizes got their names of now.
-#[test]
-fn loads_weights_with_former_names() {
-    let path =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/old/weights.safetensors");
-    let (network, description) = load(&path, &Device::flex()).unwrap();
-    let pre = &description.network.pre;
-    assert_eq!((pre.stages, pre.weight_channels, pre.alignments, pre.uncertainty), (2, 2, 2, true));
-    assert_eq!(description.kind, Some(ModelKind::Regression));
-    assert_eq!(description.reverse_steps(), 0);
-    let names: Vec<String> = values(network).into_iter().map(|(name, _)| name).collect();
-    for part in ["stages.0.", "pre.weighting.", "pre.weighted_in.", "uncertainty."] {
-        assert!(names.iter().any(|name| name.starts_with(part)), "{part}");
-    }
-}

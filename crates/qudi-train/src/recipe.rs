@@ -17,7 +17,7 @@ use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-use keys::{modern_key, modernize, set, value};
+use keys::{set, value};
 
 pub use network::{NetworkRecipe, recipe_names};
 pub use stage::{LearningPart, StageConfig};
@@ -51,7 +51,7 @@ pub struct TrainConfig {
     /// Samples that go through the network at once.
     pub batch: usize,
     /// The crops of cached bursts that are the samples; without it, every sample is a new burst.
-    #[serde(default, alias = "parts", skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub crops: Option<CropsConfig>,
     /// Batches whose gradients make one step.
     pub accumulate: usize,
@@ -59,10 +59,8 @@ pub struct TrainConfig {
     #[serde(default, skip_serializing_if = "is_default")]
     pub optimizer: OptimizerKind,
     /// The learning rate after the warm-up.
-    #[serde(alias = "rate")]
     pub lr: f64,
     /// The learning rate of the last step.
-    #[serde(alias = "floor")]
     pub min_lr: f64,
     /// Number of steps of linear warm-up.
     pub warmup: u64,
@@ -87,7 +85,7 @@ pub struct TrainConfig {
     #[serde(default, skip_serializing_if = "is_default")]
     pub noise_on: NoiseOn,
     /// Fraction of the samples at the noisiest timestep, where sampling begins; not of learned baselines.
-    #[serde(default, alias = "start", skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub noise_start_fraction: Option<f64>,
     /// Steps between checkpoints.
     pub checkpoint: u64,
@@ -125,7 +123,6 @@ pub struct CropsConfig {
     /// Bursts that are drawn in all and kept in memory; samples come back to them.
     pub bursts: u64,
     /// Consecutive frames of each burst that are kept; the others only help to restore these.
-    #[serde(alias = "kept")]
     pub cached_frames: usize,
     /// Consecutive frames of a sample.
     pub frames: usize,
@@ -207,16 +204,15 @@ impl Recipe {
         let fault = |what: String| Error::request(what, place, help);
         let mut document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
-        modernize(&mut document, "");
         for (key, text) in changes {
-            set(&mut document, &modern_key(key), value(text))?;
+            set(&mut document, key, value(text))?;
         }
         let mut recipe: Self =
             document.try_into().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
         // What is changed here is changed in every stage.
         for stage in &mut recipe.stage {
             for (key, text) in changes.iter().filter(|(key, _)| !key.starts_with("stage.")) {
-                stage.changes.insert(modern_key(key), value(text));
+                stage.changes.insert(key.clone(), value(text));
             }
         }
         recipe.checked()

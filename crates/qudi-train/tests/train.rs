@@ -384,39 +384,3 @@ fn whole_weights_start_a_network_without_a_part() {
     assert_eq!(third_loss(&without, Some(loaded)), expected);
     assert_ne!(third_loss(&whole, None), expected);
 }
-
-/// Recipes with the former names of keys equal today's.
-#[test]
-fn reads_recipes_with_former_key_names() {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/old");
-    for now in ["../tiny.toml", "../../../configs/small.toml"] {
-        let name = now.rsplit('/').next().unwrap();
-        let load = |path: &str| Recipe::load(&format!("{folder}/{path}"), &[]).unwrap();
-        assert_eq!(load(name), load(now));
-    }
-    let change = |key: &str, value: &str| {
-        Recipe::load("small", &[(key.to_owned(), value.to_owned())]).unwrap()
-    };
-    for (old, new, value) in [
-        ("train.rate", "train.lr", "2e-3"),
-        ("train.parts.kept", "train.crops.cached_frames", "7"),
-        ("data.source.1.rest", "data.source.1.static_fraction", "0.5"),
-        ("network.without", "network.ablate", "[\"flow\"]"),
-        ("network.pre.trust", "network.pre.weight_channels", "8"),
-        ("network.pre.rounds", "network.pre.stages", "1"),
-    ] {
-        assert_eq!(change(old, value), change(new, value), "{old}");
-    }
-    assert!(!change("train.rate", "2e-3").text().contains("rate ="));
-}
-
-#[test]
-fn rejects_recipes_with_removed_terms() {
-    for name in ["ms-ssim", "oriented", "lpips-squeeze"] {
-        let changes = [("train.loss.term", name), ("train.loss.perceptual", "0.1")];
-        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
-        let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
-        assert!(error.contains(&format!("`{name}` was removed")), "{error}");
-        assert!(error.contains("lpips-alex"), "{error}");
-    }
-}

@@ -74,13 +74,13 @@ pub struct SourceConfig {
     pub stride: usize,
     /// The largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from
     /// 1 to it.
-    #[serde(default = "one", alias = "shrink")]
+    #[serde(default = "one")]
     pub max_downscale: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
     #[serde(default = "usual_speed")]
     pub speed: f64,
     /// The fraction of the samples from stills in which nothing moves.
-    #[serde(default, alias = "rest")]
+    #[serde(default)]
     pub static_fraction: f64,
 }
 

@@ -1,6 +1,6 @@
 //! Stages of a recipe: trainings one after the other, each from the weights of the one before.
 
-use super::keys::{modern_key, set};
+use super::keys::set;
 use super::{Recipe, TrainConfig, is_default};
 use crate::loss::NoiseOn;
 use crate::loss::lpips::PerceptualKind;
@@ -65,7 +65,7 @@ impl Recipe {
             let fault = |what: String| Error::request(what, &place, "correct the recipe");
             let mut document = document.clone();
             for (key, value) in &stage.changes {
-                set(&mut document, &modern_key(key), value.clone())
+                set(&mut document, key, value.clone())
                     .map_err(|error| fault(error.to_string()))?;
             }
             let recipe: Self = document
