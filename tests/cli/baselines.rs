@@ -12,9 +12,9 @@ const QUICK: &str = "--device cpu -q --set network.width=4 --set train.steps=4 -
 fn with_recipe(name: &str) -> PathBuf {
     let folder = scratch(name);
     let text = std::fs::read_to_string(crate::root().join("configs/baselines/emvd.toml")).unwrap();
-    let [files, scenes] = [text.find("# Files").unwrap(), text.rfind("[[data.source]]").unwrap()];
-    let text = format!("{}{}", &text[..files], &text[scenes..]);
-    let text = text.replace("from = [\"val/video\"]", "from = [\"scene:text\"]");
+    let scenes = "[[data.source]]\nname = \"scenes\"\nkind = \"scenes\"\nfrom = [\"dead-leaves\", \"text\"]\n";
+    let text = text.replace("[train]", &format!("{scenes}speed = 5.0\n\n[train]"));
+    let text = text.replace("[validation]", "[validation]\nfrom = [\"scene:text\"]");
     std::fs::write(folder.join("scenes.toml"), text).unwrap();
     folder
 }

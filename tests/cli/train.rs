@@ -209,8 +209,7 @@ fn draws_all_bursts_before_training() {
     run(&folder, &format!("train reference.toml --bursts kept -o run {parts}"));
     assert!(std::fs::read(path(4)).unwrap() == kept);
     refused(&folder, "train reference.toml --bursts kept --prepare", &["train.crops"]);
-    let other =
-        format!("train reference.toml --bursts kept --prepare {parts} --set data.crop=40");
+    let other = format!("train reference.toml --bursts kept --prepare {parts} --set data.crop=40");
     refused(&folder, &other, &["drawn with other"]);
 }
 
@@ -287,7 +286,11 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     run(&folder, "train -o run --resume --device cpu -q");
     assert!(whole == read("run/weights.safetensors"));
     refused(&folder, &format!("train stages.toml -o run {QUICK}"), &["--resume", "--force"]);
-    refused(&folder, "train stages.toml --bursts b --prepare", &["--prepare", "each stage draws its own"]);
+    refused(
+        &folder,
+        "train stages.toml --bursts b --prepare",
+        &["--prepare", "each stage draws its own"],
+    );
     refused(&folder, "train stages.toml --prepare", &["nothing to prepare", "--pack"]);
     let changed = "train -o run --resume --device cpu -q --set train.lr=2e-3";
     refused(&folder, changed, &["train.lr"]);

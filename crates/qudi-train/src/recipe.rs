@@ -1,5 +1,6 @@
 //! Recipes: everything that decides what a training gives, in one TOML document.
 
+mod base;
 mod keys;
 mod network;
 mod rules;
@@ -17,6 +18,7 @@ use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
+use base::over_base;
 use keys::{set, value};
 
 pub use network::{NetworkRecipe, recipe_names};
@@ -188,22 +190,31 @@ impl Recipe {
     /// # Errors
     /// [`Error`] if there is none, or a key is unknown or wrong.
     pub fn load(name: &str, changes: &[(String, String)]) -> Result<Self> {
-        let text = match network::preset(name) {
-            Some(text) => text.to_owned(),
-            None => read(name)?,
-        };
-        Self::parse(&text, name, changes)
+        match network::preset(name) {
+            Some(text) => Self::parse(text, name, changes),
+            None => Self::parse_in(Path::new(name).parent(), &read(name)?, name, changes),
+        }
     }
 
-    /// A recipe from its text; `place` names it in errors.
+    /// Reads a recipe from its text; `place` names it in errors.
     ///
     /// # Errors
     /// As [`Self::load`].
     pub fn parse(text: &str, place: &str, changes: &[(String, String)]) -> Result<Self> {
+        Self::parse_in(None, text, place, changes)
+    }
+
+    fn parse_in(
+        folder: Option<&Path>,
+        text: &str,
+        place: &str,
+        changes: &[(String, String)],
+    ) -> Result<Self> {
         let help = "compare with configs/small.toml and docs/training.md";
         let fault = |what: String| Error::request(what, place, help);
-        let mut document: toml::Table =
+        let document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
+        let mut document = over_base(document, folder)?;
         for (key, text) in changes {
             set(&mut document, key, value(text))?;
         }

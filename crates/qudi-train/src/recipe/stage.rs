@@ -65,8 +65,7 @@ impl Recipe {
             let fault = |what: String| Error::request(what, &place, "correct the recipe");
             let mut document = document.clone();
             for (key, value) in &stage.changes {
-                set(&mut document, key, value.clone())
-                    .map_err(|error| fault(error.to_string()))?;
+                set(&mut document, key, value.clone()).map_err(|error| fault(error.to_string()))?;
             }
             let recipe: Self = document
                 .try_into()

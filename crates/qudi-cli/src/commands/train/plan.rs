@@ -53,7 +53,8 @@ impl Plan {
             _ => Action::Start,
         };
         if args.prepare && args.pack.is_none() && args.bursts.is_none() {
-            let help = "name a pack with --pack or, for a recipe with train.crops, a folder with --bursts";
+            let help =
+                "name a pack with --pack or, for a recipe with train.crops, a folder with --bursts";
             return Err(CliError::new("there is nothing to prepare", "--prepare", help));
         }
         let folder = if args.prepare { &args.bursts } else { &args.output };
