@@ -1,6 +1,7 @@
 //! EMVD: efficient multi-stage video denoising with recurrent spatio-temporal fusion (Maggioni et al., CVPR 2021),
 //! in the form in which it was compared with: frames as four equal channels, three levels of wavelets.
 
+mod method;
 mod transform;
 
 use burn::module::Module;

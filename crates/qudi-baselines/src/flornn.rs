@@ -1,6 +1,7 @@
 //! FloRNN: unidirectional video denoising by mimicking backward recurrent modules with look-ahead forward ones (Li
 //! et al., ECCV 2022), in the form in which it was compared with: frames as three equal channels, no noise map.
 
+mod method;
 mod pwcnet;
 mod splat;
 

@@ -5,6 +5,7 @@ mod bank;
 mod batch_norm;
 mod blocks;
 mod encoder;
+mod method;
 
 use crate::parts::{
     ConvTranspose, Corners, bursts_of, charbonnier, dense_blocks_renamed, frame, leaky, renamed,

@@ -3,6 +3,7 @@
 pub(crate) mod alignment;
 mod cell;
 mod merge;
+mod method;
 mod predenoiser;
 pub(crate) mod reconstructor;
 

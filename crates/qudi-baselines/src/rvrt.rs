@@ -2,6 +2,7 @@
 //! the size in which it was compared with.
 
 mod guided;
+mod method;
 mod swin;
 mod window;
 

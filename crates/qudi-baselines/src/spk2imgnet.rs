@@ -3,6 +3,7 @@
 
 mod align;
 mod extractor;
+mod method;
 
 use align::{Align, Levels};
 use burn::module::{Module, Param};

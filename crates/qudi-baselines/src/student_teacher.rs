@@ -5,6 +5,8 @@
 //! networks", CVPR 2018). The student learns from noisy bursts of moving scenes, and resembles two teachers: one of
 //! motion without noise, one of noise without motion.
 
+mod method;
+
 use crate::parts::renamed;
 use burn::module::Module;
 use burn::tensor::ops::PadMode;

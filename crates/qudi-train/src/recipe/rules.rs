@@ -2,7 +2,7 @@
 
 use super::{NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage};
 use crate::loss::lpips::PerceptualKind;
-use qudi_baselines::sizes::Sizes;
+use qudi_baselines::method::Sizes;
 use qudi_core::{Error, Result};
 use qudi_model::config::{NetworkConfig, Part};
 
@@ -115,7 +115,7 @@ impl Recipe {
         let refused = |what: String, key: &str| {
             Err(Error::request(what, key, "correct the recipe: see docs/training.md"))
         };
-        if let Some(problem) = sizes.problem_of_recipe() {
+        if let Some(problem) = sizes.problem_in_recipe() {
             return refused(format!("{problem}; the recipe has {sizes}"), "network");
         }
         let (frames, _) = self.sample_size();
