@@ -1,4 +1,4 @@
-//! The authors' files: which network they are of, in which size, and its weights.
+//! Reading of the authors' files: the network that they are of, its sizes and its weights.
 
 mod shapes;
 
@@ -12,10 +12,10 @@ use std::path::Path;
 pub use crate::method::{METHODS, Method, Network, Sizes};
 pub(crate) use shapes::Shapes;
 
-/// Keys of a kind that a message lists.
-const SHOWN: usize = 20;
+/// Largest number of keys of one kind in a message.
+const MAX_LISTED: usize = 20;
 
-/// What a file holds.
+/// Contents of a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Contents {
     /// The network.
@@ -24,18 +24,18 @@ pub struct Contents {
     pub sizes: String,
     /// The number of its parameters.
     pub parameters: usize,
-    /// What a file says of itself that this program wrote.
+    /// The description in a file that this program wrote.
     pub description: Option<Description>,
 }
 
-/// A network out of a file.
+/// A network from a file.
 #[derive(Debug)]
 pub struct Loaded {
     /// The network.
     pub network: Network,
     /// Its sizes.
     pub sizes: Sizes,
-    /// What a file says of itself that this program wrote; none of those of authors.
+    /// The description in a file that this program wrote; none in the authors' files.
     pub description: Option<Description>,
 }
 
@@ -44,7 +44,7 @@ fn method_of(file: &StateDict) -> Option<Method> {
     METHODS.into_iter().find(|method| file.shape(method.mark()).is_some())
 }
 
-/// What the file at `path` holds; none if it is no file of a learned method. `device` is for networks without
+/// Describes the file at `path`; none if it is no file of a learned method. `device` is for networks without
 /// weights.
 ///
 /// # Errors
@@ -53,7 +53,7 @@ pub fn describe(path: &Path, device: &Device) -> Result<Option<Contents>> {
     describe_file(&StateDict::open(path)?, device)
 }
 
-/// [`describe`] of a SafeTensors file in memory, which errors call `name`.
+/// Describes a SafeTensors file in memory, which errors call `name`, as [`describe`].
 ///
 /// # Errors
 /// As [`describe`].
@@ -77,7 +77,7 @@ pub fn load(path: &Path, method: Method, device: &Device) -> Result<Loaded> {
     load_file(&StateDict::open(path)?, method, device)
 }
 
-/// [`load`] from a SafeTensors file in memory, which errors call `name`.
+/// Loads a network from a SafeTensors file in memory, which errors call `name`, as [`load`].
 ///
 /// # Errors
 /// As [`load`].
@@ -118,7 +118,7 @@ fn is_constant(name: &str) -> bool {
     mean || constant.iter().any(|constant| name.ends_with(constant))
 }
 
-/// The names of all parameters in the file, with their shapes here and there, after comparing them all.
+/// Compares all parameters with the file, and returns their names and shapes there by our names.
 fn compared(network: &Network, file: &StateDict) -> Result<BTreeMap<String, (String, Vec<usize>)>> {
     let (mut missing, mut different) = (Vec::new(), Vec::new());
     let (mut names, mut expected) = (BTreeMap::new(), BTreeSet::new());
@@ -144,7 +144,7 @@ fn compared(network: &Network, file: &StateDict) -> Result<BTreeMap<String, (Str
     let lists = [("missing", missing), ("surplus", surplus), ("of another shape", different)];
     let faults = lists.into_iter().filter(|(_, list)| !list.is_empty());
     let shown = |list: &[String]| {
-        let more = list.len().saturating_sub(SHOWN);
+        let more = list.len().saturating_sub(MAX_LISTED);
         let first = list[..list.len() - more].join(", ");
         if more > 0 { format!("{first} and {more} more") } else { first }
     };
@@ -153,7 +153,7 @@ fn compared(network: &Network, file: &StateDict) -> Result<BTreeMap<String, (Str
     Err(Error::data(what, file.path(), "name a file of this network, whole and unchanged"))
 }
 
-/// A shape without the axis of one frame that some convolutions have.
+/// Returns a shape without the axis of one frame that some convolutions have.
 fn squeezed(shape: &[usize]) -> Vec<usize> {
     let mut shape = shape.to_vec();
     if shape.len() == 5 && shape[2] == 1 {
@@ -162,7 +162,7 @@ fn squeezed(shape: &[usize]) -> Vec<usize> {
     shape
 }
 
-/// The number of parameters, after all keys have been compared.
+/// Returns the number of parameters, after all keys have been compared.
 fn count(network: &Network, file: &StateDict) -> Result<usize> {
     compared(network, file)?;
     let is_learnt = |name: &str| !name.contains(".running_");
@@ -170,7 +170,7 @@ fn count(network: &Network, file: &StateDict) -> Result<usize> {
     Ok(shapes.filter(|(name, _)| is_learnt(name)).map(|(_, s)| s.iter().product::<usize>()).sum())
 }
 
-/// The network with the values of a file.
+/// Gives a network the values of a file.
 fn filled(network: Network, file: &StateDict) -> Result<Network> {
     let names = compared(&network, file)?;
     // A view of one number may claim any shape: values take no more than the file has.

@@ -26,9 +26,9 @@ pub struct Baseline {
 /// - counts, truth, still: `[bursts * frames, 1, height, width]`
 #[derive(Clone, Debug)]
 pub struct Bursts {
-    /// What the sensor counted.
+    /// Counts of the sensor.
     pub counts: Tensor<4>,
-    /// What it would have counted on average, without saturation.
+    /// Expected counts, without saturation.
     pub truth: Tensor<4>,
     /// Counts of the frame that is restored, as often as there are frames; for networks with teachers.
     pub still: Option<Tensor<4>>,
@@ -41,8 +41,8 @@ pub struct Bursts {
 pub struct Losses {
     /// The terms by name, `[1]` each, with their weights: training minimises the sum.
     pub terms: Vec<(&'static str, Tensor<1>)>,
-    /// Values of parameters after the step, by their places in the network, `[values]` each: statistics that it keeps
-    /// of what passes through it.
+    /// Values of parameters after the step, by their places in the network, `[values]` each: statistics that
+    /// it keeps of what passes through it.
     pub statistics: Vec<(usize, Tensor<1>)>,
 }
 
@@ -108,9 +108,7 @@ impl Baseline {
     pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
         let name = |ours: &str| match ours.strip_prefix("network.") {
             Some(own) => self.network.file_name(own),
-            None => {
-                teacher_name(&self.network, ours.strip_prefix("teachers.").unwrap_or(ours))
-            }
+            None => teacher_name(&self.network, ours.strip_prefix("teachers.").unwrap_or(ours)),
         };
         parameter_shapes(self).into_iter().map(|(ours, shape)| (name(&ours), shape)).collect()
     }
@@ -120,8 +118,8 @@ impl Baseline {
         !sizes.method().teachers().is_empty()
     }
 
-    /// Computes the losses of bursts at a step, from 0, of so many `steps`. The network and they are on an autodiff
-    /// device; bursts have a number of frames that its sizes allow.
+    /// Computes the losses of bursts at a step, from 0, of so many `steps`. The network and they are on an
+    /// autodiff device; bursts have a number of frames that its sizes allow.
     pub fn losses(&self, bursts: &Bursts, step: u64, steps: u64) -> Losses {
         let NetworkLosses { terms, statistics } =
             self.network.losses(&self.teachers, bursts, step, steps);

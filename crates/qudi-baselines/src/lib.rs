@@ -1,6 +1,7 @@
 //! The learned methods of the paper's table, written from their papers.
 //!
-//! Parameters have the names of the authors' files, so that these can be read. [`learning`] has what training needs.
+//! Parameters have the names of the authors' files, so that these can be read. [`learning`] has what training
+//! needs.
 #![warn(missing_docs)]
 
 #[cfg(test)]

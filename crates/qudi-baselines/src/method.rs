@@ -15,6 +15,7 @@ use crate::student_teacher::{self, KernelPrediction};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Result, Size};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Largest number of channels, blocks or frames that a file or a recipe may ask for.
@@ -34,8 +35,8 @@ pub(crate) trait LearnedMethod: Module {
     /// The divisor of the sides of frames.
     const MULTIPLE: usize;
 
-    /// Bytes that restoring a window takes on the processor for each pixel and feature, at most: measured with the
-    /// authors' sizes on frames of 256 x 256 (docs/notes/engineering/learned-methods.md).
+    /// Bytes that restoring a window takes on the processor for each pixel and feature, at most: measured
+    /// with the authors' sizes on frames of 256 x 256 (docs/notes/engineering/learned-methods.md).
     const BYTES: usize;
 
     /// Frames that are restored at once.
@@ -85,13 +86,14 @@ pub(crate) trait LearnedMethod: Module {
         Vec::new()
     }
 
-    /// Returns the law of a parameter's initial values, where it differs from PyTorch's. `name` is its name in files.
+    /// Returns the law of a parameter's initial values, where it differs from PyTorch's. `name` is its name
+    /// in files.
     fn initial_law(_sizes: Self::Sizes, _name: &str, _shape: &[usize]) -> Option<Law> {
         None
     }
 
-    /// Returns the numbers of frames before and after a frame that the network sees to restore it; 0 for networks
-    /// that see all frames.
+    /// Returns the numbers of frames before and after a frame that the network sees to restore it; 0 for
+    /// networks that see all frames.
     fn context(&self) -> [usize; 2];
 
     /// Restores the requested frames of a window, `[1, 1, height, width]` each.
@@ -121,7 +123,7 @@ macro_rules! methods {
         pub const METHODS: [Method; [$(Method::$method),+].len()] = [$(Method::$method),+];
 
         /// The sizes of a network; in recipes, the key `method` names the method.
-        #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+        #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
         #[serde(tag = "method")]
         pub enum Sizes {
             $(#[doc = concat!("Sizes of [`", stringify!($network), "`].")]

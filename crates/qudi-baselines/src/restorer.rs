@@ -1,4 +1,4 @@
-//! The learned methods as restorers of video: every frame of a window, tile by tile.
+//! Restoring with the learned methods: every frame of a window, tile by tile.
 
 mod brightness;
 mod window;
@@ -19,9 +19,10 @@ pub(crate) use window::{Window, copies};
 /// The side of the smallest tiles, in pixels: a multiple of what every network needs.
 pub const SMALLEST_TILE: usize = 64;
 
-/// A learned method with weights, as its authors used it: counts over full scale in, images out. Weights of authors
-/// know the brightness of their own light, and the image is not scaled to that of this acquisition. Weights that were
-/// trained here give images in the units of counts, and the acquisition says what these are.
+/// A learned method with weights, as its authors used it: counts over full scale in, images out. Weights of
+/// authors know the brightness of their own light, and the image is not scaled to that of this acquisition.
+/// Weights that were trained here give images in the units of counts, and the acquisition says what these
+/// are.
 #[derive(Debug)]
 pub struct LearnedRestorer {
     network: Network,
@@ -31,12 +32,12 @@ pub struct LearnedRestorer {
     device: Device,
 }
 
-/// The units of the images that a network gives.
+/// Units of the images that a network returns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Brightness {
-    /// Those of images at the light that its authors trained it for.
+    /// Image values at the light level that its authors trained it for.
     OfAuthors,
-    /// Those of counts over full scale.
+    /// Counts over full scale.
     OfCounts,
 }
 
@@ -49,7 +50,7 @@ impl LearnedRestorer {
         Ok(Self::of(load(path, method, device)?, device))
     }
 
-    /// The restorer of a loaded network, on the device that it was loaded onto.
+    /// Makes the restorer of a loaded network, on the device that it was loaded onto.
     pub fn of(loaded: Loaded, device: &Device) -> Self {
         let Loaded { network, sizes, description } = loaded;
         let of_authors = description.is_none();
@@ -57,7 +58,7 @@ impl LearnedRestorer {
         Self::new(network, sizes, brightness, device)
     }
 
-    /// The restorer of a network of these sizes on `device`.
+    /// Makes the restorer of a network of these sizes on `device`.
     pub fn new(network: Network, sizes: Sizes, brightness: Brightness, device: &Device) -> Self {
         Self { network, sizes, brightness, tile: TILE, device: device.clone() }
     }
@@ -75,7 +76,7 @@ impl LearnedRestorer {
         Ok(Self { tile, ..self })
     }
 
-    /// Bytes that restoring tiles of `size` takes on the processor at most, about.
+    /// Returns the bytes that restoring tiles of `size` takes on the processor, at most, about.
     pub fn memory(&self, size: Size) -> u64 {
         self.sizes.memory(size)
     }
@@ -107,9 +108,9 @@ impl Restorer for LearnedRestorer {
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
+        requested: &[usize],
     ) -> Result<Restored> {
-        let (Some(&first), Some(&last)) = (wanted.iter().min(), wanted.iter().max()) else {
+        let (Some(&first), Some(&last)) = (requested.iter().min(), requested.iter().max()) else {
             return Ok(Restored { frames: Vec::new(), std: None });
         };
         progress(self.method().name(), 0, burst.frames.len())?;
@@ -128,7 +129,7 @@ impl Restorer for LearnedRestorer {
             let name = self.method().name();
             let window = Window { name, all: &frames, requested: first..last + 1 };
             let images = self.network.restore(window)?;
-            Ok(wanted.iter().map(|number| images[number - first].clone()).collect())
+            Ok(requested.iter().map(|number| images[number - first].clone()).collect())
         })?;
         let expected = match self.brightness {
             Brightness::OfAuthors => None,

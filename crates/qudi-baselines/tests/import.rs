@@ -205,8 +205,8 @@ fn every_method_restores_every_frame() {
     }
 }
 
-/// Some frames of a window are restored from the real frames around them, as with all others; but recurrences begin
-/// elsewhere.
+/// Some frames of a window are restored from the real frames around them, as with all others; but recurrences
+/// begin elsewhere.
 #[test]
 fn wanted_frames_equal_those_of_the_whole_window() {
     let folder = tempfile::tempdir().unwrap();

@@ -3,16 +3,18 @@
 use crate::conditioning::AlignedNeighbours;
 use qudi_burst::Alignments;
 use qudi_core::{Error, Result};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Sizes of the whole network (docs/network.md).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NetworkConfig {
     /// Pixels of a side that become channels before the network and pixels again after it.
     pub fold: usize,
     /// What the network starts from.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub reference: ReferenceKind,
     /// Pre-denoiser.
     pub pre: PreConfig,
@@ -26,11 +28,12 @@ pub struct NetworkConfig {
     pub unet: UNetConfig,
     /// Parts of the method that are left out, to measure what they are worth.
     #[serde(default, alias = "without", skip_serializing_if = "Vec::is_empty")]
+    #[schemars(skip_serializing_if = "never")]
     pub ablate: Vec<Part>,
 }
 
 /// What the network starts from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ReferenceKind {
     /// Counts alone, as in the paper: the pre-denoiser sees one frame.
@@ -41,7 +44,7 @@ pub enum ReferenceKind {
 }
 
 /// What the features of the noisy image see.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum NoisyFeatures {
     /// The noisy image itself, as in the paper.
@@ -52,7 +55,7 @@ pub enum NoisyFeatures {
 }
 
 /// What the networks of the flow see of a frame and of its neighbour, warped along the flow so far.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum FlowInputs {
     /// Both images, as in the paper.
@@ -63,7 +66,7 @@ pub enum FlowInputs {
 }
 
 /// What the output of the U-Net is.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum UNetPrediction {
     /// The clean image itself, as in the paper.
@@ -77,7 +80,7 @@ pub enum UNetPrediction {
 }
 
 /// A part of the method that can be left out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Part {
     /// The forward model: the measurement of every estimate by the sensor model.
@@ -95,7 +98,7 @@ pub enum Part {
 }
 
 /// Sizes of the pre-denoiser.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PreConfig {
     /// Channels.
@@ -110,16 +113,20 @@ pub struct PreConfig {
     /// Alignments of each neighbour: by the selected motion; with 2 also as matched frame by frame; with 3
     /// also pixel by pixel, but only on frames that a refinement stage has restored.
     #[serde(default = "one", alias = "motions", skip_serializing_if = "is_one")]
+    #[schemars(skip_serializing_if = "never")]
     pub alignments: usize,
     /// Channels of the layers that weight neighbours pixel by pixel; 0 for no such layers.
     #[serde(default, alias = "trust", skip_serializing_if = "is_zero")]
+    #[schemars(skip_serializing_if = "never")]
     pub weight_channels: usize,
     /// Pre-denoisers, one after the other. All but the last are refinement stages: the window is aligned
     /// again on what each of them restores.
     #[serde(default = "one", alias = "rounds", skip_serializing_if = "is_one")]
+    #[schemars(skip_serializing_if = "never")]
     pub stages: usize,
     /// Whether the last of them predicts the uncertainty of its frames.
     #[serde(default, alias = "error", skip_serializing_if = "is_false")]
+    #[schemars(skip_serializing_if = "never")]
     pub uncertainty: bool,
 }
 
@@ -156,6 +163,11 @@ fn is_true(switch: &bool) -> bool {
     *switch
 }
 
+/// Schemas state all defaults, those too that are not written into files.
+fn never<T>(_: &T) -> bool {
+    false
+}
+
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
@@ -176,7 +188,7 @@ fn is_false(switch: &bool) -> bool {
 }
 
 /// Channels of the spatio-temporal features on three levels.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FeaturesConfig {
     /// Channels of the measurements' features.
@@ -185,11 +197,12 @@ pub struct FeaturesConfig {
     pub high: [usize; 3],
     /// What the noisy image's features see.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub noisy: NoisyFeatures,
 }
 
 /// Sizes of the flow network.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FlowConfig {
     /// Pixels of a side of one cell of the finest flow.
@@ -205,14 +218,16 @@ pub struct FlowConfig {
     /// Whether steps of Lucas and Kanade register the reference estimate on every level before the network
     /// corrects the flow; without, SPyNet alone estimates it.
     #[serde(default = "yes", skip_serializing_if = "is_true")]
+    #[schemars(skip_serializing_if = "never")]
     pub registration: bool,
     /// What the networks see of a frame and its neighbour.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub inputs: FlowInputs,
 }
 
 /// Sizes of the fusion.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FusionConfig {
     /// Level of the recurrent state.
@@ -224,7 +239,7 @@ pub struct FusionConfig {
 }
 
 /// Sizes of the U-Net.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct UNetConfig {
     /// Channels of the first level.
@@ -241,6 +256,7 @@ pub struct UNetConfig {
     pub embedding: usize,
     /// What its output is.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub predicts: UNetPrediction,
 }
 

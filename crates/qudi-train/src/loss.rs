@@ -23,6 +23,7 @@ use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::network::Qudi;
 use recomputation::{PreDenoised, Predicted, Recomputation};
 use reconstruction::{relative_reconstruction, root_mean_square};
+use schemars::JsonSchema;
 use self_conditioning::network_inputs;
 use serde::{Deserialize, Serialize};
 
@@ -39,7 +40,7 @@ const LEAST_UNIT: f32 = 0.004;
 const USUAL_ERROR: f32 = 0.3;
 
 /// How the errors of images count.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LossForm {
     /// Squared error and total variation of the error, in [0, 1], as in the paper.

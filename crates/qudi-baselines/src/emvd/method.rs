@@ -9,7 +9,8 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
 use std::f32::consts::FRAC_1_SQRT_2;
 
-/// Frames before the first one that the recurrence begins at: the authors' protocol scores the last of eleven.
+/// Frames before the first one that the recurrence begins at: the authors' protocol scores the last of
+/// eleven.
 const HISTORY: usize = 10;
 
 /// Initial colour transform: four orthonormal rows.

@@ -85,8 +85,7 @@ impl LearnedMethod for FloRnn {
 
     fn losses(&self, _: &[&Self], bursts: &Bursts, _: u64) -> NetworkLosses {
         let [counts, truth] = bursts.copies(self.channels());
-        let window: Vec<_> =
-            (0..self.window()).map(|t| frame(&counts, bursts.frames, t)).collect();
+        let window: Vec<_> = (0..self.window()).map(|t| frame(&counts, bursts.frames, t)).collect();
         let image = self.forward(&window, &self.flows(&window));
         vec![("image", loss(image, frame(&truth, bursts.frames, 1)))].into()
     }

@@ -15,8 +15,8 @@ pub(crate) enum Law {
     Random(f32),
 }
 
-/// Draws the initial values of a parameter, by its name in files and its shape. `of_weight` is the shape of the weight
-/// that a bias belongs to.
+/// Draws the initial values of a parameter, by its name in files and its shape. `of_weight` is the shape of
+/// the weight that a bias belongs to.
 ///
 /// Where authors draw from a normal law, values are uniform with the same variance.
 pub(super) fn initial_values(

@@ -1,6 +1,8 @@
 //! MemDeblur among the learned methods.
 
-use super::{BatchStatistics, EVERY_BACK, MULTIPLE, MemDeblur, Mode, PUBLISHED, Sizes, losses};
+use super::{
+    BACKWARD_STRIDE, BatchStatistics, MULTIPLE, MemDeblur, Mode, PUBLISHED, Sizes, losses,
+};
 use crate::import::Shapes;
 use crate::learning::{Bursts, Law, NetworkLosses, ends_with_any, kaiming};
 use crate::method::LearnedMethod;
@@ -54,7 +56,7 @@ impl LearnedMethod for MemDeblur {
     }
 
     fn other_lengths(_: Sizes, frames: usize) -> Option<String> {
-        let step = EVERY_BACK;
+        let step = BACKWARD_STRIDE;
         (frames <= step || frames % step != 1).then(|| format!("a multiple of {step} and one more"))
     }
 
@@ -77,8 +79,7 @@ impl LearnedMethod for MemDeblur {
 
     fn restore(&self, window: Window<'_>) -> Result<Vec<Tensor<4>>> {
         let frames = window.all();
-        let [_, _, full] =
-            self.forward(&copies(frames, self.channels()), frames.len(), Mode::Use);
+        let [_, _, full] = self.forward(&copies(frames, self.channels()), frames.len(), Mode::Use);
         Ok(window.requested_of(full))
     }
 

@@ -97,7 +97,8 @@ impl LearnedMethod for Quiver {
 
     fn losses(&self, _: &[&Self], bursts: &Bursts, _: u64) -> NetworkLosses {
         let restored = self.forward(bursts.counts.clone(), bursts.frames);
-        let [full, half, quarter, pre] = Quiver::losses(self, restored, &bursts.truth, bursts.frames);
+        let [full, half, quarter, pre] =
+            Quiver::losses(self, restored, &bursts.truth, bursts.frames);
         vec![("image", full), ("half", half), ("quarter", quarter), ("pre", pre)].into()
     }
 }

@@ -23,7 +23,8 @@ impl Window<'_> {
         self.all
     }
 
-    /// Returns the requested frames with so many before and after them, mirrored at the first and the last frame.
+    /// Returns the requested frames with so many before and after them, mirrored at the first and the last
+    /// frame.
     pub(crate) fn around(&self, [before, after]: [usize; 2]) -> Vec<Tensor<4>> {
         (0..before + self.requested.len() + after)
             .map(|i| (self.requested.start + i) as i64 - before as i64)
@@ -36,8 +37,8 @@ impl Window<'_> {
         self.split(images, self.requested.start)
     }
 
-    /// Returns the frames of `images` from `first` on, as many as are requested. Channels are copies of one picture,
-    /// and are averaged.
+    /// Returns the frames of `images` from `first` on, as many as are requested. Channels are copies of one
+    /// picture, and are averaged.
     pub(crate) fn split(&self, images: Tensor<4>, first: usize) -> Vec<Tensor<4>> {
         let images = images.mean_dim(1);
         (0..self.requested.len()).map(|i| images.clone().narrow(0, first + i, 1)).collect()

@@ -79,9 +79,8 @@ impl LearnedMethod for Rvrt {
     fn restore(&self, window: Window<'_>) -> Result<Vec<Tensor<4>>> {
         let frames = window.all();
         let count = frames.len().next_multiple_of(CLIP);
-        let even: Vec<_> = (0..count as i64)
-            .map(|place| frames[mirrored(place, frames.len())].clone())
-            .collect();
+        let even: Vec<_> =
+            (0..count as i64).map(|place| frames[mirrored(place, frames.len())].clone()).collect();
         Ok(window.requested_of(self.forward(copies(&even, self.channels()), count)))
     }
 

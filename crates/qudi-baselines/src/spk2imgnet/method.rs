@@ -1,6 +1,8 @@
 //! Spk2ImgNet among the learned methods.
 
-use super::{BLOCK, BLOCKS, Block, FRAMES, MULTIPLE, RESTORED, SCALE, Sizes, Spk2ImgNet, losses};
+use super::{
+    BLOCK, BLOCKS, Block, FRAMES, MULTIPLE, RESTORED_FRAME, SCALE, Sizes, Spk2ImgNet, losses,
+};
 use crate::import::Shapes;
 use crate::learning::{Bursts, Law, NetworkLosses, ends_with_any};
 use crate::method::LearnedMethod;
@@ -65,7 +67,7 @@ impl LearnedMethod for Spk2ImgNet {
     }
 
     fn context(&self) -> [usize; 2] {
-        [RESTORED, FRAMES - 1 - RESTORED]
+        [RESTORED_FRAME, FRAMES - 1 - RESTORED_FRAME]
     }
 
     /// Every block of frames is computed once.

@@ -1,6 +1,8 @@
 //! The student of two teachers among the learned methods.
 
-use super::{ANNEALING, KernelPrediction, MULTIPLE, Sizes, matching_loss, reconstruction_losses};
+use super::{
+    ANNEALING_STEPS, KernelPrediction, MULTIPLE, Sizes, matching_loss, reconstruction_losses,
+};
 use crate::import::Shapes;
 use crate::learning::{Bursts, Law, NetworkLosses};
 use crate::method::LearnedMethod;
@@ -77,7 +79,8 @@ impl LearnedMethod for KernelPrediction {
         })
     }
 
-    /// The student resembles its teachers, who see other bursts of the same scene and learn from the truth alone.
+    /// The student resembles its teachers, who see other bursts of the same scene and learn from the truth
+    /// alone.
     fn losses(&self, teachers: &[&Self], bursts: &Bursts, step: u64) -> NetworkLosses {
         let still = bursts.still.as_ref().unwrap_or(&bursts.counts);
         let truth = frame(&bursts.truth, bursts.frames, bursts.frames / 2);
@@ -100,7 +103,7 @@ impl LearnedMethod for KernelPrediction {
 
     /// The weight of the filtered frames falls as far in a short training as in the authors'.
     fn authors_step(step: u64, steps: u64) -> u64 {
-        let factor = ANNEALING.max(steps) as f64 / steps.max(1) as f64;
+        let factor = ANNEALING_STEPS.max(steps) as f64 / steps.max(1) as f64;
         (step as f64 * factor) as u64
     }
 }

@@ -16,6 +16,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::nearest::nearest;
 use qudi_core::{Error, Result, Size};
 use qudi_layers::StateDict;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -23,7 +24,7 @@ pub(crate) use backbone::Net;
 pub use weight_files::cache_folder;
 
 /// The perceptual term of a recipe.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "&'static str")]
 pub enum PerceptualKind {
     /// No perceptual term.

@@ -4,10 +4,11 @@ use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::timesteps::{
     NUM_TIMESTEPS, TimestepSpacing, log_logistic_timestep, sampling_timesteps,
 };
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The law of the timesteps that the network learns at.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimestepLaw {
     /// All alike (Ho et al. 2020, algorithm 1), as in the paper.
@@ -30,7 +31,7 @@ impl TimestepLaw {
 }
 
 /// What the noise of the noisy images is added to.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum NoiseOn {
     /// The true images (Ho et al. 2020, algorithm 1): the network learns the mean of what noise leaves open.

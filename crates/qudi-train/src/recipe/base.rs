@@ -10,8 +10,8 @@ use toml::{Table, Value};
 const BASES: &[(&str, &str)] =
     &[("data/open-clips.toml", include_str!("../../../../configs/data/open-clips.toml"))];
 
-/// Lays a recipe over the base that it names, if it names one: a file, relative to the recipe's folder, or else one
-/// inside the program. Tables are joined; of everything else, the recipe's value stays.
+/// Lays a recipe over the base that it names, if it names one: a file, relative to the recipe's folder, or
+/// else one inside the program. Tables are joined; of everything else, the recipe's value stays.
 ///
 /// # Errors
 /// [`Error`] if there is no such base, or it cannot be read.
@@ -35,6 +35,12 @@ pub(super) fn over_base(mut recipe: Table, folder: Option<&Path>) -> Result<Tabl
     let mut base = parsed.map_err(fault)?;
     merge(&mut base, recipe);
     Ok(base)
+}
+
+/// Returns the tables of a built-in recipe, laid over its base.
+pub fn recipe_table(name: &str) -> Option<Table> {
+    let table = super::network::preset(name)?.parse().ok()?;
+    over_base(table, None).ok()
 }
 
 /// Lays `upper` over `lower`, table by table.

@@ -1,8 +1,8 @@
-//! Keys of recipes as text: single keys that are changed.
+//! Changes of single keys of a recipe.
 
 use qudi_core::{Error, Result};
 
-/// A value of TOML, or a word as text.
+/// Parses a value of TOML; a word is text.
 pub(super) fn value(text: &str) -> toml::Value {
     let value = format!("v = {text}").parse::<toml::Table>().ok();
     let value = value.and_then(|mut table| table.remove("v"));

@@ -4,6 +4,7 @@ use qudi_baselines::method::{METHODS, Method, Sizes};
 use qudi_core::{Error, Result};
 use qudi_model::conditioning::AlignedNeighbours;
 use qudi_model::config::{NetworkConfig, PRESETS, Part, ReferenceKind};
+use schemars::JsonSchema;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -19,7 +20,7 @@ pub(super) fn preset(name: &str) -> Option<&'static str> {
 }
 
 /// The `[network]` table: sizes of the diffusion network, or, with the key `method`, of a learned baseline.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(untagged)]
 #[allow(clippy::large_enum_variant)] // one in a recipe
 pub enum NetworkRecipe {

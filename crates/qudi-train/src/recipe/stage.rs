@@ -5,21 +5,23 @@ use super::{Recipe, TrainConfig, is_default};
 use crate::loss::NoiseOn;
 use crate::loss::lpips::PerceptualKind;
 use qudi_core::{Error, Result};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// One stage: the recipe with some of its keys changed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StageConfig {
     /// The name, which its folder has, too.
     pub name: String,
     /// Keys of the recipe and their values here, such as `"train.steps" = 9000`.
     #[serde(default)]
+    #[schemars(with = "serde_json::Map<String, serde_json::Value>")]
     pub changes: toml::Table,
 }
 
 /// Parts of the network that can learn without the others.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LearningPart {
     /// The pre-denoiser.
