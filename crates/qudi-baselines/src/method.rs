@@ -242,11 +242,11 @@ macro_rules! methods {
             pub(crate) fn losses(&self, teachers: &[Self], bursts: &Bursts, step: u64, steps: u64) -> NetworkLosses {
                 match self {
                     $(Self::$method(network) => {
-                        let own = |teacher: &'_ Self| match teacher {
+                        let own = teachers.iter().filter_map(|teacher| match teacher {
                             Self::$method(teacher) => Some(teacher),
                             _ => None,
-                        };
-                        let teachers: Vec<_> = teachers.iter().filter_map(own).collect();
+                        });
+                        let teachers: Vec<_> = own.collect();
                         let step = <$network>::authors_step(step, steps);
                         LearnedMethod::losses(network, &teachers, bursts, step)
                     }),+

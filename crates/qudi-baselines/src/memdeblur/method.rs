@@ -67,10 +67,11 @@ impl LearnedMethod for MemDeblur {
     fn initial_law(_: Sizes, name: &str, shape: &[usize]) -> Option<Law> {
         let layer =
             ends_with_any(name, &["conv1.weight", "conv2.weight", "conv1.bias", "conv2.bias"]);
-        (layer && name.contains("resblocks.")).then(|| match name.ends_with(".weight") {
-            true => kaiming(INITIAL_SCALE, shape),
-            false => Law::Same(0.0),
-        })
+        if !layer || !name.contains("resblocks.") {
+            return None;
+        }
+        let is_weight = name.ends_with(".weight");
+        Some(if is_weight { kaiming(INITIAL_SCALE, shape) } else { Law::Same(0.0) })
     }
 
     fn context(&self) -> [usize; 2] {

@@ -60,7 +60,6 @@ mod tests {
     #![allow(clippy::unwrap_used)]
 
     use super::super::Recipe;
-    use super::*;
 
     #[test]
     fn shipped_recipes_have_the_clips_of_their_base() {
