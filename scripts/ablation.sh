@@ -1,18 +1,19 @@
 #!/bin/sh
-# What each part of the method is worth: the stage `perception` of `paper-mini` from one set of weights, whole and with
-# one part left out, on identical samples for equally many steps; then one and ten steps on clips, at two lights.
+# Measures the contribution of each part of the method: trains the stage `perception` of `paper-mini` from one set of
+# weights, complete and with one part left out, on identical samples for the same number of steps. Then evaluates one
+# and ten sampling steps on clips at two light levels.
 #
 #     scripts/ablation.sh PATH/TO/qudi DATA BACKBONES WEIGHTS CLIPS OUT STEPS [VARIANT...]
 #
-# BACKBONES are the weights of LPIPS, WEIGHTS those of the stage before (RUN/3-mean/weights.safetensors). Variants:
-# whole physics flow fusion self-conditioning lpips. `scripts/compare/paired.py OUT/whole.json OUT/flow.json` compares.
+# BACKBONES are the weights of LPIPS, WEIGHTS the weights of the previous stage (RUN/3-mean/weights.safetensors).
+# Variants: whole physics flow fusion self-conditioning lpips. `scripts/compare/paired.py OUT/whole.json OUT/flow.json` compares.
 set -eu
 qudi=$1 data=$2 backbones=$3 weights=$4 clips=$5 out=$6 steps=$7
 shift 7
 [ $# -gt 0 ] || set -- whole physics flow fusion self-conditioning lpips
 recipe=$(dirname "$0")/../configs/paper-mini.toml
 mkdir -p "$out"
-# What all stages have in common, and the fourth, "perception".
+# Keeps the common part of all stages and the fourth stage, "perception".
 awk "/^\\[\\[stage\\]\\]/ { n++ } n == 0 || n == 4" "$recipe" >"$out/recipe.toml"
 
 for part in "$@"; do
