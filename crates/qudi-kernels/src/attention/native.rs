@@ -10,8 +10,8 @@ use rayon::prelude::*;
 /// Number of queries whose sums are computed together.
 const LANES: usize = 64;
 
-/// Multiplies a matrix `[outputs][planes]` by `cells` pixels: `result[o] = sum over p of weight[o][p] *
-/// planes[p]`.
+/// Multiplies a matrix `[outputs][planes]` by `cells` pixels:
+/// `result[o] = sum over p of weight[o][p] * planes[p]`.
 fn product(weight: &[f32], planes: &[f32], outputs: usize, cells: usize) -> Vec<f32> {
     let geometry = geometry(planes.len() / cells, outputs, cells);
     convolve(&geometry, &[planes], weight, &vec![0.0; outputs])

@@ -19,8 +19,8 @@ pub(super) const MAX_INPUTS: usize = 5;
 #[backend_extension(Flex: cfg(feature = "flex"), Cube: cfg(feature = "cube"), Autodiff)]
 #[allow(clippy::too_many_arguments)]
 pub trait ConvBackend: Backend {
-    /// Convolves inputs `[images, channels, height, width]` with the weight `[outputs, channels, frames,
-    /// rows, columns]`; the addend has the output's shape.
+    /// Convolves inputs `[images, channels, height, width]` with the weight
+    /// `[outputs, channels, frames, rows, columns]`; the addend has the output's shape.
     fn conv_frames(
         a: FloatTensor<Self>,
         b: FloatTensor<Self>,

@@ -82,9 +82,9 @@ pub(super) fn pair(first: f32, second: f32) -> f32 {
 /// A row of a plane, and its mask.
 pub(super) type Row<'a> = (&'a [f32], Option<&'a [f32]>);
 
-/// Copies rows of input planes to a row of scratch memory: `to[i]` is the entry of the values at `left + i *
-/// step`, zero outside and where the mask is not positive. Inlined, to be compiled for the vector unit of its
-/// caller.
+/// Copies rows of input planes to a row of scratch memory: `to[i]` is the entry of the values at
+/// `left + i * step`, zero outside and where the mask is not positive. Inlined, to be compiled for the vector
+/// unit of its caller.
 #[inline(always)]
 pub(super) fn fill_row(
     format: Format,

@@ -17,8 +17,8 @@ const STRIP_ROWS: usize = 8;
 /// Maximum number of blocks in a group.
 const MAX_GROUP_SIZE: usize = 32;
 
-/// Kaiser window of 8 samples with beta = 2, the weights of a block's pixels (section IV-B): `I0(2 sqrt(1 -
-/// (2k/7 - 1)^2)) / I0(2)`.
+/// Kaiser window of 8 samples with beta = 2, the weights of a block's pixels (section IV-B):
+/// `I0(2 sqrt(1 - (2k/7 - 1)^2)) / I0(2)`.
 const KAISER: [f32; BLOCK] = [
     0.438_676_3,
     0.681_324_3,
