@@ -70,8 +70,7 @@ impl Restorer for AlignedSums {
         self.restore_frames(burst, acquisition, &all)
     }
 
-    /// Restores the requested frames. Frames whose distance is a multiple of `count` are restored together,
-    /// so that their sums share no counts.
+    /// Frames whose distance is a multiple of `count` are restored together, so that their sums share no counts.
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
@@ -147,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn requested_frames_equal_a_full_restoration() {
+    fn wanted_frames_are_those_of_all() {
         let (counts, acquisition, _) = burst(40, 0.1, 0);
         let view = BurstView { size: SIZE, frames: &counts };
         let mut aligned = AlignedSums::new(Box::new(Average), 3, 3);
