@@ -1,19 +1,19 @@
 #!/bin/sh
-# Measures the contribution of each part of the method: trains the stage `perception` of `paper-mini` from one set of
-# weights, complete and with one part left out, on identical samples for the same number of steps. Then evaluates one
-# and ten sampling steps on clips at two light levels.
+# Ablation study: trains the stage `perception` of `paper-mini` from one set of weights, whole and without one
+# part, on identical samples for equally many steps; then evaluates 1 and 10 steps at two light levels.
 #
 #     scripts/ablation.sh PATH/TO/qudi DATA BACKBONES WEIGHTS CLIPS OUT STEPS [VARIANT...]
 #
-# BACKBONES are the weights of LPIPS, WEIGHTS the weights of the previous stage (RUN/3-mean/weights.safetensors).
-# Variants: whole physics flow fusion self-conditioning lpips. `scripts/compare/paired.py OUT/whole.json OUT/flow.json` compares.
+# BACKBONES are the weights of LPIPS, WEIGHTS the result of the stage before (RUN/3-mean/weights.safetensors).
+# Variants: whole physics flow fusion self-conditioning lpips. Compare the results with
+# `scripts/compare/paired.py OUT/whole.json OUT/flow.json`.
 set -eu
 qudi=$1 data=$2 backbones=$3 weights=$4 clips=$5 out=$6 steps=$7
 shift 7
 [ $# -gt 0 ] || set -- whole physics flow fusion self-conditioning lpips
 recipe=$(dirname "$0")/../configs/paper-mini.toml
 mkdir -p "$out"
-# Keeps the common part of all stages and the fourth stage, "perception".
+# What all stages have in common, and the fourth, "perception".
 awk "/^\\[\\[stage\\]\\]/ { n++ } n == 0 || n == 4" "$recipe" >"$out/recipe.toml"
 
 for part in "$@"; do

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Trains twice: once without interruption, once repeatedly killed with SIGKILL and resumed. The weights and the whole
-# training state must be equal bit for bit.
+# Trains twice: once undisturbed, once killed with SIGKILL repeatedly and resumed. The weights and the whole
+# training state must be the same, bit for bit.
 #
 #     scripts/kill_and_resume.sh PATH/TO/qudi [KILLS] [STEPS]
 set -eu
@@ -20,13 +20,13 @@ while :; do
     "$qudi" train tiny -o "$folder/killed" $options $resume &
     run=$!
     if [ "$killed" -lt "$kills" ]; then
-        # Between 0.3 and 1.3 seconds: in the middle of steps, of writing states, and of validations.
+        # Between 0.3 and 1.3 seconds: in the middle of steps, of states being written, of validations.
         sleep "$(awk -v seed="$killed" 'BEGIN { srand(seed + 7); print 0.3 + rand() }')"
         kill -KILL "$run" 2>/dev/null || true
     fi
     if wait "$run" 2>/dev/null; then break; fi
     killed=$((killed + 1))
-    # A run killed before its first state starts again; a run killed later is resumed.
+    # A run killed before its first state starts anew; one killed later goes on.
     if [ -d "$folder/killed/state" ] || [ -d "$folder/killed/state.old" ]; then resume=--resume; fi
 done
 
