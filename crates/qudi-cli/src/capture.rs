@@ -10,7 +10,8 @@ use crate::error::{CliError, Result};
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::sensor::Sensor;
-use qudi_io::capture::{Capture, ReadOptions, SumChoice, choose_sum};
+use qudi_io::capture::{Capture, SumChoice, choose_sum};
+use qudi_io::description::ReadOptions;
 use std::io::IsTerminal;
 use std::path::Path;
 

@@ -6,7 +6,8 @@ use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::LONGEST_HALF;
-use qudi_io::capture::{Capture, ENOUGH, ReadOptions, SumChoice, SumLimit};
+use qudi_io::capture::{Capture, ENOUGH, SumChoice, SumLimit};
+use qudi_io::description::ReadOptions;
 use qudi_io::restore::Instants;
 
 /// Methods that sums are aligned for: those that align frames themselves.

@@ -13,7 +13,7 @@ use crate::methods::trained::provenance;
 use crate::methods::{METHODS, is_method};
 use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
-use qudi_io::capture::{MaskChoice, ReadOptions};
+use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_layers::Provenance;
 use std::path::PathBuf;
 use std::rc::Rc;

@@ -12,7 +12,8 @@ use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
-use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, SumChoice, Summary};
+use qudi_io::capture::{BitOrderCheck, Capture, SumChoice, Summary};
+use qudi_io::description::{MaskChoice, Packing};
 use qudi_io::sidecar::Sidecar;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
@@ -112,7 +113,7 @@ pub(crate) fn describe(
     if let Some(packing) = about.packing {
         line("packing", describe_packing(packing, summary.bit_order));
     }
-    if about.orient != qudi_io::capture::Orientation::Raw {
+    if about.orient != qudi_io::description::Orientation::Raw {
         line("turned", about.orient.name().to_owned());
     }
     if let Some(fps) = capture.fps() {
@@ -166,7 +167,7 @@ pub(crate) fn describe(
 
 fn describe_packing(packing: Packing, check: Option<BitOrderCheck>) -> String {
     let axis = match packing.axis {
-        qudi_io::capture::PackAxis::Height => "height",
+        qudi_io::description::PackAxis::Height => "height",
         _ => "width",
     };
     let order = packing.order;

@@ -9,7 +9,7 @@ use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
 use crate::places::Places;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
-use qudi_io::capture::{MaskChoice, ReadOptions};
+use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::writer::TiffSamples;
 use std::path::{Path, PathBuf};
 
