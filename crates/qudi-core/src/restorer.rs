@@ -55,29 +55,40 @@ pub trait Restorer {
         [0, 0]
     }
 
-    /// Restores every frame of `burst`.
+    /// Restores the frames `numbers` of `burst`, in that order. A frame does not depend on which others are
+    /// restored. Methods that restore all frames at once select them with [`Restored::only`].
     ///
     /// # Errors
     /// [`Error`](crate::Error) if the method cannot work with this burst.
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored>;
-
-    /// Restores only the frames `wanted` of `burst`, to what [`Self::restore`] makes of them. Methods that need
-    /// not restore the others for it save their time.
-    ///
-    /// # Errors
-    /// As [`Self::restore`].
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
-    ) -> Result<Restored> {
-        let all = self.restore(burst, acquisition)?;
-        if wanted.len() == all.frames.len() {
-            return Ok(all);
+        numbers: &[usize],
+    ) -> Result<Restored>;
+
+    /// Restores every frame of `burst`.
+    ///
+    /// # Errors
+    /// As [`Self::restore_frames`].
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let all: Vec<usize> = (0..burst.frames.len()).collect();
+        self.restore_frames(burst, acquisition, &all)
+    }
+}
+
+impl Restored {
+    /// Selects the frames `numbers` of a window that was restored whole, in that order.
+    ///
+    /// # Panics
+    /// If the window has no such frame.
+    #[must_use]
+    pub fn only(self, numbers: &[usize]) -> Self {
+        if numbers.iter().copied().eq(0..self.frames.len()) {
+            return self;
         }
-        let only = |frames: Vec<Frame>| wanted.iter().map(|&n| frames[n].clone()).collect();
-        Ok(Restored { frames: only(all.frames), std: all.std.map(only) })
+        let select = |frames: Vec<Frame>| numbers.iter().map(|&n| frames[n].clone()).collect();
+        Self { frames: select(self.frames), std: self.std.map(select) }
     }
 }
 
