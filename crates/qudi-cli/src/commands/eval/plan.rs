@@ -5,7 +5,7 @@ use super::perceptual::Perceptual;
 use super::score::Row;
 use super::table1;
 use crate::args::{Shard, Sum};
-use crate::capture::acquisition::checked_mean_level;
+use crate::capture::checked_mean_level;
 use crate::device;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;

@@ -3,7 +3,7 @@
 use super::args::Info;
 use super::record::{origin, record_document};
 use crate::args::Global;
-use crate::capture::{OpenedCapture, describe_sum, open_summed, warnings};
+use crate::capture::{Source, SummedCapture, describe_sum, warnings};
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
 use crate::places::Places;
@@ -46,9 +46,15 @@ pub(crate) fn run(
         refuse_taken(preview, overwrite)?;
     }
     let options = info.reading.options(MaskChoice::Auto);
-    let name = info.sensor.as_deref();
-    let OpenedCapture { mut capture, sensor, sum, .. } =
-        open_summed(Some(path), &options, info.reading.sum(), name, settings)?;
+    let source = Source {
+        path: Some(path),
+        options: &options,
+        sum: info.reading.sum(),
+        sensor: info.sensor.as_deref(),
+    };
+    let summed = SummedCapture::new(source.open(settings)?, &source)?;
+    let sum = summed.sum().cloned();
+    let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.preview {
