@@ -1,7 +1,7 @@
 #![no_main]
 
 use qudi_fuzz::{format, read};
-use qudi_io::capture::ReadOptions;
+use qudi_io::description::ReadOptions;
 
 // The first byte chooses a camera. Frames are small to keep files small.
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {

@@ -2,7 +2,8 @@
 //!
 //! Any result is allowed, except a panic, a hang, or memory beyond libFuzzer's limit.
 
-use qudi_io::capture::{Axes, Capture, ReadOptions, choose_sum};
+use qudi_io::capture::{Capture, choose_sum};
+use qudi_io::description::{Axes, ReadOptions};
 
 /// Number of frames read from each file.
 const FRAMES: u64 = 4;

@@ -65,32 +65,27 @@ impl Restorer for AlignedSums {
         self.method.window() * self.count
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let all: Vec<usize> = (0..burst.frames.len()).collect();
-        self.restore_frames(burst, acquisition, &all)
-    }
-
     /// Frames whose distance is a multiple of `count` are restored together, so that their sums share no counts.
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
+        numbers: &[usize],
     ) -> Result<Restored> {
         let count = self.count.min(burst.frames.len());
         let of_sums = Self::acquisition(acquisition, count)?;
         let motion = BlockMotion::find(burst, acquisition, self.block)?;
-        let mut frames: Vec<Option<Frame>> = vec![None; wanted.len()];
+        let mut frames: Vec<Option<Frame>> = vec![None; numbers.len()];
         let mut std = frames.clone();
         for pass in 0..count {
             let places: Vec<usize> =
-                (0..wanted.len()).filter(|&place| wanted[place] % count == pass).collect();
+                (0..numbers.len()).filter(|&place| numbers[place] % count == pass).collect();
             if places.is_empty() {
                 continue;
             }
             let sums = motion.sums(pass, count);
             let view = BurstView { size: burst.size, frames: &sums };
-            let of_pass: Vec<usize> = places.iter().map(|&place| wanted[place] / count).collect();
+            let of_pass: Vec<usize> = places.iter().map(|&place| numbers[place] / count).collect();
             let restored = self.method.restore_frames(view, &of_sums, &of_pass)?;
             for (&place, frame) in places.iter().zip(restored.frames) {
                 frames[place] = Some(frame);
@@ -146,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn wanted_frames_are_those_of_all() {
+    fn selected_frames_equal_those_of_the_whole_window() {
         let (counts, acquisition, _) = burst(40, 0.1, 0);
         let view = BurstView { size: SIZE, frames: &counts };
         let mut aligned = AlignedSums::new(Box::new(Average), 3, 3);

@@ -132,18 +132,13 @@ impl Restorer for QbpRefined {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let frames = ReferenceEstimate::compute(burst, acquisition)?.frames;
-        Ok(Restored { frames, std: None })
-    }
-
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
+        numbers: &[usize],
     ) -> Result<Restored> {
-        let frames = ReferenceEstimate::of_frames(burst, acquisition, wanted)?.frames;
+        let frames = ReferenceEstimate::of_frames(burst, acquisition, numbers)?.frames;
         Ok(Restored { frames, std: None })
     }
 }

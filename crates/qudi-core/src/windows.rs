@@ -182,8 +182,13 @@ mod tests {
             self.0
         }
 
-        fn restore(&mut self, burst: BurstView<'_>, _: &Acquisition) -> Result<Restored> {
-            let frames = vec![Frame::filled(burst.size, 0.0); burst.frames.len()];
+        fn restore_frames(
+            &mut self,
+            burst: BurstView<'_>,
+            _: &Acquisition,
+            numbers: &[usize],
+        ) -> Result<Restored> {
+            let frames = vec![Frame::filled(burst.size, 0.0); numbers.len()];
             Ok(Restored { frames, std: None })
         }
     }

@@ -23,7 +23,12 @@ impl Restorer for Average {
         WINDOW
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        numbers: &[usize],
+    ) -> Result<Restored> {
         let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
         let detections = acquisition.sensor.quantum_efficiency * acquisition.ppp
             + acquisition.sensor.dark_per_frame()?;
@@ -35,6 +40,6 @@ impl Restorer for Average {
             let data = sums.iter().map(|&sum| (f64::from(sum) * scale) as f32).collect();
             frames.push(Frame { size: burst.size, data });
         });
-        Ok(Restored { frames, std: None })
+        Ok(Restored { frames, std: None }.only(numbers))
     }
 }

@@ -39,7 +39,12 @@ impl Restorer for Mle {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        numbers: &[usize],
+    ) -> Result<Restored> {
         let ordinary = acquisition.sensor.dark_per_frame()?;
         let units = 1.0 / acquisition.photons_per_unit();
         let mut frames = Vec::with_capacity(burst.frames.len());
@@ -53,6 +58,6 @@ impl Restorer for Mle {
             let data = sums.iter().enumerate().map(pixel).collect();
             frames.push(Frame { size: burst.size, data });
         });
-        Ok(Restored { frames, std: None })
+        Ok(Restored { frames, std: None }.only(numbers))
     }
 }

@@ -121,18 +121,13 @@ impl Restorer for Qbp {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let all: Vec<usize> = (0..burst.frames.len()).collect();
-        self.restore_frames(burst, acquisition, &all)
-    }
-
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
+        numbers: &[usize],
     ) -> Result<Restored> {
-        Ok(Restored { frames: self.merge_frames(burst, acquisition, wanted)?, std: None })
+        Ok(Restored { frames: self.merge_frames(burst, acquisition, numbers)?, std: None })
     }
 }
 

@@ -52,7 +52,12 @@ impl Restorer for TransformDenoise {
         2 * LONGEST_HALF + 1
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        numbers: &[usize],
+    ) -> Result<Restored> {
         let ordinary = acquisition.sensor.dark_per_frame()?;
         let mut vsts: Vec<Option<VarianceStabilizer>> = vec![None; self.length() + 1];
         let mut frames = Vec::with_capacity(burst.frames.len());
@@ -65,6 +70,6 @@ impl Restorer for TransformDenoise {
             let z = denoise(SearchSettings::NORMAL, z, vst, 1.0);
             frames.push(image(&z, vst, acquisition, ordinary));
         });
-        Ok(Restored { frames, std: None })
+        Ok(Restored { frames, std: None }.only(numbers))
     }
 }
