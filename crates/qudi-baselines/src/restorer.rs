@@ -99,11 +99,6 @@ impl Restorer for LearnedRestorer {
         self.network.context()
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let all: Vec<usize> = (0..burst.frames.len()).collect();
-        self.restore_frames(burst, acquisition, &all)
-    }
-
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
