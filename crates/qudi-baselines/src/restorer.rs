@@ -19,10 +19,10 @@ pub(crate) use window::{Window, copies};
 /// The side of the smallest tiles, in pixels: a multiple of what every network needs.
 pub const SMALLEST_TILE: usize = 64;
 
-/// A learned method with weights, as its authors used it: counts over full scale in, images out. Weights of
-/// authors know the brightness of their own light, and the image is not scaled to that of this acquisition.
-/// Weights that were trained here give images in the units of counts, and the acquisition says what these
-/// are.
+/// A learned method with weights, as its authors used it, from counts over full scale to images. Authors'
+/// weights return images for the light level of their training, which are not scaled to the level of the
+/// acquisition. Weights that were trained here return images in units of counts, which the acquisition
+/// converts.
 #[derive(Debug)]
 pub struct LearnedRestorer {
     network: Network,

@@ -89,8 +89,8 @@ pub struct Sensor {
     /// Binary frames summed into one output frame.
     #[serde(default = "one")]
     pub frames_summed: u32,
-    /// Time from the first row to the last as a share of a native frame, 0 to 1: `simulate` exposes each row to
-    /// the scene at its own time, rounded to `instants`.
+    /// Time from the first row to the last as a share of a native frame, 0 to 1: `simulate` exposes each row
+    /// to the scene at its own time, rounded to `instants`.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub rolling_shutter: f64,
     /// Imperfect pixels; all off by default.

@@ -68,7 +68,7 @@ impl LearnedMethod for FloRnn {
         [1, self.window() - 2]
     }
 
-    /// The flow from each frame to the next is found once.
+    /// Restores the second frame of each window; the flow from each frame to the next is computed once.
     fn restore(&self, window: Window<'_>) -> Result<Vec<Tensor<4>>> {
         let frames = window.around(self.context());
         let copies = |frame: &Tensor<4>| frame.clone().repeat(&[1, self.channels(), 1, 1]);

@@ -75,7 +75,7 @@ impl LearnedMethod for Rvrt {
         [0, 0]
     }
 
-    /// The last frame is mirrored where their number is odd.
+    /// Restores all frames; the last one is mirrored if their number is odd.
     fn restore(&self, window: Window<'_>) -> Result<Vec<Tensor<4>>> {
         let frames = window.all();
         let count = frames.len().next_multiple_of(CLIP);

@@ -70,7 +70,7 @@ impl LearnedMethod for Spk2ImgNet {
         [RESTORED_FRAME, FRAMES - 1 - RESTORED_FRAME]
     }
 
-    /// Every block of frames is computed once.
+    /// Restores one frame of each window; every block of frames is computed once.
     fn restore(&self, window: Window<'_>) -> Result<Vec<Tensor<4>>> {
         let frames = window.around(self.context());
         let mut blocks: VecDeque<Block> = VecDeque::new();

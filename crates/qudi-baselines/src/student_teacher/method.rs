@@ -59,7 +59,7 @@ impl LearnedMethod for KernelPrediction {
         Self::file_name(name)
     }
 
-    /// Kernels start as the mean of all frames.
+    /// Lets kernels start as the mean of all frames.
     fn initial_law(s: Sizes, name: &str, shape: &[usize]) -> Option<Law> {
         let taps = s.kernel * s.kernel;
         let centre = |place: usize| if place % taps == taps / 2 { 1.0 } else { 0.0 };
@@ -79,8 +79,8 @@ impl LearnedMethod for KernelPrediction {
         })
     }
 
-    /// The student resembles its teachers, who see other bursts of the same scene and learn from the truth
-    /// alone.
+    /// Computes the loss of the student, which resembles its teachers, and the teachers' own: they see other
+    /// bursts of the same scene, and learn from the truth alone.
     fn losses(&self, teachers: &[&Self], bursts: &Bursts, step: u64) -> NetworkLosses {
         let still = bursts.still.as_ref().unwrap_or(&bursts.counts);
         let truth = frame(&bursts.truth, bursts.frames, bursts.frames / 2);
@@ -101,7 +101,7 @@ impl LearnedMethod for KernelPrediction {
         terms.into()
     }
 
-    /// The weight of the filtered frames falls as far in a short training as in the authors'.
+    /// Lets the weight of the filtered frames fall as far in a short training as in the authors'.
     fn authors_step(step: u64, steps: u64) -> u64 {
         let factor = ANNEALING_STEPS.max(steps) as f64 / steps.max(1) as f64;
         (step as f64 * factor) as u64

@@ -21,8 +21,8 @@ pub struct Defects {
     /// `.npy` of `[height][width]` dark rates in e- per pixel and native frame, instead of drawn ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dark_map: Option<String>,
-    /// `.npy` of `[height][width]`, nonzero where captures are repaired. The simulator does not need it: hot pixels are
-    /// hot in `dark_map`.
+    /// `.npy` of `[height][width]`, nonzero where captures are repaired. The simulator does not need it: hot
+    /// pixels are hot in `dark_map`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bad_pixels: Option<String>,
     /// Fraction of hot pixels.

@@ -106,14 +106,14 @@ fn usual_speed() -> f64 {
 }
 
 impl SourceConfig {
-    /// How many times smaller a sample is made.
+    /// Draws the factor by which a sample is downscaled.
     pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
         if self.max_downscale > 1.0 { self.max_downscale.powf(uniform(random)) } else { 1.0 }
     }
 }
 
 impl LightRange {
-    /// Least and most.
+    /// Returns the lowest and the highest level.
     pub fn bounds(&self) -> [f64; 2] {
         match self {
             Self::Between { from, to } => [*from, *to],
@@ -123,7 +123,7 @@ impl LightRange {
         }
     }
 
-    /// A value for a uniform number in [0, 1).
+    /// Returns the level at a uniform number in [0, 1).
     pub(super) fn at(&self, u: f64) -> f64 {
         match self {
             Self::Between { from, to } => from * (to / from).powf(u),
@@ -133,7 +133,7 @@ impl LightRange {
 }
 
 impl SensorMix {
-    /// The sensor, as it is used.
+    /// Loads the sensor, as it is used.
     ///
     /// # Errors
     /// [`Error`] if there is none of that name, or it cannot exist.
@@ -148,7 +148,7 @@ impl SensorMix {
 }
 
 impl DataConfig {
-    /// The sensors by name; sums of binary frames as `name x frames`.
+    /// Returns the sensors by name; sums of binary frames as `name x frames`.
     pub(crate) fn sensor_names(&self) -> Vec<String> {
         let name = |mix: &SensorMix| match mix.frames_summed {
             None => mix.name.clone(),
@@ -157,18 +157,18 @@ impl DataConfig {
         self.sensor.iter().map(name).collect()
     }
 
-    /// The least and most photons per pixel and frame of all sensors.
+    /// Returns the fewest and the most photons per pixel and frame of all sensors.
     pub(crate) fn light(&self) -> [f64; 2] {
         let bounds = self.sensor.iter().map(|mix| mix.ppp.bounds());
         bounds.fold([f64::INFINITY, 0.0], |[low, high], [from, to]| [low.min(from), high.max(to)])
     }
 
-    /// The names of all sources.
+    /// Returns the names of all sources.
     pub(crate) fn source_names(&self) -> Vec<String> {
         self.source.iter().map(|source| source.name.clone()).collect()
     }
 
-    /// The configuration, if samples can be drawn from it.
+    /// Returns the configuration, if samples can be drawn from it.
     ///
     /// # Errors
     /// [`Error::Request`] with the key that is wrong.
@@ -248,7 +248,7 @@ impl DataConfig {
         Ok(self)
     }
 
-    /// Whether any source reads files.
+    /// Returns true if any source reads files.
     pub fn needs_files(&self) -> bool {
         self.source.iter().any(|source| source.kind != SourceKind::Scenes)
     }

@@ -58,11 +58,11 @@ Every command reads settings in layers; the later one wins:
 | `sensor.*` | `simulate`, `eval`, `restore`, `info`, `calibrate`, `light`, `demo`: on top of the chosen sensor |
 | `network.*`, `data.*`, `train.*`, `validation.*` | `train`: on top of the chosen recipe |
 
-Unknown keys are errors everywhere. `--set` with a key that the command does not take is an error. A file and the
-environment are shared between commands: there, known keys of other commands are left alone.
+Unknown keys are errors everywhere. `--set` with a key that the command does not take is an error. A file and
+the environment are shared between commands: there, known keys of other commands are ignored.
 
-Sensor files in `sensors/` hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one from a
-preset. This page is the output of `qudi config docs`.
+Sensor files in `sensors/` hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one
+from a preset. This page is the output of `qudi config docs`.
 
 ## Keys of the simulation and the sensor
 
@@ -78,9 +78,9 @@ Keys without a default have none, or the value of the chosen sensor.
     text += "
 ## Keys of recipes
 
-A recipe is a TOML file of these keys; [training](../docs/training.md) explains how they work together. `0` stands for
-the number of an entry in a list. `base = \"data/open-clips.toml\"` starts a recipe from another file. Those who set a
-key are the recipes in this folder; the learned methods are in `baselines/`.
+A recipe is a TOML file of these keys; [training](../docs/training.md) explains how they work together. `0`
+stands for the number of an entry in a list. `base = \"data/open-clips.toml\"` starts a recipe from another file.
+The last column names the recipes in this folder that set the key; the learned methods are in `baselines/`.
 
 | key | values | default | meaning | set by |
 |---|---|---|---|---|
@@ -92,8 +92,8 @@ key are the recipes in this folder; the learned methods are in `baselines/`.
             writeln!(text, "| `{name}` | {values} | {default} | {doc} | {} |", setters(&recipes));
     }
     text += "
-Recipes with `network.method` are for [learned methods of others](../docs/training.md#learned-methods-of-others), with
-other keys in `[network]`:
+Recipes with `network.method` are for [learned methods of others](../docs/training.md#learned-methods-of-others),
+with other keys in `[network]`:
 
 | method | key | values | meaning |
 |---|---|---|---|
