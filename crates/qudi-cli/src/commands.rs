@@ -3,7 +3,6 @@
 pub(crate) mod bench {
     pub(crate) mod args;
     mod burst;
-    mod network;
     pub(crate) mod run;
 }
 

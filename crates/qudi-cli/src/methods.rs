@@ -11,6 +11,7 @@ use qudi_baselines::import::Method;
 use qudi_burst::{Average, Mle, PostFilter, Qbp, QbpRefined, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_io::capture::Capture;
+use qudi_model::config::NetworkKind;
 use qudi_model::restorer::MIN_FRAMES;
 
 /// All methods.
@@ -23,6 +24,8 @@ pub(crate) const METHODS: &[&str] = &[
     "qbp-bm3d",
     "qbp-refined",
     "qudi",
+    "qudi-regression",
+    "qudi-diffusion",
     "quiver",
     "emvd",
     "flornn",
@@ -42,7 +45,17 @@ pub(crate) fn is_method(name: &str) -> bool {
 
 /// Whether a method is a network, whose weights take time to read.
 pub(crate) fn is_network(name: &str) -> bool {
-    name == "qudi" || Method::by_name(name).is_some()
+    own_kind(name).is_some() || Method::by_name(name).is_some()
+}
+
+/// Returns the kind of a network of this project by the name of its method; `qudi` has no kind of its own.
+pub(crate) fn own_kind(name: &str) -> Option<Option<NetworkKind>> {
+    match name {
+        "qudi" => Some(None),
+        "qudi-regression" => Some(Some(NetworkKind::Regression)),
+        "qudi-diffusion" => Some(Some(NetworkKind::Diffusion)),
+        _ => None,
+    }
 }
 
 /// Windows of a clip that a method's settings are chosen on.
@@ -61,7 +74,6 @@ pub(crate) fn method(
             let mle = sampled(capture, |views| Mle::choose(views, acquisition))?;
             Ok((Box::new(mle), over(mle.length())))
         }
-        "qudi" => network::restorer(options, acquisition, capture.size()),
         "transform-denoise" | "bm3d" => {
             let transform = if name == "bm3d" { Transform::Identity } else { Transform::Integral };
             let chosen =
@@ -71,9 +83,10 @@ pub(crate) fn method(
         "qbp" => Ok((Box::new(Qbp::new(PostFilter::None)), String::new())),
         "qbp-bm3d" => Ok((Box::new(Qbp::new(PostFilter::Bm3d)), String::new())),
         "qbp-refined" | FORMER_QBP_REFINED => Ok((Box::new(QbpRefined), String::new())),
-        other => match Method::by_name(other) {
-            Some(method) => learned::restorer(method, options, acquisition, capture.size()),
-            None => Err(CliError::new(
+        other => match (own_kind(other), Method::by_name(other)) {
+            (Some(kind), _) => network::restorer(kind, options, acquisition, capture.size()),
+            (None, Some(method)) => learned::restorer(method, options, acquisition, capture.size()),
+            (None, None) => Err(CliError::new(
                 format!("no method named `{other}`"),
                 "--method",
                 format!("there are {}", METHODS.join(", ")),

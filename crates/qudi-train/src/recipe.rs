@@ -6,13 +6,16 @@ mod rules;
 mod stage;
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
+use crate::learner::diffusion::TimestepLaw;
+use crate::loss::LossForm;
 use crate::loss::lpips::PerceptualKind;
-use crate::loss::{LossForm, NoiseOn, TimestepLaw};
 use crate::optimizer::OptimizerKind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
 use qudi_kernels::ComputePrecision;
+use qudi_model::checkpoint::Sampling;
+use qudi_model::diffusion::Ablation;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -83,15 +86,15 @@ pub struct TrainConfig {
     /// Law of the timesteps that the network learns at.
     #[serde(default, skip_serializing_if = "is_default")]
     pub timesteps: TimestepLaw,
-    /// What the noise of the noisy images is added to.
+    /// Parts that are left out, to measure what they are worth; only of the diffusion. Weights do not keep it.
     #[serde(default, skip_serializing_if = "is_default")]
-    pub noise_on: NoiseOn,
-    /// Fraction of the samples at the noisiest timestep, where sampling begins; not of learned baselines.
+    pub ablate: Ablation,
+    /// Fraction of the samples at the noisiest timestep, where sampling begins; only of the diffusion.
     #[serde(default, alias = "start", skip_serializing_if = "Option::is_none")]
     pub noise_start_fraction: Option<f64>,
     /// Steps between checkpoints.
     pub checkpoint: u64,
-    /// The loss; learned baselines have their authors'.
+    /// The loss of the diffusion; the other networks have no weights to choose.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub loss: Option<LossConfig>,
     /// Licence of the weights, an SPDX expression.
@@ -99,7 +102,7 @@ pub struct TrainConfig {
 }
 
 impl TrainConfig {
-    /// The loss; of learned baselines, whose loss has no weights to choose, all weights are 0.
+    /// Returns the loss; all weights are 0 of networks that have none to choose.
     pub fn loss(&self) -> LossConfig {
         self.loss.unwrap_or(LossConfig {
             form: LossForm::default(),
@@ -111,7 +114,7 @@ impl TrainConfig {
         })
     }
 
-    /// Fraction of the samples at the noisiest timestep.
+    /// Returns the fraction of the samples at the noisiest timestep.
     pub(super) fn noise_start_fraction(&self) -> f64 {
         self.noise_start_fraction.unwrap_or(0.0)
     }
@@ -168,7 +171,7 @@ pub struct ValidationConfig {
     pub sensor: String,
     /// Photons per pixel and frame.
     pub ppp: Vec<f64>,
-    /// Reverse steps; 0 judges the pre-denoiser. Learned baselines have none.
+    /// Reverse steps; only of the diffusion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
     /// Spacing of their timesteps, which the weights keep for restoring.
@@ -233,23 +236,23 @@ impl Recipe {
         self.train.crops.map_or(whole, |crops| (crops.frames, crops.side))
     }
 
-    /// Reverse diffusion steps that the weights are made for: none where nothing but regression learns.
-    pub(super) fn default_steps(&self) -> usize {
-        if self.train.loss().prediction == 0.0 {
-            return 0;
-        }
-        self.validation.as_ref().map_or(1, |validation| validation.steps.unwrap_or(0))
+    /// Returns the sampling that the weights are made for.
+    pub(super) fn sampling(&self) -> Sampling {
+        let validation = self.validation.as_ref();
+        validation.map_or_else(Sampling::default, |validation| Sampling {
+            steps: validation.steps.unwrap_or(1),
+            spacing: validation.spacing,
+        })
     }
 
-    /// Spacing of the timesteps that the weights are made for.
-    pub(super) fn default_spacing(&self) -> TimestepSpacing {
-        self.validation.as_ref().map_or_else(TimestepSpacing::default, |v| v.spacing)
+    /// Returns the number of frames that validations restore at once.
+    pub(super) fn window(&self) -> usize {
+        self.validation.as_ref().map_or(self.data.frames.max(11), |validation| validation.frames)
     }
 
-    /// Whether only the pre-denoiser learns: frame by frame.
-    pub(super) fn learns_frames(&self) -> bool {
-        let loss = self.train.loss();
-        loss.prediction == 0.0 && loss.flow == 0.0 && loss.term == PerceptualKind::None
+    /// Returns true if the first pre-denoiser of the regression learns, and nothing else.
+    pub(super) fn trains_refinement(&self) -> bool {
+        self.train.learns == [LearningPart::Refinement]
     }
 
     /// The validation clips as a source of a pack; none if there are none with files.

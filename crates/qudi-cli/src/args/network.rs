@@ -2,7 +2,6 @@
 
 use super::number;
 use crate::methods::options::NetworkOptions;
-use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_baselines::import::{METHODS, Method};
 use qudi_layers::TILE;
@@ -11,22 +10,21 @@ use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::{Path, PathBuf};
 
-/// The network, for the method `qudi`.
+/// Options of networks.
 #[derive(Clone, Debug, Default, ClapArgs)]
-#[command(next_help_heading = "Network (method qudi)")]
+#[command(next_help_heading = "Networks (methods qudi, qudi-regression, qudi-diffusion)")]
 pub(crate) struct Network {
-    /// Weights that `qudi train` wrote [default: those that come along]; for learned methods of others
+    /// Weights that `qudi train` wrote [default: built in]; for learned methods of others
     /// METHOD=FILE, as in emvd=emvd.pth,quiver=quiver.pth (no commas in names)
     #[arg(long, value_name = "[METHOD=]FILE,...", value_delimiter = ',', value_hint = ValueHint::FilePath)]
     weights: Vec<WeightsOf>,
-    /// Spacing of the timesteps of these steps [default: what the weights say of themselves, usually
-    /// log-logistic]
+    /// qudi-diffusion: spacing of the timesteps [default: as the weights say]
     #[arg(long, value_name = "NAME")]
     spacing: Option<SpacingName>,
-    /// Sampler of these steps [default: ddim]
+    /// qudi-diffusion: sampler [default: ddim]
     #[arg(long, value_name = "NAME")]
     sampler: Option<SamplerName>,
-    /// Samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
+    /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
     #[arg(long, value_name = "K", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info
@@ -43,7 +41,7 @@ pub(crate) struct Network {
 }
 
 impl Network {
-    /// The weights of the method `qudi`, if they are named.
+    /// The weights of a network of this project, if they are named.
     pub(crate) fn own_weights(&self) -> Option<&Path> {
         self.weights.iter().find(|weights| weights.method.is_none()).map(|w| w.file.as_path())
     }
@@ -59,7 +57,7 @@ impl Network {
             given.iter().find(|(given, _)| *given).map(|(_, flag)| *flag)
         };
         NetworkOptions {
-            weights: Weights::of(self.own_weights()),
+            own_file: self.own_weights().map(Path::to_owned),
             own_files: self.weights.iter().filter(|weights| weights.method.is_none()).count(),
             learned: self
                 .weights
@@ -84,6 +82,7 @@ impl Network {
             tile_flag: self.tile.is_some().then_some("--tile"),
             device_flag: self.device.is_some().then_some("--device"),
             diffusion_flag: first(&[
+                (steps.is_some(), "--steps"),
                 (self.spacing.is_some(), "--spacing"),
                 (self.sampler.is_some(), "--sampler"),
                 (self.samples.is_some_and(|samples| samples > 1), "--samples"),
@@ -92,7 +91,7 @@ impl Network {
     }
 }
 
-/// Weights, and the learned method that they are of; none for `qudi`.
+/// Weights, and the learned method that they are of; none for the networks of this project.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct WeightsOf {
     method: Option<Method>,
@@ -121,14 +120,13 @@ impl std::str::FromStr for WeightsOf {
     }
 }
 
-/// The number of diffusion steps, for the method `qudi`.
+/// Number of reverse steps of the diffusion.
 #[derive(Clone, Copy, Debug, Default, ClapArgs)]
-#[command(next_help_heading = "Network (method qudi)")]
+#[command(next_help_heading = "Networks (methods qudi, qudi-regression, qudi-diffusion)")]
 pub(crate) struct Steps {
-    /// Reverse diffusion steps. With 0 the frames are a regression: fastest, and closest to the truth on
-    /// average. More steps draw sharper pictures, whose details are invented; the paper takes 10 [default:
-    /// what the weights say of themselves]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
+    /// qudi-diffusion: reverse steps. More steps draw sharper pictures, whose details are invented; the paper
+    /// takes 10 [default: as the weights say]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     pub(crate) steps: Option<usize>,
 }
 

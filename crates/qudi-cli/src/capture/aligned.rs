@@ -10,7 +10,8 @@ use qudi_io::capture::{Capture, ENOUGH, ReadOptions, SumChoice, SumLimit};
 use qudi_io::restore::Instants;
 
 /// Methods that sums are aligned for: those that align frames themselves.
-const METHODS: [&str; 4] = ["qbp", "qbp-bm3d", "qbp-refined", "qudi"];
+const METHODS: [&str; 6] =
+    ["qbp", "qbp-bm3d", "qbp-refined", "qudi", "qudi-regression", "qudi-diffusion"];
 
 /// Pixels that may move within the sums that are shifted.
 const FINE: f64 = 0.5;

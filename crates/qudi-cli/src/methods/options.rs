@@ -1,23 +1,20 @@
-//! What the method `qudi` is asked for, defaults filled in.
+//! Options of networks, defaults filled in.
 
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::methods::learned::LearnedWeights;
-use crate::weights::Weights;
+use crate::methods::own_kind;
 use qudi_baselines::import::Method;
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::PathBuf;
 
-/// The method that these options belong to.
-const METHOD: &str = "qudi";
-
 /// Options of the network.
 #[derive(Clone, Debug)]
 pub(crate) struct NetworkOptions {
-    /// The weights.
-    pub(crate) weights: Weights,
+    /// File of weights of a network of this project; none for the built-in ones.
+    pub(crate) own_file: Option<PathBuf>,
     /// How many files of weights are named for this network.
     pub(crate) own_files: usize,
     /// Files of weights of the learned methods of others.
@@ -47,31 +44,6 @@ pub(crate) struct NetworkOptions {
 }
 
 impl NetworkOptions {
-    /// Reverse steps: those asked for, or those that the weights were made for.
-    pub(crate) fn steps(&self) -> Result<usize> {
-        match self.steps {
-            Some(steps) => Ok(steps),
-            None => Ok(self.weights.describe()?.reverse_steps()),
-        }
-    }
-
-    /// How the frames are made, in words.
-    pub(crate) fn mode(&self) -> Result<String> {
-        Ok(match self.steps()? {
-            0 => "regression".to_owned(),
-            1 => "diffusion in 1 step".to_owned(),
-            steps => format!("diffusion in {steps} steps"),
-        })
-    }
-
-    /// The spacing of the timesteps: that asked for, or that which the weights were made for.
-    pub(crate) fn spacing(&self) -> Result<TimestepSpacing> {
-        match self.spacing {
-            Some(spacing) => Ok(spacing),
-            None => Ok(self.weights.describe()?.spacing.unwrap_or_default()),
-        }
-    }
-
     /// Numbers that convolutions multiply on a device.
     pub(crate) fn precision(&self, device: &Opened) -> Result<ComputePrecision> {
         let precision = self.precision.unwrap_or_else(|| ComputePrecision::fastest(&device.device));
@@ -82,25 +54,12 @@ impl NetworkOptions {
         Err(CliError::new(what, "--precision", "ask for another, or another --device"))
     }
 
-    /// The name of the spacing on the command line.
-    pub(crate) fn spacing_name(&self) -> Result<&'static str> {
-        Ok(match self.spacing()? {
-            TimestepSpacing::Linear => "linear",
-            TimestepSpacing::LogLogistic => "log-logistic",
-        })
-    }
-
     /// The name of the sampler on the command line.
     pub(crate) fn sampler_name(&self) -> &'static str {
         match self.sampler {
             Sampler::Ddim => "ddim",
             Sampler::Ancestral => "ancestral",
         }
-    }
-
-    /// Whether the network, asked so, predicts its uncertainty without samples.
-    pub(crate) fn predicts_uncertainty(&self) -> Result<bool> {
-        Ok(self.steps()? == 0 && self.weights.describe()?.network.pre.uncertainty)
     }
 
     /// Refuses these options where none of the methods is the network.
@@ -110,7 +69,7 @@ impl NetworkOptions {
     ) -> Result<()> {
         let methods: Vec<&str> = methods.by_ref().collect();
         self.check_weights(&methods)?;
-        let is_own = methods.contains(&METHOD);
+        let is_own = methods.iter().any(|method| own_kind(method).is_some());
         let is_learned = |method: &&str| Method::by_name(method).is_some();
         match (self.own_flag, self.tile_flag.or(self.device_flag)) {
             (Some(flag), _) if !is_own => Err(other_method(flag)),
@@ -169,25 +128,9 @@ impl NetworkOptions {
             Some(format!("{}, {steps} steps", contents.sizes))
         }))
     }
-
-    /// Refuses options that are about diffusion steps where there are none.
-    pub(crate) fn check_steps(&self) -> Result<()> {
-        match self.diffusion_flag {
-            Some(flag) if self.steps()? == 0 => Err(CliError::new(
-                format!("{flag} is for diffusion, and there are 0 steps"),
-                flag,
-                "leave it out, or ask for --steps above 0",
-            )),
-            _ => Ok(()),
-        }
-    }
 }
 
 /// A flag of the method `qudi` beside another method.
 pub(crate) fn other_method(flag: &str) -> CliError {
-    CliError::new(
-        format!("{flag} is for method {METHOD}"),
-        flag,
-        format!("leave it out, or use --method {METHOD}"),
-    )
+    CliError::new(format!("{flag} is for method qudi"), flag, "leave it out, or use --method qudi")
 }

@@ -2,11 +2,14 @@
 
 use super::options::NetworkOptions;
 use crate::error::{CliError, Result};
+use crate::methods::network::OwnNetwork;
+use crate::methods::own_kind;
 use crate::weights::Weights;
 use qudi_baselines::import::Method;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::Provenance;
+use qudi_model::config::NetworkKind;
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const TOLERATED: f64 = 10.0;
@@ -40,12 +43,12 @@ impl Trained {
     }
 }
 
-/// Why the weights that come along are not for such a capture, if they are not.
+/// Why the built-in weights of the default method are not for such a capture, if they are not.
 pub(crate) fn unknown_to_built_in(acquisition: &Acquisition) -> Result<Option<String>> {
-    Ok(unknown(&Weights::BuiltIn.describe()?.provenance, acquisition, 1.0))
+    Ok(unknown(&Weights::BuiltIn(NetworkKind::Regression).describe()?.provenance, acquisition, 1.0))
 }
 
-/// Whether the weights that come along were trained for such a capture.
+/// Whether the built-in weights of the default method were trained for such a capture.
 pub(crate) fn built_in_knows(acquisition: &Acquisition) -> Result<bool> {
     Ok(unknown_to_built_in(acquisition)?.is_none())
 }
@@ -101,8 +104,10 @@ pub(crate) fn provenance(method: &str, options: &NetworkOptions) -> Result<Optio
             let contents = options.weights_of(method)?.describe()?;
             contents.and_then(|contents| contents.description).map(|d| d.provenance)
         }
-        None if method == "qudi" => Some(options.weights.describe()?.provenance),
-        None => None,
+        None => match own_kind(method) {
+            Some(kind) => Some(OwnNetwork::of(options, kind)?.description.provenance),
+            None => None,
+        },
     })
 }
 

@@ -26,9 +26,6 @@ pub(crate) struct Bench {
     /// Results of an earlier run (--json) to compare with
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) compare: Option<PathBuf>,
-    /// Instead of methods, measure networks of these sizes with random weights: tiny, small, paper-mini, base, paper
-    #[arg(long, value_name = "A,B,...", value_delimiter = ',')]
-    pub(crate) preset: Vec<String>,
     #[command(flatten)]
     pub(crate) steps: Steps,
     #[command(flatten)]

@@ -2,7 +2,6 @@
 
 use super::args::Bench;
 use super::burst::{burst, median};
-use super::network;
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
@@ -44,9 +43,6 @@ struct Results {
 }
 
 pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
-    if !args.preset.is_empty() {
-        return network::run(args, report);
-    }
     let options = args.network.options(args.steps.steps);
     options.check_methods(args.method.iter().map(String::as_str))?;
     let old = args.compare.as_deref().map(load).transpose()?;

@@ -96,7 +96,7 @@ pub(crate) fn run(
     let options = demo.network.options(demo.steps.steps);
     options.check_weights(&[])?;
     if demo.network.own_weights().is_some() || built_in_knows(&acquisition)? {
-        let (restorer, how) = network::restorer(&options, &acquisition, SIZE)?;
+        let (restorer, how) = network::restorer(None, &options, &acquisition, SIZE)?;
         methods.push(("QUDI", restorer, format!("the network{how}")));
     } else {
         report.remark(

@@ -94,9 +94,9 @@ pub(crate) struct Eval {
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,
-    /// Numbers of reverse diffusion steps of the method qudi, each evaluated for itself; 0 is a regression
+    /// Numbers of reverse steps of qudi-diffusion, each evaluated for itself
     /// [default: what the weights say of themselves]
-    #[arg(long, value_name = "N,...", value_delimiter = ',', help_heading = "Network (method qudi)", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
+    #[arg(long, value_name = "N,...", value_delimiter = ',', help_heading = "Networks (methods qudi, qudi-regression, qudi-diffusion)", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     pub(crate) steps: Vec<usize>,
     #[command(flatten)]
     pub(crate) network: Network,

@@ -8,9 +8,10 @@ use crate::args::{Shard, Sum};
 use crate::capture::acquisition::checked_mean_level;
 use crate::device;
 use crate::error::{CliError, Result};
+use crate::methods::network::OwnNetwork;
 use crate::methods::options::NetworkOptions;
 use crate::methods::trained::provenance;
-use crate::methods::{METHODS, is_method};
+use crate::methods::{METHODS, is_method, own_kind};
 use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::capture::{MaskChoice, ReadOptions};
@@ -103,8 +104,9 @@ impl Plan {
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
         network.check_methods(methods.iter().map(String::as_str))?;
         let contenders = contenders(&methods, &network, &steps, args.table1)?;
-        let mut own = contenders.iter().filter(|contender| contender.method == "qudi");
-        own.try_for_each(|contender| contender.network.check_steps())?;
+        for Contender { method, network, .. } in &contenders {
+            own_kind(method).map(|kind| OwnNetwork::of(network, kind)).transpose()?;
+        }
         if args.table1 && args.protocol == Protocol::Quiver {
             let help = "leave one of them out";
             let what = "the table compares all methods on the same photons";
@@ -226,7 +228,7 @@ fn contenders(
         let provenance = if leaves_out { provenance(method, network)? } else { None };
         let (method, network) = (method.clone(), network.clone());
         let plain = Contender { method, trained, provenance, steps: None, network };
-        if plain.method == "qudi" && steps.len() > 1 {
+        if own_kind(&plain.method).is_some() && steps.len() > 1 {
             contenders.extend(steps.iter().map(|&steps| Contender {
                 steps: Some(steps),
                 network: NetworkOptions { steps: Some(steps), ..plain.network.clone() },

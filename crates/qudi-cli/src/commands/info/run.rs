@@ -14,7 +14,7 @@ use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
 use qudi_layers::Provenance;
-use qudi_model::checkpoint::ModelKind;
+use qudi_model::config::NetworkKind;
 use serde_json::json;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -71,7 +71,7 @@ pub(crate) fn run(
         _ if preset(subject).is_some() => sensor(subject, settings, report),
         _ if subject == "weights" => {
             settings.refuse(&["sensor."], "for weights")?;
-            weights(&Weights::BuiltIn, report)
+            weights(&Weights::BuiltIn(NetworkKind::Regression), report)
         }
         _ => Err(CliError::new(
             format!("there is no file and no sensor named `{subject}`"),
@@ -113,15 +113,13 @@ fn sensors(report: &Report) -> Result<()> {
 fn weights(weights: &Weights, report: &Report) -> Result<()> {
     let d = weights.describe()?;
     let sizes = d.network.parameters(&Device::flex());
-    let kind = match d.kind {
-        Some(ModelKind::Regression) => "regression",
-        _ => "diffusion, or regression with --steps 0",
-    };
+    let kind = d.network.kind();
+    let steps = d.sampling.map_or(String::new(), |s| format!("; {} steps by default", s.steps));
     let preset = d.preset.as_deref().unwrap_or("own sizes");
     let mut lines = vec![
         ("network", format!("{preset}, {sizes} parameters")),
         ("window", format!("{} frames", d.window)),
-        ("restores by", format!("{kind}; {} steps by default", d.reverse_steps())),
+        ("restores by", format!("{kind}{steps}")),
     ];
     lines.extend(provenance(&d.provenance));
     lines.push(("sha-256", weights.sha256()?));

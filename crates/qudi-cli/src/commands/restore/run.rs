@@ -12,9 +12,10 @@ use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_
 use crate::device;
 use crate::error::Result;
 use crate::interrupt;
+use crate::methods::network::OwnNetwork;
 use crate::methods::network::device_failed;
 use crate::methods::options::{NetworkOptions, other_method};
-use crate::methods::{is_network, method, usual_method};
+use crate::methods::{is_network, method, own_kind, usual_method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
 use qudi_baselines::import::Method;
@@ -64,8 +65,8 @@ pub(crate) fn run(
     }
     let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(0);
     let part = part.start..part.end.min(frames);
-    let is_network = job.restorer.name() == "qudi";
-    let mode = is_network.then(|| plan.network.mode()).transpose()?;
+    let own = own_kind(job.restorer.name()).map(|kind| OwnNetwork::of(&plan.network, kind));
+    let mode = own.transpose()?.map(|own| own.mode(&plan.network));
     let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
     job.warnings.extend(chi_square);
     let results = json!({"chi_square": map.chi_square(), "mode": mode, "warnings": job.warnings});
@@ -149,7 +150,7 @@ impl Job {
             None => announced_method(plan, &capture, &of_method, report)?.to_owned(),
         };
         let name = name.as_str();
-        if let Some(flag) = plan.seed_flag.filter(|_| name != "qudi") {
+        if let Some(flag) = plan.seed_flag.filter(|_| own_kind(name).is_none()) {
             return Err(other_method(flag));
         }
         let (restorer, choice) = method(name, &mut capture, &of_method, &plan.network)?;
@@ -320,19 +321,8 @@ fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Val
             "tile": options.tile,
         })));
     }
-    if method != "qudi" {
-        return Ok(None);
-    }
-    Ok(Some(json!({
-        "weights": options.weights.to_string(),
-        "weights_sha256": options.weights.sha256()?,
-        "steps": options.steps()?,
-        "spacing": options.spacing_name()?,
-        "sampler": options.sampler_name(),
-        "samples": options.samples,
-        "tile": options.tile,
-        "precision": options.precision(&device::open(&options.device)?)?,
-    })))
+    let Some(kind) = own_kind(method) else { return Ok(None) };
+    Ok(Some(OwnNetwork::of(options, kind)?.settings(options)?))
 }
 
 fn describe(

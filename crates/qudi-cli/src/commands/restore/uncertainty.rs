@@ -2,6 +2,8 @@
 
 use super::plan::Plan;
 use crate::error::{CliError, Result};
+use crate::methods::network::OwnNetwork;
+use crate::methods::own_kind;
 use qudi_core::Frame;
 use qudi_io::capture::Capture;
 use qudi_io::writer::ArrayWriter;
@@ -20,15 +22,16 @@ impl UncertaintyFile {
         finished: u64,
     ) -> Result<Self> {
         let Some(path) = &plan.uncertainty else { return Ok(Self(None)) };
-        if method != "qudi" {
+        let Some(kind) = own_kind(method) else {
             let what = format!("{method} does not predict its uncertainty");
             return Err(CliError::new(what, "--uncertainty", "use --method qudi"));
-        }
-        if plan.network.samples < 2 && !plan.network.predicts_uncertainty()? {
+        };
+        let own = OwnNetwork::of(&plan.network, kind)?;
+        if plan.network.samples < 2 && !own.predicts_uncertainty() {
             return Err(CliError::new(
                 "one sample has no uncertainty",
                 "--uncertainty",
-                "draw several with --samples K, or use --steps 0 with weights that predict it (`qudi info FILE`)",
+                "draw several with --samples K, or use --method qudi-regression, which predicts it",
             ));
         }
         if path.extension() != Some("npy".as_ref()) {

@@ -12,7 +12,7 @@ use std::path::PathBuf;
 #[derive(Debug, ClapArgs)]
 #[expect(clippy::struct_excessive_bools, reason = "switches of a command line")]
 pub(crate) struct Train {
-    /// The recipe: tiny, small, paper-mini, base, paper, a learned baseline (quiver, emvd, flornn, spk2imgnet,
+    /// The recipe: tiny, small, paper-mini, paper, a learned baseline (quiver, emvd, flornn, spk2imgnet,
     /// memdeblur, rvrt, student-teacher), or a .toml file [default with --resume: the run's own]
     pub(crate) recipe: Option<String>,
     /// Folder of the run
@@ -37,8 +37,7 @@ pub(crate) struct Train {
     /// Go on from the run's last state
     #[arg(long, conflicts_with_all = ["cache_only", "draw_only", "init"])]
     pub(crate) resume: bool,
-    /// Start from these weights instead of random ones: of the same network, or of one with one refinement
-    /// stage less
+    /// Start from these weights of the same network instead of random ones
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) init: Option<PathBuf>,
     /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1

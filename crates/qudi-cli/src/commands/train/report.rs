@@ -130,7 +130,7 @@ fn plots(steps: &[&Value], validations: &[&Value]) -> Vec<Plot> {
         curve.points.iter().all(|p| p.y >= 0.0) && curve.points.iter().any(|p| p.y > 0.0)
     };
     let losses = LOSSES.map(|(key, name)| curve(steps, key, name)).into_iter().filter(on_log_axis);
-    let uncertainty = curve(steps, "error", "uncertainty");
+    let uncertainty = curve(steps, "uncertainty", "uncertainty");
     let has_uncertainty = uncertainty.points.iter().any(|p| p.y != 0.0);
     let mut plots = vec![plot(
         "Loss",

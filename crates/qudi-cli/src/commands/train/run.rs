@@ -15,7 +15,9 @@ use crate::report::Report;
 use crate::settings::Settings;
 use qudi_baselines::learning::Baseline;
 use qudi_core::atomic_file::Overwrite;
-use qudi_model::network::Qudi;
+use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::Diffusion;
+use qudi_model::regression::Regression;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::{Lpips, fetch};
 use qudi_train::{
@@ -34,7 +36,8 @@ pub(crate) fn run(
     match plan.action {
         Action::MakePack => pack(&plan, report),
         Action::DrawBursts => match plan.recipe.network {
-            NetworkRecipe::Qudi(_) => draw::<Qudi>(&plan, report),
+            NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => draw::<Regression>(&plan, report),
+            NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => draw::<Diffusion>(&plan, report),
             NetworkRecipe::Baseline(_) => draw::<Baseline>(&plan, report),
         },
         Action::Start | Action::Resume => match plan.recipe.stages()? {
@@ -69,7 +72,12 @@ pub(super) fn find_backbones(plan: &Plan, report: &Report) -> Result<()> {
 /// Trains to the end of the recipe.
 pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     match plan.recipe.network {
-        NetworkRecipe::Qudi(_) => train_network::<Qudi>(plan, report),
+        NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => {
+            train_network::<Regression>(plan, report)
+        }
+        NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => {
+            train_network::<Diffusion>(plan, report)
+        }
         NetworkRecipe::Baseline(_) => train_network::<Baseline>(plan, report),
     }
 }
