@@ -80,8 +80,14 @@ impl Restorer for RegressionRestorer {
         self.window
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        numbers: &[usize],
+    ) -> Result<Restored> {
         check_frames(burst.frames.len(), self.window)?;
-        with_precision(self.precision, || self.restored(burst, acquisition))
+        let restored = with_precision(self.precision, || self.restored(burst, acquisition))?;
+        Ok(restored.only(numbers))
     }
 }
