@@ -29,7 +29,7 @@ impl OwnNetwork {
     /// one in the file, or the regression.
     ///
     /// # Errors
-    /// [`CliError`] if there are no such weights, or options are for the other network.
+    /// [`CliError`] if there are no such weights.
     pub(crate) fn of(options: &NetworkOptions, kind: Option<NetworkKind>) -> Result<Self> {
         let weights = match &options.own_file {
             Some(path) => Weights::File(path.clone()),
@@ -37,13 +37,6 @@ impl OwnNetwork {
         };
         let description = weights.describe()?;
         let kind = kind.unwrap_or(description.network.kind());
-        if let (NetworkKind::Regression, Some(flag)) = (kind, options.diffusion_flag) {
-            return Err(CliError::new(
-                format!("{flag} is for method qudi-diffusion"),
-                flag,
-                "leave it out, or use --method qudi-diffusion",
-            ));
-        }
         Ok(Self { weights, description, kind })
     }
 
@@ -56,9 +49,9 @@ impl OwnNetwork {
         }
     }
 
-    /// Returns true if the network predicts its uncertainty without samples.
-    pub(crate) fn predicts_uncertainty(&self) -> bool {
-        self.kind == NetworkKind::Regression
+    /// Returns the kind of the network. The regression predicts its uncertainty; the diffusion has steps.
+    pub(crate) fn kind(&self) -> NetworkKind {
+        self.kind
     }
 
     /// Returns the sampling that is asked for; by default the one that the weights were made for.

@@ -3,9 +3,11 @@
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::methods::learned::LearnedWeights;
+use crate::methods::network::OwnNetwork;
 use crate::methods::own_kind;
 use qudi_baselines::import::Method;
 use qudi_model::ComputePrecision;
+use qudi_model::config::NetworkKind;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::PathBuf;
@@ -69,6 +71,7 @@ impl NetworkOptions {
     ) -> Result<()> {
         let methods: Vec<&str> = methods.by_ref().collect();
         self.check_weights(&methods)?;
+        self.check_diffusion(&methods)?;
         let is_own = methods.iter().any(|method| own_kind(method).is_some());
         let is_learned = |method: &&str| Method::by_name(method).is_some();
         match (self.own_flag, self.tile_flag.or(self.device_flag)) {
@@ -79,6 +82,21 @@ impl NetworkOptions {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Refuses options of the diffusion where none of the methods is one.
+    pub(crate) fn check_diffusion(&self, methods: &[&str]) -> Result<()> {
+        let Some(flag) = self.diffusion_flag else { return Ok(()) };
+        for kind in methods.iter().filter_map(|method| own_kind(method)) {
+            if OwnNetwork::of(self, kind)?.kind() == NetworkKind::Diffusion {
+                return Ok(());
+            }
+        }
+        Err(CliError::new(
+            format!("{flag} is for method qudi-diffusion"),
+            flag,
+            "leave it out, or use --method qudi-diffusion",
+        ))
     }
 
     /// Refuses weights of learned methods that are not among `methods`, and two files for one of them.
@@ -131,6 +149,6 @@ impl NetworkOptions {
 }
 
 /// A flag of the method `qudi` beside another method.
-pub(crate) fn other_method(flag: &str) -> CliError {
+fn other_method(flag: &str) -> CliError {
     CliError::new(format!("{flag} is for method qudi"), flag, "leave it out, or use --method qudi")
 }

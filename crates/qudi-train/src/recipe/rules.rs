@@ -27,7 +27,7 @@ impl Recipe {
                 check(&[self.regression_rule()])?;
             }
             NetworkRecipe::Qudi(NetworkConfig::Diffusion(config)) => {
-                self.check_diffusion(config)?
+                self.check_diffusion(config)?;
             }
             NetworkRecipe::Baseline(sizes) => self.check_baseline(*sizes)?,
         }

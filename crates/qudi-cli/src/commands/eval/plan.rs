@@ -16,6 +16,7 @@ use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_layers::Provenance;
+use qudi_model::config::NetworkKind;
 use std::path::PathBuf;
 use std::rc::Rc;
 
@@ -104,9 +105,6 @@ impl Plan {
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
         network.check_methods(methods.iter().map(String::as_str))?;
         let contenders = contenders(&methods, &network, &steps, args.table1)?;
-        for Contender { method, network, .. } in &contenders {
-            own_kind(method).map(|kind| OwnNetwork::of(network, kind)).transpose()?;
-        }
         if args.table1 && args.protocol == Protocol::Quiver {
             let help = "leave one of them out";
             let what = "the table compares all methods on the same photons";
@@ -215,7 +213,7 @@ impl Plan {
     }
 }
 
-/// Every method once, and the network once for every number of steps, fewest first.
+/// Every method once, and the diffusion once for every number of steps, fewest first.
 fn contenders(
     methods: &[String],
     network: &NetworkOptions,
@@ -226,9 +224,11 @@ fn contenders(
     for method in methods {
         let trained = network.trained_here(method)?;
         let provenance = if leaves_out { provenance(method, network)? } else { None };
+        let own = own_kind(method).map(|kind| OwnNetwork::of(network, kind)).transpose()?;
+        let diffuses = own.is_some_and(|own| own.kind() == NetworkKind::Diffusion);
         let (method, network) = (method.clone(), network.clone());
         let plain = Contender { method, trained, provenance, steps: None, network };
-        if own_kind(&plain.method).is_some() && steps.len() > 1 {
+        if steps.len() > 1 && diffuses {
             contenders.extend(steps.iter().map(|&steps| Contender {
                 steps: Some(steps),
                 network: NetworkOptions { steps: Some(steps), ..plain.network.clone() },

@@ -33,8 +33,6 @@ pub(super) struct Plan {
     /// Frames per second of what plays.
     pub(super) played_fps: f64,
     pub(super) light: LightOverrides,
-    /// `--seed`, if given.
-    pub(super) seed_flag: Option<&'static str>,
     /// The method by name, unless the capture decides.
     pub(super) method: Option<String>,
     pub(super) network: NetworkOptions,
@@ -103,7 +101,6 @@ impl Plan {
                 mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
             },
-            seed_flag,
             method: args.method.clone(),
             network,
             overlap: args.overlap,

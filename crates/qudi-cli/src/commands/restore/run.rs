@@ -14,7 +14,7 @@ use crate::error::Result;
 use crate::interrupt;
 use crate::methods::network::OwnNetwork;
 use crate::methods::network::device_failed;
-use crate::methods::options::{NetworkOptions, other_method};
+use crate::methods::options::NetworkOptions;
 use crate::methods::{is_network, method, own_kind, usual_method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
@@ -271,9 +271,7 @@ fn restorer(
         Some(name) => name,
         None => announced_method(plan, &aligned.capture, &seen, report)?,
     };
-    if let Some(flag) = plan.seed_flag.filter(|_| own_kind(name).is_none()) {
-        return Err(other_method(flag));
-    }
+    plan.network.check_diffusion(&[name])?;
     let (restorer, choice) = method(name, &mut aligned.capture, &seen, &plan.network)?;
     Ok((aligned.around(restorer), choice))
 }

@@ -7,6 +7,7 @@ use crate::methods::own_kind;
 use qudi_core::Frame;
 use qudi_io::capture::Capture;
 use qudi_io::writer::ArrayWriter;
+use qudi_model::config::NetworkKind;
 
 /// A `.npy` file of uncertainties, float32 `[frames, height, width]`, or none.
 #[derive(Debug)]
@@ -26,8 +27,8 @@ impl UncertaintyFile {
             let what = format!("{method} does not predict its uncertainty");
             return Err(CliError::new(what, "--uncertainty", "use --method qudi"));
         };
-        let own = OwnNetwork::of(&plan.network, kind)?;
-        if plan.network.samples < 2 && !own.predicts_uncertainty() {
+        let is_diffusion = OwnNetwork::of(&plan.network, kind)?.kind() == NetworkKind::Diffusion;
+        if plan.network.samples < 2 && is_diffusion {
             return Err(CliError::new(
                 "one sample has no uncertainty",
                 "--uncertainty",
