@@ -1,5 +1,6 @@
 //! The command line: options of every command, and groups of options that several commands share.
 
+mod methods;
 mod network;
 pub(crate) mod number;
 pub(crate) mod reading;
@@ -7,6 +8,7 @@ mod shard;
 mod sum;
 pub(crate) mod tiff_samples;
 
+pub(crate) use methods::methods;
 pub(crate) use network::{Network, Steps};
 pub(crate) use reading::Reading;
 pub(crate) use shard::Shard;

@@ -2,7 +2,7 @@
 
 pub(crate) mod fields;
 
-use clap::error::{ContextKind, ErrorKind};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use fields::{flags, flags_in_text};
 use qudi_core::Error;
 use qudi_model::{MatrixUnits, MatrixUnitsError};
@@ -37,16 +37,19 @@ impl CliError {
 }
 
 impl CliError {
-    /// A value that a flag cannot have, in the three parts of all errors.
+    /// Returns the error for a value that a flag cannot have, in the three parts of all errors.
     pub(crate) fn of_value(refusal: &clap::Error) -> Option<Self> {
-        if refusal.kind() != ErrorKind::ValueValidation {
-            return None;
-        }
         let text = |kind| refusal.get(kind).map(ToString::to_string);
         let argument = text(ContextKind::InvalidArg)?;
         let flag = argument.split_whitespace().next().unwrap_or_default();
-        let value = text(ContextKind::InvalidValue)?;
-        let help = std::error::Error::source(refusal)?.to_string();
+        let value = text(ContextKind::InvalidValue).filter(|value| !value.is_empty())?;
+        let help = match (refusal.kind(), refusal.get(ContextKind::ValidValue)) {
+            (ErrorKind::ValueValidation, _) => std::error::Error::source(refusal)?.to_string(),
+            (ErrorKind::InvalidValue, Some(ContextValue::Strings(all))) => {
+                format!("there are {}", all.join(", "))
+            }
+            _ => return None,
+        };
         Some(Self::new(format!("{flag} is {value}"), flag, help))
     }
 }

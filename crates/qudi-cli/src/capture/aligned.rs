@@ -1,6 +1,7 @@
 //! Sums that are aligned by themselves: where motion keeps sums short, several of them are added along it.
 
 use crate::error::Result;
+use crate::methods::Method;
 use qudi_burst::{AlignedSums, choose_count};
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
@@ -8,9 +9,6 @@ use qudi_core::sensor::Sensor;
 use qudi_core::windows::LONGEST_HALF;
 use qudi_io::capture::{Capture, ENOUGH, ReadOptions, SumChoice, SumLimit};
 use qudi_io::restore::Instants;
-
-/// Methods that sums are aligned for: those that align frames themselves.
-const METHODS: [&str; 4] = ["qbp", "qbp-bm3d", "qbp-refined", "qudi"];
 
 /// Pixels that may move within the sums that are shifted.
 const FINE: f64 = 0.5;
@@ -122,13 +120,13 @@ impl Alignment {
 pub(crate) fn align_by_itself(
     capture: Capture,
     choice: &SumChoice,
-    method: Option<&str>,
+    method: Option<&Method>,
     every: Option<u64>,
     options: &ReadOptions,
     sensor: &Sensor,
 ) -> Result<(Capture, Option<Alignment>)> {
     let readable = capture.length().is_some() && !capture.forward_only();
-    let aligns = method.is_none_or(|method| METHODS.contains(&method));
+    let aligns = method.is_none_or(|method| method.aligns);
     let known = sensor.dark_per_frame().is_ok();
     if choice.limit != SumLimit::Motion || choice.still || !readable || !aligns || !known {
         return Ok((capture, None));

@@ -1,12 +1,13 @@
 //! The network behind `--method qudi`: weights, device, options.
 
 use super::options::NetworkOptions;
+use super::Built;
 use super::trained::check;
 use crate::device::{self, Opened};
 use crate::error::{CliError, Result};
 use crate::memory::{available_bytes, check_tiles};
 use qudi_core::Size;
-use qudi_core::restorer::{Acquisition, Restorer};
+use qudi_core::restorer::Acquisition;
 use qudi_model::checkpoint::ModelKind;
 use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
 
@@ -15,7 +16,7 @@ pub(crate) fn restorer(
     options: &NetworkOptions,
     acquisition: &Acquisition,
     size: Size,
-) -> Result<(Box<dyn Restorer>, String)> {
+) -> Result<Built> {
     let device = device::open(&options.device)?;
     options.check_steps()?;
     let (network, description) = options.weights.load(&device.device)?;

@@ -3,15 +3,13 @@
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::methods::learned::LearnedWeights;
+use crate::methods::{Method, QUDI};
 use crate::weights::Weights;
-use qudi_baselines::import::Method;
+use qudi_baselines::import;
 use qudi_model::ComputePrecision;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::PathBuf;
-
-/// The method that these options belong to.
-const METHOD: &str = "qudi";
 
 /// Options of the network.
 #[derive(Clone, Debug)]
@@ -21,7 +19,7 @@ pub(crate) struct NetworkOptions {
     /// How many files of weights are named for this network.
     pub(crate) own_files: usize,
     /// Files of weights of the learned methods of others.
-    pub(crate) learned: Vec<(Method, PathBuf)>,
+    pub(crate) learned: Vec<(import::Method, PathBuf)>,
     /// Reverse steps; none for those that the weights were made for.
     pub(crate) steps: Option<usize>,
     /// The spacing of their timesteps; none for that which the weights were made for.
@@ -104,18 +102,14 @@ impl NetworkOptions {
     }
 
     /// Refuses these options where none of the methods is the network.
-    pub(crate) fn check_methods<'a>(
-        &self,
-        mut methods: impl Iterator<Item = &'a str>,
-    ) -> Result<()> {
-        let methods: Vec<&str> = methods.by_ref().collect();
-        self.check_weights(&methods)?;
-        let is_own = methods.contains(&METHOD);
-        let is_learned = |method: &&str| Method::by_name(method).is_some();
+    pub(crate) fn check_methods(&self, methods: &[&Method]) -> Result<()> {
+        self.check_weights(methods)?;
+        let is_own = methods.iter().any(|method| method.is_own_network());
+        let is_network = methods.iter().any(|method| method.is_network());
         match (self.own_flag, self.tile_flag.or(self.device_flag)) {
             (Some(flag), _) if !is_own => Err(other_method(flag)),
-            (None, Some(flag)) if !is_own && !methods.iter().any(is_learned) => {
-                let help = "leave it out, or use --method qudi";
+            (None, Some(flag)) if !is_network => {
+                let help = format!("leave it out, or use --method {}", QUDI.name);
                 Err(CliError::new(format!("{flag} is for networks"), flag, help))
             }
             _ => Ok(()),
@@ -123,10 +117,10 @@ impl NetworkOptions {
     }
 
     /// Refuses weights of learned methods that are not among `methods`, and two files for one of them.
-    pub(crate) fn check_weights(&self, methods: &[&str]) -> Result<()> {
+    pub(crate) fn check_weights(&self, methods: &[&Method]) -> Result<()> {
         if self.own_files > 1 {
             let help = "name one, or METHOD=FILE for those of other methods";
-            return Err(CliError::new("several files of weights for `qudi`", "--weights", help));
+            return Err(CliError::new(format!("several files of weights for `{}`", QUDI.name), "--weights", help));
         }
         for (number, (method, _)) in self.learned.iter().enumerate() {
             let name = method.name();
@@ -134,7 +128,7 @@ impl NetworkOptions {
                 let what = format!("two files of weights for `{name}`");
                 return Err(CliError::new(what, "--weights", "name one for each method"));
             }
-            if !methods.contains(&name) {
+            if !methods.iter().any(|asked| asked.as_learned() == Some(*method)) {
                 let what = format!("weights of `{name}`, which is not asked for");
                 let help = format!("leave them out, or use --method {name}");
                 return Err(CliError::new(what, "--weights", help));
@@ -144,7 +138,7 @@ impl NetworkOptions {
     }
 
     /// A learned method's weights: those named, or those that come along.
-    pub(crate) fn weights_of(&self, method: Method) -> Result<LearnedWeights<'_>> {
+    pub(crate) fn weights_of(&self, method: import::Method) -> Result<LearnedWeights<'_>> {
         let named = self.learned.iter().find(|(of, _)| *of == method);
         let named = named.map(|(_, file)| LearnedWeights::File(file));
         named.or_else(|| LearnedWeights::built_in(method)).ok_or_else(|| {
@@ -161,8 +155,8 @@ impl NetworkOptions {
 
     /// What is known of the weights of a learned method that were trained here: their size, and the steps. None of
     /// other methods, and of weights of others.
-    pub(crate) fn trained_here(&self, method: &str) -> Result<Option<String>> {
-        let Some(method) = Method::by_name(method) else { return Ok(None) };
+    pub(crate) fn trained_here(&self, method: &Method) -> Result<Option<String>> {
+        let Some(method) = method.as_learned() else { return Ok(None) };
         let contents = self.weights_of(method)?.describe()?;
         Ok(contents.and_then(|contents| {
             let steps = contents.description?.provenance.steps;
@@ -186,8 +180,8 @@ impl NetworkOptions {
 /// A flag of the method `qudi` beside another method.
 pub(crate) fn other_method(flag: &str) -> CliError {
     CliError::new(
-        format!("{flag} is for method {METHOD}"),
+        format!("{flag} is for method {}", QUDI.name),
         flag,
-        format!("leave it out, or use --method {METHOD}"),
+        format!("leave it out, or use --method {}", QUDI.name),
     )
 }

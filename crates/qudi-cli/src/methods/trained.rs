@@ -1,9 +1,9 @@
 //! What weights were trained for, and whether a capture is like it.
 
 use super::options::NetworkOptions;
+use super::{Kind, Method};
 use crate::error::{CliError, Result};
 use crate::weights::Weights;
-use qudi_baselines::import::Method;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::Provenance;
@@ -95,14 +95,14 @@ pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Resul
 }
 
 /// What the weights of a method were trained on; nothing is known of authors' weights.
-pub(crate) fn provenance(method: &str, options: &NetworkOptions) -> Result<Option<Provenance>> {
-    Ok(match Method::by_name(method) {
-        Some(method) => {
+pub(crate) fn provenance(method: &Method, options: &NetworkOptions) -> Result<Option<Provenance>> {
+    Ok(match method.kind {
+        Kind::Learned { method, .. } => {
             let contents = options.weights_of(method)?.describe()?;
             contents.and_then(|contents| contents.description).map(|d| d.provenance)
         }
-        None if method == "qudi" => Some(options.weights.describe()?.provenance),
-        None => None,
+        Kind::Network(_) => Some(options.weights.describe()?.provenance),
+        Kind::Classical(_) => None,
     })
 }
 

@@ -1,7 +1,8 @@
 //! Options of `qudi eval`.
 
 use crate::args::reading::words;
-use crate::args::{Network, Reading, Shard, number};
+use crate::args::{Network, Reading, Shard, methods, number};
+use crate::methods::{COMPARED, Method};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_core::PppDefinition;
 use std::path::PathBuf;
@@ -25,8 +26,8 @@ pub(crate) struct Eval {
     #[arg(long)]
     pub(crate) capture: bool,
     /// Methods to compare
-    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
-    pub(crate) method: Vec<String>,
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values = COMPARED, value_parser = methods())]
+    pub(crate) method: Vec<&'static Method>,
     /// Compare all methods of the paper's table 1 that need no weights or whose --weights are named, beside its
     /// figures
     #[arg(long, conflicts_with_all = ["method", "capture"])]

@@ -10,7 +10,6 @@ use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_
 use crate::error::Result;
 use crate::interrupt;
 use crate::memory::PeakMemory;
-use crate::methods::method;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::Frame;
@@ -114,7 +113,7 @@ fn score(
     };
     let peak = PeakMemory::start();
     let start = Instant::now();
-    let (mut restorer, how) = method(&contender.method, capture, acquisition, &contender.network)?;
+    let (mut restorer, how) = contender.method.restorer(capture, acquisition, &contender.network)?;
     let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(

@@ -9,7 +9,6 @@ use super::score::{Added, Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
-use crate::methods::{is_network, method};
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;
 use qudi_core::metrics::{
@@ -94,8 +93,8 @@ impl ExposedClip {
             Capture::in_memory(&self.name, self.size, self.photons.counts.clone(), sensor)?;
         let peak = PeakMemory::start();
         let start = Instant::now();
-        let Contender { method: name, network, .. } = contender;
-        let (mut restorer, how) = method(name, &mut capture, &self.acquisition, network)?;
+        let Contender { method, network, .. } = contender;
+        let (mut restorer, how) = method.restorer(&mut capture, &self.acquisition, network)?;
         let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
@@ -162,16 +161,16 @@ impl ExposedClip {
             let peak = PeakMemory::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
-            let Contender { method: name, network, .. } = contender;
+            let Contender { method, network, .. } = contender;
             let (mut restorer, chosen) = match loaded.take() {
                 Some(loaded) => loaded,
-                None => method(name, &mut capture, &acquisition, network)?,
+                None => method.restorer(&mut capture, &acquisition, network)?,
             };
             how.clone_from(&chosen);
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();
-            loaded = is_network(name).then_some((restorer, chosen));
+            loaded = method.is_network().then_some((restorer, chosen));
             highest = [highest, peak.grown_mib()].into_iter().flatten().reduce(f64::max);
             frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
             middles.push(restored);

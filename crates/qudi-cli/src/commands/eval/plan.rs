@@ -10,7 +10,7 @@ use crate::device;
 use crate::error::{CliError, Result};
 use crate::methods::options::NetworkOptions;
 use crate::methods::trained::provenance;
-use crate::methods::{METHODS, is_method};
+use crate::methods::Method;
 use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::capture::{MaskChoice, ReadOptions};
@@ -21,7 +21,7 @@ use std::rc::Rc;
 /// A method and how it is asked.
 #[derive(Clone, Debug)]
 pub(super) struct Contender {
-    pub(super) method: String,
+    pub(super) method: &'static Method,
     /// Its weights, if it is a learned method of others that was trained here.
     pub(super) trained: Option<String>,
     /// What its weights were trained on, where it is left out of what they do not know.
@@ -34,7 +34,7 @@ pub(super) struct Contender {
 impl Contender {
     /// Its row at a light level, without scores.
     pub(super) fn row(&self, ppp: f64) -> Row {
-        let (method, trained) = (self.method.clone(), self.trained.clone());
+        let (method, trained) = (self.method.name.to_owned(), self.trained.clone());
         Row { trained, steps: self.steps, ..Row::new(method, ppp) }
     }
 }
@@ -85,13 +85,6 @@ impl Plan {
     /// [`CliError`] for unknown methods and arguments that do not go together.
     pub(super) fn new(args: &Eval, overwrite: Overwrite) -> Result<Self> {
         checked_mean_level(args.mean_level)?;
-        if let Some(unknown) = args.method.iter().find(|name| !is_method(name)) {
-            return Err(CliError::new(
-                format!("no method named `{unknown}`"),
-                "--method",
-                format!("there are {}", METHODS.join(", ")),
-            ));
-        }
         let mut steps = args.steps.clone();
         steps.sort_unstable();
         steps.dedup();
@@ -101,9 +94,9 @@ impl Plan {
             network.device_flag = None;
         }
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
-        network.check_methods(methods.iter().map(String::as_str))?;
+        network.check_methods(&methods)?;
         let contenders = contenders(&methods, &network, &steps, args.table1)?;
-        let mut own = contenders.iter().filter(|contender| contender.method == "qudi");
+        let mut own = contenders.iter().filter(|contender| contender.method.is_own_network());
         own.try_for_each(|contender| contender.network.check_steps())?;
         if args.table1 && args.protocol == Protocol::Quiver {
             let help = "leave one of them out";
@@ -215,18 +208,18 @@ impl Plan {
 
 /// Every method once, and the network once for every number of steps, fewest first.
 fn contenders(
-    methods: &[String],
+    methods: &[&'static Method],
     network: &NetworkOptions,
     steps: &[usize],
     leaves_out: bool,
 ) -> Result<Vec<Contender>> {
     let mut contenders = Vec::new();
-    for method in methods {
+    for &method in methods {
         let trained = network.trained_here(method)?;
         let provenance = if leaves_out { provenance(method, network)? } else { None };
-        let (method, network) = (method.clone(), network.clone());
+        let network = network.clone();
         let plain = Contender { method, trained, provenance, steps: None, network };
-        if plain.method == "qudi" && steps.len() > 1 {
+        if method.is_own_network() && steps.len() > 1 {
             contenders.extend(steps.iter().map(|&steps| Contender {
                 steps: Some(steps),
                 network: NetworkOptions { steps: Some(steps), ..plain.network.clone() },

@@ -2,9 +2,9 @@
 
 use super::score::{Figure, Row};
 use super::table::steps;
+use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
 use crate::report::{Cell, Column, Table};
-use qudi_baselines::import::Method;
 
 /// Light levels of the table, and of clips unless said otherwise.
 pub(super) const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
@@ -33,13 +33,11 @@ pub(super) const REASONS: &str = "The paper's figures are not these ones: it sco
     network.";
 
 /// The methods of the table that can run: those without weights, and those whose weights are named.
-pub(super) fn methods(network: &NetworkOptions) -> Vec<String> {
-    let can_run = |name: &str| match Method::by_name(name) {
-        Some(method) => network.weights_of(method).is_ok(),
-        None => true,
+pub(super) fn methods(network: &NetworkOptions) -> Vec<&'static Method> {
+    let can_run = |method: &&Method| {
+        method.as_learned().is_none_or(|learned| network.weights_of(learned).is_ok())
     };
-    let names = PAPER.iter().map(|(name, _)| *name).filter(|name| can_run(name));
-    names.map(str::to_owned).collect()
+    PAPER.iter().filter_map(|(name, _)| Method::by_name(name)).filter(can_run).collect()
 }
 
 /// The table; methods without weights for this light and sensor say so. The paper's figures stand there if the light is the paper's.
@@ -99,4 +97,14 @@ pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
         }
     }
     table.without_unknown_columns()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_methods_of_the_paper_are_here() {
+        assert!(PAPER.iter().all(|(name, _)| Method::by_name(name).is_some()));
+    }
 }

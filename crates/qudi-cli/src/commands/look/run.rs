@@ -6,7 +6,7 @@ use crate::capture::acquisition::{LightOverrides, acquisition};
 use crate::capture::{OpenedCapture, open_summed, unknown_sensor, warnings};
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
-use crate::methods::usual_method;
+use crate::methods::default::default_method;
 use crate::places::Places;
 use crate::report::html::{data_url, render};
 use crate::report::{Output, Report, duration};
@@ -25,8 +25,10 @@ use std::time::Instant;
 /// Sums of the window that one instant is restored from.
 const WINDOW: u64 = 11;
 
-/// Seconds per picture of each method, in units of aligning and merging one instant: rough, for a forecast.
-const COSTS: [(&str, f64); 3] = [("qudi", 6.0), ("qbp-refined", 2.0), ("mle", 0.1)];
+/// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
+///
+/// [`Method::cost`]: crate::methods::Method::cost
+const INSTANT_COST: f64 = 0.1;
 
 pub(crate) fn run(
     args: &Look,
@@ -155,18 +157,17 @@ fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<F
 
 /// What `qudi restore` would do, and about how long that takes.
 fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(String, Value)> {
-    let usual = usual_method(&Network::default().options(None), capture, acquisition)?;
-    let cost = COSTS.iter().find(|(name, _)| *name == usual.name).map_or(2.0, |(_, cost)| *cost);
+    let usual = default_method(&Network::default().options(None), capture, acquisition)?;
     let pictures = capture.frames();
-    let total = seconds * cost * pictures as f64;
+    let total = seconds * usual.method.cost / INSTANT_COST * pictures as f64;
     let time = duration(total);
     let reason = usual.reason.map_or(String::new(), |reason| format!(" ({reason})"));
     let sensor = &acquisition.sensor.name;
     let words = format!(
         "`qudi restore` makes {pictures} pictures by {}{reason}, sensor {sensor}, in about {time}; --every N makes fewer",
-        usual.name
+        usual.method.name
     );
-    let document = json!({"method": usual.name, "pictures": pictures, "seconds": total});
+    let document = json!({"method": usual.method.name, "pictures": pictures, "seconds": total});
     Ok((words, document))
 }
 

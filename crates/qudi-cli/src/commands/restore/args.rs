@@ -1,6 +1,7 @@
 //! Options of `qudi restore`.
 
-use crate::args::{Network, Reading, Shard, Steps, number};
+use crate::args::{Network, Reading, Shard, Steps, methods, number};
+use crate::methods::Method;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use std::path::PathBuf;
 
@@ -27,12 +28,10 @@ pub(crate) struct Restore {
     /// Where the frames go
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
-    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen),
-    /// transform-denoise, bm3d, qbp, qbp-bm3d, qbp-refined (in two passes), or qudi (the network) [default:
-    /// qudi; qbp-refined for sensors and light that the built-in weights do not know, and mle where the dark
-    /// rate is unknown, too]
-    #[arg(long, value_name = "NAME")]
-    pub(crate) method: Option<String>,
+    /// How frames are restored [default: qudi; qbp-refined for sensors and light that the built-in weights do
+    /// not know, and mle where the dark rate is unknown, too]
+    #[arg(long, value_name = "NAME", value_parser = methods())]
+    pub(crate) method: Option<&'static Method>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,

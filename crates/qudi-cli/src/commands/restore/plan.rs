@@ -6,6 +6,7 @@ use crate::args::{Global, Shard, Sum};
 use crate::capture::acquisition::LightOverrides;
 use crate::capture::{is_pipe, refuse_terminal};
 use crate::error::{CliError, Result};
+use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
 use crate::places::Places;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
@@ -36,8 +37,8 @@ pub(super) struct Plan {
     pub(super) light: LightOverrides,
     /// `--seed`, if given.
     pub(super) seed_flag: Option<&'static str>,
-    /// The method by name, unless the capture decides.
-    pub(super) method: Option<String>,
+    /// The method, unless the capture decides.
+    pub(super) method: Option<&'static Method>,
     pub(super) network: NetworkOptions,
     /// Frames that neighbouring windows share.
     pub(super) overlap: u64,
@@ -84,8 +85,8 @@ impl Plan {
             ));
         }
         let mut network = args.network.options(args.steps.steps);
-        if let Some(method) = &args.method {
-            network.check_methods(std::iter::once(method.as_str()))?;
+        if let Some(method) = args.method {
+            network.check_methods(&[method])?;
         }
         let seed_flag = args.seed.is_some().then_some("--seed");
         network.diffusion_flag = network.diffusion_flag.or(seed_flag);
@@ -105,7 +106,7 @@ impl Plan {
                 seed: args.seed.unwrap_or(0),
             },
             seed_flag,
-            method: args.method.clone(),
+            method: args.method,
             network,
             overlap: args.overlap,
             shard: args.shard,

@@ -12,12 +12,12 @@ use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_
 use crate::device;
 use crate::error::Result;
 use crate::interrupt;
+use crate::methods::default::default_method;
 use crate::methods::network::device_failed;
 use crate::methods::options::{NetworkOptions, other_method};
-use crate::methods::{is_network, method, usual_method};
+use crate::methods::{Kind, Method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
-use qudi_baselines::import::Method;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_core::windows::Windows;
@@ -50,7 +50,7 @@ pub(crate) fn run(
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut map = ChiSquareMap::new(&job.capture, &job.acquisition);
     let done = output.finished(part.clone());
-    let mut uncertainty = UncertaintyFile::create(&plan, job.restorer.name(), &job.capture, done)?;
+    let mut uncertainty = UncertaintyFile::create(&plan, job.method, &job.capture, done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
         let sink = Sink::new(&mut output, Some(&mut map), &mut uncertainty);
@@ -64,8 +64,7 @@ pub(crate) fn run(
     }
     let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(0);
     let part = part.start..part.end.min(frames);
-    let is_network = job.restorer.name() == "qudi";
-    let mode = is_network.then(|| plan.network.mode()).transpose()?;
+    let mode = job.method.is_own_network().then(|| plan.network.mode()).transpose()?;
     let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
     job.warnings.extend(chi_square);
     let results = json!({"chi_square": map.chi_square(), "mode": mode, "warnings": job.warnings});
@@ -108,6 +107,7 @@ struct Job {
     acquisition: Acquisition,
     /// Where the light comes from.
     source: &'static str,
+    method: &'static Method,
     restorer: Box<dyn Restorer>,
     /// What the method chose for this clip.
     choice: String,
@@ -129,9 +129,8 @@ impl Job {
         }
         let mut alignment = None;
         if let Some(choice) = &choice {
-            let method = plan.method.as_deref();
             (capture, alignment) =
-                align_by_itself(capture, choice, method, plan.every, &plan.read, &sensor)?;
+                align_by_itself(capture, choice, plan.method, plan.every, &plan.read, &sensor)?;
         }
         if let Some(alignment) = alignment {
             report.remark(&format!("note: {}", alignment.describe()));
@@ -144,15 +143,14 @@ impl Job {
             Some(alignment) => alignment.acquisition(&acquisition)?,
             None => acquisition.clone(),
         };
-        let name = match &plan.method {
-            Some(name) => name.clone(),
-            None => announced_method(plan, &capture, &of_method, report)?.to_owned(),
+        let method = match plan.method {
+            Some(method) => method,
+            None => announced_method(plan, &capture, &of_method, report)?,
         };
-        let name = name.as_str();
-        if let Some(flag) = plan.seed_flag.filter(|_| name != "qudi") {
+        if let Some(flag) = plan.seed_flag.filter(|_| !method.is_own_network()) {
             return Err(other_method(flag));
         }
-        let (restorer, choice) = method(name, &mut capture, &of_method, &plan.network)?;
+        let (restorer, choice) = method.restorer(&mut capture, &of_method, &plan.network)?;
         let restorer = match alignment {
             Some(alignment) => alignment.around(restorer),
             None => restorer,
@@ -177,12 +175,12 @@ impl Job {
             "frames": capture.length(),
             "height": capture.size().height,
             "width": capture.size().width,
-            "method": restorer.name(),
+            "method": method.name,
             "choice": choice,
             "window": restorer.window(),
             "overlap": overlap,
             "seed": plan.light.seed,
-            "network": network_settings(restorer.name(), &plan.network)?,
+            "network": network_settings(method, &plan.network)?,
             "ppp": acquisition.ppp,
             "exposure": acquisition.mean_level,
             "gain": acquisition.gain,
@@ -206,7 +204,17 @@ impl Job {
             let step = alignment.map_or(1, Alignment::step);
             settings["capture_fps"] = json!(fps / step as f64);
         }
-        Ok(Self { capture, acquisition, source, restorer, choice, schedule, settings, warnings })
+        Ok(Self {
+            capture,
+            acquisition,
+            source,
+            method,
+            restorer,
+            choice,
+            schedule,
+            settings,
+            warnings,
+        })
     }
 
     /// The entries of the manifest of an output folder. Weights are among the settings by their SHA-256.
@@ -261,7 +269,7 @@ impl Job {
         });
         let (capture, acquisition) = (&mut self.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
-        let is_network = is_network(restorer.name());
+        let is_network = self.method.is_network();
         let schedule = &self.schedule;
         let run = || {
             observed(observer, || {
@@ -284,12 +292,12 @@ fn announced_method(
     capture: &Capture,
     acquisition: &Acquisition,
     report: &Report,
-) -> Result<&'static str> {
-    let usual = usual_method(&plan.network, capture, acquisition)?;
+) -> Result<&'static Method> {
+    let usual = default_method(&plan.network, capture, acquisition)?;
     if let Some(reason) = &usual.reason {
-        report.remark(&format!("note: {reason}: restoring by {}", usual.name));
+        report.remark(&format!("note: {reason}: restoring by {}", usual.method.name));
     }
-    Ok(usual.name)
+    Ok(usual.method)
 }
 
 /// Says how long all pictures take, if that is long enough to be worth a line.
@@ -311,28 +319,28 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
 }
 
 /// The settings of the network that frames depend on, where it makes them.
-fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Value>> {
-    if let Some(learned) = Method::by_name(method) {
-        let weights = options.weights_of(learned)?;
-        return Ok(Some(json!({
-            "weights": weights.to_string(),
-            "weights_sha256": weights.sha256()?,
+fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<Value>> {
+    Ok(match method.kind {
+        Kind::Classical(_) => None,
+        Kind::Learned { method, .. } => {
+            let weights = options.weights_of(method)?;
+            Some(json!({
+                "weights": weights.to_string(),
+                "weights_sha256": weights.sha256()?,
+                "tile": options.tile,
+            }))
+        }
+        Kind::Network(_) => Some(json!({
+            "weights": options.weights.to_string(),
+            "weights_sha256": options.weights.sha256()?,
+            "steps": options.steps()?,
+            "spacing": options.spacing_name()?,
+            "sampler": options.sampler_name(),
+            "samples": options.samples,
             "tile": options.tile,
-        })));
-    }
-    if method != "qudi" {
-        return Ok(None);
-    }
-    Ok(Some(json!({
-        "weights": options.weights.to_string(),
-        "weights_sha256": options.weights.sha256()?,
-        "steps": options.steps()?,
-        "spacing": options.spacing_name()?,
-        "sampler": options.sampler_name(),
-        "samples": options.samples,
-        "tile": options.tile,
-        "precision": options.precision(&device::open(&options.device)?)?,
-    })))
+            "precision": options.precision(&device::open(&options.device)?)?,
+        })),
+    })
 }
 
 fn describe(
@@ -344,7 +352,7 @@ fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture.size());
-    let (name, choice) = (job.restorer.name(), &job.choice);
+    let (name, choice) = (job.method.name, &job.choice);
     let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");

@@ -2,6 +2,7 @@
 
 use super::plan::Plan;
 use crate::error::{CliError, Result};
+use crate::methods::{Method, QUDI};
 use qudi_core::Frame;
 use qudi_io::capture::Capture;
 use qudi_io::writer::ArrayWriter;
@@ -15,14 +16,15 @@ impl UncertaintyFile {
     /// of them.
     pub(super) fn create(
         plan: &Plan,
-        method: &str,
+        method: &Method,
         capture: &Capture,
         finished: u64,
     ) -> Result<Self> {
         let Some(path) = &plan.uncertainty else { return Ok(Self(None)) };
-        if method != "qudi" {
-            let what = format!("{method} does not predict its uncertainty");
-            return Err(CliError::new(what, "--uncertainty", "use --method qudi"));
+        if !method.is_own_network() {
+            let what = format!("{} does not predict its uncertainty", method.name);
+            let help = format!("use --method {}", QUDI.name);
+            return Err(CliError::new(what, "--uncertainty", help));
         }
         if plan.network.samples < 2 && !plan.network.predicts_uncertainty()? {
             return Err(CliError::new(
