@@ -42,6 +42,7 @@ pub(crate) mod eval {
     mod exposed_clip;
     mod exposing;
     mod html;
+    mod metrics;
     mod perceptual;
     mod plan;
     pub(crate) mod run;
