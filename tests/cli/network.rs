@@ -90,7 +90,11 @@ fn writes_predicted_uncertainty_beside_frames() {
     let values: Vec<f32> = values.map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
     assert!(values.iter().all(|&value| value > 0.0 && value < 1.0));
     refused(&folder, "restore b.npy -o u.npy --deviation e.npy --steps 1", &["--steps 0"]);
-    refused(&folder, "restore b.npy -o u.npy --deviation e.npy --method qbp-refined", &["--method qudi"]);
+    refused(
+        &folder,
+        "restore b.npy -o u.npy --deviation e.npy --method qbp-refined",
+        &["--method qudi"],
+    );
 }
 
 /// These weights' U-Net is silent, and their pre-denoiser has seen no simulated measurement.

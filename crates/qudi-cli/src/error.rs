@@ -5,6 +5,7 @@ pub(crate) mod fields;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use fields::{flags, flags_in_text};
 use qudi_core::Error;
+use qudi_core::nearest::nearest;
 use qudi_model::{MatrixUnits, MatrixUnitsError};
 use std::fmt::Display;
 use std::io;
@@ -46,7 +47,10 @@ impl CliError {
         let help = match (refusal.kind(), refusal.get(ContextKind::ValidValue)) {
             (ErrorKind::ValueValidation, _) => std::error::Error::source(refusal)?.to_string(),
             (ErrorKind::InvalidValue, Some(ContextValue::Strings(all))) => {
-                format!("there are {}", all.join(", "))
+                let names: Vec<&str> = all.iter().map(String::as_str).collect();
+                let hint = nearest(&value, &names);
+                let hint = hint.map_or(String::new(), |n| format!("did you mean `{n}`?  "));
+                format!("{hint}there are {}", names.join(", "))
             }
             _ => return None,
         };
@@ -63,7 +67,10 @@ impl From<Error> for CliError {
             }
             _ => Self::Error {
                 what: flags_in_text(&e.to_string()),
-                place: e.place().map(|place| flags(&place)),
+                place: e.place().map(|place| match &e {
+                    Error::Request { .. } => flags(&place),
+                    _ => place,
+                }),
                 help: e.help().map(|help| flags_in_text(&help)),
             },
         }
@@ -86,7 +93,7 @@ impl From<rayon::ThreadPoolBuildError> for CliError {
     }
 }
 
-/// Errors of writing results to standard output.
+/// Returns the error of writing results to standard output.
 pub(crate) fn stdout_error(e: io::Error) -> CliError {
     match e.kind() {
         io::ErrorKind::BrokenPipe => CliError::BrokenPipe,

@@ -126,6 +126,12 @@ pub(crate) const METHODS: &[Method] = &[
     ),
 ];
 
+/// Returns the names of the learned methods of others.
+pub(crate) fn learned_names() -> Vec<&'static str> {
+    let learned = METHODS.iter().filter(|method| method.as_learned().is_some());
+    learned.map(|method| method.name).collect()
+}
+
 impl Method {
     const fn classical(
         name: &'static str,
@@ -239,7 +245,8 @@ mod tests {
                 Kind::Learned { built_in: None, .. } => "`--weights`",
             };
             let Method { name, about, cost, .. } = method;
-            let (first, last) = (format!("| [`{name}`](#"), format!(" | {about} | {weights} | {cost} |"));
+            let (first, last) =
+                (format!("| [`{name}`](#"), format!(" | {about} | {weights} | {cost} |"));
             assert!(row.starts_with(&first) && row.ends_with(&last), "{row}\n{first}...){last}");
         }
     }

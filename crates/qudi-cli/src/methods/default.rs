@@ -24,7 +24,7 @@ pub(crate) fn default_method(
     options.check_weights(&[])?;
     let long_enough = capture.length().is_none_or(|frames| frames >= MIN_FRAMES as u64);
     let other = |method, reason| Ok(DefaultMethod { method, reason: Some(reason) });
-    if options.own_flag.or(options.tile_flag).is_some() {
+    if options.given.own.is_some() || options.tile_flag.is_some() {
         return Ok(DefaultMethod { method: &QUDI, reason: None });
     }
     if acquisition.sensor.dark_per_frame().is_err() {

@@ -4,8 +4,8 @@ use crate::device;
 use crate::error::Result;
 use crate::memory::{available_bytes, check_tiles};
 use crate::methods::options::NetworkOptions;
-use crate::methods::{Built, Kind};
 use crate::methods::trained::check;
+use crate::methods::{Built, Kind};
 use crate::weights::{NAME, Weights, sha256};
 use burn::tensor::Device;
 use qudi_baselines::import::{

@@ -1,7 +1,7 @@
 //! The network behind `--method qudi`: weights, device, options.
 
-use super::options::NetworkOptions;
 use super::Built;
+use super::options::NetworkOptions;
 use super::trained::check;
 use crate::device::{self, Opened};
 use crate::error::{CliError, Result};

@@ -1,5 +1,6 @@
-//! What the method `qudi` is asked for, defaults filled in.
+//! Options of networks, with defaults filled in.
 
+use crate::args::given::Given;
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::methods::learned::LearnedWeights;
@@ -16,13 +17,13 @@ use std::path::PathBuf;
 pub(crate) struct NetworkOptions {
     /// The weights.
     pub(crate) weights: Weights,
-    /// How many files of weights are named for this network.
+    /// Number of files of weights named for this network.
     pub(crate) own_files: usize,
     /// Files of weights of the learned methods of others.
     pub(crate) learned: Vec<(import::Method, PathBuf)>,
-    /// Reverse steps; none for those that the weights were made for.
+    /// Reverse steps; none for the default of the weights.
     pub(crate) steps: Option<usize>,
-    /// The spacing of their timesteps; none for that which the weights were made for.
+    /// Spacing of the timesteps; none for the default of the weights.
     pub(crate) spacing: Option<TimestepSpacing>,
     /// The sampler.
     pub(crate) sampler: Sampler,
@@ -32,20 +33,18 @@ pub(crate) struct NetworkOptions {
     pub(crate) device: String,
     /// Side of the tiles in pixels.
     pub(crate) tile: usize,
-    /// Numbers that convolutions multiply; none for the fastest.
+    /// Precision of convolutions; none for the fastest.
     pub(crate) precision: Option<ComputePrecision>,
-    /// The first flag given that is about the method `qudi` alone.
-    pub(crate) own_flag: Option<&'static str>,
-    /// `--tile`, if given: for any network, as the next one.
+    /// `--tile`, if given; any network takes it, like `--device`.
     pub(crate) tile_flag: Option<&'static str>,
     /// `--device`, if given.
     pub(crate) device_flag: Option<&'static str>,
-    /// The first flag given that is about diffusion steps.
-    pub(crate) diffusion_flag: Option<&'static str>,
+    /// Flags on the command line that not all networks take.
+    pub(crate) given: Given,
 }
 
 impl NetworkOptions {
-    /// Reverse steps: those asked for, or those that the weights were made for.
+    /// Returns the number of reverse steps; by default, what the weights were made for.
     pub(crate) fn steps(&self) -> Result<usize> {
         match self.steps {
             Some(steps) => Ok(steps),
@@ -53,7 +52,7 @@ impl NetworkOptions {
         }
     }
 
-    /// How the frames are made, in words.
+    /// Returns how frames are made, in words.
     pub(crate) fn mode(&self) -> Result<String> {
         Ok(match self.steps()? {
             0 => "regression".to_owned(),
@@ -62,7 +61,7 @@ impl NetworkOptions {
         })
     }
 
-    /// The spacing of the timesteps: that asked for, or that which the weights were made for.
+    /// Returns the spacing of the timesteps; by default, what the weights were made for.
     pub(crate) fn spacing(&self) -> Result<TimestepSpacing> {
         match self.spacing {
             Some(spacing) => Ok(spacing),
@@ -70,7 +69,7 @@ impl NetworkOptions {
         }
     }
 
-    /// Numbers that convolutions multiply on a device.
+    /// Returns the precision of convolutions on a device.
     pub(crate) fn precision(&self, device: &Opened) -> Result<ComputePrecision> {
         let precision = self.precision.unwrap_or_else(|| ComputePrecision::fastest(&device.device));
         if precision.is_supported(&device.device) {
@@ -80,7 +79,7 @@ impl NetworkOptions {
         Err(CliError::new(what, "--precision", "ask for another, or another --device"))
     }
 
-    /// The name of the spacing on the command line.
+    /// Returns the name of the spacing on the command line.
     pub(crate) fn spacing_name(&self) -> Result<&'static str> {
         Ok(match self.spacing()? {
             TimestepSpacing::Linear => "linear",
@@ -88,7 +87,7 @@ impl NetworkOptions {
         })
     }
 
-    /// The name of the sampler on the command line.
+    /// Returns the name of the sampler on the command line.
     pub(crate) fn sampler_name(&self) -> &'static str {
         match self.sampler {
             Sampler::Ddim => "ddim",
@@ -96,7 +95,7 @@ impl NetworkOptions {
         }
     }
 
-    /// Whether the network, asked so, predicts its uncertainty without samples.
+    /// Returns true if the network predicts its uncertainty without samples.
     pub(crate) fn predicts_uncertainty(&self) -> Result<bool> {
         Ok(self.steps()? == 0 && self.weights.describe()?.network.pre.uncertainty)
     }
@@ -106,7 +105,7 @@ impl NetworkOptions {
         self.check_weights(methods)?;
         let is_own = methods.iter().any(|method| method.is_own_network());
         let is_network = methods.iter().any(|method| method.is_network());
-        match (self.own_flag, self.tile_flag.or(self.device_flag)) {
+        match (&self.given.own, self.tile_flag.or(self.device_flag)) {
             (Some(flag), _) if !is_own => Err(other_method(flag)),
             (None, Some(flag)) if !is_network => {
                 let help = format!("leave it out, or use --method {}", QUDI.name);
@@ -119,8 +118,12 @@ impl NetworkOptions {
     /// Refuses weights of learned methods that are not among `methods`, and two files for one of them.
     pub(crate) fn check_weights(&self, methods: &[&Method]) -> Result<()> {
         if self.own_files > 1 {
-            let help = "name one, or METHOD=FILE for those of other methods";
-            return Err(CliError::new(format!("several files of weights for `{}`", QUDI.name), "--weights", help));
+            let help = "name one, or METHOD=FILE for weights of other methods";
+            return Err(CliError::new(
+                format!("several files of weights for `{}`", QUDI.name),
+                "--weights",
+                help,
+            ));
         }
         for (number, (method, _)) in self.learned.iter().enumerate() {
             let name = method.name();
@@ -137,7 +140,7 @@ impl NetworkOptions {
         Ok(())
     }
 
-    /// A learned method's weights: those named, or those that come along.
+    /// Returns a learned method's weights: the named file, or the built-in ones.
     pub(crate) fn weights_of(&self, method: import::Method) -> Result<LearnedWeights<'_>> {
         let named = self.learned.iter().find(|(of, _)| *of == method);
         let named = named.map(|(_, file)| LearnedWeights::File(file));
@@ -153,8 +156,8 @@ impl NetworkOptions {
         })
     }
 
-    /// What is known of the weights of a learned method that were trained here: their size, and the steps. None of
-    /// other methods, and of weights of others.
+    /// Returns size and steps of a learned method's weights if they were trained here; none for other methods and
+    /// for weights of others.
     pub(crate) fn trained_here(&self, method: &Method) -> Result<Option<String>> {
         let Some(method) = method.as_learned() else { return Ok(None) };
         let contents = self.weights_of(method)?.describe()?;
@@ -166,7 +169,7 @@ impl NetworkOptions {
 
     /// Refuses options that are about diffusion steps where there are none.
     pub(crate) fn check_steps(&self) -> Result<()> {
-        match self.diffusion_flag {
+        match &self.given.diffusion {
             Some(flag) if self.steps()? == 0 => Err(CliError::new(
                 format!("{flag} is for diffusion, and there are 0 steps"),
                 flag,
@@ -177,7 +180,7 @@ impl NetworkOptions {
     }
 }
 
-/// A flag of the method `qudi` beside another method.
+/// Returns the error for a flag of the method `qudi` with another method.
 pub(crate) fn other_method(flag: &str) -> CliError {
     CliError::new(
         format!("{flag} is for method {}", QUDI.name),

@@ -1,5 +1,6 @@
 //! Options of `qudi bench`.
 
+use crate::args::given::Given;
 use crate::args::{Network, Steps, methods, number};
 use crate::methods::{COMPARED, Method};
 use clap::{Args as ClapArgs, ValueHint};
@@ -12,6 +13,8 @@ use std::path::PathBuf;
 /// results with --json, and compare with them later.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Bench {
+    #[command(flatten)]
+    pub(crate) given: Given,
     /// Methods to measure
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values = COMPARED, value_parser = methods())]
     pub(crate) method: Vec<&'static Method>,

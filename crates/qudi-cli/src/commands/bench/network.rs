@@ -56,7 +56,7 @@ pub(crate) fn run(args: &Bench, report: &Report) -> Result<()> {
         let help = "ask for at least 1 round of 3 frames";
         return Err(CliError::new("nothing to measure", "--rounds, --frames", help));
     }
-    let options = args.network.options(args.steps.steps);
+    let options = args.network.options(args.steps.steps, &args.given);
     options.check_weights(&[])?;
     let device = device::open(&options.device)?;
     let (steps, sampling) = (options.steps()?, sample_options(&options, &device)?);
@@ -157,7 +157,7 @@ fn measure(
 
 type Inputs = (Conditioning, Simulated, DiffusionState);
 
-/// Inputs of a step: values do not matter for speed.
+/// Makes inputs of a step; values do not matter for speed.
 fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) -> Inputs {
     let image = || Tensor::<4>::ones([frames, 1, size.height, size.width], device) * 0.5;
     let sensor = Tensor::ones([1, SENSOR_NUMBERS], device);
@@ -177,7 +177,7 @@ fn inputs(config: &NetworkConfig, size: Size, frames: usize, device: &Device) ->
     (conditioning, simulated, state)
 }
 
-/// Seconds of the preparation and of every block of one step.
+/// Measures the preparation and every block of one step, in seconds.
 fn step(network: &Qudi, inputs: &Inputs, device: &Device) -> Vec<(&'static str, f64)> {
     let (conditioning, simulated, state) = inputs;
     let mut last = Instant::now();

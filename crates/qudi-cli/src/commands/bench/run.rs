@@ -46,7 +46,7 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
     if !args.preset.is_empty() {
         return network::run(args, report);
     }
-    let options = args.network.options(args.steps.steps);
+    let options = args.network.options(args.steps.steps, &args.given);
     options.check_methods(&args.method)?;
     let old = args.compare.as_deref().map(load).transpose()?;
     if args.rounds == 0 || args.frames == 0 {

@@ -1,6 +1,7 @@
-//! `qudi look`: a capture at a glance.
+//! `qudi look`: an overview of a capture.
 
 use super::args::Look;
+use crate::args::given::Given;
 use crate::args::{Global, Network};
 use crate::capture::acquisition::{LightOverrides, acquisition};
 use crate::capture::{OpenedCapture, open_summed, unknown_sensor, warnings};
@@ -125,13 +126,13 @@ pub(crate) fn run(
     })
 }
 
-/// `NAME-look.html` in the current folder.
+/// Returns `NAME-look.html`, in the current folder.
 fn default_output(capture: &Path) -> PathBuf {
     let stem = capture.file_stem().unwrap_or(capture.as_os_str()).to_string_lossy().into_owned();
     PathBuf::from(format!("{stem}-look.html"))
 }
 
-/// For binary frames of an unknown camera, a sensor that detects every photon.
+/// Returns a sensor that detects every photon, for binary frames of an unknown camera.
 fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     if !capture.info().binary {
         return Err(unknown_sensor(capture));
@@ -141,7 +142,7 @@ fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     Ok(ideal)
 }
 
-/// The middle of the capture, sums aligned and merged.
+/// Aligns and merges sums around the middle of the capture.
 fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<Frame> {
     let length = capture.frames().min(WINDOW);
     let first = if capture.forward_only() { 0 } else { (capture.frames() - length) / 2 };
@@ -155,9 +156,10 @@ fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<F
     Ok(qbp.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
 }
 
-/// What `qudi restore` would do, and about how long that takes.
+/// Describes what `qudi restore` would do, and about how long that takes.
 fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(String, Value)> {
-    let usual = default_method(&Network::default().options(None), capture, acquisition)?;
+    let usual =
+        default_method(&Network::default().options(None, &Given::default()), capture, acquisition)?;
     let pictures = capture.frames();
     let total = seconds * usual.method.cost / INSTANT_COST * pictures as f64;
     let time = duration(total);
@@ -171,7 +173,7 @@ fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(S
     Ok((words, document))
 }
 
-/// A frame with the tone curve of screens.
+/// Applies the tone curve of screens.
 fn for_the_eye(mut frame: Frame) -> Frame {
     for value in &mut frame.data {
         *value = linear_to_srgb(*value);

@@ -1,5 +1,6 @@
 //! Options of `qudi restore`.
 
+use crate::args::given::{DIFFUSION, Given};
 use crate::args::{Network, Reading, Shard, Steps, methods, number};
 use crate::methods::Method;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
@@ -21,6 +22,8 @@ pub(crate) enum Tonemap {
 /// output. White is 1 = full scale; the scene's mean lands at --exposure.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Restore {
+    #[command(flatten)]
+    pub(crate) given: Given,
     /// The capture: a file or a folder in any format, or - for a pipe of .npy or raw frames (--format raw-u8
     /// --size HxW)
     #[arg(value_hint = ValueHint::AnyPath)]
@@ -46,7 +49,7 @@ pub(crate) struct Restore {
     #[arg(long = "exposure", value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
     pub(crate) mean_level: Option<f64>,
     /// Seed of the diffusion [default: 0]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
+    #[arg(long, value_name = "N", group = DIFFUSION, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: Option<u64>,
     /// Frames that neighbouring windows share, blended
     #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1000))]
@@ -61,7 +64,7 @@ pub(crate) struct Restore {
     pub(crate) tonemap: Tonemap,
     /// Frames per second of what plays (.gif, .mp4, Y4M) [default: 25; the capture's own rate is in the
     /// manifest]
-    #[arg(long, value_name = "RATE", allow_negative_numbers = true, value_parser = number::real(number::PLAYED))]
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true, value_parser = number::real(number::PLAYED_FPS))]
     pub(crate) fps: Option<f64>,
     /// Do part I of N (from 1), into the same folder as the other parts
     #[arg(long, value_name = "I/N")]

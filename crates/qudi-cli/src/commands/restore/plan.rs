@@ -84,12 +84,11 @@ impl Plan {
                 "ask for it when all parts are done: the same command without --shard",
             ));
         }
-        let mut network = args.network.options(args.steps.steps);
+        let network = args.network.options(args.steps.steps, &args.given);
         if let Some(method) = args.method {
             network.check_methods(&[method])?;
         }
         let seed_flag = args.seed.is_some().then_some("--seed");
-        network.diffusion_flag = network.diffusion_flag.or(seed_flag);
         let plan = Self {
             capture: args.capture.clone(),
             output: args.output.clone(),
