@@ -112,13 +112,13 @@ impl LearnedRestorer {
         }
     }
 
-    /// The restored frames `wanted`, `[1, 1, height, width]` each, of all frames of a window.
-    fn images(&self, frames: &[Tensor<4>], wanted: Range<usize>) -> Result<Vec<Tensor<4>>> {
-        let count = wanted.len();
+    /// Restores the frames `numbers` of all `frames` of a window, `[1, 1, height, width]` each.
+    fn images(&self, frames: &[Tensor<4>], numbers: Range<usize>) -> Result<Vec<Tensor<4>>> {
+        let count = numbers.len();
         let [before, after] = self.reach();
-        // The wanted frames and those around them, mirrored at the first and the last frame of all.
+        // These frames and those around them, mirrored at the first and the last frame of all.
         let around: Vec<Tensor<4>> = (0..before + count + after)
-            .map(|i| (wanted.start + i) as i64 - before as i64)
+            .map(|i| (numbers.start + i) as i64 - before as i64)
             .map(|place| frames[mirrored(place, frames.len())].clone())
             .collect();
         let copies = |frames: Vec<Tensor<4>>, channels: usize| {
@@ -140,7 +140,7 @@ impl LearnedRestorer {
             Network::MemDeblur(network) => {
                 let images = copies(frames.to_vec(), network.channels());
                 let [_, _, full] = network.forward(&images, frames.len(), memdeblur::Mode::Use);
-                split(full, wanted.start)
+                split(full, numbers.start)
             }
             Network::Rvrt(network) => {
                 // An even number of frames.
@@ -148,7 +148,7 @@ impl LearnedRestorer {
                 let all = (0..even).map(|place| frames[mirrored(place, frames.len())].clone());
                 let all: Vec<_> = all.collect();
                 let count = all.len();
-                split(network.forward(copies(all, network.channels()), count), wanted.start)
+                split(network.forward(copies(all, network.channels()), count), numbers.start)
             }
             Network::StudentTeacher(network) => {
                 self.sliding(&around, network.frames(), |window| network.forward(window).image)?
@@ -225,18 +225,13 @@ impl Restorer for LearnedRestorer {
         self.reach()
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
-        let all: Vec<usize> = (0..burst.frames.len()).collect();
-        self.restore_frames(burst, acquisition, &all)
-    }
-
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
+        numbers: &[usize],
     ) -> Result<Restored> {
-        let (Some(&first), Some(&last)) = (wanted.iter().min(), wanted.iter().max()) else {
+        let (Some(&first), Some(&last)) = (numbers.iter().min(), numbers.iter().max()) else {
             return Ok(Restored { frames: Vec::new(), std: None });
         };
         progress(self.method().name(), 0, burst.frames.len())?;
@@ -253,7 +248,7 @@ impl Restorer for LearnedRestorer {
             };
             let frames: Vec<Tensor<4>> = planes.iter().map(part).collect();
             let images = self.images(&frames, first..last + 1)?;
-            Ok(wanted.iter().map(|number| images[number - first].clone()).collect())
+            Ok(numbers.iter().map(|number| images[number - first].clone()).collect())
         })?;
         let expected = match self.brightness {
             Brightness::OfAuthors => None,

@@ -58,7 +58,7 @@ pub(crate) const COMPARED: [&str; 2] = ["average", "mle"];
 pub(crate) const MLE: Method = Method::classical(
     "mle",
     "averages 1 to 11 frames, inverts the response of the sensor, subtracts dark counts",
-    0.02,
+    0.0002,
     classical::mle,
 );
 
@@ -66,7 +66,7 @@ pub(crate) const MLE: Method = Method::classical(
 pub(crate) const QBP_REFINED: Method = Method::classical(
     "qbp-refined",
     "runs qbp-bm3d twice, the second time on its first result",
-    0.25,
+    0.12,
     |_, _| Ok((Box::new(QbpRefined), String::new())),
 )
 .aligning();
@@ -75,21 +75,21 @@ pub(crate) const QBP_REFINED: Method = Method::classical(
 pub(crate) const QUDI: Method = Method {
     name: "qudi",
     about: "applies a trained network to aligned frames and qbp-refined",
-    cost: 0.6,
+    cost: 0.4,
     aligns: true,
     kind: Kind::Network(network::restorer),
 };
 
 /// All methods.
 pub(crate) const METHODS: &[Method] = &[
-    Method::classical("average", "averages 11 frames", 0.001, |_, _| {
+    Method::classical("average", "averages 11 frames", 0.00003, |_, _| {
         Ok((Box::new(Average), String::new()))
     }),
     MLE,
     Method::classical(
         "transform-denoise",
         "averages 1 to 11 frames, stabilizes their variance, applies BM3D",
-        0.15,
+        0.09,
         |capture, acquisition| {
             classical::transform_denoise(Transform::Integral, capture, acquisition)
         },
@@ -97,16 +97,16 @@ pub(crate) const METHODS: &[Method] = &[
     Method::classical(
         "bm3d",
         "averages 1 to 11 frames, applies BM3D with one noise level",
-        0.15,
+        0.09,
         |capture, acquisition| {
             classical::transform_denoise(Transform::Identity, capture, acquisition)
         },
     ),
-    Method::classical("qbp", "aligns patches of 11 frames and merges them", 0.05, |_, _| {
+    Method::classical("qbp", "aligns patches of 11 frames and merges them", 0.02, |_, _| {
         Ok((Box::new(Qbp::new(PostFilter::None)), String::new()))
     })
     .aligning(),
-    Method::classical("qbp-bm3d", "runs qbp, then BM3D", 0.2, |_, _| {
+    Method::classical("qbp-bm3d", "runs qbp, then BM3D", 0.1, |_, _| {
         Ok((Box::new(Qbp::new(PostFilter::Bm3d)), String::new()))
     })
     .aligning(),

@@ -43,48 +43,58 @@ pub struct Restored {
 
 /// A method: turns all frames of a window into images at once.
 pub trait Restorer {
-    /// The name in tables and on the command line.
+    /// Returns the name in tables and on the command line.
     fn name(&self) -> &'static str;
 
-    /// The number of frames that it restores together; shorter captures come as one shorter window.
+    /// Returns the number of frames that are restored together; shorter captures are one shorter window.
     fn window(&self) -> usize;
 
-    /// The frames at the beginning and at the end of a window that only help to restore those between, unless the
-    /// capture begins or ends there.
+    /// Returns the numbers of frames at the beginning and at the end of a window that are used but not
+    /// restored, unless the capture begins or ends there.
     fn context(&self) -> [usize; 2] {
         [0, 0]
     }
 
-    /// Restores every frame of `burst`.
+    /// Restores the frames `numbers` of `burst`, in that order. A frame does not depend on which others are
+    /// restored. Methods that restore all frames at once select them with [`Restored::only`].
     ///
     /// # Errors
     /// [`Error`](crate::Error) if the method cannot work with this burst.
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored>;
-
-    /// Restores only the frames `wanted` of `burst`, to what [`Self::restore`] makes of them. Methods that need
-    /// not restore the others for it save their time.
-    ///
-    /// # Errors
-    /// As [`Self::restore`].
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,
         acquisition: &Acquisition,
-        wanted: &[usize],
-    ) -> Result<Restored> {
-        let all = self.restore(burst, acquisition)?;
-        if wanted.len() == all.frames.len() {
-            return Ok(all);
+        numbers: &[usize],
+    ) -> Result<Restored>;
+
+    /// Restores every frame of `burst`.
+    ///
+    /// # Errors
+    /// As [`Self::restore_frames`].
+    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+        let all: Vec<usize> = (0..burst.frames.len()).collect();
+        self.restore_frames(burst, acquisition, &all)
+    }
+}
+
+impl Restored {
+    /// Selects the frames `numbers` of a window that was restored whole, in that order.
+    ///
+    /// # Panics
+    /// If the window has no such frame.
+    #[must_use]
+    pub fn only(self, numbers: &[usize]) -> Self {
+        if numbers.iter().copied().eq(0..self.frames.len()) {
+            return self;
         }
-        let only = |frames: Vec<Frame>| wanted.iter().map(|&n| frames[n].clone()).collect();
-        Ok(Restored { frames: only(all.frames), std: all.std.map(only) })
+        let select = |frames: Vec<Frame>| numbers.iter().map(|&n| frames[n].clone()).collect();
+        Self { frames: select(self.frames), std: self.std.map(select) }
     }
 }
 
 impl Acquisition {
-    /// The acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons per
-    /// pixel and frame, where the image has the mean level `mean_level`; seed 0, from the first frame on, no
-    /// dark map.
+    /// Creates the acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons
+    /// per pixel and frame and an image of mean level `mean_level`; seed 0, first frame 0, no dark map.
     ///
     /// # Errors
     /// [`Error`](crate::Error) if the sensor has no gain at this light.
@@ -93,24 +103,24 @@ impl Acquisition {
         Ok(Self { seed: 0, first_frame: 0, ppp, mean_level, sensor, gain, dark: None })
     }
 
-    /// The same acquisition with another seed of random draws.
+    /// Sets the seed of random draws.
     #[must_use]
     pub fn with_seed(self, seed: u64) -> Self {
         Self { seed, ..self }
     }
 
-    /// The same acquisition for a window that begins with frame `first_frame` of the capture.
+    /// Sets the number of the window's first frame in the capture.
     #[must_use]
     pub fn with_first_frame(self, first_frame: u64) -> Self {
         Self { first_frame, ..self }
     }
 
-    /// Incident photons per unit of image value.
+    /// Returns the incident photons per unit of image value.
     pub fn photons_per_unit(&self) -> f64 {
         self.ppp / self.mean_level
     }
 
-    /// Dark electrons per frame of pixel `i`; `typical` where no map is known.
+    /// Returns the dark electrons per frame of pixel `i`; `typical` where no map is known.
     pub fn dark_of(&self, i: usize, typical: f64) -> f64 {
         self.dark.as_ref().map_or(typical, |map| f64::from(map[i]))
     }

@@ -3,7 +3,7 @@
 
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
-use qudi_io::capture::bit_order_z_score;
+use qudi_io::recognition::bit_order_z_score;
 use qudi_sim::clip::{Input, Sampling};
 
 fn main() -> qudi_core::Result<()> {

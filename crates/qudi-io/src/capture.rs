@@ -5,37 +5,24 @@
 //! nothing downstream sees a raw file. Memory holds a few frames, however long the capture is.
 
 mod auto_sum;
-pub(crate) mod bit_order;
-pub(crate) mod byte_kind;
 mod calibrate;
-pub(crate) mod format_options;
-pub(crate) mod info;
-pub(crate) mod levels;
-pub(crate) mod mosaic;
-pub(crate) mod options;
-pub(crate) mod pipe;
+mod depth;
+mod mosaic;
 mod pixel_map;
-pub(crate) mod probe;
-pub(crate) mod raw_sample;
 mod summary;
 mod view;
 
 pub use auto_sum::{ENOUGH, SumChoice, SumLimit, choose_sum};
-pub use bit_order::{SURE, bit_order_z_score};
 pub use calibrate::{Calibration, calibrate};
-pub use format_options::FormatOption;
-pub use info::{CaptureInfo, Certainty, Packing};
-pub use mosaic::Mosaic;
-pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 pub use summary::{BitOrderCheck, Summary};
 
 use crate::codec;
+use crate::description::{CaptureInfo, ReadOptions, with_pedestal};
 use crate::frames::depth::DepthChecked;
+use crate::frames::pipe::{FIRST_WINDOW, STDIN};
 use crate::frames::{CountFrames, memory};
-use info::{check_sum, depth_source, state_depth};
+use depth::{check_sum, depth_source, state_depth};
 use mosaic::mosaic_plane;
-use options::with_pedestal;
-use pipe::{FIRST_WINDOW, STDIN};
 use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
 use qudi_core::limits::SAMPLE_FRAMES;

@@ -22,16 +22,11 @@ mod visionsim;
 
 pub(crate) use piped::open_pipe;
 
-use crate::capture::format_options::{FormatOption, refuse_others};
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::ReadOptions;
-use crate::capture::probe::Probe;
+use crate::description::{CaptureInfo, Certainty, FormatOption, ReadOptions, refuse_others};
 use crate::frames::CountFrames;
+use crate::recognition::Probe;
 use qudi_core::{Error, Result};
 use std::path::Path;
-
-/// Why a format is sure where a record of ours lies beside the file.
-pub(crate) const RECORD: &str = "the record beside it";
 
 /// One way to store a capture.
 #[derive(Debug)]

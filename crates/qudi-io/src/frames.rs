@@ -7,8 +7,10 @@ pub(crate) mod checksum;
 mod count_frames;
 pub(crate) mod depth;
 pub(crate) mod frame_bytes;
+pub(crate) mod levels;
 pub(crate) mod memory;
 pub(crate) mod packed;
+pub(crate) mod pipe;
 pub(crate) mod reordered;
 pub(crate) mod samples;
 

@@ -3,7 +3,9 @@
 
 pub mod capture;
 pub mod codec;
+pub mod description;
 pub mod frames;
+pub mod recognition;
 pub mod restore;
 pub mod sidecar;
 pub mod writer;

@@ -1,6 +1,6 @@
 //! The record beside every burst: what is needed to read it, and to make it again.
 
-use crate::capture::ReadOptions;
+use crate::description::ReadOptions;
 use crate::writer::BurstFormat;
 use qudi_core::Light;
 use qudi_core::Size;

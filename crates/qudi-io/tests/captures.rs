@@ -19,7 +19,8 @@ mod pipes;
 mod pixels;
 
 use qudi_core::Error;
-use qudi_io::capture::{Capture, MaskChoice, ReadOptions};
+use qudi_io::capture::Capture;
+use qudi_io::description::{MaskChoice, ReadOptions};
 use std::path::{Path, PathBuf};
 
 /// A folder of its own for each test; gone when dropped.

@@ -133,7 +133,12 @@ impl Restorer for QudiRestorer {
         }
     }
 
-    fn restore(&mut self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
+    fn restore_frames(
+        &mut self,
+        burst: BurstView<'_>,
+        acquisition: &Acquisition,
+        numbers: &[usize],
+    ) -> Result<Restored> {
         let frames = burst.frames.len();
         if frames < MIN_FRAMES {
             return Err(Error::request(
@@ -142,10 +147,11 @@ impl Restorer for QudiRestorer {
                 format!("it needs at least {MIN_FRAMES}, better {}", self.window()),
             ));
         }
-        with_precision(self.precision, || match &mut self.way {
+        let restored = with_precision(self.precision, || match &mut self.way {
             Way::Regression(restorer) => restorer.restore(burst, acquisition),
             Way::Diffusion(restorer) => restorer.restore(burst, acquisition),
-        })
+        })?;
+        Ok(restored.only(numbers))
     }
 }
 

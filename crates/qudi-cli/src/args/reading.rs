@@ -4,7 +4,7 @@ use super::{Sum, number};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
-use qudi_io::capture::{
+use qudi_io::description::{
     Axes, BitOrder, Crop, MaskChoice, Mosaic, Orientation, PackAxis, ReadOptions,
 };
 use serde::de::DeserializeOwned;

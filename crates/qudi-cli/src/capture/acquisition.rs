@@ -1,4 +1,4 @@
-//! The acquisition of a capture: its light from overrides, the record, or the counts.
+//! The acquisition of a capture: its light is given, recorded, or measured from the counts.
 
 use crate::error::{CliError, Result};
 use qudi_core::USUAL_MEAN_LEVEL;
@@ -8,7 +8,7 @@ use qudi_core::sensor::Sensor;
 use qudi_core::windows::LONGEST_HALF;
 use qudi_io::capture::{Capture, Summary};
 
-/// What the user says about the light.
+/// The light as options give it.
 #[derive(Debug)]
 pub(crate) struct LightOverrides {
     /// Incident photons per pixel and output frame.
@@ -21,23 +21,74 @@ pub(crate) struct LightOverrides {
 }
 
 impl LightOverrides {
-    /// The gain that is given, or that of the record.
-    pub(crate) fn known_gain(&self, capture: &Capture) -> Option<f64> {
+    /// Returns the gain that is given or recorded.
+    fn known_gain(&self, capture: &Capture) -> Option<f64> {
         self.gain.or(capture.info().gain)
+    }
+
+    /// Measures the counts of a capture, with the known gain.
+    pub(crate) fn measure(
+        &self,
+        capture: &mut Capture,
+        sensor: Option<&Sensor>,
+    ) -> Result<Summary> {
+        let gain = self.known_gain(capture);
+        Ok(Summary::measure(capture, sensor, gain)?)
     }
 }
 
-/// The acquisition of a capture, of which `summary` was measured with the known gain, and where its light comes from.
-pub(crate) fn acquisition(
+/// The acquisition of a capture, and where its light comes from.
+pub(crate) struct CaptureAcquisition {
+    pub(crate) acquisition: Acquisition,
+    /// The source of the light, in words.
+    pub(crate) light_source: &'static str,
+}
+
+impl CaptureAcquisition {
+    /// Takes the light of a capture from `overrides`, the record, or `summary`, which
+    /// [`LightOverrides::measure`] returned for this sensor.
+    pub(crate) fn new(
+        overrides: &LightOverrides,
+        capture: &mut Capture,
+        sensor: &Sensor,
+        summary: &Summary,
+    ) -> Result<Self> {
+        checked_mean_level(overrides.mean_level)?;
+        let output_sensor = capture.output_sensor(sensor)?;
+        let (ppp, light_source) = light(overrides, capture, sensor, summary)?;
+        let gain = match overrides.known_gain(capture) {
+            Some(gain) => gain,
+            None => output_sensor.gain_at(ppp)?,
+        };
+        let summed = output_sensor.frames_summed as f32;
+        let dark = capture.dark().map(|map| map.iter().map(|dark| dark * summed).collect());
+        let mut acquisition = Acquisition {
+            seed: overrides.seed,
+            first_frame: 0,
+            ppp,
+            mean_level: USUAL_MEAN_LEVEL,
+            sensor: output_sensor,
+            gain,
+            dark,
+        };
+        // The recorded level gives what is restored the brightness of the clip.
+        let recorded = capture.info().mean_level.filter(|_| overrides.ppp.is_none());
+        acquisition.mean_level = match overrides.mean_level.or(recorded) {
+            Some(mean_level) => mean_level,
+            None => measured_mean_level(capture, &acquisition)?,
+        };
+        Ok(Self { acquisition, light_source })
+    }
+}
+
+/// Returns the incident photons per pixel and output frame, and where they are known from.
+fn light(
     overrides: &LightOverrides,
-    capture: &mut Capture,
+    capture: &Capture,
     sensor: &Sensor,
     summary: &Summary,
-) -> Result<(Acquisition, &'static str)> {
-    checked_mean_level(overrides.mean_level)?;
-    let of_frames = capture.output_sensor(sensor)?;
+) -> Result<(f64, &'static str)> {
     let recorded = capture.info().ppp.map(|ppp| ppp * f64::from(capture.summed()));
-    let known_gain = overrides.known_gain(capture);
     let (ppp, source) = match (overrides.ppp, recorded) {
         (Some(ppp), _) => (ppp, "given"),
         (None, Some(ppp)) => (ppp, "from the record"),
@@ -62,31 +113,10 @@ pub(crate) fn acquisition(
             "the capture is dark, or the sensor's dark rate too high: give the light, or another --sensor",
         ));
     }
-    let gain = match known_gain {
-        Some(gain) => gain,
-        None => of_frames.gain_at(ppp)?,
-    };
-    let summed = of_frames.frames_summed as f32;
-    let dark = capture.dark().map(|map| map.iter().map(|dark| dark * summed).collect());
-    let mut acquisition = Acquisition {
-        seed: overrides.seed,
-        first_frame: 0,
-        ppp,
-        mean_level: USUAL_MEAN_LEVEL,
-        sensor: of_frames,
-        gain,
-        dark,
-    };
-    // That of the record, so that what is restored has the brightness of the clip.
-    let recorded = capture.info().mean_level.filter(|_| overrides.ppp.is_none());
-    acquisition.mean_level = match overrides.mean_level.or(recorded) {
-        Some(mean_level) => mean_level,
-        None => mean_level_of(capture, &acquisition)?,
-    };
-    Ok((acquisition, source))
+    Ok((ppp, source))
 }
 
-/// What the user says of the exposure, if it can be.
+/// Refuses a mean level that is not positive.
 pub(crate) fn checked_mean_level(mean_level: Option<f64>) -> Result<()> {
     match mean_level {
         Some(mean_level) if !(mean_level.is_finite() && mean_level > 0.0) => Err(CliError::new(
@@ -98,8 +128,8 @@ pub(crate) fn checked_mean_level(mean_level: Option<f64>) -> Result<()> {
     }
 }
 
-/// What the capture says of it.
-fn mean_level_of(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
+/// Measures the mean level that fits the counts of a capture.
+fn measured_mean_level(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
     let size = capture.size();
     // Pipes have shown their first frames only.
     let first = 2 * LONGEST_HALF as u64 + 1;

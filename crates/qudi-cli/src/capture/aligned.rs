@@ -1,14 +1,17 @@
 //! Sums that are aligned by themselves: where motion keeps sums short, several of them are added along it.
 
+use super::{Source, SummedCapture};
 use crate::error::Result;
 use crate::methods::Method;
+use crate::report::Report;
 use qudi_burst::{AlignedSums, choose_count};
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_core::windows::LONGEST_HALF;
-use qudi_io::capture::{Capture, ENOUGH, ReadOptions, SumChoice, SumLimit};
-use qudi_io::restore::Instants;
+use qudi_core::windows::{LONGEST_HALF, Windows};
+use qudi_io::capture::{Capture, ENOUGH, SumChoice, SumLimit};
+use qudi_io::description::ReadOptions;
+use qudi_io::restore::{Instants, Schedule};
 
 /// Pixels that may move within the sums that are shifted.
 const FINE: f64 = 0.5;
@@ -41,6 +44,13 @@ const WINDOW_BYTES: u64 = 256 << 20;
 /// Stretches of the capture that are looked at.
 const PLACES: u64 = 4;
 
+/// A capture that a method restores: its frames are sums, which may be aligned along motion.
+pub(crate) struct AlignedCapture {
+    pub(crate) capture: Capture,
+    /// How its frames, fine sums, are aligned; `None` for plain sums.
+    pub(crate) alignment: Option<Alignment>,
+}
+
 /// How the fine sums of a capture, read as its frames, are aligned.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Alignment {
@@ -51,7 +61,7 @@ pub(crate) struct Alignment {
     /// Fine sums in a block.
     block: usize,
     /// Fine sums in an aligned one.
-    pub(crate) count: usize,
+    count: usize,
 }
 
 /// Native frames in an aligned sum, and in the blocks between which motion is found.
@@ -81,7 +91,7 @@ impl Alignment {
     }
 
     /// The pictures that are made.
-    pub(crate) fn instants(self) -> Instants {
+    fn instants(self) -> Instants {
         let sum = u64::from(self.fine);
         Instants::Frames { every: self.step * sum, sum }
     }
@@ -96,18 +106,8 @@ impl Alignment {
         self.step
     }
 
-    /// `method`, which sees aligned sums.
-    pub(crate) fn around(self, method: Box<dyn Restorer>) -> Box<dyn Restorer> {
-        Box::new(AlignedSums::new(method, self.count, self.block))
-    }
-
-    /// The acquisition of what the method sees.
-    pub(crate) fn acquisition(self, acquisition: &Acquisition) -> Result<Acquisition> {
-        Ok(AlignedSums::acquisition(acquisition, self.count)?)
-    }
-
     /// What is aligned, in a sentence.
-    pub(crate) fn describe(self) -> String {
+    fn describe(self) -> String {
         format!(
             "motion is followed: each picture is restored from {WINDOW} sums of {} frames, aligned along it; --sum N adds plain sums instead",
             self.native_frames()
@@ -115,39 +115,102 @@ impl Alignment {
     }
 }
 
-/// Finds out whether sums of `capture`, which motion keeps short, can be aligned for `method`, with a picture for
-/// every `every` native frames or every sum. If so, its frames become the fine sums that are shifted.
-pub(crate) fn align_by_itself(
-    capture: Capture,
-    choice: &SumChoice,
-    method: Option<&Method>,
-    every: Option<u64>,
-    options: &ReadOptions,
-    sensor: &Sensor,
-) -> Result<(Capture, Option<Alignment>)> {
-    let readable = capture.length().is_some() && !capture.forward_only();
-    let aligns = method.is_none_or(|method| method.aligns);
-    let known = sensor.dark_per_frame().is_ok();
-    if choice.limit != SumLimit::Motion || choice.still || !readable || !aligns || !known {
-        return Ok((capture, None));
+impl AlignedCapture {
+    /// Aligns the sums of a capture, if motion keeps them short and `method` can work with aligned ones. Its frames
+    /// then become the fine sums that are shifted. `every` native frames, or every sum, one picture is made.
+    pub(crate) fn new(
+        summed: SummedCapture,
+        source: &Source<'_>,
+        sensor: &Sensor,
+        method: Option<&Method>,
+        every: Option<u64>,
+    ) -> Result<Self> {
+        let SummedCapture { capture, choice, .. } = summed;
+        let readable = capture.length().is_some() && !capture.forward_only();
+        let aligns = method.is_none_or(|method| method.aligns);
+        let known = sensor.dark_per_frame().is_ok();
+        let short = |choice: &SumChoice| choice.limit == SumLimit::Motion && !choice.still;
+        match choice.filter(short) {
+            Some(choice) if readable && aligns && known => {
+                Self::choose(capture, &choice, every, source.options, sensor)
+            }
+            _ => Ok(Self { capture, alignment: None }),
+        }
     }
-    let (sum, frames) = (choice.frames, capture.native_frames());
-    let distance = every.map_or(u64::from(sum), |every| every.min(frames)) as u32;
-    let bytes = capture.size().pixels() * size_of::<u16>();
-    let steps = (f64::from(sum) * choice.motion / FINE).ceil();
-    let steps = steps.max(STEPS).clamp(1.0, f64::from(sum));
-    let fine = (f64::from(sum) / steps).round().max(1.0) as u32;
-    let mut capture = capture.summed_by(fine, options, Some(sensor))?;
-    let alignment = |lengths| Alignment::new(lengths, choice.motion, distance);
-    let fits = |lengths: Lengths| {
-        let Alignment { fine, count, .. } = alignment(lengths);
-        let held = (WINDOW * count) as u64;
-        held * u64::from(fine) <= frames && held * bytes as u64 <= WINDOW_BYTES
-    };
-    let lengths = choose(&mut capture, choice, steps as usize, sensor, &fits)?;
-    let alignment = lengths.map(alignment);
-    let sum = alignment.map_or(sum, |alignment| alignment.fine);
-    Ok((capture.summed_by(sum, options, Some(sensor))?, alignment))
+
+    /// Chooses whether and how sums of `capture` are aligned.
+    fn choose(
+        capture: Capture,
+        choice: &SumChoice,
+        every: Option<u64>,
+        options: &ReadOptions,
+        sensor: &Sensor,
+    ) -> Result<Self> {
+        let (sum, frames) = (choice.frames, capture.native_frames());
+        let distance = every.map_or(u64::from(sum), |every| every.min(frames)) as u32;
+        let bytes = capture.size().pixels() * size_of::<u16>();
+        let steps = (f64::from(sum) * choice.motion / FINE).ceil();
+        let steps = steps.max(STEPS).clamp(1.0, f64::from(sum));
+        let fine = (f64::from(sum) / steps).round().max(1.0) as u32;
+        let mut capture = capture.summed_by(fine, options, Some(sensor))?;
+        let alignment = |lengths| Alignment::new(lengths, choice.motion, distance);
+        let fits = |lengths: Lengths| {
+            let Alignment { fine, count, .. } = alignment(lengths);
+            let held = (WINDOW * count) as u64;
+            held * u64::from(fine) <= frames && held * bytes as u64 <= WINDOW_BYTES
+        };
+        let lengths = choose(&mut capture, choice, steps as usize, sensor, &fits)?;
+        let alignment = lengths.map(alignment);
+        let sum = alignment.map_or(sum, |alignment| alignment.fine);
+        Ok(Self { capture: capture.summed_by(sum, options, Some(sensor))?, alignment })
+    }
+
+    /// Prints that motion is followed, if it is.
+    pub(crate) fn remark_alignment(&self, report: &Report) {
+        if let Some(alignment) = self.alignment {
+            report.remark(&format!("note: {}", alignment.describe()));
+        }
+    }
+
+    /// Returns the acquisition of the frames that the method sees, where `acquisition` is the capture's.
+    pub(crate) fn seen_acquisition(&self, acquisition: &Acquisition) -> Result<Acquisition> {
+        match self.alignment {
+            Some(alignment) => Ok(AlignedSums::acquisition(acquisition, alignment.count)?),
+            None => Ok(acquisition.clone()),
+        }
+    }
+
+    /// Wraps `method`, so that it sees aligned sums where sums are aligned.
+    pub(crate) fn around(&self, method: Box<dyn Restorer>) -> Box<dyn Restorer> {
+        match self.alignment {
+            Some(Alignment { count, block, .. }) => {
+                Box::new(AlignedSums::new(method, count, block))
+            }
+            None => method,
+        }
+    }
+
+    /// Returns the capture's frames in one of the sums that the method sees.
+    pub(crate) fn frames_per_sum(&self) -> u64 {
+        self.alignment.map_or(1, |alignment| alignment.count as u64)
+    }
+
+    /// Returns the windows that `restorer` restores, of which neighbours share `overlap` frames, and the pictures
+    /// made: one for every `every` native frames, or for every frame.
+    pub(crate) fn schedule(
+        &self,
+        restorer: &dyn Restorer,
+        overlap: u64,
+        every: Option<u64>,
+    ) -> Result<Schedule> {
+        let windows = Windows::of(restorer, self.capture.frames(), overlap)?;
+        let instants = match (self.alignment, every) {
+            (Some(alignment), _) => alignment.instants(),
+            (None, Some(every)) => Instants::every(every, &self.capture)?,
+            (None, None) => Schedule::all(windows).instants,
+        };
+        Ok(Schedule { windows, instants })
+    }
 }
 
 /// Chooses block and sum for a capture, read in fine sums of which `step` make a plain sum, among those that fit.

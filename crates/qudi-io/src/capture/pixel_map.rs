@@ -1,9 +1,8 @@
 //! Which pixels of a capture are bad, and how dark each one is: from files, or from the capture.
 
 use super::Capture;
-use super::info::CaptureInfo;
-use super::options::{MaskChoice, ReadOptions};
 use crate::codec::read_mat_map;
+use crate::description::{CaptureInfo, MaskChoice, ReadOptions};
 use qudi_core::Frame;
 use qudi_core::Transfer;
 use qudi_core::bad_pixels::{BadPixels, Repair};

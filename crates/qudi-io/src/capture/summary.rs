@@ -1,9 +1,9 @@
 //! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
 
 use super::Capture;
-use super::bit_order::{SURE, bit_order_z_score};
 use super::mosaic::mosaic_contrast;
-use super::options::{BitOrder, PackAxis};
+use crate::description::{BitOrder, PackAxis};
+use crate::recognition::{SURE, bit_order_z_score};
 use qudi_core::PppDefinition;
 use qudi_core::Result;
 use qudi_core::sensor::{CountLaw, DarkRate, Response, Sensor};

@@ -1,7 +1,6 @@
 //! Turning and cropping frames: where each pixel of the result comes from.
 
-use super::mosaic::MosaicPlane;
-use super::options::{Crop, Orientation};
+use crate::description::{Crop, MosaicPlane, Orientation};
 use qudi_core::Size;
 use qudi_core::{Error, Result};
 

@@ -3,15 +3,15 @@
 mod colour;
 mod spool;
 
-use crate::capture::byte_kind::ByteKind;
-use crate::capture::format_options::refuse_packing;
-use crate::capture::info::{CaptureInfo, Packing};
-use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
-use crate::capture::pipe::{FIRST_WINDOW, Pipe};
+use crate::description::{
+    Axes, BitOrder, CaptureInfo, PackAxis, Packing, ReadOptions, refuse_packing,
+};
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::{Checksum, Fetch, FrameBytes, Opener, Segment, StreamEnd, strewn};
 use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
+use crate::frames::pipe::{FIRST_WINDOW, Pipe};
 use crate::frames::samples::{Channel, MONO, SampleFrames, Scale};
+use crate::recognition::ByteKind;
 use crate::sidecar::{self, BurstLayout};
 use crate::writer::BurstFormat;
 use colour::{Colours, Layout};

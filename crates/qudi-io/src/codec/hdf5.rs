@@ -5,11 +5,10 @@ mod guard;
 
 use super::array::{Array, Hints, Place};
 use super::{Format, Recognition};
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::{Axes, ReadOptions};
-use crate::capture::probe::Probe;
 use crate::codec::hdf5::guard::{Checked, Hdf5};
+use crate::description::{Axes, CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
+use crate::recognition::Probe;
 use hdf5_pure::{Datatype, DatatypeByteOrder};
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};

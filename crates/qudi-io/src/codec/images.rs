@@ -2,13 +2,12 @@
 
 use super::npy::described;
 use super::{Format, Recognition};
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::levels::infer_levels;
-use crate::capture::options::ReadOptions;
-use crate::capture::probe::Probe;
+use crate::description::{CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
+use crate::frames::levels::infer_levels;
 use crate::frames::reordered::reordered;
 use crate::frames::samples::{Scale, no_count};
+use crate::recognition::Probe;
 use image::DynamicImage;
 use qudi_core::Size;
 use qudi_core::regular_file::require_regular;

@@ -4,13 +4,11 @@ pub(super) mod file;
 
 use super::array::{Array, Hints, Place, Stored};
 use super::{Format, Recognition};
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::{Axes, ReadOptions};
-use crate::capture::probe::Probe;
-use crate::capture::raw_sample::stem;
 use crate::codec::mat::file::{MatArray, arrays, is_level_5};
+use crate::description::{Axes, CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::chain::Chain;
+use crate::recognition::{Probe, stem};
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
 use qudi_core::{Error, Result};

@@ -2,11 +2,12 @@
 
 use super::array::{Array, Hints, Place};
 use super::{Format, Recognition};
-use crate::capture::info::{CaptureInfo, Certainty, Packing};
-use crate::capture::options::{Axes, BitOrder, PackAxis, ReadOptions};
-use crate::capture::probe::Probe;
+use crate::description::{
+    Axes, BitOrder, CaptureInfo, Certainty, PackAxis, Packing, RECORD, ReadOptions,
+};
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::Opener;
+use crate::recognition::Probe;
 use crate::sidecar::{self, BurstLayout, Sidecar};
 use crate::writer::BurstFormat;
 use flate2::read::MultiGzDecoder;
@@ -131,7 +132,7 @@ pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayo
             return None;
         }
     };
-    info.reasons.push(super::RECORD.to_owned());
+    info.reasons.push(RECORD.to_owned());
     let layout = match record {
         Sidecar::Simulated(record) => {
             info.binary = record.simulation.sensor.response == Response::Binary;

@@ -3,12 +3,11 @@
 use super::array::{Hints, Place};
 use super::npy::{array, refuse_bomb};
 use super::{Format, Recognition};
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::ReadOptions;
-use crate::capture::probe::Probe;
+use crate::description::{CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::checksum::CrcReader;
 use crate::frames::frame_bytes::{Checksum, Opener};
+use crate::recognition::Probe;
 use flate2::read::DeflateDecoder;
 use qudi_core::npy::Header;
 use qudi_core::{Error, Result};

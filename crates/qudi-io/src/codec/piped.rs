@@ -3,11 +3,9 @@
 use super::array::{Hints, Place};
 use super::npy::array;
 use super::raw::piped as piped_raw;
-use crate::capture::format_options::refuse_others;
-use crate::capture::info::CaptureInfo;
-use crate::capture::options::ReadOptions;
-use crate::capture::pipe::{Pipe, STDIN, Tail};
+use crate::description::{CaptureInfo, ReadOptions, refuse_others};
 use crate::frames::CountFrames;
+use crate::frames::pipe::{Pipe, STDIN, Tail};
 use qudi_core::npy::Header;
 use qudi_core::{Error, Result};
 use std::io::{Cursor, Read};

@@ -4,13 +4,11 @@
 //! shutter; a rolling-shutter file of exposure 1 starts with `yrange * 80` bytes to skip.
 
 use super::{Format, Recognition};
-use crate::capture::byte_kind::ByteKind;
-use crate::capture::info::{CaptureInfo, Certainty, Packing};
-use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
-use crate::capture::probe::Probe;
 use crate::codec::raw::files::frame_files;
+use crate::description::{BitOrder, CaptureInfo, Certainty, PackAxis, Packing, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement};
+use crate::recognition::{ByteKind, Probe};
 use qudi_core::Size;
 use qudi_core::{Error, Result};
 

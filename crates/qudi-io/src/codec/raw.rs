@@ -4,16 +4,16 @@
 pub(super) mod files;
 
 use super::Format;
-use crate::capture::format_options::{FormatOption, refuse_others};
-use crate::capture::info::{CaptureInfo, Packing};
-use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
-use crate::capture::pipe::{Pipe, STDIN, Tail};
-use crate::capture::probe::Probe;
 use crate::codec::raw::files::{TRAILERS, frame_files};
+use crate::description::{
+    BitOrder, CaptureInfo, FormatOption, PackAxis, Packing, ReadOptions, refuse_others,
+};
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::FrameBytes;
 use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
+use crate::frames::pipe::{Pipe, STDIN, Tail};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
+use crate::recognition::Probe;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};

@@ -5,16 +5,14 @@
 mod region;
 
 use super::{Format, Recognition};
-use crate::capture::byte_kind::ByteKind;
-use crate::capture::format_options::FormatOption;
-use crate::capture::info::{CaptureInfo, Certainty, Packing};
-use crate::capture::options::{BitOrder, Orientation, PackAxis, ReadOptions};
-use crate::capture::probe::Probe;
-use crate::capture::raw_sample::Convention;
 use crate::codec::raw::files::{ends_in_trailer, frame_files};
+use crate::description::{
+    BitOrder, CaptureInfo, Certainty, FormatOption, Orientation, PackAxis, Packing, ReadOptions,
+};
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement, stored_bytes};
 use crate::frames::samples::{MONO, SampleFrames, Scale};
+use crate::recognition::{ByteKind, Convention, Probe};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};

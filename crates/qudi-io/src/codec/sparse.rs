@@ -1,12 +1,10 @@
 //! SPAD512S sparse mode: 32-bit little-endian indices of fired pixels, a delimiter ends each frame.
 
 use super::{Format, Recognition};
-use crate::capture::format_options::FormatOption;
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::{Orientation, ReadOptions};
-use crate::capture::probe::Probe;
+use crate::description::{CaptureInfo, Certainty, FormatOption, Orientation, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::chain::Chain;
+use crate::recognition::Probe;
 use qudi_core::Size;
 use qudi_core::{Error, Result};
 use std::fs::File;

@@ -5,14 +5,11 @@
 //! and, upside down, of image row `511 - r`.
 
 use super::{Format, Recognition};
-use crate::capture::byte_kind::ByteKind;
-use crate::capture::info::{CaptureInfo, Certainty, Packing};
-use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
-use crate::capture::probe::Probe;
-use crate::capture::raw_sample::{Convention, SWISSSPAD_FILE};
 use crate::codec::raw::files::frame_files;
+use crate::description::{BitOrder, CaptureInfo, Certainty, PackAxis, Packing, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement};
+use crate::recognition::{ByteKind, Convention, Probe, SWISSSPAD_FILE};
 use qudi_core::Result;
 use qudi_core::Size;
 

@@ -6,14 +6,13 @@ mod pages;
 
 use super::npy::described;
 use super::{Format, Recognition};
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::ReadOptions;
-use crate::capture::probe::Probe;
+use crate::description::{CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::channel_pages::ChannelPages;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use crate::frames::reordered::reordered;
 use crate::frames::samples::{MONO, SampleFrames, Scale};
+use crate::recognition::Probe;
 use crate::sidecar::{self, BurstLayout};
 use description::Description;
 use pages::{TiffPages, bits_reversed, decoder, fault, photometric};

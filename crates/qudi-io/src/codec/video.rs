@@ -1,14 +1,12 @@
 //! Videos through ffmpeg, for what was stored as one. Lossy compression leaves no photon counts.
 
 use super::{Format, Recognition};
-use crate::capture::format_options::FormatOption;
-use crate::capture::info::{CaptureInfo, Certainty};
-use crate::capture::options::ReadOptions;
-use crate::capture::probe::Probe;
+use crate::description::{CaptureInfo, Certainty, FormatOption, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use crate::frames::reordered::reordered;
 use crate::frames::samples::{MONO, SampleFrames, Scale};
+use crate::recognition::Probe;
 use qudi_core::Transfer;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};

@@ -4,12 +4,12 @@ use super::array::{Hints, Stored};
 use super::images::open_files;
 use super::npy::open_array;
 use super::{Format, Recognition};
-use crate::capture::format_options::refuse_others;
-use crate::capture::info::{CaptureInfo, Certainty, Packing};
-use crate::capture::options::{BitOrder, PackAxis, ReadOptions};
-use crate::capture::probe::Probe;
+use crate::description::{
+    BitOrder, CaptureInfo, Certainty, PackAxis, Packing, ReadOptions, refuse_others,
+};
 use crate::frames::CountFrames;
 use crate::frames::reordered::reordered;
+use crate::recognition::Probe;
 use qudi_core::Size;
 use qudi_core::limits::INDEX_BYTES;
 use qudi_core::regular_file::read_limited;

@@ -1,7 +1,7 @@
 //! Sums of packed binary frames without unpacking them: 15 frames are added bit by bit with
 //! full adders over 512 pixels at once, and only the four sum bits are spread out to counters.
 
-use crate::capture::options::BitOrder;
+use crate::description::BitOrder;
 use rayon::prelude::*;
 
 /// 512 pixels: one cache line of every frame, so that each line is loaded once.

@@ -1,7 +1,7 @@
 //! The stored bytes of frames: in files, in a compressed stream, or strewn across an array whose
 //! frame axis is not the slowest. Memory is bounded by a few frames.
 
-use crate::capture::pipe::Pipe;
+use crate::frames::pipe::Pipe;
 use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};

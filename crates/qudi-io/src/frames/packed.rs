@@ -3,7 +3,7 @@
 use super::bit_sums::{MOST_FRAMES, add_packed, spread_table};
 use super::count_frames::CountFrames;
 use super::frame_bytes::FrameBytes;
-use crate::capture::options::{BitOrder, PackAxis};
+use crate::description::{BitOrder, PackAxis};
 use qudi_core::Result;
 use qudi_core::Size;
 use std::ops::Range;

@@ -3,7 +3,7 @@
 use super::count_frames::CountFrames;
 use super::frame_bytes::strewn;
 use super::samples::{MONO, SampleFrames, Scale};
-use crate::capture::options::Axes;
+use crate::description::Axes;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result, Size};
 use std::io::{BufWriter, Write};

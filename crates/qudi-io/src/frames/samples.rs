@@ -2,9 +2,8 @@
 
 use super::count_frames::CountFrames;
 use super::frame_bytes::FrameBytes;
-use crate::capture::info::CaptureInfo;
-use crate::capture::levels::infer_levels;
-use crate::capture::options::ReadOptions;
+use crate::description::{CaptureInfo, ReadOptions};
+use crate::frames::levels::infer_levels;
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};

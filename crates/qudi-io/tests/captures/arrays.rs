@@ -2,7 +2,7 @@
 
 use crate::{counts, npy, open, pack, plain, refusal, scene, scratch, write};
 use proptest::prelude::*;
-use qudi_io::capture::{Axes, BitOrder, Orientation, PackAxis, ReadOptions};
+use qudi_io::description::{Axes, BitOrder, Orientation, PackAxis, ReadOptions};
 use std::io::Write;
 
 #[test]

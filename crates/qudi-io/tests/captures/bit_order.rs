@@ -2,7 +2,7 @@
 
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
-use qudi_io::capture::{SURE, bit_order_z_score};
+use qudi_io::recognition::{SURE, bit_order_z_score};
 use qudi_sim::clip::{Input, Sampling};
 
 /// Sums of simulated binary frames of a procedural scene, seen in either order.

@@ -1,7 +1,7 @@
 //! The cameras' own raw files, made bit by bit as their layouts say.
 
 use crate::{counts, open, pack, plain, refusal, scene, scratch, write};
-use qudi_io::capture::{Orientation, ReadOptions};
+use qudi_io::description::{Orientation, ReadOptions};
 
 /// `numpy.rot90` of a 512 x 512 frame.
 fn rot90(frame: &[u16]) -> Vec<u16> {

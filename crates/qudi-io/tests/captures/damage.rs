@@ -2,7 +2,8 @@
 
 use crate::{counts, npy, open, plain, refusal, scene, scratch, write};
 use qudi_core::{Frame, Size};
-use qudi_io::capture::{Axes, Capture, MaskChoice, ReadOptions};
+use qudi_io::capture::Capture;
+use qudi_io::description::{Axes, MaskChoice, ReadOptions};
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use zip::write::SimpleFileOptions;
@@ -207,8 +208,11 @@ fn rejects_special_files_as_captures_masks_and_dark_maps() {
 fn notes_pipes_that_end_within_the_first_window() {
     let mut bytes = plain_npy();
     bytes.truncate(bytes.len() - 13 * 32 * 64 - 5);
-    let options =
-        ReadOptions { lenient: true, pack_axis: Some(qudi_io::capture::PackAxis::None), ..plain() };
+    let options = ReadOptions {
+        lenient: true,
+        pack_axis: Some(qudi_io::description::PackAxis::None),
+        ..plain()
+    };
     let capture = Capture::from_pipe(Cursor::new(bytes), &options, None).unwrap();
     assert_eq!(capture.frames(), 6);
     let notes = &capture.info().notes;
@@ -228,7 +232,7 @@ fn masks_in_fortran_order_are_read() {
     let options = ReadOptions {
         mask: MaskChoice::File(mask),
         bits: Some(3),
-        pack_axis: Some(qudi_io::capture::PackAxis::None),
+        pack_axis: Some(qudi_io::description::PackAxis::None),
         ..ReadOptions::default()
     };
     assert_eq!(open(&path, &options).unwrap().bad_pixels().hot, [2]);

@@ -2,7 +2,7 @@
 //! `tests/golden/generate/captures.py`. All hold the same 6 frames.
 
 use crate::{counts, open, plain, refusal};
-use qudi_io::capture::{Certainty, MaskChoice, PackAxis, ReadOptions};
+use qudi_io::description::{Certainty, MaskChoice, PackAxis, ReadOptions};
 use std::path::{Path, PathBuf};
 
 fn golden(name: &str) -> PathBuf {

@@ -1,10 +1,11 @@
 //! Every format with every option: applied, or refused by name.
 
 use crate::{npy, pack, plain, refusal, scene, scratch, write};
-use qudi_io::capture::{
-    Axes, BitOrder, Capture, FormatOption, MaskChoice, Orientation, PackAxis, ReadOptions,
-};
+use qudi_io::capture::Capture;
 use qudi_io::codec::FORMATS;
+use qudi_io::description::{
+    Axes, BitOrder, FormatOption, MaskChoice, Orientation, PackAxis, ReadOptions,
+};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 

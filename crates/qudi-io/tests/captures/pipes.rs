@@ -7,7 +7,8 @@ use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::Windows;
 use qudi_core::{Error, Frame};
-use qudi_io::capture::{Axes, Capture, PackAxis, ReadOptions};
+use qudi_io::capture::Capture;
+use qudi_io::description::{Axes, PackAxis, ReadOptions};
 use qudi_io::restore::{RestoreSink, Schedule, run};
 use std::ops::ControlFlow;
 

@@ -4,7 +4,8 @@ use crate::{npy, open, plain, scratch, write};
 use qudi_core::bad_pixels::BadPixels;
 use qudi_core::sensor::{Gain, Sensor};
 use qudi_core::{Camera, Frame, Light, Size};
-use qudi_io::capture::{Capture, MaskChoice, ReadOptions, calibrate};
+use qudi_io::capture::{Capture, calibrate};
+use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_sim::clip::{Input, Sampling};
 use std::ops::ControlFlow;
 use std::path::Path;
@@ -115,13 +116,13 @@ fn masks_and_dark_maps_come_from_files() {
     let file = write(folder.path(), "mask.npy", &npy("|b1", "False", "(3, 4)", &mask));
     let options = ReadOptions {
         mask: MaskChoice::File(file),
-        pack_axis: Some(qudi_io::capture::PackAxis::None),
+        pack_axis: Some(qudi_io::description::PackAxis::None),
         ..ReadOptions::default()
     };
     assert_eq!(open(&path, &options).unwrap().bad_pixels().hot, [5]);
     // Turned and cropped along with the frames: pixel (1, 1) of 3 x 4 is (2, 1) of its rot90.
     let turned = ReadOptions {
-        orient: Some(qudi_io::capture::Orientation::Rot90),
+        orient: Some(qudi_io::description::Orientation::Rot90),
         crop: Some("1:4,1:3".parse().unwrap()),
         ..options.clone()
     };

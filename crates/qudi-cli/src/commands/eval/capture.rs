@@ -6,8 +6,7 @@ use super::html::Pictures;
 use super::metrics::CHI_SQUARE;
 use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
-use crate::capture::acquisition::{LightOverrides, acquisition};
-use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_sensor};
+use crate::capture::{CaptureAcquisition, LightOverrides, Source, SummedCapture, remarks};
 use crate::error::Result;
 use crate::interrupt;
 use crate::memory::PeakMemory;
@@ -17,7 +16,7 @@ use qudi_core::Frame;
 use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
 use qudi_core::windows::Windows;
-use qudi_io::capture::{Capture, Summary};
+use qudi_io::capture::Capture;
 use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -41,21 +40,25 @@ pub(crate) fn evaluate_capture(
     overrides.refuse(&["simulate."], "with --capture, whose photons are drawn already")?;
     let seed = plan.seed.unwrap_or(SEED);
     let path = Path::new(&plan.data);
-    let OpenedCapture { mut capture, sensor, sum, .. } =
-        open_summed(Some(path), &plan.read, plan.sum, plan.sensor.as_deref(), overrides)?;
-    let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
-    if let Some(choice) = &sum {
-        report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
-    }
+    let source = Source {
+        path: Some(path),
+        options: &plan.read,
+        sum: plan.sum,
+        sensor: plan.sensor.as_deref(),
+    };
+    let summed = SummedCapture::new(source.open(overrides)?, &source)?;
+    let sensor = summed.required_sensor()?;
+    summed.remark_sum(report);
+    let mut capture = summed.capture;
     let light = LightOverrides {
         ppp: plan.ppp.first().copied(),
         gain: plan.gain,
         mean_level: plan.mean_level,
         seed,
     };
-    let gain = light.known_gain(&capture);
-    let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
-    let (acquisition, source) = acquisition(&light, &mut capture, &sensor, &summary)?;
+    let summary = light.measure(&mut capture, Some(&sensor))?;
+    let CaptureAcquisition { acquisition, light_source } =
+        CaptureAcquisition::new(&light, &mut capture, &sensor, &summary)?;
     let frames = capture.frames().min(plan.frames.unwrap_or(FRAMES));
     let mut counts = vec![0; capture.size().pixels()];
     capture.read(frames / 2, &mut counts)?;
@@ -76,7 +79,7 @@ pub(crate) fn evaluate_capture(
     drop(bar);
     remarks(&capture, report);
     let about = format!(
-        "{frames} frames of {} of {}, sensor {}, {:.4} incident photons/pixel/frame ({source}); no truth: chi-square of the counts given the result, 1 where it explains them, below where it follows their noise, above where it blurs or invents",
+        "{frames} frames of {} of {}, sensor {}, {:.4} incident photons/pixel/frame ({light_source}); no truth: chi-square of the counts given the result, 1 where it explains them, below where it follows their noise, above where it blurs or invents",
         capture.size(),
         plan.data,
         acquisition.sensor.name,
@@ -87,7 +90,7 @@ pub(crate) fn evaluate_capture(
         "format": capture.info().format,
         "frames": frames,
         "sum": capture.summed(),
-        "ppp_from": source,
+        "ppp_from": light_source,
         "gain": acquisition.gain,
         "sensor": acquisition.sensor,
         "seed": seed,

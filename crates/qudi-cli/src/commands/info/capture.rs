@@ -3,7 +3,7 @@
 use super::args::Info;
 use super::record::{origin, record_document};
 use crate::args::Global;
-use crate::capture::{OpenedCapture, describe_sum, open_summed, warnings};
+use crate::capture::{Source, SummedCapture, describe_sum, warnings};
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
 use crate::places::Places;
@@ -12,7 +12,8 @@ use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
-use qudi_io::capture::{BitOrderCheck, Capture, MaskChoice, Packing, SumChoice, Summary};
+use qudi_io::capture::{BitOrderCheck, Capture, SumChoice, Summary};
+use qudi_io::description::{MaskChoice, Packing};
 use qudi_io::sidecar::Sidecar;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
@@ -45,9 +46,15 @@ pub(crate) fn run(
         refuse_taken(preview, overwrite)?;
     }
     let options = info.reading.options(MaskChoice::Auto);
-    let name = info.sensor.as_deref();
-    let OpenedCapture { mut capture, sensor, sum, .. } =
-        open_summed(Some(path), &options, info.reading.sum(), name, settings)?;
+    let source = Source {
+        path: Some(path),
+        options: &options,
+        sum: info.reading.sum(),
+        sensor: info.sensor.as_deref(),
+    };
+    let summed = SummedCapture::new(source.open(settings)?, &source)?;
+    let sum = summed.sum().cloned();
+    let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
     let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
     if let Some(preview) = &info.preview {
@@ -112,7 +119,7 @@ pub(crate) fn describe(
     if let Some(packing) = about.packing {
         line("packing", describe_packing(packing, summary.bit_order));
     }
-    if about.orient != qudi_io::capture::Orientation::Raw {
+    if about.orient != qudi_io::description::Orientation::Raw {
         line("turned", about.orient.name().to_owned());
     }
     if let Some(fps) = capture.fps() {
@@ -166,7 +173,7 @@ pub(crate) fn describe(
 
 fn describe_packing(packing: Packing, check: Option<BitOrderCheck>) -> String {
     let axis = match packing.axis {
-        qudi_io::capture::PackAxis::Height => "height",
+        qudi_io::description::PackAxis::Height => "height",
         _ => "width",
     };
     let order = packing.order;

@@ -3,8 +3,9 @@
 use super::args::Look;
 use crate::args::given::Given;
 use crate::args::{Global, Network};
-use crate::capture::acquisition::{LightOverrides, acquisition};
-use crate::capture::{OpenedCapture, open_summed, unknown_sensor, warnings};
+use crate::capture::{
+    CaptureAcquisition, LightOverrides, Source, SummedCapture, unknown_sensor, warnings,
+};
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
 use crate::methods::default::default_method;
@@ -16,7 +17,8 @@ use qudi_burst::{PostFilter, Qbp};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Frame, linear_to_srgb};
-use qudi_io::capture::{Capture, MaskChoice, Summary};
+use qudi_io::capture::Capture;
+use qudi_io::description::MaskChoice;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
@@ -29,7 +31,7 @@ const WINDOW: u64 = 11;
 /// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
 ///
 /// [`Method::cost`]: crate::methods::Method::cost
-const INSTANT_COST: f64 = 0.1;
+const INSTANT_COST: f64 = 0.065;
 
 pub(crate) fn run(
     args: &Look,
@@ -57,34 +59,36 @@ pub(crate) fn run(
         .check()?;
     let file = Output::open(Some(&output), global.overwrite())?;
     let options = args.reading.options(MaskChoice::Auto);
-    let OpenedCapture { mut capture, sensor, sum, .. } = open_summed(
-        Some(&args.capture),
-        &options,
-        args.reading.sum(),
-        args.sensor.as_deref(),
-        settings,
-    )?;
+    let source = Source {
+        path: Some(&args.capture),
+        options: &options,
+        sum: args.reading.sum(),
+        sensor: args.sensor.as_deref(),
+    };
+    let summed = SummedCapture::new(source.open(settings)?, &source)?;
+    let sum = summed.sum().cloned();
+    let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
-    let summary = Summary::measure(&mut capture, sensor.as_ref(), gain)?;
+    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0 };
+    let summary = light.measure(&mut capture, sensor.as_ref())?;
     let warnings = warnings::of_capture(&capture, &summary);
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
     let mut line = |value: &str| {
         let _ = writeln!(text, "restore    {value}");
     };
     let mean = for_the_eye(summary.picture(&capture, sensor.as_ref(), gain));
-    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0 };
-    let of_light = match sensor {
-        Some(sensor) => acquisition(&light, &mut capture, &sensor, &summary),
+    let acquired = match sensor {
+        Some(sensor) => CaptureAcquisition::new(&light, &mut capture, &sensor, &summary),
         None => ideal_sensor(&capture).and_then(|sensor| {
-            let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
-            acquisition(&light, &mut capture, &sensor, &summary)
+            let summary = light.measure(&mut capture, Some(&sensor))?;
+            CaptureAcquisition::new(&light, &mut capture, &sensor, &summary)
         }),
     };
     let mut picture = Picture::new(mean.size, 1, 2, 1);
     picture.place(0, 0, &["MEAN"], &mean);
     let mut forecast = Value::Null;
-    match of_light {
-        Ok((acquisition, _)) => {
+    match acquired {
+        Ok(CaptureAcquisition { acquisition, .. }) => {
             let start = Instant::now();
             let instant = restore_instant(&mut capture, &acquisition)?;
             let seconds = start.elapsed().as_secs_f64();

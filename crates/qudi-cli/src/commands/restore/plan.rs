@@ -3,14 +3,13 @@
 use super::args::{Restore, Tonemap};
 use crate::args::tiff_samples::tiff_samples;
 use crate::args::{Global, Shard, Sum};
-use crate::capture::acquisition::LightOverrides;
-use crate::capture::{is_pipe, refuse_terminal};
+use crate::capture::{LightOverrides, Source, is_pipe, refuse_terminal};
 use crate::error::{CliError, Result};
 use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
 use crate::places::Places;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
-use qudi_io::capture::{MaskChoice, ReadOptions};
+use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::writer::TiffSamples;
 use std::path::{Path, PathBuf};
 
@@ -134,6 +133,16 @@ impl Plan {
         let extension = Path::new(&self.output).extension();
         let extension = extension.map(|e| e.to_string_lossy().to_lowercase());
         self.output == "-" || matches!(extension.as_deref(), Some("gif" | "mp4"))
+    }
+
+    /// Returns the capture as the plan names it.
+    pub(super) fn source(&self) -> Source<'_> {
+        Source {
+            path: (!self.reads_pipe()).then_some(self.capture.as_path()),
+            options: &self.read,
+            sum: self.sum,
+            sensor: self.sensor.as_deref(),
+        }
     }
 
     /// Whether the capture comes through standard input.

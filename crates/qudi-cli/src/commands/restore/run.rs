@@ -6,23 +6,23 @@ use super::output::{Output, Sink};
 use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
-use crate::capture::acquisition::acquisition;
-use crate::capture::aligned::{Alignment, align_by_itself};
-use crate::capture::{OpenedCapture, describe_sum, open_summed, remarks, unknown_sensor, warnings};
+use crate::capture::{
+    AlignedCapture, Alignment, CaptureAcquisition, SummedCapture, remarks, warnings,
+};
 use crate::device;
 use crate::error::Result;
 use crate::interrupt;
 use crate::methods::default::default_method;
 use crate::methods::network::device_failed;
 use crate::methods::options::{NetworkOptions, other_method};
-use crate::methods::{Kind, Method};
+use crate::methods::{Built, Kind, Method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_core::windows::Windows;
-use qudi_io::capture::{Capture, MaskChoice, Summary};
-use qudi_io::restore::{FolderRun, Inputs, Instants, Schedule, Share, run as run_method};
+use qudi_io::capture::Capture;
+use qudi_io::description::MaskChoice;
+use qudi_io::restore::{FolderRun, Inputs, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
 use std::cell::RefCell;
 use std::fmt::Write as _;
@@ -42,15 +42,16 @@ pub(crate) fn run(
 ) -> Result<()> {
     let plan = Plan::new(args, global, report.json())?;
     let mut job = Job::prepare(&plan, settings, report)?;
-    let run = job.folder_run(&plan)?;
-    let mut output = Output::open(&plan, &job.capture, run)?;
+    let settings = job.settings(&plan)?;
+    let run = job.folder_run(&plan, &settings)?;
+    let mut output = Output::open(&plan, job.capture(), run)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
-    let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(u64::MAX);
+    let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
-    let mut map = ChiSquareMap::new(&job.capture, &job.acquisition);
+    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition);
     let done = output.finished(part.clone());
-    let mut uncertainty = UncertaintyFile::create(&plan, job.method, &job.capture, done)?;
+    let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
         let sink = Sink::new(&mut output, Some(&mut map), &mut uncertainty);
@@ -60,9 +61,9 @@ pub(crate) fn run(
         // the rest is made, so that a run that keeps being killed still gets on.
         let sink = Sink::new(&mut output, None, &mut uncertainty);
         job.run(rest, sink, &plan.network, report)?;
-        output.measure_finished(&mut map, &mut job.capture, &job.schedule, part.clone())?;
+        output.measure_finished(&mut map, &mut job.aligned.capture, &job.schedule, part.clone())?;
     }
-    let frames = job.schedule.instants.pictures(&job.capture).unwrap_or(0);
+    let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(0);
     let part = part.start..part.end.min(frames);
     let mode = job.method.is_own_network().then(|| plan.network.mode()).transpose()?;
     let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
@@ -77,7 +78,7 @@ pub(crate) fn run(
     if let (Some(path), Some(picture)) = (&plan.side_by_side, map.side_by_side()) {
         picture.save(path, plan.overwrite)?;
     }
-    remarks(&job.capture, report);
+    remarks(job.capture(), report);
     for warning in &job.warnings {
         report.warning(warning);
     }
@@ -92,77 +93,66 @@ pub(crate) fn run(
     report.result(&text, || {
         json!({
             "output": plan.output,
-            "settings": job.settings,
+            "settings": settings,
             "results": results,
-            "ppp_from": job.source,
+            "ppp_from": job.light_source,
             "resumed_frames": done,
             "seconds_per_frame": seconds,
         })
     })
 }
 
-/// Everything that a run needs.
+/// What a run needs: a capture and its acquisition, the method, and the pictures that it makes.
 struct Job {
-    capture: Capture,
+    aligned: AlignedCapture,
     acquisition: Acquisition,
-    /// Where the light comes from.
-    source: &'static str,
+    light_source: &'static str,
     method: &'static Method,
     restorer: Box<dyn Restorer>,
-    /// What the method chose for this clip.
+    /// What the method chose for this capture.
     choice: String,
     schedule: Schedule,
-    settings: Value,
     /// What makes the result doubtful.
     warnings: Vec<String>,
 }
 
 impl Job {
+    /// Opens the capture, sums its frames, determines its acquisition, and makes the restorer.
     fn prepare(plan: &Plan, overrides: &Settings, report: &Report) -> Result<Self> {
-        let path = (!plan.reads_pipe()).then_some(plan.capture.as_path());
-        let name = plan.sensor.as_deref();
-        let OpenedCapture { mut capture, sensor, sum, choice } =
-            open_summed(path, &plan.read, plan.sum, name, overrides)?;
-        let sensor = sensor.ok_or_else(|| unknown_sensor(&capture))?;
-        if let Some(choice) = &sum {
-            report.remark(&format!("note: {}", describe_sum(choice, &capture, Some(&sensor))));
-        }
-        let mut alignment = None;
-        if let Some(choice) = &choice {
-            (capture, alignment) =
-                align_by_itself(capture, choice, plan.method, plan.every, &plan.read, &sensor)?;
-        }
-        if let Some(alignment) = alignment {
-            report.remark(&format!("note: {}", alignment.describe()));
-        }
-        let gain = plan.light.known_gain(&capture);
-        let summary = Summary::measure(&mut capture, Some(&sensor), gain)?;
-        let (acquisition, source) = acquisition(&plan.light, &mut capture, &sensor, &summary)?;
-        let warnings = warnings::of_capture(&capture, &summary);
-        let of_method = match alignment {
-            Some(alignment) => alignment.acquisition(&acquisition)?,
-            None => acquisition.clone(),
-        };
-        let method = match plan.method {
-            Some(method) => method,
-            None => announced_method(plan, &capture, &of_method, report)?,
-        };
-        if let Some(flag) = plan.seed_flag.filter(|_| !method.is_own_network()) {
-            return Err(other_method(flag));
-        }
-        let (restorer, choice) = method.restorer(&mut capture, &of_method, &plan.network)?;
-        let restorer = match alignment {
-            Some(alignment) => alignment.around(restorer),
-            None => restorer,
-        };
-        let overlap = plan.overlap * alignment.map_or(1, |alignment| alignment.count as u64);
-        let windows = Windows::of(restorer.as_ref(), capture.frames(), overlap)?;
-        let instants = match (alignment, plan.every) {
-            (Some(alignment), _) => alignment.instants(),
-            (None, Some(every)) => Instants::every(every, &capture)?,
-            (None, None) => Schedule::all(windows).instants,
-        };
-        let schedule = Schedule { windows, instants };
+        let source = plan.source();
+        let opened = source.open(overrides)?;
+        let summed = SummedCapture::new(opened, &source)?;
+        let sensor = summed.required_sensor()?;
+        summed.remark_sum(report);
+        let mut aligned = AlignedCapture::new(summed, &source, &sensor, plan.method, plan.every)?;
+        aligned.remark_alignment(report);
+        let capture = &mut aligned.capture;
+        let summary = plan.light.measure(capture, Some(&sensor))?;
+        let CaptureAcquisition { acquisition, light_source } =
+            CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
+        let warnings = warnings::of_capture(capture, &summary);
+        let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
+        let overlap = plan.overlap * aligned.frames_per_sum();
+        let schedule = aligned.schedule(restorer.as_ref(), overlap, plan.every)?;
+        Ok(Self {
+            aligned,
+            acquisition,
+            light_source,
+            method,
+            restorer,
+            choice,
+            schedule,
+            warnings,
+        })
+    }
+
+    fn capture(&self) -> &Capture {
+        &self.aligned.capture
+    }
+
+    /// Returns the settings that the pictures depend on, for the manifest and `--json`.
+    fn settings(&self, plan: &Plan) -> Result<Value> {
+        let (capture, acquisition) = (self.capture(), &self.acquisition);
         let place = if plan.reads_pipe() {
             capture.path().to_owned()
         } else {
@@ -175,23 +165,22 @@ impl Job {
             "frames": capture.length(),
             "height": capture.size().height,
             "width": capture.size().width,
-            "method": method.name,
-            "choice": choice,
-            "window": restorer.window(),
-            "overlap": overlap,
+            "method": self.method.name,
+            "choice": self.choice,
+            "window": self.restorer.window(),
+            "overlap": plan.overlap * self.aligned.frames_per_sum(),
             "seed": plan.light.seed,
-            "network": network_settings(method, &plan.network)?,
+            "network": network_settings(self.method, &plan.network)?,
             "ppp": acquisition.ppp,
             "exposure": acquisition.mean_level,
             "gain": acquisition.gain,
             "sensor": acquisition.sensor,
             "repaired_pixels": capture.bad_pixels().len(),
         });
-        // Noted where they were asked for, so that folders of earlier versions go on.
         if capture.summed() > 1 && plan.read.sum.is_none() {
             settings["sum"] = json!(capture.summed());
         }
-        if let Some(alignment) = alignment {
+        if let Some(alignment) = self.aligned.alignment {
             settings["aligned_sums"] = json!(alignment.native_frames());
         }
         if let Some(every) = plan.every {
@@ -200,25 +189,15 @@ impl Job {
         if plan.tonemap != Tonemap::None {
             settings["tonemap"] = json!("srgb");
         }
-        if let Some(fps) = capture.fps().or(sensor_fps(&acquisition)) {
-            let step = alignment.map_or(1, Alignment::step);
+        if let Some(fps) = capture.fps().or(sensor_fps(acquisition)) {
+            let step = self.aligned.alignment.map_or(1, Alignment::step);
             settings["capture_fps"] = json!(fps / step as f64);
         }
-        Ok(Self {
-            capture,
-            acquisition,
-            source,
-            method,
-            restorer,
-            choice,
-            schedule,
-            settings,
-            warnings,
-        })
+        Ok(settings)
     }
 
     /// The entries of the manifest of an output folder. Weights are among the settings by their SHA-256.
-    fn folder_run(&self, plan: &Plan) -> Result<FolderRun> {
+    fn folder_run(&self, plan: &Plan, settings: &Value) -> Result<FolderRun> {
         let mut inputs = Inputs::default();
         let to_folder = Path::new(&plan.output).extension().is_none() && plan.output != "-";
         if !plan.reads_pipe() && to_folder {
@@ -239,7 +218,7 @@ impl Job {
             }
         }
         let share = plan.shard.map_or(Share::Whole, Shard::share);
-        Ok(FolderRun { settings: self.settings.clone(), inputs, share })
+        Ok(FolderRun { settings: settings.clone(), inputs, share })
     }
 
     fn run(
@@ -267,7 +246,7 @@ impl Job {
             shown.borrow().stage(progress);
             interrupt::check()
         });
-        let (capture, acquisition) = (&mut self.capture, &self.acquisition);
+        let (capture, acquisition) = (&mut self.aligned.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
         let is_network = self.method.is_network();
         let schedule = &self.schedule;
@@ -286,7 +265,26 @@ impl Job {
     }
 }
 
-/// The method of those who name none; if it is not the network, the reason is said.
+/// Makes the restorer of the named method, or of the default one, for this capture.
+fn restorer(
+    plan: &Plan,
+    aligned: &mut AlignedCapture,
+    acquisition: &Acquisition,
+    report: &Report,
+) -> Result<(&'static Method, Built)> {
+    let seen = aligned.seen_acquisition(acquisition)?;
+    let method = match plan.method {
+        Some(method) => method,
+        None => announced_method(plan, &aligned.capture, &seen, report)?,
+    };
+    if let Some(flag) = plan.seed_flag.filter(|_| !method.is_own_network()) {
+        return Err(other_method(flag));
+    }
+    let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
+    Ok((method, (aligned.around(restorer), choice)))
+}
+
+/// Returns the default method; prints the reason if it is not the network.
 fn announced_method(
     plan: &Plan,
     capture: &Capture,
@@ -351,14 +349,14 @@ fn describe(
     chi_square: Option<f64>,
     seconds: Option<f64>,
 ) -> String {
-    let (acquisition, size) = (&job.acquisition, job.capture.size());
+    let (acquisition, size) = (&job.acquisition, job.capture().size());
     let (name, choice) = (job.method.name, &job.choice);
     let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
     let (ppp, mean_level) = (acquisition.ppp, acquisition.mean_level);
-    let source = job.source;
+    let source = job.light_source;
     line(
         "light",
         format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {mean_level:.4}"),

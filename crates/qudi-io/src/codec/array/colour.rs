@@ -1,7 +1,7 @@
 //! The axes of an array in memory: where colour lies, and which of it is read.
 
 use super::{Array, Place};
-use crate::capture::options::{Axes, ReadOptions};
+use crate::description::{Axes, ReadOptions};
 use qudi_core::{Error, Result};
 
 /// The extents of an array in the order of memory, slowest first, without colour.

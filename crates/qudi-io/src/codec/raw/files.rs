@@ -1,7 +1,6 @@
 //! Headerless files of equally long frames, one or many.
 
-use crate::capture::info::CaptureInfo;
-use crate::capture::options::ReadOptions;
+use crate::description::{CaptureInfo, ReadOptions};
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use qudi_core::{Error, Result};
 use std::fs::File;

@@ -1,7 +1,6 @@
 //! A TIFF whose frames are image file directories.
 
-use crate::capture::info::CaptureInfo;
-use crate::capture::options::ReadOptions;
+use crate::description::{CaptureInfo, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::samples::{Scale, no_count};
 use qudi_core::Size;

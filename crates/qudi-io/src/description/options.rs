@@ -274,7 +274,7 @@ impl FromStr for MaskChoice {
 }
 
 /// The options, with the pedestal and the threshold of the sensor where they say nothing of either.
-pub(super) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
+pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
     let mut options = options.clone();
     if options.offset.is_none()
         && options.threshold.is_none()

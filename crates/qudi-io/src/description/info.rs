@@ -1,10 +1,12 @@
 //! What is known about a capture, and how it is known.
 
 use super::mosaic::Mosaic;
-use super::options::{BitOrder, Orientation, PackAxis, ReadOptions};
+use super::options::{BitOrder, Orientation, PackAxis};
 use qudi_core::sensor::Sensor;
-use qudi_core::{Error, Result};
 use serde::Serialize;
+
+/// Why a format is sure where a record of ours lies beside the file.
+pub(crate) const RECORD: &str = "the record beside it";
 
 /// How sure a format is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -83,7 +85,7 @@ pub struct Packing {
 impl CaptureInfo {
     /// Whether a record beside the file describes it.
     pub fn is_recorded(&self) -> bool {
-        self.reasons.iter().any(|reason| reason == crate::codec::RECORD)
+        self.reasons.iter().any(|reason| reason == RECORD)
     }
 
     /// A description with nothing but names; the rest is filled in by the format.
@@ -108,55 +110,4 @@ impl CaptureInfo {
             notes: Vec::new(),
         }
     }
-}
-
-/// What the user says of the depth, unless the file knows better.
-pub(super) fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
-    if !(1..=16).contains(&bits) {
-        return Err(Error::request(format!("{bits} bits"), "bits", "counts have 1 to 16 bits"));
-    }
-    let max = ((1u32 << bits) - 1) as u16;
-    match info.max_count {
-        Some(known) if known != max => Err(Error::request(
-            format!("{bits} bits, where the file has counts up to {known}"),
-            "bits",
-            "leave it out: the file knows its depth",
-        )),
-        _ => {
-            info.max_count = Some(max);
-            Ok(())
-        }
-    }
-}
-
-/// Who says how deep the counts of a capture are.
-pub(super) fn depth_source(options: &ReadOptions, info: &CaptureInfo) -> &'static str {
-    if options.levels.is_some() {
-        "`levels`"
-    } else if info.is_recorded() {
-        "the record beside it"
-    } else if options.bits.is_some() {
-        "`bits`"
-    } else {
-        "the file itself"
-    }
-}
-
-/// Refuses sums of no frames, of more than there are, and those that 16 bits do not hold.
-pub(super) fn check_sum(sum: u32, frames: u64, info: &CaptureInfo) -> Result<()> {
-    if sum == 0 || u64::from(sum) > frames {
-        return Err(Error::request(
-            format!("{sum} frames summed into one, of {frames}"),
-            "sum",
-            "sum between 1 and all frames",
-        ));
-    }
-    if info.max_count.is_some_and(|max| u64::from(max) * u64::from(sum) > u64::from(u16::MAX)) {
-        return Err(Error::request(
-            format!("sums of {sum} frames do not fit into 16 bits"),
-            "sum",
-            "counts go up to 65535: sum fewer frames",
-        ));
-    }
-    Ok(())
 }

@@ -2,7 +2,7 @@
 
 use super::bit_order::{SURE, bit_order_z_score, standard_errors};
 use super::byte_kind::ByteKind;
-use super::options::BitOrder;
+use crate::description::BitOrder;
 use crate::frames::bit_sums::{MOST_FRAMES, add_packed};
 use qudi_core::Size;
 use qudi_core::{Error, Result};

@@ -1,0 +1,15 @@
+//! What is said about a capture, by its file ([`CaptureInfo`]) and by the user ([`ReadOptions`]).
+
+mod format_options;
+mod info;
+mod mosaic;
+mod options;
+
+pub use format_options::FormatOption;
+pub(crate) use format_options::{refuse_others, refuse_packing};
+pub(crate) use info::RECORD;
+pub use info::{CaptureInfo, Certainty, Packing};
+pub use mosaic::Mosaic;
+pub(crate) use mosaic::MosaicPlane;
+pub(crate) use options::with_pedestal;
+pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};

@@ -1,0 +1,11 @@
+//! A first look at a path: its name, its length, and the statistics of its bytes.
+
+mod bit_order;
+mod byte_kind;
+mod probe;
+mod raw_sample;
+
+pub use bit_order::{SURE, bit_order_z_score};
+pub(crate) use byte_kind::ByteKind;
+pub(crate) use probe::Probe;
+pub(crate) use raw_sample::{Convention, SWISSSPAD_FILE, stem};
