@@ -132,7 +132,7 @@ fn rejects_counts_beyond_the_depth() {
     assert!(capture.read(1, &mut [0; 64]).is_err(), "sums of such counts as well");
 }
 
-/// A record beside an array, as `convert` writes it.
+/// A record next to an array, as `convert` writes it.
 fn record(frames: u64, size: (usize, usize), max_count: u16) -> String {
     let (height, width) = size;
     format!(
