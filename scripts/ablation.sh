@@ -1,11 +1,12 @@
 #!/bin/sh
-# What each part of the method is worth: the stage `perception` of `paper-mini` from one set of weights, whole and with
-# one part left out, on identical samples for equally many steps; then one and ten steps on clips, at two lights.
+# Ablation study: trains the stage `perception` of `paper-mini` from one set of weights, whole and without one
+# part, on identical samples for equally many steps; then evaluates 1 and 10 steps at two light levels.
 #
 #     scripts/ablation.sh PATH/TO/qudi DATA BACKBONES WEIGHTS CLIPS OUT STEPS [VARIANT...]
 #
-# BACKBONES are the weights of LPIPS, WEIGHTS those of the stage before (RUN/3-mean/weights.safetensors). Variants:
-# whole physics flow fusion self-conditioning lpips. `scripts/compare/paired.py OUT/whole.json OUT/flow.json` compares.
+# BACKBONES are the weights of LPIPS, WEIGHTS the result of the stage before (RUN/3-mean/weights.safetensors).
+# Variants: whole physics flow fusion self-conditioning lpips. Compare the results with
+# `scripts/compare/paired.py OUT/whole.json OUT/flow.json`.
 set -eu
 qudi=$1 data=$2 backbones=$3 weights=$4 clips=$5 out=$6 steps=$7
 shift 7

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Trains twice: once undisturbed, once killed with SIGKILL again and again and resumed. The weights and the whole
+# Trains twice: once undisturbed, once killed with SIGKILL repeatedly and resumed. The weights and the whole
 # training state must be the same, bit for bit.
 #
 #     scripts/kill_and_resume.sh PATH/TO/qudi [KILLS] [STEPS]

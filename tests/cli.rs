@@ -1,4 +1,4 @@
-//! The program as a user meets it. The console blocks of `tests/cmd/*.md` are run as they stand.
+//! Tests of the command line. The console blocks of `tests/cmd/*.md` are run as written.
 #![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
@@ -43,12 +43,12 @@ fn console_blocks_run_as_documented() {
     for entry in std::fs::read_dir(root().join("tests/cmd")).unwrap() {
         let page = entry.unwrap().path();
         let stem = page.file_stem().unwrap().to_str().unwrap();
-        // An `.out` folder beside a case makes its commands share a sandbox.
+        // An `.out` folder next to a case makes its commands share a sandbox.
         std::fs::create_dir_all(cases.join(format!("{stem}.in"))).unwrap();
         std::fs::create_dir_all(cases.join(format!("{stem}.out"))).unwrap();
         std::fs::copy(&page, cases.join(format!("{stem}.md"))).unwrap();
     }
-    // Graphics drivers complain on standard error where nobody is logged in.
+    // Graphics drivers write warnings to standard error where nobody is logged in.
     let runtime = cases.to_str().unwrap();
     let run = trycmd::TestCases::new();
     run.env("NO_COLOR", "1").env("XDG_RUNTIME_DIR", runtime).case(cases.join("*.md")).run();

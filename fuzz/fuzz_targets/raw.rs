@@ -3,7 +3,7 @@
 use qudi_fuzz::{format, read};
 use qudi_io::description::ReadOptions;
 
-// The first byte chooses a camera; small frames, so that files stay small.
+// The first byte chooses a camera. Frames are small to keep files small.
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     let Some((&choice, bytes)) = bytes.split_first() else { return };
     let name = ["spad512s", "spad512s-8", "spad512s-16", "spad512s-sparse", "qvga", "raw-bits"];

@@ -1,15 +1,15 @@
-//! What every target does: write the bytes to a file, open it as a capture, read some frames.
+//! Common part of all targets: writes the bytes to a file, opens it as a capture, and reads some frames.
 //!
-//! Any result is fine, except a panic, a hang, or memory beyond libFuzzer's limit.
+//! Any result is allowed, except a panic, a hang, or memory beyond libFuzzer's limit.
 
 use qudi_io::capture::{Capture, choose_sum};
 use qudi_io::description::{Axes, ReadOptions};
 
-/// Frames read from each file.
+/// Number of frames read from each file.
 const FRAMES: u64 = 4;
 
-/// Opens `bytes` as a capture called `name`, with `options`: strictly, leniently, with other axes, one colour channel,
-/// one plane of a mosaic, a pedestal.
+/// Opens `bytes` as a capture called `name` with variants of `options`: strict and lenient, other axes, one
+/// colour channel, one plane of a mosaic, a pedestal.
 pub fn read(name: &str, options: &ReadOptions, bytes: &[u8]) {
     let Ok(folder) = tempfile::tempdir_in(if cfg!(target_os = "linux") { "/dev/shm" } else { "." })
     else {
@@ -45,7 +45,7 @@ pub fn read(name: &str, options: &ReadOptions, bytes: &[u8]) {
     }
 }
 
-/// Options that name a format.
+/// Returns options that name a format.
 pub fn format(name: &str) -> ReadOptions {
     ReadOptions { format: Some(name.into()), ..ReadOptions::default() }
 }

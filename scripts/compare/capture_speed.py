@@ -2,11 +2,11 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy", "photoncube==0.3.14"]
 # ///
-"""Sums windows of a long packed capture with qudi and photoncube, alternating: speed and memory.
+"""Measure speed and memory of qudi and photoncube, which alternately sum windows of a long packed capture.
 
     python scripts/compare/capture_speed.py target/release/qudi /tmp/capture.npy
 
-Makes the capture first if it does not exist: 100,000 binary frames of 256 x 512, 1.6 GB. Both
+Creates the capture if it does not exist: 100,000 binary frames of 256 x 512, 1.6 GB. Both
 programs sum windows of 1000 frames; photoncube writes its means as PNG, qudi its sums as .npy.
 The first, unmeasured round reads the file into the page cache.
 """
@@ -26,7 +26,7 @@ WINDOW, ROUNDS = 1000, 5
 
 
 def run(command: list[str]) -> tuple[float, int]:
-    """Wall time in seconds and peak resident memory in KiB."""
+    """Return the wall time in seconds and the peak resident memory in KiB."""
     start = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
@@ -35,7 +35,7 @@ def run(command: list[str]) -> tuple[float, int]:
 
 
 def make(qudi: str, capture: Path) -> None:
-    """2000 simulated frames, 50 times over: reading does not care, and simulating all takes long."""
+    """Write 2000 simulated frames 50 times: simulating all frames takes long, and does not matter for reading."""
     with tempfile.TemporaryDirectory() as folder:
         burst = Path(folder) / "burst.npy"
         command = [qudi, "simulate", "scene:chart", "--size", "256x512", "--frames", "2000"]
@@ -50,7 +50,7 @@ def make(qudi: str, capture: Path) -> None:
 def main() -> None:
     qudi, capture = sys.argv[1], Path(sys.argv[2])
     if not capture.exists():
-        # In a process of its own: a child's peak memory counts what its parent held.
+        # In a separate process: a child's peak memory includes its parent's memory.
         process = multiprocessing.Process(target=make, args=(qudi, capture))
         process.start()
         process.join()

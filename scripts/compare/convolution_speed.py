@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["torch"]
 # ///
-"""Speed of PyTorch's single convolutions in bfloat16, channels last, for comparison with `qudi-kernels`.
+"""Measure PyTorch's single convolutions in bfloat16, channels last, for comparison with `qudi-kernels`.
 
     python scripts/compare/convolution_speed.py --threads 2
 

@@ -2,12 +2,12 @@
 # requires-python = ">=3.10"
 # dependencies = ["numpy", "photoncube==0.3.14", "visionsim==0.1.0a2"]
 # ///
-"""Opens a packed burst of qudi in photoncube and visionsim and compares every pixel.
+"""Open a packed burst of qudi in photoncube and visionsim and compare every pixel.
 
     python scripts/compare/interop.py path/to/qudi
 
-The burst is 130 x 203 pixels, so that rows end inside a byte; photoncube knows widths of whole
-bytes only and is compared on a second burst of 128 x 208.
+The burst is 130 x 203 pixels, so that rows end inside a byte. photoncube supports widths of whole
+bytes only, and is compared on a second burst of 128 x 208.
 """
 
 import subprocess
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def convert_swissspad2(qudi: str, folder: Path) -> None:
-    """Files of 8 MiB through both converters: half and full array, byte by byte."""
+    """Convert files of 8 MiB with both converters, half and full array, and compare them byte by byte."""
     rng = np.random.default_rng(9)
     photoncube = str(Path(sys.executable).parent / "photoncube")
     for name, more, own in (("half", [], "swissspad2"), ("full", ["--full-array"], "swissspad2-full")):

@@ -2,16 +2,16 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "pillow", "safetensors", "torch"]
 # ///
-"""Compare LPIPS of `qudi eval` with a second writing of it in PyTorch, with the published weights.
+"""Compare LPIPS of `qudi eval` with an independent implementation in PyTorch, with the published weights.
 
     python scripts/convert/lpips.py weights
     python scripts/compare/lpips.py path/to/qudi weights
     cargo build -p qudi-train --example lpips_gradient
     python scripts/compare/lpips.py path/to/qudi weights target/debug/examples/lpips_gradient
 
-Three pictures are compared with noisy, blurred and shifted copies. Prints both distances and the largest
-difference, and with the example of `qudi-train` the largest difference of the gradients of all pixels, over the
-largest gradient. Exits with 1 where they are above 1e-4 and 1e-3.
+Three images are compared with noisy, blurred and shifted copies. Prints both distances and their largest
+difference. With the example of `qudi-train` it also prints the largest difference of the gradients of all pixels,
+relative to the largest gradient. Exits with 1 if these are above 1e-4 and 1e-3.
 """
 
 import json
@@ -32,7 +32,7 @@ TAPS = {"alexnet": [0, 3, 6, 8, 10], "vgg16": [2, 7, 14, 21, 28]}
 
 
 def features(net: str, weights: dict[str, torch.Tensor], x: torch.Tensor) -> list[torch.Tensor]:
-    """The outputs that are compared, as in torchvision's `features` up to the last of them."""
+    """Return the compared outputs, as in torchvision's `features` up to the last of them."""
     taken = []
     for place in sorted({int(name.split(".")[1]) for name in weights if name.startswith("features")}):
         if place in POOLS[net]:
@@ -47,7 +47,7 @@ def features(net: str, weights: dict[str, torch.Tensor], x: torch.Tensor) -> lis
 
 
 def distance(net: str, weights: dict[str, torch.Tensor], p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """LPIPS 0.1 of two gray images in [0, 1] (Zhang et al. 2018)."""
+    """Return LPIPS 0.1 of two gray images in [0, 1] (Zhang et al. 2018)."""
     shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)
     scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
     sides = []
@@ -59,7 +59,7 @@ def distance(net: str, weights: dict[str, torch.Tensor], p: torch.Tensor, q: tor
 
 
 def pictures() -> np.ndarray:
-    """Three smooth textures."""
+    """Return three smooth textures."""
     rng = np.random.default_rng(3)
     y, x = np.mgrid[:SIZE, :SIZE]
     waves = [np.sin(x / a + y / b) for a, b in ((3, 7), (5, -4), (11, 3))]
@@ -67,7 +67,7 @@ def pictures() -> np.ndarray:
 
 
 def gradient_difference(example: Path, folder: Path, p: np.ndarray, q: np.ndarray, work: Path) -> float:
-    """The largest difference of the gradients for `p`, over the largest gradient, of both backbones."""
+    """Return the largest difference of the gradients of `p`, relative to the largest gradient, over both backbones."""
     worst = 0.0
     np.save(work / "p.npy", p.astype(np.float32))
     np.save(work / "q.npy", q.astype(np.float32))

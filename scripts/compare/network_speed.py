@@ -2,7 +2,7 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "torch"]
 # ///
-"""Time and memory of the PyTorch network on the processor, as JSON, for comparison with the Rust one.
+"""Measure time and memory of the PyTorch network on the processor, as JSON, for comparison with Rust.
 
     python scripts/compare/network_speed.py small --threads 2             # one reverse step
     python scripts/compare/network_speed.py small --backward              # and its gradients, 128x128
@@ -11,11 +11,11 @@
     python scripts/compare/network_speed.py small --mode steps            # the ten-step loop
     python scripts/compare/network_speed.py small --mode train --frames 7 --size 96 --batch 2
 
-Times are seconds, medians after a warm-up; `cpu` is the sum over threads (on a shared machine the
-wall clock says little, PyTorch's threads wait for each other). `loop` times the network's calls and the simulated
-measurements (NumPy) of ten steps, flows estimated at the steps of the preset. Weights are
-PyTorch's random ones. `peak_mib` is the largest resident size of the whole program;
-`base_mib` what it held before the first call, mostly PyTorch itself.
+Times are medians in seconds after a warm-up. `cpu` is the sum over threads: on a shared machine the
+wall clock says little, because PyTorch's threads wait for each other. `loop` times the network's calls and the
+simulated measurements (NumPy) of ten steps, with flows estimated at the steps of the preset. Weights are random, as
+initialised by PyTorch. `peak_mib` is the largest resident size of the whole program;
+`base_mib` is its size before the first call, mostly PyTorch itself.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def backward(model: network.Qudi, x: dict[str, Tensor], frames: int) -> None:
 
 
 def train(model: network.Qudi, x: dict[str, Tensor], frames: int, adam: torch.optim.Adam) -> None:
-    """A training step without a first pass."""
+    """Run a training step without a first pass."""
     backward(model, x, frames)
     torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
     adam.step()

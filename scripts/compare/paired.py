@@ -1,9 +1,9 @@
-"""Differences between evaluations of the same clips, with the 95 % confidence of paired clips.
+"""Compare evaluations of the same clips, with 95 % confidence intervals of the paired differences.
 
     python scripts/compare/paired.py whole.json physics.json flow.json
 
-Every file is what `qudi eval --json` printed. Rows of the others are compared with the rows of the first that have
-their method, steps and light; one line for every row of every other file.
+Every file is the output of `qudi eval --json`. Rows of the other files are compared with the rows of the first file
+that have the same method, steps and light level. Prints one line for every row of every other file.
 """
 
 import json
@@ -17,14 +17,14 @@ QUANTILES = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23]
 
 
 def rows(path):
-    """The rows of a file, by method, steps and light."""
+    """Return the rows of a file by method, steps and light level."""
     with open(path, encoding="utf-8") as file:
         listed = json.load(file)["rows"]
     return {(row["method"], row.get("steps", ""), row["ppp"]): row for row in listed}
 
 
 def by_clip(row, measure):
-    """The mean of a measure for every clip, or nothing where the evaluation lacks it."""
+    """Return the mean of a measure for every clip, or None if the evaluation lacks it."""
 
     def value(clip):
         if measure in clip:
@@ -36,7 +36,7 @@ def by_clip(row, measure):
 
 
 def paired(first, other):
-    """The mean difference over clips, and half the width of its confidence interval."""
+    """Return the mean difference over clips, and half the width of its confidence interval."""
     apart = [other[clip] - first[clip] for clip in first]
     if len(apart) < 2:
         return apart[0], float("inf")

@@ -2,16 +2,16 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy"]
 # ///
-"""What texture that is right in all but its place is worth to LPIPS and the other measures of `qudi eval`.
+"""Measure how LPIPS and the other metrics of `qudi eval` score texture that is correct except for its position.
 
     python scripts/convert/lpips.py weights
     python scripts/compare/texture.py path/to/qudi CLIPS weights --ppp 3.25
 
-CLIPS is a folder of clips, each a folder of frames. The regression restores them; to its frames are added
+CLIPS is a folder of clips, each a folder of frames. The regression restores them. The script then adds to its frames
 
-- shares of the truth's own texture (what a Gaussian blur of one pixel takes away), moved by 16 pixels: as a perfect
-  sampler might draw it that knows the texture but not where its parts lie;
-- a share of the true error: a better estimate.
+- a fraction of the ground truth's texture (the difference to its Gaussian blur of one pixel), moved by 16 pixels. It
+  stands for a perfect sampler that knows the texture but not the position of its parts;
+- a fraction of the true error, which gives a better estimate.
 
 Prints means over clips and frames, as JSON.
 """
@@ -30,7 +30,7 @@ MOVED = (16, 16)
 
 
 def blurred(frames: np.ndarray) -> np.ndarray:
-    """Frames after a Gaussian blur of one pixel."""
+    """Return frames after a Gaussian blur of one pixel."""
     taps = np.exp(-0.5 * np.arange(-4.0, 5.0) ** 2)
     for axis in (1, 2):
         around = [(0, 0)] * 3
@@ -42,7 +42,7 @@ def blurred(frames: np.ndarray) -> np.ndarray:
 
 
 def variants(restored: np.ndarray, truth: np.ndarray) -> dict[str, np.ndarray]:
-    """The frames that are compared, by name."""
+    """Return the compared frames by name."""
     restored = restored * ((restored * truth).sum() / (restored**2).sum())
     texture = truth - blurred(truth)
     frames = {"regression": restored}

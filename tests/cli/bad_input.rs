@@ -3,7 +3,7 @@
 use super::support::{listing, npy_bytes, qudi, scratch};
 use std::path::Path;
 
-/// Runs `qudi` and checks the manners of its refusal; returns what it said.
+/// Runs `qudi`, checks the form of its error and the exit code, and returns standard error.
 fn refused(folder: &Path, args: &[&str]) -> String {
     let before = listing(folder);
     let output = qudi(folder).args(args).output().unwrap();
@@ -265,7 +265,7 @@ fn rejects_names_that_are_not_utf8() {
     assert!(!folder.join("out.npy").exists());
 }
 
-/// Ctrl-C in the middle: exit code 130 and no file, finished or temporary.
+/// Ctrl-C during a run ends it with exit code 130 and leaves no file, finished or temporary.
 #[cfg(unix)]
 #[test]
 fn interrupt_leaves_no_file_behind() {
@@ -275,7 +275,7 @@ fn interrupt_leaves_no_file_behind() {
         .current_dir(&folder)
         .spawn()
         .unwrap();
-    // Until the burst, the truth and the preview are being written.
+    // Waits until the burst, the truth and the preview are being written.
     let started = std::time::Instant::now();
     while listing(&folder).len() < 3 {
         assert!(started.elapsed().as_secs() < 120, "no output was begun");

@@ -1,4 +1,4 @@
-//! `qudi eval`: the same photons for everyone, bars, exports.
+//! `qudi eval`: the same photons for all methods, thresholds, exports.
 
 use crate::support::{listing, qudi, refused, run, scratch};
 use serde_json::Value;
@@ -50,7 +50,7 @@ fn other_programs_are_scored_on_the_same_photons() {
             .success();
     }
     let both = eval(&folder, "clips --method mle --ppp 9.75 --external theirs=theirs");
-    // Times differ; everything else is the same figure.
+    // Only times differ.
     for key in ["psnr_a", "psnr", "ssim", "ssim_g", "chi_square"] {
         let (own, external) = (&both["rows"][0][key], &both["rows"][1][key]);
         assert_eq!(own, &ours["rows"][0][key], "a seed gives the same photons");
@@ -117,7 +117,7 @@ fn report_is_one_self_contained_file() {
     for fetched in ["http://", "https://", "src=\"/", "url("] {
         assert!(!page.contains(fetched), "{fetched}");
     }
-    // Synthetic scenes have a true flow, and so a figure for flicker.
+    // Flicker is measured along the true flow of synthetic scenes.
     let found = eval(&folder, "scene:dead-leaves --ppp 26 --frames 11");
     let flicker = |row: usize| found["rows"][row]["flicker"].as_f64().unwrap();
     assert!(flicker(0) > 0.0 && flicker(1) > flicker(0), "a shorter mean is noisier: {found}");
@@ -142,7 +142,7 @@ fn quiver_protocol_scores_the_middle_of_every_window() {
     qudi(&folder).args("eval scene:text --protocol quiver --frames 10".split(' ')).assert().code(2);
 }
 
-/// A recorded clip has no true flow; one is estimated on it, and says about the same.
+/// The flow of a recorded clip is estimated, with about the same flicker as along the true flow.
 #[test]
 fn recorded_clips_flicker_along_an_estimated_flow() {
     let folder = scratch("eval-flow");
@@ -249,7 +249,7 @@ fn appearance_is_measured_where_it_is_asked_for() {
     refused(&folder, &format!("{small} --appearance"), &["--appearance", "32 x 32"]);
 }
 
-/// Every number of steps has its row; what they add is measured against the fewest.
+/// Every number of steps has its row; their additions are measured against the fewest steps.
 #[test]
 fn numbers_of_steps_are_compared_in_one_run() {
     let folder = scratch("eval-steps");
@@ -267,7 +267,7 @@ fn numbers_of_steps_are_compared_in_one_run() {
         added.iter().all(|ratio| (0.001..10.0).contains(&ratio.as_f64().unwrap())),
         "{added:?}"
     );
-    // Two steps alone are no other two steps.
+    // A run of two steps alone gives the same frames.
     let alone = eval(
         &folder,
         "scene:text --size 64x64 --frames 4 --ppp 5 --method qudi --steps 2 --device cpu --appearance",
@@ -313,7 +313,7 @@ fn clips_are_chosen_by_name() {
     refused(&folder, "eval clips --clips d --ppp 5", &["`d`", "--clips", "a, b, c"]);
 }
 
-/// Weights of a small EMVD, as its authors' keys name them.
+/// Writes weights of a small EMVD under its authors' keys.
 fn emvd_weights(folder: &Path) {
     use qudi_baselines::emvd::Emvd;
     use safetensors::tensor::{Dtype, TensorView};
@@ -356,7 +356,7 @@ fn learned_methods_run_with_the_weights_that_are_named() {
     assert!(info.contains("emvd") && info.contains("4 channels"), "{info}");
     run(&folder, "simulate scene:text --size 32x48 --frames 4 --ppp 3 -o b.npy -q");
     run(&folder, &format!("restore b.npy --method emvd {weights} -o r.npy -q"));
-    // Its weights come along; others do not.
+    // Only its weights are bundled.
     run(&folder, "restore b.npy --method emvd -o built-in.npy -q");
     let frames = ["r.npy", "built-in.npy"].map(|file| std::fs::read(folder.join(file)).unwrap());
     assert_ne!(frames[0], frames[1]);

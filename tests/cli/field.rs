@@ -1,10 +1,10 @@
-//! Real captures without a manual: sums by themselves, chosen instants, warnings, a first look.
+//! Real captures without a manual: automatic sums, chosen instants, warnings, a first look.
 
 use crate::support::{listing, npy_bytes, qudi, refused, run, scratch};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// A folder with `c.npy`: binary frames of a bright square that moves by `speed` pixels a frame.
+/// Creates a folder with `c.npy`: binary frames of a bright square that moves by `speed` pixels a frame.
 fn capture(name: &str, frames: usize, rate: f64, speed: f64) -> PathBuf {
     let folder = scratch(name);
     let (height, width) = (32, 48);
@@ -90,7 +90,7 @@ fn pedestal_of_a_simulated_camera_is_subtracted_again() {
     assert_eq!(bytes("back.npy")[data..], plain[data..]);
 }
 
-/// A texture that moves evenly is restored from sums along its motion, by methods that follow motion.
+/// Methods that follow motion restore an evenly moving texture from sums along its motion.
 #[test]
 fn aligns_sums_by_itself_where_things_move() {
     let folder = capture("field-align", 330, 0.2, 0.15);
@@ -105,7 +105,7 @@ fn aligns_sums_by_itself_where_things_move() {
         let text = said(&folder, &format!("{restore} {other} -o other.npy -f"));
         assert!(!text.contains("motion is followed"), "{other}: {text}");
     }
-    // All pictures, and those of an interrupted run with the others.
+    // All frames are the same, also when an interrupted run is continued.
     run(&folder, "restore c.npy --sensor swissspad2 --method qbp -o all");
     let pictures = listing(&folder.join("all"));
     let frame = |n: usize| folder.join(format!("all/frame_{n:06}.png"));
@@ -118,7 +118,7 @@ fn aligns_sums_by_itself_where_things_move() {
     assert_eq!(std::fs::read(frame(7)).unwrap(), before);
 }
 
-/// Frames of a clip are repeated, those of scenes cannot be; rows of a rolling shutter lie behind.
+/// Frames of a clip are repeated, frames of scenes cannot be; rows of a rolling shutter lag behind.
 #[test]
 fn clips_repeat_frames_and_rows_roll() {
     let folder = scratch("field-rolling");
@@ -169,7 +169,7 @@ fn pictures_of_chosen_instants_are_those_of_all() {
     for n in 0..22 {
         assert_eq!(frame("sixth", n), frame("all", 2 * n), "picture {n}");
     }
-    // Apart from each other, or between sums: each from a window of its own.
+    // Distant frames, or frames between sums, are each restored from a window of their own.
     run(&folder, &format!("{restore} -o apart --every 33"));
     assert_eq!(listing(&folder.join("apart")).len(), 4 + 1);
     run(&folder, &format!("{restore} -o sliding --every 2 --end 60"));
@@ -242,7 +242,7 @@ fn looks_at_a_capture_on_one_page() {
     assert!(text.contains("restore    `qudi restore` makes") && text.contains("sum  "), "{text}");
     let page = std::fs::read_to_string(folder.join("c-look.html")).unwrap();
     assert!(page.contains("base64,iVBOR") && page.contains("c.npy"));
-    // Without a sensor, binary frames are shown all the same.
+    // Binary frames are shown without a sensor, too.
     run(&folder, "look c.npy -o look.png");
     let size = image::image_dimensions(folder.join("look.png")).unwrap();
     assert!(size.0 > 2 * 48 && size.1 > 32, "{size:?}");

@@ -1,4 +1,4 @@
-//! The method `qudi` on the command line: weights, devices, options, and what is refused.
+//! The method `qudi` on the command line: weights, devices, options and errors.
 
 use crate::support::{listing, qudi, refused, run, scratch};
 use burn::tensor::Device;
@@ -9,7 +9,7 @@ use qudi_model::config::NetworkConfig;
 use qudi_model::network::init_parameters;
 use std::path::{Path, PathBuf};
 
-/// A folder with a burst and untrained weights of the smallest network.
+/// Creates a folder with a burst and untrained weights of the smallest network.
 fn prepared(name: &str) -> PathBuf {
     let folder = scratch(name);
     qudi(&folder)
@@ -75,7 +75,7 @@ fn restores_a_burst_and_resumes() {
     assert!(String::from_utf8_lossy(&header[..128]).contains("(13, 32, 40)"));
 }
 
-/// The built-in weights tell how far their frames may be off; the frames are the same.
+/// The built-in weights predict their uncertainty; the frames are the same with and without it.
 #[test]
 fn writes_predicted_uncertainty_beside_frames() {
     let folder = prepared("network-errors");
@@ -153,8 +153,8 @@ fn rejects_unfit_weights_and_options_in_three_parts() {
     assert!(!folder.join("none").join("000000.png").exists(), "no partial output");
 }
 
-/// Without a word about methods or weights: the network that comes along where it knows the sensor and the
-/// light, else the best method that needs no training.
+/// The default method is the bundled network if it was trained for the sensor and the light, else the best
+/// method without trained weights.
 #[test]
 fn default_method_follows_the_capture() {
     let folder = scratch("network-usual");
@@ -180,7 +180,7 @@ fn default_method_follows_the_capture() {
     assert!(said.contains("small") && said.contains("qudi-paper"), "{said}");
 }
 
-/// What is published is what was trained, rounded, and its hash is right.
+/// Published weights are the trained ones, rounded, and their hash is right.
 #[test]
 fn published_weights_restore_what_trained_ones_do() {
     let folder = prepared("network-publish");
@@ -221,7 +221,8 @@ fn processor_passes_selftest() {
     refused(&folder, "selftest --only nothing", &["--only"]);
 }
 
-/// Where there is a graphics card, or a driver that imitates one: what such a driver does in seconds.
+/// Runs only with a graphics card or a driver that emulates one, at sizes that such a driver takes seconds
+/// for.
 #[cfg(feature = "wgpu")]
 #[test]
 #[expect(clippy::print_stderr, reason = "says that it is skipped")]
@@ -240,7 +241,8 @@ fn graphics_card_matches_the_processor() {
     assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// Products of 16 bits restore what those of 32 do, on any number of threads, and units must be there.
+/// 16-bit products restore the same as 32-bit ones, on any number of threads; a missing matrix unit is an
+/// error.
 #[test]
 fn precisions_restore_alike() {
     let folder = scratch("network-precision");

@@ -1,10 +1,10 @@
-//! What `qudi simulate` writes: formats, records, truth, flow, reproducibility.
+//! Outputs of `qudi simulate`: formats, records, truth, flow, reproducibility.
 
 use crate::support::{listing, npy_bytes, qudi, scratch};
 use assert_cmd::Command;
 use std::path::Path;
 
-/// Header text and data of a `.npy` file.
+/// Reads header text and data of a `.npy` file.
 fn npy(path: &Path) -> (String, Vec<u8>) {
     let bytes = std::fs::read(path).unwrap();
     assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
@@ -259,7 +259,7 @@ fn uses_dark_map_beside_the_sensor_file() {
     );
 }
 
-/// A stand-in for ffmpeg on PATH delivers frames, or fails half-way.
+/// An imitation of ffmpeg on PATH delivers frames, or fails half-way.
 #[cfg(unix)]
 #[test]
 fn reads_videos_through_ffmpeg() {

@@ -1,4 +1,4 @@
-//! `qudi serve` and devices of other machines, here all on this one.
+//! `qudi serve` and remote devices, all on this machine.
 
 use crate::support::{qudi, refused, scratch};
 use std::io::{BufRead, BufReader};
@@ -8,7 +8,7 @@ use std::process::{Child, ChildStdout, Command, Stdio};
 /// A server that ends with the test.
 struct Server {
     process: Child,
-    /// Open as long as it runs: it ends when nobody can read what it says.
+    /// Held open while the server runs, which ends when nobody can read its output.
     _output: BufReader<ChildStdout>,
     /// `ws://127.0.0.1:PORT`
     name: String,
@@ -44,7 +44,7 @@ fn weights(folder: &Path, run: &str, devices: &str) -> Vec<u8> {
     std::fs::read(folder.join(run).join("weights.safetensors")).unwrap()
 }
 
-/// Of the last step.
+/// Returns the loss of the last step.
 fn loss(folder: &Path, run: &str) -> f64 {
     let metrics = std::fs::read_to_string(folder.join(run).join("metrics.jsonl")).unwrap();
     let lines =
@@ -52,7 +52,7 @@ fn loss(folder: &Path, run: &str) -> f64 {
     lines.filter_map(|line| line["total"].as_f64()).next_back().unwrap()
 }
 
-/// One server, and two that share the batches: the same bits. Kernels are Burn's own there, not ours.
+/// One server and two that share the batches give the same bits. Servers use Burn's own kernels.
 #[test]
 fn machines_share_batches_without_changing_the_result() {
     let folder = scratch("remote-train");

@@ -1,8 +1,8 @@
-//! Reports: pages, tables, and text that a terminal must not obey.
+//! Reports: pages, tables, and escape sequences in text.
 
 use crate::support::{listing, npy_bytes, qudi, scratch};
 
-/// A gray clip of eleven frames.
+/// Writes a gray clip of eleven frames.
 fn write_clip(path: &std::path::Path, height: usize, width: usize) {
     let data: Vec<u8> = (0..11 * height * width)
         .flat_map(|i| (0.2 + 0.6 * ((i % width) as f32 / width as f32)).to_le_bytes())
@@ -11,7 +11,7 @@ fn write_clip(path: &std::path::Path, height: usize, width: usize) {
     std::fs::write(path, npy_bytes("<f4", &shape, &data)).unwrap();
 }
 
-/// A clip of eleven images in a folder.
+/// Writes a clip of eleven images into a folder.
 fn write_images(folder: &std::path::Path, height: u32, width: u32) {
     std::fs::create_dir_all(folder).unwrap();
     for n in 0..11 {

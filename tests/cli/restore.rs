@@ -1,4 +1,4 @@
-//! `qudi restore`: outputs agree, interrupted runs go on, parts meet, settings do not mix.
+//! `qudi restore`: outputs agree, interrupted runs continue, shards complete each other, settings do not mix.
 
 use crate::support::{listing, qudi, scratch};
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ fn burst(name: &str, frames: u32) -> PathBuf {
     folder
 }
 
-/// By `mle` unless `args` say otherwise: quick, and what is tested here is the same for all methods.
+/// Restores by `mle` unless `args` name a method: it is fast, and these tests hold for all methods.
 fn restore(folder: &Path, args: &str) {
     let quick = if args.contains("--method") { "" } else { " --method mle" };
     qudi(folder)
@@ -25,7 +25,7 @@ fn restore(folder: &Path, args: &str) {
         .success();
 }
 
-/// Name and content of every file of a folder.
+/// Reads name and content of every file of a folder.
 fn contents(folder: &Path) -> Vec<(String, Vec<u8>)> {
     listing(folder)
         .into_iter()
@@ -127,7 +127,7 @@ fn parts_of_the_work_meet_in_one_folder() {
     for part in ["2/3", "1/3", "3/3"] {
         restore(&folder, &format!("b.npy -o parts --shard {part}"));
     }
-    // A last look completes the manifest with the misfit of all frames.
+    // The last run completes the manifest with the misfit of all frames.
     restore(&folder, "b.npy -o parts");
     assert!(contents(&folder.join("whole")) == contents(&folder.join("parts")));
     qudi(&folder)
@@ -154,21 +154,21 @@ fn short_captures_and_long_overlaps_work() {
     assert!(!folder.join("no").exists());
 }
 
-/// What the pipe tells nobody is said by hand.
-const KNOWN: &str = "--sensor qudi-paper --ppp 9.75";
+/// Options for facts that a pipe does not carry.
+const PIPE_OPTIONS: &str = "--sensor qudi-paper --ppp 9.75";
 
 fn piped(folder: &Path, args: &str, input: &[u8]) -> std::process::Output {
     let mut command = qudi(folder);
     let quick = if args.contains("--method") { "" } else { " --method mle" };
     command.arg("restore").args((args.to_owned() + quick).split_whitespace());
-    command.args(KNOWN.split(' '));
+    command.args(PIPE_OPTIONS.split(' '));
     command.write_stdin(input).output().unwrap()
 }
 
 #[test]
 fn pipe_restores_the_same_frames_as_a_file() {
     let folder = burst("restore-pipe", 43);
-    restore(&folder, &format!("b.npy -o file.npy --method average {KNOWN}"));
+    restore(&folder, &format!("b.npy -o file.npy --method average {PIPE_OPTIONS}"));
     let expected = std::fs::read(folder.join("file.npy")).unwrap();
     let array = std::fs::read(folder.join("b.npy")).unwrap();
     let raw = &array[128..];
@@ -190,7 +190,7 @@ fn pipe_restores_the_same_frames_as_a_file() {
     assert_eq!(listing(&folder.join("frames")).len(), 20 + 1, "nothing of the old run is left");
 }
 
-/// Frames come out while the pipe still runs: a camera does not end.
+/// Frames are written while the pipe is still open.
 #[test]
 fn restores_a_running_pipe_frame_by_frame() {
     use std::io::{Read, Write};
@@ -199,7 +199,7 @@ fn restores_a_running_pipe_frame_by_frame() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
         .current_dir(&folder)
         .args("restore - -o - -q --format raw-u8 --size 64x80 --method average".split(' '))
-        .args(KNOWN.split(' '))
+        .args(PIPE_OPTIONS.split(' '))
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()
@@ -218,7 +218,7 @@ fn restores_a_running_pipe_frame_by_frame() {
     screen.read_to_end(&mut rest).unwrap();
     assert_eq!(rest.len(), (27 - 8) * (6 + 5120));
     assert!(child.wait().unwrap().success());
-    // Whoever looks may leave early.
+    // The reader of the frames may end early.
     let mut child = Command::new(env!("CARGO_BIN_EXE_qudi"))
         .current_dir(&folder)
         .args("restore b.npy --method mle -o - -q".split(' '))

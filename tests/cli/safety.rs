@@ -1,9 +1,10 @@
-//! What must not be lost or believed: inputs, files of others, bars on no number, results of another capture.
+//! Inputs and other programs' files are kept; results of other captures and thresholds without a number are
+//! refused.
 
 use crate::support::{listing, npy_bytes, qudi, refused, run, scratch};
 use std::path::PathBuf;
 
-/// A folder with a burst `b.npy`, its truth as a folder `fr`, and weights.
+/// Creates a folder with a burst `b.npy`, its truth as a folder `fr`, and weights.
 fn prepared(name: &str) -> PathBuf {
     let folder = scratch(name);
     run(
@@ -71,7 +72,7 @@ fn force_deletes_no_foreign_file() {
     let simulate = "simulate scene:text --size 32x40 --frames 3 --seed 1 -o s.npy -q -f --truth";
     refused(&folder, &format!("{simulate} m"), &["notes.tex"]);
     assert_eq!(listing(&folder.join("m")), ["frame_000000.png", "notes.tex"]);
-    // Beside frames of ours as well.
+    // Also next to frames that this program wrote.
     std::fs::write(folder.join("fr/notes.tex"), "mine").unwrap();
     refused(&folder, &format!("{simulate} fr"), &["notes.tex"]);
     refused(&folder, "restore b.npy --method average -o fr -f", &["not made by this program"]);
@@ -158,7 +159,7 @@ fn weights_restore_equal_frames_by_name_and_path() {
     assert!(manifest.contains("\"mode\": \"diffusion in 2 steps\""), "{manifest}");
 }
 
-/// Each of these used to eat memory, to abort, or to be believed.
+/// Numbers that once filled the memory, aborted the program or were accepted are refused with their range.
 #[test]
 fn rejects_numbers_out_of_range_with_the_range() {
     let folder = prepared("safety-numbers");

@@ -3,7 +3,7 @@
 use crate::support::{qudi, scratch};
 use std::path::Path;
 
-/// A run of every command that is quick, with the parts of the settings that it takes.
+/// A short run of every command, with the parts of the settings that it takes.
 const COMMANDS: &[(&str, &[&str])] = &[
     ("simulate scene:text --size 16x16 --frames 3 -o s.npy -f", &["simulate", "sensor"]),
     ("eval scene:text --frames 11 --ppp 9.75 --method average", &["simulate", "sensor"]),
@@ -87,7 +87,7 @@ fn files_and_the_environment_are_shared_between_commands() {
     }
 }
 
-/// What a command accepts changes what it does.
+/// Accepted keys change the result.
 #[test]
 fn applies_keys_that_a_command_takes() {
     let folder = prepared("settings-applied");

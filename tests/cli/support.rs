@@ -1,9 +1,9 @@
-//! What the tests of the program share: running it, empty folders, NumPy files.
+//! Shared helpers of the tests: running the program, empty folders, NumPy files.
 
 use assert_cmd::Command;
 use std::path::{Path, PathBuf};
 
-/// The program, run in a folder; weights in the user's cache are not seen.
+/// Returns the command `qudi` for a folder, without the weights in the user's cache.
 pub(crate) fn qudi(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_qudi"));
     command.current_dir(folder).env("NO_COLOR", "1");
@@ -11,7 +11,7 @@ pub(crate) fn qudi(folder: &Path) -> Command {
     command
 }
 
-/// An empty folder of this name.
+/// Creates an empty folder of this name.
 pub(crate) fn scratch(name: &str) -> PathBuf {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
     let _ = std::fs::remove_dir_all(&folder);
@@ -19,7 +19,7 @@ pub(crate) fn scratch(name: &str) -> PathBuf {
     folder
 }
 
-/// Names in a folder, sorted.
+/// Lists the names in a folder, sorted.
 pub(crate) fn listing(folder: &Path) -> Vec<String> {
     let mut names: Vec<_> = std::fs::read_dir(folder)
         .unwrap()
@@ -29,7 +29,7 @@ pub(crate) fn listing(folder: &Path) -> Vec<String> {
     names
 }
 
-/// Runs the program with arguments that it accepts, and gives what it printed.
+/// Runs the program, which must succeed, and returns its output.
 pub(crate) fn run(folder: &Path, args: &str) -> String {
     let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -37,7 +37,7 @@ pub(crate) fn run(folder: &Path, args: &str) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// Checks that arguments are refused in three parts, with these words among them.
+/// Checks that arguments are refused with a three-part error that contains these words.
 pub(crate) fn refused(folder: &Path, args: &str, words: &[&str]) {
     let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -47,7 +47,7 @@ pub(crate) fn refused(folder: &Path, args: &str, words: &[&str]) {
     }
 }
 
-/// A `.npy` file as NumPy would write it.
+/// Returns a `.npy` file as NumPy would write it.
 pub(crate) fn npy_bytes(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let text = format!(
         "{:<117}\n",

@@ -44,19 +44,19 @@ impl File {
         self.cases().find(|case| case.name == name).unwrap()
     }
 
-    /// A tensor of f32, by its name in the file.
+    /// Returns a tensor of f32, by its name in the file.
     pub fn f32s(&self, name: &str) -> Vec<f32> {
         let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
         let bytes = tensors.tensor(name).unwrap().data().chunks_exact(4);
         bytes.map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect()
     }
 
-    /// A tensor of bytes, by its name in the file.
+    /// Returns a tensor of bytes, by its name in the file.
     pub fn bytes(&self, name: &str) -> Vec<u8> {
         SafeTensors::deserialize(&self.bytes).unwrap().tensor(name).unwrap().data().to_vec()
     }
 
-    /// A tensor of f64, by its name in the file.
+    /// Returns a tensor of f64, by its name in the file.
     pub fn f64s(&self, name: &str) -> Vec<f64> {
         let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
         let bytes = tensors.tensor(name).unwrap().data().chunks_exact(8);
@@ -83,7 +83,7 @@ impl Case<'_> {
         !self.case["inputs"][name].is_null()
     }
 
-    /// The values of an input.
+    /// Returns the values of an input.
     pub fn values(&self, name: &str) -> Vec<f32> {
         let input = &self.case["inputs"][name];
         if let Some(values) = input["values"].as_array() {
@@ -102,7 +102,7 @@ impl Case<'_> {
         values
     }
 
-    /// Indices of the first dimension where an input, and its gradient, count as zero.
+    /// Returns the indices of the first dimension where an input and its gradient are zero.
     fn zeroed(&self, name: &str) -> Vec<usize> {
         let zero = self.case["inputs"][name]["zero"].as_array();
         zero.into_iter().flatten().map(|n| n.as_u64().unwrap() as usize).collect()
@@ -122,23 +122,23 @@ impl Case<'_> {
         Tensor::from_data(TensorData::new(parameter(name, &shape), shape), device)
     }
 
-    /// The shape of a parameter.
+    /// Returns the shape of a parameter.
     pub fn parameter_shape(&self, name: &str) -> Vec<usize> {
         let shape = self.case["parameters"][name].as_array().unwrap();
         shape.iter().map(|side| side.as_u64().unwrap() as usize).collect()
     }
 
-    /// Whether the file has the gradient of an input or of a parameter.
+    /// Returns true if the file has the gradient of an input or of a parameter.
     pub fn has_gradient(&self, name: &str) -> bool {
         ["grad", "cut"].iter().any(|kind| self.expected(&format!("{kind}.{name}")).is_some())
     }
 
-    /// Names of all parameters.
+    /// Returns the names of all parameters.
     pub fn parameters(&self) -> Vec<&str> {
         self.case["parameters"].as_object().unwrap().keys().map(String::as_str).collect()
     }
 
-    /// The factors of an output in the sum whose gradients the file holds.
+    /// Returns the factors of an output in the sum whose gradients the file holds.
     pub fn cotangent<const D: usize>(&self, output: &str, device: &Device) -> Tensor<D> {
         let shape: [usize; D] = Self::shape(&self.case["outputs"][output]);
         let values = uniform(&format!("cotangent.{output}"), shape.iter().product());
@@ -146,7 +146,7 @@ impl Case<'_> {
         Tensor::from_data(TensorData::new(values, shape), device)
     }
 
-    /// The same, flattened.
+    /// Returns the factors of [`Self::cotangent`], flattened.
     pub fn flat_cotangent(&self, output: &str, device: &Device) -> Tensor<1> {
         let shape = self.case["outputs"][output].as_array().unwrap();
         let count = shape.iter().map(|side| side.as_u64().unwrap() as usize).product();
@@ -161,13 +161,13 @@ impl Case<'_> {
         Some(bytes.map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect())
     }
 
-    /// Whether an output is that of the reference to 1e-4 of its largest value.
+    /// Checks that an output equals the reference to 1e-4 of its largest value.
     pub fn check_output<const D: usize>(&self, name: &str, got: Tensor<D>) {
         let got = got.into_data().try_to_vec::<f32>().unwrap();
         self.close(&format!("output.{name}"), &got, 1e-4);
     }
 
-    /// Whether a gradient is that of the reference to 1e-3 of its largest value.
+    /// Checks that a gradient equals the reference to 1e-3 of its largest value.
     pub fn check_gradient<const D: usize>(&self, name: &str, got: Tensor<D>) {
         let mut got = got.into_data().try_to_vec::<f32>().unwrap();
         if self.has_input(name) {
@@ -199,7 +199,7 @@ impl Case<'_> {
         }
     }
 
-    /// Whether `got` is a tensor of the case, in terms of its largest value.
+    /// Checks that `got` equals a tensor of the case, relative to its largest value.
     pub fn close(&self, name: &str, got: &[f32], tolerance: f32) {
         let place = format!("{}/{name}", self.name);
         let expected = self.expected(name).unwrap_or_else(|| panic!("{place} is not in the file"));
@@ -212,7 +212,7 @@ impl Case<'_> {
     }
 }
 
-/// Numbers in [-1, 1) that depend on the name and the place alone (tests/golden/generate/uniform.py).
+/// Returns numbers in [-1, 1) that depend on the name and the place alone (tests/golden/generate/uniform.py).
 pub fn uniform(name: &str, count: usize) -> Vec<f64> {
     let key = u64::from(crc32fast::hash(name.as_bytes())) << 32;
     (0..count as u64)
@@ -226,7 +226,7 @@ pub fn uniform(name: &str, count: usize) -> Vec<f64> {
         .collect()
 }
 
-/// A weight or bias.
+/// Returns the values of a weight or bias.
 pub fn parameter(name: &str, shape: &[usize]) -> Vec<f32> {
     let count = shape.iter().product();
     let (mut offset, mut scale) = (0.0, 0.1);
@@ -241,7 +241,7 @@ pub fn parameter(name: &str, shape: &[usize]) -> Vec<f32> {
     uniform(name, count).iter().map(|value| (offset + scale * value) as f32).collect()
 }
 
-/// Gaussian noise by Box and Muller.
+/// Draws Gaussian noise by Box and Muller.
 pub fn gaussian(name: &str, count: usize) -> Vec<f32> {
     let uniform: Vec<f64> =
         uniform(name, 2 * count).iter().map(|v| f64::midpoint(*v, 1.0)).collect();

@@ -1,4 +1,4 @@
-//! BM3D on one image, and windows of 11 frames through every method.
+//! Benchmarks of BM3D on one image and of every method on windows of 11 frames.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use qudi_burst::bm3d;

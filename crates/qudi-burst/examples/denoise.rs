@@ -1,4 +1,4 @@
-//! BM3D on one image, for comparison with other programs.
+//! Denoises one image with BM3D, for comparison with other programs.
 //!
 //!     cargo run --release -p qudi-burst --example denoise -- NOISY.npy SIGMA OUT.npy
 //!

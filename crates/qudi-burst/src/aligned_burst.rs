@@ -1,5 +1,5 @@
-//! All frames of a window aligned with each of them, before anybody decides which to trust. A robust merge
-//! decides by a formula; a network that sees them all can learn to.
+//! Alignment of all frames of a window with each frame, before any frame is weighted. A robust merge weights
+//! the aligned frames with a formula; a network that receives all of them can learn the weights.
 
 use crate::denoise::stabilized::{image, units};
 use crate::denoise::vst::VarianceStabilizer;
@@ -17,12 +17,12 @@ use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 use std::sync::OnceLock;
 
-/// Variance of the errors of the reference estimate, in units of the counts' variance, about.
+/// Approximate variance of the reference estimate's errors, in units of the counts' variance.
 const REFERENCE_ERROR: f32 = 0.1;
 
-/// Least variance of a count: what certainly counts nothing, or full scale, still differs from it by
-/// something.
-const LEAST_VARIANCE: f64 = 1e-4;
+/// Lower bound of a count's variance. It keeps the standardization finite where the expected count is 0 or
+/// full scale.
+const MIN_VARIANCE: f64 = 1e-4;
 
 /// A window aligned on its reference estimate.
 #[derive(Debug)]
@@ -37,33 +37,34 @@ pub struct AlignedBurst<'a> {
     frames: Vec<Frame>,
     /// The reference estimate, in mean counts.
     references: ReferenceFrames,
-    /// The motion of the patches of each frame to all frames, found when first asked for.
+    /// The motion of the patches of each frame to all frames, computed on first use.
     motions: Vec<OnceLock<FrameMotion>>,
 }
 
-/// The motion of the patches of a frame to all frames.
+/// Motion of the patches of one frame to all frames.
 #[derive(Clone, Debug)]
 struct FrameMotion {
-    /// Along the most likely hypotheses.
+    /// Motion along the most likely hypothesis of each patch.
     selected: PatchMotion,
-    /// As matched frame by frame.
+    /// Motion matched frame by frame on the reference frames.
     matched: PatchMotion,
 }
 
-/// The alignments of each neighbour with a frame.
+/// Set of alignments computed for each neighbour of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Alignments {
-    /// The selected motion of its patches.
+    /// The selected motion of each patch.
     Selected,
-    /// The selected motion, and the motion as matched frame by frame: freer, and fitting the noise of what it
-    /// was matched on.
+    /// The selected motion and the motion matched frame by frame. The matched motion is less constrained, and
+    /// fits the noise of the frames that it was matched on.
     WithMatched,
-    /// Both, and pixel by pixel whichever of the motions around fits best: freer still.
+    /// Both motions, and per pixel the best-fitting motion of the surrounding patches (the least
+    /// constrained).
     WithPerPixel,
 }
 
 impl Alignments {
-    /// How often each neighbour is aligned.
+    /// Returns the number of alignments per neighbour.
     pub fn count(self) -> usize {
         match self {
             Self::Selected => 1,
@@ -73,20 +74,20 @@ impl Alignments {
     }
 }
 
-/// What is known of a frame from all frames of its window. A standardized count is the count less what the
-/// reference estimate expects of the frame, in units of the sigma of its noise.
+/// A frame with the evidence that all frames of its window hold about it. A standardized count is the count
+/// minus the count that the reference estimate predicts, in units of its noise sigma.
 #[derive(Clone, Debug)]
 pub struct AlignedFrame {
     /// The reference estimate, in image units.
     pub reference: Frame,
     /// The merged frame: unbiased and still noisy, in image units.
     pub merged: Frame,
-    /// Sigma of the merged frame's noise at each pixel, in image units.
+    /// Noise sigma of the merged frame at each pixel, in image units.
     pub noise_sigma: Frame,
     /// Standardized counts of the frame itself, then of its aligned neighbours, nearest first, for each of
-    /// the [`Alignments`]. Zero past the ends of the window and of the image.
+    /// the [`Alignments`]. Pixels outside the window or the image are zero.
     pub counts: Vec<Frame>,
-    /// What the reference estimate expects of the aligned neighbours, standardized likewise.
+    /// Counts that the reference estimate predicts for the aligned neighbours, standardized in the same way.
     pub expected: Vec<Frame>,
 }
 
@@ -100,7 +101,7 @@ impl<'a> AlignedBurst<'a> {
         Self { burst, velocity, vst, acquisition, ordinary_dark, frames, references, motions }
     }
 
-    /// Aligns the window again, on better frames in image units.
+    /// Aligns the window again on better frames, given in image units.
     #[must_use]
     pub fn realign(self, frames: Vec<Frame>) -> Self {
         let units = units(self.acquisition);
@@ -119,12 +120,12 @@ impl<'a> AlignedBurst<'a> {
         Self { frames, references, motions, ..self }
     }
 
-    /// The size of the frames.
+    /// Returns the size of the frames.
     pub fn size(&self) -> Size {
         self.burst.size
     }
 
-    /// The number of frames in the window.
+    /// Returns the number of frames in the window.
     pub fn frame_count(&self) -> usize {
         self.frames.len()
     }
@@ -185,9 +186,9 @@ impl<'a> AlignedBurst<'a> {
         }
     }
 
-    /// Merges restored frames of this window, in image units, each with its neighbours along their motion.
-    /// Each was denoised on its own and errs in its own way. `error_variances` are those of the errors that
-    /// the frames do not share, about.
+    /// Merges restored frames of this window, in image units, with their neighbours along the selected
+    /// motion. It reduces the errors that neighbouring frames do not share. `error_variances` holds the
+    /// approximate variance of these independent errors at each pixel.
     pub fn temporal_filter(&self, frames: &[Frame], error_variances: &[Frame]) -> Vec<Frame> {
         let motions: Vec<&PatchMotion> =
             (0..frames.len()).map(|frame| &self.motion(frame).selected).collect();
@@ -205,7 +206,8 @@ impl<'a> AlignedBurst<'a> {
         })
     }
 
-    /// Warps the counts of frame `k`, and its estimate, onto the reference along the motion of every patch.
+    /// Warps the counts of frame `k` and its reference estimate onto frame `reference`, along the motion of
+    /// each patch.
     fn warped(&self, reference: usize, k: usize, motion: &PatchMotion) -> [Frame; 2] {
         let Self { burst, references, .. } = self;
         [&burst.frames[k], &references.frames[k]].map(|image| {
@@ -213,14 +215,15 @@ impl<'a> AlignedBurst<'a> {
         })
     }
 
-    /// Sigma of a count of the given mean.
+    /// Returns the sigma of a count with the given mean.
     fn count_sigma(&self, mean: f32) -> f32 {
         let variance = self.burst.moments.variance_at_mean(f64::from(mean));
-        variance.max(LEAST_VARIANCE).sqrt() as f32
+        variance.max(MIN_VARIANCE).sqrt() as f32
     }
 
-    /// Sigma in image units of merged counts whose mean is `means`: half of what separates the images one
-    /// sigma above and below, through the inverse of the transform; black is no bound.
+    /// Returns the noise sigma of merged counts with mean `means`, in image units. It is half the distance
+    /// between the inverse transforms one sigma above and one sigma below the mean. Values below black are
+    /// not cut.
     fn noise_sigma(&self, means: &Frame, noise: &Frame) -> Frame {
         let n = self.burst.frames.len() as f64;
         let units = units(self.acquisition);

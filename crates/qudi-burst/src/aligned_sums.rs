@@ -1,9 +1,9 @@
-//! Bursts longer than a method's window: sums of aligned frames.
+//! Aligned sums: long exposures for bursts longer than a method's window.
 //!
-//! Where light is short, quanta burst photography merges hundreds of frames: blocks of them are aligned, and
-//! every frame is shifted along the motion between blocks (Ma et al. 2020, sections 5.1 and 5.2). Here a method
-//! restores its window of frames as ever, but each of them is the sum of many frames of the capture, shifted
-//! by whole pixels: counts remain counts, with the law that the sensor's sums have.
+//! In low light, quanta burst photography merges hundreds of frames. It aligns blocks of frames and shifts
+//! each frame along the motion between blocks (Ma et al. 2020, sections 5.1 and 5.2). Here a method restores
+//! its usual window of frames, but each frame is the sum of many captured frames, shifted by whole pixels.
+//! Whole-pixel shifts keep the counts integer, with the distribution of the sensor's own sums.
 
 mod choice;
 mod motion;
@@ -15,7 +15,7 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Frame, Result};
 use std::fmt;
 
-/// A method whose every frame is the sum of several, aligned.
+/// A method that restores aligned sums of frames instead of single frames.
 pub struct AlignedSums {
     method: Box<dyn Restorer>,
     count: usize,
@@ -31,12 +31,13 @@ impl fmt::Debug for AlignedSums {
 }
 
 impl AlignedSums {
-    /// Lets `method` see sums of `count` frames, aligned along the motion between sums of `block` frames.
+    /// Creates a method that restores sums of `count` frames, aligned along the motion between sums of
+    /// `block` frames.
     pub fn new(method: Box<dyn Restorer>, count: usize, block: usize) -> Self {
         Self { method, count: count.max(1), block: block.max(1) }
     }
 
-    /// The acquisition of sums of `count` frames.
+    /// Returns the acquisition of sums of `count` frames.
     ///
     /// # Errors
     /// [`Error::Request`] if sums do not fit into 16 bits.
@@ -49,7 +50,7 @@ impl AlignedSums {
         }
         of_sums.sensor.frames_summed = frames as u32;
         of_sums.ppp *= count as f64;
-        // What moves carries the dark counts of many pixels.
+        // A shifted sum mixes the dark counts of many pixels, so there is no dark map for it.
         of_sums.dark = None;
         Ok(of_sums)
     }
@@ -108,8 +109,8 @@ mod tests {
 
     const SIZE: Size = Size { height: 64, width: 80 };
 
-    /// A texture that moves by `speed` pixels a frame: binary frames, their acquisition, and the scene of
-    /// frame `middle`.
+    /// Exposes binary frames of a texture that moves by `speed` pixels per frame. Returns the frames, their
+    /// acquisition and the scene at frame `middle`.
     fn burst(frames: usize, speed: f32, middle: usize) -> (Vec<Vec<u16>>, Acquisition, Frame) {
         let scene = |t: usize| {
             Frame::from_fn(SIZE, |x, y| {
@@ -135,7 +136,7 @@ mod tests {
         let qbp = || Box::new(Qbp::new(PostFilter::None));
         let short = quality(qbp().as_mut(), 160, 11);
         let long = quality(&mut AlignedSums::new(qbp(), 30, 15), 0, 330);
-        // 30 times the light are 14.8 dB less noise.
+        // 30 times the light reduces the noise by 14.8 dB.
         assert!(long > short + 6.0, "{short} {long}");
     }
 

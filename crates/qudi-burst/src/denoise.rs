@@ -1,4 +1,4 @@
-//! Removing noise from single images.
+//! Denoising of single images.
 
 pub(crate) mod block_statistics;
 pub(crate) mod bm3d;

@@ -1,11 +1,12 @@
-//! Classical restoration of single-photon bursts: the methods of the field, written from their papers, and
-//! the reference estimate that a network goes on from.
+//! Classical restoration of single-photon bursts: published methods, written from their papers, and the
+//! reference estimate on which the networks build.
 //!
-//! All methods are [`Restorer`](qudi_core::restorer::Restorer)s: a window of counts `[frames][height][width]`
-//! in, all its frames out, in image units. Constants were chosen on training clips, those of the
-//! [`ReferenceEstimate`] on validation clips.
+//! All methods are [`Restorer`](qudi_core::restorer::Restorer)s: they take a window of counts
+//! `[frames][height][width]` and return all its frames in image units. Their constants were chosen on
+//! training clips; the constants of [`ReferenceEstimate`] were chosen on validation clips.
 #![warn(missing_docs)]
-// Loops over patches are inlined into functions that are compiled for the vector unit, and plain for them.
+// Loops over patches are inlined into functions compiled for the vector unit, and stay simple for the
+// compiler.
 #![allow(clippy::inline_always, clippy::needless_range_loop)]
 
 mod aligned_burst;

@@ -1,4 +1,4 @@
-//! Merging aligned frames.
+//! Merging of aligned frames.
 
 pub(crate) mod blocks;
 pub(crate) mod cubic;

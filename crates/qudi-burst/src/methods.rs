@@ -1,4 +1,4 @@
-//! The classical methods, as published; one a file.
+//! The published classical methods, one per file.
 
 mod average;
 mod mle;

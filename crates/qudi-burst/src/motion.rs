@@ -1,4 +1,4 @@
-//! Motion between the frames of a burst.
+//! Motion estimation between the frames of a burst.
 
 mod affine;
 pub(crate) mod block_alignment;

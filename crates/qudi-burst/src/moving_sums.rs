@@ -4,8 +4,8 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{CountLaw, CountMoments};
 use qudi_core::windows::LONGEST_HALF;
 
-/// Calls `f` for every frame with the sum of the frames within `radius` of it and how many those are; the
-/// window's ends have fewer.
+/// Calls `f` for every frame, with the sum of the frames within `radius` of it and the number of these
+/// frames. There are fewer at the ends of the window.
 pub fn moving_sums(burst: BurstView<'_>, radius: usize, mut f: impl FnMut(&[u32], u32)) {
     let n = burst.frames.len();
     let mut sums = vec![0u32; burst.size.pixels()];
@@ -28,12 +28,13 @@ pub fn moving_sums(burst: BurstView<'_>, radius: usize, mut f: impl FnMut(&[u32]
     }
 }
 
-/// Chooses the radius of moving means by Stein's unbiased risk estimate (SURE) on windows of the clip, if
-/// what follows leaves `noise_left` of the variance of a mean (1 if nothing follows).
+/// Chooses the radius of moving means with Stein's unbiased risk estimate (SURE) on windows of the clip.
+/// `noise_left` is the fraction of a mean's noise variance that remains after any later denoiser (1 without
+/// one).
 ///
 /// With `y` a frame's counts and `m` the mean of the `L` frames around it, `E (m - y)^2 + (2 / L - 1) Var y`
-/// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise; the
-/// sensor says what `Var y` is.
+/// is the mean squared error of `m` (Stein 1981; Mallows 1973), of which `Var y / L` is noise. The sensor's
+/// description gives `Var y`.
 pub fn sure_window_radius(
     samples: &[BurstView<'_>],
     acquisition: &Acquisition,
@@ -55,7 +56,8 @@ pub fn sure_window_radius(
     let full = f64::from(acquisition.sensor.max_count());
     let mut risks = [0.0; LONGEST_HALF + 1];
     for burst in samples {
-        // From the longest mean: short ones of few bits lie at the ends, where nothing varies.
+        // The longest mean gives the variance: short means of few bits lie at the ends, where the variance is
+        // 0.
         let mut variances = Vec::with_capacity(burst.frames.len());
         moving_sums(*burst, LONGEST_HALF, |sums, n| {
             let n = f64::from(n);
@@ -69,8 +71,9 @@ pub fn sure_window_radius(
     (0..risks.len()).min_by(|&a, &b| risks[a].total_cmp(&risks[b])).unwrap_or(0)
 }
 
-/// Variance of a count where the mean of `n` of them is `mean`. The variance bends over the mean
-/// (`p (1 - p)` of binary frames), and the mean is uncertain by `variance / n`: to second order.
+/// Estimates the variance of a count from the mean of `n` counts. The variance is a concave function of the
+/// mean (`p (1 - p)` for binary frames), and the mean has a variance of `variance / n`. The bias is corrected
+/// to second order.
 fn unbiased_variance(moments: &CountMoments, mean: f64, n: f64, full: f64) -> f64 {
     let step = full / 16.0;
     let at = mean.clamp(step, full - step);
@@ -86,7 +89,8 @@ mod tests {
     use qudi_core::sensor::Sensor;
     use qudi_core::{Frame, Size};
 
-    /// Single binary frames of a still scene, too: none of them shows that it varies.
+    /// Checks the choice on static scenes, including single binary frames, whose values never vary on their
+    /// own.
     #[test]
     fn chooses_long_windows_for_static_scenes() {
         let size = Size { height: 48, width: 64 };
@@ -104,7 +108,7 @@ mod tests {
                     &acquisition,
                     noise_left,
                 );
-                // 7 frames or more: from there on hardly anything is to be won.
+                // Beyond 7 frames hardly anything is gained.
                 assert!(radius >= 3, "{name}, {noise_left} left: {radius}");
             }
         }

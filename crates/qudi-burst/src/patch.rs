@@ -7,10 +7,10 @@ use std::ops::Range;
 /// Side of a patch in pixels (Ma et al. 2020, section 5).
 pub(crate) const SIDE: usize = 16;
 
-/// The samples of a patch, by row.
+/// Samples of a patch, by row.
 pub(crate) type Patch = [[f32; SIDE]; SIDE];
 
-/// The displacements or velocities of all patches, `[frame][patch]`, right and down in pixels.
+/// Displacements or velocities of all patches, `[frame][patch]`, right and down in pixels.
 pub(crate) type PatchMotion = Vec<Vec<[f32; 2]>>;
 
 /// Enlarges an image of size `from` to `size` by repeating its last row and column.
@@ -18,13 +18,13 @@ pub(crate) fn padded(values: &[f32], from: Size, size: Size) -> Frame {
     Frame::from_fn(size, |x, y| values[y.min(from.height - 1) * from.width + x.min(from.width - 1)])
 }
 
-/// The size of an image enlarged to hold at least one patch.
+/// Returns the size of an image enlarged to hold at least one patch.
 pub(crate) fn padded_size(size: Size) -> Size {
     Size { height: size.height.max(SIDE), width: size.width.max(SIDE) }
 }
 
-/// Finds the samples of a patch that starts at `start` which lie in an image of `length` pixels, along one
-/// axis.
+/// Returns the range of a patch's samples that lie inside an image of `length` pixels along one axis. The
+/// patch starts at `start`.
 pub(crate) fn inside(start: f32, length: usize) -> Range<usize> {
     let first = (-0.5 - start).ceil().clamp(0.0, SIDE as f32);
     let end = ((length as f32 - 0.5 - start).floor() + 1.0).clamp(first, SIDE as f32);
@@ -42,13 +42,13 @@ pub(crate) fn bilinear(image: &Frame, corner: [f32; 2]) -> Patch {
     patch
 }
 
-/// [`bilinear`] row by row, compiled for the vector unit of its caller.
+/// Row-wise [`bilinear`], inlined to be compiled for the vector unit of its caller.
 pub(crate) struct BilinearSamples<'a> {
     image: &'a Frame,
-    /// The pixel before the corner.
+    /// Pixel before the corner.
     corner: [isize; 2],
     weights: [f32; 4],
-    /// Whether all columns lie in the image.
+    /// True if all columns lie inside the image.
     within: bool,
 }
 
@@ -63,7 +63,7 @@ impl<'a> BilinearSamples<'a> {
         Self { image, corner, weights, within }
     }
 
-    /// Row `r` of the patch.
+    /// Returns row `r` of the patch.
     #[inline(always)]
     pub(crate) fn row(&self, r: usize) -> [f32; SIDE] {
         let (upper, lower) = (self.source(r), self.source(r + 1));
@@ -80,7 +80,7 @@ impl<'a> BilinearSamples<'a> {
         between(self.weights, &above, &below)
     }
 
-    /// The image's row that is nearest to row `r` of the patch.
+    /// Returns the row of the image nearest to row `r` of the patch.
     #[inline(always)]
     fn source(&self, r: usize) -> &'a [f32] {
         let last = self.image.size.height as isize - 1;
@@ -88,7 +88,7 @@ impl<'a> BilinearSamples<'a> {
     }
 }
 
-/// A row between the pixels of two rows.
+/// Interpolates a row between the pixels of two rows.
 #[inline(always)]
 fn between(weights: [f32; 4], upper: &[f32], lower: &[f32]) -> [f32; SIDE] {
     let (a, b) = (&upper[..SIDE], &upper[1..=SIDE]);
@@ -101,7 +101,7 @@ fn between(weights: [f32; 4], upper: &[f32], lower: &[f32]) -> [f32; SIDE] {
     row
 }
 
-/// The sum of all samples of a patch, sixteen at a time.
+/// Returns the sum of all samples of a patch, computed sixteen at a time.
 #[inline(always)]
 pub(crate) fn total(patch: &Patch) -> f32 {
     let mut lanes = [0.0f32; SIDE];

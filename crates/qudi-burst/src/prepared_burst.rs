@@ -1,4 +1,4 @@
-//! The counts of a window, ready to be aligned and merged.
+//! Counts of a window, prepared for alignment and merging.
 
 use crate::merge::hot_pixels::HotPixels;
 use crate::motion::grid::Grid;
@@ -9,16 +9,16 @@ use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 use std::borrow::Borrow;
 
-/// The counts of a window, with hot pixels repaired and small frames padded to one patch.
+/// Counts of a window, with hot pixels repaired and small frames padded to one patch.
 #[derive(Debug)]
 pub(crate) struct PreparedBurst {
     /// Size of the window's frames; `frames` may be larger.
     pub(crate) size: Size,
-    /// Counts, at least as large as a patch.
+    /// Counts; frames are at least as large as a patch.
     pub(crate) frames: Vec<Frame>,
     /// Mean and variance of the sensor's counts.
     pub(crate) moments: CountMoments,
-    /// The patches that are aligned and merged.
+    /// Patches of alignment and merging.
     pub(crate) grid: Grid,
 }
 
@@ -33,7 +33,7 @@ impl PreparedBurst {
         Self { size: burst.size, frames, moments, grid: Grid::half_overlapping(size) }
     }
 
-    /// The size of the padded frames.
+    /// Returns the size of the padded frames.
     pub(crate) fn padded_size(&self) -> Size {
         self.frames[0].size
     }
@@ -49,14 +49,15 @@ impl PreparedBurst {
         Frame { size: self.size, data: rows.copied().collect() }
     }
 
-    /// Variance of the difference of two matched pixels of images whose errors are `error_variance` times the
-    /// variance of the counts of frame `reference`; above zero also for images without noise.
+    /// Returns the variance of the difference of two matched pixels of images whose errors have
+    /// `error_variance` times the variance of the counts of frame `reference`. It is positive even for images
+    /// without noise.
     pub(crate) fn matching_variance(&self, reference: usize, error_variance: f32) -> f32 {
         let single = self.moments.variance_at_mean(self.frames[reference].mean()) as f32;
         (2.0 * (error_variance * single)).max(1e-6)
     }
 
-    /// Variance of a count of the mean count of `patch`.
+    /// Returns the variance of a count whose mean is the mean of `patch`.
     pub(crate) fn variance_of(&self, patch: &Patch) -> f32 {
         let pixels = patch.as_flattened().len() as f32;
         let mean = patch.iter().flatten().sum::<f32>() / pixels;
@@ -64,8 +65,8 @@ impl PreparedBurst {
     }
 }
 
-/// Lists up to `count` of `frames` frames, the nearest to `reference` first: itself, and of two as near the
-/// later one.
+/// Lists up to `count` of `frames` frames, nearest to `reference` first, starting with `reference` itself. Of
+/// two equally near frames the later one comes first.
 pub(crate) fn nearest(frames: usize, reference: usize, count: usize) -> Vec<usize> {
     let mut list: Vec<usize> = (0..frames).collect();
     list.sort_by_key(|&frame| (frame.abs_diff(reference), frame < reference));

@@ -1,7 +1,7 @@
-//! The reference estimate of a window, in two passes of aligning and merging. The first is quanta burst
-//! photography with BM3D. What it restores shows the second where things are and which frames fit, far better
-//! than noisy frames can. Basic estimates for a second pass are BM3D's idea (Dabov et al. 2007, section
-//! III-B), here applied to the whole method.
+//! Reference estimate of a window, in two passes of aligning and merging. The first pass is quanta burst
+//! photography with BM3D. Its result guides the second pass: it shows motion and misfits much better than
+//! noisy frames do. Basic estimates for a second pass are BM3D's idea (Dabov et al. 2007, section III-B),
+//! here applied to the whole method.
 
 use crate::denoise::bm3d::SearchSettings;
 use crate::denoise::stabilized::{denoise, image};
@@ -21,26 +21,27 @@ use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
 use rayon::prelude::*;
 
-/// Constant of the Wiener filter where reference frames decide what fits, chosen on the validation clips.
+/// Constant of the Wiener filter where reference frames decide the weights, chosen on the validation clips.
 pub(crate) const WIENER_C: f32 = 0.7;
 
-/// Variance of the errors of the first pass, in units of the counts' variance, about.
+/// Approximate variance of the first pass's errors, in units of the counts' variance.
 const FIRST_PASS_ERROR: f32 = 0.3;
 
-/// The noise sigma that BM3D assumes in the second pass, in units of the merge's own.
+/// Noise sigma assumed by BM3D in the second pass, in units of the merge's own.
 const SIGMA_FACTOR: f64 = 1.0;
 
-/// BM3D in both passes: more than half of its time is saved for less than 0.1 dB. The first pass only shows where
-/// things are.
+/// Search settings of BM3D in the first pass, which only guides the second. The settings of both passes save
+/// more than half of BM3D's time for less than 0.1 dB.
 const FIRST_SEARCH: SearchSettings = SearchSettings { radius: 6, step: [6, 6] };
+/// Search settings of BM3D in the second pass.
 const SECOND_SEARCH: SearchSettings = SearchSettings { radius: 12, step: [4, 3] };
 
-/// The best classical estimate of a window, which a network goes on from.
+/// The best classical estimate of a window, on which the networks build.
 #[derive(Debug)]
 pub struct ReferenceEstimate {
     /// Restored frames, in image units.
     pub frames: Vec<Frame>,
-    /// Their mean counts, padded to one patch.
+    /// Mean counts of the restored frames, padded to one patch.
     pub(crate) mean_counts: Vec<Frame>,
     pub(crate) burst: PreparedBurst,
     pub(crate) velocity: Option<ConstantVelocity>,
@@ -59,7 +60,7 @@ impl ReferenceEstimate {
         Self::of_frames(view, acquisition, &all)
     }
 
-    /// Restores the frames `wanted` of the window in the second pass.
+    /// Restores the requested frames of the window in the second pass.
     fn of_frames(view: BurstView<'_>, acquisition: &Acquisition, wanted: &[usize]) -> Result<Self> {
         let Acquisition { sensor, gain, .. } = acquisition;
         let ordinary_dark = sensor.dark_per_frame()?;
@@ -152,7 +153,7 @@ mod tests {
     use std::ops::ControlFlow;
     use std::rc::Rc;
 
-    /// Both passes tell of every frame before they begin it, and stop there if they are asked to.
+    /// Checks that both passes report progress before every frame, and stop there on request.
     #[test]
     fn passes_tell_of_every_frame_and_stop() {
         let size = Size { height: 32, width: 40 };

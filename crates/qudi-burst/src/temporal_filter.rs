@@ -1,6 +1,6 @@
-//! Temporal filter of restored frames: each was denoised on its own and errs in its own way, and a merge with
-//! its neighbours flickers less. The frames take the place of the counts in the robust merge (Hasinoff et al.
-//! 2016, section 5), their errors that of the noise.
+//! Temporal filter of restored frames. Frames denoised separately have independent errors, and merging
+//! neighbours reduces flicker. It is the robust merge (Hasinoff et al. 2016, section 5) with restored frames
+//! in place of counts, and their errors in place of noise.
 
 use crate::merge::cubic::cubic_within;
 use crate::merge::wiener::{AlignedPatch, merge};
@@ -10,19 +10,19 @@ use crate::prepared_burst::nearest;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
-/// Frames that each is merged with. Those farther away have moved too far to fit.
-const NEAREST: usize = 6;
+/// Number of neighbours merged with each frame. Farther frames have moved too far to fit.
+const NEIGHBOURS: usize = 6;
 
-/// Constant of the Wiener filter: the squared difference, in units of that which errors make, at which a
-/// frame gets half its weight.
+/// Constant of the Wiener filter: the squared difference at which a frame gets half its weight, in units of
+/// the expected squared difference of errors.
 const WIENER_C: f32 = 2.0;
 
-/// Least variance of errors: what has none must not divide by zero.
-const LEAST: f32 = 1e-8;
+/// Lower bound of the error variance; prevents division by zero.
+const MIN_VARIANCE: f32 = 1e-8;
 
-/// Merges each of the restored `frames` of a window with its neighbours along `motions`, those of the patches
-/// of each frame to all frames. `error_variances` are those of the errors that the frames do not share,
-/// about; one frame of the same size for each.
+/// Merges each of the restored `frames` of a window with its neighbours. `motions` holds for each frame the
+/// motion of its patches to all frames. `error_variances` holds for each frame the approximate variance of
+/// the errors that it does not share with other frames, at each pixel.
 pub(crate) fn temporal_filter(
     frames: &[Frame],
     error_variances: &[Frame],
@@ -36,7 +36,7 @@ pub(crate) fn temporal_filter(
     let grid = Grid::half_overlapping(large);
     let filtered = |reference: usize| {
         let (errors, motion) = (&errors[reference], motions[reference]);
-        let others = &nearest(frames.len(), reference, NEAREST + 1)[1..];
+        let others = &nearest(frames.len(), reference, NEIGHBOURS + 1)[1..];
         let mut filtered = grid.blended(large, size, |i| {
             let corner = grid.corner(i);
             let aligned = |k: usize, d: [f32; 2]| {
@@ -50,7 +50,7 @@ pub(crate) fn temporal_filter(
             let rows = corner[1]..corner[1] + SIDE;
             let rows = rows.map(|y| errors.row(y)[corner[0]..][..SIDE].iter().sum::<f32>());
             let variance = rows.sum::<f32>() / (SIDE * SIDE) as f32;
-            merge(&patches, variance.max(LEAST), WIENER_C).0
+            merge(&patches, variance.max(MIN_VARIANCE), WIENER_C).0
         });
         // Cubic samples overshoot, but nothing is darker than black.
         filtered.data.iter_mut().for_each(|value| *value = value.max(0.0));
@@ -70,7 +70,7 @@ mod tests {
 
     const SIZE: Size = Size { height: 48, width: 64 };
 
-    /// Texture that has moved by `shift` pixels.
+    /// Returns a texture that has moved by `shift` pixels.
     fn texture(shift: f32) -> Frame {
         Frame::from_fn(SIZE, |x, y| {
             let (x, y) = (x as f32 - shift, y as f32 + 0.5 * shift);
@@ -85,12 +85,12 @@ mod tests {
         Frame { size: frame.size, data: values.collect() }
     }
 
-    /// Along the motion that patches of the frames themselves are matched by.
+    /// Applies the filter along the motion found by matching patches of the frames themselves.
     fn filtered(frames: &[Frame], errors: &[Frame]) -> Vec<Frame> {
         let large =
             |frame: &Frame| Pyramid::new(&padded(&frame.data, frame.size, padded_size(frame.size)));
         let pyramids: Vec<Pyramid> = frames.iter().map(large).collect();
-        let variance = |error: &Frame| (2.0 * error.mean() as f32).max(LEAST);
+        let variance = |error: &Frame| (2.0 * error.mean() as f32).max(MIN_VARIANCE);
         let flows = pyramids.iter().zip(errors).map(|(here, error)| {
             pyramids.iter().map(|there| align(here, there, variance(error))).collect()
         });

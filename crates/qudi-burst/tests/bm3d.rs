@@ -1,4 +1,4 @@
-//! BM3D against the reference package's figures: `tests/golden/baselines`, made by
+//! BM3D compared with the PSNR of the reference package: `tests/golden/baselines`, made by
 //! `tests/golden/generate/baselines.py`.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
@@ -34,7 +34,7 @@ fn bm3d_reaches_the_reference_package() {
         let found = psnr(&bm3d(&noisy(&truth, &noise, sigma), sigma), &truth);
         let expected = figure["psnr"].as_f64().unwrap();
         println!("{name} {:2.0}: {found:.3} dB, package {expected:.3}", sigma * 255.0);
-        // One small image differs more than the mean of many: docs/notes/burst/bm3d.md has those.
+        // One small image varies more than the mean of many, which docs/notes/burst/bm3d.md gives.
         assert!(found > expected - 0.25, "{name} {sigma}: {found} dB, package {expected} dB");
         shortfall.push(expected - found);
     }

@@ -1,4 +1,4 @@
-//! The motion that QBP finds, on procedural scenes whose motion is known.
+//! Accuracy of QBP's motion on procedural scenes with known motion.
 //!
 //!     cargo test --release -p qudi-burst --test flow -- --nocapture
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
@@ -20,7 +20,7 @@ fn exposed(scene: &Scene, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Acquisitio
     (counts, Acquisition::new(sensor, ppp, light.mean_level).unwrap())
 }
 
-/// End-point errors of all patches that stay inside, from `reference` to `other`.
+/// Returns the end-point errors from `reference` to `other` of all patches that stay inside the image.
 fn errors(scene: &Scene, ppp: f64, reference: usize, others: &[usize]) -> Vec<f64> {
     let (counts, acquisition) = exposed(scene, ppp, 11);
     let burst = BurstView { size: scene.size, frames: &counts };
@@ -29,7 +29,7 @@ fn errors(scene: &Scene, ppp: f64, reference: usize, others: &[usize]) -> Vec<f6
     for &other in others {
         let truth = scene.flow(reference as f64, other as f64);
         for (corner, found) in corners.iter().zip(&flow[other]) {
-            // The middle of the patch lies between four pixels.
+            // The centre of the patch lies between four pixels.
             let at = (corner[1] + 8) * scene.size.width + corner[0] + 8;
             let whole = [0, 15].into_iter().all(|dy| {
                 [0, 15]
@@ -53,7 +53,7 @@ fn leaves(seed: u64, speed: f64) -> Scene {
     Procedural { kind: ProceduralScene::DeadLeaves, size: SIZE, seed, speed }.scene()
 }
 
-/// The whole scene moves alike, up to 8 pixels per frame, so up to 40 over five frames.
+/// Checks global shifts of up to 8 pixels per frame, or 40 pixels over five frames.
 #[test]
 fn shifts_up_to_8_pixels_per_frame_are_found_to_half_a_pixel() {
     for velocity in [[0.0, 0.0], [0.4, 0.3], [2.5, -1.0], [-5.5, 3.2], [8.0, 0.0], [-4.5, -6.5]] {
@@ -78,7 +78,7 @@ fn shifts_up_to_8_pixels_per_frame_are_found_to_half_a_pixel() {
     }
 }
 
-/// The whole scene pans and turns about its middle: every patch moves otherwise.
+/// Checks a scene that pans and turns about its centre, so that every patch moves differently.
 #[test]
 fn turning_is_found_to_half_a_pixel() {
     let centre = [96.0, 96.0];
@@ -95,8 +95,8 @@ fn turning_is_found_to_half_a_pixel() {
     }
 }
 
-/// Leaves that move each on its own, most smaller than a patch: few patches have one motion, and the
-/// bound is only that finding it is better than finding nothing.
+/// Checks leaves that move independently, most of them smaller than a patch. Few patches have a single
+/// motion, so the bound only asks for less error than zero motion has.
 #[test]
 fn occluders_stay_distinct_at_small_scale() {
     for speed in [2.0, 8.0] {

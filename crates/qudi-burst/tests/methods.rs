@@ -1,4 +1,4 @@
-//! All methods on moving scenes, on any number of threads, and on input that nobody wants.
+//! All methods on moving scenes, on different numbers of threads, and on degenerate input.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use qudi_burst::Average;
@@ -27,7 +27,7 @@ fn acquisition(sensor: Sensor, ppp: f64) -> Acquisition {
     Acquisition::new(sensor, ppp, 0.45).unwrap()
 }
 
-/// A window of a scene in motion, and its truth.
+/// Simulates a window of a moving scene. Returns it with its ground truth.
 fn exposed(size: Size, sensor: &Sensor, ppp: f64, frames: usize) -> (Vec<Vec<u16>>, Vec<Frame>) {
     let scene = Procedural { kind: ProceduralScene::Text, size, seed: 2, speed: 2.0 }.scene();
     let mut camera = Camera::new(sensor, size, Light { ppp, mean_level: 0.45 }, 5).unwrap();
@@ -57,7 +57,7 @@ fn every_method_beats_the_average_of_a_moving_scene() {
             let found = mean_psnr(&restored, &truth);
             let name = method.name();
             println!("{} {name}: {found:.2} dB, average {naive:.2} dB", acquisition.sensor.name);
-            // A sum of 11 is no better than the average where everything moves.
+            // A sum of 11 frames is no better than the average where everything moves.
             let margin = if name == "transform-denoise" { 0.0 } else { 0.5 };
             assert!(found > naive + margin, "{name}: {found} dB, average {naive} dB");
         }
@@ -67,7 +67,7 @@ fn every_method_beats_the_average_of_a_moving_scene() {
 #[test]
 fn second_pass_beats_the_first() {
     let size = Size { height: 96, width: 112 };
-    // Single binary frames of so little light show the second round no more than the first.
+    // Single binary frames at this light level gain nothing from the second pass.
     let cases = [("qudi-paper", 3.25, 0.1), ("qudi-paper", 26.0, 1.0), ("swissspad2", 0.5, -0.1)];
     for (name, ppp, margin) in cases {
         let sensor = Sensor::load(name).unwrap();
@@ -87,7 +87,8 @@ fn second_pass_beats_the_first() {
         println!("{name} at {ppp} PPP: {first:.2} dB, {second:.2} dB, merged {merged:.2} dB");
         assert!(second > first + margin, "{name}: {first} dB, then {second} dB");
         assert!(second > merged, "{name}: BM3D makes {second} dB of {merged} dB");
-        // Half of all normal errors are within 0.6745 deviations; ghosts, which no noise explains, are few.
+        // Half of all normal errors lie within 0.6745 standard deviations; few are ghosts, which noise cannot
+        // explain.
         let errors = aligned.iter().zip(&truth).flat_map(|(aligned, truth)| {
             let AlignedFrame { merged, noise_sigma, .. } = aligned;
             let pixels = merged.data.iter().zip(&noise_sigma.data).zip(&truth.data);
@@ -101,9 +102,9 @@ fn second_pass_beats_the_first() {
     }
 }
 
-/// Counts of a scene at rest, less what the reference estimate expects of them, are noise of sigma one, the frame's
-/// own as much as its neighbours'; what is expected of these hardly differs. Past the ends of the window
-/// there is nothing.
+/// Checks the standardized counts of a static scene: minus the reference estimate's prediction they are noise
+/// of sigma one, for the frame itself and for its neighbours. The predictions for neighbours hardly differ.
+/// Frames outside the window are zero.
 #[test]
 fn neighbours_are_standardized() {
     let size = Size { height: 48, width: 64 };
@@ -125,13 +126,13 @@ fn neighbours_are_standardized() {
     let own = deviation(&aligned.counts[0]);
     assert!((0.9..1.1).contains(&own), "{own}");
     for (seen, expected) in aligned.counts[1..7].iter().zip(&aligned.expected) {
-        // Between pixels some of the noise averages out.
+        // Interpolation between pixels averages out some of the noise.
         let (seen, expected) = (deviation(seen), deviation(expected));
         assert!((0.55..1.1).contains(&seen) && expected < 0.2, "{seen}, expected {expected}");
     }
     assert!(aligned.counts[7..].iter().chain(&aligned.expected[6..]).all(|f| deviation(f) == 0.0));
 
-    // The truth in place of the reference estimate shows it as well: what it expects is what the camera counts.
+    // The truth replaces the reference estimate: its prediction is what the camera counts.
     let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
     let aligned = AlignedBurst::new(reference, &acquisition).realign(vec![still.clone(); 7]).frame(
         2,
@@ -158,7 +159,7 @@ fn neighbours_are_standardized() {
     let mean = aligned.counts[0].mean();
     assert!(mean.abs() < 0.06, "{mean}");
     let differences = aligned.expected[..6].iter().map(deviation).fold(0.0, f64::max);
-    // On a smooth slope a path may be a little off.
+    // A path may be slightly off on a smooth slope.
     assert!(differences < 0.02, "{differences}");
 }
 
@@ -178,7 +179,7 @@ fn result_does_not_depend_on_threads() {
     assert_eq!(on(1), on(2));
 }
 
-/// One frame, tiny frames, none or all of the light: every pixel of every frame is a number.
+/// Checks that every pixel is a number for one frame, tiny frames, no light and full light.
 #[test]
 fn odd_values_give_valid_pictures() {
     for name in ["qudi-paper", "swissspad2", "qis4-gj"] {

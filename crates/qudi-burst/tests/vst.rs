@@ -1,5 +1,5 @@
-//! Variances and exact inverses of the transforms: against SciPy (`tests/golden/generate/baselines.py`) and
-//! against simulated counts.
+//! Variances and exact inverses of the transforms, compared with SciPy (`tests/golden/generate/baselines.py`)
+//! and with simulated counts.
 #![allow(clippy::unwrap_used)]
 
 use qudi_burst::{Transform, VarianceStabilizer};
@@ -25,7 +25,7 @@ fn binomial_transform_matches_scipy() {
         let (z, variance) = (value("mean"), value("variance"));
         assert!((stabilizer.invert(z) / detections - 1.0).abs() < 1e-3, "{figure}");
         assert!((stabilizer.sigma(z).powi(2) / variance - 1.0).abs() < 5e-3, "{figure}");
-        // The variance of sums of 77 is 1 everywhere, that of 7 only in the middle.
+        // The variance of sums of 77 is 1 everywhere; the variance of sums of 7 is 1 only in the middle.
         let (trials, p) = (value("trials"), value("p"));
         if trials > 70.0 || (p > 0.2 && p < 0.8) {
             assert!((variance - 1.0).abs() < 0.03, "{figure}");
@@ -49,15 +49,15 @@ fn generalized_transform_matches_scipy() {
         let (z, electrons) = (value("mean"), value("electrons"));
         assert!((exact.invert(z) / electrons - 1.0).abs() < 2e-3, "{figure}: {}", exact.invert(z));
         assert!((exact.sigma(z).powi(2) / value("variance") - 1.0).abs() < 0.01, "{figure}");
-        // The closed form is asymptotic, and knows no cut at zero counts.
+        // The closed form is asymptotic and ignores the clipping at zero counts.
         if electrons > 4.0 {
             assert!((closed.invert(z) / electrons - 1.0).abs() < 0.03, "{}", closed.invert(z));
         }
     }
 }
 
-/// Sums of simulated counts, transformed, averaged, and inverted give the light back, up to where
-/// counts are nearly all saturated.
+/// Checks that simulated counts, summed, transformed, averaged and inverted, return the light, up to nearly
+/// full saturation.
 #[test]
 fn inverses_are_unbiased_on_simulated_counts() {
     let size = Size { height: 128, width: 128 };
@@ -89,7 +89,7 @@ fn inverses_are_unbiased_on_simulated_counts() {
                     let variance =
                         z.iter().map(|z| (z - mean).powi(2)).sum::<f64>() / z.len() as f64;
                     let found = stabilizer.invert(mean);
-                    // Four standard errors of the mean through the inverse's slope.
+                    // Four standard errors of the mean, through the slope of the inverse.
                     let step = 4.0 * (variance / z.len() as f64).sqrt();
                     let slope = stabilizer.invert(mean + step) - found;
                     let case =
@@ -99,7 +99,7 @@ fn inverses_are_unbiased_on_simulated_counts() {
                         "{case}: {found}, truth {detections}"
                     );
                     let expected = stabilizer.sigma(mean).powi(2);
-                    // That of deep samples is the asymptotic one, too large for a few electrons.
+                    // The inverse of deep samples is asymptotic, and too large for a few electrons.
                     assert!(
                         (variance / expected - 1.0).abs() < 0.06 || name == "qis4-gj",
                         "{case}: {variance} {expected}"
@@ -110,14 +110,14 @@ fn inverses_are_unbiased_on_simulated_counts() {
     }
 }
 
-/// The integral keeps its variance where Anscombe's collapses: near saturation.
+/// Checks that the integral keeps unit variance near saturation, where Anscombe's transform does not.
 #[test]
 fn integral_transform_follows_counts_into_saturation() {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let gain = sensor.gain_at(3.25).unwrap();
     let of = |transform| VarianceStabilizer::new(transform, &sensor, gain, 1);
     let (anscombe, integral) = (of(Transform::Anscombe), of(Transform::Integral));
-    // Of a mean count of 6 of 7.
+    // Mean count of 6 out of 7.
     let deviation = |s: &VarianceStabilizer| s.sigma(s.transform(6.0));
     assert!(deviation(&anscombe) < 0.75, "{}", deviation(&anscombe));
     assert!((deviation(&integral) - 1.0).abs() < 0.2, "{}", deviation(&integral));

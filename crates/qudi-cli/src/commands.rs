@@ -105,7 +105,6 @@ pub(crate) mod train {
     pub(crate) mod args;
     mod data;
     mod environment;
-    mod events;
     mod pictures;
     mod plan;
     mod report;

@@ -1,4 +1,4 @@
-//! Nanoseconds per pixel of the camera, beside the floor of one random word per pixel.
+//! Nanoseconds per pixel of the camera, compared with drawing one random word per pixel, the lower bound.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use qudi_core::sensor::Sensor;

@@ -15,10 +15,11 @@ use crate::sensor::{
 };
 use rayon::prelude::*;
 
-/// Expected detections above this would overflow counters and make no sense.
+/// Upper bound of the expected detections per pixel and output frame; beyond it counters overflow.
 const MAX_DETECTIONS: f64 = 1e9;
 
-/// Counters with a dead time are simulated arrival by arrival; more would take minutes a frame.
+/// Upper bound of the expected arrivals for counters with a dead time, which are simulated arrival by
+/// arrival.
 const MAX_ARRIVALS: f64 = 1e5;
 
 /// Rows handed to a thread at a time.
@@ -46,7 +47,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A camera with frames of `size` under `light`.
+    /// Creates a camera with frames of `size` under `light`.
     ///
     /// # Errors
     /// [`Error`] for an impossible sensor, an unreadable dark map, or light beyond all bounds.
@@ -54,7 +55,7 @@ impl Camera {
         Self::with_maps(sensor, PixelMaps::draw(sensor, size)?, size, light, seed)
     }
 
-    /// A camera whose pixel pattern, `maps` of `sensor` for frames of `size`, is drawn already.
+    /// Creates a camera with the given pixel pattern (`maps`, drawn for `sensor` and frames of `size`).
     pub fn with_maps(
         sensor: &Sensor,
         maps: PixelMaps,
@@ -104,23 +105,23 @@ impl Camera {
         })
     }
 
-    /// Gain in DN/e-.
+    /// Returns the gain in DN/e-.
     pub fn gain(&self) -> f64 {
         self.gain
     }
 
-    /// The light.
+    /// Returns the light.
     pub fn light(&self) -> Light {
         self.light
     }
 
-    /// The camera's pixel pattern.
+    /// Returns the camera's pixel pattern.
     pub fn maps(&self) -> &PixelMaps {
         &self.maps
     }
 
-    /// Exposes output frame `index` to the instants of one exposure (one instant: nothing moves
-    /// during it). Returns `height * width` counts.
+    /// Exposes output frame `index` to the instants of one exposure and returns `height * width` counts. With
+    /// one instant, nothing moves during the exposure.
     ///
     /// # Errors
     /// [`Error::Request`] if an instant has another size or values that are no light.
@@ -161,7 +162,7 @@ impl Camera {
         Ok(counts)
     }
 
-    /// The pedestal of a linear sensor, dead pixels included.
+    /// Adds the pedestal of a linear sensor, also to dead pixels.
     fn add_pedestal(&self, counts: &mut [u16]) {
         if self.sensor.offset > 0.0 && self.sensor.response == Response::Linear {
             let offset = self.sensor.offset.round() as u16;
@@ -195,8 +196,8 @@ impl Camera {
         Ok(())
     }
 
-    /// Counts of a frame whose pixels are independent of each other and of the past.
-    /// `scale` turns image values into electrons; dark electrons count `dark_times` native frames.
+    /// Draws the counts of a frame whose pixels are independent of each other and of earlier frames.
+    /// `scale` converts image values into electrons; dark electrons of `dark_times` native frames are added.
     fn draw_rows(
         &self,
         table: Option<&CountTable>,
@@ -236,7 +237,7 @@ impl Camera {
         counts
     }
 
-    /// Linear sensor with cross-talk: electrons first, then the neighbours' share, then the readout.
+    /// Exposes a linear sensor with cross-talk: draws electrons, adds the neighbours' share, then reads out.
     fn expose_with_crosstalk(&self, index: u64, scene: &Frame) -> Vec<u16> {
         let width = self.size.width;
         let scale = self.electrons_per_value as f32;
@@ -266,7 +267,7 @@ impl Camera {
         counts
     }
 
-    /// Binary frames one by one, each with its own instant of the scene, and their sum.
+    /// Exposes binary frames one by one, each to its own instant of the scene, and returns their sum.
     fn expose_binary_frames(&mut self, index: u64, instants: &[&Frame]) -> Vec<u16> {
         let n = self.sensor.frames_summed as usize;
         let scale = (self.electrons_per_value / n as f64) as f32;
@@ -293,7 +294,7 @@ impl Camera {
         sum
     }
 
-    /// Adds afterpulses of the previous binary frame, then cross-talk of what fired by then.
+    /// Adds afterpulses of the previous binary frame, then cross-talk from all pixels that have fired.
     fn add_echoes(&mut self, number: u64, mut fired: Vec<u16>) -> Vec<u16> {
         let width = self.size.width;
         let (afterpulse, crosstalk) =
@@ -335,7 +336,7 @@ impl Camera {
         fired
     }
 
-    /// Indices of the up to 4 neighbours of a pixel.
+    /// Returns the indices of the up to 4 neighbours of a pixel.
     fn neighbours(&self, x: usize, y: usize) -> impl Iterator<Item = usize> {
         let Size { height, width } = self.size;
         let i = y * width + x;
@@ -350,7 +351,7 @@ impl Camera {
     }
 }
 
-/// Mean of frames of one size.
+/// Averages frames of one size.
 fn average(frames: &[&Frame]) -> Frame {
     let mut mean = frames[0].clone();
     for frame in &frames[1..] {

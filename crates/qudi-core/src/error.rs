@@ -1,4 +1,4 @@
-//! What can go wrong, in three parts: what happened, where, and what to do about it.
+//! Errors in three parts: what happened, where, and what to do about it.
 
 pub mod nearest;
 
@@ -30,7 +30,7 @@ pub enum Error {
         what: String,
         /// The file.
         path: PathBuf,
-        /// The way out.
+        /// What to do about it.
         help: String,
     },
     /// A sensor that cannot exist.
@@ -40,7 +40,7 @@ pub enum Error {
         what: String,
         /// The sensor's name or file.
         place: String,
-        /// The way out.
+        /// What to do about it.
         help: String,
     },
     /// A request that contradicts itself or the data.
@@ -50,7 +50,7 @@ pub enum Error {
         what: String,
         /// The option or the input it concerns.
         place: String,
-        /// The way out.
+        /// What to do about it.
         help: String,
     },
     /// The caller asked to stop.
@@ -59,22 +59,22 @@ pub enum Error {
 }
 
 impl Error {
-    /// An operating-system error with the action in words.
+    /// Wraps an error of the operating system with the action in words.
     pub fn io(action: impl Into<String>, path: &Path, source: io::Error) -> Self {
         Self::Io { action: action.into(), path: path.to_owned(), source }
     }
 
-    /// A malformed or unsuitable file.
+    /// Creates the error for a malformed or unsuitable file.
     pub fn data(what: impl Into<String>, path: &Path, help: impl Into<String>) -> Self {
         Self::Data { what: what.into(), path: path.to_owned(), help: help.into() }
     }
 
-    /// A request that cannot be met.
+    /// Creates the error for a request that cannot be met.
     pub fn request(what: impl Into<String>, place: impl Display, help: impl Into<String>) -> Self {
         Self::Request { what: what.into(), place: place.to_string(), help: help.into() }
     }
 
-    /// The file, sensor or option that the error concerns.
+    /// Returns the file, sensor or option that the error concerns.
     pub fn place(&self) -> Option<String> {
         match self {
             Self::Io { path, .. } | Self::Data { path, .. } => Some(path.display().to_string()),
@@ -83,7 +83,7 @@ impl Error {
         }
     }
 
-    /// The way out.
+    /// Returns what to do about it.
     pub fn help(&self) -> Option<String> {
         match self {
             Self::Io { source, .. } => Some(io_help(source.kind()).to_owned()),

@@ -1,4 +1,5 @@
-//! Files of any kind: written whole or not at all, read within limits, NumPy arrays, names in natural order, ffmpeg.
+//! Files of any kind: written whole or not at all, read within limits, NumPy arrays, names in natural order,
+//! ffmpeg.
 
 pub mod atomic_file;
 mod ffmpeg;

@@ -2,7 +2,7 @@
 
 use crate::frame::Size;
 
-/// Where the surface seen at each pixel goes, in pixels.
+/// Displacement of the surface seen at each pixel, in pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Flow {
     /// Rows and columns.

@@ -13,7 +13,7 @@ pub struct Size {
 }
 
 impl Size {
-    /// A size whose pixel count is positive and below 2^29.
+    /// Creates a size, checking that its pixel count is positive and below 2^29.
     ///
     /// # Errors
     /// [`Error::Request`] naming `place` otherwise.
@@ -28,7 +28,7 @@ impl Size {
         }
     }
 
-    /// Number of pixels.
+    /// Returns the number of pixels.
     pub fn pixels(self) -> usize {
         self.height * self.width
     }
@@ -62,7 +62,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The frame with white, 1, at its 99.5th percentile; what is brighter is clipped.
+    /// Scales the frame so that its 99.5th percentile becomes white, 1; brighter pixels are clipped.
     #[must_use]
     pub fn with_white_at_highlights(mut self) -> Self {
         let mut sorted = self.data.clone();
@@ -75,12 +75,12 @@ impl Frame {
         self
     }
 
-    /// A frame of one value.
+    /// Creates a frame of one value.
     pub fn filled(size: Size, value: f32) -> Self {
         Self { size, data: vec![value; size.pixels()] }
     }
 
-    /// A frame computed from pixel positions `(x, y)`.
+    /// Creates a frame from a function of the pixel position `(x, y)`.
     pub fn from_fn(size: Size, mut f: impl FnMut(usize, usize) -> f32) -> Self {
         let mut data = Vec::with_capacity(size.pixels());
         for y in 0..size.height {
@@ -89,18 +89,18 @@ impl Frame {
         Self { size, data }
     }
 
-    /// Row `y`.
+    /// Returns row `y`.
     #[inline]
     pub fn row(&self, y: usize) -> &[f32] {
         &self.data[y * self.size.width..(y + 1) * self.size.width]
     }
 
-    /// Mean of all samples, in f64.
+    /// Returns the mean of all samples, in f64.
     pub fn mean(&self) -> f64 {
         self.data.iter().map(|&v| f64::from(v)).sum::<f64>() / self.data.len() as f64
     }
 
-    /// Bilinear sample at pixel coordinates; outside, the border's value.
+    /// Interpolates bilinearly at pixel coordinates; outside, the border is repeated.
     pub fn bilinear(&self, x: f64, y: f64) -> f32 {
         let (w, h) = (self.size.width, self.size.height);
         let x = x.clamp(0.0, (w - 1) as f64);

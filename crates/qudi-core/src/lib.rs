@@ -1,5 +1,4 @@
-//! The photon and the image: frames, sensors, light, cameras, metrics, and what every method of restoration
-//! gets.
+//! The basic types: frames, sensors, light, cameras, metrics, and the interface of restoration methods.
 //!
 //! A [`Camera`], which is a [`sensor::Sensor`] under a certain [`Light`], turns [`Frame`]s in [0, 1] into
 //! photon counts. A [`restorer::Restorer`] turns counts into frames, and [`metrics`] compare them with the

@@ -1,4 +1,4 @@
-//! How much light there is: photons per pixel (PPP) in its three meanings, and lux.
+//! Amounts of light: photons per pixel (PPP) in its three meanings, and lux.
 
 pub(crate) mod mean_level;
 
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// The mean value of usual scenes, assumed where the true one is unknown.
 pub const USUAL_MEAN_LEVEL: f64 = 0.45;
 
-/// What a number of "photons per pixel" counts.
+/// Meaning of a number of "photons per pixel".
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PppDefinition {
@@ -43,7 +43,7 @@ impl Checksum {
         self.0.update(&bytes);
     }
 
-    /// The sum so far.
+    /// Returns the checksum of all values so far.
     pub fn crc32(&self) -> u32 {
         self.0.clone().finalize()
     }
@@ -76,18 +76,18 @@ impl ClipStatistics {
         self.checksum.add(values);
     }
 
-    /// CRC-32 of all values so far.
+    /// Returns the CRC-32 of all values so far.
     pub fn crc32(&self) -> u32 {
         self.checksum.crc32()
     }
 
-    /// Mean value of the clip; 0 for none.
+    /// Returns the mean value of the clip; 0 if it is empty.
     pub fn mean(&self) -> f64 {
         let (count, sum) = self.bins.iter().fold((0, 0.0), |(n, s), b| (n + b.0, s + b.1));
         if count == 0 { 0.0 } else { sum / count as f64 }
     }
 
-    /// Mean of `f(value)` over the clip; exact for 8-bit sources, else to the width of a bin.
+    /// Returns the mean of `f(value)` over the clip; exact for 8-bit sources, else to the width of a bin.
     fn mean_of(&self, f: impl Fn(f64) -> f64) -> f64 {
         let filled = self.bins.iter().filter(|b| b.0 > 0);
         let (count, sum) = filled.fold((0, 0.0), |(n, s), &(count, sum)| {
@@ -97,7 +97,7 @@ impl ClipStatistics {
     }
 }
 
-/// The light that makes `value` in the sense of `definition`, for a clip of these statistics.
+/// Finds the light that makes `value` in the sense of `definition`, for a clip of these statistics.
 /// `dark` is the array's mean dark electrons per output frame.
 ///
 /// # Errors
@@ -202,7 +202,7 @@ pub enum Spectrum {
 }
 
 impl Spectrum {
-    /// Photons per lux, second and square micrometre.
+    /// Returns the photons per lux, second and square micrometre.
     ///
     /// `lambda / (683.002 lm/W * V * h * c)`: 4091 at 555 nm. For daylight the measured range is
     /// 11,000 to 11,850; 11,400 is used.
@@ -218,7 +218,7 @@ impl Spectrum {
         }
     }
 
-    /// Light of one wavelength, V from the Gaussian fit to the CIE 1924 photopic curve
+    /// Creates light of one wavelength, with V from the Gaussian fit to the CIE 1924 photopic curve
     /// `1.019 exp(-285.4 (um - 0.559)^2)`; good to a few per cent of the peak.
     pub fn wavelength(nm: f64) -> Self {
         if (nm - 555.0).abs() < 1e-9 {
@@ -229,12 +229,12 @@ impl Spectrum {
     }
 }
 
-/// Photons per pixel and exposure at an illuminance on the sensor plane.
+/// Returns the photons per pixel and exposure at an illuminance on the sensor plane.
 pub fn ppp_from_lux(lux: f64, exposure_s: f64, pitch_um: f64, spectrum: Spectrum) -> f64 {
     lux * exposure_s * pitch_um * pitch_um * spectrum.photons_per_lux_second_um2()
 }
 
-/// Illuminance on the sensor plane from that of a diffuse scene through a lens:
+/// Converts the illuminance of a diffuse scene into the illuminance on the sensor plane behind a lens:
 /// `E = E_scene * R * T / (4 N^2 (1 + m)^2)`.
 pub fn sensor_lux(
     scene_lux: f64,

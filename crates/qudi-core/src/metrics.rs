@@ -1,4 +1,4 @@
-//! How close an estimate is to the truth.
+//! Metrics of an estimate against the truth.
 
 mod calibration;
 mod chi_square;

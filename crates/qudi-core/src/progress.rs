@@ -1,49 +1,49 @@
-//! What a method is doing while it restores a window, for those who wait for it.
+//! Progress of a method within a window.
 //!
-//! Methods tell how far they have come; whoever called them on this thread hears it and may stop them.
+//! Methods report their progress to the observer of their thread, which may stop them.
 
 use crate::{Error, Result};
 use std::cell::RefCell;
 use std::ops::ControlFlow;
 use std::rc::Rc;
 
-/// How far a part of the work on a window has come.
+/// Progress of one stage of the work on a window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Progress {
-    /// What is done now.
+    /// Name of the stage.
     pub stage: &'static str,
-    /// Frames or steps of it that are done.
+    /// Frames or steps that are done.
     pub done: usize,
-    /// All of them.
+    /// Frames or steps in all.
     pub total: usize,
 }
 
-/// Hears of progress and says whether to go on.
+/// Function that receives progress and decides whether to continue.
 pub type Observer = Rc<dyn Fn(Progress) -> ControlFlow<()>>;
 
 thread_local! {
     static OBSERVER: RefCell<Option<Observer>> = const { RefCell::new(None) };
 }
 
-/// Puts the observer before back, also after a panic.
-struct Before(Option<Observer>);
+/// Guard that restores the previous observer, also after a panic.
+struct Previous(Option<Observer>);
 
-impl Drop for Before {
+impl Drop for Previous {
     fn drop(&mut self) {
         OBSERVER.set(self.0.take());
     }
 }
 
-/// Runs `run`; `observer` hears of the progress of methods that run on this thread.
+/// Runs `run`; `observer` receives the progress of methods that run on this thread.
 pub fn observed<T>(observer: Observer, run: impl FnOnce() -> T) -> T {
-    let _before = Before(OBSERVER.replace(Some(observer)));
+    let _previous = Previous(OBSERVER.replace(Some(observer)));
     run()
 }
 
-/// Tells that `done` of `total` frames or steps of a stage are done.
+/// Reports that `done` of `total` frames or steps of a stage are done.
 ///
 /// # Errors
-/// [`Error::Interrupted`] if whoever hears it wants the method to stop.
+/// [`Error::Interrupted`] if the observer stops the method.
 pub fn progress(stage: &'static str, done: usize, total: usize) -> Result<()> {
     let observer = OBSERVER.with_borrow(Clone::clone);
     match observer.map(|observer| observer(Progress { stage, done, total })) {

@@ -3,7 +3,7 @@
 use rand::rngs::ChaCha8Rng;
 use rand::{Rng, SeedableRng};
 
-/// What a stream is for; streams of different purposes never meet.
+/// Purpose of a stream; streams of different purposes are independent.
 #[derive(Clone, Copy, Debug)]
 pub enum Domain {
     /// Detections and read noise.
@@ -14,7 +14,7 @@ pub enum Domain {
     Pattern = 2,
     /// The layout of a procedural scene.
     Scene = 3,
-    /// What training draws.
+    /// Random draws of training.
     Training = 4,
 }
 
@@ -29,12 +29,12 @@ pub struct Streams {
 }
 
 impl Streams {
-    /// The streams of `seed`.
+    /// Creates the streams of `seed`.
     pub fn new(seed: u64) -> Self {
         Self { key: ChaCha8Rng::seed_from_u64(seed).get_seed() }
     }
 
-    /// The stream of row `y` of frame `frame`.
+    /// Returns the stream of row `y` of frame `frame`.
     pub fn row(&self, domain: Domain, frame: u64, y: usize) -> ChaCha8Rng {
         let mut rng = ChaCha8Rng::from_seed(self.key);
         let frame = frame & ((1 << FRAME_BITS) - 1);
@@ -43,7 +43,7 @@ impl Streams {
     }
 }
 
-/// Uniform in [0, 1) with 53 bits.
+/// Draws a uniform number in [0, 1) with 53 bits.
 pub fn uniform(rng: &mut impl Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
 }

@@ -43,14 +43,14 @@ pub struct Restored {
 
 /// A method: turns all frames of a window into images at once.
 pub trait Restorer {
-    /// The name in tables and on the command line.
+    /// Returns the name in tables and on the command line.
     fn name(&self) -> &'static str;
 
-    /// The number of frames that it restores together; shorter captures come as one shorter window.
+    /// Returns the number of frames that are restored together; shorter captures are one shorter window.
     fn window(&self) -> usize;
 
-    /// The frames at the beginning and at the end of a window that only help to restore those between, unless the
-    /// capture begins or ends there.
+    /// Returns the numbers of frames at the beginning and at the end of a window that are used but not
+    /// restored, unless the capture begins or ends there.
     fn context(&self) -> [usize; 2] {
         [0, 0]
     }
@@ -93,9 +93,8 @@ impl Restored {
 }
 
 impl Acquisition {
-    /// The acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons per
-    /// pixel and frame, where the image has the mean level `mean_level`; seed 0, from the first frame on, no
-    /// dark map.
+    /// Creates the acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons
+    /// per pixel and frame and an image of mean level `mean_level`; seed 0, first frame 0, no dark map.
     ///
     /// # Errors
     /// [`Error`](crate::Error) if the sensor has no gain at this light.
@@ -104,24 +103,24 @@ impl Acquisition {
         Ok(Self { seed: 0, first_frame: 0, ppp, mean_level, sensor, gain, dark: None })
     }
 
-    /// The same acquisition with another seed of random draws.
+    /// Sets the seed of random draws.
     #[must_use]
     pub fn with_seed(self, seed: u64) -> Self {
         Self { seed, ..self }
     }
 
-    /// The same acquisition for a window that begins with frame `first_frame` of the capture.
+    /// Sets the number of the window's first frame in the capture.
     #[must_use]
     pub fn with_first_frame(self, first_frame: u64) -> Self {
         Self { first_frame, ..self }
     }
 
-    /// Incident photons per unit of image value.
+    /// Returns the incident photons per unit of image value.
     pub fn photons_per_unit(&self) -> f64 {
         self.ppp / self.mean_level
     }
 
-    /// Dark electrons per frame of pixel `i`; `typical` where no map is known.
+    /// Returns the dark electrons per frame of pixel `i`; `typical` where no map is known.
     pub fn dark_of(&self, i: usize, typical: f64) -> f64 {
         self.dark.as_ref().map_or(typical, |map| f64::from(map[i]))
     }

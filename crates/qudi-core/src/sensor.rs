@@ -1,4 +1,4 @@
-//! The sensor: its parameters with units, and what it does to light.
+//! The sensor: its parameters with units, and its response to light.
 //!
 //! Linear sensors (quanta image sensors, photon counters, CMOS):
 //! `e = min(Poisson(QE * theta + dark), full_well)`, `v = e + Normal(0, read_noise)`,
@@ -29,7 +29,7 @@ pub use units::{DarkRate, FullWell, Gain};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// How a pixel answers to light.
+/// Response of a pixel to light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Response {
@@ -48,7 +48,7 @@ pub struct Sensor {
     /// One line about the sensor.
     #[serde(default)]
     pub summary: String,
-    /// How a pixel answers to light.
+    /// Response of a pixel to light.
     pub response: Response,
     /// Bits per output sample of one native frame; 1 for binary sensors.
     pub bits: u8,
@@ -87,13 +87,14 @@ pub struct Sensor {
     /// Binary frames summed into one output frame.
     #[serde(default = "one")]
     pub frames_summed: u32,
-    /// Time from the first row to the last, as a share of a native frame: 0 for a global shutter. Simulated only.
+    /// Time from the first row to the last, as a share of a native frame: 0 for a global shutter. Simulated
+    /// only.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub rolling_shutter: f64,
     /// Imperfect pixels; all off by default.
     #[serde(default)]
     pub defects: Defects,
-    /// Where the numbers come from.
+    /// Sources of the numbers.
     #[serde(default)]
     pub sources: Vec<String>,
     /// Keys whose numbers no source confirms.
@@ -111,7 +112,7 @@ fn is_zero(value: &f64) -> bool {
 }
 
 impl Sensor {
-    /// Largest output value: `2^bits - 1`, or the number of summed binary frames.
+    /// Returns the largest output value: `2^bits - 1`, or the number of summed binary frames.
     pub fn max_count(&self) -> u16 {
         match self.response {
             Response::Linear => ((1u32 << self.bits) - 1) as u16,
@@ -119,12 +120,12 @@ impl Sensor {
         }
     }
 
-    /// Bits that an output sample needs.
+    /// Returns the number of bits that an output sample needs.
     pub fn output_bits(&self) -> u8 {
         (16 - self.max_count().leading_zeros()) as u8
     }
 
-    /// Dark electrons of an ordinary pixel per *output* frame (the median, where pixels differ).
+    /// Returns the dark electrons of an ordinary pixel per *output* frame (the median, where pixels differ).
     ///
     /// # Errors
     /// [`Error::Sensor`] if the rate is per second and the frame rate is unknown.
@@ -132,7 +133,7 @@ impl Sensor {
         Ok(self.per_native_frame(self.dark, "dark")? * f64::from(self.frames_summed))
     }
 
-    /// A dark rate in electrons per native frame.
+    /// Converts a dark rate into electrons per native frame.
     pub(crate) fn per_native_frame(&self, rate: DarkRate, key: &str) -> Result<f64> {
         match (rate, self.fps) {
             (DarkRate::PerFrame(electrons), _) => Ok(electrons),
@@ -144,7 +145,7 @@ impl Sensor {
         }
     }
 
-    /// Gain in DN/e- at `ppp` incident photons per pixel and output frame.
+    /// Returns the gain in DN/e- at `ppp` incident photons per pixel and output frame.
     ///
     /// # Errors
     /// [`Error::Sensor`] if the rule has no finite answer at this light.
@@ -171,7 +172,7 @@ impl Sensor {
         ))
     }
 
-    /// Gain in DN/e-, unless its rule follows the light.
+    /// Returns the gain in DN/e-, or `None` if it depends on the light.
     pub fn fixed_gain(&self) -> Option<f64> {
         match self.gain {
             Gain::Fixed(_) | Gain::Unit | Gain::Fwc => self.gain_at(1.0).ok(),
@@ -179,7 +180,7 @@ impl Sensor {
         }
     }
 
-    /// Linear estimate of the incident photons per pixel and output frame from counts: the sum of
+    /// Estimates the incident photons per pixel and output frame linearly from counts: the sum of
     /// `frames` output frames of one pixel, dark counts subtracted, never negative. A saturated
     /// binary pixel is taken as one detection short of saturation (Ma et al. 2020, eq. 4).
     pub fn estimate_flux(&self, sum: f64, frames: u32, gain: f64, dark_per_frame: f64) -> f64 {

@@ -1,8 +1,8 @@
-//! What the numbers of an image file mean: display values or linear light.
+//! Meaning of the numbers of an image file: display values or linear light.
 
 use serde::{Deserialize, Serialize};
 
-/// How file values become the scene's radiance.
+/// Conversion of file values into the scene's radiance.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Transfer {
@@ -14,7 +14,7 @@ pub enum Transfer {
 }
 
 impl Transfer {
-    /// The value as radiance in [0, 1].
+    /// Converts a file value into radiance in [0, 1].
     pub fn decode(self, value: f32) -> f32 {
         match self {
             Self::AsIs => value,
@@ -22,7 +22,7 @@ impl Transfer {
         }
     }
 
-    /// Gray from R, G, B in [0, 1]: BT.601 luma of the values as they are, or the luminance of
+    /// Computes gray from R, G, B in [0, 1]: BT.601 luma of the values as they are, or the luminance of
     /// BT.709 primaries in linear light.
     pub fn gray(self, [r, g, b]: [f32; 3]) -> f32 {
         match self {
@@ -34,12 +34,12 @@ impl Transfer {
     }
 }
 
-/// IEC 61966-2-1 decoding.
+/// Decodes sRGB (IEC 61966-2-1).
 pub fn srgb_to_linear(v: f32) -> f32 {
     if v <= 0.040_45 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
 }
 
-/// IEC 61966-2-1 encoding.
+/// Encodes sRGB (IEC 61966-2-1).
 pub fn linear_to_srgb(v: f32) -> f32 {
     if v <= 0.003_130_8 { v * 12.92 } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 }
 }

@@ -1,4 +1,4 @@
-//! A long capture as overlapping windows, and their results as one clip.
+//! Division of a long capture into overlapping windows, and blending of their results into one clip.
 
 use crate::error::{Error, Result};
 use crate::frame::Frame;
@@ -6,7 +6,7 @@ use crate::restorer::Restorer;
 use std::collections::VecDeque;
 use std::ops::Range;
 
-/// Most frames on either side: a window of 11.
+/// Largest number of frames on either side: a window of 11.
 pub const LONGEST_HALF: usize = 5;
 
 /// Windows of equal length over a number of frames; the last one is moved to end with the capture.
@@ -20,7 +20,7 @@ pub struct Windows {
 }
 
 impl Windows {
-    /// Windows of `length` frames, each sharing `overlap` with the one before.
+    /// Creates windows of `length` frames, each sharing `overlap` with the one before.
     ///
     /// # Errors
     /// [`Error::Request`] if the overlap is no shorter than the window.
@@ -35,8 +35,8 @@ impl Windows {
         Ok(Self { frames, length, stride: length - overlap, context: [0, 0] })
     }
 
-    /// The windows in which `restorer` restores a capture of `frames` frames: of those that a window restores, each
-    /// shares `overlap` with the one before.
+    /// Creates the windows in which `restorer` restores a capture of `frames` frames. Each shares `overlap`
+    /// of its restored frames with the one before.
     ///
     /// # Errors
     /// [`Error::Request`] if the overlap is no shorter than what a window restores.
@@ -48,24 +48,24 @@ impl Windows {
         Ok(Self { frames, length, stride, context })
     }
 
-    /// The same windows over another number of frames.
+    /// Returns the same windows over another number of frames.
     #[must_use]
     pub fn over(self, frames: u64) -> Self {
         Self { frames, ..self }
     }
 
-    /// Number of windows.
+    /// Returns the number of windows.
     pub fn count(&self) -> u64 {
         (self.frames - self.held()).div_ceil(self.stride) + 1
     }
 
-    /// Frames of window `number`.
+    /// Returns the frames of window `number`.
     pub fn range(&self, number: u64) -> Range<u64> {
         let start = (number * self.stride).min(self.frames - self.held());
         start..start + self.held()
     }
 
-    /// Frames that window `number` restores: all but its context, which its neighbours restore.
+    /// Returns the frames that window `number` restores: all but its context, which its neighbours restore.
     pub fn restored(&self, number: u64) -> Range<u64> {
         let Range { start, end } = self.range(number);
         let first = if number == 0 { start } else { start + self.context[0] };
@@ -73,18 +73,18 @@ impl Windows {
         first..if last { end } else { end - self.context[1] }
     }
 
-    /// One past the last frame of window `number`, if there are that many.
+    /// Returns the end (exclusive) of window `number`, had the capture that many frames.
     pub fn nominal_end(&self, number: u64) -> u64 {
         number.saturating_mul(self.stride).saturating_add(self.length)
     }
 
-    /// Frames of every window.
+    /// Returns the number of frames of every window.
     fn held(&self) -> u64 {
         self.length.min(self.frames)
     }
 
-    /// The weight of window `number` at `frame`, which it and the window before restore: over an overlap of `n`
-    /// frames it grows linearly from `1 / (n + 1)` to `n / (n + 1)`.
+    /// Returns the weight of window `number` at `frame`, which the window before restores, too: over an
+    /// overlap of `n` frames it grows linearly from `1 / (n + 1)` to `n / (n + 1)`.
     pub fn weight(&self, number: u64, frame: u64) -> f32 {
         let range = self.restored(number);
         let before = self.restored(number.saturating_sub(1));
@@ -92,13 +92,13 @@ impl Windows {
         (frame - range.start + 1) as f32 / (shared + 1) as f32
     }
 
-    /// The first window that restores `frame`.
+    /// Returns the number of the first window that restores `frame`.
     pub fn first_with(&self, frame: u64) -> u64 {
         (0..self.count()).find(|&n| self.restored(n).end > frame).unwrap_or(0)
     }
 }
 
-/// Blends the pictures of overlapping windows.
+/// Blending of the frames of overlapping windows.
 #[derive(Debug, Default)]
 pub struct CrossFade {
     /// Number of the first waiting frame.
@@ -107,8 +107,8 @@ pub struct CrossFade {
 }
 
 impl CrossFade {
-    /// Takes the pictures of a window, from number `start` on. `weight` says how much of it goes into a picture
-    /// that the window before has made, too.
+    /// Adds the frames of a window, from number `start` on. `weight` is the share of a frame in the blend
+    /// with the same frame of the window before.
     pub fn push(&mut self, start: u64, frames: Vec<Frame>, weight: impl Fn(u64) -> f32) {
         if self.waiting.is_empty() {
             self.first = start;
@@ -127,7 +127,8 @@ impl CrossFade {
         self.waiting.extend(frames);
     }
 
-    /// The next picture before `until`, the first of the next window, with its number.
+    /// Returns the next finished frame with its number, if it comes before `until`, where the next window
+    /// begins.
     pub fn pop(&mut self, until: u64) -> Option<(u64, Frame)> {
         if self.first >= until {
             return None;
@@ -165,7 +166,7 @@ mod tests {
         assert!(Windows::new(20, 3, 3).is_err());
     }
 
-    /// Restores what it is given, if it sees some frames around.
+    /// Restorer that returns its input and needs some frames of context.
     struct Sees([usize; 2]);
 
     impl Restorer for Sees {

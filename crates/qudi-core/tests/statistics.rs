@@ -17,7 +17,7 @@ fn expose_flat(sensor: &Sensor, detections: f64, frames: u64) -> Vec<Vec<u16>> {
     (0..frames).map(|t| camera.expose(t, &[&scene]).unwrap()).collect()
 }
 
-/// How many standard deviations a chi-square statistic lies from its mean (Wilson, Hilferty
+/// Returns how many standard deviations a chi-square statistic lies from its mean (Wilson, Hilferty
 /// 1931), with cells below 10 expected counts pooled.
 fn chi_square_z(observed: &[u64], probabilities: &[f64]) -> f64 {
     let n = observed.iter().sum::<u64>() as f64;

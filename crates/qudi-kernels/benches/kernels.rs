@@ -1,4 +1,5 @@
-//! Our operations on flex beside Burn's own on flex, at the sizes of `small` on 11 frames of 256 x 256.
+//! Benchmarks of these operations against Burn's own, both on flex, at the sizes of the recipe `small` on 11
+//! frames of 256 x 256 pixels.
 //!
 //!     cargo bench -p qudi-kernels
 #![allow(missing_docs)]
@@ -18,7 +19,7 @@ fn tensor<const D: usize>(shape: [usize; D], device: &Device) -> Tensor<D> {
     Tensor::<D>::ones(shape, device) * 0.3
 }
 
-/// Runs `ours` and `burns` forward; then both with their gradients, of the sum of the result.
+/// Benchmarks `ours` and `burns`: forward, then with the gradients of the result's sum.
 fn pair<const D: usize>(
     c: &mut Criterion,
     name: &str,

@@ -1,4 +1,4 @@
-//! Self-attention over the cells of a frame, one head.
+//! Single-head self-attention over the cells of a frame.
 
 #[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
@@ -11,7 +11,7 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::softmax;
 use extension::AttentionBackend;
 
-/// `softmax(q k^T / sqrt(C)) v` for every image, over its cells.
+/// Computes `softmax(q k^T / sqrt(C)) v` over the cells of each image.
 ///
 /// # Shapes
 /// `qkv`: `[images, 3 C, height, width]`, queries, keys and values joined by channel; result `[images, C,

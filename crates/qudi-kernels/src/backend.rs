@@ -1,10 +1,10 @@
-//! Which tensors our own operations can take.
+//! Selection of tensors that the operations of this crate support.
 
 use burn::tensor::{Device, Tensor};
 use std::cell::Cell;
 use std::thread::LocalKey;
 
-/// Whether tensors of this device are computed by the flex backend.
+/// Returns true if the flex backend computes tensors of this device.
 pub fn is_flex(device: &Device) -> bool {
     #[cfg(feature = "flex")]
     {
@@ -21,7 +21,7 @@ pub fn is_flex(device: &Device) -> bool {
     }
 }
 
-/// Whether tensors of this device are computed by a graphics card.
+/// Returns true if a graphics card computes this tensor with the operations of this crate.
 pub(crate) fn is_cube<const D: usize>(tensor: &Tensor<D>) -> bool {
     #[cfg(feature = "cube")]
     {
@@ -40,11 +40,11 @@ pub(crate) fn is_cube<const D: usize>(tensor: &Tensor<D>) -> bool {
 }
 
 thread_local! {
-    /// Whether this thread goes without our own operations.
+    /// True if this thread uses Burn's stock operations only.
     static STOCK: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Sets a thread's variable until it is dropped, also by a panic.
+/// Guard that sets a thread-local variable until it is dropped, also during a panic.
 pub(crate) struct Switch<T: Copy + 'static> {
     variable: &'static LocalKey<Cell<T>>,
     before: T,
@@ -62,13 +62,14 @@ impl<T: Copy> Drop for Switch<T> {
     }
 }
 
-/// Runs `run` with Burn's stock operations in place of our own on this thread: what ours are checked against.
+/// Runs `run` on this thread with Burn's stock operations in place of the operations of this crate. Tests
+/// compare the two.
 pub fn with_stock_operations<T>(run: impl FnOnce() -> T) -> T {
     let _switch = Switch::turn(&STOCK, true);
     run()
 }
 
-/// Whether our own operations take this tensor: they are written for f32 on flex.
+/// Returns true if the operations of this crate support this tensor: f32 on flex.
 pub(crate) fn is_native<const D: usize>(tensor: &Tensor<D>) -> bool {
     tensor.dtype() == burn::tensor::DType::F32 && is_flex(&tensor.device()) && !STOCK.get()
 }

@@ -1,12 +1,12 @@
 //! Convolutions over frames, in two and three dimensions, with their gradients.
 //!
-//! Frames are folded into the batch, `[bursts * frames, channels, height, width]`; a kernel that spans
-//! several frames reads the neighbours from there. On the flex backend the work is done here, directly
-//! on the planes: a tile of all input planes is copied to scratch memory with its borders, and blocks of
-//! output channels and pixels run over all taps in registers. Against unfolding into a matrix (im2col) this
-//! copies each value once instead of once a tap, which matters with few channels. With bfloat16 the copy is
-//! rounded, and blocks run on the processor's matrix units. Graphics cards use Burn's
-//! convolutions, and products of matrices for the gradient of the weights; other backends use Burn's alone.
+//! Frames are folded into the batch, `[bursts * frames, channels, height, width]`. A kernel that spans
+//! several frames reads its neighbours there. The flex backend convolves the planes directly: it copies a
+//! tile of all input planes with its borders to scratch memory, and blocks of output channels and pixels run
+//! over all taps in registers. Unfolding into a matrix (im2col) copies each value once per tap; this copies
+//! it once, which matters with few channels. With bfloat16 the copy is rounded, and blocks run on the
+//! processor's matrix units. Graphics cards use Burn's convolutions, and matrix products for the gradient of
+//! the weights. Other backends use Burn's operations alone.
 
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 mod amx;
@@ -48,23 +48,23 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
 use burn::tensor::module::{conv2d, conv3d};
 use burn::tensor::ops::ConvOptions;
-use extension::{ConvBackend, INPUTS};
+use extension::{ConvBackend, MAX_INPUTS};
 
-/// What one call does besides the sum over the taps.
+/// Options of one convolution.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Step of the output's grid in rows and columns: 1 or 2.
+    /// Stride of the output in rows and columns: 1 or 2.
     pub stride: usize,
-    /// Added to the result, of its shape.
+    /// Tensor added to the result, of its shape.
     pub addend: Option<Tensor<4>>,
-    /// What follows.
+    /// Activation applied to the result.
     pub activation: Activation,
 }
 
-/// What follows the sum.
+/// Activation applied after the sum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
-    /// Nothing.
+    /// No activation.
     None,
     /// Negative values become zero.
     Relu,
@@ -76,7 +76,7 @@ impl Default for Options {
     }
 }
 
-/// Convolves `inputs`, joined by channel, frame by frame.
+/// Convolves each frame of `inputs`, joined by channel.
 ///
 /// # Shapes
 /// `inputs`: `[images, channels, height, width]` each; `weight`: `[outputs, channels, rows,
@@ -103,7 +103,7 @@ pub fn conv_2d(
     finish(conv2d(joined(inputs), weight, Some(bias), stock), options)
 }
 
-/// Convolves `inputs`, joined by channel, over the frames of every burst.
+/// Convolves `inputs`, joined by channel, over the frames of each burst.
 ///
 /// # Shapes
 /// `inputs`: `[bursts * frames, channels, height, width]` each; `weight`: `[outputs, channels, frames, rows,
@@ -136,7 +136,7 @@ pub fn conv_3d(
     finish(output.swap_dims(1, 2).reshape([images, outputs, height, width]), options)
 }
 
-/// A convolution whose products have fewer bits; what follows them has all.
+/// Computes a convolution in the thread's reduced precision. Addend and activation have full precision.
 fn reduced<const D: usize>(
     numbers: Reduced,
     inputs: &[Tensor<4>],
@@ -167,7 +167,7 @@ fn finish(mut output: Tensor<4>, options: Options) -> Tensor<4> {
     }
 }
 
-/// The convolution as one operation of the backend, ours.
+/// Calls the backend extension of this crate.
 fn extended(
     inputs: &[Tensor<4>],
     weight: Tensor<5>,
@@ -175,7 +175,7 @@ fn extended(
     frames: usize,
     options: Options,
 ) -> Tensor<4> {
-    if inputs.len() > INPUTS {
+    if inputs.len() > MAX_INPUTS {
         return extended(&[joined(inputs)], weight, bias, frames, options);
     }
     let [images, _, height, width] = inputs[0].dims();
@@ -196,7 +196,7 @@ fn extended(
     geometry.check(inputs, &weight, &bias, options.addend.as_ref());
     let unused = Tensor::<1>::zeros([1], &bias.device()).into_dispatch();
     let mut list = inputs.iter().map(|input| input.clone().into_dispatch());
-    let [a, b, c, d, e]: [_; INPUTS] =
+    let [a, b, c, d, e]: [_; MAX_INPUTS] =
         std::array::from_fn(|_| list.next().unwrap_or_else(|| unused.clone()));
     let addend = options.addend.map_or(unused, Tensor::into_dispatch);
     let (weight, bias) = (weight.into_dispatch(), bias.into_dispatch());
@@ -204,8 +204,8 @@ fn extended(
 }
 
 impl Geometry {
-    /// The loops of `native` rely on these; a wrong shape is a broken invariant of the caller, as in
-    /// Burn's own operations.
+    /// Checks the shapes, on which the unchecked loops of `native` rely. A wrong shape is a broken invariant
+    /// of the caller, as in Burn's own operations.
     fn check(
         &self,
         inputs: &[Tensor<4>],

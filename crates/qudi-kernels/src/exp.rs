@@ -1,15 +1,15 @@
-//! The exponential in operations that have vector forms.
+//! Exponential function in operations that vectorize.
 
-/// 1.5 * 2^23.
+/// Rounding constant `1.5 * 2^23`: adding it rounds an f32 to an integer.
 const ROUNDING: f32 = 12_582_912.0;
 
-/// `exp(x)` to 2e-7 for x from -87 to 88, cut there: a polynomial of degree six after reduction to half a
-/// power of two (Cephes, expf).
+/// Computes `exp(x)` to 2e-7 for x from -87 to 88; larger and smaller x are clamped. It reduces x to half a
+/// power of two and evaluates a polynomial of degree six (Cephes, expf).
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
-    // Adding this number rounds to a whole one and leaves it in the lowest bits; a cast would check for
-    // numbers that do not fit and has no vector form.
+    // Adding this number rounds to an integer and leaves it in the lowest bits. A cast would check the range
+    // and does not vectorize.
     let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUNDING);
     let n = shifted - ROUNDING;
     let r = n.mul_add(-0.693_359_4, x);

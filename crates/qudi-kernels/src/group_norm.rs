@@ -1,5 +1,5 @@
-//! Group normalisation (Wu and He 2018) with weights that may differ between images, and SiLU, in one
-//! pass each way.
+//! Group normalisation (Wu and He 2018) with weights that may differ between images, and SiLU, fused into one
+//! pass in each direction.
 
 #[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
@@ -12,28 +12,29 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::silu;
 use extension::GroupNormBackend;
 
-/// Added to the variance.
+/// Constant added to the variance.
 pub const EPSILON: f32 = 1e-5;
 
-/// How one call normalises.
+/// Options of one normalisation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Norm {
-    /// Groups of channels; divides the channels.
+    /// Number of groups; divides the channels.
     pub groups: usize,
-    /// What follows the affine part.
+    /// Activation applied after the affine part.
     pub activation: Activation,
 }
 
-/// What follows the affine part.
+/// Activation applied after the affine part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
-    /// Nothing.
+    /// No activation.
     None,
-    /// `v * sigmoid(v)`.
+    /// SiLU, `v * sigmoid(v)`.
     Silu,
 }
 
-/// `(x - mean) / sqrt(variance + EPSILON) * weight + bias` by group of channels, then the activation.
+/// Computes `(x - mean) / sqrt(variance + EPSILON) * weight + bias` by group of channels, then the
+/// activation.
 ///
 /// # Shapes
 /// `x` and result: `[images, channels, height, width]`; `weight`, `bias`: `[rows, channels]`, row `image *
@@ -64,11 +65,11 @@ pub fn group_norm(x: Tensor<4>, weight: Tensor<2>, bias: Tensor<2>, norm: Norm) 
     }
 }
 
-/// The mean of every row, in two sums: graphics cards add up few long rows slowly.
+/// Computes the mean of every row, in two sums: graphics cards are slow at few long rows.
 fn row_means(x: Tensor<2>) -> Tensor<2> {
-    const MOST_PARTS: usize = 256;
+    const MAX_PARTS: usize = 256;
     let [rows, length] = x.dims();
-    let parts = (1..=MOST_PARTS).rev().find(|&parts| length.is_multiple_of(parts)).unwrap_or(1);
+    let parts = (1..=MAX_PARTS).rev().find(|&parts| length.is_multiple_of(parts)).unwrap_or(1);
     let means = x.reshape([rows * parts, length / parts]).mean_dim(1);
     means.reshape([rows, parts]).mean_dim(1)
 }

@@ -1,4 +1,4 @@
-//! The processor's units for products of bfloat16, and which of them convolutions use.
+//! The processor's units for products of bfloat16, and their selection for convolutions.
 #![allow(unsafe_code)]
 
 use crate::backend::Switch;
@@ -7,23 +7,23 @@ use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
 
-/// What multiplies bfloat16 in convolutions on the processor. Sums have 32 bits with each of them.
+/// Units that multiply bfloat16 in convolutions on the processor. All sum in 32 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MatrixUnits {
-    /// None: numbers are rounded to bfloat16, then multiplied with 32 bits, at no better speed.
+    /// No unit: numbers are rounded to bfloat16 and multiplied in 32 bits, without a gain in speed.
     F32,
-    /// The vector unit's products of pairs (AVX512-BF16).
+    /// Products of pairs on the vector unit (AVX512-BF16).
     Avx512Bf16,
     /// Tiles of 16 x 32 values (AMX).
     Amx,
 }
 
-/// Units that cannot be used.
+/// Error for units that cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum MatrixUnitsError {
     /// No units have this name.
     Unknown(String),
-    /// This processor, or its operating system, has no such units.
+    /// The processor or its operating system does not provide these units.
     Unavailable(MatrixUnits),
 }
 
@@ -67,32 +67,32 @@ thread_local! {
 }
 
 impl MatrixUnits {
-    /// The environment variable that forces one of them.
+    /// Environment variable that forces one of the units.
     pub const VARIABLE: &str = "QUDI_KERNELS";
 
-    /// Whether this machine has them.
+    /// Returns true if this machine has these units.
     pub fn is_available(self) -> bool {
         match self {
             Self::F32 => true,
             Self::Avx512Bf16 => vectors_of_pairs(),
             Self::Amx => {
                 static AMX: OnceLock<bool> = OnceLock::new();
-                // Tests of this crate run a model of it.
+                // Tests of this crate run a model of the unit.
                 cfg!(test) || *AMX.get_or_init(|| vectors_of_pairs() && tiles())
             }
         }
     }
 
-    /// Whether they are faster than 32 bits where they are available. Intel's vector units take twice as long for a
-    /// product of pairs as for one of 32 bits (docs/notes/engineering/bfloat16.md).
+    /// Returns true if the units, where available, are faster than 32 bits. Intel's vector units take twice
+    /// as long for a product of pairs as for one of 32 bits (docs/notes/engineering/bfloat16.md).
     fn pays(self) -> bool {
         self != Self::Avx512Bf16 || made_by_amd()
     }
 
-    /// The best that this machine has, or those that `QUDI_KERNELS` names.
+    /// Returns the units that `QUDI_KERNELS` names, or else the fastest ones of this machine.
     ///
     /// # Errors
-    /// [`MatrixUnitsError`] if the variable names none, or some that this machine lacks.
+    /// [`MatrixUnitsError`] if the variable names no units, or units that this machine lacks.
     pub fn chosen() -> Result<Self, MatrixUnitsError> {
         static CHOSEN: OnceLock<Result<MatrixUnits, MatrixUnitsError>> = OnceLock::new();
         let choose = || match std::env::var(Self::VARIABLE) {
@@ -109,7 +109,7 @@ impl MatrixUnits {
         CHOSEN.get_or_init(choose).clone()
     }
 
-    /// Those that a convolution on this thread uses.
+    /// Returns the units that convolutions on this thread use.
     pub(crate) fn current() -> Self {
         FORCED.get().unwrap_or_else(|| Self::chosen().unwrap_or(Self::F32))
     }
@@ -151,28 +151,29 @@ fn made_by_amd() -> bool {
     false
 }
 
-/// Whether there are tiles, and the operating system lets this process use them.
+/// Returns true if the processor has tiles, and the operating system lets this process use them.
 #[cfg(all(feature = "flex", target_arch = "x86_64", target_os = "linux"))]
 fn tiles() -> bool {
     use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
-    /// Bits of leaf 7: tiles, and their products of bfloat16.
+    /// Bits of CPUID leaf 7: tiles, and their products of bfloat16.
     const AMX: u32 = 1 << 24 | 1 << 22;
-    /// The state of tiles in XCR0: configuration and data.
+    /// Bits of the tile state in XCR0: configuration and data.
     const STATE: u64 = 1 << 17 | 1 << 18;
-    /// `ARCH_REQ_XCOMP_PERM` of Linux, and the component of tile data.
+    /// Linux's `ARCH_REQ_XCOMP_PERM`.
     const REQUEST: libc::c_long = 0x1023;
+    /// State component of tile data.
     const TILE_DATA: libc::c_long = 18;
 
     #[target_feature(enable = "xsave")]
     fn enabled() -> u64 {
-        // SAFETY: the register 0 exists wherever the instruction does.
+        // SAFETY: register 0 exists wherever the instruction does.
         unsafe { _xgetbv(0) }
     }
     let present = __cpuid(0).eax >= 7 && __cpuid_count(7, 0).edx & AMX == AMX;
     if !present || !is_x86_feature_detected!("xsave") {
         return false;
     }
-    // SAFETY: the processor has the instruction, as was asked.
+    // SAFETY: the processor has the instruction, as checked above.
     if unsafe { enabled() } & STATE != STATE {
         return false;
     }

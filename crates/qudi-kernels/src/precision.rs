@@ -1,9 +1,9 @@
-//! Numbers that convolutions multiply (Micikevicius et al. 2018, section 3): of 16 bits, graphics cards and
-//! the matrix units of processors multiply several times as many. Weights, sums and all between convolutions
-//! have 32 bits.
+//! Precision of the numbers that convolutions multiply (Micikevicius et al. 2018, section 3). Graphics cards
+//! and the matrix units of processors multiply 16-bit numbers several times as fast. Weights, sums and all
+//! other operations have 32 bits.
 //!
-//! Of the two kinds of 16 bits only that with the range of 32 will do: nothing holds the U-Net's residual
-//! sums below what the other one can hold (docs/notes/training/sixteen-bits.md).
+//! Only bfloat16, which has the range of 32 bits, is supported: nothing bounds the U-Net's residual sums to
+//! the range of half precision (docs/notes/training/sixteen-bits.md).
 
 use crate::backend::{Switch, is_flex};
 use crate::matrix_units::MatrixUnits;
@@ -12,14 +12,14 @@ use serde::{Deserialize, Serialize};
 use std::cell::Cell;
 use std::fmt;
 
-/// The numbers that convolutions multiply.
+/// Precision of the numbers that convolutions multiply.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ComputePrecision {
-    /// 32 bits.
+    /// Single precision (32 bits).
     #[default]
     F32,
-    /// 16 bits, 8 of them for the value: exact to 4e-3, from 1e-38 to 3e38 as with 32 bits.
+    /// Bfloat16: 16 bits with a relative precision of 4e-3 and the range of 32 bits, 1e-38 to 3e38.
     Bf16,
 }
 
@@ -27,27 +27,28 @@ thread_local! {
     static PRECISION: Cell<ComputePrecision> = const { Cell::new(ComputePrecision::F32) };
 }
 
-/// Runs `run` with convolutions of this precision on this thread; gradients of what it computes have it, too.
+/// Runs `run` with convolutions of this precision on this thread. Gradients of its results have the same
+/// precision.
 pub fn with_precision<T>(precision: ComputePrecision, run: impl FnOnce() -> T) -> T {
     let _switch = Switch::turn(&PRECISION, precision);
     run()
 }
 
 impl ComputePrecision {
-    /// Whether a device computes with such numbers. A processor without units for them rounds to them, at no
-    /// better speed.
+    /// Returns true if the device computes with this precision. A processor without matrix units rounds to
+    /// bfloat16, without a gain in speed.
     pub fn is_supported(self, device: &Device) -> bool {
         device.supports_dtype(self.dtype())
     }
 
-    /// The fastest of those that restore equally well on this device: 16 bits on a processor with units for
-    /// them, else 32.
+    /// Returns the fastest precision that restores equally well on this device: bfloat16 on a processor with
+    /// matrix units, single precision otherwise.
     pub fn fastest(device: &Device) -> Self {
         let has_units = MatrixUnits::current() != MatrixUnits::F32;
         if is_flex(device) && has_units { Self::Bf16 } else { Self::F32 }
     }
 
-    /// Whether a convolution of `input` on this thread has fewer bits than `input`.
+    /// Returns true if a convolution of `input` on this thread has fewer bits than `input`.
     pub(crate) fn reduces(input: &Tensor<4>) -> bool {
         PRECISION.get() != Self::F32 && input.dtype() == DType::F32
     }
@@ -60,7 +61,7 @@ impl ComputePrecision {
     }
 }
 
-/// As recipes and options name it.
+/// Formats the precision as recipes and options name it.
 impl fmt::Display for ComputePrecision {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -70,24 +71,24 @@ impl fmt::Display for ComputePrecision {
     }
 }
 
-/// Numbers of the thread's precision around one of Burn's convolutions.
+/// Conversion to the thread's precision around one of Burn's convolutions.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Reduced {
     dtype: FloatDType,
 }
 
 impl Reduced {
-    /// For a convolution of `input`; none if it is computed as it is.
+    /// Creates the conversion for a convolution of `input`; `None` if it has full precision.
     pub(crate) fn of(input: &Tensor<4>) -> Option<Self> {
         ComputePrecision::reduces(input).then(|| Self { dtype: PRECISION.get().dtype() })
     }
 
-    /// What is multiplied.
+    /// Casts an operand to the reduced precision.
     pub(crate) fn narrow<const D: usize>(self, x: Tensor<D>) -> Tensor<D> {
         x.cast(self.dtype)
     }
 
-    /// What comes of it, in 32 bits.
+    /// Casts a result to 32 bits.
     pub(crate) fn widen(sum: Tensor<4>) -> Tensor<4> {
         sum.cast(FloatDType::F32)
     }

@@ -1,9 +1,9 @@
-//! Results that are written once, without zeroing the memory before.
+//! Vectors that are written once, without zeroing their memory before.
 #![allow(unsafe_code)]
 
 use std::mem::MaybeUninit;
 
-/// A vector of `length` values, all of which `write` must have written.
+/// Creates a vector of `length` values, all of which `write` must write.
 ///
 /// Zeroing them first would cost as much as a light operation itself.
 pub(crate) fn fill(length: usize, write: impl FnOnce(&mut [MaybeUninit<f32>])) -> Vec<f32> {

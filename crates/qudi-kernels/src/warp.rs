@@ -11,9 +11,9 @@ use burn::tensor::ops::{GridSampleOptions, GridSamplePaddingMode, InterpolateMod
 use burn::tensor::{Device, Tensor, TensorData};
 use extension::WarpBackend;
 
-/// What `x` looks like at `(column + flow_x, row + flow_y)`: bilinear, coordinates clamped to the grid
-/// (`grid_sample` with `align_corners` and border padding). No gradient reaches the flow where a coordinate
-/// was clamped.
+/// Samples `x` at `(column + flow_x, row + flow_y)` with bilinear interpolation. Coordinates are clamped to
+/// the grid (`grid_sample` with `align_corners` and border padding). The flow gets no gradient where a
+/// coordinate was clamped.
 ///
 /// # Shapes
 /// `x` and result: `[images, channels, height, width]`; `flow`: `[images, 2, height, width]`, x before y, in
@@ -26,7 +26,7 @@ pub fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     }
     let device = flow.device();
     let pixels = flow.permute([0, 2, 3, 1]) + positions(height, width, &device);
-    // grid_sample wants [-1, 1] from the first pixel's centre to the last one's.
+    // grid_sample expects [-1, 1] from the first pixel's centre to the last one's.
     let scale = [2.0 / (width.max(2) - 1) as f32, 2.0 / (height.max(2) - 1) as f32];
     let scale = Tensor::<1>::from_floats(scale, &device).reshape([1, 1, 1, 2]);
     let options = GridSampleOptions::new(InterpolateMode::Bilinear)
@@ -35,7 +35,7 @@ pub fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     x.grid_sample_2d(pixels * scale - 1.0, options)
 }
 
-/// Column and row of every pixel, `[1, height, width, 2]`.
+/// Returns the column and row of every pixel, `[1, height, width, 2]`.
 fn positions(height: usize, width: usize, device: &Device) -> Tensor<4> {
     let places = (0..height).flat_map(|y| (0..width).flat_map(move |x| [x as f32, y as f32]));
     Tensor::from_data(TensorData::new(places.collect(), [1, height, width, 2]), device)

@@ -1,5 +1,5 @@
-//! Every operation against PyTorch, forward and backward, on both CPU backends: flex takes our own, ndarray
-//! Burn's.
+//! Every operation compared with PyTorch, forward and backward, on both CPU backends. Flex uses the
+//! operations of this crate, ndarray uses Burn's.
 #![allow(clippy::unwrap_used)]
 
 #[path = "../../../tests/golden/cases.rs"]
@@ -12,12 +12,12 @@ use qudi_kernels::group_norm::{self, Norm, group_norm};
 use qudi_kernels::warp;
 
 fn devices() -> [Device; 2] {
-    #[allow(deprecated)] // asked for by name
+    #[allow(deprecated)] // selected by name
     let ndarray = Device::ndarray();
     [Device::flex().autodiff(), ndarray.autodiff()]
 }
 
-/// Gradients of the case's sum for inputs and parameters.
+/// Compares the gradients of the case's sum for inputs and parameters.
 fn check<const D: usize, const E: usize>(
     case: &Case<'_>,
     output: Tensor<4>,
@@ -63,7 +63,7 @@ fn convolutions_match_pytorch() {
             if case.about["conv"] == "3d" {
                 let weight: Tensor<5> = case.parameter("conv.weight", &device).require_grad();
                 let frames = case.number("frames");
-                // Inputs in parts must do the same as one.
+                // Inputs in parts must give the same result as one.
                 let parts = [x.clone().narrow(1, 0, 1), x.clone().narrow(1, 1, 1)];
                 let y = conv_3d(&parts, weight.clone(), bias.clone(), frames, options);
                 check(&case, y, &[("x", &x)], &[("conv.weight", &weight)], &biases);

@@ -1,5 +1,4 @@
-//! Reduced precision against single precision on numbers that were rounded by hand, on every unit of the
-//! machine.
+//! Reduced precision compared with single precision on numbers rounded by hand, on every unit of the machine.
 #![allow(clippy::unwrap_used)]
 
 #[path = "../../../tests/golden/cases.rs"]
@@ -35,7 +34,7 @@ fn list<const D: usize>(x: Tensor<D>) -> Vec<f32> {
     x.into_data().try_to_vec().unwrap()
 }
 
-/// Sum, and gradients of input, weight, bias and addend for `cotangent`.
+/// Returns the result, and the gradients of input, weight, bias and addend for `cotangent`.
 fn run(
     [x, addend, cotangent]: [Tensor<4>; 3],
     weight: Tensor<5>,
@@ -65,12 +64,12 @@ fn run(
 
 fn each_unit(run: impl Fn(MatrixUnits)) {
     for units in [MatrixUnits::F32, MatrixUnits::Avx512Bf16, MatrixUnits::Amx] {
-        // What this machine lacks cannot be checked on it.
+        // Units that this machine lacks cannot be tested on it.
         let _ = with_matrix_units(units, || run(units));
     }
 }
 
-/// Without units for them the very numbers; with such units sums have another order.
+/// Asserts equality. Without matrix units the values are identical; with them, sums have another order.
 fn assert_same(units: MatrixUnits, got: &[f32], expected: &[f32], about: &str) {
     let scale = expected.iter().fold(1e-3f32, |scale, value| scale.max(value.abs()));
     let allowed = if units == MatrixUnits::F32 { 0.0 } else { 3e-6 * scale };
@@ -80,8 +79,8 @@ fn assert_same(units: MatrixUnits, got: &[f32], expected: &[f32], about: &str) {
     }
 }
 
-/// Products are of rounded numbers, summed in 32 bits; bias and addend keep all their bits. On the way back
-/// the same holds of gradients.
+/// Checks that products take rounded numbers and sum in 32 bits, and that bias and addend are not rounded.
+/// The same holds for gradients in the backward pass.
 #[test]
 fn bf16_rounds_products_only() {
     let device = Device::flex().autodiff();
@@ -117,7 +116,7 @@ fn bf16_rounds_products_only() {
     });
 }
 
-/// Every unit computes the same on shapes that fill no block, whatever the number of threads.
+/// Checks that all units agree on shapes that fill no block, with any number of threads.
 #[test]
 fn units_agree_on_any_shape() {
     let device = Device::flex().autodiff();
@@ -159,7 +158,7 @@ fn units_agree_on_any_shape() {
     }
 }
 
-/// What the processor lacks is refused in words.
+/// Checks that missing units are refused with an error.
 #[test]
 fn missing_units_are_refused() {
     for units in [MatrixUnits::Avx512Bf16, MatrixUnits::Amx] {
@@ -175,8 +174,8 @@ fn missing_units_are_refused() {
     assert_eq!("amx".parse(), Ok(MatrixUnits::Amx));
 }
 
-/// What is rounded here is what a backend with such numbers computes, but for the order of sums; Burn's
-/// flex also rounds results, and sums weights' gradients in 16 bits.
+/// Compares this rounding with a backend that computes in bfloat16, up to the order of sums. Burn's flex also
+/// rounds results, and sums weight gradients in 16 bits.
 #[test]
 fn bf16_rounding_matches_the_definition() {
     let device = Device::flex().autodiff();
@@ -200,7 +199,7 @@ fn bf16_rounding_matches_the_definition() {
     }
 }
 
-/// The switch holds for what runs inside of it, and ends with it.
+/// Checks that the precision holds for the closure only.
 #[test]
 fn single_precision_reads_back() {
     let device = Device::flex().autodiff();

@@ -1,5 +1,5 @@
-//! Our convolutions against Burn's own on the ndarray backend, over many shapes: several tiles, more planes
-//! than fit into scratch, odd sizes, channels that fill no block.
+//! Convolutions compared with Burn's own on the ndarray backend over many shapes: several tiles, more planes
+//! than fit into scratch memory, odd sizes, channels that fill no block.
 #![allow(clippy::unwrap_used)]
 
 #[path = "../../../tests/golden/cases.rs"]
@@ -31,7 +31,7 @@ fn values(count: usize, seed: usize) -> Vec<f32> {
     uniform(&format!("shapes {seed}"), count).into_iter().map(|value| value as f32).collect()
 }
 
-/// Output and gradients of all inputs, weight and bias.
+/// Returns the output and the gradients of all inputs, weight and bias.
 fn run(shape: Shape, relu: bool, device: &Device) -> Vec<Vec<f32>> {
     let (images, frames, channels, height, width, outputs, kernel, stride) = shape;
     let tensor =
@@ -66,7 +66,7 @@ fn run(shape: Shape, relu: bool, device: &Device) -> Vec<Vec<f32>> {
 
 #[test]
 fn output_shapes_match_burn() {
-    #[allow(deprecated)] // asked for by name
+    #[allow(deprecated)] // selected by name
     let burns = Device::ndarray().autodiff();
     let ours = Device::flex().autodiff();
     for &shape in SHAPES {

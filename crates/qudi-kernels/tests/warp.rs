@@ -1,4 +1,4 @@
-//! The warp by itself: known translations, borders, and its gradients against finite differences.
+//! Tests of the warp: known translations, borders, and its gradients against finite differences.
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -7,7 +7,7 @@ use qudi_kernels::warp;
 const SIZE: [usize; 2] = [9, 13];
 
 fn devices() -> [Device; 2] {
-    #[allow(deprecated)] // asked for by name
+    #[allow(deprecated)] // selected by name
     let ndarray = Device::ndarray();
     [Device::flex(), ndarray]
 }
@@ -31,7 +31,7 @@ fn values(tensor: Tensor<4>) -> Vec<f32> {
 #[test]
 fn warp_by_a_translation_shifts_and_repeats_borders() {
     for device in devices() {
-        // A plane is what bilinear interpolation reproduces exactly.
+        // Bilinear interpolation reproduces a plane exactly.
         let x = image(|x, y| 3.0 * x - 2.0 * y, &device);
         for (dx, dy) in [(0.0, 0.0), (2.0, -3.0), (0.25, 1.5), (-40.0, 70.0)] {
             let got = values(warp(x.clone(), constant_flow(dx, dy, &device)));
@@ -52,7 +52,7 @@ fn warp_by_a_translation_shifts_and_repeats_borders() {
 #[test]
 fn gradients_are_finite_differences() {
     let wave = |x: f32, y: f32| (0.7 * x + 0.3 * y).sin() + (0.2 * x * y).cos();
-    // Away from whole coordinates, where the slope jumps.
+    // Fractional displacements: the slope jumps at integer coordinates.
     let (dx, dy) = (0.37, -0.42);
     for device in devices() {
         let weight = image(|x, y| (1.3 * x - 0.9 * y).sin(), &device);

@@ -1,11 +1,11 @@
-//! Convolutions of frames, and over frames.
+//! Convolutions of single frames and over frames.
 
 use super::parameters::zeros;
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 
-/// A convolution of frames one by one.
+/// A convolution of each frame.
 #[derive(Module, Debug)]
 pub struct Conv2d {
     /// `[outputs, inputs, rows, columns]`
@@ -23,22 +23,22 @@ pub struct Conv3d {
     bias: Option<Param<Tensor<1>>>,
 }
 
-/// Whether a layer has a bias.
+/// Presence of a layer's bias.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bias {
-    /// It has.
+    /// With a bias.
     Yes,
-    /// It has none.
+    /// Without a bias.
     No,
 }
 
-/// One value for every output of a weight.
+/// Returns the bias, or zeros for every output of `weight`.
 fn bias_or_zeros<const D: usize>(bias: Option<&Param<Tensor<1>>>, weight: &Tensor<D>) -> Tensor<1> {
     bias.map_or_else(|| Tensor::zeros([weight.dims()[0]], &weight.device()), Param::val)
 }
 
 impl Conv2d {
-    /// A layer of zeros; [`init_parameters`](crate::init_parameters) gives weights their values by name.
+    /// Creates a layer of zeros; [`init_parameters`](crate::init_parameters) sets weights by name.
     pub fn zeros(
         [inputs, outputs]: [usize; 2],
         kernel: usize,
@@ -67,38 +67,38 @@ impl Conv2d {
         Self { weight: Param::from_tensor(Tensor::cat(parts, 1)), ..self }
     }
 
-    /// The weights, `[outputs, inputs, rows, columns]`.
+    /// Returns the weights, `[outputs, inputs, rows, columns]`.
     pub fn weight(&self) -> Tensor<4> {
         self.weight.val()
     }
 
-    /// The number of inputs.
+    /// Returns the number of inputs.
     pub fn inputs(&self) -> usize {
         self.weight.lazy_shape().as_slice()[1]
     }
 
-    /// The sum alone. `inputs` are joined by channel, `[images, channels, height, width]`.
+    /// Applies the convolution to `inputs`, `[images, channels, height, width]`, joined by channel.
     pub fn linear(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options::default())
     }
 
-    /// The sum and an addend.
+    /// Applies the convolution and adds `addend`.
     pub fn add(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
         self.call(inputs, Options { addend: Some(addend), ..Options::default() })
     }
 
-    /// The sum and an addend, then ReLU.
+    /// Applies the convolution, adds `addend`, and applies ReLU.
     pub fn add_relu(&self, inputs: &[Tensor<4>], addend: Tensor<4>) -> Tensor<4> {
         let activation = Activation::Relu;
         self.call(inputs, Options { addend: Some(addend), activation, ..Options::default() })
     }
 
-    /// The sum, then ReLU.
+    /// Applies the convolution and ReLU.
     pub fn relu(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options { activation: Activation::Relu, ..Options::default() })
     }
 
-    /// The sum at every second row and column.
+    /// Applies the convolution with stride 2.
     pub fn stride2(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options { stride: 2, ..Options::default() })
     }
@@ -111,7 +111,7 @@ impl Conv2d {
 }
 
 impl Conv3d {
-    /// A layer of zeros with kernel 5 x 5 x 5.
+    /// Creates a layer of zeros with a kernel of 5 x 5 x 5.
     pub fn zeros([inputs, outputs]: [usize; 2], bias: Bias, device: &Device) -> Self {
         Self {
             weight: zeros([outputs, inputs, 5, 5, 5], device),
@@ -119,28 +119,28 @@ impl Conv3d {
         }
     }
 
-    /// The sum. `x`: `[bursts * frames, channels, height, width]`.
+    /// Applies the convolution to `x`, `[bursts * frames, channels, height, width]`.
     pub fn linear(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         self.call(x, frames, Options::default())
     }
 
-    /// The sum and an addend, then ReLU.
+    /// Applies the convolution, adds `addend`, and applies ReLU.
     pub fn add_relu(&self, x: Tensor<4>, frames: usize, addend: Tensor<4>) -> Tensor<4> {
         let activation = Activation::Relu;
         self.call(x, frames, Options { addend: Some(addend), activation, ..Options::default() })
     }
 
-    /// The sum, then ReLU.
+    /// Applies the convolution and ReLU.
     pub fn relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         self.call(x, frames, Options { activation: Activation::Relu, ..Options::default() })
     }
 
-    /// The sum at every second row and column.
+    /// Applies the convolution with stride 2 in rows and columns.
     pub fn stride2(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         self.call(x, frames, Options { stride: 2, ..Options::default() })
     }
 
-    /// The sum at every second row and column, then ReLU.
+    /// Applies the convolution with stride 2 in rows and columns, and ReLU.
     pub fn stride2_relu(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         let activation = Activation::Relu;
         self.call(x, frames, Options { stride: 2, activation, ..Options::default() })

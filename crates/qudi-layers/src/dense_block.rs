@@ -1,14 +1,14 @@
-//! The residual dense block (Zhang et al. 2018, section 3.3).
+//! Residual dense block (Zhang et al. 2018, section 3.3).
 
 use super::{Bias, Conv2d};
 use burn::module::Module;
 use burn::tensor::activation::gelu;
 use burn::tensor::{Device, Tensor};
 
-/// Dense layers of a block.
+/// Number of dense layers in a block.
 const LAYERS: usize = 3;
 
-/// Layers that each see all layers before, and a residual.
+/// Residual block of layers that each take the outputs of all previous layers.
 #[derive(Module, Debug)]
 pub struct DenseBlock {
     layers: Vec<Conv2d>,
@@ -16,7 +16,7 @@ pub struct DenseBlock {
 }
 
 impl DenseBlock {
-    /// The block, all weights zero.
+    /// Creates a block of zeros.
     pub fn zeros(width: usize, growth: usize, device: &Device) -> Self {
         let layer = |l| Conv2d::zeros([width + l * growth, growth], 3, Bias::Yes, device);
         let all = width + LAYERS * growth;
@@ -26,7 +26,7 @@ impl DenseBlock {
         }
     }
 
-    /// What the layers add to `x`, and `x`.
+    /// Applies the block with ReLU after each layer, and adds `x`.
     ///
     /// # Shapes
     /// - x, result: `[images, channels, height, width]`
@@ -34,7 +34,7 @@ impl DenseBlock {
         self.through(x, Conv2d::relu)
     }
 
-    /// The same with GELU after each layer in place of ReLU.
+    /// Applies the block with GELU after each layer, and adds `x`.
     ///
     /// # Shapes
     /// - x, result: `[images, channels, height, width]`

@@ -1,4 +1,4 @@
-//! Group normalisation with what comes after it.
+//! Group normalisation and its activation.
 
 use super::parameters::zeros;
 use burn::module::{Module, Param};
@@ -15,22 +15,22 @@ pub struct GroupNorm {
 }
 
 impl GroupNorm {
-    /// The norm of so many channels, weights zero.
+    /// Creates a normalisation of `channels` channels, with weights of zero.
     pub fn zeros(channels: usize, device: &Device) -> Self {
         Self { weight: zeros([channels], device), bias: zeros([channels], device) }
     }
 
-    /// The norm alone. `x`: `[images, channels, height, width]`.
+    /// Normalises `x`, `[images, channels, height, width]`.
     pub fn plain(&self, x: Tensor<4>) -> Tensor<4> {
         self.call(x, group_norm::Activation::None)
     }
 
-    /// The norm and SiLU.
+    /// Normalises and applies SiLU.
     pub fn silu(&self, x: Tensor<4>) -> Tensor<4> {
         self.call(x, group_norm::Activation::Silu)
     }
 
-    /// The norm, `scale` and `shift` of every burst, and SiLU. `scale`, `shift`: `[bursts, channels]`.
+    /// Normalises, applies `scale` and `shift` of each burst, `[bursts, channels]`, and applies SiLU.
     pub fn film_silu(&self, x: Tensor<4>, scale: Tensor<2>, shift: Tensor<2>) -> Tensor<4> {
         let slope = scale + 1.0;
         let weight = slope.clone() * self.weight.val().unsqueeze();
@@ -45,7 +45,7 @@ impl GroupNorm {
     }
 }
 
-/// The largest divisor of the channels that is at most eight.
+/// Returns the number of groups: the largest divisor of the channels up to eight.
 fn groups(channels: usize) -> usize {
     (1..=8).rev().find(|&groups| channels.is_multiple_of(groups)).unwrap_or(1)
 }

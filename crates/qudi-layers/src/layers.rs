@@ -1,23 +1,23 @@
-//! Convolutions one after the other.
+//! Sequence of convolutions.
 
 use super::{Bias, Conv2d};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-/// Convolutions one after the other, each but the last followed by ReLU.
+/// A sequence of convolutions, each but the last followed by ReLU.
 #[derive(Module, Debug)]
 pub struct Layers {
     layers: Vec<Conv2d>,
 }
 
 impl Layers {
-    /// Layers of these inputs and outputs, all weights zero.
+    /// Creates layers of zeros with the given numbers of inputs and outputs.
     pub fn zeros(sizes: &[[usize; 2]], kernel: usize, device: &Device) -> Self {
         let layer = |&sizes| Conv2d::zeros(sizes, kernel, Bias::Yes, device);
         Self { layers: sizes.iter().map(layer).collect() }
     }
 
-    /// What the last layer gives. `inputs` are joined by channel, `[images, channels, height, width]`.
+    /// Applies all layers to `inputs`, `[images, channels, height, width]`, joined by channel.
     ///
     /// # Panics
     /// Without layers.

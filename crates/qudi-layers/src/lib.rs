@@ -1,4 +1,5 @@
-//! What several networks are made of: layers, parameters by name, in the program and in files, and tiles of frames.
+//! Building blocks shared by the networks: layers, named parameters in memory and in files, and tiling of
+//! frames.
 #![warn(missing_docs)]
 
 #[cfg(test)]

@@ -1,11 +1,11 @@
-//! A matrix and a bias.
+//! Linear layer: a matrix and a bias.
 
 use super::parameters::zeros;
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::conv::{Options, conv_2d};
 
-/// A matrix and a bias.
+/// A linear layer: a matrix and a bias.
 #[derive(Module, Debug)]
 pub struct Linear {
     /// `[outputs, inputs]`
@@ -15,12 +15,12 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// A layer of zeros.
+    /// Creates a layer of zeros.
     pub fn zeros([inputs, outputs]: [usize; 2], device: &Device) -> Self {
         Self { weight: zeros([outputs, inputs], device), bias: zeros([outputs], device) }
     }
 
-    /// The same for every pixel, on its channels.
+    /// Applies the layer to the channels of every pixel.
     ///
     /// # Shapes
     /// - x: `[images, inputs, height, width]`
@@ -32,7 +32,7 @@ impl Linear {
         conv_2d(&[x], weight, self.bias.val(), Options::default())
     }
 
-    /// The product and the bias.
+    /// Applies the layer to rows.
     ///
     /// # Shapes
     /// - x: `[rows, inputs]`

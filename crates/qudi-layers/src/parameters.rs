@@ -1,9 +1,10 @@
-//! Parameters by name: initial values, and values from elsewhere.
+//! Named parameters: initial values, and values from files.
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param, ParamId};
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// A parameter that takes no memory before it is filled or used: sizes may come from a file that lies.
+/// Creates a parameter of zeros that takes no memory until it is filled or used, because sizes may come from
+/// an untrusted file.
 pub fn zeros<const D: usize>(shape: [usize; D], device: &Device) -> Param<Tensor<D>> {
     let init = move |device: &Device, require_grad: bool| {
         Tensor::zeros(shape, device).set_require_grad(require_grad)
@@ -11,7 +12,7 @@ pub fn zeros<const D: usize>(shape: [usize; D], device: &Device) -> Param<Tensor
     Param::uninitialized(ParamId::new(), init, device.clone(), true, shape.into())
 }
 
-/// Gives every parameter of `module` the values that `values` has for its name and shape.
+/// Sets every parameter of `module` to the values that `values` returns for its name and shape.
 pub fn init_parameters<M: Module>(module: M, values: impl FnMut(&str, &[usize]) -> Vec<f32>) -> M {
     module.map(&mut Initialize { path: Vec::new(), values })
 }

@@ -1,22 +1,22 @@
-//! What weights were trained on, and by which program.
+//! Provenance of weights: their training data and program.
 
 use serde::{Deserialize, Serialize};
 
-/// What a file of weights says about their training.
+/// Provenance of a file of weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// The version of the program that wrote it.
+    /// Version of the program that wrote the file.
     pub program: String,
-    /// The sensors of the training data.
+    /// Sensors of the training data.
     pub sensors: Vec<String>,
-    /// The least and most photons per pixel and frame of the training data.
+    /// Minimum and maximum light of the training data, in photons per pixel and frame (PPP).
     pub ppp: [f64; 2],
-    /// The names of the training data.
+    /// Names of the training data sets.
     pub data: Vec<String>,
-    /// Optimization steps.
+    /// Number of optimization steps.
     pub steps: u64,
-    /// The commit of the program that trained it.
+    /// Commit of the program that trained the weights.
     pub commit: Option<String>,
-    /// The licence of the weights.
+    /// Licence of the weights.
     pub licence: String,
 }

@@ -1,10 +1,10 @@
-//! Resampling: pixels into channels, finer and coarser grids, flows from one scale to another.
+//! Resampling: pixels into channels, finer and coarser grids, and flows between scales.
 
 use burn::tensor::Tensor;
 use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::{AvgPoolOptions, PadMode};
 
-/// `[bursts * frames, c, h, w]` as `[bursts, frames, c, h, w]`.
+/// Reshapes `[bursts * frames, c, h, w]` to `[bursts, frames, c, h, w]`.
 pub fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
     let [images, c, h, w] = x.dims();
     x.reshape([images / frames, frames, c, h, w])
@@ -29,7 +29,7 @@ pub fn pixel_unshuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     ])
 }
 
-/// The inverse of [`pixel_unshuffle`].
+/// Applies the inverse of [`pixel_unshuffle`].
 pub fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
@@ -44,7 +44,7 @@ pub fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     ])
 }
 
-/// Means of 2 x 2 pixels.
+/// Averages squares of 2 x 2 pixels.
 ///
 /// # Shapes
 /// - x: `[images, channels, height, width]`
@@ -53,7 +53,7 @@ pub fn avg_pool2(x: Tensor<4>) -> Tensor<4> {
     avg_pool2d(x, AvgPoolOptions::new([2, 2]))
 }
 
-/// Means of `scale` x `scale` pixels, `scale` a power of two.
+/// Averages squares of `scale` x `scale` pixels; `scale` must be a power of two.
 pub fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
     for _ in 0..scale.ilog2() {
         x = avg_pool2(x);
@@ -61,8 +61,8 @@ pub fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
     x
 }
 
-/// Twice the size, bilinear with half-pixel centres, edges repeated. Composed: Burn's own has no gradient
-/// on GPUs.
+/// Doubles the size with bilinear interpolation, half-pixel centres and repeated edges. It is composed of
+/// simple operations, because Burn's interpolation has no gradient on GPUs.
 pub fn upsample2(x: Tensor<4>) -> Tensor<4> {
     upsample2_axis(upsample2_axis(x, 2), 3)
 }
@@ -80,7 +80,7 @@ fn upsample2_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {
     Tensor::stack::<5>(vec![before, after], axis + 1).reshape(shape)
 }
 
-/// Each pixel twice in both directions.
+/// Repeats each pixel twice in both directions.
 pub fn repeat(x: Tensor<4>) -> Tensor<4> {
     let [images, channels, height, width] = x.dims();
     x.reshape([images, channels, height, 1, width, 1]).repeat(&[1, 1, 1, 2, 1, 2]).reshape([
@@ -91,7 +91,7 @@ pub fn repeat(x: Tensor<4>) -> Tensor<4> {
     ])
 }
 
-/// A flow of one scale on another; both powers of two.
+/// Converts a flow from one scale to another; both must be powers of two.
 pub fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
     let mut scale = from;
     while scale > to {
@@ -105,7 +105,8 @@ pub fn rescale_flow(mut flow: Tensor<4>, from: usize, to: usize) -> Tensor<4> {
     flow
 }
 
-/// Means over squares of `2 * radius + 1` pixels; edges repeated. `radius` is 2 or 4.
+/// Averages squares of `2 * radius + 1` pixels around each pixel, with repeated edges; `radius` must be 2 or
+/// 4.
 pub fn mean_around(x: Tensor<4>, radius: usize) -> Tensor<4> {
     mean_axis(mean_axis(x, 2, radius), 3, radius)
 }
@@ -115,7 +116,7 @@ fn mean_axis(x: Tensor<4>, axis: usize, radius: usize) -> Tensor<4> {
     let mut pads = [(0, 0); 4];
     pads[axis] = (radius, radius);
     let padded = x.pad(pads, PadMode::Edge);
-    // Sums of `count` values, `step` apart, beginning at each of the first `size` places.
+    // Sums of `count` values, `step` apart, beginning at each of the first `size` positions.
     let sums = |x: &Tensor<4>, size: usize, step: usize, count: usize| {
         let at = |k: usize| x.clone().narrow(axis, k * step, size);
         (1..count).fold(at(0), |sum, k| sum + at(k))
@@ -128,7 +129,7 @@ fn mean_axis(x: Tensor<4>, axis: usize, radius: usize) -> Tensor<4> {
     sum / (2 * radius + 1) as f32
 }
 
-/// Half of what the pixel after has more than the one before, along rows and along columns; edges repeated.
+/// Computes central differences along rows and along columns, with repeated edges.
 pub fn differences(x: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let along = |axis: usize| {
         let size = x.dims()[axis];

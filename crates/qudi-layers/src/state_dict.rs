@@ -1,10 +1,11 @@
-//! Named tensors of the `.pth` files that PyTorch writes, and of SafeTensors files.
+//! Named tensors of `.pth` files written by PyTorch, and of SafeTensors files.
 //!
-//! Files come from elsewhere. The reader executes nothing, bounds what it builds, and reads a tensor's bytes
-//! only after its type and shape are known to be those of the network.
+//! Files are untrusted. The reader executes nothing, bounds the memory that it allocates, and reads a
+//! tensor's bytes only after its type and shape have been matched with the network's.
 //!
-//! The tensors of a checkpoint that holds more than them lie below `state_dict.`, `params.` or `model.`, and
-//! names of networks that several devices trained begin with `module.`; none of these belongs to the names here.
+//! In a checkpoint with further content, the tensors are below `state_dict.`, `params.` or `model.`. The
+//! names of networks trained on several devices begin with `module.`. These prefixes are removed from the
+//! names here.
 
 use burn::tensor::{bf16, f16};
 use pytorch_reader::{DType, PytorchReader};
@@ -14,10 +15,10 @@ use safetensors::tensor::{Dtype, SafeTensors};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Longest SafeTensors file: the largest network, QUIVER with 64 features, has 630 MB.
-const LONGEST: u64 = 1 << 30;
+/// Maximum size of a SafeTensors file in bytes: the largest network, QUIVER with 64 features, has 630 MB.
+const MAX_FILE_BYTES: u64 = 1 << 30;
 
-/// What may stand before the names in a checkpoint.
+/// Prefixes of the names in a checkpoint.
 const PREFIXES: [&str; 6] =
     ["state_dict.module.", "state_dict.", "module.", "params_ema.", "params.", "model."];
 
@@ -25,11 +26,11 @@ const PREFIXES: [&str; 6] =
 pub struct StateDict {
     path: PathBuf,
     reader: Reader,
-    /// What stands before the names.
+    /// Prefix of the names.
     prefix: &'static str,
     /// Shapes by name.
     shapes: BTreeMap<String, Vec<usize>>,
-    /// Bytes of the file.
+    /// Size of the file in bytes.
     length: u64,
 }
 
@@ -39,15 +40,15 @@ enum Reader {
 }
 
 impl StateDict {
-    /// Reads the names; the values follow when asked for.
+    /// Opens a file and reads the names of its tensors; values are read on request.
     ///
     /// # Errors
     /// [`Error`] if the file cannot be read, or is no dictionary of tensors.
     pub fn open(path: &Path) -> Result<Self> {
         if path.extension().is_some_and(|extension| extension == "safetensors") {
-            return Self::of_bytes(read_limited(path, LONGEST, "read the weights")?, path);
+            return Self::of_bytes(read_limited(path, MAX_FILE_BYTES, "read the weights")?, path);
         }
-        // The reader names no file where one is missing.
+        // The reader's error for a missing file does not name it.
         let about = std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
         let reader = PytorchReader::new(path).map_err(|e| {
             let help =
@@ -57,7 +58,7 @@ impl StateDict {
         Ok(Self::new(path, Reader::Pytorch(reader), about.len()))
     }
 
-    /// Reads the names of a SafeTensors file in memory; errors say that it is at `path`.
+    /// Reads the names of a SafeTensors file in memory; `path` is used in errors only.
     ///
     /// # Errors
     /// [`Error::Data`] if it is not whole.
@@ -94,37 +95,37 @@ impl StateDict {
         Self { path: path.to_owned(), reader, prefix, shapes, length }
     }
 
-    /// Where the file is.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Bytes of the file.
+    /// Returns the size of the file in bytes.
     pub fn length(&self) -> u64 {
         self.length
     }
 
-    /// What a SafeTensors file says under a key of its metadata.
+    /// Returns the value of a key in a SafeTensors file's metadata.
     pub fn metadata(&self, key: &str) -> Option<String> {
         let Reader::SafeTensors(bytes) = &self.reader else { return None };
         let (_, header) = SafeTensors::read_metadata(bytes).ok()?;
         header.metadata().as_ref()?.get(key).cloned()
     }
 
-    /// The names of all tensors, sorted.
+    /// Returns the names of all tensors, sorted.
     pub fn names(&self) -> Vec<String> {
         self.shapes.keys().cloned().collect()
     }
 
-    /// The shape of a tensor, if there is one of this name.
+    /// Returns the shape of a tensor, or `None` if there is no tensor of this name.
     pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
         self.shapes.get(name).cloned()
     }
 
-    /// The values of one tensor, row-major.
+    /// Reads the values of one tensor, row-major.
     ///
     /// # Errors
-    /// [`Error::Data`] if there is no such tensor of finite floats of this shape.
+    /// [`Error::Data`] if there is no tensor of finite floats with this name and shape.
     pub fn read(&self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         let full = format!("{}{name}", self.prefix);
         let wrong = |what: String| {
@@ -173,7 +174,7 @@ impl StateDict {
         let values = floats.values(&bytes);
         if values.len() != shape.iter().product::<usize>() {
             return Err(wrong(format!(
-                "`{name}` has {} values, not those of its shape",
+                "`{name}` has {} values, which does not match its shape",
                 values.len()
             )));
         }
@@ -184,7 +185,7 @@ impl StateDict {
     }
 }
 
-/// Floats that files hold.
+/// Types of floats in files.
 #[derive(Clone, Copy)]
 enum Floats {
     F32,
@@ -235,7 +236,7 @@ mod tests {
             let file = StateDict::open(&golden(name)).unwrap();
             assert_eq!(file.read("a.weight", &[2, 3]).unwrap(), expected("a.weight", 6));
             assert_eq!(file.read("b.weight", &[3, 2, 1, 1]).unwrap(), expected("b.weight", 6));
-            // Two views of one storage, and one whose rows are columns there.
+            // Two views of one storage, and a transposed view.
             let both = expected("both", 10);
             assert_eq!(file.read("both.last", &[6]).unwrap(), both[4..]);
             assert_eq!(file.read("both.first", &[4]).unwrap(), both[..4]);
@@ -257,7 +258,7 @@ mod tests {
         }
     }
 
-    /// The file calls a function in the place of a tensor: nothing is called, and there is no tensor.
+    /// Checks that a pickle that calls a function in place of a tensor executes nothing and gives no tensor.
     #[test]
     fn executes_no_code_of_a_pickle() {
         let file =
@@ -291,7 +292,7 @@ mod tests {
         assert!(open(b"").is_err());
     }
 
-    /// Depth that needs stack, lengths that need memory, memos that grow: all refused.
+    /// Checks that files whose nesting, lengths or memos would exhaust memory are refused.
     #[test]
     fn refuses_hostile_pickles() {
         let mut deep = vec![0x80, 2, b'N'];

@@ -1,15 +1,15 @@
-//! The only bridge between images in memory and tensors.
+//! Conversion between images in memory and tensors.
 
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use qudi_core::{Error, Result, Size};
 
-/// Images as a tensor, `[images, 1, height, width]`. `values` holds whole images, row-major.
+/// Converts images to a tensor, `[images, 1, height, width]`. `values` holds whole images, row-major.
 pub fn to_tensor(values: Vec<f32>, size: Size, device: &Device) -> Tensor<4> {
     let images = values.len() / size.pixels();
     Tensor::from_data(TensorData::new(values, [images, 1, size.height, size.width]), device)
 }
 
-/// The values of a tensor, row-major.
+/// Reads the values of a tensor, row-major.
 ///
 /// # Errors
 /// [`Error::Request`] if the device fails; kernels report their errors only here.
@@ -26,12 +26,13 @@ pub fn read<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>> {
     data.try_into_vec::<f32>().map_err(|e| failed(e.to_string()))
 }
 
-/// The gradient for `x`, zero where there is none.
+/// Returns the gradient of `x`, or zeros if there is none.
 pub fn gradient_of<const D: usize>(x: &Tensor<D>, gradients: &Gradients) -> Tensor<D> {
     x.grad(gradients).unwrap_or_else(|| x.clone().inner().zeros_like())
 }
 
-/// The sum of `x` times the gradient for it: the gradient of that sum is what is left to do for `x`.
+/// Returns the sum of `x * gradient`. Its own gradient with respect to `x` is `gradient`, which continues
+/// backpropagation through `x`.
 pub fn product<const D: usize>(x: Tensor<D>, gradient: Tensor<D>) -> Tensor<1> {
     (x * Tensor::from_inner(gradient)).sum()
 }

@@ -1,5 +1,5 @@
-//! Images before and after the network: mirrored at their edges up to the size that it needs, and cut into
-//! tiles.
+//! Padding and tiling of images for a network: images are mirrored at their edges up to the required size,
+//! and cut into tiles.
 
 mod tiles;
 
@@ -9,30 +9,30 @@ use qudi_core::{Frame, Result, Size};
 
 pub use tiles::Tiles;
 
-/// The default side of tiles, in pixels.
+/// Default side of tiles, in pixels.
 pub const TILE: usize = 512;
 
-/// The place in a row of `count` that a place beyond its ends is mirrored to: the ends themselves are not repeated.
+/// Mirrors a position into a row of `count` values, without repeating the ends.
 pub fn mirrored(place: i64, count: usize) -> usize {
     let period = (2 * count as i64 - 2).max(1);
     let place = place.rem_euclid(period);
     (if place < count as i64 { place } else { period - place }) as usize
 }
 
-/// How images of one size are padded and cut into tiles.
+/// Padding and tiling of images of one size.
 #[derive(Debug)]
 pub struct Tiling {
-    /// The size of the images.
+    /// Size of the images.
     from: Size,
-    /// The size of the padded images.
+    /// Size of the padded images.
     pub size: Size,
-    /// The tiles of the padded images.
+    /// Tiles of the padded images.
     pub tiles: Tiles,
 }
 
 impl Tiling {
-    /// The tiling of images of size `from`, for a network that needs multiples of `multiple`, in tiles of
-    /// about `side` pixels.
+    /// Plans the tiling of images of size `from` for a network that requires multiples of `multiple`, in
+    /// tiles of about `side` pixels.
     pub fn new(from: Size, multiple: usize, side: usize) -> Self {
         let size = Size {
             height: from.height.next_multiple_of(multiple),
@@ -43,7 +43,7 @@ impl Tiling {
         Self { from, size, tiles: Tiles::new(size, side, overlap, multiple) }
     }
 
-    /// Mirrors images at their lower and right edges.
+    /// Pads images by mirroring them at their lower and right edges.
     pub fn padded(&self, images: &[f32]) -> Vec<f32> {
         let Self { from, size, .. } = self;
         let mut values = Vec::with_capacity(images.len() / from.pixels() * size.pixels());
@@ -68,10 +68,10 @@ impl Tiling {
         images.chunks_exact(self.size.pixels()).map(cropped).collect()
     }
 
-    /// Joins the tiles of an image or of several, which `of_tile` gives by their number, and crops them.
+    /// Joins the tiles of one or more images and crops them; `of_tile` computes a tile by its number.
     ///
     /// # Errors
-    /// Those of `of_tile`, and [`Error`](qudi_core::Error) if the device fails.
+    /// Errors of `of_tile`, and [`Error`](qudi_core::Error) if the device fails.
     pub fn joined(
         &self,
         mut of_tile: impl FnMut(usize) -> Result<Vec<Tensor<4>>>,

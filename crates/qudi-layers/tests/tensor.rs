@@ -1,4 +1,4 @@
-//! The bridge to tensors, on every CPU backend.
+//! Conversion to tensors and back, on every CPU backend.
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
@@ -7,7 +7,7 @@ use qudi_layers::tensor::{read, to_tensor};
 
 #[test]
 fn tensors_hold_images_unchanged() {
-    #[allow(deprecated)] // asked for by name
+    #[allow(deprecated)] // selected by name
     let devices = [Device::flex(), Device::ndarray()];
     let values: Vec<f32> = (0..30).map(|i| i as f32).collect();
     for device in devices {

@@ -1,4 +1,4 @@
-//! Where scenes come from: files of all kinds, pipes, stills in motion, procedural scenes.
+//! Sources of scenes: files of all kinds, pipes, stills in motion, procedural scenes.
 //!
 //! An [`Input`] says what to read and can be opened as often as needed; an [`ExposureSource`]
 //! yields, for each output frame, the instants that one exposure sees.
@@ -22,7 +22,7 @@ use qudi_core::Result;
 use qudi_core::flow::Flow;
 use qudi_core::{Frame, Size};
 
-/// What is known of a clip before it is read.
+/// Properties of a clip that are known before it is read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClipInfo {
     /// Frame size.
@@ -31,7 +31,7 @@ pub struct ClipInfo {
     pub frames: Option<u64>,
 }
 
-/// What a pixel sees during one output frame.
+/// The scene during one output frame.
 #[derive(Clone, Debug)]
 pub struct Exposure {
     /// The scene at evenly spaced instants of the exposure.
@@ -41,7 +41,7 @@ pub struct Exposure {
 }
 
 impl Exposure {
-    /// The sharp scene in the middle of the exposure: what a restoration should show.
+    /// Returns the sharp scene in the middle of the exposure, which a restoration should show.
     pub fn truth(&self) -> &Frame {
         self.middle.as_ref().unwrap_or(&self.instants[self.instants.len() / 2])
     }
@@ -49,25 +49,25 @@ impl Exposure {
 
 /// A clip, exposure by exposure.
 pub trait ExposureSource {
-    /// What is known of it.
+    /// Returns its size and length.
     fn info(&self) -> ClipInfo;
 
-    /// The next exposure; none at the end.
+    /// Reads the next exposure; `None` at the end.
     fn next(&mut self) -> Result<Option<Exposure>>;
 
-    /// True flow from exposure `index` to the next, where the scene is synthetic.
+    /// Returns the true flow from exposure `index` to the next; `None` for recorded clips.
     fn flow(&self, index: u64) -> Option<Flow>;
 }
 
 /// Single frames of a recorded clip, one after another.
 pub trait FrameReader {
-    /// The size of every frame.
+    /// Returns the size of every frame.
     fn size(&self) -> Size;
 
-    /// Frames in all, if known.
+    /// Returns the number of frames, if known.
     fn frames(&self) -> Option<u64>;
 
-    /// The next frame; none at the end.
+    /// Reads the next frame; `None` at the end.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if it cannot be read.

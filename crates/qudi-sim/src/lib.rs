@@ -1,7 +1,7 @@
 //! Scenes to counts: scenes and clips, exposed by a simulated camera.
 //!
-//! A [`clip::Input`] says what to read and yields frames in [0, 1]; [`simulate`] sees it through a
-//! [`Camera`](qudi_core::Camera) and hands counts to a [`Sink`].
+//! A [`clip::Input`] yields frames in [0, 1]; [`simulate`] exposes them with a
+//! [`Camera`](qudi_core::Camera) and passes the counts to a [`Sink`].
 #![warn(missing_docs)]
 
 pub mod clip;

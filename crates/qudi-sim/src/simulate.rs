@@ -13,18 +13,18 @@ use qudi_core::{Frame, Size};
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
 
-/// A simulation, complete: the same value gives the same photons.
+/// Complete description of a simulation: the same value gives the same photons.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Simulation {
-    /// Where the scene comes from.
+    /// Source of the scene.
     pub input: Input,
-    /// How frames are taken from it.
+    /// Sampling of frames from the source.
     pub sampling: Sampling,
     /// The sensor, gain rule included.
     pub sensor: Sensor,
     /// Photons per pixel, in the sense of `ppp_def`.
     pub ppp: f64,
-    /// What `ppp` counts.
+    /// Meaning of `ppp`.
     pub ppp_def: PppDefinition,
     /// Image value that receives `ppp` photons; the clip's mean if absent.
     #[serde(rename = "exposure")]
@@ -33,10 +33,10 @@ pub struct Simulation {
     pub seed: u64,
 }
 
-/// How far a simulation is.
+/// Progress of a simulation.
 #[derive(Clone, Copy, Debug)]
 pub struct Progress {
-    /// Which of the two passes.
+    /// The current pass.
     pub stage: Stage,
     /// Frames done in it.
     pub done: u64,
@@ -53,7 +53,7 @@ pub enum Stage {
     Exposing,
 }
 
-/// What is known before the first exposure.
+/// Properties that are known before the first exposure.
 #[derive(Clone, Copy, Debug)]
 pub struct Start {
     /// Frame size.
@@ -62,28 +62,28 @@ pub struct Start {
     pub frames: u64,
 }
 
-/// One exposed frame and what is known about it.
+/// One exposed frame with its number and its truth.
 #[derive(Debug)]
 pub struct Exposed<'a> {
     /// Its number.
     pub index: u64,
     /// The counts, `[height * width]`.
     pub counts: &'a [u16],
-    /// The scene in the middle of the exposure, of each row's own behind a rolling shutter.
+    /// The scene in the middle of the exposure; of each row's exposure for a rolling shutter.
     pub truth: &'a Frame,
 }
 
-/// Where exposed frames go.
+/// Receiver of exposed frames.
 pub trait Sink {
-    /// Called once, before the first frame.
+    /// Starts the output; called once, before the first frame.
     fn start(&mut self, start: Start) -> Result<()>;
 
-    /// One frame; `flow` computes the true motion to the next frame of a synthetic scene (none for
+    /// Receives one frame; `flow` computes the true motion to the next frame of a synthetic scene (`None` for
     /// recorded clips and after the last frame).
     fn frame(&mut self, exposed: Exposed<'_>, flow: &dyn Fn() -> Option<Flow>) -> Result<()>;
 }
 
-/// What a simulation found and did.
+/// Results of a simulation.
 #[derive(Clone, Debug)]
 pub struct Summary {
     /// Frame size.
@@ -106,7 +106,7 @@ pub struct Summary {
     pub hot_and_dead: (usize, usize),
 }
 
-/// Runs a simulation. `on` hears of every frame and may end it.
+/// Runs a simulation. `on` is called for every frame and may stop it.
 ///
 /// # Errors
 /// [`Error`] of the input, the sensor, the light or the sink; [`Error::Interrupted`] if `on`

@@ -1,4 +1,4 @@
-//! Same seed, same photons: whatever the threads, the length of the clip, the way they are drawn.
+//! Photons depend on the seed alone, not on threads or the length of the clip.
 #![allow(clippy::unwrap_used)]
 
 use proptest::prelude::*;
@@ -15,7 +15,7 @@ fn expose(sensor: &Sensor, size: Size, seed: u64, threads: usize, frames: u64) -
     })
 }
 
-/// Every way through the camera: tables, direct draws, single binary frames, echoes.
+/// Returns sensors for every path through the camera: tables, direct draws, single binary frames, echoes.
 fn sensors() -> Vec<Sensor> {
     let mut uneven = Sensor::load("qudi-paper").unwrap();
     uneven.defects.dark_spread = 0.7;
@@ -44,8 +44,8 @@ fn photons_do_not_depend_on_threads() {
     }
 }
 
-/// Photons of a seed are a promise to everyone who has a record: changing them is a new major
-/// version. Pinned where the mathematical library is known.
+/// Records rely on the photons of a seed: changing them needs a new major version. Checked only where the
+/// mathematical library is known.
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
 #[test]
 fn photons_of_a_seed_do_not_change() {
@@ -58,12 +58,12 @@ fn photons_of_a_seed_do_not_change() {
             crc32fast::hash(&bytes)
         })
         .collect();
-    assert_eq!(sums, PINNED);
+    assert_eq!(sums, EXPECTED_CHECKSUMS);
 }
 
 /// CRC-32 of three frames of each of `sensors()`.
 #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
-const PINNED: [u32; 6] =
+const EXPECTED_CHECKSUMS: [u32; 6] =
     [3_921_897_508, 2_884_552_629, 2_724_855_200, 3_641_929_682, 3_081_532_661, 3_851_747_618];
 
 proptest! {

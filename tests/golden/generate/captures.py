@@ -27,7 +27,7 @@ bits = (rng.random((6, 12, 20)) < light).astype(np.uint8)
 np.save(out / "counts.npy", counts)
 np.save(out / "bits.npy", bits)
 
-# NumPy archives, with a label beside the capture, as spike cameras' data come.
+# NumPy archives, with a label next to the counts, as spike cameras' data come.
 np.savez(out / "stored.npz", spk=counts, label=np.int64(3), name=np.array("a.jpg"))
 np.savez_compressed(out / "deflated.npz", spk=counts, label=np.int64(3), name=np.array("a.jpg"))
 np.savez(out / "two.npz", left=counts, right=bits)

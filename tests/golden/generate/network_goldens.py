@@ -66,7 +66,7 @@ KERNELS = {"conv", "group_norm", "warp"}
 Tensors = dict[str, Tensor]
 
 
-# The network of the golden values, and the same with every switch on the paper's side.
+# The network of the golden values, and the same with every switch set as in the paper.
 TINY = network.with_former_keys(tomllib.loads((OUT / "tiny.toml").read_text())["network"])
 PAPER = TINY | {
     "reference": "none",

@@ -1,4 +1,5 @@
-//! How many frames make up an aligned sum: as many as best predict frames that were held back.
+//! Choice of the number of frames per aligned sum by cross-validation: the number that best predicts held-out
+//! frames.
 
 use super::AlignedSums;
 use super::motion::BlockMotion;
@@ -7,13 +8,14 @@ use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::{Frame, Result};
 use std::ops::Range;
 
-/// Frames of a burst that are predicted, at most.
-const PREDICTED: usize = 12;
+/// Maximum number of places in a burst where frames are held out and predicted.
+const MAX_PREDICTIONS: usize = 12;
 
-/// Chooses the number of `counts` for which [`AlignedSums`] of quanta burst photography err least, along the
-/// motion between sums of `block` frames. At some places of the samples `held` frames are held back; the others
-/// predict them. Noise adds the same to all predictions' errors. Of numbers that do as well, within the error of
-/// this measurement, it is the largest.
+/// Chooses the number of frames per sum, among `counts`, with the least prediction error of [`AlignedSums`]
+/// of quanta burst photography. Motion is found between sums of `block` frames. At several places in
+/// `samples`, `held` frames are held out and predicted from the others. The noise of held-out frames adds the
+/// same error to all predictions. Among numbers whose errors are equal within one standard error, the largest
+/// is chosen.
 ///
 /// # Errors
 /// [`Error`](qudi_core::Error) if sums do not fit into 16 bits, or the dark rate of the sensor is unknown.
@@ -28,7 +30,7 @@ pub fn choose_count(
     for &sample in samples {
         let motion = BlockMotion::find(sample, acquisition, block)?;
         let frames = sample.frames.len();
-        let places = PREDICTED.div_ceil(samples.len()).min(frames / (8 * held));
+        let places = MAX_PREDICTIONS.div_ceil(samples.len()).min(frames / (8 * held));
         let back: Vec<Range<usize>> = (0..places)
             .map(|place| (place + 1) * frames / (places + 1))
             .map(|middle| middle - held / 2..middle + held.div_ceil(2))
@@ -52,8 +54,8 @@ pub fn choose_count(
     Ok(largest_of_the_best(&errors).map(|best| counts[best]))
 }
 
-/// The last choice that errs no more than the best one, within the standard error of their difference:
-/// `[place][choice]`.
+/// Returns the last choice whose error exceeds the least one by no more than the standard error of their
+/// difference. `errors` is `[place][choice]`.
 fn largest_of_the_best(errors: &[Vec<f64>]) -> Option<usize> {
     let n = errors.len() as f64;
     let total = |choice: usize| errors.iter().map(|errors| errors[choice]).sum::<f64>();
@@ -68,7 +70,7 @@ fn largest_of_the_best(errors: &[Vec<f64>]) -> Option<usize> {
     choices.rev().find(as_good)
 }
 
-/// Squared error of the sum of `frames` frames that `image` predicts.
+/// Returns the squared error between the predicted and the actual sum of `frames` frames.
 fn squared_error(
     image: &Frame,
     shown: &[u16],

@@ -1,4 +1,4 @@
-//! The motion of a burst, and its frames summed along it.
+//! Motion of a burst between blocks of frames, and sums of frames along it.
 
 use super::AlignedSums;
 use crate::merge::hot_pixels::HotPixels;
@@ -10,23 +10,23 @@ use qudi_core::{Result, Size};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Blocks along which velocities are taken for constant.
-const STRETCH: usize = 2 * LONGEST_HALF + 1;
+/// Blocks in a stretch of constant velocity.
+const STRETCH_BLOCKS: usize = 2 * LONGEST_HALF + 1;
 
-/// Nats by which a velocity must fit better than rest or than that of the whole frame: of so many that are
-/// tried, some fit by chance.
-const EVIDENCE: f32 = 6.0;
+/// Log-likelihood, in nats, by which a velocity must fit better than rest or the global velocity. Among the
+/// many velocities tried, some fit well by chance.
+const EVIDENCE_THRESHOLD: f32 = 6.0;
 
-/// The counts of a burst and the velocity at every place of every block of frames.
+/// Counts of a burst and the velocity of each patch in each block of frames.
 #[derive(Debug)]
 pub(super) struct BlockMotion<'a> {
     size: Size,
     counts: Vec<Cow<'a, [u16]>>,
-    /// Frames of a block.
+    /// Frames per block.
     block: usize,
-    /// Pixels per frame, `[block][patch]`.
+    /// Velocity in pixels per frame, `[block][patch]`.
     velocities: Vec<Vec<[f32; 2]>>,
-    /// The patch of every pixel.
+    /// Index of the patch of each pixel.
     patch: Vec<u32>,
 }
 
@@ -52,15 +52,15 @@ impl<'a> BlockMotion<'a> {
         };
         while motion.velocities.len() < blocks.len() {
             let done = motion.velocities.len();
-            let end = (done + STRETCH).min(blocks.len());
-            let first = end.saturating_sub(STRETCH);
+            let end = (done + STRETCH_BLOCKS).min(blocks.len());
+            let first = end.saturating_sub(STRETCH_BLOCKS);
             let view = BurstView { size: burst.size, frames: &blocks[first..end] };
             motion.add_stretch(&PreparedBurst::new(view, &of_blocks), done - first);
         }
         Ok(motion)
     }
 
-    /// Adds the velocities of the blocks of `stretch` from number `first` on.
+    /// Appends the velocities of the blocks of `stretch`, starting with block `first`.
     fn add_stretch(&mut self, stretch: &PreparedBurst, first: usize) {
         let grid = &stretch.grid;
         if self.patch.is_empty() {
@@ -68,7 +68,7 @@ impl<'a> BlockMotion<'a> {
             let place = |i: usize| [i % width, i / width].map(|at| at as f32);
             self.patch = (0..self.size.pixels()).map(|i| grid.around(place(i))[0] as u32).collect();
         }
-        let found = ConstantVelocity::find(stretch, EVIDENCE);
+        let found = ConstantVelocity::find(stretch, EVIDENCE_THRESHOLD);
         let frames = self.block as f32;
         for number in first..stretch.frames.len() {
             self.velocities.push(match &found {
@@ -80,7 +80,7 @@ impl<'a> BlockMotion<'a> {
         }
     }
 
-    /// The sums of `count` frames around every `count`th frame from `first` on.
+    /// Returns sums of `count` frames around every `count`th frame, starting with frame `first`.
     pub(super) fn sums(&self, first: usize, count: usize) -> Vec<Vec<u16>> {
         let frames = self.counts.len();
         let middles: Vec<usize> = (first..frames).step_by(count).collect();
@@ -91,8 +91,8 @@ impl<'a> BlockMotion<'a> {
         middles.par_iter().map(sum).collect()
     }
 
-    /// Sums of `count` of the frames `kept`, one of them around frame `middle`, up to [`STRETCH`] in all; and the
-    /// place of that one among them.
+    /// Sums groups of `count` of the frames `kept`, up to [`STRETCH_BLOCKS`] groups, one of them around frame
+    /// `middle`. Returns the sums and the index of that group.
     pub(super) fn sums_of(
         &self,
         kept: &[usize],
@@ -100,9 +100,10 @@ impl<'a> BlockMotion<'a> {
         count: usize,
     ) -> (Vec<Vec<u16>>, usize) {
         let start = kept.partition_point(|&frame| frame < middle).saturating_sub(count / 2);
-        let before = (start / count).min(STRETCH / 2);
+        let before = (start / count).min(STRETCH_BLOCKS / 2);
         let first = start - before * count;
-        let groups: Vec<&[usize]> = kept[first..].chunks_exact(count).take(STRETCH).collect();
+        let groups: Vec<&[usize]> =
+            kept[first..].chunks_exact(count).take(STRETCH_BLOCKS).collect();
         let sum = |(number, group): (usize, &&[usize])| {
             let at = if number == before { middle } else { group[count / 2] };
             self.sum(at, group.iter().copied())
@@ -110,7 +111,7 @@ impl<'a> BlockMotion<'a> {
         (groups.par_iter().enumerate().map(sum).collect(), before)
     }
 
-    /// The sum of some frames, each shifted onto frame `middle`.
+    /// Sums the given frames, each shifted onto frame `middle`.
     pub(super) fn sum(&self, middle: usize, frames: impl IntoIterator<Item = usize>) -> Vec<u16> {
         let Size { height, width } = self.size;
         let velocities = &self.velocities[(middle / self.block).min(self.velocities.len() - 1)];
@@ -131,7 +132,7 @@ impl<'a> BlockMotion<'a> {
     }
 }
 
-/// The sum of frames, nothing aligned.
+/// Sums frames without alignment.
 fn plain_sum(frames: &[Cow<'_, [u16]>]) -> Vec<u16> {
     let mut sum = frames[0].to_vec();
     for frame in &frames[1..] {
@@ -145,7 +146,7 @@ mod tests {
     use super::*;
     use qudi_core::sensor::Sensor;
 
-    /// A bright bar that moves by a pixel every two frames stays where it is.
+    /// Checks that a bright bar moving by a pixel every two frames stays in place in the sums.
     #[test]
     fn sums_follow_what_moves() {
         let size = Size { height: 48, width: 96 };

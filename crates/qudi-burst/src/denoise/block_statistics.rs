@@ -1,11 +1,11 @@
-//! Figures of a noisy plane that its noise hardly changes: those of the means of its 8 x 8 blocks.
+//! Statistics of a noisy plane that are robust to its noise: computed from the means of 8 x 8 blocks.
 
 use qudi_core::Frame;
 
-/// Side of the blocks.
+/// Side of a block in pixels.
 const SIDE: usize = 8;
 
-/// Range of block means, and the mean over blocks of some function of them.
+/// Range of the block means, and the mean over blocks of a variance function.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Spread {
     pub(crate) low: f64,
@@ -13,7 +13,7 @@ pub(crate) struct Spread {
     pub(crate) variance: f64,
 }
 
-/// The spread of `plane`, with the mean of `variance` of its block means.
+/// Computes the range of the block means of `plane`, and the mean of `variance` over them.
 pub(crate) fn spread(plane: &Frame, variance: impl Fn(f64) -> f64) -> Spread {
     let (mut low, mut high, mut total, mut pixels) = (f64::INFINITY, f64::NEG_INFINITY, 0.0, 0);
     for y in (0..plane.size.height).step_by(SIDE) {

@@ -1,4 +1,4 @@
-//! BM3D on frames of stabilized variance, and the way back to image units.
+//! BM3D on frames of stabilized variance, and their conversion back to image units.
 
 use super::block_statistics::{Spread, spread};
 use super::bm3d::{SearchSettings, bm3d_with};
@@ -7,7 +7,7 @@ use qudi_core::Frame;
 use qudi_core::restorer::Acquisition;
 use rayon::prelude::*;
 
-/// Denoises a stabilized frame by BM3D. The sigma of its noise is `scale` times that of the transform.
+/// Denoises a stabilized frame with BM3D. `scale` is the noise sigma in units of the transform's own.
 pub(crate) fn denoise(
     search: SearchSettings,
     mut z: Frame,
@@ -24,12 +24,13 @@ pub(crate) fn denoise(
     clean
 }
 
-/// The image units of one detection.
+/// Returns the image value of one detection.
 pub(crate) fn units(acquisition: &Acquisition) -> f64 {
     1.0 / (acquisition.photons_per_unit() * acquisition.sensor.quantum_efficiency)
 }
 
-/// Inverts the transform of a denoised frame and subtracts the `ordinary` or mapped dark detections.
+/// Inverts the transform of a denoised frame and subtracts dark detections, from the dark map or the
+/// `ordinary` value.
 pub(crate) fn image(
     z: &Frame,
     vst: &VarianceStabilizer,

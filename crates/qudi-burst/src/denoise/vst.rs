@@ -1,50 +1,52 @@
 //! Variance-stabilising transforms of sums of counts, and their exact unbiased inverses.
 //!
-//! - Binary sensors: the binomial Anscombe transform (Anscombe 1948; Chan, Elgendy and Wang, "Images
-//!   from bits", Sensors 16(11):1961, 2016, eq. 14).
-//! - Linear sensors: the generalized Anscombe transform (Murtagh et al. 1995; Makitalo and Foi 2013),
-//!   or the integral of `1 / sqrt(Var y)` over the mean count, which also follows the counts into
-//!   saturation, where their variance falls.
+//! - Binary sensors: the binomial Anscombe transform (Anscombe 1948; Chan, Elgendy and Wang, "Images from
+//!   bits", Sensors 16(11):1961, 2016, eq. 14).
+//! - Linear sensors: the generalized Anscombe transform (Murtagh et al. 1995; Makitalo and Foi 2013), or the
+//!   integral of `1 / sqrt(Var y)` over the mean count. The integral also follows the counts into saturation,
+//!   where their variance falls.
 //!
-//! All are scaled to deviation 1. The inverse is exact (Makitalo and Foi 2011): the detections at
-//! which the *expected* transform, under the sensor's own law with its rounding and clipping, is
-//! the given value. Only samples too deep to tabulate use the closed form.
+//! All are scaled to a standard deviation of 1. The inverse is exact (Makitalo and Foi 2011): it returns the
+//! detections at which the *expected* transform equals the given value, under the sensor's own distribution
+//! with its rounding and clipping. Only counts too large to tabulate use the closed form.
 
 use qudi_core::Frame;
 use qudi_core::sensor::{CountLaw, CountMoments, Response, Sensor};
 use rayon::prelude::*;
 
-/// How sums of counts are transformed.
+/// Variance-stabilising transform of sums of counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Transform {
-    /// Not at all: the mean count.
+    /// No transform: the mean count.
     Identity,
-    /// Binomial Anscombe for binary sensors, generalized Anscombe for linear ones.
+    /// The binomial Anscombe transform for binary sensors, the generalized one for linear sensors.
     Anscombe,
-    /// The integral of one over the deviation; the same as `Anscombe` for binary sensors.
+    /// The integral of one over the standard deviation; equals `Anscombe` for binary sensors.
     Integral,
 }
 
-/// Deeper linear samples are not tabulated: the closed form is exact enough, and they rarely clip.
-const DEEPEST: u16 = 63;
+/// Largest maximum count of linear sensors that is tabulated. Above it, counts rarely clip and the closed
+/// form is accurate enough.
+const MAX_TABULATED_COUNT: u16 = 63;
 
-/// Larger sums of binary frames neither: their law is that of Poisson's, nearly.
-const MOST_FRAMES: f64 = 4096.0;
+/// Largest sum of binary counts that is tabulated. Larger sums are nearly Poisson-distributed.
+const MAX_TABULATED_SUM: f64 = 4096.0;
 
-/// Nodes of the inverse, quadratic in the detections.
+/// Number of nodes of the inverse, spaced quadratically in the detections.
 const NODES: usize = 256;
 
-/// Steps of the integral.
+/// Number of steps of the integral.
 const STEPS: usize = 4096;
 
-/// A transform of the sum of some frames of one sensor.
+/// A transform of sums of a given number of frames of one sensor.
 #[derive(Clone, Debug)]
 pub struct VarianceStabilizer {
     frames: f64,
     forward: Forward,
-    /// Detections per frame, expected transform and its deviation, rising; empty for deep samples.
+    /// Detections per frame, expected transform and its standard deviation, ascending. Empty where the closed
+    /// form is used.
     nodes: Vec<[f64; 3]>,
-    /// DN per electron; 1 for binary sensors.
+    /// Gain in DN per electron; 1 for binary sensors.
     gain: f64,
     moments: CountMoments,
 }
@@ -67,7 +69,7 @@ enum Forward {
 }
 
 impl Forward {
-    /// Of the sum of `frames` frames.
+    /// Transforms the sum of `frames` frames.
     fn at(&self, sum: f64, frames: f64) -> f64 {
         match self {
             Self::Identity => sum / frames,
@@ -91,7 +93,7 @@ impl Forward {
 }
 
 impl VarianceStabilizer {
-    /// For sums of `frames` frames of `sensor` at `gain` DN/e-.
+    /// Creates the transform of sums of `frames` frames of `sensor`, at `gain` DN per electron.
     pub fn new(transform: Transform, sensor: &Sensor, gain: f64, frames: u32) -> Self {
         let law = CountLaw::new(sensor, gain);
         let moments = CountMoments::new(&law);
@@ -100,19 +102,21 @@ impl VarianceStabilizer {
         let forward = match (transform, sensor.response) {
             (Transform::Identity, _) => Forward::Identity,
             (_, Response::Binary) => Forward::Binomial { trials: n * full },
-            (Transform::Integral, Response::Linear) if sensor.max_count() <= DEEPEST => {
+            (Transform::Integral, Response::Linear)
+                if sensor.max_count() <= MAX_TABULATED_COUNT =>
+            {
                 Forward::Table { full, values: integral(&moments, full) }
             }
             (_, Response::Linear) => {
-                // Rounding adds a twelfth of a count squared.
+                // Rounding adds a variance of 1/12 DN^2.
                 let variance = sensor.read_noise.powi(2) + 1.0 / (12.0 * gain * gain);
                 Forward::Generalized { gain, variance }
             }
         };
         let mut stabilizer = Self { frames: n, forward, nodes: Vec::new(), gain, moments };
         let shallow = match sensor.response {
-            Response::Linear => sensor.max_count() <= DEEPEST,
-            Response::Binary => n * full <= MOST_FRAMES,
+            Response::Linear => sensor.max_count() <= MAX_TABULATED_COUNT,
+            Response::Binary => n * full <= MAX_TABULATED_SUM,
         };
         if shallow {
             stabilizer.tabulate(&law, sensor, frames);
@@ -120,24 +124,24 @@ impl VarianceStabilizer {
         stabilizer
     }
 
-    /// The transform of a sum of counts, which may lie between whole ones.
+    /// Transforms a sum of counts, which may be fractional.
     pub fn transform(&self, sum: f64) -> f64 {
         self.forward.at(sum, self.frames)
     }
 
-    /// The transform of a frame of mean counts.
+    /// Transforms a frame of mean counts.
     pub(crate) fn stabilized(&self, means: &Frame) -> Frame {
         let z = |&mean: &f32| self.transform(self.frames * f64::from(mean)) as f32;
         Frame { size: means.size, data: means.data.par_iter().map(z).collect() }
     }
 
-    /// The detections per frame whose expected transform is `z`, between 0 and half a count short
-    /// of saturation.
+    /// Returns the detections per frame whose expected transform is `z`, between 0 and half a count below
+    /// saturation.
     pub fn invert(&self, z: f64) -> f64 {
         if self.nodes.is_empty() { self.closed_form(z) } else { self.look_up(z, 0) }
     }
 
-    /// The value closest to `z` that some light is expected to give.
+    /// Clamps `z` to the range of expected transforms over all light levels.
     pub(crate) fn possible(&self, z: f64) -> f64 {
         match (self.nodes.first(), self.nodes.last()) {
             (Some(least), Some(most)) => z.clamp(least[1], most[1]),
@@ -145,13 +149,13 @@ impl VarianceStabilizer {
         }
     }
 
-    /// The mean count whose expected transform is `z`.
+    /// Returns the mean count whose expected transform is `z`.
     pub fn mean_count(&self, z: f64) -> f64 {
         self.moments.at(self.invert(z)).0
     }
 
-    /// The deviation of the transform where it is expected to be `z`: close to 1, or that of the mean
-    /// count.
+    /// Returns the standard deviation of the transform where its expected value is `z`: close to 1, or the
+    /// mean count's own standard deviation for [`Transform::Identity`].
     pub fn sigma(&self, z: f64) -> f64 {
         match (&self.forward, self.nodes.is_empty()) {
             (_, false) => self.look_up(z, 2),
@@ -191,14 +195,15 @@ impl VarianceStabilizer {
         }
     }
 
-    /// Expected value and deviation of the transform under the exact law of the sum.
+    /// Tabulates the expected value and standard deviation of the transform under the exact distribution of
+    /// the sum.
     fn tabulate(&mut self, law: &CountLaw, sensor: &Sensor, frames: u32) {
         let full = f64::from(sensor.max_count());
         let most = match sensor.response {
             Response::Linear => law.detections_for_mean(full),
             Response::Binary => -full * (0.5 / (self.frames * full)).ln(),
         };
-        // Sums of binary frames are sums of more binary frames.
+        // A sum of binary sums is a sum of more binary frames.
         let mut longer = sensor.clone();
         longer.frames_summed *= frames;
         let binary = CountLaw::new(&longer, 1.0);
@@ -214,26 +219,27 @@ impl VarianceStabilizer {
             let values = || sum.iter().enumerate().map(|(s, p)| (self.transform(s as f64), p));
             let mean: f64 = values().map(|(z, p)| z * p).sum();
             let variance: f64 = values().map(|(z, p)| (z - mean) * (z - mean) * p).sum();
-            // Without light and noise the first nodes may coincide.
+            // Without light and noise, the first nodes may coincide.
             if self.nodes.last().is_none_or(|node| node[1] < mean - 1e-9) {
                 self.nodes.push([detections, mean, variance.max(0.0).sqrt()]);
             }
         }
-        // A gain at which every count is 0: nothing to look up.
+        // The gain is so low that every count is 0: there is nothing to look up.
         if self.nodes.len() < 2 {
             self.nodes.clear();
         }
     }
 }
 
-/// `integral from 0 to m of 1 / sqrt(Var y)` at `STEPS + 1` means.
+/// Computes `integral from 0 to m of 1 / sqrt(Var y)` at `STEPS + 1` means.
 fn integral(moments: &CountMoments, full: f64) -> Vec<f64> {
     let step = full / STEPS as f64;
     let mut total = 0.0;
     let mut values = vec![0.0];
     for i in 0..STEPS {
         let middle = (i as f64 + 0.5) * step;
-        // A noiseless law has no variance at its ends: there a count differs by half a step at most.
+        // A noiseless distribution has zero variance at its ends, where a count differs by at most half a
+        // step.
         let variance = moments.variance_at_mean(middle).max(0.25 * step);
         total += step / variance.sqrt();
         values.push(total);
@@ -241,7 +247,7 @@ fn integral(moments: &CountMoments, full: f64) -> Vec<f64> {
     values
 }
 
-/// The law of the sum of two independent counts.
+/// Convolves the distributions of two independent counts: the distribution of their sum.
 fn convolve(a: &[f64], b: &[f64]) -> Vec<f64> {
     let mut sum = vec![0.0; a.len() + b.len() - 1];
     for (i, &p) in a.iter().enumerate().filter(|(_, p)| **p > 0.0) {

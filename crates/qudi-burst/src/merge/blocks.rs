@@ -1,5 +1,5 @@
-//! Blocks of consecutive frames around a reference frame, and the motion of each frame from that
-//! of the blocks.
+//! Blocks of consecutive frames around a reference frame, and interpolation of the blocks' motion to single
+//! frames.
 
 use crate::patch::PatchMotion;
 use std::ops::Range;
@@ -8,13 +8,13 @@ use std::ops::Range;
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Blocks {
     pub(crate) ranges: Vec<Range<usize>>,
-    /// The block with the reference frame in its middle.
+    /// Index of the block whose middle is the reference frame.
     pub(crate) reference: usize,
 }
 
 impl Blocks {
-    /// Divides `frames` frames into blocks of `length` frames (odd), one of them around `reference`; those at
-    /// the ends may be shorter.
+    /// Divides `frames` frames into blocks of `length` frames (odd), one of them around `reference`. Blocks
+    /// at the ends may be shorter.
     pub(crate) fn around(reference: usize, frames: usize, length: usize) -> Self {
         let half = length / 2;
         let own = reference.saturating_sub(half)..(reference + half + 1).min(frames);
@@ -44,8 +44,9 @@ impl Blocks {
         std::iter::once(self.reference).chain(others).map(|k| &self.ranges[k])
     }
 
-    /// Interpolates the motion of every patch to every frame, `[frame][patch]`: linear between the middles of
-    /// blocks, and beyond them. The reference block's motion is zero at `reference`.
+    /// Interpolates the motion of every patch to every frame, `[frame][patch]`. It is linear between the
+    /// middles of the blocks, and extrapolated beyond them. The reference block's motion is zero at
+    /// `reference`.
     pub(crate) fn interpolate(&self, flows: &PatchMotion, reference: usize) -> PatchMotion {
         let middle = |k: usize| {
             let range = &self.ranges[k];
@@ -96,7 +97,7 @@ mod tests {
     fn interpolates_constant_velocity_exactly() {
         for (reference, length) in [(5, 3), (0, 3), (10, 5), (4, 1)] {
             let blocks = Blocks::around(reference, 11, length);
-            // 2 pixels per frame, as the blocks' middles show it.
+            // 2 pixels per frame, measured at the middles of the blocks.
             let flows: Vec<Vec<[f32; 2]>> = (0..blocks.ranges.len())
                 .map(|k| {
                     let range = &blocks.ranges[k];

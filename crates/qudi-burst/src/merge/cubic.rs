@@ -1,18 +1,20 @@
-//! Patches between pixels by cubic convolution (Keys, "Cubic convolution interpolation for digital image
-//! processing", IEEE TASSP 29(6), 1981), which keeps fine texture that bilinear means lose.
+//! Sampling of patches between pixels by cubic convolution (Keys, "Cubic convolution interpolation for
+//! digital image processing", IEEE TASSP 29(6), 1981). It keeps fine texture that bilinear interpolation
+//! loses.
 
 use crate::patch::{Patch, SIDE, inside};
 use multiversion::multiversion;
 use qudi_core::Frame;
 
-/// Weights of the samples at -1, 0, 1 and 2 for the place `part` between 0 and 1 (Keys 1981, eq. 15).
+/// Returns the weights of the samples at -1, 0, 1 and 2 for a position `part` between 0 and 1 (Keys 1981, eq.
+/// 15).
 fn taps(part: f32) -> [f32; 4] {
     let near = |s: f32| (1.5 * s - 2.5) * s * s + 1.0;
     let far = |s: f32| ((2.5 - 0.5 * s) * s - 4.0) * s + 2.0;
     [far(1.0 + part), near(part), near(1.0 - part), far(2.0 - part)]
 }
 
-/// What the taps leave of the variance of white noise along an axis.
+/// Returns the factor by which the taps reduce the variance of white noise along an axis.
 pub(crate) fn noise_factor(part: f32) -> f32 {
     taps(part).iter().map(|tap| tap * tap).sum()
 }
@@ -23,7 +25,7 @@ fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     let (width, height) = (image.size.width as isize, image.size.height as isize);
     let [x, y] = corner.map(|c| c.floor() as isize - 1);
     let [across, down] = corner.map(|c| taps(c - c.floor()));
-    // Plain loops over whole rows, which compilers turn into vectors.
+    // Plain loops over whole rows vectorize.
     let mut rows = [[0.0f32; SIDE]; SIDE + 3];
     let within = x >= 0 && x + (SIDE as isize) + 3 <= width;
     for (r, row) in (y..).zip(&mut rows) {
@@ -45,7 +47,7 @@ fn cubic(image: &Frame, corner: [f32; 2]) -> Patch {
     patch
 }
 
-/// Samples the patch whose corner is at `at`; what lies outside the image is taken from `own` at `corner`.
+/// Samples the patch whose corner is at `at`. Pixels outside the image are taken from `own` at `corner`.
 pub(crate) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [usize; 2]) -> Patch {
     let mut patch = cubic(image, at);
     let (columns, rows) = (inside(at[0], image.size.width), inside(at[1], image.size.height));
@@ -62,7 +64,7 @@ pub(crate) fn cubic_within(image: &Frame, at: [f32; 2], own: &Frame, corner: [us
     patch
 }
 
-/// A row between the pixels of `source`.
+/// Interpolates a row between the pixels of `source`.
 #[inline(always)]
 fn along(taps: [f32; 4], source: &[f32]) -> [f32; SIDE] {
     let (a, b) = (&source[..SIDE], &source[1..=SIDE]);
@@ -85,7 +87,7 @@ mod tests {
     use super::*;
     use qudi_core::Size;
 
-    /// Cubic convolution reproduces parabolas (Keys 1981, section III).
+    /// Checks that cubic convolution reproduces parabolas (Keys 1981, section III).
     #[test]
     fn reproduces_parabolas() {
         let parabola = |x: f32, y: f32| 0.02 * x * x - 0.03 * y * y + 0.01 * x * y + x - 0.5 * y;

@@ -5,7 +5,7 @@ use multiversion::multiversion;
 use std::f32::consts::PI;
 use std::sync::LazyLock;
 
-/// Coefficients of a patch; transposed, which nothing here minds.
+/// Coefficients of a patch, transposed; all users treat both axes alike.
 #[derive(Clone, Debug)]
 pub(crate) struct Spectrum {
     pub(crate) re: Patch,
@@ -24,7 +24,7 @@ impl Spectrum {
     pub(crate) const ZERO: Self = Self { re: [[0.0; SIDE]; SIDE], im: [[0.0; SIDE]; SIDE] };
 }
 
-/// The transform, not normalised: white noise of variance v has `256 v` per coefficient.
+/// Computes the unnormalised transform: white noise of variance v has variance `256 v` per coefficient.
 #[multiversion(targets("x86_64+avx2"))]
 pub(crate) fn forward(patch: &Patch, spectrum: &mut Spectrum) {
     spectrum.re = *patch;
@@ -34,10 +34,10 @@ pub(crate) fn forward(patch: &Patch, spectrum: &mut Spectrum) {
     columns(spectrum);
 }
 
-/// The real part of the inverse, compiled for the vector unit of its caller.
+/// Computes the real part of the inverse. Inlined, to be compiled for the vector unit of its caller.
 #[inline(always)]
 pub(crate) fn inverse(mut spectrum: Spectrum) -> Patch {
-    // The inverse is the transform with both parts exchanged, before and after.
+    // The inverse is the transform with real and imaginary parts exchanged before and after.
     std::mem::swap(&mut spectrum.re, &mut spectrum.im);
     columns(&mut spectrum);
     transpose(&mut spectrum);
@@ -49,7 +49,7 @@ pub(crate) fn inverse(mut spectrum: Spectrum) -> Patch {
     spectrum.im
 }
 
-/// Radix-2 transform (Cooley and Tukey 1965) down all columns.
+/// Applies the radix-2 transform (Cooley and Tukey 1965) down all columns.
 #[inline(always)]
 fn columns(Spectrum { re, im }: &mut Spectrum) {
     for i in 0..SIDE {
@@ -108,7 +108,7 @@ mod tests {
                     im += value * sin;
                 }
             }
-            // Transposed: the column index runs along u.
+            // The spectrum is transposed: the column index runs along u.
             assert!((spectrum.re[u][v] - re).abs() < 0.02, "{u} {v}");
             assert!((spectrum.im[u][v] - im).abs() < 0.02, "{u} {v}");
         }

@@ -1,5 +1,5 @@
-//! Hot and dead pixels of a window, repaired from their neighbours (Ma et al. 2020, section 7): a
-//! capture's own are masked long before; this is for those that appear.
+//! Repair of hot and dead pixels from their neighbours (Ma et al. 2020, section 7). The known bad pixels of a
+//! sensor are masked before; this finds the ones that appear later.
 
 use qudi_core::bad_pixels::BadPixels;
 use qudi_core::restorer::BurstView;
@@ -12,7 +12,7 @@ pub(crate) struct HotPixels {
 }
 
 impl HotPixels {
-    /// Looks for them in the sum of the window.
+    /// Finds bad pixels in the sum of the window.
     pub(crate) fn find(burst: BurstView<'_>, max_count: u16) -> Self {
         let mut sums = vec![0u32; burst.size.pixels()];
         for frame in burst.frames {
@@ -35,7 +35,7 @@ impl HotPixels {
         Self { pixels }
     }
 
-    /// Counts with bad pixels replaced by the mean of their good neighbours.
+    /// Replaces bad pixels with the mean of their good neighbours.
     pub(crate) fn repaired(&self, counts: &[u16]) -> Vec<f32> {
         let mut repaired: Vec<f32> = counts.iter().map(|&count| f32::from(count)).collect();
         for (i, neighbours) in self.pixels.iter().filter(|(_, good)| !good.is_empty()) {
@@ -45,8 +45,8 @@ impl HotPixels {
         repaired
     }
 
-    /// Counts with bad pixels replaced by a good neighbour, another one in every frame: their noise stays that
-    /// of a count.
+    /// Replaces bad pixels with one good neighbour, a different one in every frame, so that the noise stays
+    /// the noise of a count.
     pub(crate) fn replaced<'a>(&self, counts: &'a [u16], frame: usize) -> Cow<'a, [u16]> {
         if self.pixels.is_empty() {
             return Cow::Borrowed(counts);

@@ -1,4 +1,4 @@
-//! A frame merged with its neighbours, from its merged patches.
+//! A frame merged with its neighbours, blended from merged patches.
 
 use super::blocks::Blocks;
 use super::cubic::noise_factor as cubic_noise;
@@ -10,20 +10,20 @@ use qudi_core::Frame;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// A frame merged with its neighbours. Variances of noise are in units of the variance of one frame's counts.
+/// A frame merged with its neighbours. Noise variances are in units of the variance of one frame's counts.
 #[derive(Debug)]
 pub(crate) struct MergedFrame {
     /// Mean counts.
     pub(crate) counts: Frame,
-    /// Variance of their noise, the mean of all patches.
+    /// Noise variance of the counts, averaged over all patches.
     pub(crate) noise: f64,
-    /// Variance of the noise of every patch.
+    /// Noise variance of each patch.
     pub(crate) patch_noise: Vec<f32>,
 }
 
 impl MergedFrame {
-    /// Merges blocks of frames along the motion of the reference's patches, which are sampled bilinearly
-    /// (Ma et al. 2020, section 5.2).
+    /// Merges blocks of frames along the motion of the reference's patches, with bilinear sampling (Ma et al.
+    /// 2020, section 5.2).
     pub(crate) fn from_blocks(
         burst: &PreparedBurst,
         blocks: &Blocks,
@@ -54,7 +54,7 @@ impl MergedFrame {
         })
     }
 
-    /// Merges frame `reference` with all others along the motion of its patches. What fits is decided on the
+    /// Merges frame `reference` with all others along the motion of its patches. Weights are decided on the
     /// reference frames, and patches are sampled with cubic convolution.
     pub(crate) fn on_reference_frames(
         burst: &PreparedBurst,
@@ -81,7 +81,7 @@ impl MergedFrame {
         })
     }
 
-    /// Blends merged patches, each with the variance of its noise.
+    /// Blends merged patches, given with their noise variances.
     fn from_patches(
         burst: &PreparedBurst,
         patch: impl Fn(usize) -> (Patch, f32) + Send + Sync,
@@ -95,13 +95,14 @@ impl MergedFrame {
     }
 }
 
-/// What sampling between pixels, `d` away, leaves of the variance of white noise along each axis; `along`
-/// says it of one.
+/// Returns the factors by which sampling at displacement `d` reduces the variance of white noise along each
+/// axis; `along` computes the factor of one axis.
 fn left_of_noise(d: [f32; 2], along: impl Fn(f32) -> f32) -> [f32; 2] {
     d.map(|d| along(d - d.floor()))
 }
 
-/// What bilinear samples, `part` of a pixel away, leave of the variance of white noise along an axis.
+/// Returns the factor by which bilinear sampling, `part` of a pixel away, reduces the variance of white
+/// noise.
 fn bilinear_noise(part: f32) -> f32 {
     part * part + (1.0 - part) * (1.0 - part)
 }

@@ -1,6 +1,6 @@
-//! Robust merge of aligned patches: a Wiener filter over time in the frequency domain, which gives
-//! coefficients that do not fit the reference little weight (Hasinoff et al. 2016, section 5; Ma et al. 2020,
-//! section 5.2).
+//! Robust merge of aligned patches: a Wiener filter over time in the frequency domain. Coefficients that
+//! differ from the reference get little weight (Hasinoff et al. 2016, section 5; Ma et al. 2020, section
+//! 5.2).
 
 use super::dft16::{Spectrum, forward, inverse};
 use crate::patch::{Patch, SIDE};
@@ -11,22 +11,22 @@ use multiversion::multiversion;
 pub(crate) struct AlignedPatch {
     /// Mean counts, warped onto the reference.
     pub(crate) patch: Patch,
-    /// Frames behind it.
+    /// Number of frames in the block.
     pub(crate) frames: f32,
-    /// Variance of its noise, in units of the variance of one frame's counts.
+    /// Noise variance of the patch, in units of the variance of one frame's counts.
     pub(crate) noise: f32,
 }
 
-/// Merges `patches`, the reference first, of frames whose counts have the given `variance`. `wiener_c` is the
-/// squared difference, in units of that which noise makes, at which a coefficient gets half its weight.
-/// Returns the patch and the variance of its noise, in units of the variance of one frame's counts.
+/// Merges `patches`, the reference first. Counts of single frames have the given `variance`. A coefficient
+/// gets half its weight where its squared difference is `wiener_c` times the expected squared difference of
+/// noise. Returns the patch and its noise variance, in units of the variance of one frame's counts.
 pub(crate) fn merge(patches: &[AlignedPatch], variance: f32, wiener_c: f32) -> (Patch, f32) {
     let spectra = spectra(patches.iter().map(|aligned| &aligned.patch));
     merge_spectra(patches, &spectra, &spectra, variance, wiener_c)
 }
 
-/// Merges `patches` like [`merge`], but decides on `shown`, estimates of what the patches show, which
-/// coefficients fit.
+/// Merges `patches` like [`merge`], but computes the weights of the coefficients on `shown`, estimates of the
+/// same patches with less noise.
 pub(crate) fn merge_by_reference(
     patches: &[AlignedPatch],
     shown: &[Patch],
@@ -38,7 +38,7 @@ pub(crate) fn merge_by_reference(
     merge_spectra(patches, &spectra, &shown, variance, wiener_c)
 }
 
-/// The spectra of patches, computed where they stay: moving them would take as long as half a transform.
+/// Computes the spectra of patches in place: moving them would take as long as half a transform.
 fn spectra<'a>(patches: impl ExactSizeIterator<Item = &'a Patch>) -> Vec<Spectrum> {
     let mut spectra = vec![Spectrum::ZERO; patches.len()];
     for (patch, spectrum) in patches.zip(&mut spectra) {
@@ -47,8 +47,8 @@ fn spectra<'a>(patches: impl ExactSizeIterator<Item = &'a Patch>) -> Vec<Spectru
     spectra
 }
 
-/// Merges the `spectra` of `patches`. The robustness weight of each coefficient follows from how far
-/// `criterion` differs from that of the reference.
+/// Merges the `spectra` of `patches`. The weight of each coefficient follows from the difference between its
+/// `criterion` and the reference's.
 #[multiversion(targets("x86_64+avx2"))]
 fn merge_spectra(
     patches: &[AlignedPatch],
@@ -64,7 +64,7 @@ fn merge_spectra(
     for row in sum.re.iter_mut().chain(&mut sum.im).flatten() {
         *row *= share;
     }
-    // Of each coefficient: how much of it is the reference's, and the noise of the others.
+    // For each coefficient: the reference's share, and the noise of the others.
     let mut own = [[share; SIDE]; SIDE];
     let mut noise = [[0.0f32; SIDE]; SIDE];
     for (k, aligned) in patches.iter().enumerate().skip(1) {
@@ -91,7 +91,7 @@ fn merge_spectra(
     (inverse(sum), left / (SIDE * SIDE) as f32)
 }
 
-/// Squared magnitudes of the difference's coefficients.
+/// Returns the squared magnitudes of the coefficients of `a - b`.
 #[inline(always)]
 fn powers(a: &Spectrum, b: &Spectrum) -> Patch {
     let mut powers = [[0.0; SIDE]; SIDE];
@@ -135,12 +135,12 @@ mod tests {
             assert!((a - b).abs() < 0.05, "{a} {b}");
         }
         assert!(noise > 0.95, "{noise}");
-        // With noise that large they could be the same.
+        // With noise this large, both could be the same.
         let (_, noise) = merge(&[aligned(&texture(1)), aligned(&other)], 1e4, 4.0);
         assert!(noise < 0.55, "{noise}");
     }
 
-    /// However much the patches differ, if the estimates agree: that was noise.
+    /// Checks that patches are merged if their estimates agree, however much the patches themselves differ.
     #[test]
     fn reference_patches_decide_what_fits() {
         let other = texture(5).map(|row| row.map(|v| 40.0 - 3.0 * v));

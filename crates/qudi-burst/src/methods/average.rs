@@ -1,5 +1,5 @@
-//! The mean of the window, scaled: what everyone tries first. No response is inverted and no dark
-//! count subtracted; motion blurs.
+//! Scaled mean of the window: the naive baseline. It does not invert the sensor's response or subtract dark
+//! counts, and motion blurs.
 
 use crate::moving_sums::moving_sums;
 use qudi_core::Frame;
@@ -7,11 +7,11 @@ use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::CountLaw;
 
-/// Mean of 11 frames.
+/// Mean of 11 frames, scaled to image units.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Average;
 
-/// Frames averaged.
+/// Number of frames averaged.
 const WINDOW: usize = 11;
 
 impl Restorer for Average {
@@ -32,7 +32,7 @@ impl Restorer for Average {
         let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
         let detections = acquisition.sensor.quantum_efficiency * acquisition.ppp
             + acquisition.sensor.dark_per_frame()?;
-        // The count that an image value of `mean_level` gives on average.
+        // Mean count per unit of image value.
         let per_unit = law.mean(detections) / acquisition.mean_level;
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, WINDOW / 2, |sums, n| {

@@ -1,5 +1,5 @@
-//! The most likely flux of a moving mean: response inverted, dark counts subtracted, over as many
-//! frames as the motion allows.
+//! Maximum-likelihood flux of a moving mean: it inverts the sensor's response and subtracts dark counts. The
+//! length of the mean is limited by motion.
 
 use crate::moving_sums::{moving_sums, sure_window_radius};
 use qudi_core::Frame;
@@ -7,24 +7,24 @@ use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 
-/// Maximum-likelihood estimate over a window of 1 to 11 frames.
+/// Maximum-likelihood estimate of the flux over a window of 1 to 11 frames.
 #[derive(Clone, Copy, Debug)]
 pub struct Mle {
     radius: usize,
 }
 
 impl Mle {
-    /// Estimates over `radius` frames on either side.
+    /// Creates an estimate over `radius` frames on either side.
     pub fn new(radius: usize) -> Self {
         Self { radius }
     }
 
-    /// Chooses the length on windows of the clip, by [`sure_window_radius`].
+    /// Chooses the length on windows of the clip, with [`sure_window_radius`].
     pub fn choose(samples: &[BurstView<'_>], acquisition: &Acquisition) -> Self {
         Self { radius: sure_window_radius(samples, acquisition, 1.0) }
     }
 
-    /// The number of frames in each sum.
+    /// Returns the number of frames in each sum.
     pub fn length(self) -> usize {
         2 * self.radius + 1
     }

@@ -1,8 +1,8 @@
-//! Quanta burst photography (Ma, Gupta, Ulku, Bruschini, Charbon and Gupta, ACM TOG 39(4), 2020):
-//! frames are summed into blocks, the blocks aligned patch by patch with one reference, the motion
-//! interpolated between them, the frames warped and merged robustly, and the response inverted.
+//! Quanta burst photography (Ma, Gupta, Ulku, Bruschini, Charbon and Gupta, ACM TOG 39(4), 2020). Frames are
+//! summed into blocks, and the blocks are aligned patch by patch with one reference. Their motion is
+//! interpolated to single frames, the frames are warped and merged robustly, and the response is inverted.
 //!
-//! Every frame of the window is the reference once. Binary and few-bit counts are treated alike.
+//! Every frame of the window serves as the reference once. Binary and few-bit counts are treated alike.
 
 use crate::denoise::bm3d::SearchSettings;
 use crate::denoise::stabilized::{denoise, image};
@@ -15,30 +15,30 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
 
-/// The filter that follows the merge.
+/// Filter applied after the merge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PostFilter {
-    /// Nothing follows.
+    /// No filter.
     None,
-    /// BM3D on the merged frame, its variance stabilized.
+    /// BM3D on the merged frame, with stabilized variance.
     Bm3d,
 }
 
 /// Settings of QBP, chosen on training clips.
 #[derive(Clone, Copy, Debug)]
 pub struct QbpSettings {
-    /// Blocks hold as many frames as it takes for this many detections per pixel, at most 5.
+    /// Number of detections per pixel in a block, which sets its length of at most 5 frames.
     pub detections_per_block: f64,
-    /// The constant of the Wiener filter: the squared difference, in units of that which noise makes, at
-    /// which a block gets half its weight.
+    /// Constant of the Wiener filter: the squared difference at which a coefficient gets half its weight, in
+    /// units of the expected squared difference of noise.
     pub wiener_c: f32,
-    /// The noise sigma that BM3D assumes, in units of the merge's own.
+    /// Noise sigma assumed by BM3D, in units of the merge's own.
     pub bm3d_sigma_factor: f64,
 }
 
 impl QbpSettings {
-    /// The default settings before `post_filter`. Where BM3D follows, it pays to merge less: noise can still
-    /// be removed, ghosts cannot.
+    /// Creates the default settings for a given `post_filter`. With BM3D the merge is more selective: the
+    /// remaining noise can be removed later, but ghosts cannot.
     pub fn new(post_filter: PostFilter) -> Self {
         let wiener_c = match post_filter {
             PostFilter::None => 64.0,
@@ -98,13 +98,13 @@ impl Qbp {
         Ok(references.iter().map(|&reference| restore(reference)).collect())
     }
 
-    /// Chooses how many frames are summed into a block.
+    /// Returns the number of frames in a block.
     pub(crate) fn block_length(self, acquisition: &Acquisition) -> Result<usize> {
         let sensor = &acquisition.sensor;
         let detections = sensor.quantum_efficiency * acquisition.ppp + sensor.dark_per_frame()?;
         let frames =
             (self.settings.detections_per_block / detections).ceil().clamp(1.0, 5.0) as usize;
-        // Odd, so that a block has a middle.
+        // An odd number, so that a block has a middle frame.
         Ok(frames | 1)
     }
 }
@@ -131,17 +131,17 @@ impl Restorer for Qbp {
     }
 }
 
-/// The motion of every patch of one frame to every frame of its window.
+/// Motion of every patch of one frame to every frame of its window.
 #[derive(Clone, Debug)]
 pub struct PatchFlow {
-    /// Corners of the patches of 16 x 16 pixels, `(x, y)`.
+    /// Corners of the 16 x 16 pixel patches, `(x, y)`.
     pub corners: Vec<[usize; 2]>,
-    /// Displacements, `[frame][patch]`, right and down in pixels.
+    /// Displacements `[frame][patch]` in pixels, right and down.
     pub flow: PatchMotion,
 }
 
 impl PatchFlow {
-    /// Finds the motion that [`Qbp`] goes by for frame `reference`, to measure it.
+    /// Finds the motion that [`Qbp`] uses for frame `reference`, for evaluation.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown.

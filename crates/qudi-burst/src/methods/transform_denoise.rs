@@ -1,6 +1,6 @@
-//! Transform Denoise (Chan, Elgendy and Wang, "Images from bits: non-iterative image reconstruction
-//! for quanta image sensors", Sensors 16(11):1961, 2016): sums of frames, a variance-stabilising
-//! transform, BM3D, the exact inverse. Without the transform it is BM3D alone.
+//! Transform Denoise (Chan, Elgendy and Wang, "Images from bits: non-iterative image reconstruction for
+//! quanta image sensors", Sensors 16(11):1961, 2016): sums of frames, a variance-stabilising transform, BM3D,
+//! and the exact inverse. Without the transform it is BM3D alone.
 
 use crate::denoise::bm3d::SearchSettings;
 use crate::denoise::stabilized::{denoise, image};
@@ -10,9 +10,9 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Frame, Result};
 
-/// What BM3D leaves of the variance of the noise, about (chosen on training clips,
+/// Approximate fraction of the noise variance that remains after BM3D (chosen on training clips,
 /// docs/notes/burst/stabilization-and-length.md).
-const NOISE_LEFT: f64 = 0.05;
+const REMAINING_NOISE: f64 = 0.05;
 
 /// BM3D on moving sums of frames.
 #[derive(Clone, Copy, Debug)]
@@ -22,22 +22,22 @@ pub struct TransformDenoise {
 }
 
 impl TransformDenoise {
-    /// Denoises sums of `2 * radius + 1` frames.
+    /// Creates a method that denoises sums of `2 * radius + 1` frames.
     pub fn new(transform: Transform, radius: usize) -> Self {
         Self { transform, radius }
     }
 
-    /// Chooses the length of the sums on windows of the clip, so that what moves is not blurred more
-    /// than the noise allows.
+    /// Chooses the length of the sums on windows of the clip, as a trade-off between motion blur and noise
+    /// ([`sure_window_radius`]).
     pub fn choose(
         transform: Transform,
         samples: &[BurstView<'_>],
         acquisition: &Acquisition,
     ) -> Self {
-        Self::new(transform, sure_window_radius(samples, acquisition, NOISE_LEFT))
+        Self::new(transform, sure_window_radius(samples, acquisition, REMAINING_NOISE))
     }
 
-    /// The number of frames in each sum.
+    /// Returns the number of frames in each sum.
     pub fn length(self) -> usize {
         2 * self.radius + 1
     }

@@ -1,38 +1,39 @@
-//! Affine maps between frames, and steps towards the one that aligns a frame with another.
+//! Affine maps between frames, and Gauss-Newton steps that align a frame with another.
 
 use qudi_core::{Frame, Size};
 
-/// Mean squared residual around a pixel, in the noise's variance, at which it counts a quarter; and how far
-/// that is taken from.
-const TRUST: f32 = 1.4;
-const RADIUS: usize = 2;
+/// Mean squared residual around a pixel, in units of the noise's variance, at which its weight falls to a
+/// quarter.
+const ROBUST_SCALE: f32 = 1.4;
+/// Radius of the square over which residuals are averaged, in pixels.
+const RESIDUAL_RADIUS: usize = 2;
 
-/// Deviation of a step at the image's border, in pixels, if nothing is seen.
-const PRIOR: f32 = 0.5;
+/// Prior sigma of a step at the image's border, in pixels.
+const STEP_SIGMA: f32 = 0.5;
 
-/// Longest step there.
-const LONGEST: f64 = 2.0;
+/// Largest step at the image's border, in pixels.
+const MAX_STEP: f64 = 2.0;
 
-/// Fewest pixels that two frames share.
-const FEWEST: usize = 64;
+/// Minimum number of pixels that two frames must share.
+const MIN_SHARED_PIXELS: usize = 64;
 
-/// Weight that keeps slopes as they are.
-const STIFF: f64 = 1e9;
+/// Weight of the prior that keeps slopes fixed.
+const FIXED_SLOPE_WEIGHT: f64 = 1e9;
 
-/// Which numbers of a map a step may change.
+/// Parameters of a map that a step may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Freedom {
-    /// The constants.
+    /// The translation only.
     Shift,
-    /// All.
+    /// All parameters.
     Affine,
 }
 
-/// Numbers of an affine map.
-const NUMBERS: usize = 6;
+/// Number of parameters of an affine map.
+const PARAMETERS: usize = 6;
 
-/// For each coordinate its constant and its slopes along x and y; places in pixels from the centre of the
-/// image.
+/// An affine map: for each coordinate its constant and its slopes along x and y. Positions are in pixels from
+/// the centre of the image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Affine([[f32; 3]; 2]);
 
@@ -41,12 +42,12 @@ impl Affine {
         Self([[x, 1.0, 0.0], [y, 0.0, 1.0]])
     }
 
-    /// Where a place goes.
+    /// Maps a position.
     pub(crate) fn of(self, [x, y]: [f32; 2]) -> [f32; 2] {
         self.0.map(|[constant, along, across]| constant + along * x + across * y)
     }
 
-    /// Where what is at a place has come from.
+    /// Applies the inverse map to a position.
     pub(crate) fn inverse_of(self, [x, y]: [f32; 2]) -> [f32; 2] {
         let [[u, a, b], [v, c, d]] = self.0;
         let determinant = a * d - b * c;
@@ -54,7 +55,7 @@ impl Affine {
         [(d * x - b * y) / determinant, (a * y - c * x) / determinant]
     }
 
-    /// The same between images whose pixels are `times` smaller.
+    /// Converts the map to images whose pixels are `times` smaller.
     pub(crate) fn finer(mut self, times: f32) -> Self {
         for numbers in &mut self.0 {
             numbers[0] *= times;
@@ -62,8 +63,8 @@ impl Affine {
         self
     }
 
-    /// `frame` aligned with the image that this maps from, bilinear between pixels; NaN where it does not
-    /// reach.
+    /// Aligns `frame` with the image that this maps from, with bilinear interpolation. Pixels outside the
+    /// frame are NaN.
     pub(crate) fn aligned(self, frame: &Frame) -> Vec<f32> {
         let size = frame.size;
         let centre = centre(size);
@@ -75,9 +76,10 @@ impl Affine {
         (0..size.pixels()).map(value).collect()
     }
 
-    /// A step of Gauss and Newton (Lucas and Kanade 1981) towards the map that aligns a frame with `template`,
-    /// robustly: what moves otherwise hardly counts, however strong its contrast. `values` are the frame aligned
-    /// upon it by this map, both of size `size`; nothing if they have too little in common.
+    /// Takes a Gauss-Newton step (Lucas and Kanade 1981) towards the map that aligns a frame with `template`.
+    /// `values` is the frame aligned by this map; both have size `size`. The step is robust: pixels that move
+    /// differently get little weight, however strong their contrast. Returns `None` if the two share too few
+    /// pixels.
     pub(crate) fn stepped(
         self,
         values: &[f32],
@@ -87,7 +89,7 @@ impl Affine {
     ) -> Option<Self> {
         let differences = values.iter().zip(template).map(|(value, wanted)| (value - wanted).abs());
         let mut known: Vec<f32> = differences.clone().filter(|d| d.is_finite()).collect();
-        if known.len() < FEWEST {
+        if known.len() < MIN_SHARED_PIXELS {
             return None;
         }
         let half = known.len() / 2;
@@ -96,8 +98,8 @@ impl Affine {
         let variance = (median / 0.6745).powi(2).max(1e-12);
         let centre = centre(size);
         let border = centre[0].max(centre[1]);
-        let mut normal = [[0.0f64; NUMBERS]; NUMBERS];
-        let mut pull = [0.0f64; NUMBERS];
+        let mut normal = [[0.0f64; PARAMETERS]; PARAMETERS];
+        let mut pull = [0.0f64; PARAMETERS];
         for y in 1..size.height - 1 {
             for x in 1..size.width - 1 {
                 let i = y * size.width + x;
@@ -107,7 +109,7 @@ impl Affine {
                 if (residual + across + down).is_nan() {
                     continue;
                 }
-                let excess = misfit[i] / (TRUST * variance);
+                let excess = misfit[i] / (ROBUST_SCALE * variance);
                 let weight = 1.0 / (1.0 + excess * excess);
                 let weight = f64::from(weight * weight);
                 let from = [(x as f32 - centre[0]) / border, (y as f32 - centre[1]) / border];
@@ -123,30 +125,32 @@ impl Affine {
         }
         for (p, row) in normal.iter_mut().enumerate() {
             let slope = p % 3 > 0;
-            let stiff = if slope && freedom == Freedom::Shift { STIFF } else { 0.0 };
-            row[p] += f64::from(variance / (PRIOR * PRIOR)) + stiff;
+            let stiff = if slope && freedom == Freedom::Shift { FIXED_SLOPE_WEIGHT } else { 0.0 };
+            row[p] += f64::from(variance / (STEP_SIGMA * STEP_SIGMA)) + stiff;
         }
         let step = solved(normal, pull)?;
         let mut next = self;
         for (numbers, step) in next.0.iter_mut().zip(step.chunks_exact(3)) {
             for (p, (number, step)) in numbers.iter_mut().zip(step).enumerate() {
                 let unit = if p == 0 { 1.0 } else { border };
-                *number -= step.clamp(-LONGEST, LONGEST) as f32 / unit;
+                *number -= step.clamp(-MAX_STEP, MAX_STEP) as f32 / unit;
             }
         }
         Some(next)
     }
 }
 
-/// The place that maps are about.
+/// Returns the origin of the maps' coordinates: the centre of the image.
 pub(crate) fn centre(size: Size) -> [f32; 2] {
     [size.width, size.height].map(|side| 0.5 * (side as f32 - 1.0))
 }
 
-/// Means of squares around every pixel, of those that are numbers.
+/// Computes the mean square around every pixel, over the finite values.
 fn mean_squares(values: &[f32], size: Size) -> Vec<f32> {
     let Size { height, width } = size;
-    let near = |at: usize, length: usize| at.saturating_sub(RADIUS)..(at + RADIUS + 1).min(length);
+    let near = |at: usize, length: usize| {
+        at.saturating_sub(RESIDUAL_RADIUS)..(at + RESIDUAL_RADIUS + 1).min(length)
+    };
     let add = |sums: &mut [[f32; 2]], values: &[[f32; 2]]| {
         for (sum, value) in sums.iter_mut().zip(values) {
             *sum = [sum[0] + value[0], sum[1] + value[1]];
@@ -156,9 +160,12 @@ fn mean_squares(values: &[f32], size: Size) -> Vec<f32> {
     let squares: Vec<[f32; 2]> = squares.collect();
     let mut rows = vec![[0.0; 2]; values.len()];
     for (sums, squares) in rows.chunks_exact_mut(width).zip(squares.chunks_exact(width)) {
-        // From left to right: `shift` is how far right of the pixel the value lies.
-        for shift in (0..=2 * RADIUS).filter(|shift| shift.abs_diff(RADIUS) < width) {
-            let (skipped, from) = (RADIUS.saturating_sub(shift), shift.saturating_sub(RADIUS));
+        // `shift` is the offset to the right of the summed value plus `RESIDUAL_RADIUS`.
+        for shift in
+            (0..=2 * RESIDUAL_RADIUS).filter(|shift| shift.abs_diff(RESIDUAL_RADIUS) < width)
+        {
+            let (skipped, from) =
+                (RESIDUAL_RADIUS.saturating_sub(shift), shift.saturating_sub(RESIDUAL_RADIUS));
             add(&mut sums[skipped..], &squares[from..]);
         }
     }
@@ -173,7 +180,7 @@ fn mean_squares(values: &[f32], size: Size) -> Vec<f32> {
     means
 }
 
-/// Bilinear between pixels, no number outside.
+/// Interpolates bilinearly; returns NaN outside the frame.
 fn between(frame: &Frame, x: f32, y: f32) -> f32 {
     let Size { height, width } = frame.size;
     if !(x >= 0.0 && y >= 0.0 && x < (width - 1) as f32 && y < (height - 1) as f32) {
@@ -187,9 +194,13 @@ fn between(frame: &Frame, x: f32, y: f32) -> f32 {
     upper + (y - top as f32) * (lower - upper)
 }
 
-/// The solution of a symmetric positive system whose lower half is given, by Cholesky's factors.
-fn solved(mut matrix: [[f64; NUMBERS]; NUMBERS], mut x: [f64; NUMBERS]) -> Option<[f64; NUMBERS]> {
-    for p in 0..NUMBERS {
+/// Solves a symmetric positive definite system by Cholesky factorization. Only the lower half of `matrix` is
+/// read.
+fn solved(
+    mut matrix: [[f64; PARAMETERS]; PARAMETERS],
+    mut x: [f64; PARAMETERS],
+) -> Option<[f64; PARAMETERS]> {
+    for p in 0..PARAMETERS {
         for q in 0..=p {
             let sum: f64 = (0..q).map(|r| matrix[p][r] * matrix[q][r]).sum();
             let rest = matrix[p][q] - sum;
@@ -204,8 +215,8 @@ fn solved(mut matrix: [[f64; NUMBERS]; NUMBERS], mut x: [f64; NUMBERS]) -> Optio
         let sum: f64 = (0..p).map(|r| matrix[p][r] * x[r]).sum();
         x[p] = (x[p] - sum) / matrix[p][p];
     }
-    for p in (0..NUMBERS).rev() {
-        let sum: f64 = (p + 1..NUMBERS).map(|r| matrix[r][p] * x[r]).sum();
+    for p in (0..PARAMETERS).rev() {
+        let sum: f64 = (p + 1..PARAMETERS).map(|r| matrix[r][p] * x[r]).sum();
         x[p] = (x[p] - sum) / matrix[p][p];
     }
     Some(x)
@@ -228,11 +239,11 @@ mod tests {
     fn solves_linear_systems() {
         let row =
             |p: usize| std::array::from_fn(|q| if p == q { 4.0 } else { 1.0 / (p + q) as f64 });
-        let matrix: [[f64; NUMBERS]; NUMBERS] = std::array::from_fn(row);
-        let wanted: [f64; NUMBERS] = std::array::from_fn(|p| p as f64 - 2.5);
+        let matrix: [[f64; PARAMETERS]; PARAMETERS] = std::array::from_fn(row);
+        let wanted: [f64; PARAMETERS] = std::array::from_fn(|p| p as f64 - 2.5);
         let right = matrix.map(|row| row.iter().zip(&wanted).map(|(a, x)| a * x).sum());
         let found = solved(matrix, right).unwrap_or_else(|| panic!("it is positive"));
         assert!(found.iter().zip(&wanted).all(|(a, b)| (a - b).abs() < 1e-12), "{found:?}");
-        assert!(solved([[0.0; NUMBERS]; NUMBERS], right).is_none());
+        assert!(solved([[0.0; PARAMETERS]; PARAMETERS], right).is_none());
     }
 }

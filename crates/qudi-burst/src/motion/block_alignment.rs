@@ -12,7 +12,7 @@ use std::borrow::Cow;
 /// Aligns the blocks of a window of counts.
 #[derive(Debug)]
 pub(crate) struct BlockAligner {
-    /// Frames in a block; odd.
+    /// Frames per block; odd.
     block_length: usize,
     /// Pyramids of single frames, for blocks of one frame.
     pyramids: Vec<Pyramid>,
@@ -35,7 +35,7 @@ impl BlockAligner {
         (blocks, motion)
     }
 
-    /// The pyramid of the mean of block `k`.
+    /// Returns the pyramid of the mean of block `k`.
     fn pyramid(&self, burst: &PreparedBurst, blocks: &Blocks, k: usize) -> Cow<'_, Pyramid> {
         let range = blocks.ranges[k].clone();
         if let [pyramid] = self.pyramids.get(range.clone()).unwrap_or_default() {
@@ -52,8 +52,8 @@ impl BlockAligner {
     }
 }
 
-/// Matches the `patches` patches of the reference block in all other blocks, and interpolates their motion to
-/// all frames. `variance` is that of the difference of two matched pixels of single frames.
+/// Matches all patches of the reference block in all other blocks, and interpolates their motion to all
+/// frames. `variance` is the variance of the difference of two matched pixels of single frames.
 pub(crate) fn align_blocks<'a>(
     blocks: &Blocks,
     reference: usize,

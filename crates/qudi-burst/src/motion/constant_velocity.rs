@@ -1,4 +1,4 @@
-//! Constant velocity of every patch, as the counts of all frames agree on.
+//! Constant velocity of every patch, estimated from the counts of all frames.
 
 use super::grid::Grid;
 use super::pyramid::smooth;
@@ -8,21 +8,22 @@ use crate::prepared_burst::PreparedBurst;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
-/// Frames from one whose velocities are searched to the next; those of the others follow from these.
-const ANCHORS: usize = 6;
+/// Spacing in frames of the anchors at which velocities are searched. The velocities of other frames follow
+/// from these.
+const ANCHOR_SPACING: usize = 6;
 
-/// The constant velocity of every patch of a window, from its counts alone.
+/// Constant velocity of every patch of a window, estimated from its counts alone.
 #[derive(Debug)]
 pub(crate) struct ConstantVelocity {
-    /// Counts, smoothed.
+    /// Smoothed counts.
     pub(crate) smoothed: Vec<Frame>,
     /// Velocities of the patches of every frame, `[frame][patch]`.
     velocities: PatchMotion,
 }
 
 impl ConstantVelocity {
-    /// Finds the velocities of a window; none if there are too few frames to agree. They are rest, or that of
-    /// the whole frame, unless another fits better by `evidence` nats.
+    /// Finds the velocities of a window, or returns `None` if it has too few frames. A patch is static or
+    /// moves with the whole frame unless another velocity fits better by `evidence` nats.
     pub(crate) fn find(burst: &PreparedBurst, evidence: f32) -> Option<Self> {
         let frames = &burst.frames;
         if frames.len() < 3 {
@@ -30,7 +31,8 @@ impl ConstantVelocity {
         }
         let search = VelocitySearch::new(frames, &burst.moments);
         let grid = &burst.grid;
-        let anchors = ((frames.len() - 1) % ANCHORS / 2..frames.len()).step_by(ANCHORS);
+        let anchors =
+            ((frames.len() - 1) % ANCHOR_SPACING / 2..frames.len()).step_by(ANCHOR_SPACING);
         let found: Vec<_> = anchors.map(|k| (k, search.velocities(grid, k, evidence))).collect();
         let of = |frame: usize| {
             let (anchor, velocities) = found.iter().min_by_key(|(k, _)| k.abs_diff(frame))?;
@@ -41,12 +43,12 @@ impl ConstantVelocity {
         Some(Self { smoothed: frames.par_iter().map(smooth).collect(), velocities })
     }
 
-    /// The velocities of the patches of frame `frame`, in pixels per frame.
+    /// Returns the velocities of the patches of frame `frame`, in pixels per frame.
     pub(crate) fn velocities(&self, frame: usize) -> &[[f32; 2]] {
         &self.velocities[frame]
     }
 
-    /// The motion of every patch of frame `reference` to every frame.
+    /// Returns the motion of every patch of frame `reference` to every frame.
     pub(crate) fn motion(&self, reference: usize) -> PatchMotion {
         let velocities = &self.velocities[reference];
         let time = |k: usize| k as f32 - reference as f32;
@@ -56,8 +58,8 @@ impl ConstantVelocity {
     }
 }
 
-/// The velocity of patch `i` from those of the patches `time` frames later: that of the patch which it has
-/// moved to.
+/// Returns the velocity of patch `i` given the velocities `time` frames later: the velocity of the patch that
+/// it has moved to.
 fn carried(grid: &Grid, velocities: &[[f32; 2]], i: usize, time: f32) -> [f32; 2] {
     let centre = grid.corner(i).map(|corner| (corner + grid.side / 2) as f32);
     let mut v = velocities[i];
@@ -79,14 +81,14 @@ mod tests {
     #[test]
     fn carries_velocities_along_their_own_motion() {
         let grid = Grid::new(SIZE, SIDE, SIDE / 2);
-        // The left half moves right, two pixels per frame, the right half rests.
+        // The left half moves right by two pixels per frame, the right half is static.
         let border = |x: usize| if x < 48 { [2.0, 0.0] } else { [0.0, 0.0] };
         let velocities: Vec<[f32; 2]> =
             (0..grid.len()).map(|i| border(grid.corner(i)[0])).collect();
         for i in 0..grid.len() {
             let [x, _] = grid.corner(i);
             let found = carried(&grid, &velocities, i, 2.0);
-            // Four pixels on, a patch within two of the border has crossed it.
+            // Two frames later, a patch within four pixels of the border has crossed it.
             if x < 40 {
                 assert_eq!(found, [2.0, 0.0]);
             } else if x > 48 {

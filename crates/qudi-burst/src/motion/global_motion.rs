@@ -1,8 +1,8 @@
-//! The camera's own motion: what most of the image does together, however unevenly.
+//! Global motion: the common motion of most of the image, caused by the camera.
 //!
-//! A patch of a few photons says little of its motion, the whole image a lot. Squares of the image vote on
-//! the shift from each frame to the next; then affine maps are found that lay all frames upon the mean of the
-//! others, which is far less noisy than any of them.
+//! A patch of a few photons tells little about its motion, but the whole image tells a lot. Squares of the
+//! image vote on the shift from each frame to the next. Affine maps then align every frame with the mean of
+//! the others, which has much less noise than a single frame.
 
 use super::affine::{Affine, Freedom, centre};
 use super::pyramid::{shrink, smooth};
@@ -11,52 +11,56 @@ use qudi_core::sensor::CountMoments;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 
-/// Pixels of the frames along a side of a pixel where squares vote.
-const VOTES: usize = 4;
+/// Factor by which frames are shrunk for the vote.
+const VOTE_SHRINK: usize = 4;
 
-/// The same where frames are registered, coarse to fine, and what is found there. The first is coarser than
-/// that of the votes, which are wrong by some pixels where something else has more contrast.
+/// Shrink factors and motion models of registration, from coarse to fine. The first level is coarser than the
+/// vote's, because votes can be wrong by a few pixels where another motion has more contrast.
 const LEVELS: [(usize, Freedom); 3] =
     [(8, Freedom::Shift), (4, Freedom::Shift), (2, Freedom::Affine)];
 
-/// Farthest shift from one frame to the next, in pixels of the votes' level, and shifts along each axis.
-const FARTHEST: isize = 8;
-const ACROSS: isize = 2 * FARTHEST + 1;
+/// Maximum shift from one frame to the next, in pixels of the vote's level.
+const MAX_SHIFT: isize = 8;
+/// Number of shifts along each axis.
+const SHIFTS_PER_AXIS: isize = 2 * MAX_SHIFT + 1;
 
-/// Least side of that level.
-const SMALLEST: usize = 12;
+/// Minimum side of the vote's level, in pixels.
+const MIN_SIDE: usize = 12;
 
-/// Side of the squares that vote, in the same, and nats that each has at most.
-const VOTER: usize = 5;
-const MOST: f32 = 8.0;
+/// Side of a voting square, in pixels of the vote's level.
+const VOTER_SIDE: usize = 5;
+/// Upper bound of a square's vote, in nats.
+const MAX_VOTE: f32 = 8.0;
 
-/// Times that the mean of the others is made anew on each level, and steps towards it each time.
+/// Number of rounds per level. Each round computes the mean of the other frames again.
 const ROUNDS: usize = 3;
+/// Gauss-Newton steps per round.
 const STEPS: usize = 2;
 
-/// The motion of a whole window: one affine map from the middle frame to each frame.
+/// Motion of a whole window: one affine map from the middle frame to each frame.
 #[derive(Clone, Debug)]
 pub(crate) struct GlobalMotion {
     centre: [f32; 2],
-    /// From where the middle frame is, about, to each.
+    /// Maps from an approximate middle frame to each frame.
     maps: Vec<Affine>,
 }
 
 impl GlobalMotion {
-    /// Of a window's frames of mean counts, whose errors are `error` times the variance of counts; nothing if
-    /// frames are too few or too small to tell.
+    /// Estimates the motion of a window's mean counts, whose errors have `error` times the variance of
+    /// counts. Returns `None` if there are too few frames or they are too small.
     pub(crate) fn find(frames: &[Frame], moments: &CountMoments, error: f32) -> Option<Self> {
         let whole = frames.first()?.size;
-        let size = Size { height: whole.height / VOTES, width: whole.width / VOTES };
-        if frames.len() < 3 || size.height.min(size.width) < SMALLEST {
+        let size = Size { height: whole.height / VOTE_SHRINK, width: whole.width / VOTE_SHRINK };
+        if frames.len() < 3 || size.height.min(size.width) < MIN_SIDE {
             return None;
         }
-        let small: Vec<Frame> = frames.par_iter().map(|frame| shrink(frame, size, VOTES)).collect();
+        let small: Vec<Frame> =
+            frames.par_iter().map(|frame| shrink(frame, size, VOTE_SHRINK)).collect();
         let share = 1.0 / small.len() as f32;
         let variance = Frame::from_fn(size, |x, y| {
             let mean = share * small.iter().map(|frame| frame.row(y)[x]).sum::<f32>();
             let variance = moments.variance_at_mean(f64::from(mean)) as f32;
-            error * variance.max(1e-4) / (VOTES * VOTES) as f32
+            error * variance.max(1e-4) / (VOTE_SHRINK * VOTE_SHRINK) as f32
         });
         let shifts: Vec<[f32; 2]> =
             small.windows(2).map(|pair| shift(&pair[0], &pair[1], &variance)).collect();
@@ -68,7 +72,7 @@ impl GlobalMotion {
             [0, 1].map(|axis| sign * along(axis))
         };
         let mut maps: Vec<Affine> = (0..frames.len()).map(|k| Affine::shift(sum(k))).collect();
-        let mut last = VOTES;
+        let mut last = VOTE_SHRINK;
         for (ratio, freedom) in LEVELS {
             let times = last as f32 / ratio as f32;
             maps = maps.into_iter().map(|map| map.finer(times)).collect();
@@ -84,8 +88,8 @@ impl GlobalMotion {
         Some(Self { centre: centre(whole), maps })
     }
 
-    /// By how much what is at `place` of frame `reference` is displaced in frame `k`, in pixels, right and
-    /// down.
+    /// Returns the displacement to frame `k` of the point at `place` in frame `reference`, in pixels, right
+    /// and down.
     pub(crate) fn displacement(&self, place: [f32; 2], reference: usize, k: usize) -> [f32; 2] {
         let from = [place[0] - self.centre[0], place[1] - self.centre[1]];
         let to = self.maps[k].of(self.maps[reference].inverse_of(from));
@@ -93,39 +97,41 @@ impl GlobalMotion {
     }
 }
 
-/// The shift that most of the image agrees on, to a part of a pixel. Squares vote, each by the likelihood of
-/// its counts, but within limits: what has much contrast and moves otherwise must not outvote the rest.
+/// Estimates the shift that most of the image agrees on, with subpixel precision. Each square votes with the
+/// likelihood of its counts, up to a bound, so that a moving object of high contrast does not outvote the
+/// rest.
 fn shift(here: &Frame, there: &Frame, variance: &Frame) -> [f32; 2] {
-    let shifts: Vec<[isize; 2]> = (0..ACROSS * ACROSS)
-        .map(|label| [label % ACROSS - FARTHEST, label / ACROSS - FARTHEST])
+    let shifts: Vec<[isize; 2]> = (0..SHIFTS_PER_AXIS * SHIFTS_PER_AXIS)
+        .map(|label| [label % SHIFTS_PER_AXIS - MAX_SHIFT, label / SHIFTS_PER_AXIS - MAX_SHIFT])
         .collect();
     let costs: Vec<f32> =
         shifts.par_iter().map(|&shift| cost([here, there, variance], shift)).collect();
-    // Of what nothing tells apart, the least.
+    // Of equally likely shifts, the smallest is chosen.
     let length = |label: usize| shifts[label].map(|d| d * d).iter().sum::<isize>();
     let order = |&a: &usize, &b: &usize| {
         costs[a].total_cmp(&costs[b]).then_with(|| length(a).cmp(&length(b)))
     };
     let best = (0..costs.len()).min_by(order).unwrap_or(0);
     let along = |place: usize, step: usize| {
-        let whole = place as f32 - FARTHEST as f32;
-        if place == 0 || place + 1 == ACROSS as usize {
+        let whole = place as f32 - MAX_SHIFT as f32;
+        if place == 0 || place + 1 == SHIFTS_PER_AXIS as usize {
             return whole;
         }
         whole + lowest_between([costs[best - step], costs[best], costs[best + step]])
     };
-    let across = ACROSS as usize;
+    let across = SHIFTS_PER_AXIS as usize;
     [along(best % across, 1), along(best / across, across)]
 }
 
-/// Nats that a shift costs, mean of all squares within both images; infinite if those are few.
+/// Computes the cost of a shift in nats, averaged over all squares inside both images. It is infinite if
+/// there are too few squares.
 fn cost([here, there, variance]: [&Frame; 3], [dx, dy]: [isize; 2]) -> f32 {
     let Size { height, width } = here.size;
     let range = |d: isize, length: usize| {
         d.min(0).unsigned_abs()..length.saturating_sub(d.max(0).unsigned_abs())
     };
     let (rows, columns) = (range(dy, height), range(dx, width));
-    let mut sums = vec![0.0f32; columns.len() / VOTER];
+    let mut sums = vec![0.0f32; columns.len() / VOTER_SIDE];
     let (mut sum, mut voters) = (0.0, 0);
     for (n, y) in rows.enumerate() {
         let start = columns.start.wrapping_add_signed(dx);
@@ -133,22 +139,22 @@ fn cost([here, there, variance]: [&Frame; 3], [dx, dy]: [isize; 2]) -> f32 {
         let here = here.row(y)[columns.clone()].iter();
         let squares = here.zip(there).zip(&variance.row(y)[columns.clone()]);
         let squares: Vec<f32> = squares.map(|((a, b), v)| (a - b) * (a - b) / (4.0 * v)).collect();
-        for (sum, squares) in sums.iter_mut().zip(squares.chunks_exact(VOTER)) {
+        for (sum, squares) in sums.iter_mut().zip(squares.chunks_exact(VOTER_SIDE)) {
             *sum += squares.iter().sum::<f32>();
         }
-        if n % VOTER == VOTER - 1 {
-            let noise = 0.5 * (VOTER * VOTER) as f32;
-            sum += sums.iter().map(|square| (square - noise).min(MOST)).sum::<f32>();
+        if n % VOTER_SIDE == VOTER_SIDE - 1 {
+            let noise = 0.5 * (VOTER_SIDE * VOTER_SIDE) as f32;
+            sum += sums.iter().map(|square| (square - noise).min(MAX_VOTE)).sum::<f32>();
             voters += sums.len();
             sums.fill(0.0);
         }
     }
-    let all = (height / VOTER) * (width / VOTER);
+    let all = (height / VOTER_SIDE) * (width / VOTER_SIDE);
     if 5 * voters < 2 * all { f32::INFINITY } else { sum / voters as f32 }
 }
 
-/// Every frame a little closer to the mean of the others (Baker and Matthews, "Lucas-Kanade 20 years on",
-/// IJCV 56(3), 2004, but with a template that all frames make).
+/// Moves every frame a little closer to the mean of the others (Baker and Matthews, "Lucas-Kanade 20 years
+/// on", IJCV 56(3), 2004, with the mean of the other frames as template).
 fn registered(frames: &[Frame], maps: &[Affine], freedom: Freedom) -> Vec<Affine> {
     let size = frames[0].size;
     let aligned: Vec<Vec<f32>> =
@@ -188,7 +194,7 @@ mod tests {
 
     const SIZE: Size = Size { height: 112, width: 144 };
 
-    /// Texture of mean 2 without a period.
+    /// Returns an aperiodic texture of mean 2.
     fn texture(x: f32, y: f32) -> f32 {
         let wave = |i: u8| {
             let i = f32::from(i);
@@ -203,7 +209,7 @@ mod tests {
         CountMoments::new(&CountLaw::new(&sensor, sensor.gain_at(3.25).unwrap()))
     }
 
-    /// Where the camera looks, in pixels, unevenly; and by how much it is nearer.
+    /// Uneven camera path: x and y in pixels, and zoom.
     const PATH: [[f32; 3]; 7] = [
         [-21.0, 4.0, 0.98],
         [-16.0, 1.5, 0.985],
@@ -214,8 +220,8 @@ mod tests {
         [26.0, 3.5, 1.02],
     ];
 
-    /// Frames whose counts vary as photons do, about; a dark square of a tenth of the image stays where it
-    /// is.
+    /// Simulates frames whose counts vary approximately as photons do. A dark square of a tenth of the image
+    /// stays in place.
     fn frames(moments: &CountMoments) -> Vec<Frame> {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let [cx, cy] = centre(SIZE);

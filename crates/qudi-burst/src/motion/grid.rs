@@ -1,11 +1,11 @@
-//! Patches that cover an image.
+//! Grid of patches that cover an image.
 
 use crate::patch::{Patch, SIDE};
 use multiversion::multiversion;
 use qudi_core::{Frame, Size};
 use std::borrow::Borrow;
 
-/// Corners of square patches, the last ones at the borders.
+/// Corners of square patches, the last ones at the image's borders.
 #[derive(Clone, Debug)]
 pub(crate) struct Grid {
     pub(crate) side: usize,
@@ -14,7 +14,7 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
-    /// Patches of `side` pixels, `step` apart, on an image at least that large.
+    /// Creates a grid of patches of `side` pixels, `step` apart, on an image at least that large.
     pub(crate) fn new(size: Size, side: usize, step: usize) -> Self {
         let corners = |length: usize| {
             let last = length.saturating_sub(side);
@@ -23,24 +23,24 @@ impl Grid {
         Self { side, xs: corners(size.width), ys: corners(size.height) }
     }
 
-    /// Lays out the patches of alignment and merging: each overlaps the next by half (Ma et al. 2020, section
-    /// 5.1).
+    /// Creates the grid of alignment and merging: each patch overlaps the next by half (Ma et al. 2020,
+    /// section 5.1).
     pub(crate) fn half_overlapping(size: Size) -> Self {
         Self::new(size, SIDE, SIDE / 2)
     }
 
-    /// The number of patches.
+    /// Returns the number of patches.
     pub(crate) fn len(&self) -> usize {
         self.xs.len() * self.ys.len()
     }
 
-    /// Corner of patch `i`.
+    /// Returns the corner of patch `i`.
     pub(crate) fn corner(&self, i: usize) -> [usize; 2] {
         [self.xs[i % self.xs.len()], self.ys[i / self.xs.len()]]
     }
 
-    /// The upper left part, of size `to`, of a frame of size `from` that overlapping patches make, each of
-    /// which fades out towards its borders.
+    /// Blends overlapping patches, faded out towards their borders, into a frame of size `from`, and crops it
+    /// to size `to`.
     pub(crate) fn blended<P: Borrow<Patch>>(
         &self,
         from: Size,
@@ -70,7 +70,7 @@ impl Grid {
         Frame { size: to, data }
     }
 
-    /// The patch whose centre is nearest to `point`, and its neighbours left, right, above and below.
+    /// Returns the patch whose centre is nearest to `point`, and its neighbours left, right, above and below.
     pub(crate) fn around(&self, point: [f32; 2]) -> [usize; 5] {
         let nearest = |corners: &[usize], at: f32| {
             let corner = at - 0.5 * self.side as f32;
@@ -92,7 +92,7 @@ impl Grid {
         ]
     }
 
-    /// The 3 x 3 patches around patch `i` and itself, as far as there are so many.
+    /// Returns the 3 x 3 patches around patch `i` including itself, without patches outside the grid.
     pub(crate) fn touching(&self, i: usize) -> impl Iterator<Item = usize> + use<> {
         let (columns, rows) = (self.xs.len(), self.ys.len());
         let (x, y) = (i % columns, i / columns);
@@ -101,7 +101,7 @@ impl Grid {
         })
     }
 
-    /// Medians of both components over the 3 x 3 patches around every patch.
+    /// Computes the medians of both components over the 3 x 3 patches around every patch.
     pub(crate) fn medians(&self, flow: &[[f32; 2]]) -> Vec<[f32; 2]> {
         let (columns, rows) = (self.xs.len(), self.ys.len());
         let mut medians = vec![[0.0; 2]; flow.len()];
@@ -120,7 +120,7 @@ impl Grid {
         medians
     }
 
-    /// The medians where there are fewer patches around.
+    /// Computes the medians at the border, where fewer patches surround patch `i`.
     fn median_at_border(&self, flow: &[[f32; 2]], i: usize) -> [f32; 2] {
         [0, 1].map(|component| {
             let mut near: Vec<f32> = self.touching(i).map(|patch| flow[patch][component]).collect();
@@ -130,7 +130,7 @@ impl Grid {
     }
 }
 
-/// Adds a patch times its window, and the window, to the rows of an image from the patch's corner on.
+/// Adds a patch times its window, and the window, to the rows of an image, starting at the patch's corner.
 #[multiversion(targets("x86_64+avx2"))]
 fn add_weighted(
     patch: &Patch,
@@ -149,8 +149,9 @@ fn add_weighted(
     }
 }
 
-/// Medians of 3 x 3 values, two columns apart in three rows; `out` is two columns shorter on each side. By
-/// exchanges that need no branches (Smith, "Implementing median filters in XC4000E FPGAs", XCELL 23, 1996).
+/// Computes medians of 3 x 3 values, two columns apart, from three rows. `out` is two columns shorter on each
+/// side. It uses a branch-free exchange network (Smith, "Implementing median filters in XC4000E FPGAs", XCELL
+/// 23, 1996).
 #[multiversion(targets("x86_64+avx2"))]
 fn medians_of_nine(rows: [&[f32]; 3], out: &mut [f32]) {
     const LANES: usize = 8;
@@ -197,7 +198,7 @@ fn medians_of_nine(rows: [&[f32]; 3], out: &mut [f32]) {
 mod tests {
     use super::*;
 
-    /// Inside and at the borders, of grids as narrow as they get.
+    /// Compares medians with sorted values inside the grid and at its borders, down to the narrowest grids.
     #[test]
     fn medians_are_the_middle_of_sorted_values() {
         for (width, height) in [(16, 16), (24, 16), (32, 24), (120, 88), (168, 24)] {

@@ -1,10 +1,10 @@
-//! Selection of motion hypotheses: every patch moves as it was matched frame by frame, with constant
+//! Selection of motion hypotheses. Every patch moves as it was matched frame by frame, with constant
 //! velocity, or with most of the image, whichever the counts of all frames make most likely.
 //!
-//! Matching reference frames repeats their errors: what they lost cannot be matched, and what they made up
-//! moves as it was merged. Counts are independent from frame to frame. A hypothesis is judged by the
-//! likelihood of all frames' counts: the patch is what the reference estimate shows plus something unknown,
-//! the same in all frames, plus noise.
+//! Matching reference frames repeats their errors: lost detail cannot be matched, and artefacts move as they
+//! were merged. Counts are independent from frame to frame. A hypothesis is therefore judged by the
+//! likelihood of the counts of all frames. The model of a patch is the reference estimate, plus an unknown
+//! difference that is the same in all frames, plus noise.
 
 use super::constant_velocity::ConstantVelocity;
 use super::global_motion::GlobalMotion;
@@ -17,15 +17,15 @@ use multiversion::multiversion;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
-/// By how much a frame may fit worse on a selected hypothesis, in units of the noise's variance. Beyond it,
-/// something came in between, and the frame's own match is kept.
-const WORSE: f32 = 100.0;
+/// Largest increase of a frame's misfit on a selected hypothesis, in units of the noise's variance. Beyond it
+/// the patch is occluded, and the frame's own match is kept.
+const MAX_EXTRA_MISFIT: f32 = 100.0;
 
-/// Settings of the selection, which depend on what the reference's patch is known from.
+/// Settings of the selection, which depend on the source of the reference's patch.
 #[derive(Clone, Copy)]
 struct Settings {
-    /// Variance of one frame's noise in units of that of the reference's errors, both smoothed; 0 where
-    /// nothing is known.
+    /// Variance of one frame's noise over the variance of the reference's errors, both after smoothing. It is
+    /// 0 where the reference tells nothing beyond its own counts.
     known: f32,
     /// Penalty of each pixel that leaves the image, in units of the noise's variance.
     outside: f32,
@@ -34,15 +34,15 @@ struct Settings {
 }
 
 impl Settings {
-    /// The reference is a frame of counts.
+    /// Settings for a reference that is a frame of counts.
     const COUNTS: Self = Self { known: 0.0, outside: 10.0, window: 2 };
-    /// The reference is an estimate.
+    /// Settings for a reference that is an estimate.
     const ESTIMATE: Self = Self { known: 6.0, outside: 0.1, window: 1 };
 }
 
-/// Penalties of hypotheses on reference frames, in units of the noise's variance. Reference frames hold the
-/// noise of the counts that judge hypotheses found in them, and the more freely one was found, the more of
-/// that noise it fits: then noise is merged with itself.
+/// Penalties of hypotheses on reference frames, in units of the noise's variance. Reference frames contain
+/// the noise of the same counts that judge hypotheses found on them. The less constrained a hypothesis is,
+/// the more of that noise it fits, and the merge then averages noise with itself.
 mod penalty {
     pub(crate) const MATCHED: f32 = 200.0;
     pub(crate) const CONSTANT: f32 = 200.0;
@@ -52,15 +52,16 @@ mod penalty {
     pub(crate) const REST: f32 = 0.0;
 }
 
-/// Variance that smoothing leaves of white noise along an axis, and the correlation of neighbours after it.
-const LEFT: f32 = 70.0 / 256.0;
+/// Fraction of the variance of white noise that remains after smoothing along an axis.
+const REMAINING_VARIANCE: f32 = 70.0 / 256.0;
+/// Correlation of neighbouring pixels after smoothing.
 const CORRELATION: f32 = 0.8;
 
-/// The motion that a hypothesis gives every patch, and its penalty.
+/// Penalty of a hypothesis, and the motion that it gives every patch.
 type Hypothesis = (f32, PatchMotion);
 
-/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and
-/// global motion, by the counts alone. Without velocities the matched motion stays.
+/// Selects the motion of every patch of frame `reference` by the counts alone. The candidates are the
+/// `matched` motion, constant velocity and global motion. Without velocities, the matched motion is returned.
 pub(crate) fn select_on_counts(
     burst: &PreparedBurst,
     velocity: Option<&ConstantVelocity>,
@@ -82,9 +83,9 @@ pub(crate) fn select_on_counts(
     selector.select_all(reference, &hypotheses)
 }
 
-/// Selects the motion of every patch of frame `reference` from the `matched` one, constant velocity and
-/// global motion, both as they are and refined on the reference frames, and rest. Without velocities the
-/// matched motion stays.
+/// Selects the motion of every patch of frame `reference`. The candidates are the `matched` motion, rest, and
+/// constant velocity and global motion, each unchanged and refined on the reference frames. Without
+/// velocities, the matched motion is returned.
 pub(crate) fn select_on_estimates(
     burst: &PreparedBurst,
     velocity: Option<&ConstantVelocity>,
@@ -114,7 +115,7 @@ pub(crate) fn select_on_estimates(
     selector.select_all(reference, &hypotheses)
 }
 
-/// The global motion at the centres of all patches.
+/// Evaluates the global motion at the centres of all patches.
 fn global_hypothesis(
     burst: &PreparedBurst,
     global: &GlobalMotion,
@@ -158,7 +159,7 @@ struct HypothesisSelector<'a> {
 }
 
 impl HypothesisSelector<'_> {
-    /// Selects the hypothesis of every patch; what was matched comes first in `hypotheses`.
+    /// Selects the hypothesis of every patch; the first of `hypotheses` must be the matched motion.
     fn select_all(&self, reference: usize, hypotheses: &[Hypothesis]) -> PatchMotion {
         let paths: Vec<Vec<[f32; 2]>> = (0..self.burst.grid.len())
             .into_par_iter()
@@ -173,7 +174,8 @@ impl HypothesisSelector<'_> {
         frames.map(|k| paths.iter().map(|path| path[k]).collect()).collect()
     }
 
-    /// Selects the most likely path of a patch. A frame that denies it keeps the first path's displacement.
+    /// Selects the most likely path of a patch. Frames that fit it badly keep the displacement of the first
+    /// path.
     fn select(
         &self,
         corner: [usize; 2],
@@ -196,22 +198,22 @@ impl HypothesisSelector<'_> {
                 self.add(&own, k, d, &mut sums);
                 sums.misfit(variance, self.settings.outside)
             });
-            if new - old >= WORSE {
+            if new - old >= MAX_EXTRA_MISFIT {
                 *d = matched;
             }
         }
         path
     }
 
-    /// Variance of the smoothed counts where the patch lies.
+    /// Returns the variance of the smoothed counts at the patch.
     fn variance(&self, [x, y]: [usize; 2]) -> f32 {
         let rows = (y..y + SIDE).map(|y| self.template.row(y)[x..x + SIDE].iter().sum::<f32>());
         let mean = rows.sum::<f32>() / (SIDE * SIDE) as f32;
         let variance = self.burst.moments.variance_at_mean(f64::from(mean)) as f32;
-        variance.max(1e-4) * LEFT * LEFT
+        variance.max(1e-4) * REMAINING_VARIANCE * REMAINING_VARIANCE
     }
 
-    /// Twice the negative log-likelihood of a path but for a constant, as if pixels were independent.
+    /// Computes twice the negative log-likelihood of a path up to a constant, as if pixels were independent.
     fn cost(&self, corner: [usize; 2], path: &[[f32; 2]]) -> f32 {
         let variance = self.variance(corner);
         let margin = ((self.settings.window - 1) * SIDE) as f32 / 2.0;
@@ -230,7 +232,7 @@ impl HypothesisSelector<'_> {
         cost
     }
 
-    /// The reference's own patch at `corner`.
+    /// Returns the reference's own patch at `corner`.
     fn own(&self, corner: [f32; 2]) -> Own {
         Own { corner, patch: bilinear(self.template, corner) }
     }
@@ -275,18 +277,17 @@ struct Own {
     patch: Patch,
 }
 
-/// Sums of the differences from the template over the frames of a path, by pixel.
+/// Sums over the frames of a path of the differences from the template, by pixel.
 struct Sums {
     sum: Patch,
     squares: Patch,
-    /// Frames in which only a part of the patch lies inside, and the variances of their noise, in that of a whole
-    /// pixel.
+    /// Number of frames, per pixel, in which only a part of the patch lies inside the image.
     count: Patch,
     noise: Patch,
-    /// The same of frames in which all of it does.
+    /// Number of frames in which the whole patch lies inside the image.
     whole_count: f32,
     whole_noise: f32,
-    /// Pixels of frames that lie outside.
+    /// Number of pixels outside the image, over all frames.
     outside: f32,
 }
 
@@ -304,14 +305,15 @@ impl Sums {
         }
     }
 
-    /// Adds the residuals of a frame in which the whole patch lies inside.
+    /// Adds the residuals of a frame in which the whole patch lies inside the image.
     fn add_whole(&mut self, here: &Patch, there: &Patch, noise: f32) {
         add_residuals(here, there, &mut self.sum, &mut self.squares);
         self.whole_count += 1.0;
         self.whole_noise += noise;
     }
 
-    /// Squared differences over what noise makes.
+    /// Returns the sum of squared differences minus its expectation for noise, in units of the noise's
+    /// variance.
     fn misfit(&self, variance: f32, outside: f32) -> f32 {
         let noise = total(&self.noise) + self.whole_noise * (SIDE * SIDE) as f32;
         total(&self.squares) / variance - noise + outside * self.outside
@@ -329,7 +331,7 @@ fn add_residuals(here: &Patch, there: &Patch, sum: &mut Patch, squares: &mut Pat
     }
 }
 
-/// As much of a misfit as a difference common to all frames explains.
+/// Returns the part of the misfit that a difference common to all frames explains.
 #[multiversion(targets("x86_64+avx2"))]
 fn common(sums: &Sums, known: f32, variance: f32) -> f32 {
     let mut common = [[0.0; SIDE]; SIDE];
@@ -353,7 +355,7 @@ mod tests {
 
     const SIZE: Size = Size { height: 96, width: 112 };
 
-    /// A window of a texture that moves, and the mean counts of its frames.
+    /// Simulates a window of a moving texture. Returns it with the mean counts of its frames.
     fn burst(ppp: f64, moved: impl Fn(f32) -> [f32; 2]) -> (PreparedBurst, Vec<Frame>) {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let light = Light { ppp, mean_level: 0.45 };
@@ -382,7 +384,7 @@ mod tests {
         (burst, frames)
     }
 
-    /// Mean distance from the truth of the flow from frame 5 to all others, of patches off the border.
+    /// Returns the mean end-point error of the flow from frame 5 to all others, over patches off the border.
     fn error(burst: &PreparedBurst, motion: &PatchMotion, moved: impl Fn(f32) -> [f32; 2]) -> f32 {
         let mut errors = Vec::new();
         for (k, patches) in motion.iter().enumerate() {
@@ -412,7 +414,7 @@ mod tests {
         assert!(after < 0.5 * before, "{before} before, {after} px after");
     }
 
-    /// With light and good reference frames matching is right.
+    /// Checks that the matched motion is kept with enough light and good reference frames.
     #[test]
     fn keeps_matched_motion_where_it_accelerates() {
         let moved = |t: f32| [0.25 * (t - 5.0) * (t - 5.0), 0.0];
@@ -426,8 +428,8 @@ mod tests {
         assert!(before < 0.3 && after < before + 0.05, "{before} before, {after} px after");
     }
 
-    /// Reference frames of a scene at rest that hold a fifth of their frames' counts, smoothed: matching
-    /// follows the noise of these, which judges hypotheses, too.
+    /// Checks that noise does not move patches of a static scene. Its reference frames hold a fifth of their
+    /// frames' counts, smoothed, so that matching follows the same noise that judges the hypotheses.
     #[test]
     fn noise_in_reference_frames_does_not_move_patches() {
         let moved = |_: f32| [0.0, 0.0];

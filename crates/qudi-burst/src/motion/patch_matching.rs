@@ -1,8 +1,8 @@
-//! Where each patch of a reference lies in another block of frames (Ma et al. 2020, section 5.1).
+//! Patch matching: finds each patch of a reference in another block of frames (Ma et al. 2020, section 5.1).
 //!
-//! From coarse to fine, every patch starts at the best of what its parent, the parent's neighbours and
-//! the median of all found, and searches around it; at the finest level, steps of Lucas and Kanade (1981)
-//! refine it below a pixel.
+//! The search runs from coarse to fine. Every patch starts at the best of its parent's displacement, the
+//! displacements of the parent's neighbours and the median of all, and searches around it. At the finest
+//! level, steps of Lucas and Kanade (1981) refine the displacement to subpixel precision.
 
 use super::grid::Grid;
 use super::patch_refinement::refine;
@@ -10,15 +10,15 @@ use super::pyramid::{Level, Pyramid};
 use multiversion::multiversion;
 use qudi_core::Frame;
 
-/// Cost of a search's step per squared pixel, in nats, at each level: where there is little to see, a
-/// patch moves as its parent does. The coarsest knows no parent, and may go far.
-const RELUCTANCE: [f32; 3] = [0.5, 0.5, 0.1];
+/// Cost in nats of moving one pixel squared from the start of the search, at each level, finest first. It
+/// makes a patch with little texture follow its parent. The coarsest level has no parent and a lower cost.
+const STEP_COST: [f32; 3] = [0.5, 0.5, 0.1];
 
-/// Search radius at each level, finest first, in its pixels.
+/// Search radius in pixels at each level, finest first.
 const RADII: [isize; 3] = [1, 4, 8];
 
-/// The displacement of every patch of `reference` in `other`, in pixels, right and down. `variance` is
-/// that of the noise of any two pixels' difference.
+/// Finds the displacement of every patch of `reference` in `other`, in pixels, right and down. `variance` is
+/// the noise variance of the difference of two pixels.
 pub(crate) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<[f32; 2]> {
     let mut parents: Option<(Grid, Vec<[isize; 2]>)> = None;
     for (number, (level, there)) in reference.levels.iter().zip(&other.levels).enumerate().rev() {
@@ -33,10 +33,10 @@ pub(crate) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<
             there: &there.image,
             side,
             radius: RADII[number],
-            // Squared differences count in nats: over twice the variance.
-            reluctance: RELUCTANCE[number] * 2.0 * noise,
+            // A squared difference in nats is divided by twice the variance.
+            step_cost: STEP_COST[number] * 2.0 * noise,
         };
-        // The camera's own motion: for patches whose parent saw too little of it.
+        // The camera's own motion serves patches whose parent had too little texture.
         let overall = parents.as_ref().map_or([0; 2], |(_, flow)| median(flow));
         let search = |i: usize| {
             let corner = grid.corner(i);
@@ -55,7 +55,7 @@ pub(crate) fn align(reference: &Pyramid, other: &Pyramid, variance: f32) -> Vec<
     refine([image, there], &grid, starts, variance)
 }
 
-/// Medians of both components.
+/// Returns the medians of both components.
 fn median(flow: &[[isize; 2]]) -> [isize; 2] {
     std::array::from_fn(|k| {
         let mut values: Vec<isize> = flow.iter().map(|d| d[k]).collect();
@@ -64,7 +64,7 @@ fn median(flow: &[[isize; 2]]) -> [isize; 2] {
     })
 }
 
-/// The displacement of least squared difference within `radius` of the best of `starts`.
+/// Finds the displacement of least squared difference within `radius` of the best of `starts`.
 #[multiversion(targets("x86_64+avx2"))]
 fn best<'a>(matching: &Matching<'a>, corner: [usize; 2], starts: &[[isize; 2]]) -> [isize; 2] {
     let mut start = (f32::INFINITY, [0; 2]);
@@ -80,7 +80,7 @@ fn best<'a>(matching: &Matching<'a>, corner: [usize; 2], starts: &[[isize; 2]]) 
         for dx in -matching.radius..=matching.radius {
             let d = matching.inside(corner, [start[0] + dx, start[1] + dy]);
             let cost =
-                matching.difference(corner, d) + matching.reluctance * (dx * dx + dy * dy) as f32;
+                matching.difference(corner, d) + matching.step_cost * (dx * dx + dy * dy) as f32;
             if cost < best.0 {
                 best = (cost, d);
             }
@@ -89,18 +89,18 @@ fn best<'a>(matching: &Matching<'a>, corner: [usize; 2], starts: &[[isize; 2]]) 
     best.1
 }
 
-/// The search for one level's patches.
+/// Search for the patches of one level.
 struct Matching<'a> {
     image: &'a Frame,
     there: &'a Frame,
     side: usize,
     radius: isize,
-    /// Squared difference that a step of a pixel must win.
-    reluctance: f32,
+    /// Squared difference that a step of one pixel costs.
+    step_cost: f32,
 }
 
 impl Matching<'_> {
-    /// Kept inside the image: what has left it cannot be found.
+    /// Clamps the displacement so that the patch stays inside the image.
     #[inline(always)]
     fn inside(&self, corner: [usize; 2], d: [isize; 2]) -> [isize; 2] {
         let size = self.image.size;

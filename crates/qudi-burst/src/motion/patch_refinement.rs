@@ -1,28 +1,28 @@
-//! Refinement of patch displacements below a pixel by Lucas and Kanade's steps ("An iterative image
-//! registration technique", IJCAI 1981), and their regularization: flat patches move with their surroundings.
+//! Subpixel refinement of patch displacements with Lucas and Kanade's steps ("An iterative image registration
+//! technique", IJCAI 1981), and their regularization: patches without texture move with their surroundings.
 
 use super::grid::Grid;
 use crate::patch::{BilinearSamples, Patch, SIDE};
 use multiversion::multiversion;
 use qudi_core::Frame;
 
-/// Steps of the refinement, as in the authors' experiments.
+/// Number of refinement steps, as in the authors' experiments.
 const STEPS: usize = 3;
 
 /// Prior sigma of the refinement, in pixels.
 const STEP_SIGMA: f32 = 0.5;
 
-/// Prior sigma of a patch's motion around that of its neighbours, in pixels.
+/// Prior sigma of the difference between a patch's motion and its neighbours' motion, in pixels.
 const NEIGHBOUR_SIGMA: f32 = 0.25;
 
-/// Iterations of the regularization; each hands motion on by one patch.
+/// Iterations of the regularization; each propagates motion by one patch.
 const ITERATIONS: usize = 4;
 
-/// The farthest that refinement may move a patch in all, in pixels.
-const LONGEST: f32 = 1.0;
+/// Maximum total displacement by refinement, in pixels.
+const MAX_REFINEMENT: f32 = 1.0;
 
-/// Refines the displacements `starts` of all patches of the first image in the second. `variance` is that of
-/// the noise of any two pixels' difference.
+/// Refines the displacements `starts` of all patches of the first image in the second. `variance` is the
+/// noise variance of the difference of two pixels.
 pub(crate) fn refine(
     [image, there]: [&Frame; 2],
     grid: &Grid,
@@ -36,10 +36,10 @@ pub(crate) fn refine(
     regularize(grid, &refined, variance)
 }
 
-/// A refined displacement and how well the patch's texture determines it.
+/// A refined displacement, and how well the patch's texture determines it.
 struct Refined {
     flow: [f32; 2],
-    /// The structure tensor: sums of the gradient's products xx, xy and yy.
+    /// Structure tensor: sums of the gradient's products xx, xy and yy.
     slopes: [f32; 3],
 }
 
@@ -63,7 +63,7 @@ fn refine_patch(
         if x0 > 0 && x0 + SIDE < row.len() {
             slopes_x[r] = half_difference(&row[x0 + 1..x0 + 1 + SIDE], &row[x0 - 1..x0 - 1 + SIDE]);
         } else {
-            // At a border the last pixel is its own neighbour.
+            // The last pixel before a border is its own neighbour.
             let at = |x: usize| row[x.min(row.len() - 1)];
             let right: [f32; SIDE] = std::array::from_fn(|c| at(x0 + c + 1));
             let left: [f32; SIDE] = std::array::from_fn(|c| at((x0 + c).saturating_sub(1)));
@@ -77,7 +77,7 @@ fn refine_patch(
     let mut d = start;
     for _ in 0..STEPS {
         let moved = BilinearSamples::new(there, [x0 as f32 + d[0], y0 as f32 + d[1]]);
-        // The sums of the slopes' products with the difference, sixteen at a time.
+        // Sums of the products of slopes and difference, sixteen at a time.
         let (mut along_x, mut along_y) = ([0.0f32; SIDE], [0.0f32; SIDE]);
         for r in 0..SIDE {
             let row = moved.row(r);
@@ -90,7 +90,7 @@ fn refine_patch(
         let step = solve.solve([along_x.iter().sum(), along_y.iter().sum()]);
         for k in 0..2 {
             let from_start = d[k] - step[k] - start[k];
-            d[k] = start[k] + from_start.clamp(-LONGEST, LONGEST);
+            d[k] = start[k] + from_start.clamp(-MAX_REFINEMENT, MAX_REFINEMENT);
         }
     }
     Refined { flow: d, slopes: [xx, xy, yy] }
@@ -106,7 +106,7 @@ fn half_difference(a: &[f32], b: &[f32]) -> [f32; SIDE] {
     row
 }
 
-/// The sum of the products of two patches' samples, sixteen at a time.
+/// Returns the sum of the products of two patches' samples, computed sixteen at a time.
 #[inline(always)]
 fn total_product(a: &Patch, b: &Patch) -> f32 {
     let mut lanes = [0.0f32; SIDE];
@@ -118,8 +118,8 @@ fn total_product(a: &Patch, b: &Patch) -> f32 {
     lanes.iter().sum()
 }
 
-/// Draws every patch towards the median motion of its neighbourhood, as far as its own gradients leave its
-/// motion open.
+/// Regularizes the motion: each patch is drawn towards the median motion of its neighbourhood, as far as its
+/// own gradients leave its motion undetermined.
 fn regularize(grid: &Grid, refined: &[Refined], variance: f32) -> Vec<[f32; 2]> {
     let mut flow: Vec<[f32; 2]> = refined.iter().map(|patch| patch.flow).collect();
     let ridge = variance / (NEIGHBOUR_SIGMA * NEIGHBOUR_SIGMA);
@@ -142,7 +142,7 @@ struct Damped {
 }
 
 impl Damped {
-    /// Inverts the matrix of entries xx, xy and yy; `ridge` is above 0.
+    /// Inverts the matrix of entries xx, xy and yy; `ridge` must be positive.
     fn new([xx, xy, yy]: [f32; 3], ridge: f32) -> Self {
         let (xx, yy) = (xx + ridge, yy + ridge);
         let determinant = xx * yy - xy * xy;

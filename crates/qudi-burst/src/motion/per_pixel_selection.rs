@@ -1,6 +1,5 @@
-//! Per-pixel selection of motion: one patch has one motion, but where things move past each other it holds
-//! two. What reference frames show of a pixel's surroundings selects among the motions of the patches around
-//! it.
+//! Per-pixel selection of motion. A patch has one motion, but at motion boundaries it contains two. The
+//! reference frames around each pixel select among the motions of the surrounding patches.
 
 use super::reference_frames::ReferenceFrames;
 use crate::patch::{Patch, PatchMotion, SIDE, inside};
@@ -9,22 +8,22 @@ use multiversion::multiversion;
 use qudi_core::Frame;
 use rayon::prelude::*;
 
-/// Radius of the squares that are compared, in pixels.
+/// Radius of the compared squares, in pixels.
 const RADIUS: usize = 2;
 
-/// Motions less than so many pixels apart in both components are one.
-const SAME: f32 = 0.4;
+/// Minimum difference in a component between two distinct motions, in pixels.
+const MIN_MOTION_DIFFERENCE: f32 = 0.4;
 
-/// By how much any other motion must fit better than the patch's own, in the variance of the noise of two
-/// pixels' difference: where all fit, noise would choose.
-const RELUCTANCE: f32 = 0.1;
+/// Penalty of any other motion than the patch's own, in units of the noise variance of two pixels'
+/// difference. Without it, noise would choose where all motions fit.
+const SWITCH_PENALTY: f32 = 0.1;
 
-/// Pixels of a square.
+/// Number of pixels in a square.
 const AREA: f32 = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as f32;
 
-/// Warps the counts of frame `k`, and its estimate, onto the reference pixel by pixel along whichever motion
-/// in `motions`, of the patch or of those around it, makes the estimates the most alike. The first motion is
-/// kept where all fit.
+/// Warps the counts of frame `k` and its estimate onto the reference, each pixel along the motion that makes
+/// the estimates most alike. Candidates are the `motions` of the patch and of the patches around it. The
+/// patch's first motion is kept where all fit.
 pub(crate) fn per_pixel_selection(
     burst: &PreparedBurst,
     references: &ReferenceFrames,
@@ -35,7 +34,7 @@ pub(crate) fn per_pixel_selection(
     let sample = |image: &Frame, i, d| references.sample(burst, image, i, d, reference);
     let estimates = &references.frames;
     let variance = burst.matching_variance(reference, references.error_variance);
-    let reluctance = AREA * RELUCTANCE * variance;
+    let switch_penalty = AREA * SWITCH_PENALTY * variance;
     let motions = motions.map(|motion| &motion[k]);
     let patch = |i: usize| {
         let here = sample(&estimates[reference], i, [0.0; 2]);
@@ -47,8 +46,8 @@ pub(crate) fn per_pixel_selection(
             let mut misfit = misfit(&here, &there);
             exclude_outside(burst, &mut misfit, i, d);
             let own = number == 0;
-            // Most motions fit no pixel better, and then nobody asks for their counts.
-            if !own && !fits_anywhere(&mut misfit, reluctance, &least) {
+            // Most motions fit no pixel better, and their counts need not be sampled.
+            if !own && !fits_anywhere(&mut misfit, switch_penalty, &least) {
                 continue;
             }
             let counts = sample(&burst.frames[k], i, d);
@@ -60,13 +59,14 @@ pub(crate) fn per_pixel_selection(
     [0, 1].map(|image| burst.blended(|i| &patches[i][image]))
 }
 
-/// Adds the `reluctance` to a misfit, and finds out whether any pixel fits better than what did so far.
+/// Adds the `switch_penalty` to a misfit, and returns true if any pixel then fits better than its least
+/// misfit so far.
 #[multiversion(targets("x86_64+avx2"))]
-fn fits_anywhere(misfit: &mut Patch, reluctance: f32, least: &Patch) -> bool {
+fn fits_anywhere(misfit: &mut Patch, switch_penalty: f32, least: &Patch) -> bool {
     let mut lowest = [f32::INFINITY; SIDE];
     for y in 0..SIDE {
         for x in 0..SIDE {
-            misfit[y][x] += reluctance;
+            misfit[y][x] += switch_penalty;
             let better = misfit[y][x] < least[y][x];
             lowest[x] = if better { -1.0 } else { lowest[x] };
         }
@@ -74,7 +74,7 @@ fn fits_anywhere(misfit: &mut Patch, reluctance: f32, least: &Patch) -> bool {
     lowest.iter().any(|&value| value < 0.0)
 }
 
-/// Takes what fits better, or all of it.
+/// Replaces the pixels that fit better, or all of them if `all` is set.
 #[multiversion(targets("x86_64+avx2"))]
 fn take_better(
     misfit: &Patch,
@@ -94,14 +94,17 @@ fn take_better(
     }
 }
 
-/// Lists the motions of patch `i`, of those that touch it, and rest; each once.
+/// Lists the distinct motions of patch `i` and of the patches that touch it, and rest.
 fn motions_around(burst: &PreparedBurst, i: usize, motions: [&Vec<[f32; 2]>; 2]) -> Vec<[f32; 2]> {
     let mut distinct: Vec<[f32; 2]> = Vec::with_capacity(20);
     let all = motions.iter().flat_map(|motion| {
         std::iter::once(i).chain(burst.grid.touching(i)).map(|patch| motion[patch])
     });
     for d in all.chain(std::iter::once([0.0; 2])) {
-        let known = |m: &[f32; 2]| (m[0] - d[0]).abs() < SAME && (m[1] - d[1]).abs() < SAME;
+        let known = |m: &[f32; 2]| {
+            (m[0] - d[0]).abs() < MIN_MOTION_DIFFERENCE
+                && (m[1] - d[1]).abs() < MIN_MOTION_DIFFERENCE
+        };
         if !distinct.iter().any(known) {
             distinct.push(d);
         }
@@ -109,7 +112,7 @@ fn motions_around(burst: &PreparedBurst, i: usize, motions: [&Vec<[f32; 2]>; 2])
     distinct
 }
 
-/// Lets what lies outside of the image fit nothing.
+/// Sets the misfit of pixels outside the image to infinity.
 fn exclude_outside(burst: &PreparedBurst, misfit: &mut Patch, i: usize, d: [f32; 2]) {
     let corner = burst.grid.corner(i);
     let size = burst.padded_size();
@@ -127,7 +130,7 @@ fn exclude_outside(burst: &PreparedBurst, misfit: &mut Patch, i: usize, d: [f32;
     }
 }
 
-/// Squared differences, summed over the squares around each pixel as far as they lie in the patch.
+/// Sums squared differences over the square around each pixel, clipped to the patch.
 #[multiversion(targets("x86_64+avx2"))]
 fn misfit(a: &Patch, b: &Patch) -> Patch {
     let mut rows = [[0.0f32; SIDE]; SIDE + 2 * RADIUS];
@@ -161,8 +164,8 @@ mod tests {
 
     const SIZE: Size = Size { height: 64, width: 80 };
 
-    /// Mean counts of two textures: the right one rests, the left one comes before it, three pixels per
-    /// frame.
+    /// Returns the mean counts of two textures. The right one is static; the left one is in front and moves
+    /// by three pixels per frame.
     fn scene(t: usize) -> Frame {
         Frame::from_fn(SIZE, |x, y| {
             let (x, y) = (x as f32, y as f32);
@@ -173,8 +176,8 @@ mod tests {
         })
     }
 
-    /// Errors of frame 1 warped onto frame 4 by patches and by pixels, if patches left of `border` move with
-    /// the front.
+    /// Returns the errors of frame 1 warped onto frame 4 by patches and by pixels, where patches left of
+    /// `border` move with the front.
     fn errors(border: usize) -> [f32; 2] {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
@@ -202,8 +205,8 @@ mod tests {
         })
     }
 
-    /// In frame 4 the border lies at 32; patches up to half a patch beyond are said to move with the front,
-    /// too.
+    /// Checks the pixels at a motion boundary. In frame 4 the boundary lies at column 32, and patches up to
+    /// half a patch beyond it move with the front.
     #[test]
     fn pixels_at_a_motion_border_move_on_their_own() {
         for border in [32, 40] {

@@ -1,24 +1,24 @@
-//! A block of frames at the scales that alignment works on.
+//! Pyramid of a block of frames at the scales of alignment.
 
 use crate::patch::SIDE;
 use qudi_core::{Frame, Size};
 
-/// Coarser levels: by which factor than the level before, and the side of the patches matched on it.
+/// Coarser levels: the shrink factor from the level before, and the side of the patches matched on it.
 const COARSER: [(usize, usize); 2] = [(2, SIDE), (4, SIDE / 2)];
 
-/// Mean counts, smoothed, finest level first.
+/// Smoothed mean counts, finest level first.
 #[derive(Clone, Debug)]
 pub(crate) struct Pyramid {
     pub(crate) levels: Vec<Level>,
 }
 
-/// One scale.
+/// One scale of a pyramid.
 #[derive(Clone, Debug)]
 pub(crate) struct Level {
     pub(crate) image: Frame,
-    /// Coarser than the level before by this.
+    /// Shrink factor from the level before.
     pub(crate) ratio: usize,
-    /// Side of its patches; it is at least that large.
+    /// Side of its patches; the image is at least that large.
     pub(crate) side: usize,
 }
 
@@ -38,7 +38,7 @@ impl Pyramid {
     }
 }
 
-/// Means of `ratio` x `ratio` pixels.
+/// Averages squares of `ratio` x `ratio` pixels.
 pub(crate) fn shrink(image: &Frame, size: Size, ratio: usize) -> Frame {
     let scale = 1.0 / (ratio * ratio) as f32;
     Frame::from_fn(size, |x, y| {
@@ -48,7 +48,8 @@ pub(crate) fn shrink(image: &Frame, size: Size, ratio: usize) -> Frame {
     })
 }
 
-/// Binomial filter 1 4 6 4 1 both ways, borders repeated: without it single photons are matched.
+/// Applies the binomial filter 1 4 6 4 1 along both axes, with borders repeated. Without it, single photons
+/// would be matched.
 pub(crate) fn smooth(image: &Frame) -> Frame {
     const TAPS: [f32; 5] = [0.0625, 0.25, 0.375, 0.25, 0.0625];
     let Size { height, width } = image.size;

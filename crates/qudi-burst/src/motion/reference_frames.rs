@@ -1,5 +1,5 @@
-//! Estimates of all frames of a window, on which motion is found once more: they show far better than noisy
-//! counts where things are, and what does not fit.
+//! Estimates of all frames of a window, on which motion is found again. They show positions and misfits much
+//! better than noisy counts do.
 
 use super::block_alignment::align_blocks;
 use super::global_motion::GlobalMotion;
@@ -12,25 +12,25 @@ use qudi_core::Frame;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Variance of the frames' errors when global motion is found, in units of the counts' variance. It is small
-/// because global motion goes by squares of many pixels.
+/// Variance of the frames' errors for the estimation of global motion, in units of the counts' variance. It
+/// is small because global motion uses squares of many pixels.
 const GLOBAL_MOTION_ERROR: f32 = 0.05;
 
 /// Estimates of the mean counts of all frames of a window.
 #[derive(Debug)]
 pub(crate) struct ReferenceFrames {
-    /// Mean counts, as large as the padded frames.
+    /// Mean counts, of the size of the padded frames.
     pub(crate) frames: Vec<Frame>,
-    /// Variance of their errors, in units of the counts' variance.
+    /// Variance of the estimates' errors, in units of the counts' variance.
     pub(crate) error_variance: f32,
-    /// Their pyramids.
+    /// Pyramids of the estimates.
     pub(crate) pyramids: Vec<Pyramid>,
-    /// The motion of most of the image; none if frames are too few or too small.
+    /// Motion of most of the image; `None` if frames are too few or too small.
     pub(crate) global_motion: Option<GlobalMotion>,
 }
 
 impl ReferenceFrames {
-    /// Prepares estimates of the mean counts of `burst`, whose errors are `error_variance` times the counts'
+    /// Prepares estimates of the mean counts of `burst`, whose errors have `error_variance` times the counts'
     /// variance.
     pub(crate) fn new(burst: &PreparedBurst, frames: Vec<Frame>, error_variance: f32) -> Self {
         let pyramids = frames.par_iter().map(Pyramid::new).collect();
@@ -46,8 +46,8 @@ impl ReferenceFrames {
         align_blocks(&blocks, reference, variance, burst.grid.len(), pyramid)
     }
 
-    /// Samples patch `i` of `image`, displaced by `d`, with cubic convolution. Where it has left the image,
-    /// it shows the estimate of frame `reference`.
+    /// Samples patch `i` of `image`, displaced by `d`, with cubic convolution. Pixels outside the image are
+    /// taken from the estimate of frame `reference`.
     pub(crate) fn sample(
         &self,
         burst: &PreparedBurst,

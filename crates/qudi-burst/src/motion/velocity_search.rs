@@ -1,10 +1,10 @@
-//! Search for the constant velocity that the counts of all frames agree on.
+//! Search for the constant velocity that best explains the counts of all frames.
 //!
-//! Two frames of a few photons say little of how a faint texture moves from one to the other. Along the right
-//! path, though, all frames of a window show the same, and differ by noise alone. Of all velocities on a
-//! lattice every patch takes the one along which the frames vary least, and neighbours help each other:
-//! semi-global matching (Hirschmüller, "Stereo processing by semiglobal matching and mutual information",
-//! IEEE TPAMI 30(2), 2008, eq. 13) with velocities for disparities. What is found is exhaustive and knows no
+//! Two frames of a few photons tell little about the motion of a faint texture. Along the right path,
+//! however, all frames of a window show the same content and differ by noise alone. Every patch takes the
+//! velocity of a lattice along which the frames vary least. Neighbours support each other by semi-global
+//! matching (Hirschmüller, "Stereo processing by semiglobal matching and mutual information", IEEE TPAMI
+//! 30(2), 2008, eq. 13), with velocities in place of disparities. The search is exhaustive and needs no
 //! start, unlike a search from coarse to fine.
 
 use super::grid::Grid;
@@ -13,89 +13,95 @@ use qudi_core::sensor::CountMoments;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 
-/// Pixels of the frames along a side of a pixel here.
-const SHRINK: usize = 4;
+/// Factor by which frames are shrunk for the search.
+const SHRINK_FACTOR: usize = 4;
 
-/// From one velocity of the lattice to the next, in pixels here per frame, and the fastest in these steps.
-const STEP: f32 = 0.1;
-const FASTEST: usize = 20;
-const ACROSS: usize = 2 * FASTEST + 1;
-const VELOCITIES: usize = ACROSS * ACROSS;
+/// Step of the velocity lattice, in shrunk pixels per frame.
+const VELOCITY_STEP: f32 = 0.1;
+/// Largest velocity along an axis, in steps of the lattice.
+const MAX_STEPS: usize = 20;
+/// Number of velocities along an axis.
+const VELOCITIES_PER_AXIS: usize = 2 * MAX_STEPS + 1;
+/// Number of velocities of the lattice.
+const VELOCITIES: usize = VELOCITIES_PER_AXIS * VELOCITIES_PER_AXIS;
 
-/// The label of no motion.
-const REST: usize = FASTEST * ACROSS + FASTEST;
+/// Label of zero velocity.
+const REST_LABEL: usize = MAX_STEPS * VELOCITIES_PER_AXIS + MAX_STEPS;
 
-/// Pixels here around a patch's centre, to either side, that decide for it.
+/// Radius of the square around a patch's centre that is compared, in shrunk pixels.
 const RADIUS: usize = 2;
 
-/// Nats of a mean excess of one variance over those pixels: half of them for each that noise leaves
-/// independent.
-const NATS: f32 = 1.0 / 3.0;
+/// Nats per unit of the square's mean excess variance: half the number of pixels that are independent after
+/// smoothing.
+const NATS_PER_EXCESS: f32 = 1.0 / 3.0;
 
-/// Price in nats of the next velocity of the lattice, and of any other, from one patch to its neighbour (`P1`
-/// and `P2` there).
-const NEXT: f32 = 1.0;
-const ANY: f32 = 6.0;
+/// Penalty in nats of the adjacent velocity between neighbouring patches (`P1` in the paper).
+const ADJACENT_PENALTY: f32 = 1.0;
+/// Penalty in nats of any other velocity between neighbouring patches (`P2` in the paper).
+const JUMP_PENALTY: f32 = 6.0;
 
-/// Variance that the filter 1 2 1 leaves of white noise along a side, and the correlation of neighbours after
-/// it.
-const LEFT: f32 = 0.375;
+/// Fraction of the variance of white noise that remains after the filter 1 2 1 along an axis.
+const REMAINING_VARIANCE: f32 = 0.375;
+/// Correlation of neighbouring pixels after the filter.
 const CORRELATION: f32 = 2.0 / 3.0;
 
-/// Frames small enough to try every velocity.
+/// Shrunk frames, small enough to try every velocity.
 #[derive(Debug)]
 pub(crate) struct VelocitySearch {
     frames: Vec<Frame>,
-    /// Of the noise of each pixel.
+    /// Noise variance of each pixel.
     variance: Vec<f32>,
     size: Size,
 }
 
 impl VelocitySearch {
-    /// Of the counts of a window.
+    /// Prepares the search on the counts of a window.
     pub(crate) fn new(frames: &[Frame], moments: &CountMoments) -> Self {
         let size = frames[0].size;
-        let size = Size { height: size.height / SHRINK, width: size.width / SHRINK };
+        let size = Size { height: size.height / SHRINK_FACTOR, width: size.width / SHRINK_FACTOR };
         let frames: Vec<Frame> =
-            frames.par_iter().map(|frame| smoothed(&shrink(frame, size, SHRINK))).collect();
+            frames.par_iter().map(|frame| smoothed(&shrink(frame, size, SHRINK_FACTOR))).collect();
         let share = 1.0 / frames.len() as f32;
         let variance = |p: usize| {
             let mean = share * frames.iter().map(|frame| frame.data[p]).sum::<f32>();
             let variance = moments.variance_at_mean(f64::from(mean)) as f32;
-            variance.max(1e-4) * LEFT * LEFT / (SHRINK * SHRINK) as f32
+            variance.max(1e-4) * REMAINING_VARIANCE * REMAINING_VARIANCE
+                / (SHRINK_FACTOR * SHRINK_FACTOR) as f32
         };
         let variance = (0..size.pixels()).map(variance).collect();
         Self { frames, variance, size }
     }
 
-    /// The velocity of every patch of frame `reference`, in the pixels of the frames per frame, right and
-    /// down. It is rest, or that of the whole frame, unless another fits better by `evidence` nats.
+    /// Finds the velocity of every patch of frame `reference`, in pixels of the frames per frame, right and
+    /// down. A patch is static or moves with the whole frame unless another velocity fits better by
+    /// `evidence` nats.
     pub(crate) fn velocities(&self, grid: &Grid, reference: usize, evidence: f32) -> Vec<[f32; 2]> {
         let places: Vec<[usize; 2]> = (0..grid.len())
-            .map(|i| grid.corner(i).map(|corner| (corner + grid.side / 2) / SHRINK))
+            .map(|i| grid.corner(i).map(|corner| (corner + grid.side / 2) / SHRINK_FACTOR))
             .collect();
         let columns: Vec<Vec<f32>> = (0..VELOCITIES)
             .into_par_iter()
             .map(|label| {
                 let excess = self.excess(reference, velocity(label));
-                places.iter().map(|&place| NATS * self.around(place, &excess)).collect()
+                places.iter().map(|&place| NATS_PER_EXCESS * self.around(place, &excess)).collect()
             })
             .collect();
         let cost: Vec<Vec<f32>> = (0..places.len())
             .map(|i| columns.iter().map(|column: &Vec<f32>| column[i]).collect())
             .collect();
         let total = matched(&cost, grid.xs.len());
-        let priors = if evidence > 0.0 { vec![REST, common(&columns)] } else { Vec::new() };
+        let priors = if evidence > 0.0 { vec![REST_LABEL, common(&columns)] } else { Vec::new() };
         let velocity = |total: &Vec<f32>| {
             let best = lowest_label(total);
             let as_good = |&&prior: &&usize| total[prior] - total[best] < evidence;
             let label = priors.iter().find(as_good).copied().unwrap_or(best);
             lowest_around(total, label)
         };
-        total.iter().map(|total| velocity(total).map(|v| v * SHRINK as f32)).collect()
+        total.iter().map(|total| velocity(total).map(|v| v * SHRINK_FACTOR as f32)).collect()
     }
 
-    /// By how much the frames vary along a velocity more than noise does, in its variance, at every pixel.
+    /// Computes the excess variance of the frames along a velocity at every pixel, in units of the noise's
+    /// variance.
     fn excess(&self, reference: usize, velocity: [f32; 2]) -> Vec<f32> {
         let Size { height, width } = self.size;
         let pixels = self.size.pixels();
@@ -105,7 +111,7 @@ impl VelocitySearch {
             let shift = Shift::new(d);
             let (columns, rows) = (shift.range(0, width), shift.range(1, height));
             let length = columns.len();
-            // Where nothing is left, places do not exist.
+            // Without overlap there are no positions.
             for y in rows.filter(|_| length > 0) {
                 let [upper, lower] = [0, 1].map(|below| {
                     let row = frame.row((y as isize + shift.whole[1]) as usize + below);
@@ -133,7 +139,7 @@ impl VelocitySearch {
             .collect()
     }
 
-    /// Mean of `plane` around a place.
+    /// Returns the mean of `plane` over the square around a position.
     fn around(&self, [x, y]: [usize; 2], plane: &[f32]) -> f32 {
         let near =
             |at: usize, length: usize| at.saturating_sub(RADIUS)..(at + RADIUS + 1).min(length);
@@ -144,7 +150,8 @@ impl VelocitySearch {
     }
 }
 
-/// Squared deviations from the mean of `count` values, over what noise makes of them. One value says nothing.
+/// Returns the excess over noise of the squared deviations of `count` values from their mean. It is 0 for one
+/// value.
 fn over_noise(sum: f32, squares: f32, count: f32, noise: f32, variance: f32) -> f32 {
     if count < 2.0 {
         return 0.0;
@@ -152,16 +159,17 @@ fn over_noise(sum: f32, squares: f32, count: f32, noise: f32, variance: f32) -> 
     (squares - sum * sum / count) / variance - noise * (1.0 - 1.0 / count)
 }
 
-/// Velocity of a label, in pixels here per frame.
+/// Returns the velocity of a label, in shrunk pixels per frame.
 fn velocity(label: usize) -> [f32; 2] {
-    [label % ACROSS, label / ACROSS].map(|k| (k as f32 - FASTEST as f32) * STEP)
+    [label % VELOCITIES_PER_AXIS, label / VELOCITIES_PER_AXIS]
+        .map(|k| (k as f32 - MAX_STEPS as f32) * VELOCITY_STEP)
 }
 
-/// A displacement between pixels.
+/// A displacement with subpixel precision.
 struct Shift {
     whole: [isize; 2],
     weights: [f32; 4],
-    /// Variance left of the noise of the pixels between which one samples.
+    /// Factor by which interpolation reduces the noise's variance.
     noise: f32,
 }
 
@@ -177,7 +185,7 @@ impl Shift {
         }
     }
 
-    /// Places along an axis that stay inside.
+    /// Returns the positions along an axis whose displaced positions lie inside the image.
     fn range(&self, axis: usize, length: usize) -> std::ops::Range<usize> {
         let (whole, length) = (self.whole[axis], length as isize);
         let start = (-whole).clamp(0, length);
@@ -191,8 +199,8 @@ impl Shift {
     }
 }
 
-/// What every velocity costs every patch, `[patch][label]`, when neighbours have their say, from left, right,
-/// above and below.
+/// Aggregates the cost of every velocity for every patch, `[patch][label]`, over paths from the left, right,
+/// top and bottom.
 fn matched(cost: &[Vec<f32>], columns: usize) -> Vec<Vec<f32>> {
     let rows = cost.len() / columns;
     let across = |y: usize| (0..columns).map(move |x| y * columns + x).collect::<Vec<_>>();
@@ -215,7 +223,7 @@ fn matched(cost: &[Vec<f32>], columns: usize) -> Vec<Vec<f32>> {
     total
 }
 
-/// The costs of a line's patches, with the best that their predecessors allow (Hirschmüller 2008, eq. 13).
+/// Aggregates the costs of the patches along a line (Hirschmüller 2008, eq. 13).
 fn along(cost: &[Vec<f32>], line: &[usize]) -> Vec<Vec<f32>> {
     let mut summed: Vec<Vec<f32>> = Vec::with_capacity(line.len());
     for &i in line {
@@ -225,19 +233,19 @@ fn along(cost: &[Vec<f32>], line: &[usize]) -> Vec<Vec<f32>> {
         };
         let least = last.iter().copied().fold(f32::INFINITY, f32::min);
         let from = |label: usize| {
-            let (x, y) = (label % ACROSS, label / ACROSS);
-            let mut best = last[label].min(least + ANY);
+            let (x, y) = (label % VELOCITIES_PER_AXIS, label / VELOCITIES_PER_AXIS);
+            let mut best = last[label].min(least + JUMP_PENALTY);
             if x > 0 {
-                best = best.min(last[label - 1] + NEXT);
+                best = best.min(last[label - 1] + ADJACENT_PENALTY);
             }
-            if x + 1 < ACROSS {
-                best = best.min(last[label + 1] + NEXT);
+            if x + 1 < VELOCITIES_PER_AXIS {
+                best = best.min(last[label + 1] + ADJACENT_PENALTY);
             }
             if y > 0 {
-                best = best.min(last[label - ACROSS] + NEXT);
+                best = best.min(last[label - VELOCITIES_PER_AXIS] + ADJACENT_PENALTY);
             }
-            if y + 1 < ACROSS {
-                best = best.min(last[label + ACROSS] + NEXT);
+            if y + 1 < VELOCITIES_PER_AXIS {
+                best = best.min(last[label + VELOCITIES_PER_AXIS] + ADJACENT_PENALTY);
             }
             best - least
         };
@@ -247,31 +255,35 @@ fn along(cost: &[Vec<f32>], line: &[usize]) -> Vec<Vec<f32>> {
     summed
 }
 
-/// The label of the velocity that costs all patches together the least.
+/// Returns the label of the velocity with the least total cost over all patches.
 fn common(columns: &[Vec<f32>]) -> usize {
     let cost = |label: usize| columns[label].iter().map(|&cost| f64::from(cost)).sum::<f64>();
     let costs: Vec<f64> = (0..VELOCITIES).map(cost).collect();
-    (0..VELOCITIES).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(REST)
+    (0..VELOCITIES).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(REST_LABEL)
 }
 
-/// The label of the velocity of least cost.
+/// Returns the label of the velocity of least cost.
 fn lowest_label(total: &[f32]) -> usize {
     (0..VELOCITIES).min_by(|&a, &b| total[a].total_cmp(&total[b])).unwrap_or(0)
 }
 
-/// The velocity of label `best`, between the lattice's by parabolas.
+/// Refines the velocity of label `best` between lattice points by fitting parabolas.
 fn lowest_around(total: &[f32], best: usize) -> [f32; 2] {
     let at = velocity(best);
     let offset = |k: usize, step: usize| {
-        if k == 0 || k + 1 == ACROSS {
+        if k == 0 || k + 1 == VELOCITIES_PER_AXIS {
             return 0.0;
         }
         lowest_between([total[best - step], total[best], total[best + step]])
     };
-    [at[0] + STEP * offset(best % ACROSS, 1), at[1] + STEP * offset(best / ACROSS, ACROSS)]
+    [
+        at[0] + VELOCITY_STEP * offset(best % VELOCITIES_PER_AXIS, 1),
+        at[1] + VELOCITY_STEP * offset(best / VELOCITIES_PER_AXIS, VELOCITIES_PER_AXIS),
+    ]
 }
 
-/// Where the parabola through the least of costs and its neighbours is lowest, in steps from it.
+/// Returns the minimum of the parabola through three costs, in steps from the middle one, clamped to half a
+/// step.
 pub(crate) fn lowest_between([below, least, above]: [f32; 3]) -> f32 {
     let bend = below - 2.0 * least + above;
     let part = 0.5 * (below - above) / bend;
@@ -279,7 +291,8 @@ pub(crate) fn lowest_between([below, least, above]: [f32; 3]) -> f32 {
     if bend > 0.0 && part.is_finite() { part.clamp(-0.5, 0.5) } else { 0.0 }
 }
 
-/// The filter 1 2 1 both ways, borders repeated: shifts between pixels then change noise less.
+/// Applies the filter 1 2 1 along both axes, with borders repeated. It makes the noise depend less on
+/// subpixel shifts.
 fn smoothed(image: &Frame) -> Frame {
     let Size { height, width } = image.size;
     let rows = Frame::from_fn(image.size, |x, y| {
@@ -298,7 +311,7 @@ mod tests {
     use qudi_core::sensor::{CountLaw, Sensor};
     use qudi_core::{Camera, Light};
 
-    /// A texture too faint for two frames, moving evenly: the true velocity is that of nearly every patch.
+    /// Checks that the velocity of a texture too faint for two frames is found for nearly every patch.
     #[test]
     fn finds_faint_constant_motion() {
         let size = Size { height: 96, width: 112 };
@@ -343,7 +356,7 @@ mod tests {
         assert!((found[0] - at[0]).abs() < 1e-3 && (found[1] - at[1]).abs() < 1e-3, "{found:?}");
     }
 
-    /// What one patch does not know its neighbours tell; what it knows better it keeps.
+    /// Checks that a patch without evidence follows its neighbours, and a patch with evidence does not.
     #[test]
     fn neighbouring_hypotheses_help_but_do_not_overrule() {
         let certain =

@@ -1,11 +1,11 @@
-//! Flicker: how much a clip changes along the motion of its truth (Lai et al. 2018).
+//! Warping error: the change of a clip along its true motion, a measure of flicker (Lai et al. 2018).
 
 use qudi_core::Frame;
 use qudi_core::flow::Flow;
 
-/// Mean squared difference between `now` and `next` sampled where the surfaces have gone, over what
-/// stays visible; `None` if nothing does. The truth's own value is not 0: surfaces turn, grow, and
-/// are sampled between pixels, so that the excess over it is what a method adds.
+/// Returns the mean squared difference between `now` and `next` sampled along `flow`, over visible pixels, or
+/// `None` if no pixel is visible. The value of the ground truth is not 0, because surfaces turn, grow, and
+/// are sampled between pixels. The excess over it is the flicker that a method adds.
 pub fn warping_error(now: &Frame, next: &Frame, flow: &Flow) -> Option<f64> {
     let width = now.size.width;
     let (mut total, mut n) = (0.0, 0u64);

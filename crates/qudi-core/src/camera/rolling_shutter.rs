@@ -3,31 +3,31 @@
 use crate::frame::Frame;
 use crate::sensor::Sensor;
 
-/// Shows each row the scene of its own time: the last row that of the frame, those above an earlier one.
+/// Rolling shutter: the last row sees the scene at the time of the frame, rows above it see earlier times.
 ///
-/// Times are rounded to the instants of an exposure, so that fast motion wants several of them for each native
-/// frame. What was before the first exposure is unknown: there the scene stands still.
+/// Times are rounded to the instants of an exposure, so that fast motion needs several instants per native
+/// frame. Before the first exposure the scene is assumed static.
 #[derive(Clone, Debug)]
 pub struct RollingShutter {
     /// Time from the first row to the last, in output frames.
     delay: f64,
-    /// Instants of the exposure before.
+    /// Instants of the previous exposure.
     before: Vec<Frame>,
 }
 
 impl RollingShutter {
-    /// The shutter of `sensor`.
+    /// Creates the shutter of `sensor`.
     pub fn new(sensor: &Sensor) -> Self {
         let delay = sensor.rolling_shutter / f64::from(sensor.frames_summed);
         Self { delay, before: Vec::new() }
     }
 
-    /// Whether rows differ in time.
+    /// Returns true if rows are exposed at different times.
     pub fn rolls(&self) -> bool {
         self.delay > 0.0
     }
 
-    /// The instants of the next exposure as the rows see them.
+    /// Returns the instants of the next exposure as the rows see them.
     pub fn roll(&mut self, instants: &[Frame]) -> Vec<Frame> {
         if !self.rolls() {
             return instants.to_vec();
@@ -60,7 +60,7 @@ mod tests {
 
     const SIZE: Size = Size { height: 4, width: 2 };
 
-    /// Instants whose value is their time, in instants.
+    /// Creates instants whose value is their time, in instants.
     fn exposure(number: usize, count: usize) -> Vec<Frame> {
         (0..count).map(|i| Frame::filled(SIZE, (number * count + i) as f32)).collect()
     }

@@ -1,6 +1,6 @@
 //! "Did you mean": the nearest known name.
 
-/// The name closest to `word`, if any is close enough to be a typing mistake.
+/// Returns the name closest to `word`, if any is close enough to be a typing mistake.
 pub fn nearest<'a>(word: &str, names: &[&'a str]) -> Option<&'a str> {
     names
         .iter()

@@ -1,4 +1,4 @@
-//! Unfinished files and folders; dropped before `finish`, they leave nothing behind.
+//! Files and folders that appear only when finished; dropped before `finish`, they leave nothing behind.
 
 use crate::error::{Error, Result};
 use std::fs::File;
@@ -11,7 +11,7 @@ use tempfile::{NamedTempFile, TempDir};
 pub enum Overwrite {
     /// Refuse.
     No,
-    /// Replace a file; a folder only if all that it holds is ours.
+    /// Replace a file, or a folder if this program wrote everything in it.
     Yes,
 }
 
@@ -23,7 +23,7 @@ pub struct PendingFile {
     overwrite: Overwrite,
 }
 
-/// The folder of `path`, `.` for a bare name.
+/// Returns the folder of `path`, `.` for a bare name.
 fn parent(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
@@ -44,7 +44,7 @@ pub fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
 }
 
 impl PendingFile {
-    /// Starts a file beside where it will be.
+    /// Creates a temporary file in the folder of `path`.
     ///
     /// # Errors
     /// [`Error`] if the name is taken or the folder cannot be written.
@@ -68,7 +68,7 @@ impl PendingFile {
         })
     }
 
-    /// Writes a file whose bytes are all there.
+    /// Writes `bytes` to a new file.
     ///
     /// # Errors
     /// [`Error`] if the name is taken, or the file cannot be written.
@@ -78,7 +78,7 @@ impl PendingFile {
         file.finish()
     }
 
-    /// The name it will have.
+    /// Returns the name after [`Self::finish`].
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -88,7 +88,7 @@ impl PendingFile {
         Error::io("write", &self.path, e)
     }
 
-    /// The open file, everything written so far flushed to it.
+    /// Flushes everything written so far and returns the open file.
     ///
     /// # Errors
     /// If it cannot be written.
@@ -106,7 +106,7 @@ impl PendingFile {
         let fault = |e: std::io::Error| Error::io("write", &path, e);
         let file = self.writer.into_inner().map_err(|e| fault(e.into_error()))?;
         file.as_file().sync_all().map_err(fault)?;
-        // Whoever took the name since the start keeps it.
+        // A file that took the name in the meantime is kept.
         let named = match self.overwrite {
             Overwrite::Yes => file.persist(&path),
             Overwrite::No => file.persist_noclobber(&path),
@@ -136,7 +136,7 @@ impl std::io::Seek for PendingFile {
 pub struct OwnFolder {
     /// A file that every such folder holds.
     pub marker: &'static str,
-    /// Whether a file of this name is written into such folders.
+    /// Returns true for names of files that are written into such folders.
     pub is_own_file: fn(&str) -> bool,
 }
 
@@ -189,8 +189,8 @@ pub struct PendingFolder {
 }
 
 impl PendingFolder {
-    /// Starts a folder beside where it will be. A folder is overwritten only if all its files are of `own`,
-    /// or if it is empty.
+    /// Creates a temporary folder in the parent of `path`. An existing folder is overwritten only if it is
+    /// empty or all its files are of `own`.
     ///
     /// # Errors
     /// [`Error`] if the name is taken or the parent folder cannot be written.
@@ -209,12 +209,12 @@ impl PendingFolder {
         Ok(Self { folder, path: path.to_owned(), overwrite, own })
     }
 
-    /// The name of a file inside, for writing.
+    /// Returns the path of a file inside, for writing.
     pub fn file(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 
-    /// The name it will have.
+    /// Returns the name after [`Self::finish`].
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -226,9 +226,9 @@ impl PendingFolder {
     pub fn finish(self) -> Result<()> {
         let fault = |e| Error::io("rename the finished folder to", &self.path, e);
         if self.overwrite == Overwrite::Yes && self.path.is_dir() {
-            // Something else may have been put there since the start.
+            // Another program may have written to it in the meantime.
             self.own.check(&self.path)?;
-            // The old folder steps aside first, and comes back if the new one cannot take its place.
+            // The old folder is renamed first, and renamed back if the new one cannot replace it.
             let aside = self.folder.path().with_extension("old");
             std::fs::rename(&self.path, &aside).map_err(fault)?;
             if let Err(e) = std::fs::rename(self.folder.path(), &self.path) {

@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-/// The command `ffmpeg`. Ctrl-C at the terminal does not reach it: it is for this program, which ends ffmpeg itself.
+/// Returns the command `ffmpeg`, shielded from Ctrl-C at the terminal: this program ends it.
 pub fn ffmpeg() -> Command {
     #[allow(unused_mut)] // process groups are Unix's
     let mut command = Command::new("ffmpeg");

@@ -1,4 +1,4 @@
-//! File names in the order that people number them.
+//! Natural order of file names: numbers in them are compared by value.
 
 use std::cmp::Ordering;
 

@@ -44,7 +44,7 @@ pub enum Sample {
 }
 
 impl Sample {
-    /// Bytes per sample.
+    /// Returns the number of bytes per sample.
     pub fn bytes(self) -> usize {
         match self {
             Self::Bool | Self::U8 => 1,
@@ -73,7 +73,7 @@ impl Sample {
         })
     }
 
-    /// The value of full scale, 1 for booleans and floats; wide integers have no customary one.
+    /// Returns the value of full scale, 1 for booleans and floats; wide integers have none.
     pub fn full_scale(self) -> Option<f32> {
         match self {
             Self::U8 => Some(255.0),
@@ -93,7 +93,7 @@ impl Sample {
         }
     }
 
-    /// The sample in `bytes`, which holds exactly one.
+    /// Decodes the sample in `bytes`, which holds exactly one.
     pub fn decode(self, bytes: &[u8]) -> f32 {
         let mut word = [0u8; 8];
         word[..bytes.len()].copy_from_slice(bytes);
@@ -116,7 +116,7 @@ impl Sample {
     }
 }
 
-/// What a `.npy` header says.
+/// Header of a `.npy` file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Header {
     /// Sample type.
@@ -174,8 +174,8 @@ impl Header {
         Ok(Self { sample, shape, fortran, data_start: (prefix + length) as u64 })
     }
 
-    /// The data that follow this header in `reader`, the last axis the fastest. An array in Fortran order is
-    /// read whole.
+    /// Returns the data that follow this header in `reader`, the last axis the fastest. An array in Fortran
+    /// order is read whole.
     ///
     /// # Errors
     /// [`Error`] if an array in Fortran order cannot be read, or is too large to be held.
@@ -204,7 +204,7 @@ impl Header {
         Ok(Box::new(Cursor::new(self.transposed(&data))))
     }
 
-    /// Data in Fortran order with the last axis the fastest.
+    /// Transposes data in Fortran order, so that the last axis is the fastest.
     fn transposed(&self, data: &[u8]) -> Vec<u8> {
         let length = self.sample.bytes();
         let stride = |axis: usize| self.shape[..axis].iter().product::<usize>();
@@ -225,7 +225,7 @@ impl Header {
         turned
     }
 
-    /// Bytes of data that the header promises, if that is a possible number.
+    /// Returns the number of data bytes that the header promises, or `None` if it overflows.
     pub fn data_bytes(&self) -> Option<u64> {
         let samples = self.shape.iter().try_fold(1u64, |n, &d| n.checked_mul(d as u64))?;
         samples.checked_mul(self.sample.bytes() as u64)
@@ -283,7 +283,7 @@ fn parse_dictionary(text: &str) -> Option<(String, bool, Vec<usize>)> {
     Some((descr, fortran, shape))
 }
 
-/// A `.npy` header, version 1.0, padded to 64 bytes as NumPy does.
+/// Writes a `.npy` header, version 1.0, padded to 64 bytes as NumPy does.
 ///
 /// `descr` is NumPy's type string, as in `|u1`, `<u2`, `<f4`.
 pub fn write_header(out: &mut impl Write, descr: &str, shape: &[usize]) -> std::io::Result<()> {
@@ -327,12 +327,12 @@ pub fn read_image(path: &Path) -> Result<Frame> {
     Ok(Frame { size, data })
 }
 
-/// Reads a three-dimensional `.npy` of at most `most` frames: floats as they are, which may lie
+/// Reads up to `max_frames` frames of a three-dimensional `.npy`: floats as they are, which may lie
 /// outside [0, 1]; bytes and words relative to full scale.
 ///
 /// # Errors
 /// [`Error`] if it cannot be read, has other axes, or holds values that are not finite.
-pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
+pub fn read_clip(path: &Path, max_frames: usize) -> Result<Vec<Frame>> {
     let (header, reader) = Header::open(path)?;
     let (&[frames, height, width], Some(full)) =
         (header.shape.as_slice(), header.sample.full_scale())
@@ -350,7 +350,7 @@ pub fn read_clip(path: &Path, most: usize) -> Result<Vec<Frame>> {
     let mut bytes = vec![0u8; size.pixels() * header.sample.bytes()];
     let mut clip = Vec::new();
     let mut reader = header.in_c_order(reader, path)?;
-    for _ in 0..frames.min(most) {
+    for _ in 0..frames.min(max_frames) {
         reader.read_exact(&mut bytes).map_err(|e| Error::io("read a frame", path, e))?;
         let samples = bytes.chunks_exact(header.sample.bytes());
         let data: Vec<f32> = samples.map(|b| header.sample.decode(b) / full).collect();
@@ -368,7 +368,7 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// Headers come from strangers: anything but a panic.
+        /// Reading an arbitrary header returns a result and never panics.
         #[test]
         fn hostile_npy_headers_never_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..300), magic: bool) {
             if magic && bytes.len() > 8 {

@@ -1,4 +1,4 @@
-//! Files that end: devices and pipes in their place would be read for ever, or waited for.
+//! Regular files only: a device never ends, and opening a named pipe waits for a writer.
 
 use crate::error::{Error, Result};
 use std::fs::File;
@@ -24,7 +24,7 @@ pub fn require_regular(path: &Path, action: &str) -> Result<u64> {
     Ok(about.len())
 }
 
-/// Opens a regular file; `action` says what for, as in "open the GIF".
+/// Opens a regular file; `action` names the purpose in errors, as in "open the GIF".
 ///
 /// # Errors
 /// [`Error`] if it is no regular file or cannot be opened.

@@ -1,4 +1,5 @@
-//! The mean level of a restored picture where nothing is known about it: that of usual scenes, or less.
+//! Default mean level of a restored picture: the mean level of usual scenes, or less for scenes with
+//! highlights.
 
 use crate::error::Result;
 use crate::frame::Size;
@@ -7,21 +8,22 @@ use crate::restorer::{Acquisition, BurstView};
 use crate::sensor::{CountLaw, Response};
 use crate::windows::LONGEST_HALF;
 
-/// The side of the squares over which photons are counted, in pixels: single ones are mostly noise.
+/// Side in pixels of the squares over which photons are counted, since single pixels are mostly noise.
 const SIDE: usize = 8;
 
-/// The share of a square's brightest and of its darkest pixels that do not count, as one in so many: hot and
-/// dead ones.
-const TRIMMED: usize = 16;
+/// Inverse share of a square's brightest and of its darkest pixels that are left out: they may be hot or
+/// dead.
+const TRIM_DIVISOR: usize = 16;
 
-/// The share of squares that may be brighter than white, as one in so many.
-const BRIGHTER: usize = 1000;
+/// Inverse share of the squares that may be brighter than white.
+const CLIPPED_DIVISOR: usize = 1000;
 
-/// The image value of the brightest square that counts: details smaller than a square are brighter still.
-const BRIGHT: f64 = 0.75;
+/// Image value given to the brightest remaining square, below 1 since details smaller than a square are
+/// brighter.
+const HIGHLIGHT_LEVEL: f64 = 0.75;
 
-/// The image value that should receive `acquisition.ppp` photons: [`USUAL_MEAN_LEVEL`], or less where parts
-/// of the scene would be brighter than white.
+/// Estimates the image value that should receive `acquisition.ppp` photons: [`USUAL_MEAN_LEVEL`], or less
+/// where parts of the scene would be brighter than white.
 ///
 /// `acquisition.mean_level` is not used. `read` is asked for the first, the middle and the last 11 of
 /// `frames` frames, in this order.
@@ -41,12 +43,13 @@ pub fn fitting_mean_level(
     for start in starts {
         let frames = (start..start + length).map(&mut read).collect::<Result<Vec<_>>>()?;
         let bright = brightest(BurstView { size, frames: &frames }, acquisition)?;
-        mean_level = mean_level.min(BRIGHT * acquisition.ppp / bright.max(f64::MIN_POSITIVE));
+        mean_level =
+            mean_level.min(HIGHLIGHT_LEVEL * acquisition.ppp / bright.max(f64::MIN_POSITIVE));
     }
     Ok(mean_level)
 }
 
-/// Photons per pixel and frame that a thousandth of the squares exceed.
+/// Returns the photons per pixel and frame that a thousandth of the squares exceed.
 fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
     let typical = acquisition.sensor.dark_per_frame()?;
     let size = burst.size;
@@ -63,7 +66,7 @@ fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
             let mut pixels: Vec<(u32, f64)> =
                 places.map(|i| (sums[i], acquisition.dark_of(i, typical))).collect();
             pixels.sort_unstable_by_key(|&(sum, _)| sum);
-            let trimmed = pixels.len() / TRIMMED;
+            let trimmed = pixels.len() / TRIM_DIVISOR;
             let pixels = &pixels[trimmed..pixels.len() - trimmed];
             let dark = pixels.iter().map(|(_, dark)| dark).sum::<f64>() / pixels.len() as f64;
             let total: f64 = pixels.iter().map(|&(sum, _)| f64::from(sum)).sum();
@@ -72,7 +75,7 @@ fn brightest(burst: BurstView<'_>, acquisition: &Acquisition) -> Result<f64> {
             squares.push((flux, total / f64::from(samples), dark));
         }
     }
-    let place = squares.len() - 1 - squares.len() / BRIGHTER;
+    let place = squares.len() - 1 - squares.len() / CLIPPED_DIVISOR;
     let (_, &mut (flux, mean, dark), _) =
         squares.select_nth_unstable_by(place, |a, b| f64::total_cmp(&a.0, &b.0));
     if acquisition.sensor.response == Response::Binary {
@@ -95,7 +98,8 @@ mod tests {
 
     const SIZE: Size = Size { height: 64, width: 80 };
 
-    /// The exposure found for a scene whose mean gets `ppp` photons, every `hot`-th pixel at full scale.
+    /// Estimates the exposure of a scene whose mean gets `ppp` photons, with every `hot`-th pixel at full
+    /// scale.
     fn estimated(scene: &Frame, sensor: &str, ppp: f64, hot: usize) -> f64 {
         let sensor = Sensor::load(sensor).unwrap();
         let light = Light { ppp, mean_level: scene.mean() };
@@ -112,7 +116,7 @@ mod tests {
         .unwrap()
     }
 
-    /// A fifth of the scene three times as bright as the rest.
+    /// Creates a scene with a fifth of it three times as bright as the rest.
     fn lamp(brightest: f32) -> Frame {
         Frame::from_fn(SIZE, |x, _| if x < 16 { brightest } else { brightest / 3.0 })
     }
@@ -122,7 +126,7 @@ mod tests {
         let even = Frame::from_fn(SIZE, |x, _| 0.5 + 0.004 * x as f32);
         assert_eq!(estimated(&even, "qudi-paper", 3.25, usize::MAX), USUAL_MEAN_LEVEL);
         assert_eq!(estimated(&even, "spad512s", 0.3, usize::MAX), USUAL_MEAN_LEVEL);
-        // Hot pixels are not the scene's.
+        // Hot pixels do not belong to the scene.
         assert_eq!(estimated(&even, "spad512s", 0.05, 131), USUAL_MEAN_LEVEL);
     }
 

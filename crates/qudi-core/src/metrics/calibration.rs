@@ -1,22 +1,22 @@
-//! Predicted uncertainty beside true errors: overall, where nothing is, and where much is.
+//! Calibration of the predicted uncertainty: overall, in flat parts and in textured parts.
 
 use super::detail::{SIDE, quarters};
 use crate::frame::Frame;
 
-/// The root mean square of errors over that of their predicted sigma: 1 where the prediction is right, above where it
-/// promises too much.
+/// Ratio of the root mean square error to the root mean square predicted sigma: 1 where the prediction is
+/// right, above 1 where it is too small.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Calibration {
-    /// Over the whole frame.
+    /// Ratio over the whole frame.
     pub all: f64,
-    /// In the quarter of the squares of 16 x 16 pixels in which the truth has least.
+    /// Ratio in the quarter of the squares of 16 x 16 pixels in which the truth has least detail.
     pub flat: f64,
-    /// In the quarter in which it has most.
+    /// Ratio in the quarter in which the truth has most detail.
     pub textured: f64,
 }
 
-/// How well `sigma` predicts the errors of an image. `None` for frames of different sizes or of fewer than four
-/// squares, or where sigma is zero.
+/// Compares `sigma` with the errors of an image. Returns `None` for frames of different sizes or of fewer
+/// than four squares, or where sigma is zero.
 pub fn calibration(image: &Frame, sigma: &Frame, truth: &Frame) -> Option<Calibration> {
     if image.size != truth.size || sigma.size != truth.size {
         return None;
@@ -62,9 +62,9 @@ mod tests {
         let image = Frame::from_fn(size, |x, y| truth.data[y * 64 + x] + error(x, y));
         let sigma = Frame::filled(size, 0.04);
         let Some(found) = calibration(&image, &sigma, &truth) else { panic!("large enough") };
-        let wanted = [(0.0004f64 + 0.0036).sqrt() / 2f64.sqrt() / 0.04, 0.5, 1.5];
-        for (found, wanted) in [found.all, found.flat, found.textured].into_iter().zip(wanted) {
-            assert!((found - wanted).abs() < 1e-4, "{found} for {wanted}");
+        let expected = [(0.0004f64 + 0.0036).sqrt() / 2f64.sqrt() / 0.04, 0.5, 1.5];
+        for (found, expected) in [found.all, found.flat, found.textured].into_iter().zip(expected) {
+            assert!((found - expected).abs() < 1e-4, "{found} for {expected}");
         }
         assert_eq!(calibration(&image, &Frame::filled(size, 0.0), &truth), None);
     }

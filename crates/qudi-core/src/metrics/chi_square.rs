@@ -1,14 +1,14 @@
-//! Does the result explain the photons? The restored frames are measured again by the sensor's law,
+//! Consistency of a result with the photons. The restored frames are measured again by the sensor's law
 //! and compared with the counts: `chi^2 = (y - E y)^2 / Var y`, 1 on average where the image is
-//! right, above where it invents or blurs, below where it follows the noise.
+//! right, above 1 where it invents or blurs, below 1 where it follows the noise.
 
 use crate::error::Result;
 use crate::frame::{Frame, Size};
 use crate::restorer::Acquisition;
 use crate::sensor::{CountLaw, CountMoments};
 
-/// Variances below this (in DN^2) tell nothing: a black pixel of a noiseless sensor.
-const LEAST_VARIANCE: f64 = 1e-6;
+/// Lower bound of the variances (in DN^2) that are used: black pixels of a noiseless sensor have none.
+const MIN_VARIANCE: f64 = 1e-6;
 
 /// Reduced chi-square of a restored clip, with a map.
 #[derive(Clone, Debug)]
@@ -20,14 +20,14 @@ pub struct Consistency {
 }
 
 impl Consistency {
-    /// For frames of `size` of the acquisition's sensor.
+    /// Creates an empty sum for frames of `size` of the acquisition's sensor.
     pub fn new(size: Size, acquisition: &Acquisition) -> Self {
         let law = CountLaw::new(&acquisition.sensor, acquisition.gain);
         let moments = CountMoments::new(&law);
         Self { moments, size, map: vec![0.0; size.pixels()], frames: 0 }
     }
 
-    /// Compares one frame with its counts, and gives its own mean.
+    /// Compares one frame with its counts, and returns its own mean.
     ///
     /// # Errors
     /// [`Error`](crate::Error) if the sensor's dark rate is unknown.
@@ -43,7 +43,7 @@ impl Consistency {
         for (i, (&image, &count)) in restored.data.iter().zip(counts).enumerate() {
             let detections = f64::from(image).max(0.0) * photons + acquisition.dark_of(i, typical);
             let (mean, variance) = self.moments.at(detections);
-            if variance > LEAST_VARIANCE {
+            if variance > MIN_VARIANCE {
                 let chi_square = (f64::from(count) - mean).powi(2) / variance;
                 self.map[i] += chi_square;
                 total += chi_square;
@@ -53,13 +53,13 @@ impl Consistency {
         Ok(total / self.map.len() as f64)
     }
 
-    /// Mean over all pixels and frames; `None` before the first frame.
+    /// Returns the mean over all pixels and frames; `None` before the first frame.
     pub fn chi_square(&self) -> Option<f64> {
         let mean = self.map.iter().sum::<f64>() / self.map.len() as f64;
         (self.frames > 0).then(|| mean / self.frames as f64)
     }
 
-    /// Mean over frames, `[height][width]`.
+    /// Returns the mean over frames, `[height][width]`.
     pub fn map(&self) -> Frame {
         let scale = 1.0 / self.frames.max(1) as f64;
         let data = self.map.iter().map(|&sum| (sum * scale) as f32).collect();

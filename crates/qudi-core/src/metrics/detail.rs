@@ -1,21 +1,21 @@
-//! Detail beside that of the truth: where nothing is, and where much is.
+//! Detail of an image relative to the truth, in flat and in textured parts.
 
 use crate::frame::Frame;
 
-/// Side of the squares that are ranked by how much is in them.
+/// Side of the squares that are ranked by their detail.
 pub(super) const SIDE: usize = 16;
 
-/// The energy of the gradients of an image over that of the truth: 1 where it has as much detail.
+/// Energy of the gradients of an image divided by the energy of the truth's: 1 where it has as much detail.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Detail {
-    /// In the quarter of the squares in which the truth has least: above 1 where grain was added.
+    /// Ratio in the quarter of the squares with the least detail: above 1 where grain was added.
     pub flat: f64,
-    /// In the quarter in which it has most: below 1 where it was smoothed.
+    /// Ratio in the quarter with the most detail: below 1 where the image was smoothed.
     pub textured: f64,
 }
 
-/// The detail of an image beside that of the truth. `None` for frames of different sizes, with fewer than four
-/// squares of 16 x 16 pixels, or where the truth is constant in a quarter of them.
+/// Measures the detail of an image relative to the truth. Returns `None` for frames of different sizes, with
+/// fewer than four squares of 16 x 16 pixels, or where the truth is constant in a quarter of them.
 pub fn detail(estimate: &Frame, truth: &Frame) -> Option<Detail> {
     if estimate.size != truth.size {
         return None;
@@ -28,8 +28,8 @@ pub fn detail(estimate: &Frame, truth: &Frame) -> Option<Detail> {
     Some(Detail { flat: flat?, textured: textured? })
 }
 
-/// The upper left corners of the squares of 16 x 16 pixels in which there is least, and of those in which there is
-/// most: a quarter of all each. `None` of fewer than four squares.
+/// Returns the upper left corners of the quarter of squares with the least detail and of the quarter with the
+/// most; `None` for fewer than four squares.
 pub(super) fn quarters(truth: &Frame) -> Option<[Vec<[usize; 2]>; 2]> {
     let mut ranked: Vec<_> =
         squares(truth).into_iter().map(|square| (energy(truth, square), square)).collect();
@@ -39,14 +39,14 @@ pub(super) fn quarters(truth: &Frame) -> Option<[Vec<[usize; 2]>; 2]> {
     (quarter > 0).then(|| [corners(&ranked[..quarter]), corners(&ranked[count - quarter..])])
 }
 
-/// The upper left corners of whole squares.
+/// Returns the upper left corners of whole squares.
 fn squares(frame: &Frame) -> Vec<[usize; 2]> {
     let rows = (0..frame.size.height / SIDE).map(|row| row * SIDE);
     let columns = 0..frame.size.width / SIDE;
     rows.flat_map(|y| columns.clone().map(move |column| [y, column * SIDE])).collect()
 }
 
-/// The sum of squared differences of neighbours in a square.
+/// Sums the squared differences of neighbouring pixels in a square.
 fn energy(frame: &Frame, [top, left]: [usize; 2]) -> f64 {
     let width = frame.size.width;
     let value = |y: usize, x: usize| f64::from(frame.data[(top + y) * width + left + x]);
@@ -69,7 +69,7 @@ mod tests {
     use super::*;
     use crate::frame::Size;
 
-    /// Left half a slope, right half stripes.
+    /// Creates a scene with a slope on the left and stripes on the right.
     fn scene(grain: f32, contrast: f32) -> Frame {
         let size = Size { height: 32, width: 64 };
         Frame::from_fn(size, |x, y| {

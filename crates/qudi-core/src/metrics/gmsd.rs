@@ -1,16 +1,17 @@
-//! Gradient magnitude similarity deviation (Xue et al. 2014, "Gradient Magnitude Similarity Deviation: A Highly
-//! Efficient Perceptual Image Quality Index").
+//! Gradient magnitude similarity deviation (Xue et al. 2014, "Gradient Magnitude Similarity Deviation: A
+//! Highly Efficient Perceptual Image Quality Index").
 
 use crate::frame::{Frame, Size};
 
-/// Their constant of 170, for images in [0, 1] instead of 8 bits.
+/// The authors' constant of 170, for images in [0, 1] instead of 8 bits.
 const STABILITY: f64 = 170.0 / (255.0 * 255.0);
 
-/// The standard deviation over pixels of how alike the lengths of gradients are: 0 for equal images, larger for worse
-/// ones. Both are clipped to [0, 1]. `None` for frames of different sizes or without a square of 2 x 2 pixels.
+/// Returns the standard deviation of the gradient magnitude similarity: 0 for equal images, larger for worse
+/// ones. Both are clipped to [0, 1]. `None` for frames of different sizes or without a square of 2 x 2
+/// pixels.
 ///
-/// As in the authors' program, means of squares of 2 x 2 pixels are compared, gradients are Prewitt's, and images are
-/// dark outside.
+/// As in the authors' program, means of squares of 2 x 2 pixels are compared, gradients are Prewitt's, and
+/// images are dark outside.
 pub fn gmsd(estimate: &Frame, truth: &Frame) -> Option<f64> {
     if estimate.size != truth.size || truth.size.height < 2 || truth.size.width < 2 {
         return None;
@@ -23,14 +24,14 @@ pub fn gmsd(estimate: &Frame, truth: &Frame) -> Option<f64> {
     let count = size.pixels() as f64;
     let mean = similarity.iter().sum::<f64>() / count;
     let squares = similarity.iter().map(|s| (s - mean).powi(2)).sum::<f64>();
-    // The sample's, as MATLAB's std2.
+    // Sample standard deviation, as MATLAB's std2.
     Some((squares / (count - 1.0).max(1.0)).sqrt())
 }
 
-/// Lengths of the gradients of an image at half its size.
+/// Computes the lengths of the gradients of an image at half its size.
 fn gradients(frame: &Frame) -> (Size, Vec<f64>) {
     let Size { height, width } = frame.size;
-    // The last odd row or column stands beside darkness.
+    // An odd last row or column is averaged with zeros.
     let size = Size { height: height.div_ceil(2), width: width.div_ceil(2) };
     let value = |y: usize, x: usize| {
         if y < height && x < width {

@@ -2,12 +2,12 @@
 
 use crate::frame::Frame;
 
-/// Octaves: structure of about 2 to 4 pixels, 4 to 8, 8 to 16, 16 to 32, and coarser.
+/// Number of octaves: structure of about 2 to 4 pixels, 4 to 8, 8 to 16, 16 to 32, and coarser.
 pub const OCTAVES: usize = 5;
 
-/// The energy per pixel of an image in each octave, finest first: what means of squares of 1, 2, 4, 8 and 16 pixels
-/// lose of each other, and what the last ones have. They add up to the mean square. Rows and columns past the last
-/// whole square of 16 x 16 pixels are left out; `None` if there is none.
+/// Returns the energy per pixel of an image in each octave, finest first: the differences between means of
+/// squares of 1, 2, 4, 8 and 16 pixels, and the means of the last. They add up to the mean square. Rows and
+/// columns past the last whole square of 16 x 16 pixels are left out; `None` if there is none.
 pub fn octave_energies(image: &Frame) -> Option<[f64; OCTAVES]> {
     let largest = 1 << (OCTAVES - 1);
     let [mut height, mut width] =

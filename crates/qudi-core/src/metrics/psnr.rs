@@ -2,17 +2,17 @@
 
 use crate::frame::Frame;
 
-/// PSNR of `estimate` against `truth`, both clipped to [0, 1]; infinite if they are equal.
+/// Returns the PSNR of `estimate` against `truth`, both clipped to [0, 1]; infinite if they are equal.
 pub fn psnr(estimate: &Frame, truth: &Frame) -> f64 {
     scaled_psnr(estimate, truth, 1.0)
 }
 
-/// PSNR after the best global gain: photon counts fix an image only up to its exposure.
+/// Returns the PSNR after the best global gain: photon counts fix an image only up to its exposure.
 pub fn gain_aligned_psnr(estimate: &Frame, truth: &Frame) -> f64 {
     scaled_psnr(estimate, truth, best_gain(estimate, truth))
 }
 
-/// The factor on `estimate` that leaves the least squared error; 1 for a black estimate.
+/// Returns the factor on `estimate` with the least squared error; 1 for a black estimate.
 pub fn best_gain(estimate: &Frame, truth: &Frame) -> f64 {
     let (mut cross, mut square) = (0.0, 0.0);
     for (&e, &t) in estimate.data.iter().zip(&truth.data) {

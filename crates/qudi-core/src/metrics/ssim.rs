@@ -5,28 +5,28 @@ use crate::frame::{Frame, Size};
 const K1: f64 = 0.01;
 const K2: f64 = 0.03;
 
-/// Uniform window of QUIVER's and QuDi's tables: scikit-image's default.
-const UNIFORM: usize = 7;
+/// Side of the uniform window of QUIVER's and QuDi's tables: scikit-image's default.
+const UNIFORM_WINDOW: usize = 7;
 
-/// Gaussian window of the original paper: 11 x 11, sigma 1.5.
-const GAUSSIAN: usize = 11;
+/// Side of the Gaussian window of the original paper: 11 x 11, sigma 1.5.
+const GAUSSIAN_WINDOW: usize = 11;
 const SIGMA: f64 = 1.5;
 
-/// SSIM with a uniform 7 x 7 window, sample covariance, and a border of 3 pixels left out:
+/// Returns SSIM with a uniform 7 x 7 window, sample covariance, and a border of 3 pixels left out:
 /// `skimage.metrics.structural_similarity(truth, estimate, data_range=1)`. Both are clipped to
 /// [0, 1]. `None` for frames smaller than the window.
 pub fn ssim(estimate: &Frame, truth: &Frame) -> Option<f64> {
-    let n = (UNIFORM * UNIFORM) as f64;
-    similarity(estimate, truth, &[1.0 / UNIFORM as f64; UNIFORM], n / (n - 1.0))
+    let n = (UNIFORM_WINDOW * UNIFORM_WINDOW) as f64;
+    similarity(estimate, truth, &[1.0 / UNIFORM_WINDOW as f64; UNIFORM_WINDOW], n / (n - 1.0))
 }
 
-/// SSIM with a Gaussian 11 x 11 window of sigma 1.5 and population covariance, a border of 5 pixels
+/// Returns SSIM with a Gaussian 11 x 11 window of sigma 1.5 and population covariance, a border of 5 pixels
 /// left out: `structural_similarity(..., gaussian_weights=True, sigma=1.5,
 /// use_sample_covariance=False, data_range=1)`. `None` for frames smaller than the window.
 pub fn gaussian_ssim(estimate: &Frame, truth: &Frame) -> Option<f64> {
-    let mut window = [0.0; GAUSSIAN];
+    let mut window = [0.0; GAUSSIAN_WINDOW];
     for (i, weight) in window.iter_mut().enumerate() {
-        let x = i as f64 - (GAUSSIAN / 2) as f64;
+        let x = i as f64 - (GAUSSIAN_WINDOW / 2) as f64;
         *weight = (-0.5 * (x / SIGMA).powi(2)).exp();
     }
     let sum: f64 = window.iter().sum();
@@ -60,7 +60,7 @@ fn similarity(estimate: &Frame, truth: &Frame, window: &[f64], unbias: f64) -> O
     Some(total / mx.len() as f64)
 }
 
-/// Separable filter, where the window lies inside the image.
+/// Filters rows, then columns, where the window lies inside the image.
 fn filter(image: &[f64], size: Size, window: &[f64]) -> Vec<f64> {
     let (n, out) = (window.len(), size.width + 1 - window.len());
     let mut rows = Vec::with_capacity(size.height * out);

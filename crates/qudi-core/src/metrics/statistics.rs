@@ -14,17 +14,17 @@ pub struct Statistics {
 }
 
 /// Two-sided 95 % quantiles of Student's distribution for 1 to 30 degrees of freedom.
-const STUDENT: [f64; 30] = [
+const STUDENT_QUANTILES: [f64; 30] = [
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160,
     2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056,
     2.052, 2.048, 2.045, 2.042,
 ];
 
-/// The same for many degrees of freedom.
-const NORMAL: f64 = 1.96;
+/// The 97.5 % quantile of the normal distribution, for more degrees of freedom.
+const NORMAL_QUANTILE: f64 = 1.96;
 
 impl Statistics {
-    /// The statistics of `values`; `None` if there are none.
+    /// Computes the statistics of `values`; `None` if there are none.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n = values.len();
         if n == 0 {
@@ -34,7 +34,7 @@ impl Statistics {
         let ci95 = (n > 1).then(|| {
             let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
             let error = (squares / (n - 1) as f64 / n as f64).sqrt();
-            STUDENT.get(n - 2).copied().unwrap_or(NORMAL) * error
+            STUDENT_QUANTILES.get(n - 2).copied().unwrap_or(NORMAL_QUANTILE) * error
         });
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);

@@ -3,18 +3,19 @@
 use crate::frame::Size;
 use std::fmt::Write as _;
 
-/// A hot pixel outshines its brightest good neighbours by this factor ...
-const HOT_FACTOR: f64 = 2.0;
+/// Least ratio of a hot pixel to its brightest good neighbours.
+const HOT_RATIO: f64 = 2.0;
 
-/// ... and by this many standard deviations of their counts.
+/// Least difference of a hot pixel from its brightest good neighbours, in standard deviations of their
+/// counts.
 const HOT_SIGMAS: f64 = 8.0;
 
-/// A dead pixel is silent where all its neighbours but two count more than this: chance does that
-/// once in e^18 pixels, and black parts of a scene are larger.
-const DEAD_EXPECTED: f64 = 18.0;
+/// Count that all neighbours but two of a dead pixel exceed. By chance a good pixel is silent there once in
+/// e^18 pixels, and black parts of a scene are larger.
+const DEAD_NEIGHBOUR_COUNT: f64 = 18.0;
 
-/// Pixels of a neighbourhood, 5 x 5 around the pixel.
-const REACH: isize = 2;
+/// Radius of the neighbourhood of a pixel: 5 x 5 pixels.
+const NEIGHBOUR_RADIUS: isize = 2;
 
 /// Bad pixels of an array, as indices in rising order.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -29,7 +30,7 @@ pub struct BadPixels {
 
 impl BadPixels {
     /// Looks for isolated pixels far off their neighbourhood in the `sums` of `frames` frames.
-    /// Counts per frame go up to `max_count` (1 for binary frames, whose rates are unbent first).
+    /// Counts per frame go up to `max_count` (1 for binary frames, whose saturation is corrected first).
     ///
     /// Optics spread even a star over several pixels; a single one that is twice as bright as the
     /// second brightest around it is a defect.
@@ -45,9 +46,10 @@ impl BadPixels {
             .collect();
         let mut bad = Self::default();
         // Where nothing is bright, no pixel is known to be dead.
-        let is_lit = detections.iter().any(|&value| value > DEAD_EXPECTED);
+        let is_lit = detections.iter().any(|&value| value > DEAD_NEIGHBOUR_COUNT);
         for i in 0..size.pixels() {
-            // Beyond what noise alone can do, or empty: others need no look at their neighbours.
+            // Only pixels beyond what noise alone explains, or empty ones, are compared with their
+            // neighbours.
             let (bright, empty) = (detections[i] > HOT_SIGMAS, is_lit && sums[i] == 0);
             if !bright && !empty {
                 continue;
@@ -59,7 +61,7 @@ impl BadPixels {
             // The very brightest may be a defect itself.
             let usual = around.brightest[1];
             let noise = (usual + 1.0).sqrt();
-            if detections[i] > HOT_FACTOR * usual && detections[i] > usual + HOT_SIGMAS * noise {
+            if detections[i] > HOT_RATIO * usual && detections[i] > usual + HOT_SIGMAS * noise {
                 bad.hot.push(i);
             } else if empty && around.dark < 3 {
                 bad.dead.push(i);
@@ -69,17 +71,17 @@ impl BadPixels {
         bad
     }
 
-    /// The number of bad pixels.
+    /// Returns the number of bad pixels.
     pub fn len(&self) -> usize {
         self.hot.len() + self.dead.len()
     }
 
-    /// Whether there are none.
+    /// Returns true if there are no bad pixels.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// For each pixel whether it is bad.
+    /// Returns a mask that is true for bad pixels.
     pub fn mask(&self, size: Size) -> Vec<bool> {
         let mut mask = vec![false; size.pixels()];
         for &i in self.hot.iter().chain(&self.dead) {
@@ -88,7 +90,7 @@ impl BadPixels {
         mask
     }
 
-    /// In words.
+    /// Describes the bad pixels in words.
     pub fn describe(&self, size: Size) -> String {
         let mut text = String::new();
         let percent = |n: usize| 100.0 * n as f64 / size.pixels() as f64;
@@ -102,22 +104,22 @@ impl BadPixels {
     }
 }
 
-/// What the pixels around one show.
+/// Statistics of the pixels around one pixel.
 struct Neighbours {
     count: usize,
     /// The brightest two.
     brightest: [f64; 2],
-    /// How many are too dark to tell a dead pixel by.
+    /// Number of pixels that are too dark to reveal a dead one.
     dark: usize,
 }
 
 impl Neighbours {
     fn of(i: usize, size: Size, detections: &[f64]) -> Self {
         let mut around = Self { count: 0, brightest: [f64::NEG_INFINITY; 2], dark: 0 };
-        neighbours(i, size, REACH, |j| {
+        neighbours(i, size, NEIGHBOUR_RADIUS, |j| {
             let value = detections[j];
             around.count += 1;
-            around.dark += usize::from(value <= DEAD_EXPECTED);
+            around.dark += usize::from(value <= DEAD_NEIGHBOUR_COUNT);
             let [first, second] = &mut around.brightest;
             if value > *first {
                 *second = std::mem::replace(first, value);
@@ -129,26 +131,26 @@ impl Neighbours {
     }
 }
 
-/// Reach of the surroundings of a clump: 9 x 9 pixels.
-const WIDE: isize = 4;
+/// Radius of the surroundings of a clump: 9 x 9 pixels.
+const CLUMP_RADIUS: isize = 4;
 
-/// A clump outshines the pixels around it by this factor: optics leave a rim around bright things.
-const CLUMP_FACTOR: f64 = 4.0;
+/// Least ratio of a clump to the pixels around it: optics leave a rim around bright objects.
+const CLUMP_RATIO: f64 = 4.0;
 
-/// Counts pixels that are no isolated defects, but far brighter than most pixels around them.
+/// Counts pixels that are not isolated defects, but far brighter than most pixels around them.
 fn doubtful(detections: &[f64], size: Size, bad: &BadPixels) -> usize {
     let known = bad.mask(size);
     let mut around = Vec::with_capacity(80);
     let mut count = 0;
     for i in 0..size.pixels() {
-        // What noise alone can do is no clump.
+        // Noise alone explains these.
         if known[i] || detections[i] <= HOT_SIGMAS {
             continue;
         }
         // Most pixels are darker than their surroundings and need no second look.
         let mut mean = 0.0;
         let mut n = 0.0;
-        neighbours(i, size, REACH, |j| {
+        neighbours(i, size, NEIGHBOUR_RADIUS, |j| {
             mean += detections[j];
             n += 1.0;
         });
@@ -156,26 +158,26 @@ fn doubtful(detections: &[f64], size: Size, bad: &BadPixels) -> usize {
             continue;
         }
         around.clear();
-        neighbours(i, size, WIDE, |j| around.push(detections[j]));
+        neighbours(i, size, CLUMP_RADIUS, |j| around.push(detections[j]));
         let upper = around.len() * 3 / 4;
         if around.len() < 24 {
             continue;
         }
         let (_, &mut usual, _) = around.select_nth_unstable_by(upper, f64::total_cmp);
         let noise = HOT_SIGMAS * (usual + 1.0).sqrt();
-        if detections[i] > CLUMP_FACTOR * usual && detections[i] > usual + noise {
+        if detections[i] > CLUMP_RATIO * usual && detections[i] > usual + noise {
             count += 1;
         }
     }
     count
 }
 
-/// Calls `f` with the pixels within `reach` of pixel `i`, itself left out.
-fn neighbours(i: usize, size: Size, reach: isize, mut f: impl FnMut(usize)) {
+/// Calls `f` with the pixels within `radius` of pixel `i`, itself left out.
+fn neighbours(i: usize, size: Size, radius: isize, mut f: impl FnMut(usize)) {
     let (y, x) = ((i / size.width) as isize, (i % size.width) as isize);
     let (height, width) = (size.height as isize, size.width as isize);
-    for ny in (y - reach).max(0)..(y + reach + 1).min(height) {
-        for nx in (x - reach).max(0)..(x + reach + 1).min(width) {
+    for ny in (y - radius).max(0)..(y + radius + 1).min(height) {
+        for nx in (x - radius).max(0)..(x + radius + 1).min(width) {
             if (ny, nx) != (y, x) {
                 f((ny * width + nx) as usize);
             }
@@ -196,14 +198,14 @@ impl Repair {
         let widest = size.height.max(size.width) as isize;
         let good = |i: usize| -> Vec<usize> {
             let mut found = Vec::new();
-            let mut reach = 1;
-            while found.is_empty() && reach <= widest {
-                neighbours(i, size, reach, |j| {
+            let mut radius = 1;
+            while found.is_empty() && radius <= widest {
+                neighbours(i, size, radius, |j| {
                     if !mask[j] {
                         found.push(j);
                     }
                 });
-                reach *= 2;
+                radius *= 2;
             }
             found
         };
@@ -212,12 +214,12 @@ impl Repair {
         Self { pixels: pixels.collect() }
     }
 
-    /// The number of repaired pixels.
+    /// Returns the number of repaired pixels.
     pub fn count(&self) -> usize {
         self.pixels.len()
     }
 
-    /// Copies one good neighbour, another one in each frame: the noise stays that of a count
+    /// Copies one good neighbour, another one in each frame, which keeps the noise of a count
     /// (Ma et al. 2020, whose code does the same with one draw for all pixels).
     pub fn frame(&self, frame: u64, counts: &mut [u16]) {
         for (i, good) in &self.pixels {
@@ -226,7 +228,8 @@ impl Repair {
         }
     }
 
-    /// Puts the mean of the good neighbours, which is what many frames of [`Repair::frame`] tend to.
+    /// Replaces bad pixels by the mean of their good neighbours, the limit of many frames of
+    /// [`Repair::frame`].
     pub fn sums(&self, sums: &mut [u32]) {
         for (i, good) in &self.pixels {
             let total: u64 = good.iter().map(|&j| u64::from(sums[j])).sum();
@@ -236,7 +239,7 @@ impl Repair {
     }
 }
 
-/// A fixed choice that looks random (SplitMix64's finaliser, Steele et al. 2014).
+/// Scrambles a number (SplitMix64's finaliser, Steele et al. 2014).
 pub fn scramble(mut z: u64) -> u64 {
     z = z.wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);

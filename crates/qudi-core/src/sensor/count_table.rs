@@ -13,18 +13,18 @@ use crate::random::uniform;
 use rand::Rng;
 use wide::i16x8;
 
-/// Counts up to 7 (3 bits): a row of eight 16-bit thresholds fills one SIMD register.
+/// Largest count of a table, 7 (3 bits): a row of eight 16-bit thresholds fills one SIMD register.
 const MAX_COUNT: usize = 7;
 
-/// Most rows of a table; beyond, nodes move apart (and `delta` draws get more frequent).
+/// Largest number of rows; for more light, nodes move apart (and `delta` draws get more frequent).
 const MAX_ROWS: f32 = 8192.0;
 const NODES_PER_DETECTION: f32 = 128.0;
 
-/// Marks counts that the fast pass leaves open.
-const OPEN: u16 = u16::MAX;
+/// Marker of counts that the fast pass leaves open.
+const OPEN_COUNT: u16 = u16::MAX;
 
-/// Counts that are looked through for open ones at a time.
-const SCAN: usize = 16;
+/// Number of counts that are searched for open ones at a time.
+const SCAN_LENGTH: usize = 16;
 
 /// Tabulated laws of a count over a range of expected detections.
 #[derive(Clone, Debug)]
@@ -49,7 +49,7 @@ pub(crate) struct RowScratch {
 }
 
 impl CountTable {
-    /// A table for means up to `max_detections`, or none if the samples are too deep, the light too
+    /// Creates a table for means up to `max_detections`, or `None` if the samples are too deep, the light too
     /// strong, or arrivals not independent (dead time): then counts are drawn directly.
     pub(crate) fn new(law: &CountLaw, max_detections: f64) -> Option<Self> {
         if usize::from(law.max_count) > MAX_COUNT || law.dead_time > 0.0 {
@@ -105,7 +105,7 @@ impl CountTable {
         Some(Self { law: law.clone(), nodes_per_detection: per_detection, rows, tails })
     }
 
-    /// One count for each of `scratch.detections`, which are not negative.
+    /// Draws one count for each of `scratch.detections`, which are not negative.
     pub(crate) fn draw_row(
         &self,
         scratch: &mut RowScratch,
@@ -132,41 +132,43 @@ impl CountTable {
             // Thresholds fall, so the set lanes are the lowest ones.
             let decided = below.trailing_ones() as u16;
             let open = ties != 0 || (bits >> 16) as u16 <= limit;
-            *count = if open { OPEN } else { decided };
+            *count = if open { OPEN_COUNT } else { decided };
         }
-        for (chunk, counts) in counts.chunks_mut(SCAN).enumerate() {
+        for (chunk, counts) in counts.chunks_mut(SCAN_LENGTH).enumerate() {
             // Without a branch per count; most chunks hold no open one.
-            if counts.iter().map(|&count| u16::from(count == OPEN)).sum::<u16>() == 0 {
+            if counts.iter().map(|&count| u16::from(count == OPEN_COUNT)).sum::<u16>() == 0 {
                 continue;
             }
-            for (i, count) in counts.iter_mut().enumerate().filter(|(_, count)| **count == OPEN) {
-                let x = chunk * SCAN + i;
+            for (i, count) in
+                counts.iter_mut().enumerate().filter(|(_, count)| **count == OPEN_COUNT)
+            {
+                let x = chunk * SCAN_LENGTH + i;
                 *count = self.draw_open(detections[x], bits(&random[4 * x..]), rng);
             }
         }
     }
 
-    /// Node of each pixel, and the bound of its extra detection.
+    /// Computes the node of each pixel, and the bound of its extra detection.
     fn place(&self, detections: &[f32], nodes: &mut [u32], limits: &mut [u16]) {
         // Adding 2^23 rounds to an integer and leaves it in the low bits; unlike a cast, this is
         // one instruction for a whole vector.
-        const SHIFT: f32 = 8_388_608.0;
+        const ROUNDING_SHIFT: f32 = 8_388_608.0;
         let per_detection = self.nodes_per_detection;
         let scale = 65536.0 / per_detection;
         let last = (self.rows.len() - 1) as f32;
         for ((&mean, node), limit) in detections.iter().zip(nodes).zip(limits) {
             let position = (mean * per_detection).min(last);
-            let nearest = (position + SHIFT) - SHIFT;
+            let nearest = (position + ROUNDING_SHIFT) - ROUNDING_SHIFT;
             let floor = if nearest > position { nearest - 1.0 } else { nearest };
-            *node = (floor + SHIFT).to_bits() & 0xffff;
+            *node = (floor + ROUNDING_SHIFT).to_bits() & 0xffff;
             // 1 - exp(-delta) <= delta: above it, no extra detection for certain. Beyond the table
             // every pixel is left open.
             let bound = if position < last { (position - floor) * scale } else { 65535.0 };
-            *limit = (bound + SHIFT).to_bits() as u16;
+            *limit = (bound + ROUNDING_SHIFT).to_bits() as u16;
         }
     }
 
-    /// A count at `detections` expected, from its 32 bits and as many more as it takes.
+    /// Draws a count at `detections` expected, from its 32 bits and as many more as it takes.
     #[cold]
     fn draw_open(&self, detections: f32, bits: u32, rng: &mut impl Rng) -> u16 {
         let position = detections * self.nodes_per_detection;
@@ -201,7 +203,7 @@ mod tests {
     use rand::rngs::ChaCha8Rng;
     use std::convert::Infallible;
 
-    /// A count from given bits, as `draw_row` would find it.
+    /// Draws a count from given bits, as `draw_row` would.
     fn draw(table: &CountTable, detections: f32, bits: u32, rng: &mut ChaCha8Rng) -> u16 {
         let mut words = Given { bits, rest: rng };
         let mut scratch = RowScratch { detections: vec![detections], ..RowScratch::default() };

@@ -83,7 +83,7 @@ impl Defects {
     }
 }
 
-/// What differs from pixel to pixel, for one array size.
+/// Properties that differ from pixel to pixel, for one array size.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PixelMaps {
     /// Dark electrons per native frame, `[height * width]`; absent if all pixels are alike.
@@ -95,7 +95,7 @@ pub struct PixelMaps {
 }
 
 impl PixelMaps {
-    /// Mean dark electrons per pixel and output frame over the array.
+    /// Returns the mean dark electrons per pixel and output frame over the array.
     ///
     /// # Errors
     /// [`Error::Sensor`] if the sensor's rate is per second and its frame rate unknown.

@@ -8,7 +8,7 @@ use serde_json::Value;
 use std::path::Path;
 
 impl Sensor {
-    /// A preset by name, or a TOML file by path.
+    /// Loads a preset by name, or a TOML file by path.
     ///
     /// # Errors
     /// [`Error`] if there is no such preset or file, or if it describes no possible sensor.
@@ -16,7 +16,7 @@ impl Sensor {
         Self::from_document(load_document(name_or_path)?, name_or_path)
     }
 
-    /// A sensor from its document, checked.
+    /// Reads and checks a sensor from its document.
     ///
     /// # Errors
     /// [`Error::Sensor`] for unknown keys, missing keys, wrong types and impossible values.
@@ -33,7 +33,7 @@ impl Sensor {
     }
 }
 
-/// The document of a preset or a TOML file, its `base` filled in, ready for overrides.
+/// Loads the document of a preset or a TOML file, with its `base` filled in, ready for overrides.
 ///
 /// # Errors
 /// [`Error`] if it cannot be found, read or parsed.
@@ -67,7 +67,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         merge_documents(&mut merged, document);
         document = merged;
     }
-    // Maps are named from where the sensor file lies.
+    // Paths of maps are relative to the sensor file.
     for key in ["/defects/dark_map", "/defects/bad_pixels"] {
         if let Some(map) = document.pointer_mut(key)
             && let Some(name) = map.as_str()
@@ -81,7 +81,7 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
     Ok(document)
 }
 
-/// The names of all built-in sensors.
+/// Returns the names of all built-in sensors.
 fn preset_names() -> Vec<&'static str> {
     PRESETS.iter().map(|preset| preset.name).collect()
 }
@@ -103,7 +103,7 @@ fn parse(text: &str, place: &str) -> Result<Value> {
     serde_json::to_value(document).map_err(|e| fault(e.to_string(), place.to_owned()))
 }
 
-/// The first key whose value is NaN or infinite, which JSON could not hold.
+/// Returns the first key whose value is NaN or infinite, which JSON could not hold.
 fn not_finite(key: &str, value: &toml::Value) -> Option<String> {
     match value {
         toml::Value::Float(v) => (!v.is_finite()).then(|| key.to_owned()),

@@ -1,4 +1,4 @@
-//! One count, drawn from first principles: electrons, read noise, digitiser; or binary frames.
+//! Drawing one count from first principles: electrons, read noise, digitiser; or binary frames.
 
 use super::{CountLaw, Response};
 use crate::random::uniform;
@@ -6,12 +6,12 @@ use rand::Rng;
 use rand_distr::{Binomial, Distribution, Poisson, StandardNormal};
 
 impl CountLaw {
-    /// A count at `detections` expected per output frame.
+    /// Draws a count at `detections` expected per output frame.
     pub(crate) fn draw(&self, detections: f64, rng: &mut impl Rng) -> u16 {
         self.draw_with_extra(detections, 0, rng)
     }
 
-    /// A count when `extra` detections came on top of a Poisson number with mean `detections`.
+    /// Draws a count with `extra` detections on top of a Poisson number of mean `detections`.
     pub(crate) fn draw_with_extra(&self, detections: f64, extra: u32, rng: &mut impl Rng) -> u16 {
         match self.response {
             Response::Linear if self.dead_time > 0.0 => {
@@ -32,7 +32,7 @@ impl CountLaw {
         }
     }
 
-    /// Read noise, gain, rounding half to even, clipping.
+    /// Adds read noise, applies the gain, rounds half to even and clips.
     pub(crate) fn digitise(&self, electrons: f64, rng: &mut impl Rng) -> u16 {
         let mut voltage = electrons.min(self.full_well);
         if self.read_noise > 0.0 {
@@ -44,10 +44,10 @@ impl CountLaw {
     }
 }
 
-/// Below this mean, inversion is faster than the rejection method of `rand_distr`.
+/// Mean below which inversion is faster than the rejection method of `rand_distr`.
 const INVERSION_LIMIT: f64 = 12.0;
 
-/// A Poisson number as f64.
+/// Draws a Poisson number as f64.
 pub(crate) fn poisson(mean: f64, rng: &mut impl Rng) -> f64 {
     if mean >= INVERSION_LIMIT {
         return Poisson::new(mean).expect("means are checked to be finite").sample(rng);
@@ -63,7 +63,7 @@ pub(crate) fn poisson(mean: f64, rng: &mut impl Rng) -> f64 {
     k
 }
 
-/// A binomial number.
+/// Draws a binomial number.
 pub(crate) fn binomial(n: u64, p: f64, rng: &mut impl Rng) -> u64 {
     if n <= 16 {
         return (0..n).map(|_| u64::from(uniform(rng) < p)).sum();
@@ -71,7 +71,7 @@ pub(crate) fn binomial(n: u64, p: f64, rng: &mut impl Rng) -> u64 {
     Binomial::new(n, p.clamp(0.0, 1.0)).expect("a probability").sample(rng)
 }
 
-/// Counts of a non-paralysable counter in one exposure; `dead_time` as a fraction of it.
+/// Draws the count of a non-paralysable counter in one exposure; `dead_time` is a fraction of the exposure.
 pub(crate) fn counted(mean: f64, dead_time: f64, rng: &mut impl Rng) -> f64 {
     if mean <= 0.0 {
         return 0.0;

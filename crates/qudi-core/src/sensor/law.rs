@@ -4,7 +4,7 @@
 
 use super::{Response, Sensor};
 
-/// How `k` electrons become an output value, and how many there are.
+/// Distribution of the number of electrons, and their conversion into an output value.
 #[derive(Clone, Debug)]
 pub struct CountLaw {
     pub(crate) response: Response,
@@ -18,7 +18,7 @@ pub struct CountLaw {
 }
 
 impl CountLaw {
-    /// The law of `sensor` at a gain in DN/e-.
+    /// Creates the law of `sensor` at a gain in DN/e-.
     pub fn new(sensor: &Sensor, gain: f64) -> Self {
         Self {
             response: sensor.response,
@@ -30,7 +30,7 @@ impl CountLaw {
         }
     }
 
-    /// The law of one binary frame of a summed sensor.
+    /// Returns the law of one binary frame of a summed sensor.
     pub(crate) fn single_frame(mut self) -> Self {
         self.max_count = 1;
         self
@@ -41,7 +41,7 @@ impl CountLaw {
         self.dead_time
     }
 
-    /// `P(y = j)` for `j` in `0..=max_count`, at `detections` expected per output frame
+    /// Computes `P(y = j)` for `j` in `0..=max_count`, at `detections` expected per output frame
     /// (`QE * theta + dark`).
     pub fn probabilities(&self, detections: f64) -> Vec<f64> {
         let tails = self.tails(detections);
@@ -50,7 +50,7 @@ impl CountLaw {
         above.zip(below).map(|(a, b)| a - b).collect()
     }
 
-    /// `P(y > j)` for `j` in `0..max_count`: sums of positive terms, exact also where tiny.
+    /// Computes `P(y > j)` for `j` in `0..max_count`: sums of positive terms, exact also where tiny.
     pub(crate) fn tails(&self, detections: f64) -> Vec<f64> {
         let n = usize::from(self.max_count);
         if self.response == Response::Binary {
@@ -74,7 +74,7 @@ impl CountLaw {
         tails
     }
 
-    /// Mean output value at `detections` expected per output frame.
+    /// Computes the mean output value at `detections` expected per output frame.
     pub fn mean(&self, detections: f64) -> f64 {
         if self.response == Response::Binary {
             let n = f64::from(self.max_count);
@@ -90,7 +90,7 @@ impl CountLaw {
         mean / total
     }
 
-    /// What the mean output approaches in endless light.
+    /// Returns the limit of the mean output for unbounded light.
     fn largest_mean(&self) -> f64 {
         if self.response == Response::Binary || self.full_well.is_infinite() {
             return f64::from(self.max_count);
@@ -99,9 +99,9 @@ impl CountLaw {
         low as f64 + (low..high).map(|j| self.exceeds(j, self.full_well)).sum::<f64>()
     }
 
-    /// Expected detections per output frame whose mean output value is `mean`: the inverse of
-    /// [`CountLaw::mean`], kept between 0 and where half a count is left to saturation, of the output or of
-    /// the full well.
+    /// Computes the expected detections per output frame whose mean output value is `mean`: the inverse of
+    /// [`CountLaw::mean`], clamped to between 0 and half a count below saturation of the output or of the
+    /// full well.
     pub fn detections_for_mean(&self, mean: f64) -> f64 {
         let largest = self.largest_mean();
         let target = mean.min(largest - 0.5f64.min(0.5 * largest));
@@ -117,7 +117,7 @@ impl CountLaw {
         0.5 * (low + high)
     }
 
-    /// `P(y > j | k electrons)`.
+    /// Computes `P(y > j | k electrons)`.
     pub(crate) fn exceeds(&self, j: usize, k: f64) -> f64 {
         let k = k.min(self.full_well);
         if self.read_noise == 0.0 {
@@ -127,8 +127,8 @@ impl CountLaw {
         0.5 * libm::erfc((threshold - k) / (std::f64::consts::SQRT_2 * self.read_noise))
     }
 
-    /// Outputs `j` below the first always exceed given `k` electrons, from the second on never
-    /// (beyond 12 standard deviations of the read noise: 1e-33).
+    /// Returns the range of thresholds `j` that the output for `k` electrons neither always nor never exceeds
+    /// (to 12 standard deviations of the read noise: 1e-33).
     fn uncertain_outputs(&self, k: f64) -> (usize, usize) {
         let n = usize::from(self.max_count);
         let k = k.min(self.full_well);
@@ -156,7 +156,7 @@ impl CountLaw {
     }
 }
 
-/// `P(N >= k)` of a non-paralysable counter that starts live: the k-th count needs k arrivals
+/// Computes `P(N >= k)` of a non-paralysable counter that starts live: the k-th count needs k arrivals
 /// within the time that k-1 dead times leave (renewal theory; Mueller 1973).
 fn counted_at_least(k: u32, mean: f64, dead_time: f64) -> f64 {
     let live = 1.0 - f64::from(k.saturating_sub(1)) * dead_time;
@@ -201,7 +201,7 @@ pub(crate) fn for_each_poisson(mean: f64, mut f: impl FnMut(f64, f64)) {
     }
 }
 
-/// `P(S > j)` for `j` in `0..n`, S binomial.
+/// Computes `P(S > j)` for `j` in `0..n`, S binomial.
 fn binomial_tails(n: usize, p: f64) -> Vec<f64> {
     let mut tails = vec![0.0; n];
     if p <= 0.0 {

@@ -5,14 +5,14 @@ use super::{CountLaw, Response};
 /// Nodes of the table; between them both moments are nearly straight.
 const NODES: usize = 512;
 
-/// Deeper samples follow Poisson's and Gauss's laws closely; their exact sums would take long.
-const DEEPEST: u16 = 1023;
+/// Largest count whose moments are summed exactly; deeper samples are close to Poisson and Gaussian laws.
+const MAX_EXACT_COUNT: u16 = 1023;
 
 /// Mean and variance of counts under one law.
 #[derive(Clone, Debug)]
 pub struct CountMoments {
-    /// Detections at the last node; nodes lie at `most * (i / NODES)^2`.
-    most: f64,
+    /// Detections at the last node; nodes lie at `max_detections * (i / NODES)^2`.
+    max_detections: f64,
     nodes: Vec<(f64, f64)>,
 }
 
@@ -20,8 +20,8 @@ impl CountMoments {
     /// Tabulates `law` up to where counts are nearly saturated.
     pub fn new(law: &CountLaw) -> Self {
         let full = f64::from(law.max_count);
-        let exact = law.max_count <= DEEPEST && law.response == Response::Linear;
-        let most = if exact {
+        let exact = law.max_count <= MAX_EXACT_COUNT && law.response == Response::Linear;
+        let max_detections = if exact {
             law.detections_for_mean(0.98 * full)
         } else if law.response == Response::Binary {
             full * 5.0
@@ -29,7 +29,7 @@ impl CountMoments {
             full / law.gain
         };
         let node = |i: usize| {
-            let detections = most * (i as f64 / NODES as f64).powi(2);
+            let detections = max_detections * (i as f64 / NODES as f64).powi(2);
             if exact {
                 let (mut mean, mut square) = (0.0, 0.0);
                 for (y, p) in law.probabilities(detections).iter().enumerate() {
@@ -45,20 +45,21 @@ impl CountMoments {
             let variance = detections + law.read_noise * law.read_noise;
             (law.gain * detections, law.gain * law.gain * variance + 1.0 / 12.0)
         };
-        Self { most, nodes: (0..=NODES).map(node).collect() }
+        Self { max_detections, nodes: (0..=NODES).map(node).collect() }
     }
 
-    /// Mean and variance at `detections` expected per output frame.
+    /// Returns mean and variance at `detections` expected per output frame.
     pub fn at(&self, detections: f64) -> (f64, f64) {
-        let detections = detections.clamp(0.0, self.most);
-        let i = ((NODES as f64 * (detections / self.most).sqrt()) as usize).min(NODES - 1);
-        let node = |i: usize| self.most * (i as f64 / NODES as f64).powi(2);
+        let detections = detections.clamp(0.0, self.max_detections);
+        let i =
+            ((NODES as f64 * (detections / self.max_detections).sqrt()) as usize).min(NODES - 1);
+        let node = |i: usize| self.max_detections * (i as f64 / NODES as f64).powi(2);
         let part = (detections - node(i)) / (node(i + 1) - node(i));
         let (low, high) = (self.nodes[i], self.nodes[i + 1]);
         (low.0 + part * (high.0 - low.0), low.1 + part * (high.1 - low.1))
     }
 
-    /// Variance where the mean is `mean`.
+    /// Returns the variance where the mean is `mean`.
     pub fn variance_at_mean(&self, mean: f64) -> f64 {
         let above = self.nodes.partition_point(|node| node.0 < mean).clamp(1, NODES);
         let (low, high) = (self.nodes[above - 1], self.nodes[above]);
@@ -80,7 +81,7 @@ mod tests {
             let moments = CountMoments::new(&law);
             for detections in [1e-4, 0.03, 0.7, 2.2, 5.9] {
                 // Deep sensors are approximated: near darkness the cut at zero counts.
-                let deep = law.max_count > DEEPEST && detections < 5.0;
+                let deep = law.max_count > MAX_EXACT_COUNT && detections < 5.0;
                 if deep || law.max_count == 1 && detections > 4.0 {
                     continue;
                 }

@@ -1,4 +1,4 @@
-//! The sensors that come with the program: `configs/sensors/*.toml`, built in.
+//! The built-in sensors: `configs/sensors/*.toml`.
 
 /// A built-in sensor.
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +34,7 @@ presets!(
     "cis-phone",
 );
 
-/// The preset of this name.
+/// Returns the preset of this name.
 pub fn preset(name: &str) -> Option<&'static Preset> {
     PRESETS.iter().find(|p| p.name == name)
 }

@@ -21,7 +21,7 @@ pub enum DarkRate {
 }
 
 impl DarkRate {
-    /// The number without its unit.
+    /// Returns the number without its unit.
     pub fn value(self) -> f64 {
         let (Self::PerFrame(v) | Self::PerSecond(v)) = self;
         v
@@ -64,12 +64,12 @@ impl std::str::FromStr for DarkRate {
 pub struct FullWell(f64);
 
 impl FullWell {
-    /// A capacity in e-; infinity for none.
+    /// Creates a capacity in e-; infinity for none.
     pub fn new(electrons: f64) -> Self {
         Self(electrons)
     }
 
-    /// The capacity in e-.
+    /// Returns the capacity in e-.
     pub fn electrons(self) -> f64 {
         self.0
     }

@@ -8,16 +8,16 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, backend_extension};
 
-/// Backends with our attention.
+/// Backends with the fused attention.
 #[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
 pub trait AttentionBackend: Backend {
-    /// See [`attention`](super::attention).
+    /// Computes [`attention`](super::attention).
     fn cell_attention(qkv: FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
-/// The gradient.
+/// Backends with the gradient of the fused attention.
 pub trait AttentionGradient: Backend {
-    /// See [`attention`](super::attention).
+    /// Computes the gradient of [`attention`](super::attention).
     fn cell_attention_gradient(
         qkv: FloatTensor<Self>,
         gradient: FloatTensor<Self>,
@@ -51,7 +51,7 @@ mod flex {
     }
 }
 
-/// The step behind an attention.
+/// Backward step of an attention.
 #[derive(Debug)]
 struct Step;
 

@@ -1,5 +1,5 @@
-//! Attention on plain memory. Products of matrices are 1x1 convolutions whose weights are keys or values;
-//! scores lie `[keys][queries]`, so that the softmax of neighbouring queries runs in vectors.
+//! Attention on slices of memory. Matrix products are 1x1 convolutions whose weights are the keys or values.
+//! Scores are stored as `[keys][queries]`, so that the softmax of neighbouring queries vectorizes.
 
 use crate::conv::Geometry;
 use crate::conv::native::{forward as convolve, weight_gradients};
@@ -7,16 +7,17 @@ use crate::exp::exp;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-/// Queries whose sums are kept side by side.
+/// Number of queries whose sums are computed together.
 const LANES: usize = 64;
 
-/// `[channels] x [planes]` applied to `cells` pixels: `result[o] = sum over p of weight[o][p] * planes[p]`.
+/// Multiplies a matrix `[outputs][planes]` by `cells` pixels:
+/// `result[o] = sum over p of weight[o][p] * planes[p]`.
 fn product(weight: &[f32], planes: &[f32], outputs: usize, cells: usize) -> Vec<f32> {
     let geometry = geometry(planes.len() / cells, outputs, cells);
     convolve(&geometry, &[planes], weight, &vec![0.0; outputs])
 }
 
-/// `result[a][b] = sum over cells of left[a] * right[b]`.
+/// Computes `result[a][b] = sum over cells of left[a] * right[b]`.
 fn outer(left: &[f32], right: &[f32], cells: usize) -> Vec<f32> {
     let geometry = geometry(right.len() / cells, left.len() / cells, cells);
     weight_gradients(&geometry, &[right], left, None).weight
@@ -38,7 +39,7 @@ fn geometry(planes: usize, outputs: usize, cells: usize) -> Geometry {
     }
 }
 
-/// `[rows][columns]` to `[columns][rows]`, times `scale`.
+/// Transposes `[rows][columns]` to `[columns][rows]`, and multiplies by `scale`.
 fn transposed(values: &[f32], columns: usize, scale: f32) -> Vec<f32> {
     let rows = values.len() / columns;
     let mut result = Vec::with_capacity(values.len());
@@ -48,13 +49,13 @@ fn transposed(values: &[f32], columns: usize, scale: f32) -> Vec<f32> {
     result
 }
 
-/// Queries, keys and values of an image, `[channels][cells]` each.
+/// Splits an image into queries, keys and values, `[channels][cells]` each.
 fn parts(qkv: &[f32]) -> [&[f32]; 3] {
     let size = qkv.len() / 3;
     [&qkv[..size], &qkv[size..2 * size], &qkv[2 * size..]]
 }
 
-/// Probabilities `[keys][queries]` of an image.
+/// Computes the attention probabilities `[keys][queries]` of an image.
 fn probabilities(qkv: &[f32], channels: usize, cells: usize) -> Vec<f32> {
     let [queries, keys, _] = parts(qkv);
     let scale = (channels as f32).sqrt().recip();
@@ -63,7 +64,7 @@ fn probabilities(qkv: &[f32], channels: usize, cells: usize) -> Vec<f32> {
     scores
 }
 
-/// Softmax over the first axis of `[keys][queries]`.
+/// Softmax over the first axis of `[keys][queries]`, in place.
 struct Softmax<'a> {
     scores: &'a mut [f32],
     queries: usize,
@@ -105,7 +106,7 @@ fn softmax(scores: &mut [f32], queries: usize) {
     }
 }
 
-/// See [`attention`](super::attention).
+/// Computes [`attention`](super::attention).
 pub(super) fn forward([_, channels, height, width]: [usize; 4], qkv: &[f32]) -> Vec<f32> {
     let (channels, cells) = (channels / 3, height * width);
     let images = qkv.par_chunks(3 * channels * cells).map(|qkv| {
@@ -115,7 +116,7 @@ pub(super) fn forward([_, channels, height, width]: [usize; 4], qkv: &[f32]) -> 
     images.collect::<Vec<_>>().concat()
 }
 
-/// The gradient for `qkv`.
+/// Computes the gradient with respect to `qkv`.
 pub(super) fn gradient(
     [_, channels, height, width]: [usize; 4],
     qkv: &[f32],
@@ -142,7 +143,7 @@ pub(super) fn gradient(
     images.collect::<Vec<_>>().concat()
 }
 
-/// Gradients for scores from those for probabilities, in place.
+/// Conversion of gradients with respect to probabilities into gradients with respect to scores, in place.
 struct ThroughSoftmax<'a> {
     shares: &'a [f32],
     gradient: &'a mut [f32],

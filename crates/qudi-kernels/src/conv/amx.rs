@@ -8,18 +8,19 @@ use super::tiles::{
 use super::weight_tiles::Work;
 use std::arch::asm;
 
-/// Bytes from one row of a tile of weights to the next.
+/// Bytes between rows of a tile of weights.
 const WEIGHT_ROW: usize = size_of::<Row>();
 
-/// Bytes from one row of sums to the next.
+/// Bytes between rows of sums.
 const SUM_ROW: usize = PIXELS * size_of::<f32>();
 
-/// `palette 1`: rows and bytes of a row of the eight tiles.
+/// Configuration of `palette 1`: rows of the eight tiles, and bytes per row.
 #[repr(C, align(64))]
 struct Configuration([u8; 64]);
 
 impl Configuration {
-    /// Tiles 0 to 3 for sums, 4 and 5 for weights of `group` pairs, 6 and 7 for pixels.
+    /// Creates a configuration with tiles 0 to 3 for sums, 4 and 5 for weights of `group` pairs, 6 and 7 for
+    /// pixels.
     fn new(group: usize) -> Self {
         let mut bytes = [0; 64];
         bytes[0] = 1;
@@ -36,13 +37,15 @@ impl Configuration {
     }
 }
 
-/// The unit, configured on this thread until it is dropped.
+/// Guard of the unit, configured on this thread until it is dropped.
 #[derive(Debug)]
 struct Amx(());
 
 impl Amx {
+    /// Configures the unit.
+    ///
     /// # Safety
-    /// The processor must have the unit, and the process the permission to use it.
+    /// The processor must have the unit, and the process must have permission to use it.
     unsafe fn configured(group: usize) -> Self {
         let configuration = Configuration::new(group);
         // SAFETY: 64 readable bytes; nothing else on this thread uses tiles.
@@ -72,7 +75,7 @@ macro_rules! load {
     };
 }
 
-/// Writes them.
+/// Stores 16 rows of 64 bytes, `stride` apart.
 macro_rules! store {
     ($tile:literal, $to:expr, $stride:expr) => {
         asm!(
@@ -92,8 +95,8 @@ macro_rules! add_product {
 }
 
 impl Amx {
-    /// Adds the products of `A` tiles on the left by `B` on the right to the sums: tiles 0 and 1 for the first on the
-    /// left, 2 and 3 for the second. Rows lie so many bytes apart.
+    /// Adds the products of `A` left tiles and `B` right tiles to the sums: tiles 0 and 1 for the first left
+    /// tile, 2 and 3 for the second. Rows are the given number of bytes apart.
     ///
     /// # Safety
     /// The unit must be configured, and the tiles readable.
@@ -122,10 +125,10 @@ impl Amx {
         }
     }
 
-    /// Writes the sums.
+    /// Stores the sums.
     ///
     /// # Safety
-    /// The unit must be configured, and as many tiles writable.
+    /// The unit must be configured, and the `A` by `B` destination tiles writable.
     #[inline(always)]
     unsafe fn store<const A: usize, const B: usize, T>(to: [[*mut T; 2]; 2], row: usize) {
         // SAFETY: as in `add_products`.
@@ -143,10 +146,10 @@ impl Amx {
         }
     }
 
-    /// [`MatrixUnit::multiply`] of `A` tiles of weights by `B` of pixels.
+    /// Implements [`MatrixUnit::multiply`] for `A` tiles of weights and `B` tiles of pixels.
     ///
     /// # Safety
-    /// As there.
+    /// Same as [`MatrixUnit::multiply`].
     #[inline(always)]
     unsafe fn multiply<const A: usize, const B: usize>(block: &Block<'_>, sums: &mut Sums) {
         let plane = block.plane * size_of::<f32>();
@@ -157,7 +160,7 @@ impl Amx {
             asm!("tilezero tmm2", "tilezero tmm3", options(nostack, nomem));
             for &offset in block.offsets {
                 let pixels = block.pixels.add(offset as usize);
-                // Without a second tile, its place is not read.
+                // Without a second tile, its address is not read.
                 let left = [weights, weights.wrapping_add(SIDE)];
                 let right = [pixels, pixels.wrapping_add(SIDE)];
                 Self::add_products::<A, B, _, _>((left, WEIGHT_ROW), (right, plane));
@@ -169,10 +172,10 @@ impl Amx {
         }
     }
 
-    /// [`MatrixUnit::correlate`] of `A` tiles of planes by `B` of channels.
+    /// Implements [`MatrixUnit::correlate`] for `A` tiles of planes and `B` tiles of channels.
     ///
     /// # Safety
-    /// As there.
+    /// Same as [`MatrixUnit::correlate`].
     #[inline(always)]
     unsafe fn correlate<const A: usize, const B: usize>(
         what: &Correlation,
@@ -234,10 +237,10 @@ impl MatrixUnit for Amx {
     }
 }
 
-/// The blocks of a tile of the image; machines with the unit have these vectors.
+/// Computes the blocks of a tile of the image. All machines with the unit have AVX-512.
 ///
 /// # Safety
-/// The processor must have the unit, and the process the permission to use it.
+/// The processor must have the unit, and the process must have permission to use it.
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512cd,avx2,fma")]
 #[cfg_attr(test, allow(dead_code))] // the model stands in
 pub(super) unsafe fn work(tile: &Tile<'_>, group: usize) {
@@ -245,10 +248,10 @@ pub(super) unsafe fn work(tile: &Tile<'_>, group: usize) {
     unsafe { blocks(&Amx::configured(group), tile, group) }
 }
 
-/// The products of a tile of the image for the gradient of weights.
+/// Computes the products of a tile of the image for the gradient of weights.
 ///
 /// # Safety
-/// The processor must have the unit, and the process the permission to use it.
+/// The processor must have the unit, and the process must have permission to use it.
 #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512dq,avx512cd,avx2,fma")]
 #[cfg_attr(test, allow(dead_code))] // the model stands in
 pub(super) unsafe fn correlate(work: &Work<'_>, sums: &mut [WeightSums]) {
@@ -256,12 +259,12 @@ pub(super) unsafe fn correlate(work: &Work<'_>, sums: &mut [WeightSums]) {
     unsafe { work.correlate(&Amx::configured(SIDE), sums) }
 }
 
-/// Whether the unit computes what its model does.
+/// Returns true if the unit computes the same as its model.
 pub(crate) fn agrees() -> bool {
     const GROUP: usize = 5;
     const PLANE: usize = 40;
     let value = |number: usize| {
-        // Numbers of few bits: all products and sums are exact.
+        // Numbers with few bits: all products and sums are exact.
         let half = |number: usize| (((number * 37 % 17) as f32 - 8.0).to_bits()) >> 16;
         f32::from_bits(half(number) << 16 | half(number + 3))
     };

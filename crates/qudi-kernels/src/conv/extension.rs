@@ -1,4 +1,4 @@
-//! The convolution as an operation of Burn's backends, differentiable once.
+//! Convolution as an operation of Burn's backends, differentiable once.
 
 use super::geometry::Geometry;
 use burn::backend::autodiff::NodeId;
@@ -9,18 +9,18 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, backend_extension};
 
-/// Inputs of one call; longer lists are joined first.
-pub(super) const INPUTS: usize = 5;
+/// Maximum number of inputs of one call; longer lists are joined first.
+pub(super) const MAX_INPUTS: usize = 5;
 
-/// Backends with our convolution.
+/// Backends with the convolution of this crate.
 ///
-/// Extensions of Burn take no lists of tensors: unused inputs, and an addend where there is none, are any
-/// tensors; the geometry says what counts.
+/// Extensions of Burn take no lists of tensors. Unused inputs and a missing addend are therefore arbitrary
+/// tensors, which the geometry marks as unused.
 #[backend_extension(Flex: cfg(feature = "flex"), Cube: cfg(feature = "cube"), Autodiff)]
 #[allow(clippy::too_many_arguments)]
 pub trait ConvBackend: Backend {
-    /// Inputs `[images, channels, height, width]`, weight `[outputs, channels, frames, rows, columns]`, an
-    /// addend of the output's shape.
+    /// Convolves inputs `[images, channels, height, width]` with the weight
+    /// `[outputs, channels, frames, rows, columns]`; the addend has the output's shape.
     fn conv_frames(
         a: FloatTensor<Self>,
         b: FloatTensor<Self>,
@@ -34,9 +34,9 @@ pub trait ConvBackend: Backend {
     ) -> FloatTensor<Self>;
 }
 
-/// The gradients; `output` is given where the convolution cut at zero.
+/// Backends with the convolution's gradients; `output` is given where the convolution has a ReLU.
 pub trait ConvGradients: Backend {
-    /// For every input, the addend last.
+    /// Computes the gradient of every input, the addend's last.
     fn conv_input_gradients(
         weight: FloatTensor<Self>,
         gradient: FloatTensor<Self>,
@@ -44,7 +44,7 @@ pub trait ConvGradients: Backend {
         geometry: Geometry,
     ) -> Vec<FloatTensor<Self>>;
 
-    /// For weight and bias.
+    /// Computes the gradients of weight and bias.
     fn conv_weight_gradients(
         inputs: Vec<FloatTensor<Self>>,
         gradient: FloatTensor<Self>,
@@ -179,11 +179,11 @@ mod cube {
     }
 }
 
-/// The step behind a convolution.
+/// Backward step of a convolution.
 #[derive(Debug)]
 struct Step;
 
-/// What the step needs: checkpointed inputs and weight, the output where it was cut at zero.
+/// State of the backward step: checkpointed inputs and weight, and the output where there is a ReLU.
 #[derive(Clone, Debug)]
 struct State<T> {
     inputs: Vec<NodeId>,
@@ -192,8 +192,8 @@ struct State<T> {
     geometry: Geometry,
 }
 
-/// Inputs, addend, weight, bias.
-const PARENTS: usize = INPUTS + 3;
+/// Number of parents: inputs, addend, weight and bias.
+const PARENTS: usize = MAX_INPUTS + 3;
 
 impl<B: ConvBackend + ConvGradients> Backward<B, PARENTS> for Step {
     type State = State<FloatTensor<B>>;
@@ -206,9 +206,9 @@ impl<B: ConvBackend + ConvGradients> Backward<B, PARENTS> for Step {
     ) {
         let gradient = grads.consume::<B>(&ops.node);
         let State { inputs, weight, output, geometry } = ops.state;
-        let (values, weights) = ops.parents.split_at(INPUTS + 1);
+        let (values, weights) = ops.parents.split_at(MAX_INPUTS + 1);
         let used = values[..inputs.len()].iter();
-        let used = used.chain(geometry.addend.then_some(&values[INPUTS]));
+        let used = used.chain(geometry.addend.then_some(&values[MAX_INPUTS]));
         if used.clone().any(Option::is_some) {
             let weight = checkpointer.retrieve_node_output(weight);
             let (gradient, output) = (gradient.clone(), output.clone());
@@ -255,7 +255,7 @@ impl<B: ConvBackend + ConvGradients, C: CheckpointStrategy> ConvBackend for Auto
             OpsKind::Tracked(mut prep) => {
                 let used = &tensors[..geometry.channels.len()];
                 let inputs = used.iter().map(|tensor| prep.checkpoint(tensor)).collect();
-                let weight = prep.checkpoint(&tensors[INPUTS + 1]);
+                let weight = prep.checkpoint(&tensors[MAX_INPUTS + 1]);
                 let output = forward(tensors, geometry.clone());
                 let kept = geometry.relu.then(|| output.clone());
                 prep.finish(State { inputs, weight, output: kept, geometry }, output)

@@ -1,49 +1,50 @@
-//! The sizes of one convolution.
+//! Sizes of a convolution.
 
-/// A convolution over frames folded into the batch, zero padding of half the kernel on every side.
+/// Sizes of a convolution over frames folded into the batch, with zero padding of half the kernel on every
+/// side.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Geometry {
-    /// Images: bursts times frames.
+    /// Number of images: bursts times frames.
     pub images: usize,
-    /// Frames of one burst; the temporal kernel does not reach past them.
+    /// Frames per burst; the temporal kernel does not cross bursts.
     pub frames: usize,
     /// Channels of each input; the inputs are joined in this order.
     pub channels: Vec<usize>,
-    /// Grid of the inputs.
+    /// Height of the inputs.
     pub height: usize,
-    /// Grid of the inputs.
+    /// Width of the inputs.
     pub width: usize,
-    /// Channels of the output.
+    /// Number of output channels.
     pub outputs: usize,
-    /// Kernel: frames, rows, columns; all odd.
+    /// Kernel size in frames, rows and columns; all odd.
     pub kernel: [usize; 3],
-    /// Step of the output grid in rows and columns: 1 or 2.
+    /// Stride of the output in rows and columns: 1 or 2.
     pub stride: usize,
-    /// Whether a tensor of the output's shape is added.
+    /// True if a tensor of the output's shape is added.
     pub addend: bool,
-    /// Whether negative results become zero.
+    /// True if a ReLU follows.
     pub relu: bool,
-    /// Whether products take bfloat16; sums and all besides have 32 bits.
+    /// True if products use bfloat16; sums and all other operations have 32 bits.
     pub bf16: bool,
 }
 
 impl Geometry {
-    /// Channels of all inputs.
+    /// Returns the number of channels of all inputs together.
     pub fn all_channels(&self) -> usize {
         self.channels.iter().sum()
     }
 
-    /// Rows and columns of the output.
+    /// Returns the rows and columns of the output.
     pub fn output_grid(&self) -> [usize; 2] {
         [self.height.div_ceil(self.stride), self.width.div_ceil(self.stride)]
     }
 
-    /// Values of one output channel's kernel.
+    /// Returns the number of kernel values per pair of input and output channel.
     pub fn taps(&self) -> usize {
         self.all_channels() * self.kernel.iter().product::<usize>()
     }
 
-    /// Multiplications of the whole convolution.
+    /// Returns the number of multiplications of the convolution.
     pub fn multiplications(&self) -> usize {
         let [rows, columns] = self.output_grid();
         self.images * self.outputs * self.taps() * rows * columns

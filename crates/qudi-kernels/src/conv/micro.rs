@@ -1,8 +1,7 @@
-//! The innermost loops: a block of output channels times a few vectors of neighbouring pixels,
-//! kept in registers while one runs over all taps.
+//! Innermost loops: a block of output channels times a few vectors of neighbouring pixels, kept in registers
+//! during the loop over all taps.
 //!
-//! A tap is an offset into scratch memory, so the same loops serve every kernel size, stride and
-//! direction.
+//! A tap is an offset into scratch memory, so the same loops serve every kernel size, stride and direction.
 // Plain indices over arrays of known length: the compiler unrolls them into registers.
 #![allow(unsafe_code, clippy::needless_range_loop)]
 
@@ -11,22 +10,22 @@ use super::tiles;
 use pulp::{Arch, Simd, WithSimd};
 use std::hint::black_box;
 
-/// Channels and vectors of the kinds of blocks: 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512,
-/// NEON). Best first: the more channels, the fewer loads.
+/// Block sizes in channels and vectors. 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512, NEON).
+/// The best come first: more channels need fewer loads.
 pub(super) const KINDS: [(usize, usize); 6] = [(12, 2), (10, 2), (8, 3), (8, 2), (6, 2), (4, 3)];
 
-/// The kind of block that wastes least on results of `outputs` channels and `columns` pixels.
+/// Chooses the block size that wastes least on results of `outputs` channels and `columns` pixels.
 pub(super) fn block(outputs: usize, columns: usize) -> (usize, usize) {
     let (lanes, registers) = machine();
     let fits = |&(channels, vectors): &(usize, usize)| channels * vectors < registers;
     let cost = |&(channels, vectors): &(usize, usize)| {
         outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors * lanes)
     };
-    // Of equals the first.
+    // Of equal costs, the first is chosen.
     KINDS.into_iter().filter(fits).min_by_key(cost).unwrap_or(KINDS[5])
 }
 
-/// Longest run of pixels of a block on this machine.
+/// Returns the longest run of pixels of a block on this machine.
 pub(super) fn longest_run(format: Format) -> usize {
     match format {
         Format::Tiles(_) => tiles::PIXELS,
@@ -34,12 +33,12 @@ pub(super) fn longest_run(format: Format) -> usize {
     }
 }
 
-/// Values of a vector on this machine.
+/// Returns the number of values in a vector on this machine.
 pub(super) fn lanes() -> usize {
     machine().0
 }
 
-/// Values of a vector on this machine, and its registers.
+/// Returns the number of values in a vector on this machine, and its number of registers.
 fn machine() -> (usize, usize) {
     struct Machine;
     impl WithSimd for Machine {
@@ -52,16 +51,16 @@ fn machine() -> (usize, usize) {
     Arch::new().dispatch(Machine)
 }
 
-/// How the 32 bits of scratch memory and of the weights are multiplied.
+/// Multiplication of the 32-bit entries of scratch memory and weights.
 pub(super) trait Products<S: Simd> {
-    /// `a * b + sum`.
+    /// Computes `a * b + sum`.
     ///
     /// # Safety
     /// The machine must have the instructions.
     unsafe fn multiply_add(simd: S, a: S::f32s, b: S::f32s, sum: S::f32s) -> S::f32s;
 }
 
-/// They are one number.
+/// Multiplication of entries that hold one f32 each.
 #[derive(Debug)]
 pub(super) struct Single;
 
@@ -72,11 +71,11 @@ impl<S: Simd> Products<S> for Single {
     }
 }
 
-/// `sums[m][v] += sum over k of weights[k * M + m] * x[offsets[k] + v * lanes ..]`.
+/// Computes `sums[m][v] += sum over k of weights[k * M + m] * x[offsets[k] + v * lanes ..]`.
 ///
 /// # Safety
-/// `x` must be valid for reads of `V * S::F32_LANES` values from every one of the `offsets`, and
-/// `weights` for `offsets.len() * M` values; the machine must have the instructions of `P`.
+/// `x` must be valid for reads of `V * S::F32_LANES` values from every one of the `offsets`, and `weights`
+/// for `offsets.len() * M` values; the machine must have the instructions of `P`.
 #[inline(always)]
 pub(super) unsafe fn accumulate<S: Simd, P: Products<S>, const M: usize, const V: usize>(
     simd: S,
@@ -107,8 +106,8 @@ pub(super) unsafe fn accumulate<S: Simd, P: Products<S>, const M: usize, const V
     *sums = acc;
 }
 
-/// Sums over rows and their pixels `p < length` of `dy[m][p] * x[offsets[k] + p]`, lane by lane. Rows of `dy` are
-/// `length` values apart, those of `x` `step`.
+/// Sums `dy[m][p] * x[offsets[k] + p]` over rows and their pixels `p < length`, lane by lane. Rows of `dy`
+/// are `length` values apart, rows of `x` are `step` values apart.
 ///
 /// # Safety
 /// A value has `T`'s size. Each `dy` must be valid for `rows * length` values and every row of `x` for `length` values
@@ -121,7 +120,7 @@ pub(super) unsafe fn correlate<S: Simd, P: Products<S>, T, const M: usize, const
     offsets: [usize; K],
     [rows, length, step]: [usize; 3],
 ) -> [[S::f32s; K]; M] {
-    // A zero that the compiler does not know: known ones are written to memory first, by a call.
+    // A zero that the compiler does not know: it would store a known one to memory first, with a call.
     let zero = simd.splat_f32s(black_box(0.0));
     let mut sums = [[zero; K]; M];
     for row in 0..rows {

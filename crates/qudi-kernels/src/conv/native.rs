@@ -1,4 +1,4 @@
-//! The convolution and its gradients on plain memory.
+//! Convolution and its gradients on slices of memory.
 #![allow(unsafe_code)]
 
 use super::geometry::Geometry;
@@ -7,8 +7,8 @@ use super::run::{Finish, Packed, Target, run};
 use super::source::Source;
 use super::weight_gradient::{WeightGradient, weight_gradient};
 
-/// Results, `[images, outputs, rows, columns]`. Inputs `[images, channels, height, width]`, then the addend
-/// if there is one; weights `[outputs, channels, frames, rows, columns]`.
+/// Computes the output `[images, outputs, rows, columns]`. Inputs are `[images, channels, height, width]`,
+/// followed by the addend if there is one; weights are `[outputs, channels, frames, rows, columns]`.
 pub(crate) fn forward(
     geometry: &Geometry,
     inputs: &[&[f32]],
@@ -34,8 +34,8 @@ pub(crate) fn forward(
     output
 }
 
-/// Gradients for the inputs, one for each, the addend excepted; `output` is what [`forward`] gave, where it
-/// cut at zero.
+/// Computes the gradient of each input, without the addend's; `output` is the result of [`forward`], given
+/// where it has a ReLU.
 pub(crate) fn input_gradients(
     geometry: &Geometry,
     weight: &[f32],
@@ -68,13 +68,13 @@ pub(crate) fn input_gradients(
     parts.into_iter().map(|(part, _)| part).collect()
 }
 
-/// The gradient for the addend.
+/// Computes the gradient of the addend.
 pub(super) fn addend_gradient(gradient: &[f32], output: &[f32]) -> Vec<f32> {
     let pairs = gradient.iter().zip(output);
     pairs.map(|(&gradient, &output)| if output > 0.0 { gradient } else { 0.0 }).collect()
 }
 
-/// Gradients for weights and bias.
+/// Computes the gradients of weights and bias.
 pub(crate) fn weight_gradients(
     geometry: &Geometry,
     inputs: &[&[f32]],
@@ -98,7 +98,7 @@ fn with_channels<'a>(inputs: &[&'a [f32]], geometry: &Geometry) -> Vec<(&'a [f32
     inputs.iter().copied().zip(geometry.channels.iter().copied()).collect()
 }
 
-/// A source of the geometry's grid without inputs.
+/// Creates a source of the geometry's size without inputs.
 fn source(geometry: &Geometry) -> Source<'_> {
     Source {
         inputs: &[],
@@ -110,10 +110,10 @@ fn source(geometry: &Geometry) -> Source<'_> {
     }
 }
 
-/// The parts as initialised vectors.
+/// Converts the parts to initialised vectors.
 ///
 /// # Safety
-/// Every value of every part, `plane` a channel, must have been written.
+/// All values of all parts must have been written; `plane` is the number of values per channel.
 unsafe fn written<P: AsMut<[(Vec<f32>, usize)]>>(mut parts: P, plane: usize) -> P {
     for (part, channels) in parts.as_mut() {
         // SAFETY: the caller's promise; the capacity was reserved by `Target::new`.
@@ -123,7 +123,7 @@ unsafe fn written<P: AsMut<[(Vec<f32>, usize)]>>(mut parts: P, plane: usize) -> 
 }
 
 impl Geometry {
-    /// The same convolution with the grid as one row, where taps do not reach past their own pixel.
+    /// Converts the convolution to one with a single row, if its taps do not reach past their own pixel.
     fn flattened(&self) -> Self {
         let mut flat = self.clone();
         if self.kernel[1..] == [1, 1] && self.stride == 1 {

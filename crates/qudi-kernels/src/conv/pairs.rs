@@ -1,4 +1,4 @@
-//! Products of pairs of bfloat16 by the vector unit (AVX512-BF16).
+//! Products of pairs of bfloat16 on the vector unit (AVX512-BF16).
 #![allow(unsafe_code)]
 
 use super::micro::Products;
@@ -7,7 +7,7 @@ use pulp::x86::V4;
 use std::arch::x86_64::{__m512, __m512bh, _mm512_dpbf16_ps};
 use std::mem::transmute;
 
-/// Every 32 bits hold two numbers, whose products are added together.
+/// Multiplication of entries that hold two bfloat16 each, whose products are added.
 #[derive(Debug)]
 pub(super) struct Pairs;
 
@@ -29,14 +29,16 @@ impl Products<V4> for Pairs {
     }
 }
 
-/// What is compiled for this unit.
+/// Work compiled for the AVX512-BF16 unit.
 pub(super) trait PairWork {
+    /// Does the work; inlined.
+    ///
     /// # Safety
-    /// The processor must have AVX512-BF16. To be inlined.
+    /// The processor must have AVX512-BF16.
     unsafe fn work(self, simd: V4);
 }
 
-/// Runs `work`.
+/// Runs `work`, compiled for AVX512-BF16.
 ///
 /// # Safety
 /// The processor must have AVX512-BF16.
@@ -46,10 +48,10 @@ unsafe fn compiled(simd: V4, work: impl PairWork) {
     unsafe { work.work(simd) }
 }
 
-/// Runs `work` where scratch memory holds pairs: where the processor was found to multiply them.
+/// Runs `work`. Scratch memory must hold pairs, which it does only on processors that multiply them.
 pub(super) fn with_pairs(work: impl PairWork) {
     debug_assert!(MatrixUnits::Avx512Bf16.is_available());
-    let Some(simd) = V4::try_new() else { unreachable!("the units were asked for") };
-    // SAFETY: as said.
+    let Some(simd) = V4::try_new() else { unreachable!("the units were found before") };
+    // SAFETY: scratch memory holds pairs only where AVX512-BF16 was found.
     unsafe { compiled(simd, work) }
 }

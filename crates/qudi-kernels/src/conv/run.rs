@@ -1,4 +1,4 @@
-//! Runs a pass: fills scratch, calls the innermost loops, writes results.
+//! Execution of a pass: fills scratch memory, calls the innermost loops, and writes results.
 #![allow(unsafe_code)]
 
 #[cfg(all(target_arch = "x86_64", not(test)))]
@@ -15,14 +15,14 @@ use rayon::prelude::*;
 use std::cell::RefCell;
 
 thread_local! {
-    /// Scratch memory of a thread, kept between calls.
+    /// Scratch memory of a thread, reused between calls.
     pub(super) static SCRATCH: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
 }
 
 /// Results of a convolution: parts joined by channel, `[images, channels, height, width]` each.
 #[derive(Clone, Debug)]
 pub(super) struct Target {
-    /// First value and channels of every part.
+    /// First value and number of channels of each part.
     parts: Vec<(*mut f32, usize)>,
     height: usize,
     width: usize,
@@ -34,7 +34,7 @@ unsafe impl Send for Target {}
 unsafe impl Sync for Target {}
 
 impl Target {
-    /// The spare capacity of `parts`, each of which holds `images * channels * height * width` values.
+    /// Reserves `images * channels * height * width` values of capacity in each of the `parts`.
     pub(super) fn new(
         parts: &mut [(Vec<f32>, usize)],
         images: usize,
@@ -49,7 +49,7 @@ impl Target {
         Self { parts: parts.collect(), height, width }
     }
 
-    /// First value of a plane.
+    /// Returns the first value of a plane.
     ///
     /// # Safety
     /// The image must exist.
@@ -69,20 +69,20 @@ impl Target {
 /// A pass over input planes, cut into tiles, with its weights in the order of the innermost loops.
 #[derive(Clone, Debug)]
 pub(super) struct Packed {
-    /// `[block][scratch plane][tap][channel of the block]`; empty where there are tiles.
+    /// Weights `[block][scratch plane][tap][channel of the block]`; empty for matrix units.
     values: Vec<f32>,
-    /// The weights as [`tiles::packed`]; else empty.
+    /// Weights in the layout of [`tiles::packed`]; empty otherwise.
     pub(super) tiles: Vec<tiles::Row>,
-    /// Channels and vectors of a block.
+    /// Block size in channels and vectors.
     block: (usize, usize),
     pub(super) outputs: usize,
-    /// Scratch planes.
+    /// Number of scratch planes.
     planes: usize,
     tiling: Tiling,
 }
 
 impl Packed {
-    /// `weight(output, plane, tap)` over so many input planes.
+    /// Packs the weights `weight(output, plane, tap)` of `planes` input planes.
     pub(super) fn new(
         pass: &Pass,
         bf16: bool,
@@ -105,7 +105,7 @@ impl Packed {
         } else {
             let per_channel = scratch_planes * taps;
             values = vec![0.0; outputs.next_multiple_of(block.0) * per_channel];
-            // A convolution of nothing has no weights.
+            // A convolution without inputs or taps has no weights.
             let size = (block.0 * per_channel).max(1);
             values.par_chunks_mut(size).enumerate().for_each(|(number, values)| {
                 let first = number * block.0;
@@ -121,18 +121,18 @@ impl Packed {
     }
 }
 
-/// Results start from these and may be cut at zero.
+/// Initial values of the results, and their activation.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Finish<'a> {
-    /// One value per output channel; zero if there is none.
+    /// One value per output channel; zero if absent.
     pub(super) bias: Option<&'a [f32]>,
-    /// A value for every result, of the shape of a target of one part.
+    /// One value per result, in the shape of a target of one part.
     pub(super) addend: Option<&'a [f32]>,
     pub(super) relu: bool,
 }
 
-/// Correlates `source` with `weights` over `images` images. Every result of the pass's grid is written
-/// once by one thread, and its sum runs in the same order whatever the tiles.
+/// Correlates `source` with `weights` over `images` images. Every result of the pass's grid is written by one
+/// thread only, and its sum has the same order with any tiles.
 pub(super) fn run(
     source: Source<'_>,
     images: usize,
@@ -177,11 +177,11 @@ pub(super) fn run(
     });
 }
 
-/// The work on one filled tile.
+/// Work on one filled tile.
 pub(super) struct Tile<'a> {
     pub(super) scratch: &'a [f32],
     pub(super) offsets: &'a [u32],
-    /// First, end and number of the scratch planes that are filled.
+    /// First, end and total number of the scratch planes that are filled.
     pub(super) planes: (usize, usize, usize),
     pub(super) pass: &'a Pass,
     pub(super) tiling: &'a Tiling,
@@ -198,7 +198,7 @@ impl WithSimd for Tile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // SAFETY: these products are the machine's own.
+        // SAFETY: `Single` needs no instructions beyond `S`.
         unsafe { self.products::<S, Single>(simd) }
     }
 }
@@ -219,9 +219,10 @@ impl Tile<'_> {
             #[cfg(target_arch = "x86_64")]
             Format::Pairs => pairs::with_pairs(self),
             #[cfg(not(target_arch = "x86_64"))]
-            Format::Pairs => unreachable!("units were asked for"),
+            Format::Pairs => unreachable!("the format requires the units"),
             #[cfg(all(target_arch = "x86_64", not(test)))]
-            // SAFETY: there are tiles only where the processor has the unit, and with permission.
+            // SAFETY: the format is `Tiles` only where the processor has the unit, and the process may use
+            // it.
             Format::Tiles(group) => unsafe { amx::work(&self, group) },
             #[cfg(any(not(target_arch = "x86_64"), test))]
             // SAFETY: the model needs no unit.
@@ -229,6 +230,8 @@ impl Tile<'_> {
         }
     }
 
+    /// Multiplies all blocks with the products `P`.
+    ///
     /// # Safety
     /// The machine must have the instructions of `P`.
     #[inline(always)]
@@ -246,6 +249,8 @@ impl Tile<'_> {
         }
     }
 
+    /// Multiplies blocks of `M` channels by `V` vectors of pixels.
+    ///
     /// # Safety
     /// The machine must have the instructions of `P`.
     #[inline(always)]
@@ -277,7 +282,7 @@ impl Tile<'_> {
         }
     }
 
-    /// First value of a run of results of one channel.
+    /// Returns the address of the first value in a run of results of one channel.
     #[inline(always)]
     fn place(&self, channel: usize, row: usize, column: usize) -> *mut f32 {
         let [y, x] = self.pass.place;
@@ -287,7 +292,7 @@ impl Tile<'_> {
         unsafe { self.target.plane(self.image, channel).add(y * self.target.width + x) }
     }
 
-    /// Writes a run of results of one channel, where `sums` holds the sums over the planes in scratch.
+    /// Writes a run of results of one channel. `sums` holds the sums over the planes in scratch memory.
     #[inline(always)]
     pub(super) fn finish(&self, channel: usize, row: usize, column: usize, sums: &mut [f32]) {
         let to = self.place(channel, row, column);
@@ -320,7 +325,7 @@ impl Tile<'_> {
         }
     }
 
-    /// What is added to a run of results of one channel.
+    /// Returns the addends of a run of results of one channel.
     #[inline(always)]
     fn addends(&self, channel: usize, row: usize, column: usize, count: usize) -> Option<&[f32]> {
         let addend = self.finish.addend?;
@@ -330,7 +335,7 @@ impl Tile<'_> {
         Some(&addend[from..from + count])
     }
 
-    /// The bias, or what the planes before these have added up to.
+    /// Returns the initial values of a block: the bias, or the sums over previous planes.
     #[inline(always)]
     fn start<S: Simd, const M: usize, const V: usize>(
         &self,

@@ -1,27 +1,27 @@
-//! How values lie in scratch memory: as they are, or rounded to bfloat16.
+//! Formats of scratch memory: f32, or rounded to bfloat16.
 
 use crate::matrix_units::MatrixUnits;
 use pulp::{Simd, WithSimd};
 use std::ops::Range;
 
-/// What one place in scratch memory, 32 bits, holds.
+/// Content of a 32-bit entry of scratch memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Format {
     /// One value of one plane.
     Single,
-    /// The same, rounded to bfloat16.
+    /// One value, rounded to bfloat16.
     Rounded,
     /// Values of two neighbouring planes in bfloat16, the first in the lower half.
     Pairs,
-    /// The same for tiles, which take planes by groups of so many pairs.
+    /// Pairs as above, for matrix units that take planes in groups of this many pairs.
     Tiles(usize),
 }
 
-/// Most pairs of planes of a tile.
-const GROUP: usize = 16;
+/// Maximum number of pairs of planes in a tile.
+const MAX_GROUP: usize = 16;
 
 impl Format {
-    /// What a convolution over `planes` input planes uses.
+    /// Chooses the format of a convolution over `planes` input planes.
     pub(super) fn new(bf16: bool, planes: usize) -> Self {
         match (bf16, MatrixUnits::current()) {
             (false, _) => Self::Single,
@@ -29,12 +29,12 @@ impl Format {
             (true, MatrixUnits::Avx512Bf16) => Self::Pairs,
             (true, MatrixUnits::Amx) => {
                 let pairs = planes.div_ceil(2);
-                Self::Tiles(pairs.div_ceil(pairs.div_ceil(GROUP)))
+                Self::Tiles(pairs.div_ceil(pairs.div_ceil(MAX_GROUP)))
             }
         }
     }
 
-    /// Scratch planes for `planes` input planes; those past the last one are zero.
+    /// Returns the number of scratch planes for `planes` input planes; the last ones may be zero.
     pub(super) fn scratch_planes(self, planes: usize) -> usize {
         match self {
             Self::Single | Self::Rounded => planes,
@@ -43,12 +43,12 @@ impl Format {
         }
     }
 
-    /// Scratch planes that only go together.
+    /// Returns the number of scratch planes that must be multiplied together.
     pub(super) fn group(self) -> usize {
         if let Self::Tiles(group) = self { group } else { 1 }
     }
 
-    /// What stands in the place of scratch plane `number` for `value(plane)`.
+    /// Returns the entry of scratch plane `number`, where `value(plane)` is the value of an input plane.
     pub(super) fn place(self, number: usize, value: impl Fn(usize) -> f32) -> f32 {
         match self {
             Self::Single => value(number),
@@ -58,22 +58,22 @@ impl Format {
     }
 }
 
-/// The upper half of a value's bits, rounded to the nearest, ties to even.
+/// Returns the upper half of a value's bits, rounded to the nearest, ties to even.
 #[inline(always)]
 pub(super) fn upper(x: f32) -> u32 {
     let bits = x.to_bits();
     let rounded = bits.wrapping_add(0x7fff + (bits >> 16 & 1));
-    // The carry must not run over what says that it is not a number.
+    // The carry must not turn NaN into another number.
     if x.is_nan() { 0x7fc0 } else { rounded >> 16 }
 }
 
-/// The nearest bfloat16.
+/// Rounds to the nearest bfloat16.
 #[inline(always)]
 pub(super) fn round(x: f32) -> f32 {
     f32::from_bits(upper(x) << 16)
 }
 
-/// The bits of two values in bfloat16.
+/// Packs two values in bfloat16 into 32 bits.
 #[inline(always)]
 pub(super) fn pair(first: f32, second: f32) -> f32 {
     f32::from_bits(upper(second) << 16 | upper(first))
@@ -82,8 +82,9 @@ pub(super) fn pair(first: f32, second: f32) -> f32 {
 /// A row of a plane, and its mask.
 pub(super) type Row<'a> = (&'a [f32], Option<&'a [f32]>);
 
-/// Copies rows of input planes to a row of scratch: `to[i]` stands for the values at `left + i * step`, zero outside
-/// and where the mask is not positive. Compiled for the vector unit of its caller.
+/// Copies rows of input planes to a row of scratch memory: `to[i]` is the entry of the values at
+/// `left + i * step`, zero outside and where the mask is not positive. Inlined, to be compiled for the vector
+/// unit of its caller.
 #[inline(always)]
 pub(super) fn fill_row(
     format: Format,
@@ -120,7 +121,8 @@ pub(super) fn fill_row(
     }
 }
 
-/// The places of a row of `length` scratch values whose sources lie in a row of `available` values.
+/// Returns the positions in a row of `length` scratch values whose sources lie in a row of `available`
+/// values.
 #[inline(always)]
 fn inside(available: usize, left: isize, step: usize, length: usize) -> Range<usize> {
     let step = step as isize;
@@ -129,7 +131,7 @@ fn inside(available: usize, left: isize, step: usize, length: usize) -> Range<us
     start..place(available as isize - left).max(start)
 }
 
-/// Copies a row from `offset` on.
+/// Copies a row, starting at `offset`.
 #[inline(always)]
 pub(super) fn copy((from, mask): Row<'_>, offset: usize, step: usize, to: &mut [f32]) {
     let from = &from[offset..];
@@ -140,7 +142,7 @@ pub(super) fn copy((from, mask): Row<'_>, offset: usize, step: usize, to: &mut [
                 *to = from;
             }
         }
-        // Only gradients are masked, and those are read one by one.
+        // Only gradients are masked; they are read one by one.
         Some(mask) => {
             debug_assert_eq!(step, 1);
             for ((to, &from), &mask) in to.iter_mut().zip(from).zip(&mask[offset..]) {
@@ -150,7 +152,7 @@ pub(super) fn copy((from, mask): Row<'_>, offset: usize, step: usize, to: &mut [
     }
 }
 
-/// Joins two rows to one of pairs; a missing one is zero.
+/// Joins two rows to one row of pairs; a missing row is zero.
 #[inline(always)]
 fn join(rows: [Option<Row<'_>>; 2], offset: usize, step: usize, to: &mut [f32]) {
     match rows {
@@ -184,7 +186,7 @@ fn join(rows: [Option<Row<'_>>; 2], offset: usize, step: usize, to: &mut [f32]) 
     }
 }
 
-/// Joins every second value of two rows. By twos, which become vectors; steps would not.
+/// Joins every second value of two rows. The loop reads pairs of values, which vectorizes; strides would not.
 #[inline(always)]
 fn pairs_of_every_second(a: &[f32], b: &[f32], to: &mut [f32]) {
     let Some((last, to)) = to.split_last_mut() else { return };
@@ -203,7 +205,7 @@ pub(super) fn round_all(values: &mut [f32]) {
     }
 }
 
-/// Rounds values into half the memory.
+/// Conversion of values to bfloat16 in half the memory.
 pub(super) struct Narrow<'a> {
     pub(super) from: &'a [f32],
     pub(super) to: &'a mut [u16],

@@ -1,4 +1,4 @@
-//! The planes that a convolution reads, and their copy into scratch memory.
+//! Input planes of a convolution, and their copy into scratch memory.
 
 use super::pass::{Pass, Tiling};
 use super::scratch::{Format, Row, copy, fill_row};
@@ -8,22 +8,22 @@ use std::ops::Range;
 /// Inputs joined by channel, `[images, channels, height, width]` each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Source<'a> {
-    /// Values and channels of every input.
+    /// Values and number of channels of each input.
     pub(super) inputs: &'a [(&'a [f32], usize)],
-    /// Where this, of the shape of the only input, is not positive, the input counts as zero.
+    /// Mask of the shape of the only input: where it is not positive, the input counts as zero.
     pub(super) mask: Option<&'a [f32]>,
-    /// Frames of one burst.
+    /// Frames per burst.
     pub(super) frames: usize,
-    /// Grid of the inputs.
+    /// Height of the inputs.
     pub(super) height: usize,
     pub(super) width: usize,
-    /// Frames that the kernel covers.
+    /// Number of frames that the kernel covers.
     pub(super) depth: usize,
 }
 
 impl<'a> Source<'a> {
-    /// Channel `number / depth` of the frame `number % depth - depth / 2` away from `image`, and its mask;
-    /// nothing past the ends of the burst.
+    /// Returns channel `number / depth` of the frame `number % depth - depth / 2` away from `image`, and its
+    /// mask. Returns `None` outside the burst.
     fn plane(&self, image: usize, number: usize) -> Option<Row<'a>> {
         let (mut channel, delta) = (number / self.depth, number % self.depth);
         let frame = (image % self.frames + delta).checked_sub(self.depth / 2)?;
@@ -43,8 +43,8 @@ impl<'a> Source<'a> {
         None
     }
 
-    /// Copies what a tile of `pass` needs of the scratch planes `planes` of `image` to `scratch`, zeros around the
-    /// edges.
+    /// Copies the input of a tile of `pass` from the scratch planes `planes` of `image` to `scratch`, with
+    /// zeros around the edges.
     pub(super) fn fill(
         self,
         image: usize,
@@ -57,7 +57,7 @@ impl<'a> Source<'a> {
         Arch::new().dispatch(Fill { source: self, image, planes, pass, tiling, at, scratch });
     }
 
-    /// Copies a tile of every plane, rows of `length` values with zeros past the tile.
+    /// Copies a tile of every plane, in rows of `length` values with zeros after the tile.
     pub(super) fn copy_tile(
         &self,
         image: usize,
@@ -77,7 +77,7 @@ impl<'a> Source<'a> {
     }
 }
 
-/// [`Source::fill`]. A struct, since closures are not compiled for the vector unit.
+/// Implementation of [`Source::fill`]. A struct, since closures are not compiled for the vector unit.
 struct Fill<'a> {
     source: Source<'a>,
     image: usize,
@@ -126,7 +126,7 @@ impl WithSimd for Fill<'_> {
     }
 }
 
-/// The row of a plane that begins at `start`.
+/// Returns the row of a plane that begins at `start`.
 #[inline(always)]
 fn row_of(plane: Option<Row<'_>>, start: usize, width: usize) -> Option<Row<'_>> {
     let (values, mask) = plane?;

@@ -1,7 +1,7 @@
-//! The convolution by operations that every backend has.
+//! Convolution by operations that every backend has.
 //!
-//! Burn's gradient of the weights is, unless it is tuned for minutes, a convolution with a kernel as large as the
-//! image. Here it is a product of matrices for every image: gradients times neighbourhoods.
+//! Burn's gradient of the weights, unless it is autotuned for minutes, is a convolution with a kernel as
+//! large as the image. Here it is a matrix product for every image: gradients times neighbourhoods.
 
 use super::geometry::Geometry;
 use burn::backend::Backend;
@@ -24,24 +24,24 @@ impl Geometry {
         ConvOptions::new([1, self.stride, self.stride], self.padding(), [1, 1, 1], 1)
     }
 
-    /// Whether the kernel spans several frames.
+    /// Returns true if the kernel spans several frames.
     fn is_deep(&self) -> bool {
         self.kernel[0] > 1
     }
 
-    /// `[outputs, channels, rows, columns]`
+    /// Returns the shape `[outputs, channels, rows, columns]` of the weight.
     fn flat_weight(&self) -> Shape {
         let [_, rows, columns] = self.kernel;
         Shape::new([self.outputs, self.all_channels(), rows, columns])
     }
 }
 
-/// What a product takes: 16 bits, if the geometry says so.
+/// Casts the operands of products to bfloat16 if the geometry requires it.
 fn narrow<B: Backend>(x: FloatTensor<B>, geometry: &Geometry) -> FloatTensor<B> {
     if geometry.bf16 { B::float_cast(x, FloatDType::BF16) } else { x }
 }
 
-/// What comes of it, in 32 bits.
+/// Casts the result of products to 32 bits.
 fn widen<B: Backend>(x: FloatTensor<B>, geometry: &Geometry) -> FloatTensor<B> {
     if geometry.bf16 { B::float_cast(x, FloatDType::F32) } else { x }
 }
@@ -50,21 +50,21 @@ fn joined<B: Backend>(mut inputs: Vec<FloatTensor<B>>) -> FloatTensor<B> {
     if inputs.len() == 1 { inputs.remove(0) } else { B::float_cat(inputs, 1) }
 }
 
-/// `[bursts * frames, channels, height, width]` as `[bursts, channels, frames, height, width]`.
+/// Reshapes `[bursts * frames, channels, height, width]` to `[bursts, channels, frames, height, width]`.
 fn by_burst<B: Backend>(x: FloatTensor<B>, frames: usize) -> FloatTensor<B> {
     let [images, channels, height, width] = x.shape().dims();
     let shape = Shape::new([images / frames, frames, channels, height, width]);
     B::float_swap_dims(B::float_reshape(x, shape), 1, 2)
 }
 
-/// The reverse of [`by_burst`].
+/// Applies the inverse of [`by_burst`].
 fn by_image<B: Backend>(x: FloatTensor<B>) -> FloatTensor<B> {
     let [bursts, channels, frames, height, width] = x.shape().dims();
     let shape = Shape::new([bursts * frames, channels, height, width]);
     B::float_reshape(B::float_swap_dims(x, 1, 2), shape)
 }
 
-/// The convolution with all that follows it; `inputs` without the addend.
+/// Computes the convolution with addend and activation; `inputs` does not include the addend.
 pub(super) fn forward<B: Backend>(
     geometry: &Geometry,
     inputs: Vec<FloatTensor<B>>,
@@ -89,18 +89,18 @@ pub(super) fn forward<B: Backend>(
     if geometry.relu { B::relu(output) } else { output }
 }
 
-/// The gradient before the cut at zero.
+/// Computes the gradient before the ReLU.
 fn uncut<B: Backend>(gradient: FloatTensor<B>, output: Option<FloatTensor<B>>) -> FloatTensor<B> {
     match output {
         None => gradient,
         Some(output) => {
-            // Not negative: its sign is one where it was not cut.
+            // The output is not negative: its sign is one where the gradient passes.
             B::float_mul(gradient, B::float_sign(output))
         }
     }
 }
 
-/// The gradients for every input, and for the addend.
+/// Computes the gradients of every input and of the addend.
 pub(super) fn input_gradients<B: Backend>(
     geometry: &Geometry,
     weight: FloatTensor<B>,
@@ -112,7 +112,7 @@ pub(super) fn input_gradients<B: Backend>(
     let channels = geometry.all_channels();
     let (narrowed, weight) =
         (narrow::<B>(gradient.clone(), geometry), narrow::<B>(weight, geometry));
-    // Only the shape of what stands for the inputs counts.
+    // The input gradient only reads the shape of its input.
     let (device, dtype) = (weight.device(), weight.dtype());
     let like = |shape: Shape| B::float_zeros(shape, &device, dtype.into());
     let all = if geometry.is_deep() {
@@ -136,7 +136,7 @@ pub(super) fn input_gradients<B: Backend>(
     parts
 }
 
-/// The gradients for weight and bias.
+/// Computes the gradients of weight and bias.
 pub(super) fn weight_gradients<B: Backend>(
     geometry: &Geometry,
     inputs: Vec<FloatTensor<B>>,
@@ -170,7 +170,7 @@ pub(super) fn weight_gradients<B: Backend>(
     (weight.expect("a kernel of at least one frame"), bias)
 }
 
-/// The images with zeros around them.
+/// Pads the images with zeros.
 fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> {
     let [_, rows, columns] = geometry.padding();
     if rows == 0 && columns == 0 {
@@ -188,7 +188,7 @@ fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> 
     B::float_slice_assign(zeros, &inside, x)
 }
 
-/// The images `dt - depth / 2` frames later in their bursts, zeros past the ends.
+/// Shifts images by `dt - depth / 2` frames within their bursts, with zeros past the ends.
 fn shifted<B: Backend>(
     x: FloatTensor<B>,
     frames: usize,
@@ -213,7 +213,7 @@ fn shifted<B: Backend>(
     B::float_reshape(moved, Shape::new([images, channels, height, width]))
 }
 
-/// What every tap sees of every cell, `[images, taps * channels, cells]`, of padded images.
+/// Gathers the pixels that each tap reads for each cell of padded images, `[images, taps * channels, cells]`.
 fn neighbourhoods<B: Backend>(geometry: &Geometry, x: &FloatTensor<B>) -> FloatTensor<B> {
     let [_, rows, columns] = geometry.kernel;
     let [height, width] = geometry.output_grid();
@@ -261,7 +261,8 @@ mod tests {
         assert!(worst < 2e-5 * largest, "{what}: {worst} of {largest}");
     }
 
-    /// Strides, odd sizes, several inputs, kernels over frames, with and without a cut at zero.
+    /// Compares both implementations over strides, odd sizes, several inputs and temporal kernels, with and
+    /// without ReLU.
     #[test]
     fn gradients_equal_those_of_our_own_loops() {
         let cases = [

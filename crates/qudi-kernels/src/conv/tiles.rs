@@ -1,22 +1,23 @@
-//! Convolutions by tiles of a processor's matrix unit (AMX).
+//! Convolution with tiles of a processor's matrix unit (AMX).
 //!
-//! A tile of weights, 16 output channels by up to 16 pairs of planes, times a tile of scratch memory, the
-//! same pairs by 16 neighbouring pixels, adds to 16 channels by 16 pixels. Scratch memory holds pairs of
-//! planes, so a tile's rows are read from there with the plane's stride, at the offset of every tap, and
-//! results lie as planes do: nothing is unfolded or transposed.
+//! A tile of weights holds 16 output channels by up to 16 pairs of planes. Times a tile of scratch memory,
+//! the same pairs by 16 neighbouring pixels, it adds to 16 channels by 16 pixels. Scratch memory holds pairs
+//! of planes. A tile's rows are read there with the plane's stride, at the offset of each tap, and results
+//! are stored as planes. Nothing is unfolded or transposed.
 #![allow(unsafe_code)]
 
 use super::run::Tile;
 use rayon::prelude::*;
 
-/// Results of a block: two tiles of channels by two of pixels.
+/// Channels of a block: two tiles.
 pub(super) const OUTPUTS: usize = 2 * SIDE;
+/// Pixels of a block: two tiles.
 pub(super) const PIXELS: usize = 2 * SIDE;
 
-/// Rows of a tile, and 32-bit places of a row.
+/// Rows of a tile, and 32-bit entries per row.
 pub(super) const SIDE: usize = 16;
 
-/// A row of a tile of weights, in one cache line: pairs of planes of one channel.
+/// Row of a tile of weights, in one cache line: pairs of planes of one channel.
 #[repr(C, align(64))]
 #[derive(Clone, Debug)]
 pub(super) struct Row(pub(super) [f32; SIDE]);
@@ -26,37 +27,38 @@ pub(super) struct Row(pub(super) [f32; SIDE]);
 #[derive(Clone, Debug)]
 pub(super) struct Sums(pub(super) [[f32; PIXELS]; OUTPUTS]);
 
-/// What a block multiplies.
+/// Operands of a block.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Block<'a> {
-    /// Tiles of weights, for every offset.
+    /// Tiles of weights for every offset.
     pub(super) weights: *const Row,
-    /// Tiles of weights and of pixels, one or two of each.
+    /// Numbers of tiles of weights and of pixels, one or two each.
     pub(super) tiles: [usize; 2],
-    /// The block's first pixel in the first scratch plane.
+    /// First pixel of the block in the first scratch plane.
     pub(super) pixels: *const f32,
-    /// Where the first plane of a group lies for a tap, in places from `pixels`.
+    /// Offsets from `pixels` of a group's first plane, for each tap.
     pub(super) offsets: &'a [u32],
-    /// Pairs of planes of a group.
+    /// Pairs of planes per group.
     pub(super) group: usize,
-    /// Places from one scratch plane to the next.
+    /// Entries between neighbouring scratch planes.
     pub(super) plane: usize,
 }
 
-/// What adds up to a part of a gradient of weights: sixteen planes, seen from one tap, times sixteen channels of the
+/// Operands of a part of the weight gradient: sixteen planes, read at one tap, times sixteen channels of the
 /// gradient.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Correlation {
-    /// Every tile's first pixel in its first scratch plane.
+    /// First pixel of each tile in its first scratch plane.
     pub(super) pixels: [*const u16; 2],
-    /// Every tile's first row of gradients.
+    /// First row of gradients of each tile.
     pub(super) gradients: [*const Row; 2],
-    /// Tiles of planes and of gradients, one or two of each.
+    /// Numbers of tiles of planes and of gradients, one or two each.
     pub(super) tiles: [usize; 2],
-    /// Values from one scratch plane to the next.
+    /// Values between neighbouring scratch planes.
     pub(super) plane: usize,
-    /// Lines, products of 32 neighbouring pixels in each, and values from one line to the next in scratch memory.
+    /// Number of lines.
     pub(super) lines: usize,
+    /// Values between neighbouring lines in scratch memory.
     pub(super) steps: usize,
     pub(super) line: usize,
 }
@@ -64,16 +66,16 @@ pub(super) struct Correlation {
 /// Sums of a tile of weights, `[plane][channel]`.
 pub(super) type WeightSums = [Row; SIDE];
 
-/// A matrix unit, or its model.
+/// A matrix unit or its model.
 pub(super) trait MatrixUnit {
-    /// The sums of a block; with one tile of weights those of the first 16 channels, with one of pixels those of the
-    /// first 16 pixels.
+    /// Computes the sums of a block. With one tile of weights it computes only the first 16 channels, with
+    /// one tile of pixels only the first 16 pixels.
     ///
     /// # Safety
     /// The machine must have the unit. All tiles must be readable.
     unsafe fn multiply(&self, block: &Block<'_>, sums: &mut Sums);
 
-    /// Adds to the sums of all tiles of planes by those of channels.
+    /// Adds the products of all tiles of planes and all tiles of channels to `sums`.
     ///
     /// # Safety
     /// The machine must have the unit, configured for groups of [`SIDE`]. All tiles of pixels and gradients, and
@@ -81,8 +83,8 @@ pub(super) trait MatrixUnit {
     unsafe fn correlate(&self, what: &Correlation, sums: [[*mut WeightSums; 2]; 2]);
 }
 
-/// Weights as tiles, `[block][group][tap][tile of channels][channel][pair]`; the last block has one tile of
-/// channels if that is enough.
+/// Packs weights as tiles, `[block][group][tap][tile of channels][channel][pair]`. The last block has one
+/// tile of channels if that is enough.
 pub(super) fn packed(
     outputs: usize,
     planes: usize,
@@ -93,7 +95,7 @@ pub(super) fn packed(
     let rows_per_channel = planes / group * taps;
     let mut rows =
         vec![const { Row([0.0; SIDE]) }; outputs.next_multiple_of(SIDE) * rows_per_channel];
-    // A convolution of nothing has no weights.
+    // A convolution without inputs or taps has no weights.
     let size = (OUTPUTS * rows_per_channel).max(1);
     rows.par_chunks_mut(size).enumerate().for_each(|(block, rows)| {
         let channels = rows.len() / rows_per_channel;
@@ -111,7 +113,7 @@ pub(super) fn packed(
     rows
 }
 
-/// All blocks of a tile of the image.
+/// Computes all blocks of a tile of the image.
 ///
 /// # Safety
 /// The machine must have the unit.
@@ -149,13 +151,13 @@ pub(super) unsafe fn blocks(unit: &impl MatrixUnit, tile: &Tile<'_>, group: usiz
     }
 }
 
-/// The two numbers of a pair.
+/// Unpacks the two numbers of a pair.
 fn halves(bits: f32) -> [f32; 2] {
     let bits = bits.to_bits();
     [f32::from_bits(bits << 16), f32::from_bits(bits & 0xffff_0000)]
 }
 
-/// The unit's sums by plain loops: what tests on machines without it check the rest with.
+/// Model of the unit with plain loops, for tests on machines without it.
 #[derive(Debug)]
 pub(super) struct Model;
 
@@ -213,7 +215,7 @@ mod tests {
     use crate::conv::{Geometry, native};
     use crate::matrix_units::{MatrixUnits, with_matrix_units};
 
-    /// Repeatable numbers in [-1, 1).
+    /// Generates reproducible numbers in [-1, 1).
     fn numbers(seed: usize, count: usize) -> Vec<f32> {
         let mut state = (seed as u32).wrapping_mul(2_654_435_769) | 1;
         let mut next = || {
@@ -233,10 +235,10 @@ mod tests {
         }
     }
 
-    /// Sums over tiles, by the model of the matrix unit, are those over rounded numbers.
+    /// Compares sums over tiles, computed by the model of the matrix unit, with sums over rounded numbers.
     #[test]
     fn tiles_cover_every_shape() {
-        // Channels of the inputs, outputs, frames, rows, columns, kernel, stride.
+        // Channels of the inputs, outputs, frames, rows and columns, kernel, stride.
         #[allow(clippy::type_complexity)]
         let shapes: [(&[usize], usize, usize, [usize; 2], [usize; 3], usize); 9] = [
             (&[1], 1, 1, [1, 1], [1, 1, 1], 1),

@@ -1,4 +1,4 @@
-//! The gradients of a convolution's weights and bias.
+//! Gradients of a convolution's weights and bias.
 #![allow(unsafe_code)]
 
 use super::micro;
@@ -14,10 +14,10 @@ use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-/// Taps of a block.
+/// Taps per block.
 const TAPS: usize = 3;
 
-/// Partial sums: enough for many threads, and the same for any number of them.
+/// Number of partial sums: enough for many threads, and independent of their number.
 pub(super) const PARTS: usize = 16;
 
 /// Gradients of weights, `[outputs, planes, taps]`, and of the bias.
@@ -27,11 +27,11 @@ pub(crate) struct WeightGradient {
     pub(crate) bias: Vec<f32>,
 }
 
-/// Neighbouring pixels of a vector of bfloat16.
+/// Number of pixels in a vector of bfloat16.
 const HALVES: usize = 32;
 
-/// Sums over all images and results of `gradient` (of the pass's grid) times what the taps read of `source`.
-/// Sizes: planes of `source`, images, channels of `gradient`.
+/// Sums `gradient` (on the pass's grid) times the values that the taps read from `source`, over all images
+/// and results. The sizes are planes of `source`, images, and channels of `gradient`.
 pub(super) fn weight_gradient(
     source: Source<'_>,
     [planes, images, outputs]: [usize; 3],
@@ -62,7 +62,7 @@ pub(super) fn weight_gradient(
                 let length = tiling.columns.next_multiple_of(lanes);
                 let area = tiling.scratch();
                 let needed = area + outputs * tiling.rows * length;
-                // What is rounded lies behind what it was rounded from.
+                // Rounded values are stored after their f32 originals.
                 let all = if halves { needed + needed.div_ceil(2) } else { needed };
                 if scratch.len() < all {
                     scratch.resize(all, 0.0);
@@ -134,16 +134,17 @@ fn add(to: &mut [f32], from: &[f32]) {
     }
 }
 
-/// The work on one filled tile.
+/// Work on one filled tile.
 struct Tile<'a> {
     taps: &'a [f32],
-    /// `[outputs][rows][length]`, zero past the tile's columns.
+    /// Gradients `[outputs][rows][length]`, zero past the tile's columns.
     dy: &'a [f32],
-    /// The same in bfloat16, where that is multiplied.
+    /// Taps in bfloat16, where products use it.
     narrow_taps: &'a [u16],
+    /// Gradients in bfloat16, where products use it.
     narrow_dy: &'a [u16],
     offsets: &'a [u32],
-    /// Number of the first offset among `all` taps of one output.
+    /// Index of the first offset among `all` taps of one output.
     first: usize,
     all: usize,
     rows: usize,
@@ -160,7 +161,8 @@ impl WithSimd for Tile<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let values = (self.taps.as_ptr(), self.dy.as_ptr());
-        // SAFETY: these products are the machine's own. As many output channels as registers hold.
+        // SAFETY: `Single` needs no instructions beyond `S`. The block has as many output channels as
+        // registers hold.
         unsafe {
             if S::REGISTER_COUNT >= 32 {
                 self.blocks::<S, Single, f32, 8, TAPS>(simd, values);
@@ -182,8 +184,10 @@ impl PairWork for Tile<'_> {
 }
 
 impl Tile<'_> {
+    /// Computes the sums of all blocks of `M` channels by `K` taps.
+    ///
     /// # Safety
-    /// The machine must have the instructions of `P`; `taps` and `dy` are this tile's.
+    /// The machine must have the instructions of `P`; `taps` and `dy` must belong to this tile.
     #[inline(always)]
     unsafe fn blocks<S: Simd, P: Products<S>, T, const M: usize, const K: usize>(
         self,
@@ -200,8 +204,8 @@ impl Tile<'_> {
                     self.offsets[(k + j).min(self.offsets.len() - 1)] as usize
                 });
                 let sizes = [self.rows, self.length, self.pass.stride * self.tiling.row];
-                // SAFETY: rows of `dy` are `length` long, whole vectors; so much lies in scratch after every
-                // tap of a row (`Pass::tiling`).
+                // SAFETY: rows of `dy` are `length` long, whole vectors; as many values lie in scratch memory
+                // after every tap of a row (`Pass::tiling`).
                 let sums = unsafe {
                     let dy = outputs.map(|start| dy.add(start));
                     micro::correlate::<S, P, T, M, K>(simd, dy, taps, offsets, sizes)

@@ -1,8 +1,9 @@
-//! The gradient of a convolution's weights by tiles of a processor's matrix unit (AMX).
+//! Gradient of a convolution's weights with tiles of a processor's matrix unit (AMX).
 //!
-//! A tile of sixteen planes, seen from one tap, by 32 neighbouring pixels, times a tile of the same pixels by
-//! sixteen channels of the gradient, adds to sixteen planes by sixteen channels. Planes lie in scratch memory as
-//! they are, rounded to bfloat16: every tap reads its tiles there at its own offset. Gradients are turned once.
+//! A tile of sixteen planes by 32 neighbouring pixels, read at one tap, times a tile of the same pixels by
+//! sixteen channels of the gradient, adds to sixteen planes by sixteen channels. Planes are stored in scratch
+//! memory unchanged but for rounding to bfloat16: every tap reads its tiles there at its own offset.
+//! Gradients are transposed once.
 #![allow(unsafe_code)]
 
 use super::pass::{Pass, Tiling};
@@ -18,11 +19,11 @@ use std::cell::RefCell;
 use std::ops::Range;
 
 thread_local! {
-    /// Turned gradients: memory that the next call on this thread uses again.
-    static TURNED: RefCell<Vec<Row>> = const { RefCell::new(Vec::new()) };
+    /// Buffer of transposed gradients, reused by the next call on this thread.
+    static TRANSPOSED: RefCell<Vec<Row>> = const { RefCell::new(Vec::new()) };
 }
 
-/// As [`super::weight_gradient::weight_gradient`], with bfloat16.
+/// Computes [`super::weight_gradient::weight_gradient`] in bfloat16.
 pub(super) fn weight_gradient(
     source: Source<'_>,
     [planes, images, outputs]: [usize; 3],
@@ -45,7 +46,7 @@ pub(super) fn weight_gradient(
             let (image, number) = (task / tiling.count(), task % tiling.count());
             let (at, size) = tiling.tile(number, pass.grid);
             let rows = lines.turned(outputs, size[0]);
-            TURNED.with_borrow_mut(|turned| {
+            TRANSPOSED.with_borrow_mut(|turned| {
                 if turned.len() < rows {
                     turned.resize(rows, Row([0.0; SIDE]));
                 }
@@ -94,25 +95,26 @@ pub(super) fn weight_gradient(
     WeightGradient { weight, bias }
 }
 
-/// How pixels of a tile follow each other in products.
+/// Layout of a tile's pixels in products.
 struct Lines {
-    /// Values from one row of the gradient to the next.
+    /// Values between neighbouring rows of the gradient.
     pitch: usize,
-    /// Whether all rows are one line; else every row is its own.
+    /// True if all rows form one line; otherwise each row is its own line.
     joined: bool,
-    /// Values of scratch from one row of results to the next.
+    /// Scratch values between neighbouring rows of results.
     line: usize,
 }
 
 impl Lines {
-    /// Where the stride is 1, rows of the gradient get the pitch of scratch memory, zeros between them.
+    /// Chooses the layout. With stride 1, rows of the gradient get the pitch of scratch memory, with zeros
+    /// between them.
     fn new(pass: &Pass, tiling: &Tiling) -> Self {
         let joined = pass.stride == 1;
         let pitch = if joined { tiling.row } else { tiling.columns.next_multiple_of(PIXELS) };
         Self { pitch, joined, line: pass.stride * tiling.row }
     }
 
-    /// Lines of a tile of so many rows, and products of a line.
+    /// Returns the number of lines of a tile with `rows` rows, and the number of products per line.
     fn count(&self, rows: usize) -> [usize; 2] {
         if self.joined {
             [1, (rows * self.pitch).div_ceil(PIXELS)]
@@ -121,13 +123,14 @@ impl Lines {
         }
     }
 
-    /// Rows of the turned gradients of so many channels.
+    /// Returns the number of rows that the transposed gradients of `outputs` channels take.
     fn turned(&self, outputs: usize, rows: usize) -> usize {
         let [lines, steps] = self.count(rows);
         outputs.div_ceil(SIDE) * lines * steps * SIDE
     }
 
-    /// Turns a tile of the gradient: `[tile of channels][pair of pixels][channel]`. Adds it to the bias's.
+    /// Transposes a tile of the gradient to `[tile of channels][pair of pixels][channel]`, and adds its sum
+    /// to `bias`.
     fn turn(
         &self,
         gradient: &Source<'_>,
@@ -157,7 +160,7 @@ impl Lines {
     }
 }
 
-/// Turns up to sixteen channels of `used` values each: a row for every pair of values.
+/// Transposition of up to sixteen channels of `used` values each: one row for every pair of values.
 struct Turn<'a> {
     values: &'a [f32],
     used: usize,
@@ -188,7 +191,7 @@ impl WithSimd for Turn<'_> {
     }
 }
 
-/// Rows become columns: halves of the square are exchanged, then quarters, down to single values.
+/// Transposes a square: exchanges its halves, then its quarters, down to single values.
 #[inline(always)]
 fn transposed(square: &mut [[f32; SIDE]; SIDE]) {
     exchanged::<8>(square);
@@ -207,7 +210,7 @@ fn exchanged<const SIZE: usize>(square: &mut [[f32; SIDE]; SIDE]) {
     }
 }
 
-/// Calls `run` with planes of a tile in bfloat16, and finite numbers for a while past them.
+/// Calls `run` with the planes of a tile in bfloat16, followed by finite values that products may read.
 fn with_planes(
     source: &Source<'_>,
     image: usize,
@@ -218,7 +221,7 @@ fn with_planes(
     run: impl FnOnce(&[u16]),
 ) {
     let area = planes.len() * tiling.plane();
-    // Tiles hold sixteen planes, and products go on past the last row.
+    // Tiles hold sixteen planes, and products read past the last row.
     let all = planes.len().next_multiple_of(SIDE) * tiling.plane() + past(tiling);
     SCRATCH.with_borrow_mut(|scratch| {
         let needed = area + all.div_ceil(2);
@@ -235,31 +238,31 @@ fn with_planes(
     });
 }
 
-/// Values that products read past a plane: the rest of a row of taps, and of a product.
+/// Returns the number of values that products read past a plane: the rest of a row of taps, and of a product.
 fn past(tiling: &Tiling) -> usize {
     2 * tiling.row + 2 * PIXELS
 }
 
-/// The work on one tile whose planes and gradients are there.
+/// Work on one tile whose planes and gradients are in memory.
 pub(super) struct Work<'a> {
     pixels: &'a [u16],
     turned: &'a [Row],
     lines: &'a Lines,
     rows: usize,
     tiling: &'a Tiling,
-    /// Of the taps, in a plane.
+    /// Offsets of the taps in a plane.
     offsets: &'a [u32],
-    /// First tile of planes, and how many there are.
+    /// Index of the first tile of planes.
     first: usize,
     tiles: usize,
-    /// Taps, tiles of all planes, tiles of channels.
+    /// Numbers of taps, of tiles of all planes, and of tiles of channels.
     sizes: [usize; 3],
 }
 
 impl Work<'_> {
     fn run(&self, sums: &mut [WeightSums]) {
         #[cfg(all(target_arch = "x86_64", not(test)))]
-        // SAFETY: there are tiles only where the processor has the unit, and with permission.
+        // SAFETY: this path is taken only where the processor has the unit, and the process may use it.
         unsafe {
             super::amx::correlate(self, sums);
         }
@@ -270,6 +273,8 @@ impl Work<'_> {
         }
     }
 
+    /// Adds the products of the tile to `sums`.
+    ///
     /// # Safety
     /// The machine must have the unit.
     #[inline(always)]
@@ -280,7 +285,7 @@ impl Work<'_> {
         for (tap, &offset) in self.offsets.iter().enumerate() {
             for planes in (0..self.tiles).step_by(2) {
                 for channels in (0..output_tiles).step_by(2) {
-                    // The last block repeats its last tile, and leaves the repeat out.
+                    // The last block repeats its last tile, and drops the repeat.
                     let tile = |number: usize| (planes + number).min(self.tiles - 1);
                     let channel = |number: usize| (channels + number).min(output_tiles - 1);
                     let places: [[usize; 2]; 2] = array::from_fn(|p| {

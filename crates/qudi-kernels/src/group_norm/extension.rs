@@ -1,4 +1,4 @@
-//! The normalisation as an operation of Burn's backends, differentiable once.
+//! Group normalisation as an operation of Burn's backends, differentiable once.
 
 use super::Norm;
 use burn::backend::autodiff::NodeId;
@@ -9,10 +9,10 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, backend_extension};
 
-/// Backends with our normalisation.
+/// Backends with the fused normalisation.
 #[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
 pub trait GroupNormBackend: Backend {
-    /// See [`group_norm`](super::group_norm).
+    /// Computes [`group_norm`](super::group_norm).
     fn group_norm_rows(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
@@ -21,9 +21,9 @@ pub trait GroupNormBackend: Backend {
     ) -> FloatTensor<Self>;
 }
 
-/// The gradients for `x`, weight and bias.
+/// Backends with the gradients of the fused normalisation.
 pub trait GroupNormGradients: Backend {
-    /// See [`group_norm`](super::group_norm).
+    /// Computes the gradients of [`group_norm`](super::group_norm) for `x`, weight and bias.
     fn group_norm_gradients(
         x: FloatTensor<Self>,
         weight: FloatTensor<Self>,
@@ -75,7 +75,7 @@ mod flex {
     }
 }
 
-/// The step behind a normalisation.
+/// Backward step of a normalisation.
 #[derive(Debug)]
 struct Step;
 

@@ -1,4 +1,4 @@
-//! The normalisation and its gradients on plain memory.
+//! Group normalisation and its gradients on slices of memory.
 // Plain indices over arrays of known length: the compiler turns them into vectors.
 #![allow(clippy::needless_range_loop)]
 
@@ -9,12 +9,12 @@ use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Values summed in f32 before they go into a sum in f64.
+/// Number of values summed in f32 before they are added to a sum in f64.
 const BLOCK: usize = 1024;
-/// Sums side by side, so that the compiler can use vectors.
+/// Number of interleaved sums, so that the compiler can use vectors.
 const LANES: usize = 16;
 
-/// Gradients for `x`, weight and bias.
+/// Gradients with respect to `x`, weight and bias.
 #[derive(Debug)]
 pub(super) struct NormGradients {
     pub(super) x: Vec<f32>,
@@ -22,15 +22,15 @@ pub(super) struct NormGradients {
     pub(super) bias: Vec<f32>,
 }
 
-/// Sizes that follow from the shapes.
+/// Sizes derived from the shapes.
 struct Sizes {
-    /// Values of a channel of one image.
+    /// Values per channel of one image.
     plane: usize,
-    /// Channels of a group.
+    /// Channels per group.
     group: usize,
     channels: usize,
     groups: usize,
-    /// Images that share a row of weights.
+    /// Number of images that share a row of weights.
     share: usize,
 }
 
@@ -45,14 +45,14 @@ impl Sizes {
         }
     }
 
-    /// Number of the weight of channel `k` of group `number` among all images' groups.
+    /// Returns the index of the weight of channel `k` in group `number` of all images' groups.
     fn weight(&self, number: usize, k: usize) -> usize {
         let (image, group) = (number / self.groups, number % self.groups);
         image / self.share * self.channels + group * self.group + k
     }
 }
 
-/// See [`group_norm`](super::group_norm).
+/// Computes [`group_norm`](super::group_norm).
 pub(super) fn forward(
     shape: [usize; 4],
     norm: Norm,
@@ -71,7 +71,7 @@ pub(super) fn forward(
     })
 }
 
-/// One group of one image.
+/// Forward pass of one group of one image.
 struct Forward<'a> {
     sizes: &'a Sizes,
     activation: Activation,
@@ -102,7 +102,7 @@ impl WithSimd for Forward<'_> {
     }
 }
 
-/// Gradients of a sum whose gradient for the result is `gradient`.
+/// Computes the gradients of `x`, weight and bias from the gradient of the result.
 pub(super) fn gradients(
     shape: [usize; 4],
     norm: Norm,
@@ -134,7 +134,7 @@ pub(super) fn gradients(
     NormGradients { x: dx, weight: dweight, bias: dbias }
 }
 
-/// One group of one image.
+/// Backward pass of one group of one image.
 struct Backward<'a> {
     sizes: &'a Sizes,
     activation: Activation,
@@ -161,7 +161,7 @@ impl WithSimd for Backward<'_> {
     }
 }
 
-/// Writes the gradient for one group of one image; gives those for its channels' weights and biases.
+/// Writes the gradient of one group of one image. Returns the gradients of its channels' weights and biases.
 #[inline(always)]
 fn group_gradient(
     x: &[f32],
@@ -197,7 +197,8 @@ fn group_gradient(
     sums
 }
 
-/// Writes the gradient before the affine part, and sums it, once times the normal value and once alone.
+/// Writes the gradient before the affine part. Returns its sum and the sum of its products with the
+/// normalised value.
 #[inline(always)]
 fn through<const SILU: bool>(
     x: &[f32],
@@ -235,7 +236,7 @@ fn through<const SILU: bool>(
     (affine as f32, plain as f32)
 }
 
-/// Mean, and one over the deviation.
+/// Returns the mean, and one over the standard deviation.
 #[inline(always)]
 fn moments(x: &[f32]) -> (f32, f32) {
     let (mut sum, mut squares) = (0f64, 0f64);

@@ -8,16 +8,16 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, backend_extension};
 
-/// Backends with our warp.
+/// Backends with the fused warp.
 #[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
 pub trait WarpBackend: Backend {
-    /// See [`warp`](super::warp).
+    /// Computes [`warp`](super::warp).
     fn warp(x: FloatTensor<Self>, flow: FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
-/// The gradients for `x` and `flow`.
+/// Backends with the gradients of the fused warp.
 pub trait WarpGradients: Backend {
-    /// See [`warp`](super::warp).
+    /// Computes the gradients of [`warp`](super::warp) for `x` and `flow`.
     fn warp_gradients(
         x: FloatTensor<Self>,
         flow: FloatTensor<Self>,
@@ -57,7 +57,7 @@ mod flex {
     }
 }
 
-/// The step behind a warp.
+/// Backward step of a warp.
 #[derive(Debug)]
 struct Step;
 

@@ -1,24 +1,24 @@
-//! Warping and its gradients on plain memory.
+//! Warping and its gradients on slices of memory.
 
 use crate::uninitialised::fill;
 use rayon::prelude::*;
 
-/// Planes that share one computation of where pixels come from.
-const SHARE: usize = 8;
+/// Number of planes per task, which share the computation of source positions.
+const PLANES_PER_TASK: usize = 8;
 
-/// Where one pixel of the result comes from.
+/// Source position of one pixel of the result.
 #[derive(Clone, Copy, Debug)]
 struct Place {
-    /// Numbers of the pixels above left, above right, below left, below right.
+    /// Indices of the pixels above left, above right, below left and below right.
     corners: [u32; 4],
-    /// Shares of the right and of the lower pixels.
+    /// Weight of the right pixels.
     right: f32,
     below: f32,
-    /// Whether x and y were not clamped.
+    /// True for each of x and y that was not clamped.
     free: [bool; 2],
 }
 
-/// Places of all pixels; `flow` is `[2, height, width]`.
+/// Computes the source positions of all pixels; `flow` is `[2, height, width]`.
 fn places(flow: &[f32], height: usize, width: usize) -> Vec<Place> {
     let (x_flow, y_flow) = flow.split_at(height * width);
     let mut places = Vec::with_capacity(height * width);
@@ -44,8 +44,8 @@ fn places(flow: &[f32], height: usize, width: usize) -> Vec<Place> {
     places
 }
 
-/// The two neighbours of a clamped coordinate, the share of the second, and whether it was free.
-/// A coordinate that is no number counts as the first.
+/// Returns the two neighbours of a clamped coordinate, the weight of the second, and true if it was not
+/// clamped. NaN counts as the first coordinate.
 fn split(coordinate: f32, size: usize) -> (usize, usize, f32, bool) {
     let last = (size - 1) as f32;
     let clamped = coordinate.max(0.0).min(last);
@@ -58,18 +58,20 @@ fn split(coordinate: f32, size: usize) -> (usize, usize, f32, bool) {
     )
 }
 
-/// See [`warp`](super::warp).
+/// Computes [`warp`](super::warp).
 pub(super) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
     let [_, channels, height, width] = shape;
     let plane = height * width;
-    let shares = channels.div_ceil(SHARE);
+    let shares = channels.div_ceil(PLANES_PER_TASK);
     fill(x.len(), |result| {
         // Each task takes a few planes of one image.
         let images = result.chunks_mut(channels * plane).zip(x.chunks(channels * plane));
         let tasks: Vec<_> = images
             .zip(flow.chunks(2 * plane))
             .flat_map(|((result, x), flow)| {
-                let parts = result.chunks_mut(SHARE * plane).zip(x.chunks(SHARE * plane));
+                let parts = result
+                    .chunks_mut(PLANES_PER_TASK * plane)
+                    .zip(x.chunks(PLANES_PER_TASK * plane));
                 parts.map(move |(result, x)| (result, x, flow))
             })
             .collect();
@@ -88,7 +90,7 @@ pub(super) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
     })
 }
 
-/// Gradients for `x` and `flow`.
+/// Computes the gradients of `x` and `flow`.
 pub(super) fn gradients(
     shape: [usize; 4],
     x: &[f32],

@@ -1,20 +1,20 @@
-//! Tiles of a frame that overlap, and how their results are blended.
+//! Overlapping tiles of a frame, and blending of their results.
 
 use qudi_core::Size;
 
-/// Where tiles of one size lie on a frame.
+/// Positions of tiles of one size on a frame.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tiles {
     frame: Size,
-    /// Size of every tile.
+    /// Size of each tile.
     pub tile: Size,
     rows: Vec<usize>,
     columns: Vec<usize>,
 }
 
 impl Tiles {
-    /// Tiles of `side` pixels (smaller where the frame is) that share at least `overlap`; frame, side and
-    /// overlap are multiples of `multiple`, and so are all positions.
+    /// Plans tiles of `side` pixels (smaller where the frame is) that overlap by at least `overlap`. Frame,
+    /// side and overlap must be multiples of `multiple`; all positions are, too.
     pub fn new(frame: Size, side: usize, overlap: usize, multiple: usize) -> Self {
         let starts = |length: usize| {
             let side = side.min(length);
@@ -29,17 +29,17 @@ impl Tiles {
         Self { frame, tile, rows: starts(frame.height), columns: starts(frame.width) }
     }
 
-    /// Number of tiles.
+    /// Returns the number of tiles.
     pub fn count(&self) -> usize {
         self.rows.len() * self.columns.len()
     }
 
-    /// First row and column of a tile.
+    /// Returns the first row and column of a tile.
     fn corner(&self, number: usize) -> [usize; 2] {
         [self.rows[number / self.columns.len()], self.columns[number % self.columns.len()]]
     }
 
-    /// Tile `number` of every image.
+    /// Crops tile `number` from every image.
     pub fn crop(&self, number: usize, images: &[f32]) -> Vec<f32> {
         let [top, left] = self.corner(number);
         let mut values =
@@ -53,7 +53,7 @@ impl Tiles {
         values
     }
 
-    /// Adds tile `number` of every image to `images`, weighted so that all tiles together count once.
+    /// Adds tile `number` of every image to `images`. The weights of overlapping tiles add up to one.
     pub fn blend(&self, number: usize, tiles: &[f32], images: &mut [f32]) {
         let [top, left] = self.corner(number);
         let rows = shares(&self.rows, self.tile.height, number / self.columns.len());
@@ -71,8 +71,8 @@ impl Tiles {
     }
 }
 
-/// Weight of every place of tile `number` along one axis: ramps over the overlaps, normalised by what the
-/// other tiles have there.
+/// Returns the weights of tile `number` along one axis: ramps over the overlaps, normalised by the sum over
+/// all tiles.
 fn shares(starts: &[usize], side: usize, number: usize) -> Vec<f32> {
     let weight = |n: usize, place: usize| -> f32 {
         let Some(i) = place.checked_sub(starts[n]).filter(|&i| i < side) else { return 0.0 };

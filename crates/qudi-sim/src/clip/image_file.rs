@@ -12,7 +12,7 @@ use std::path::Path;
 /// Extensions of image files.
 pub(super) const EXTENSIONS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
 
-/// Whether a file's name is that of an image.
+/// Returns true if the name ends like an image file's.
 pub fn is_image(path: &Path) -> bool {
     let known = |e: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known));
     path.extension().is_some_and(known) && path.is_file()
@@ -34,7 +34,7 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
     let file = BufReader::new(open_regular(path, "open the image")?);
     let guessed = ImageReader::new(file).with_guessed_format();
     let reader = guessed.map_err(|e| Error::io("open the image", path, e))?;
-    // A few kilobytes can stand for gigabytes of pixels: the header is asked before anything is decoded.
+    // A few kilobytes can decode to gigabytes of pixels: the size in the header is checked first.
     let decoder = reader.into_decoder().map_err(|e| unreadable(e, path))?;
     let (width, height) = decoder.dimensions();
     if u64::from(width) * u64::from(height) > IMAGE_PIXELS {
@@ -57,7 +57,7 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
     DynamicImage::from_decoder(decoder).map_err(|e| unreadable(e, path))
 }
 
-/// Says why an image cannot be decoded.
+/// Creates the error for an image that cannot be decoded.
 fn unreadable(e: ImageError, path: &Path) -> Error {
     match e {
         ImageError::IoError(e) if e.kind() != std::io::ErrorKind::UnexpectedEof => {
@@ -111,7 +111,7 @@ fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame
     Ok(Frame { size, data })
 }
 
-/// Floating-point files may hold anything; scenes hold values in [0, 1].
+/// Checks that floating-point values are in [0, 1], as in all scenes.
 pub(super) fn check_values(data: &[f32], path: &Path) -> Result<()> {
     let Some(bad) = data.iter().find(|v| !(0.0..=1.0).contains(*v)) else { return Ok(()) };
     Err(Error::data(
@@ -125,7 +125,7 @@ pub(super) fn check_values(data: &[f32], path: &Path) -> Result<()> {
 mod tests {
     use super::*;
 
-    /// A PNG whose header claims `side` x `side` gray pixels, without any.
+    /// Creates a PNG whose header claims `side` x `side` gray pixels, without any.
     fn empty_png(side: u32) -> Vec<u8> {
         let mut header = b"IHDR".to_vec();
         header.extend(side.to_be_bytes());

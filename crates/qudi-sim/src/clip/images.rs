@@ -22,7 +22,7 @@ impl ImageFolder {
         let mut files = Vec::new();
         for entry in std::fs::read_dir(folder).map_err(read)? {
             let path = entry.map_err(read)?.path();
-            // macOS leaves `._a.png` beside `a.png` on other file systems: attributes, no image.
+            // macOS adds `._a.png` for every `a.png` on other file systems: attributes, no image.
             if is_image(&path) && !file_name(&path).starts_with("._") {
                 files.push(path);
             }

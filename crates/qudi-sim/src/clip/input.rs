@@ -1,4 +1,4 @@
-//! What to read, in a form that can be written down and opened again.
+//! Inputs in a form that can be recorded and opened again.
 
 use super::gif::Gif;
 use super::image_file::{EXTENSIONS, read_still};
@@ -21,7 +21,7 @@ use std::io::{BufReader, Read, Seek, SeekFrom, Write};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-/// A place that scenes come from.
+/// Source of a scene.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "type", rename_all = "kebab-case")]
 pub enum Input {
@@ -71,18 +71,18 @@ pub enum Input {
     },
 }
 
-/// How a clip is taken from its input.
+/// Sampling of a clip from its input.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sampling {
     /// Output frames at most; synthetic scenes need it.
     pub frames: Option<u64>,
     /// Instants per exposure; 1: nothing moves while a frame is exposed.
     pub instants: usize,
-    /// Times that a frame of a recorded clip comes in a row: cameras of thousands of frames per second see the
-    /// same image of a video again and again.
+    /// Repetitions of every frame of a recorded clip: cameras of thousands of frames per second see the same
+    /// image of a video many times.
     #[serde(default = "one")]
     pub frames_per_image: u64,
-    /// What file values mean.
+    /// Meaning of file values.
     pub transfer: Transfer,
     /// File value of white in `.npy` arrays, if not the type's full scale.
     pub white: Option<f32>,
@@ -108,7 +108,7 @@ fn one() -> u64 {
 const SYNTHETIC_FRAMES: u64 = 11;
 
 impl Input {
-    /// What `text` names: a file, a folder, `scene:NAME`, or `-` for Y4M on standard input.
+    /// Finds the input that `text` names: a file, a folder, `scene:NAME`, or `-` for Y4M on standard input.
     /// `motion`, `size`, `seed` and `speed` are for the synthetic kinds.
     ///
     /// # Errors
@@ -161,7 +161,7 @@ impl Input {
         Ok(input)
     }
 
-    /// A recorded clip: a folder of frames or a file.
+    /// Creates the input for a recorded clip: a folder of frames or a file.
     ///
     /// # Errors
     /// [`Error`] if there is none.
@@ -169,14 +169,14 @@ impl Input {
         Self::parse(&path.to_string_lossy(), None, None, 0, 0.0)
     }
 
-    /// One image, at rest.
+    /// Creates the input for one image without motion.
     pub fn still(path: &Path) -> Self {
         let motion = StillMotion::default();
         Self::Still { path: path.to_owned(), motion, size: None, seed: 0 }
     }
 
     /// Copies standard input to a temporary file, so that the clip can be read twice.
-    /// Does nothing for other kinds. `on` is asked between pieces whether to go on.
+    /// Does nothing for other kinds. `on` is called between pieces and may stop the copy.
     ///
     /// # Errors
     /// [`Error`] if it cannot be read or stored; [`Error::Interrupted`] if `on` breaks.
@@ -285,12 +285,12 @@ impl Input {
         Ok(Box::new(Recorded::new(reader, sampling.instants, sampling.frames)))
     }
 
-    /// Whether it is a synthetic scene, whose flow is known.
+    /// Returns true for synthetic scenes, whose flow is known.
     pub fn is_synthetic(&self) -> bool {
         matches!(self, Self::Still { .. } | Self::Procedural(_))
     }
 
-    /// The file or folder behind it, for messages.
+    /// Returns the name of the file or folder, for messages.
     pub fn place(&self) -> String {
         match self {
             Self::Images { path }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// Frames of a PPM stream, converted to gray.
 pub(super) struct PpmStream<R: BufRead> {
     reader: R,
-    /// The next frame, which has been decoded already.
+    /// The next frame, already decoded.
     next: Option<Frame>,
     size: Size,
     path: PathBuf,

@@ -4,16 +4,16 @@ use super::{ClipInfo, Exposure, ExposureSource, FrameReader};
 use qudi_core::flow::Flow;
 use qudi_core::{Frame, Result, Size};
 
-/// A clip whose every frame comes several times.
+/// Reader that repeats every frame of another one.
 pub(super) struct Repeated {
     reader: Box<dyn FrameReader>,
     times: u64,
-    /// The frame that comes, and how often it still does.
+    /// The current frame, and its remaining repetitions.
     current: Option<(Frame, u64)>,
 }
 
 impl Repeated {
-    /// Every frame of `reader`, `times` times in a row.
+    /// Creates a reader that repeats every frame of `reader` `times` times.
     pub(super) fn new(reader: Box<dyn FrameReader>, times: u64) -> Self {
         Self { reader, times, current: None }
     }
@@ -50,8 +50,8 @@ pub(super) struct Recorded {
 }
 
 impl Recorded {
-    /// At most `limit` exposures of `instants` recorded frames each; an incomplete last one is
-    /// left out.
+    /// Creates a source of at most `limit` exposures of `instants` recorded frames each, without an
+    /// incomplete last one.
     pub(super) fn new(reader: Box<dyn FrameReader>, instants: usize, limit: Option<u64>) -> Self {
         Self { reader, instants, left: limit }
     }

@@ -15,7 +15,7 @@ use std::process::{Child, ChildStdout, Stdio};
 /// Frames of a video, decoded by `ffmpeg`.
 pub struct Video {
     child: Child,
-    /// What ffmpeg says; a file, since a full pipe would stop it.
+    /// Standard error of ffmpeg; a file, since a full pipe would block it.
     words: File,
     frames: PpmStream<BufReader<ChildStdout>>,
     path: PathBuf,
@@ -76,7 +76,7 @@ impl Video {
     }
 }
 
-/// ffmpeg's own words about what went wrong.
+/// Creates the error from ffmpeg's own messages.
 fn failed(child: &mut Child, words: &mut File, path: &Path) -> Error {
     let _ = child.kill();
     let _ = child.wait();

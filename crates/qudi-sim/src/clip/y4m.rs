@@ -10,7 +10,7 @@ use std::io::{Chain, Cursor, Read};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-/// The longest first line: the decoder reads no longer one either.
+/// Bytes of the longest first line that the decoder reads.
 const HEADER_BYTES: usize = 1024;
 
 /// Counts the bytes that the decoder takes: it reports a cut-off frame as a plain end.
@@ -61,7 +61,7 @@ impl<R: Read> Y4m<R> {
     }
 }
 
-/// The first line of a stream with its end, or as much as a header can hold.
+/// Reads the first line of a stream with its end, or as much as a header can hold.
 fn first_line(reader: &mut impl Read) -> std::io::Result<Vec<u8>> {
     let mut line = Vec::new();
     let mut byte = [0];
@@ -71,7 +71,7 @@ fn first_line(reader: &mut impl Read) -> std::io::Result<Vec<u8>> {
     Ok(line)
 }
 
-/// The header with a colour space that the decoder knows, and the bits of a sample.
+/// Returns the header with a colour space that the decoder knows, and the bits of a sample.
 ///
 /// ffmpeg writes more depths than the decoder has names for; all depths above 8 bits have the layout of 12.
 fn with_known_layout(line: &[u8], path: &Path) -> Result<(Vec<u8>, u32)> {
@@ -147,7 +147,7 @@ impl<R: Read> FrameReader for Y4m<R> {
 mod tests {
     use super::*;
 
-    /// The first frame of a stream of 2 x 1 pixels in a colour space, with these bytes.
+    /// Decodes the first frame of a stream of 2 x 1 pixels in a colour space, with these bytes.
     fn first(parameters: &str, bytes: &[u8]) -> Result<Vec<f32>> {
         let header = format!("YUV4MPEG2 W2 H1 F25:1 {parameters}\nFRAME\n");
         let stream = [header.as_bytes(), bytes].concat();

@@ -57,7 +57,7 @@ const GLYPHS: &[(char, [u8; GLYPH_WIDTH])] = &[
     ('Z', [0x61, 0x51, 0x49, 0x45, 0x43]),
 ];
 
-/// Whether the dot at (column, row) of `c` is set; characters without a glyph are blank.
+/// Returns true if the dot at (column, row) of `c` is set; characters without a glyph are blank.
 fn dot(c: char, column: usize, row: usize) -> bool {
     GLYPHS
         .binary_search_by_key(&c.to_ascii_uppercase(), |glyph| glyph.0)
@@ -103,7 +103,7 @@ impl Line {
         f64::from(u8::from(set))
     }
 
-    /// Signed distance to the stroke's edge in pixels, positive inside: the half-way level of the
+    /// Returns the signed distance to the stroke's edge in pixels, positive inside: the half-way level of the
     /// bilinearly interpolated dots.
     pub(super) fn inside(&self, [x, y]: [f64; 2]) -> f64 {
         let u = (x - self.origin[0]) / self.dot - 0.5;

@@ -1,4 +1,4 @@
-//! Layers from back to front: what is seen at every pixel, and where it goes.
+//! Rendering and optical flow of layers from back to front.
 
 use super::{Motion, Paint, Placement, Shape};
 use qudi_core::flow::Flow;
@@ -8,11 +8,11 @@ use rayon::prelude::*;
 /// One moving surface.
 #[derive(Clone, Debug)]
 pub struct Layer {
-    /// Where it goes.
+    /// Motion.
     pub motion: Motion,
-    /// Where it is, in its own coordinates (those of time 0).
+    /// Outline in the layer's own coordinates, equal to the frame's at time 0.
     pub shape: Shape,
-    /// What it looks like, in its own coordinates.
+    /// Surface in the layer's own coordinates.
     pub paint: Paint,
 }
 
@@ -26,7 +26,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// The scene at time `t`.
+    /// Renders the scene at time `t`.
     pub fn render(&self, t: f64) -> Frame {
         let mut frame = Frame::filled(self.size, 0.0);
         let placed = self.placed(t);
@@ -44,7 +44,8 @@ impl Scene {
         frame
     }
 
-    /// Displacement of what is seen at time `from` until time `to`, on the pixels of `from`.
+    /// Computes the displacement of the visible surfaces from time `from` to time `to`, on the pixels of
+    /// `from`.
     pub fn flow(&self, from: f64, to: f64) -> Flow {
         let Size { height, width } = self.size;
         let (seen, later) = (self.labels(from), self.labels(to));
@@ -69,7 +70,7 @@ impl Scene {
         flow
     }
 
-    /// Index of the frontmost layer at every pixel.
+    /// Returns the index of the frontmost layer at every pixel.
     fn labels(&self, t: f64) -> Vec<u32> {
         let placed = self.placed(t);
         let mut labels = vec![0u32; self.size.pixels()];
@@ -106,10 +107,10 @@ struct Placed<'a> {
     reach: Reach,
 }
 
-/// The circle, centre and radius, that holds a layer; none if it is unbounded.
+/// Centre and radius of a circle around a layer; `None` if it is unbounded.
 type Reach = Option<([f64; 2], f64)>;
 
-/// Columns of row `y` that a circle reaches.
+/// Returns the columns of row `y` that a circle covers.
 fn columns(reach: Reach, y: usize, width: usize) -> std::ops::Range<usize> {
     let Some(([cx, cy], radius)) = reach else { return 0..width };
     let dy = y as f64 - cy;
@@ -145,8 +146,8 @@ mod tests {
         }
     }
 
-    /// Following the flow finds the same surface: the error of backward warping stays that of
-    /// bilinear interpolation, far below that of not moving at all.
+    /// Following the flow finds the same surface: backward warping has only the error of bilinear
+    /// interpolation, far below the error without warping.
     #[test]
     fn flow_leads_to_the_same_surface() {
         for scene in scenes() {

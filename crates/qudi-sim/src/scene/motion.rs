@@ -12,17 +12,17 @@ pub struct Motion {
     pub zoom: f64,
     /// Fixed point of rotation and zoom, in local coordinates.
     pub centre: [f64; 2],
-    /// Where the local origin lies in the frame at time 0, before rotation and zoom.
+    /// Position of the local origin in the frame at time 0, before rotation and zoom.
     pub shift: [f64; 2],
 }
 
 impl Motion {
-    /// Translation only.
+    /// Creates a motion by translation only.
     pub fn pan(velocity: [f64; 2]) -> Self {
         Self { velocity, rotation: 0.0, zoom: 1.0, centre: [0.0; 2], shift: [0.0; 2] }
     }
 
-    /// Where everything is at time `t`.
+    /// Returns the placement at time `t`.
     pub fn at(&self, t: f64) -> Placement {
         let (sin, cos) = (self.rotation * t).sin_cos();
         Placement {
@@ -46,12 +46,12 @@ pub struct Placement {
     /// Magnification since time 0.
     pub scale: f64,
     centre: [f64; 2],
-    /// Where the centre is in the frame.
+    /// Position of the centre in the frame.
     origin: [f64; 2],
 }
 
 impl Placement {
-    /// Where the local point `q` is.
+    /// Maps the local point `q` into the frame.
     pub fn to_scene(&self, q: [f64; 2]) -> [f64; 2] {
         let (dx, dy) = (self.scale * (q[0] - self.centre[0]), self.scale * (q[1] - self.centre[1]));
         [
@@ -60,7 +60,7 @@ impl Placement {
         ]
     }
 
-    /// Which local point is at `p`.
+    /// Maps the point `p` of the frame to a local point.
     pub fn to_local(&self, p: [f64; 2]) -> [f64; 2] {
         let (dx, dy) = ((p[0] - self.origin[0]) / self.scale, (p[1] - self.origin[1]) / self.scale);
         [

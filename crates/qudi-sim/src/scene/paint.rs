@@ -4,7 +4,7 @@ use qudi_core::{Frame, Size};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
-/// What a layer looks like, in its own coordinates. Values stay in [0, 1].
+/// Surface of a layer in its own coordinates, with values in [0, 1].
 #[derive(Clone, Debug)]
 pub enum Paint {
     /// One value.
@@ -20,14 +20,14 @@ pub enum Paint {
         /// Phase in cycles.
         phase: f64,
     },
-    /// An image, mirrored at its borders, with halvings of it for when it is seen from afar.
+    /// An image, mirrored at its borders, with halved copies for small magnifications.
     Image(Arc<Vec<Frame>>),
     /// A resolution chart: star, bars, slanted edge and grey steps.
     Chart(Size),
 }
 
 impl Paint {
-    /// A picture as paint.
+    /// Creates the paint of a picture.
     pub fn image(frame: Frame) -> Self {
         let mut levels = vec![frame];
         while let Some(half) = halved(&levels[levels.len() - 1]) {
@@ -36,7 +36,7 @@ impl Paint {
         Self::Image(Arc::new(levels))
     }
 
-    /// Value at a local point seen at magnification `scale`.
+    /// Returns the value at a local point seen at magnification `scale`.
     pub(super) fn value(&self, [x, y]: [f64; 2], scale: f64) -> f32 {
         match self {
             Self::Flat(value) => *value,
@@ -54,7 +54,7 @@ impl Paint {
     }
 }
 
-/// Half the size by 2 x 2 means; none below 2 pixels.
+/// Halves the size by 2 x 2 means; `None` below 2 pixels.
 fn halved(frame: &Frame) -> Option<Frame> {
     let size = Size { height: frame.size.height / 2, width: frame.size.width / 2 };
     (size.height >= 2 && size.width >= 2).then(|| {
@@ -65,7 +65,7 @@ fn halved(frame: &Frame) -> Option<Frame> {
     })
 }
 
-/// Index of a mirrored signal of length `n` (no repeated border sample).
+/// Returns the index into a mirrored signal of length `n` (no repeated border sample).
 fn mirror(i: i64, n: usize) -> usize {
     if n == 1 {
         return 0;
@@ -75,7 +75,7 @@ fn mirror(i: i64, n: usize) -> usize {
     i.min(period - i) as usize
 }
 
-/// Catmull-Rom interpolation (Keys 1981, a = -1/2), clipped to [0, 1].
+/// Interpolates by Catmull-Rom splines (Keys 1981, a = -1/2), clipped to [0, 1].
 fn bicubic(frame: &Frame, x: f64, y: f64) -> f32 {
     let weights = |t: f64| {
         [
@@ -98,17 +98,17 @@ fn bicubic(frame: &Frame, x: f64, y: f64) -> f32 {
     sum.clamp(0.0, 1.0) as f32
 }
 
-/// Soft step one pixel wide around zero distance.
+/// Returns a soft step one pixel wide around zero distance.
 fn step(distance: f64) -> f64 {
     (0.5 + distance).clamp(0.0, 1.0)
 }
 
-/// Bars of a period in pixels, with soft edges.
+/// Draws bars of a period in pixels, with soft edges.
 fn bars(position: f64, period: f64) -> f64 {
     step(period / TAU * (TAU * position / period).sin())
 }
 
-/// The chart on a plane of `size`: drawn in units of the shorter side.
+/// Draws the chart on a plane of `size`, in units of the shorter side.
 fn chart(size: Size, x: f64, y: f64) -> f64 {
     let unit = size.height.min(size.width) as f64;
     let (dx, dy) = (x - 0.5 * (size.width - 1) as f64, y - 0.5 * (size.height - 1) as f64);

@@ -32,7 +32,7 @@ pub const PROCEDURAL: &[ProceduralScene] = &[
 ];
 
 impl ProceduralScene {
-    /// Name on the command line, after `scene:`.
+    /// Returns the name on the command line, after `scene:`.
     pub fn name(self) -> &'static str {
         match self {
             Self::DeadLeaves => "dead-leaves",
@@ -42,7 +42,7 @@ impl ProceduralScene {
         }
     }
 
-    /// The kind of this name.
+    /// Returns the kind of this name.
     pub fn by_name(name: &str) -> Option<Self> {
         PROCEDURAL.iter().copied().find(|kind| kind.name() == name)
     }
@@ -51,7 +51,7 @@ impl ProceduralScene {
 /// A procedural scene with all its parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Procedural {
-    /// What it shows.
+    /// Kind of the scene.
     pub kind: ProceduralScene,
     /// Frame size.
     pub size: Size,
@@ -62,7 +62,7 @@ pub struct Procedural {
 }
 
 impl Procedural {
-    /// The layers.
+    /// Creates the layers.
     pub fn scene(&self) -> Scene {
         let mut rng = Streams::new(self.seed).row(Domain::Scene, self.kind as u64, 0);
         let layers = match self.kind {
@@ -79,7 +79,7 @@ impl Procedural {
         (w, h, w.min(h))
     }
 
-    /// A velocity up to `self.speed`, in any direction.
+    /// Draws a velocity up to `self.speed`, in any direction.
     fn velocity(&self, rng: &mut impl Rng) -> [f64; 2] {
         let (angle, speed) = (TAU * uniform(rng), self.speed * uniform(rng).sqrt());
         [speed * angle.cos(), speed * angle.sin()]

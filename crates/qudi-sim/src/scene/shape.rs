@@ -2,7 +2,7 @@
 
 use super::font::Line;
 
-/// Where a layer is opaque, in its own coordinates.
+/// Outline of a layer in its own coordinates; it is opaque inside.
 #[derive(Clone, Debug)]
 pub enum Shape {
     /// No outline: the layer covers the plane.
@@ -26,7 +26,7 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Opacity in [0, 1] at a local point; `scale` is the magnification it is seen at.
+    /// Returns the opacity in [0, 1] at a local point, seen at magnification `scale`.
     pub(super) fn coverage(&self, [x, y]: [f64; 2], scale: f64) -> f32 {
         let inside = match self {
             Self::Everything => return 1.0,
@@ -39,7 +39,7 @@ impl Shape {
         (0.5 + inside * scale).clamp(0.0, 1.0) as f32
     }
 
-    /// Centre and radius of a circle around it; none if unbounded.
+    /// Returns centre and radius of a circle around it; `None` if unbounded.
     pub(super) fn bounds(&self) -> Option<([f64; 2], f64)> {
         match self {
             Self::Everything => None,

@@ -60,9 +60,9 @@ impl std::str::FromStr for StillMotion {
     }
 }
 
-/// The scene of a still under `motion`, in frames of `size` around its centre.
+/// Creates the scene of a still under `motion`, in frames of `size` around its centre.
 ///
-/// Beyond its borders the image goes on mirrored. The cut-outs of `layers` are drawn from `seed`;
+/// Beyond its borders the image is mirrored. The cut-outs of `layers` are drawn from `seed`;
 /// they move up to 2 pixels per frame faster than the pan.
 pub fn still_scene(image: Frame, motion: StillMotion, size: Size, seed: u64) -> Scene {
     let centre = [0.5 * (image.size.width as f64 - 1.0), 0.5 * (image.size.height as f64 - 1.0)];
@@ -88,7 +88,7 @@ pub fn still_scene(image: Frame, motion: StillMotion, size: Size, seed: u64) -> 
         let radius = w.min(h) * (0.06 + 0.14 * uniform(&mut rng));
         let (angle, speed) = (TAU * uniform(&mut rng), 2.0 * uniform(&mut rng));
         let velocity = [motion.pan[0] + speed * angle.cos(), motion.pan[1] + speed * angle.sin()];
-        // What the disc shows comes from elsewhere in the image.
+        // The disc shows another part of the image.
         let from = [w * (uniform(&mut rng) - 0.5), h * (uniform(&mut rng) - 0.5)];
         let source = [at[0] + from[0], at[1] + from[1]];
         layers.push(Layer {

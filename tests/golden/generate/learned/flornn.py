@@ -111,7 +111,7 @@ class Decoder(nn.Module):
         self.features = size
 
     def forward(self, first: Tensor, second: Tensor, before: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-        """Flow and features, from those of the coarser level."""
+        """Flow and features from the coarser level."""
         if before is None:
             features = F.leaky_relu(correlation(first, second), 0.1)
         else:

@@ -283,7 +283,7 @@ class Quiver(nn.Module):
 
 
 def gradient_loss(x: Tensor, y: Tensor) -> Tensor:
-    """Mean |x - y|, and half of that of both Sobel derivatives, borders left out; images [N, 1, H, W]."""
+    """Mean |x - y|, and half the same of both Sobel derivatives, borders left out; images [N, 1, H, W]."""
     sobel = torch.tensor([[1, 0, -1], [2, 0, -2], [1, 0, -1]]).to(x)
     kernels = torch.stack([sobel, sobel.T])[:, None]
     slopes = (F.conv2d(x, kernels) - F.conv2d(y, kernels)).abs().mean((0, 2, 3))

@@ -49,7 +49,7 @@ def regions(size: int, window: int, shift: int) -> Tensor:
 
 
 def windows(x: Tensor, sizes: Sizes) -> Tensor:
-    """[B, D, H, W, C] to [windows, cells of one, C], whose order is that of the image."""
+    """[B, D, H, W, C] to [windows, cells of one, C], in the order of the image."""
     b, d, h, w, c = x.shape
     x = x.view(b, d // sizes[0], sizes[0], h // sizes[1], sizes[1], w // sizes[2], sizes[2], c)
     return x.permute(0, 1, 3, 5, 2, 4, 6, 7).reshape(-1, math.prod(sizes), c)
@@ -234,7 +234,7 @@ class Rvrt(nn.Module):
         middle: int = 64,
         levels: int = 6,
     ):
-        """`blocks` are those of a propagation; the first stage and the last one have one each."""
+        """`blocks` belong to a propagation; the first stage and the last one have one each."""
         super().__init__()
         wide = features, heads
         flat, deep = (1, window, window), (2, window, window)

@@ -120,7 +120,7 @@ class Extractor(nn.Module):
 
 
 class Cascade(nn.Module):
-    """Features of a neighbour, aligned to those of the key block, from three levels of both."""
+    """Features of a neighbour, aligned to the features of the key block, from three levels of both."""
 
     def __init__(self, features: int, groups: int) -> None:
         super().__init__()

@@ -94,7 +94,7 @@ def reconstruction(result: dict[str, Tensor], truth: Tensor, iteration: int) -> 
 
 
 def match(student: dict[str, Tensor], teacher: dict[str, Tensor]) -> Tensor:
-    """How far features of the student are from those of a teacher, which is constant."""
+    """Distance of features of the student to the features of a teacher, which is constant."""
     return sum(F.mse_loss(student[key], teacher[key].detach()) for key in ("extracted", "bottom"))
 
 

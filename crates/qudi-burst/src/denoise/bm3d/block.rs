@@ -1,8 +1,8 @@
 //! 8 x 8 blocks in registers, and the orthonormal or unit-norm transforms of BM3D on them.
 //!
-//! A block is eight rows of eight lanes. A 2-D transform works down the columns, transposes, and
-//! works down them again, so coefficients lie transposed; every coefficient is treated alike, and
-//! the inverse turns them back.
+//! A block is eight rows of eight lanes. A 2-D transform works down the columns, transposes, and works down
+//! them again, so the coefficients are stored transposed. All coefficients are treated alike, and the inverse
+//! transposes them back.
 
 use wide::f32x8;
 
@@ -15,10 +15,10 @@ pub(crate) type Block = [f32x8; BLOCK];
 /// A 2-D transform and its inverse.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Transform {
-    /// Biorthogonal wavelets 1.5 over three levels, periodic, each row of unit norm: the same noise
-    /// in every coefficient.
+    /// Biorthogonal wavelet 1.5 over three levels, periodic. Each row has unit norm, so that every
+    /// coefficient has the same noise.
     Bior,
-    /// Discrete cosines.
+    /// Discrete cosine transform.
     Dct,
 }
 
@@ -44,7 +44,7 @@ impl Transform {
     }
 }
 
-/// The block of `image` (rows of `width`) whose corner is at offset `at`.
+/// Loads the block of `image` (rows of `width`) whose corner is at offset `at`.
 #[inline]
 pub(crate) fn load(image: &[f32], width: usize, at: usize) -> Block {
     std::array::from_fn(|r| {
@@ -62,7 +62,7 @@ pub(crate) fn add_row(samples: &mut [f32], row: f32x8) {
     samples.copy_from_slice(&(f32x8::new(sum) + row).to_array());
 }
 
-/// 1-D Haar transform across `group`, whose length is a power of two, in place and orthonormal.
+/// Applies the orthonormal 1-D Haar transform across `group`, whose length is a power of two, in place.
 #[inline]
 pub(crate) fn haar(group: &mut [Block]) {
     let n = group.len();
@@ -75,7 +75,7 @@ pub(crate) fn haar(group: &mut [Block]) {
     }
 }
 
-/// The inverse of [`haar`].
+/// Applies the inverse of [`haar`] in place.
 #[inline]
 pub(crate) fn inverse_haar(group: &mut [Block]) {
     let n = group.len();
@@ -88,7 +88,7 @@ pub(crate) fn inverse_haar(group: &mut [Block]) {
     }
 }
 
-/// Sum and difference over the root of two: its own inverse.
+/// Replaces two blocks by their sum and difference over the square root of two; its own inverse.
 #[inline]
 fn butterfly(group: &mut [Block], i: usize, j: usize) {
     const ROOT: f32 = std::f32::consts::FRAC_1_SQRT_2;
@@ -100,9 +100,9 @@ fn butterfly(group: &mut [Block], i: usize, j: usize) {
     }
 }
 
-/// Lifting step of the wavelet: the outer taps of its low-pass filter, 11/64 of the neighbouring
-/// details. The outermost pair (3/128) meets itself with the other sign on a period of 8, as
-/// all of them do at the coarser levels, which are Haar's.
+/// Lifting coefficient of the wavelet: the outer taps of its low-pass filter, 11/64 of the neighbouring
+/// details. On a period of 8 the outermost pair (3/128) cancels itself, as all outer taps do at the coarser
+/// levels, which are Haar's.
 const LIFT: f32 = 11.0 / 64.0;
 
 /// Norms that the lifting leaves: of the two details of level 2, and of the detail of level 3.
@@ -239,7 +239,8 @@ mod tests {
         }
     }
 
-    /// Every coefficient of white noise has the noise's variance: rows of the 1-D matrix have norm 1.
+    /// Checks that rows of the 1-D matrices have norm 1, so that coefficients of white noise keep its
+    /// variance.
     #[test]
     fn rows_have_unit_norm_and_cosines_are_cosines() {
         for (step, name) in [(bior as fn(&mut Block), "bior"), (dct, "dct")] {

@@ -1,19 +1,20 @@
-//! What happens to a group of similar blocks in the transform domain.
+//! Filters of a group of similar blocks in the transform domain.
 
 use super::block::{Block, Transform, haar, inverse_haar};
 use wide::f32x8;
 
-/// How coefficients are shrunk.
+/// Shrinkage of coefficients.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Filter {
-    /// Coefficients below this are cut (eq. 4).
+    /// Sets coefficients below this threshold to zero (eq. 4).
     Cut(f32),
-    /// Multiplied by `b^2 / (b^2 + variance)`, `b` the coefficient of the basic estimate (eq. 8).
+    /// Multiplies coefficients by `b^2 / (b^2 + variance)`, where `b` is the basic estimate's coefficient
+    /// (eq. 8).
     Wiener(f32),
 }
 
 impl Filter {
-    /// The 2-D transform of the pass (section IV-B).
+    /// Returns the 2-D transform of the pass (section IV-B).
     pub(crate) fn transform(self) -> Transform {
         match self {
             Self::Cut(_) => Transform::Bior,
@@ -21,12 +22,12 @@ impl Filter {
         }
     }
 
-    /// Filters `noisy`, a power of two of transformed blocks; `basic` holds the same blocks of the
-    /// basic estimate. Returns the group's weight: the inverse of the variance that is left
-    /// (eqs. 10 and 11).
+    /// Filters `noisy`, transformed blocks whose number is a power of two. `basic` holds the same blocks of
+    /// the basic estimate. Returns the weight of the group: the inverse of its remaining noise variance (eqs.
+    /// 10 and 11).
     pub(crate) fn apply(self, noisy: &mut [Block], basic: &mut [Block]) -> f32 {
         haar(noisy);
-        // The group's mean stays, however dark.
+        // The group's mean is kept, however dark it is.
         let mean = noisy[0][0].to_array()[0];
         let weight = match self {
             Self::Cut(threshold) => cut(noisy, threshold),

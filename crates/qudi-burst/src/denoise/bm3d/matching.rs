@@ -1,23 +1,23 @@
-//! Block matching: for every reference block of a row, the most similar blocks around it.
+//! Block matching: finds the blocks most similar to each reference block of a row.
 //!
-//! All reference blocks of a row are compared with their neighbours at one displacement at a time.
-//! Squared differences are summed down the columns of the eight rows once, and blocks are sums of
-//! eight neighbouring columns: a third of the work of comparing block by block, and along rows.
+//! All reference blocks of a row are compared with their neighbours at one displacement at a time. Squared
+//! differences are summed down the columns of the eight rows once, and a block's sum adds eight neighbouring
+//! columns. This takes a third of the work of comparing block by block, and runs along rows.
 
 use super::block::BLOCK;
 use multiversion::multiversion;
 use qudi_core::Size;
 
-/// Where similar blocks are looked for, and which count as similar.
+/// Search region and similarity criterion of block matching.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Search {
-    /// Pixels between reference blocks.
+    /// Step between reference blocks, in pixels.
     pub(crate) step: usize,
-    /// Largest displacement in pixels, in x and in y.
+    /// Maximum displacement in x and in y, in pixels.
     pub(crate) radius: usize,
-    /// Blocks in a group at most; the reference block is one of them.
-    pub(crate) most: usize,
-    /// Mean squared difference that similar blocks stay below.
+    /// Maximum number of blocks in a group, including the reference block.
+    pub(crate) max_blocks: usize,
+    /// Upper bound of the mean squared difference of similar blocks.
     pub(crate) threshold: f32,
 }
 
@@ -30,7 +30,7 @@ pub(crate) struct Match {
     pub(crate) at: u32,
 }
 
-/// Finds groups row by row; keeps its buffers.
+/// Matcher that finds groups row by row and reuses its buffers.
 #[derive(Debug, Default)]
 pub(crate) struct Matcher {
     columns: Vec<f32>,
@@ -42,8 +42,8 @@ pub(crate) struct Matcher {
 }
 
 impl Matcher {
-    /// Groups of the reference blocks with corners at row `y` and columns `xs` (rising), each
-    /// sorted by distance, the block itself first.
+    /// Returns the groups of the reference blocks with corners at row `y` and columns `xs` (ascending). Each
+    /// group is sorted by distance, and the reference block comes first.
     pub(crate) fn groups(
         &mut self,
         image: &[f32],
@@ -59,10 +59,11 @@ impl Matcher {
             group.push(Match { distance: 0.0, at: (y * width + x) as u32 });
         }
         self.bounds.clear();
-        let bound = if search.most > 1 { search.threshold * (BLOCK * BLOCK) as f32 } else { 0.0 };
+        let bound =
+            if search.max_blocks > 1 { search.threshold * (BLOCK * BLOCK) as f32 } else { 0.0 };
         self.bounds.resize(xs.len(), bound);
         let reach = search.radius as isize;
-        // From the middle outwards: the best blocks tend to be near, and bounds fall soon.
+        // From the middle outwards: the best blocks tend to be near, so the bounds fall soon.
         let outwards = || (0..=2 * reach).map(|k| if k % 2 == 0 { -k / 2 } else { (k + 1) / 2 });
         for dy in outwards() {
             let Some(other) = y.checked_add_signed(dy).filter(|other| other + BLOCK <= height)
@@ -77,15 +78,15 @@ impl Matcher {
                 };
                 if last >= 0 {
                     self.compare(image, width, [y, other], first, last as usize + BLOCK, dx);
-                    self.collect(first, last as usize, other * width, xs, dx, search.most);
+                    self.collect(first, last as usize, other * width, xs, dx, search.max_blocks);
                 }
             }
         }
         &self.groups
     }
 
-    /// Fills `columns` with eight-row sums of squared differences from column `first` on, and
-    /// `columns` thereafter with sums over eight of them.
+    /// Computes the squared differences of blocks at displacement `dx`. `columns` receives the sums over
+    /// eight rows and eight columns, starting with column `first`.
     fn compare(
         &mut self,
         image: &[f32],
@@ -109,7 +110,8 @@ impl Matcher {
         sum_neighbours(&self.fours[..n - 3], 4, &mut self.columns[..n - 7]);
     }
 
-    /// Lets the blocks at displacement `dx`, compared just now, into their groups.
+    /// Inserts the blocks at displacement `dx` into their groups; [`Self::compare`] must have computed their
+    /// distances.
     fn collect(
         &mut self,
         first: usize,
@@ -117,29 +119,29 @@ impl Matcher {
         row: usize,
         xs: &[usize],
         dx: isize,
-        most: usize,
+        max_blocks: usize,
     ) {
         let inside = xs.partition_point(|&x| x < first)..xs.partition_point(|&x| x <= first + last);
         for i in inside {
             let distance = self.columns[xs[i] - first];
             if distance < self.bounds[i] {
                 let group = &mut self.groups[i];
-                if group.len() == most {
+                if group.len() == max_blocks {
                     group.pop();
                 }
                 let at = (row + xs[i].wrapping_add_signed(dx)) as u32;
-                // The reference block stays first, also among equals.
+                // The reference block stays first, also among equal blocks.
                 let place = 1 + group[1..].partition_point(|other| other.distance <= distance);
                 group.insert(place, Match { distance, at });
-                if group.len() == most {
-                    self.bounds[i] = group[most - 1].distance;
+                if group.len() == max_blocks {
+                    self.bounds[i] = group[max_blocks - 1].distance;
                 }
             }
         }
     }
 }
 
-/// `out[x]` is the sum over eight rows of the squared differences at column `x`.
+/// Computes `out[x]`, the sum over eight rows of the squared differences at column `x`.
 #[multiversion(targets("x86_64+avx2"))]
 fn square_differences(a: [&[f32]; BLOCK], b: [&[f32]; BLOCK], out: &mut [f32]) {
     let n = out.len();
@@ -155,7 +157,7 @@ fn square_differences(a: [&[f32]; BLOCK], b: [&[f32]; BLOCK], out: &mut [f32]) {
     }
 }
 
-/// `out[x] = sums[x] + sums[x + step]`.
+/// Computes `out[x] = sums[x] + sums[x + step]`.
 #[multiversion(targets("x86_64+avx2"))]
 fn sum_neighbours(sums: &[f32], step: usize, out: &mut [f32]) {
     for ((out, a), b) in out.iter_mut().zip(sums).zip(&sums[step..]) {
@@ -167,7 +169,7 @@ fn sum_neighbours(sums: &[f32], step: usize, out: &mut [f32]) {
 mod tests {
     use super::*;
 
-    /// Against the definition, block by block, at every border and with a full group.
+    /// Compares block matching with an exhaustive search, at every border and with a full group.
     #[test]
     fn block_matching_equals_exhaustive_search() {
         let size = Size { height: 23, width: 30 };
@@ -176,7 +178,7 @@ mod tests {
         let xs: Vec<usize> = (0..=22).step_by(3).chain([22]).collect();
         let mut matcher = Matcher::default();
         for y in [0, 6, 15] {
-            let search = Search { step: 3, radius: 9, most: 6, threshold: 2500.0 };
+            let search = Search { step: 3, radius: 9, max_blocks: 6, threshold: 2500.0 };
             let groups = matcher.groups(&image, size, y, &xs, search).to_vec();
             for (&x, group) in xs.iter().zip(&groups) {
                 let mut expected = Vec::new();
@@ -201,7 +203,7 @@ mod tests {
         }
     }
 
-    /// A texture repeated 5 columns and 3 rows away is found there.
+    /// Checks that a texture repeated 5 columns and 3 rows away is found there.
     #[test]
     fn known_shifts_are_found() {
         let size = Size { height: 32, width: 40 };
@@ -211,7 +213,7 @@ mod tests {
             image[(12 + 3 + r) * 40 + 15 + 5 + c] = 1000.0 + (r * 8 + c) as f32;
             image[(4 + r) * 40 + 4 + c] = 1000.0 + (r * 8 + c) as f32;
         }
-        let search = Search { step: 3, radius: 19, most: 2, threshold: 1.0 };
+        let search = Search { step: 3, radius: 19, max_blocks: 2, threshold: 1.0 };
         let groups = Matcher::default().groups(&image, size, 4, &[4], search).to_vec();
         assert_eq!(groups[0].len(), 2);
         assert_eq!(groups[0][1], Match { distance: 0.0, at: 15 * 40 + 20 });

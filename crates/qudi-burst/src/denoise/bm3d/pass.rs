@@ -1,7 +1,7 @@
-//! One pass over the image: groups, filter, and the weighted mean of overlapping estimates.
+//! One pass of BM3D over the image: grouping, filtering, and the weighted mean of overlapping estimates.
 //!
-//! Strips of rows are worked on in parallel, each into buffers of its own, which are added up in
-//! their order: the same sums on any number of threads.
+//! Strips of rows are processed in parallel, each into its own buffers. The buffers are added in order, so
+//! the sums are the same with any number of threads.
 
 use super::block::{BLOCK, Block, add_row, load};
 use super::filter::Filter;
@@ -10,13 +10,14 @@ use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 use wide::f32x8;
 
-/// Rows of reference blocks in a strip. Part of the result's rounding, so not of the machine.
-const STRIP: usize = 8;
+/// Rows of reference blocks in a strip. It affects the rounding of the result, so it does not depend on the
+/// machine.
+const STRIP_ROWS: usize = 8;
 
-/// Blocks of the largest group.
-const LARGEST: usize = 32;
+/// Maximum number of blocks in a group.
+const MAX_GROUP_SIZE: usize = 32;
 
-/// Kaiser's window of 8 samples with beta = 2, which weighs the pixels of a block (section IV-B):
+/// Kaiser window of 8 samples with beta = 2, the weights of a block's pixels (section IV-B):
 /// `I0(2 sqrt(1 - (2k/7 - 1)^2)) / I0(2)`.
 const KAISER: [f32; BLOCK] = [
     0.438_676_3,
@@ -35,7 +36,7 @@ pub(crate) fn pass(noisy: &Frame, guide: &Frame, search: Search, filter: Filter)
     let rows = corners(size.height, search.step);
     let columns = corners(size.width, search.step);
     let strips: Vec<Strip> = rows
-        .par_chunks(STRIP)
+        .par_chunks(STRIP_ROWS)
         .map(|rows| {
             let mut strip = Strip::new(size, rows, search.radius);
             let mut matcher = Matcher::default();
@@ -63,16 +64,17 @@ pub(crate) fn pass(noisy: &Frame, guide: &Frame, search: Search, filter: Filter)
     Frame { size, data }
 }
 
-/// Corners of reference blocks along a side of `length`, `step` apart, the last one at its end.
+/// Returns the corners of reference blocks along a side of `length` pixels, `step` apart, the last one at its
+/// end.
 fn corners(length: usize, step: usize) -> Vec<usize> {
     let last = length - BLOCK;
     (0..last).step_by(step).chain([last]).collect()
 }
 
-/// Estimates of some rows of reference blocks.
+/// Estimates of a strip of reference blocks.
 struct Strip {
     width: usize,
-    /// First image row that they reach.
+    /// First image row of the strip.
     first: usize,
     sums: Vec<f32>,
     weights: Vec<f32>,
@@ -88,9 +90,9 @@ impl Strip {
 
     /// Filters one group and adds its blocks.
     fn filter(&mut self, noisy: &Frame, guide: &Frame, group: &[Match], filter: Filter) {
-        let mut noisy_blocks: [Block; LARGEST] = [[f32x8::ZERO; BLOCK]; LARGEST];
-        let mut guide_blocks: [Block; LARGEST] = [[f32x8::ZERO; BLOCK]; LARGEST];
-        // Haar's transform takes powers of two.
+        let mut noisy_blocks: [Block; MAX_GROUP_SIZE] = [[f32x8::ZERO; BLOCK]; MAX_GROUP_SIZE];
+        let mut guide_blocks: [Block; MAX_GROUP_SIZE] = [[f32x8::ZERO; BLOCK]; MAX_GROUP_SIZE];
+        // Haar's transform needs a power of two.
         let n = 1 << group.len().ilog2();
         let transform = filter.transform();
         for (block, similar) in noisy_blocks.iter_mut().zip(&group[..n]) {

@@ -96,7 +96,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
     let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
     write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
-    let mut watch = Watch::new(recipe, folder, report)?;
+    let mut watch = Watch::new(recipe, folder, report);
     let learnt =
         device::guarded("training", || run.learn(plan.workers, &mut |event| watch.event(&event)));
     let [step, steps] = run.progress();

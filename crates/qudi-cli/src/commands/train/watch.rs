@@ -1,7 +1,6 @@
-//! Watching a run: progress, pictures, event file, report.
+//! Watching a run: progress, pictures, report.
 
 use super::environment::ENVIRONMENT;
-use super::events::EventFile;
 use super::pictures::strip;
 use super::report::{Source, page};
 use crate::error::{CliError, Result};
@@ -32,7 +31,6 @@ pub(crate) struct Watch<'a> {
     steps: u64,
     samples: f64,
     bar: Bar,
-    events: EventFile,
     start: Instant,
     taken: u64,
     /// Of the last step; averaged, single ones jump.
@@ -42,9 +40,8 @@ pub(crate) struct Watch<'a> {
 }
 
 impl<'a> Watch<'a> {
-    pub(crate) fn new(recipe: &Recipe, folder: &'a Path, report: &'a Report) -> Result<Self> {
-        Ok(Self {
-            events: EventFile::create(folder)?,
+    pub(crate) fn new(recipe: &Recipe, folder: &'a Path, report: &'a Report) -> Self {
+        Self {
             report,
             folder,
             steps: recipe.train.steps,
@@ -55,12 +52,15 @@ impl<'a> Watch<'a> {
             loss: None,
             last: None,
             error: None,
-        })
+        }
     }
 
     pub(crate) fn event(&mut self, event: &Event<'_>) -> ControlFlow<()> {
         let shown = match event {
-            Event::Step(step) => self.step(step),
+            Event::Step(step) => {
+                self.step(step);
+                Ok(())
+            }
             Event::Validation(validation) => self.validation(validation),
             Event::Saved(_) => Ok(()),
         };
@@ -70,19 +70,13 @@ impl<'a> Watch<'a> {
         if self.error.is_some() { ControlFlow::Break(()) } else { interrupt::check() }
     }
 
-    fn step(&mut self, step: &StepReport) -> Result<()> {
+    fn step(&mut self, step: &StepReport) {
         self.taken += 1;
         let loss = self.loss.map_or(step.loss.total, |loss| 0.98 * loss + 0.02 * step.loss.total);
         self.loss = Some(loss);
         let rate = self.samples * self.taken as f64 / self.start.elapsed().as_secs_f64();
         let text = format!("loss {loss:.5} rate {:.1e} {rate:.2} samples/s", step.lr);
         self.bar.learning(text, step.step, self.steps);
-        let scalar = |tag: &str, value: f64| (tag.to_owned(), value);
-        let mut scalars = vec![scalar("loss/total", step.loss.total)];
-        let terms = step.loss.terms.iter();
-        scalars.extend(terms.map(|(name, value)| (format!("loss/{name}"), *value)));
-        scalars.extend([scalar("train/rate", step.lr), scalar("train/norm", step.norm)]);
-        self.events.scalars(step.step, &scalars)
     }
 
     /// The last validation, or what went wrong while watching.
@@ -105,11 +99,6 @@ impl<'a> Watch<'a> {
         );
         self.bar.above(&text, self.report);
         self.last = Some(validation.clone());
-        let scalars = validation.means().into_iter().flat_map(|(ppp, [psnr_a, psnr, ssim])| {
-            let named = [("psnr-a", psnr_a), ("psnr", psnr), ("ssim", ssim)];
-            named.map(|(name, value)| (format!("validation/{name} at {ppp} PPP"), value))
-        });
-        self.events.scalars(validation.step, &scalars.collect::<Vec<_>>())?;
         let folder = self.folder.join(SAMPLES);
         let made = std::fs::create_dir_all(&folder);
         made.map_err(|e| Error::io("make the folder of pictures", &folder, e))?;
