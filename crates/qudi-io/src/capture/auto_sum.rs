@@ -36,9 +36,9 @@ pub struct SumChoice {
     pub frames: u32,
     /// Detections per pixel and native frame.
     pub detections: f64,
-    /// Pixels that the scene moves per native frame; an upper bound if it seems to stand still.
+    /// Pixels that the scene moves per native frame; an upper bound if no motion is seen.
     pub motion: f64,
-    /// True if the scene seems to stand still.
+    /// True if no motion is seen.
     pub still: bool,
     /// Limit of the sum.
     pub limit: SumLimit,

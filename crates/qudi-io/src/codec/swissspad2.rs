@@ -13,7 +13,7 @@ use crate::recognition::{ByteKind, Convention, Probe, SWISSSPAD_FILE_BYTES};
 use qudi_core::Result;
 use qudi_core::Size;
 
-pub(crate) const HALF: Format = Format {
+pub(crate) const HALF_ARRAY: Format = Format {
     name: "swissspad2",
     title: "SwissSPAD2 raw files, half array",
     options: super::BIT_FILE_OPTIONS,
@@ -23,7 +23,7 @@ pub(crate) const HALF: Format = Format {
     },
 };
 
-pub(crate) const FULL: Format = Format {
+pub(crate) const FULL_ARRAY: Format = Format {
     name: "swissspad2-full",
     title: "SwissSPAD2 raw files, full array",
     options: super::BIT_FILE_OPTIONS,

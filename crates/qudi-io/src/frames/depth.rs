@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 pub(crate) struct DepthChecked {
     inner: Box<dyn CountFrames>,
     max_count: u16,
-    /// Source of the depth, as in "`bits`" or "the record beside it".
+    /// Source of the depth, as in "`bits`" or "the file itself".
     source: &'static str,
     path: PathBuf,
 }

@@ -32,7 +32,7 @@ fn sums(scene: &str, seed: u64, ppp: f64, lengths: &[u64]) -> Vec<(u64, Vec<u32>
     found
 }
 
-/// The same bits, unpacked in the other order.
+/// Reverses the order of the bits of every byte.
 fn reversed(sums: &[u32]) -> Vec<u32> {
     sums.chunks(8).flat_map(|eight| eight.iter().rev().copied()).collect()
 }

@@ -114,7 +114,7 @@ pub(crate) fn run(
     })
 }
 
-/// Returns the sensor to start from, and its name for `base` if it is a preset.
+/// The sensor to start from, and its name for `base` if it is a preset.
 fn base_sensor(
     args: &Calibrate,
     settings: &Settings,
@@ -126,7 +126,7 @@ fn base_sensor(
         let sensor = required_sensor(capture)?;
         (sensor.name.clone(), settings.adjusted(sensor)?)
     };
-    // The name of a changed preset cannot be the base.
+    // A preset with changes has no name to build on.
     let preset = preset(&name).is_some() && !settings.overrides_sensor();
     Ok((preset.then_some(name), sensor))
 }
@@ -182,7 +182,7 @@ fn document(
         changes(&mut text);
         return text;
     }
-    // A sensor file of the user: all its settings, then the measured ones.
+    // A sensor of the user's own: everything it says, then what was measured.
     let mut own = sensor.clone();
     own.name = stem.into_owned();
     own.dark = DarkRate::PerFrame(calibration.bulk);

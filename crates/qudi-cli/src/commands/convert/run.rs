@@ -76,7 +76,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
 }
 
-/// Opens the capture, from a file or a pipe, summed as asked.
+/// The capture, from a file or a pipe, summed as asked.
 fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
     let capture = if is_pipe(&args.capture) {
         refuse_terminal("cat burst.npy | qudi convert - -o out.tif")?;
@@ -90,7 +90,7 @@ fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
     }
 }
 
-/// Copies frames without unpacking them: all, or none.
+/// Frames copied without unpacking them: all, or none.
 fn copy_packed(
     capture: &mut Capture,
     format: BurstFormat,
@@ -143,7 +143,7 @@ fn conversion(
     })
 }
 
-/// Returns the largest possible count: known, or the largest value of the sample type that the counts need.
+/// The largest count that can appear: known, or that of the sample type needed for what is there.
 fn largest_count(capture: &mut Capture, args: &Convert) -> Result<u16> {
     if let Some(max) = capture.max_count() {
         return Ok(max);

@@ -1,4 +1,4 @@
-//! `qudi info CAPTURE`: the format, its certainty, and the contents.
+//! `qudi info CAPTURE`: what it is, how sure that is, and what is in it.
 
 use super::args::Info;
 use super::record::{origin, record_document};
@@ -20,13 +20,13 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-/// Width of the histogram's bars in characters.
-const BAR_WIDTH: usize = 40;
+/// Columns of the histogram's bars.
+const BAR: usize = 40;
 
 /// Counts shown in the histogram; more are grouped.
 const BINS: usize = 8;
 
-/// Describes a capture; `record` is the record next to it, with its path.
+/// `record` is the record beside it, and where that lies.
 pub(crate) fn run(
     path: &Path,
     record: Option<&(Sidecar, PathBuf)>,
@@ -201,7 +201,7 @@ fn histogram(text: &mut String, histogram: &[u64]) {
         let (low, high) = (i * width, ((i + 1) * width - 1).min(histogram.len() - 1));
         let label = if low == high { format!("{low}") } else { format!("{low}-{high}") };
         let key = if i == 0 { "counts" } else { "" };
-        let bar = "#".repeat((bin as f64 / most as f64 * BAR_WIDTH as f64).round() as usize);
+        let bar = "#".repeat((bin as f64 / most as f64 * BAR as f64).round() as usize);
         let percent = 100.0 * bin as f64 / total.max(1) as f64;
         let _ = writeln!(text, "{key:<11}{label:>11} {percent:>7.3} % {bar}");
     }

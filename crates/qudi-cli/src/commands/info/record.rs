@@ -1,11 +1,11 @@
-//! Records of bursts: the origin of a burst, and how to make it again.
+//! Records of bursts: where a burst comes from, and how to make it again.
 
 use qudi_io::sidecar::Sidecar;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::Path;
 
-/// Returns the record as a JSON document.
+/// The record as a JSON document.
 pub(crate) fn record_document(record: &Sidecar) -> Value {
     match record {
         Sidecar::Simulated(record) => json!(record),
@@ -13,7 +13,7 @@ pub(crate) fn record_document(record: &Sidecar) -> Value {
     }
 }
 
-/// Describes the origin of a burst, and how to make it again.
+/// Where a burst comes from, and how to make it again.
 pub(crate) fn origin(record: &Sidecar, path: &Path) -> String {
     let mut text = String::new();
     let mut line = |key: &str, value: String| {

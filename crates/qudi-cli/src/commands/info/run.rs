@@ -109,7 +109,7 @@ fn sensors(report: &Report) -> Result<()> {
     report.result(&text, || json!(sensors))
 }
 
-/// Describes a weight file by its own description.
+/// A weight file, as it describes itself.
 fn weights(weights: &Weights, report: &Report) -> Result<()> {
     let d = weights.describe()?;
     let sizes = d.network.parameters(&Device::flex());
@@ -128,7 +128,7 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
     report.result(&to_text(&lines), || json!(weights.describe().ok()))
 }
 
-/// Returns lines on the training of weights.
+/// What weights were trained on.
 fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
     let commit = p.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}"));
     let [least, most] = p.ppp;
@@ -141,7 +141,7 @@ fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
     ]
 }
 
-/// Formats lines of keys and values.
+/// Lines of keys and values.
 fn to_text(lines: &[(&str, String)]) -> String {
     let mut text = String::new();
     for (key, value) in lines {
@@ -150,7 +150,7 @@ fn to_text(lines: &[(&str, String)]) -> String {
     text
 }
 
-/// Describes a weight file of a learned method of others.
+/// A weight file of a learned method of others.
 fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
     let Contents { method, sizes, parameters, description } = contents;
     let sha256 = Weights::File(path.to_owned()).sha256()?;
@@ -187,7 +187,7 @@ fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {
     report.result(&text, || json!(sensor))
 }
 
-/// Describes a record without its burst.
+/// A record, without its burst.
 fn burst(path: &Path, report: &Report) -> Result<()> {
     let record = Sidecar::load(path)?;
     let burst = match &record {
@@ -204,7 +204,7 @@ fn burst(path: &Path, report: &Report) -> Result<()> {
     report.result(&(text + &origin(&record, path)), || record_document(&record))
 }
 
-/// Lists the formats that captures are read from.
+/// The formats that captures are read from.
 fn formats(report: &Report) -> Result<()> {
     let width = FORMATS.iter().map(|format| format.name.len()).max().unwrap_or(0) + 2;
     let lines: Vec<String> =

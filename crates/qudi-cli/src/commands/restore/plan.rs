@@ -36,7 +36,7 @@ pub(super) struct Plan {
     pub(super) light: LightOverrides,
     /// `--seed`, if given.
     pub(super) seed_flag: Option<&'static str>,
-    /// Name of the method, unless the capture decides.
+    /// The method by name, unless the capture decides.
     pub(super) method: Option<String>,
     pub(super) network: NetworkOptions,
     /// Frames that neighbouring windows share.

@@ -31,7 +31,7 @@ use std::path::Path;
 use std::rc::Rc;
 use std::time::Instant;
 
-/// Least seconds of a run whose duration is forecast.
+/// Seconds from which on it is said beforehand how long a run takes.
 const LONG_RUN: f64 = 300.0;
 
 pub(crate) fn run(
@@ -57,8 +57,8 @@ pub(crate) fn run(
         let sink = Sink::new(&mut output, Some(&mut map), &mut uncertainty);
         job.run(rest, sink, &plan.network, report)?;
     } else {
-        // Frames of an interrupted run are measured in the same order, after the rest is restored, so that a
-        // run that keeps being killed makes progress.
+        // Frames of an interrupted run are measured with the others, in the same order; but after
+        // the rest is made, so that a run that keeps being killed still gets on.
         let sink = Sink::new(&mut output, None, &mut uncertainty);
         job.run(rest, sink, &plan.network, report)?;
         output.measure_finished(&mut map, &mut job.aligned.capture, &job.schedule, part.clone())?;
@@ -103,16 +103,16 @@ pub(crate) fn run(
     })
 }
 
-/// The values of a run: a capture and its acquisition, the method, and the pictures that it makes.
+/// What a run needs: a capture and its acquisition, the method, and the pictures that it makes.
 struct Job {
     aligned: AlignedCapture,
     acquisition: Acquisition,
     light_source: &'static str,
     restorer: Box<dyn Restorer>,
-    /// Settings that the method chose for this capture.
+    /// What the method chose for this capture.
     choice: String,
     schedule: Schedule,
-    /// Warnings about the result.
+    /// What makes the result doubtful.
     warnings: Vec<String>,
 }
 
@@ -189,7 +189,7 @@ impl Job {
         Ok(settings)
     }
 
-    /// Returns the entries of an output folder's manifest. Weights are in the settings by their SHA-256.
+    /// The entries of the manifest of an output folder. Weights are among the settings by their SHA-256.
     fn folder_run(&self, plan: &Plan, settings: &Value) -> Result<FolderRun> {
         let mut inputs = Inputs::default();
         let to_folder = Path::new(&plan.output).extension().is_none() && plan.output != "-";
@@ -216,12 +216,12 @@ impl Job {
 
     fn run(
         &mut self,
-        pictures: Range<u64>,
+        wanted: Range<u64>,
         mut sink: Sink<'_>,
         network: &NetworkOptions,
         report: &Report,
     ) -> Result<()> {
-        if pictures.is_empty() {
+        if wanted.is_empty() {
             return Ok(());
         }
         let bar = Rc::new(RefCell::new(report.bar()));
@@ -246,7 +246,7 @@ impl Job {
         let run = || {
             observed(observer, || {
                 let on = &mut progress;
-                run_method(restorer, capture, schedule, pictures, acquisition, &mut sink, on)
+                run_method(restorer, capture, schedule, wanted, acquisition, &mut sink, on)
             })
         };
         if is_network {
@@ -258,8 +258,7 @@ impl Job {
     }
 }
 
-/// Makes the restorer of the method that is named, or of the usual one, and says what it chose for this
-/// capture.
+/// Makes the restorer of the method that is named, or of the usual one, and says what it chose for this capture.
 fn restorer(
     plan: &Plan,
     aligned: &mut AlignedCapture,
@@ -292,7 +291,7 @@ fn announced_method(
     Ok(usual.name)
 }
 
-/// Forecasts how long all pictures take, if that is long.
+/// Says how long all pictures take, if that is long enough to be worth a line.
 fn forecast_time(seconds_per_picture: f64, pictures: u64, report: &Report) {
     let seconds = seconds_per_picture * pictures as f64;
     if seconds < LONG_RUN {
@@ -304,7 +303,7 @@ fn forecast_time(seconds_per_picture: f64, pictures: u64, report: &Report) {
     ));
 }
 
-/// Returns the output frames per second of a sensor whose rate is known.
+/// Output frames per second of a sensor whose rate is known.
 fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
     let sensor = &acquisition.sensor;
     sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed))
