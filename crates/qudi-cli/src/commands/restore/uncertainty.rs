@@ -1,4 +1,4 @@
-//! The uncertainty of every pixel, written beside the frames: as the network predicts it, or over samples.
+//! The uncertainty of every pixel, written next to the frames: as the network predicts it, or over samples.
 
 use super::plan::Plan;
 use crate::error::{CliError, Result};
@@ -13,7 +13,7 @@ pub(super) struct UncertaintyFile(Option<ArrayWriter>);
 
 impl UncertaintyFile {
     /// Creates the file that the plan asks for. An earlier run that finished some frames wrote no uncertainty
-    /// of them.
+    /// for them.
     pub(super) fn create(
         plan: &Plan,
         method: &Method,
