@@ -176,7 +176,7 @@ fn default_method_follows_the_capture() {
         String::from_utf8_lossy(&output.stdout).into_owned()
     };
     let cases = [
-        ("--ppp 3.25", 4, "by qudi-regression (regression) on cpu"),
+        ("--ppp 3.25", 4, "by qudi (regression) on cpu"),
         ("--sensor spad512s --sum 7 --ppp 3.25", 4, "by qudi"),
         ("--sensor qis16-gj --ppp 3.25", 4, "by qbp-refined"),
         ("--ppp 3.25", 2, "by qbp-refined"),

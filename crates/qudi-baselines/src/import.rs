@@ -95,7 +95,7 @@ pub struct Loaded {
 
 impl Method {
     /// The name on the command line.
-    pub fn name(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
             Self::Quiver => "quiver",
             Self::Emvd => "emvd",

@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use burn::tensor::DeviceType;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-/// How names of other machines' devices begin.
+/// Prefix of the names of other machines' devices.
 pub(crate) const REMOTE: &str = "ws://";
 
 /// A device that `--device` can name.
@@ -24,13 +24,13 @@ pub(crate) struct Opened {
 }
 
 impl Opened {
-    /// Whether it computes in the program's own memory.
+    /// Returns true if it computes in the program's own memory.
     pub(crate) fn is_processor(&self) -> bool {
         matches!(self.name.as_str(), "cpu" | "flex" | "ndarray")
     }
 }
 
-/// All devices: the CPU first, then the graphics cards of each backend that was compiled in.
+/// Lists all devices: the CPU first, then the graphics cards of each backend that was compiled in.
 pub(crate) fn list() -> Vec<Listed> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut devices = Vec::new();
@@ -49,7 +49,7 @@ pub(crate) fn list() -> Vec<Listed> {
     devices
 }
 
-/// The feature that this build lacks for a backend.
+/// Returns the feature that this build lacks for a backend.
 fn feature_of(backend: &str) -> Option<&'static str> {
     let features = [
         ("wgpu", cfg!(feature = "wgpu")),
@@ -126,7 +126,7 @@ fn open_remote(name: String) -> Result<Opened> {
     ))
 }
 
-/// The first real graphics card, or the processor.
+/// Returns the name of the first real graphics card, or of the processor.
 fn best() -> String {
     // Drivers that compute on the processor are slower than our own way to do so.
     let software = ["llvmpipe", "lavapipe", "swiftshader", "software", "cpu"];
@@ -178,7 +178,7 @@ pub(crate) fn quieten_drivers() {
     }
 }
 
-/// Backends with the names of their cards; looked for once, since drivers talk on standard error.
+/// Returns backends with the names of their cards; searched once, since drivers print to standard error.
 fn all_cards() -> &'static [(&'static str, Vec<String>)] {
     static CARDS: OnceLock<Vec<(&'static str, Vec<String>)>> = OnceLock::new();
     CARDS.get_or_init(find_cards)

@@ -22,7 +22,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 use std::path::Path;
 
-/// The origin of values that nobody set.
+/// Origin of values that are not set.
 const DEFAULT: &str = "default";
 
 /// The settings of one command.
@@ -35,7 +35,7 @@ pub(crate) struct Settings {
     recipe: Vec<(String, Value, String)>,
 }
 
-/// Who sets a key.
+/// Origin of a key's value.
 enum Origin<'a> {
     /// A file or the environment, which other commands read as well.
     Shared(&'a str),
@@ -99,7 +99,7 @@ impl Settings {
         Ok(())
     }
 
-    /// `QUDI_SIMULATE_PPP=9.75` sets `simulate.ppp`.
+    /// Adds the environment: `QUDI_SIMULATE_PPP=9.75` sets `simulate.ppp`.
     fn add_environment(&mut self) -> Result<()> {
         let parts = commands::SETTINGS.iter().chain(commands::RECIPE);
         let prefixes: Vec<String> = parts.map(|part| format!("{}_", variable(part))).collect();
@@ -180,19 +180,19 @@ impl Settings {
         })
     }
 
-    /// All keys with value and origin.
+    /// Returns all keys with value and origin.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&str, &Value, &str)> {
         KEYS.iter()
             .zip(&self.values)
             .map(|(key, (value, origin))| (key.name, value, origin.as_str()))
     }
 
-    /// Keys of a recipe that were set, with value and origin.
+    /// Returns the keys of a recipe that were set, with value and origin.
     pub(crate) fn recipe_changes(&self) -> &[(String, Value, String)] {
         &self.recipe
     }
 
-    /// The value of a key; ask for an `Option` where it may be unset.
+    /// Returns the value of a key; ask for an `Option` where it may be unset.
     pub(crate) fn get<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
         let (value, origin) = self.find(name);
         serde_json::from_value(value.clone()).map_err(|e| {
@@ -204,12 +204,12 @@ impl Settings {
         })
     }
 
-    /// The value of a key if somebody set it.
+    /// Returns the value of a key if it is set.
     pub(crate) fn given<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>> {
         if self.find(name).1 == DEFAULT { Ok(None) } else { self.get(name).map(Some) }
     }
 
-    /// The value of a key that has a text form of its own.
+    /// Parses the value of a key that has a text form of its own.
     pub(crate) fn parse<T: std::str::FromStr<Err = String>>(
         &self,
         name: &str,
@@ -230,12 +230,12 @@ impl Settings {
         (value, origin)
     }
 
-    /// A sensor by name or file, with all overrides of `[sensor]`.
+    /// Loads a sensor by name or file, with all overrides of `[sensor]`.
     pub(crate) fn sensor(&self, name: &str) -> Result<Sensor> {
         self.overridden(load_document(name)?, name)
     }
 
-    /// A sensor that is known already, with all overrides of `[sensor]`.
+    /// Applies all overrides of `[sensor]` to a sensor.
     pub(crate) fn adjusted(&self, sensor: Sensor) -> Result<Sensor> {
         if !self.overrides_sensor() {
             return Ok(sensor);
@@ -244,7 +244,7 @@ impl Settings {
         self.overridden(serde_json::to_value(sensor).unwrap_or(Value::Null), &name)
     }
 
-    /// Whether a key of `[sensor]` is set.
+    /// Returns true if a key of `[sensor]` is set.
     pub(crate) fn overrides_sensor(&self) -> bool {
         self.iter().any(|(key, value, _)| key.starts_with("sensor.") && !value.is_null())
     }
@@ -265,17 +265,17 @@ impl Settings {
     }
 }
 
-/// Keys of recipes with their values in the recipe that is shown, and that recipe's name.
+/// Returns the name of the recipe that documents the keys, and its keys with their values.
 pub(crate) fn shown_recipe() -> (&'static str, Vec<(String, Value)>) {
     (recipe_keys::SHOWN, recipe_keys::of_preset(recipe_keys::SHOWN))
 }
 
-/// Recipes of learned methods of others by name, with the sizes of their networks.
+/// Returns recipes of learned methods of others by name, with the sizes of their networks.
 pub(crate) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
     recipe_keys::baseline_sizes()
 }
 
-/// The environment variable that sets a key.
+/// Returns the environment variable that sets a key.
 fn variable(key: &str) -> String {
     format!("QUDI_{}", key.replace('.', "_").to_uppercase())
 }
@@ -289,7 +289,7 @@ fn unknown_key(name: &str, names: &[&str], origin: &str) -> CliError {
     )
 }
 
-/// A value in TOML notation; anything else is a string.
+/// Parses a value in TOML notation; anything else is a string.
 fn parse_value(text: &str) -> Value {
     let document = toml::from_str::<Value>(&format!("v = {text}"));
     match document.as_ref().ok().and_then(Value::as_object) {
@@ -298,7 +298,7 @@ fn parse_value(text: &str) -> Value {
     }
 }
 
-/// A value in TOML notation.
+/// Formats a value in TOML notation.
 pub(crate) fn toml_text(value: &Value) -> String {
     toml::Value::try_from(value).map_or_else(|_| value.to_string(), |value| value.to_string())
 }

@@ -1,5 +1,5 @@
 //! Median nanoseconds per pixel of 3-bit exposures, one line per number of threads.
-//! scripts/compare/simulator_speed.py runs it beside NumPy.
+//! scripts/compare/simulator_speed.py compares it with NumPy.
 #![allow(clippy::print_stdout)]
 
 use qudi_core::sensor::Sensor;

@@ -1,5 +1,6 @@
 //! Options of commands that may run the network.
 
+use super::given::{DIFFUSION, Given, OWN};
 use super::number;
 use crate::methods::options::NetworkOptions;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
@@ -19,13 +20,13 @@ pub(crate) struct Network {
     #[arg(long, value_name = "[METHOD=]FILE,...", value_delimiter = ',', value_hint = ValueHint::FilePath)]
     weights: Vec<WeightsOf>,
     /// qudi-diffusion: spacing of the timesteps [default: as the weights say]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     spacing: Option<SpacingName>,
     /// qudi-diffusion: sampler [default: ddim]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     sampler: Option<SamplerName>,
     /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
-    #[arg(long, value_name = "K", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
+    #[arg(long, value_name = "K", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info
     /// --devices`) [default: auto]
@@ -36,12 +37,12 @@ pub(crate) struct Network {
     tile: Option<usize>,
     /// Numbers that its convolutions multiply; sums have 32 bits with each [default: bf16 on processors that
     /// multiply it faster, else f32]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", group = OWN)]
     precision: Option<PrecisionName>,
 }
 
 impl Network {
-    /// The weights of a network of this project, if they are named.
+    /// Returns the weights of a network of this project, if they are named.
     pub(crate) fn own_weights(&self) -> Option<&Path> {
         self.weights.iter().find(|weights| weights.method.is_none()).map(|w| w.file.as_path())
     }
@@ -51,11 +52,10 @@ impl Network {
         self.weights.iter().map(|weights| &weights.file)
     }
 
-    /// The options for a number of steps, with their defaults filled in.
-    pub(crate) fn options(&self, steps: Option<usize>) -> NetworkOptions {
-        let first = |given: &[(bool, &'static str)]| {
-            given.iter().find(|(given, _)| *given).map(|(_, flag)| *flag)
-        };
+    /// Returns the options for a number of steps, with their defaults filled in; `given` are the flags on the
+    /// command line.
+    pub(crate) fn options(&self, steps: Option<usize>, given: &Given) -> NetworkOptions {
+        let weights = self.own_weights().map(|_| "--weights".to_owned());
         NetworkOptions {
             own_file: self.own_weights().map(Path::to_owned),
             own_files: self.weights.iter().filter(|weights| weights.method.is_none()).count(),
@@ -71,22 +71,9 @@ impl Network {
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),
             tile: self.tile.unwrap_or(TILE),
             precision: self.precision.map(PrecisionName::precision),
-            own_flag: first(&[
-                (self.own_weights().is_some(), "--weights"),
-                (steps.is_some(), "--steps"),
-                (self.spacing.is_some(), "--spacing"),
-                (self.sampler.is_some(), "--sampler"),
-                (self.samples.is_some(), "--samples"),
-                (self.precision.is_some(), "--precision"),
-            ]),
             tile_flag: self.tile.is_some().then_some("--tile"),
             device_flag: self.device.is_some().then_some("--device"),
-            diffusion_flag: first(&[
-                (steps.is_some(), "--steps"),
-                (self.spacing.is_some(), "--spacing"),
-                (self.sampler.is_some(), "--sampler"),
-                (self.samples.is_some_and(|samples| samples > 1), "--samples"),
-            ]),
+            given: Given { own: weights.or_else(|| given.own.clone()), ..given.clone() },
         }
     }
 }
@@ -126,7 +113,7 @@ impl std::str::FromStr for WeightsOf {
 pub(crate) struct Steps {
     /// qudi-diffusion: reverse steps. More steps draw sharper pictures, whose details are invented; the paper
     /// takes 10 [default: as the weights say]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
+    #[arg(long, value_name = "N", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     pub(crate) steps: Option<usize>,
 }
 

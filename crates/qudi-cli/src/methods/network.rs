@@ -1,6 +1,7 @@
 //! The networks of this project behind `--method qudi`, `qudi-regression` and `qudi-diffusion`: weights, device,
 //! options.
 
+use super::Built;
 use super::options::NetworkOptions;
 use super::trained::check;
 use crate::device;
@@ -17,6 +18,15 @@ use qudi_model::regression::{Regression, RegressionRestorer};
 use qudi_model::restorer::Model;
 use serde_json::{Value, json};
 
+/// The network that a method of this project runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum NetworkChoice {
+    /// The network of the named weights, or the best one with built-in weights.
+    Best,
+    /// A network of this kind.
+    Of(NetworkKind),
+}
+
 /// A network of this project with its weights.
 pub(crate) struct OwnNetwork {
     weights: Weights,
@@ -25,18 +35,21 @@ pub(crate) struct OwnNetwork {
 }
 
 impl OwnNetwork {
-    /// Finds the weights of a method: the named file, or the built-in ones. Without a `kind`, the network is the
-    /// one in the file, or the regression.
+    /// Finds the weights of a method: the named file, or the built-in ones.
     ///
     /// # Errors
     /// [`CliError`] if there are no such weights.
-    pub(crate) fn of(options: &NetworkOptions, kind: Option<NetworkKind>) -> Result<Self> {
-        let weights = match &options.own_file {
-            Some(path) => Weights::File(path.clone()),
-            None => Weights::BuiltIn(kind.unwrap_or(NetworkKind::Regression)),
+    pub(crate) fn new(options: &NetworkOptions, choice: NetworkChoice) -> Result<Self> {
+        let weights = match (&options.own_file, choice) {
+            (Some(path), _) => Weights::File(path.clone()),
+            (None, NetworkChoice::Best) => Weights::BuiltIn(NetworkKind::Regression),
+            (None, NetworkChoice::Of(kind)) => Weights::BuiltIn(kind),
         };
         let description = weights.describe()?;
-        let kind = kind.unwrap_or(description.network.kind());
+        let kind = match choice {
+            NetworkChoice::Best => description.network.kind(),
+            NetworkChoice::Of(kind) => kind,
+        };
         Ok(Self { weights, description, kind })
     }
 
@@ -84,12 +97,12 @@ impl OwnNetwork {
 
 /// Makes the restorer of a method, and says how it makes frames and on which device.
 pub(crate) fn restorer(
-    kind: Option<NetworkKind>,
+    choice: NetworkChoice,
     options: &NetworkOptions,
     acquisition: &Acquisition,
     size: Size,
-) -> Result<(Box<dyn Restorer>, String)> {
-    let own = OwnNetwork::of(options, kind)?;
+) -> Result<Built> {
+    let own = OwnNetwork::new(options, choice)?;
     let device = device::open(&options.device)?;
     check(&own.description.provenance, acquisition)?;
     if device.is_processor() {

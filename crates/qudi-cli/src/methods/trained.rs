@@ -1,11 +1,10 @@
 //! What weights were trained for, and whether a capture is like it.
 
+use super::network::OwnNetwork;
 use super::options::NetworkOptions;
+use super::{Kind, Method};
 use crate::error::{CliError, Result};
-use crate::methods::network::OwnNetwork;
-use crate::methods::own_kind;
 use crate::weights::Weights;
-use qudi_baselines::import::Method;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::Provenance;
@@ -43,12 +42,12 @@ impl Trained {
     }
 }
 
-/// Why the built-in weights of the default method are not for such a capture, if they are not.
+/// Why the weights that come along are not for such a capture, if they are not.
 pub(crate) fn unknown_to_built_in(acquisition: &Acquisition) -> Result<Option<String>> {
     Ok(unknown(&Weights::BuiltIn(NetworkKind::Regression).describe()?.provenance, acquisition, 1.0))
 }
 
-/// Whether the built-in weights of the default method were trained for such a capture.
+/// Whether the weights that come along were trained for such a capture.
 pub(crate) fn built_in_knows(acquisition: &Acquisition) -> Result<bool> {
     Ok(unknown_to_built_in(acquisition)?.is_none())
 }
@@ -98,16 +97,14 @@ pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Resul
 }
 
 /// What the weights of a method were trained on; nothing is known of authors' weights.
-pub(crate) fn provenance(method: &str, options: &NetworkOptions) -> Result<Option<Provenance>> {
-    Ok(match Method::by_name(method) {
-        Some(method) => {
+pub(crate) fn provenance(method: &Method, options: &NetworkOptions) -> Result<Option<Provenance>> {
+    Ok(match method.kind {
+        Kind::Learned { method, .. } => {
             let contents = options.weights_of(method)?.describe()?;
             contents.and_then(|contents| contents.description).map(|d| d.provenance)
         }
-        None => match own_kind(method) {
-            Some(kind) => Some(OwnNetwork::of(options, kind)?.description.provenance),
-            None => None,
-        },
+        Kind::Network(choice) => Some(OwnNetwork::new(options, choice)?.description.provenance),
+        Kind::Classical(_) => None,
     })
 }
 

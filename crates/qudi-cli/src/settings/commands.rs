@@ -20,18 +20,18 @@ const COMMANDS: &[(&str, &[&[&str]])] = &[
     ("config", &[SETTINGS, RECIPE]),
 ];
 
-/// Whether a command takes a key.
+/// Returns true if a command takes a key.
 pub(super) fn takes(command: &str, key: &str) -> bool {
     let part = key.split('.').next().unwrap_or_default();
     parts(command).any(|taken| taken == part)
 }
 
-/// The parts that a command takes, as in `sensor.*`; empty if there are none.
+/// Returns the parts that a command takes, as in `sensor.*`; empty if there are none.
 pub(super) fn taken(command: &str) -> String {
     parts(command).map(|part| format!("{part}.*")).collect::<Vec<_>>().join(", ")
 }
 
-/// Commands that take a part of the settings.
+/// Returns the commands that take a part of the settings.
 pub(super) fn takers(part: &str) -> Vec<&'static str> {
     let all = COMMANDS.iter().map(|(command, _)| *command);
     all.filter(|command| parts(command).any(|taken| taken == part)).collect()

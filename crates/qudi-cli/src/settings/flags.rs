@@ -8,7 +8,7 @@ use clap::{Arg, ArgMatches, Command, ValueHint};
 pub(crate) struct KeyFlags(pub(super) Vec<(&'static Key, String)>);
 
 impl KeyFlags {
-    /// The first flag that was given, with its dashes.
+    /// Returns the first flag on the command line, with its dashes.
     pub(crate) fn first(&self) -> Option<String> {
         self.0.first().and_then(|(key, _)| key.flag).map(|flag| format!("--{}", flag.long))
     }
@@ -39,7 +39,7 @@ impl clap::Args for KeyFlags {
     }
 }
 
-/// The argument of a key that has a flag.
+/// Makes the argument of a key that has a flag.
 fn argument(key: &'static Key) -> Option<Arg> {
     let flag = key.flag?;
     let default = match key.default.trim_matches('"') {

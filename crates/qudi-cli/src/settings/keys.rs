@@ -12,13 +12,13 @@ pub(crate) struct Key {
     pub(crate) default: &'static str,
     /// Meaning and unit.
     pub(crate) doc: &'static str,
-    /// How text without quotes is read.
+    /// Meaning of text without quotes.
     pub(crate) kind: Kind,
     /// The flag of `qudi simulate` that sets it.
     pub(crate) flag: Option<KeyFlag>,
 }
 
-/// How text without quotes is read.
+/// Meaning of text without quotes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// As it stands.
@@ -32,7 +32,7 @@ pub(crate) enum Kind {
 pub(crate) struct KeyFlag {
     /// Name without dashes.
     pub(crate) long: &'static str,
-    /// What stands for the value in `--help`.
+    /// Placeholder of the value in `--help`.
     pub(crate) value: &'static str,
     /// Heading in `--help`.
     pub(crate) heading: &'static str,
@@ -62,7 +62,7 @@ const fn text(name: &'static str, default: &'static str, doc: &'static str) -> K
     Key::new(name, default, doc, Kind::Text)
 }
 
-/// All keys. Those of `[sensor]` override the chosen sensor's own values.
+/// All keys. The part `[sensor]` overrides the values of the chosen sensor.
 pub(crate) const KEYS: &[Key] = &[
     text("simulate.sensor", "\"qudi-paper\"", "sensor preset, or path of a sensor file").flag("sensor", "NAME|FILE", "Sensor"),
     value("simulate.ppp", "3.25", "photons per pixel and output frame, in the sense of `ppp_def`").flag("ppp", "PPP", "Light"),

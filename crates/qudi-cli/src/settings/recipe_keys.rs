@@ -1,4 +1,4 @@
-//! The keys of recipes, found by serializing the recipes that come along.
+//! The keys of recipes, found by serializing the built-in recipes.
 
 use super::flatten;
 use qudi_train::{Recipe, recipe_names};
@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 /// The recipe whose values stand in `qudi config docs`.
 pub(super) const SHOWN: &str = "small";
 
-/// Keys of a recipe with their values, numbers of lists as `0`.
+/// Returns the keys of a recipe with their values, numbers of lists as `0`.
 pub(super) fn of_preset(name: &str) -> Vec<(String, Value)> {
     let mut leaves = Vec::new();
     if let Ok(mut recipe) = Recipe::load(name, &[]) {
@@ -22,7 +22,7 @@ pub(super) fn of_preset(name: &str) -> Vec<(String, Value)> {
     leaves
 }
 
-/// Recipes of learned methods of others by name, with the sizes of their networks.
+/// Returns recipes of learned methods of others by name, with the sizes of their networks.
 pub(super) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
     let sizes = |name: &'static str| {
         let keys = of_preset(name).into_iter();
@@ -38,7 +38,7 @@ pub(super) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
     recipe_names().filter_map(sizes).collect()
 }
 
-/// All keys of all recipes that come along, numbers of lists as `0`.
+/// Returns all keys of the built-in recipes, numbers of lists as `0`.
 pub(super) fn names() -> &'static [String] {
     static NAMES: OnceLock<Vec<String>> = OnceLock::new();
     NAMES.get_or_init(|| {
@@ -52,7 +52,7 @@ pub(super) fn names() -> &'static [String] {
     })
 }
 
-/// Whether recipes have such a key, or a table of that name.
+/// Returns true if recipes have such a key, or a table of that name.
 pub(super) fn is_known(key: &str, value: &Value) -> bool {
     let generic = generic(key);
     let below = format!("{generic}.");
@@ -64,7 +64,7 @@ pub(super) fn is_known(key: &str, value: &Value) -> bool {
     recipe_names().any(|preset| Recipe::load(preset, &change).is_ok())
 }
 
-/// The key with every number of a list as `0`.
+/// Returns the key with every number of a list as `0`.
 fn generic(key: &str) -> String {
     let part = |part: &'_ str| match part.parse::<usize>() {
         Ok(_) => "0".to_owned(),
@@ -73,7 +73,7 @@ fn generic(key: &str) -> String {
     key.split('.').map(part).collect::<Vec<_>>().join(".")
 }
 
-/// Leaves by dotted name, the first entry of lists of tables standing for all.
+/// Returns the leaves by dotted name, the first entry of lists of tables standing for all.
 fn tables(document: Value) -> Vec<(String, Value)> {
     let mut leaves = Vec::new();
     flatten("", document, &mut leaves);

@@ -10,13 +10,13 @@ use qudi_sim::scene::{Procedural, ProceduralScene};
 /// The clip's mean image value, close enough for a benchmark.
 const EXPOSURE: f64 = 0.45;
 
-/// The median of some times.
+/// Returns the median.
 pub(super) fn median(mut times: Vec<f64>) -> f64 {
     times.sort_by(f64::total_cmp);
     times[times.len() / 2]
 }
 
-/// A simulated burst to restore.
+/// Simulates a burst to restore.
 pub(super) fn burst(args: &Bench) -> Result<(Vec<Vec<u16>>, Acquisition)> {
     let sensor = Sensor::load("qudi-paper")?;
     let light = Light { ppp: 3.25, mean_level: EXPOSURE };

@@ -38,7 +38,7 @@ fn show(settings: &Settings, report: &Report) -> Result<()> {
     })
 }
 
-/// The reference of all keys; `configs/README.md` is this text.
+/// Writes the reference of all keys; `configs/README.md` is this text.
 fn docs() -> String {
     let mut text = String::from(
         "# Settings

@@ -5,11 +5,12 @@ use super::capture;
 use super::record::{origin, record_document};
 use crate::args::Global;
 use crate::error::{CliError, Result};
+use crate::methods::learned_names;
 use crate::report::Report;
 use crate::settings::Settings;
 use crate::weights::Weights;
 use burn::tensor::Device;
-use qudi_baselines::import::{Contents, METHODS, Method, describe};
+use qudi_baselines::import::{Contents, describe};
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
@@ -53,7 +54,7 @@ pub(crate) fn run(
                 None => Err(CliError::new(
                     "weights of no network that is known here",
                     path.display(),
-                    format!("known are {}", METHODS.map(Method::name).join(", ")),
+                    format!("known are {}", learned_names().join(", ")),
                 )),
             }
         }
@@ -109,7 +110,7 @@ fn sensors(report: &Report) -> Result<()> {
     report.result(&text, || json!(sensors))
 }
 
-/// A weight file, as it describes itself.
+/// Describes weights.
 fn weights(weights: &Weights, report: &Report) -> Result<()> {
     let d = weights.describe()?;
     let sizes = d.network.parameters(&Device::flex());
@@ -126,7 +127,7 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
     report.result(&to_text(&lines), || json!(weights.describe().ok()))
 }
 
-/// What weights were trained on.
+/// Returns lines about the training of weights.
 fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
     let commit = p.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}"));
     let [least, most] = p.ppp;
@@ -139,7 +140,7 @@ fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
     ]
 }
 
-/// Lines of keys and values.
+/// Formats lines of keys and values.
 fn to_text(lines: &[(&str, String)]) -> String {
     let mut text = String::new();
     for (key, value) in lines {
@@ -148,7 +149,7 @@ fn to_text(lines: &[(&str, String)]) -> String {
     text
 }
 
-/// A weight file of a learned method of others.
+/// Describes weights of a learned method of others.
 fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
     let Contents { method, sizes, parameters, description } = contents;
     let sha256 = Weights::File(path.to_owned()).sha256()?;
@@ -185,7 +186,7 @@ fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {
     report.result(&text, || json!(sensor))
 }
 
-/// A record, without its burst.
+/// Describes a record without its burst.
 fn burst(path: &Path, report: &Report) -> Result<()> {
     let record = Sidecar::load(path)?;
     let burst = match &record {
@@ -202,7 +203,7 @@ fn burst(path: &Path, report: &Report) -> Result<()> {
     report.result(&(text + &origin(&record, path)), || record_document(&record))
 }
 
-/// The formats that captures are read from.
+/// Lists the formats that captures are read from.
 fn formats(report: &Report) -> Result<()> {
     let width = FORMATS.iter().map(|format| format.name.len()).max().unwrap_or(0) + 2;
     let lines: Vec<String> =

@@ -3,7 +3,7 @@
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
-/// Write weights in half precision, half the size, with their SHA-256 beside them
+/// Write weights in half precision, half the size, with their SHA-256 next to them
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Publish {
     /// Weights that `qudi train` wrote

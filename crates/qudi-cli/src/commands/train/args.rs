@@ -44,7 +44,7 @@ pub(crate) struct Train {
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
     pub(crate) device: Vec<String>,
     /// Threads that draw samples
-    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MOST_THREADS))]
+    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
     pub(crate) workers: usize,
     /// Download the weights of the recipe's LPIPS term into --backbones first, with curl
     #[arg(long, requires = "backbones")]

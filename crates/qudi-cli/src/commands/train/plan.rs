@@ -8,7 +8,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_train::{RECIPE, Recipe, recipe_names};
 use std::path::PathBuf;
 
-/// What is to be done.
+/// Action of a training run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Action {
     /// Decode the recipe's files into a pack.
@@ -39,7 +39,7 @@ pub(super) struct Plan {
     pub(super) devices: Vec<String>,
     /// Threads that draw samples.
     pub(super) workers: usize,
-    /// Whether LPIPS weights are downloaded first.
+    /// True if LPIPS weights are downloaded first.
     pub(super) fetch: bool,
     pub(super) backbones: Option<PathBuf>,
     pub(super) overwrite: Overwrite,

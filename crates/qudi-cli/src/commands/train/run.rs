@@ -13,6 +13,7 @@ use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::Report;
 use crate::settings::Settings;
+use crate::version::COMMIT;
 use qudi_baselines::learning::Baseline;
 use qudi_core::atomic_file::Overwrite;
 use qudi_model::config::NetworkConfig;
@@ -101,7 +102,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
         From::Start(init.transpose()?)
     };
     let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
-    let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
+    let commit = COMMIT.map(str::to_owned);
     let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
     write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
     let mut watch = Watch::new(recipe, folder, report);
