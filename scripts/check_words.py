@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-CHECKED = "README.md CHANGELOG.md docs/notes tests scripts crates/qudi-core crates/qudi-sim".split()
+CHECKED = "README.md CHANGELOG.md docs/notes tests scripts crates/qudi-core crates/qudi-sim crates/qudi-io".split()
 COLUMNS = 110
 # Words that only this project used in this sense, and their replacements.
 BANNED = {

@@ -255,13 +255,13 @@ fn numbers_of_steps_are_compared_in_one_run() {
     let folder = scratch("eval-steps");
     let scored = eval(
         &folder,
-        "scene:text --size 64x64 --frames 4 --ppp 5 --method average,qudi --steps 2,0 --device cpu --appearance --html r.html --csv r.csv --markdown r.md",
+        "scene:text --size 64x64 --frames 4 --ppp 5 --method average,qudi-regression,qudi-diffusion --steps 2,1 --device cpu --appearance --html r.html --csv r.csv --markdown r.md",
     );
     let rows = scored["rows"].as_array().unwrap();
     let steps: Vec<_> = rows.iter().map(|row| row["steps"].as_u64()).collect();
-    assert_eq!(steps, [None, Some(0), Some(2)]);
-    assert!(rows[..2].iter().all(|row| row["added_over_missed"].is_null()));
-    let added = rows[2]["added_over_missed"].as_array().unwrap();
+    assert_eq!(steps, [None, None, Some(1), Some(2)]);
+    assert!(rows[..3].iter().all(|row| row["added_over_missed"].is_null()));
+    let added = rows[3]["added_over_missed"].as_array().unwrap();
     assert_eq!(added.len(), 5);
     assert!(
         added.iter().all(|ratio| (0.001..10.0).contains(&ratio.as_f64().unwrap())),
@@ -270,9 +270,9 @@ fn numbers_of_steps_are_compared_in_one_run() {
     // A run of two steps alone gives the same frames.
     let alone = eval(
         &folder,
-        "scene:text --size 64x64 --frames 4 --ppp 5 --method qudi --steps 2 --device cpu --appearance",
+        "scene:text --size 64x64 --frames 4 --ppp 5 --method qudi-diffusion --steps 2 --device cpu --appearance",
     );
-    assert_eq!(alone["rows"][0]["psnr_a"], rows[2]["psnr_a"]);
+    assert_eq!(alone["rows"][0]["psnr_a"], rows[3]["psnr_a"]);
     assert!(alone["rows"][0]["steps"].is_null());
     // The regression predicts its uncertainty; one sample does not.
     let of = |row: &Value| row["error_over_sigma_textured"]["all"]["mean"].as_f64();
@@ -283,11 +283,13 @@ fn numbers_of_steps_are_compared_in_one_run() {
     assert!(read("r.csv").starts_with("method,steps,ppp,clip,frame,"), "{}", read("r.csv"));
     assert!(read("r.md").contains("What more steps added"));
     let page = read("r.html");
-    assert!(page.contains("qudi, 2 steps") && page.contains("Perception against distortion"));
+    assert!(
+        page.contains("qudi-diffusion, 2 steps") && page.contains("Perception against distortion")
+    );
     refused(
         &folder,
-        "eval scene:text --size 64x64 --frames 4 --ppp 5 --method mle --steps 0,2",
-        &["--steps", "method qudi"],
+        "eval scene:text --size 64x64 --frames 4 --ppp 5 --method mle --steps 1,2",
+        &["--steps", "method qudi-diffusion"],
     );
 }
 

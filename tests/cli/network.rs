@@ -1,15 +1,15 @@
-//! The method `qudi` on the command line: weights, devices, options and errors.
+//! The networks on the command line: weights, devices, options and errors.
 
 use crate::support::{listing, qudi, refused, run, scratch};
 use burn::tensor::Device;
 use qudi_core::atomic_file::Overwrite;
 use qudi_layers::Provenance;
-use qudi_model::checkpoint::{Description, Precision, save};
+use qudi_model::checkpoint::{Description, Precision, Sampling, save};
 use qudi_model::config::NetworkConfig;
-use qudi_model::network::init_parameters;
+use qudi_model::init_parameters;
 use std::path::{Path, PathBuf};
 
-/// Creates a folder with a burst and untrained weights of the smallest network.
+/// Creates a folder with a burst and weights of the smallest network, a diffusion.
 fn prepared(name: &str) -> PathBuf {
     let folder = scratch(name);
     qudi(&folder)
@@ -19,15 +19,18 @@ fn prepared(name: &str) -> PathBuf {
         )
         .assert()
         .success();
-    weights(&folder.join("w.safetensors"), 0.0);
+    weights(&folder.join("w.safetensors"), 0.01);
     folder
 }
 
 fn weights(path: &Path, value: f32) {
     let network = NetworkConfig::preset("tiny").unwrap();
+    let NetworkConfig::Diffusion(sizes) = &network else { panic!("tiny is a diffusion") };
+    let module = sizes.init(1, &Device::flex());
+    let module = init_parameters(module, |_, shape| vec![value; shape.iter().product()]);
     let description = Description {
         preset: Some("tiny".into()),
-        network: network.clone(),
+        network,
         window: 11,
         provenance: Provenance {
             program: "qudi test".into(),
@@ -38,14 +41,8 @@ fn weights(path: &Path, value: f32) {
             commit: None,
             licence: "MIT OR Apache-2.0".into(),
         },
-        default_steps: None,
-        kind: None,
-        spacing: None,
+        sampling: Some(Sampling::default()),
     };
-    let mut module = network.init(1, &Device::flex());
-    if value != 0.0 {
-        module = init_parameters(module, |_, shape| vec![value; shape.iter().product()]);
-    }
     save(&module, &description, Precision::Single, path, Overwrite::Yes).unwrap();
 }
 
@@ -67,10 +64,7 @@ fn restores_a_burst_and_resumes() {
     // Other weights or steps are another result: the folder refuses to mix them.
     refused(&folder, &format!("{common} -o whole --steps 3").replace("--steps 2 ", ""), &["whole"]);
     run("info w.safetensors");
-    let samples = "--samples 2 --deviation d.npy --sampler ancestral";
-    refused(&folder, &format!("{common} -o s.npy {samples}"), &["samples would not differ"]);
-    weights(&folder.join("w.safetensors"), 0.01);
-    run(&format!("{common} -o s.npy {samples}"));
+    run(&format!("{common} -o s.npy --samples 2 --uncertainty d.npy --sampler ancestral"));
     let header = std::fs::read(folder.join("d.npy")).unwrap();
     assert!(String::from_utf8_lossy(&header[..128]).contains("(13, 32, 40)"));
 }
@@ -89,21 +83,39 @@ fn writes_predicted_uncertainty_beside_frames() {
     let values = deviations[deviations.len() - 13 * 32 * 40 * 4..].chunks_exact(4);
     let values: Vec<f32> = values.map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
     assert!(values.iter().all(|&value| value > 0.0 && value < 1.0));
-    refused(&folder, "restore b.npy -o u.npy --deviation e.npy --steps 1", &["--steps 0"]);
-    refused(&folder, "restore b.npy -o u.npy --deviation e.npy --method guide", &["--method qudi"]);
+    let with =
+        |method: &str| format!("restore b.npy -o u.npy --uncertainty e.npy --method {method}");
+    refused(&folder, &with("qudi-diffusion"), &["--method qudi-regression"]);
+    refused(&folder, &with("qbp-refined"), &["--method qudi"]);
 }
 
-/// These weights' U-Net is silent, and their pre-denoiser has seen no simulated measurement.
+/// Both networks have built-in weights; options of the diffusion are refused for the regression.
 #[test]
-fn regression_weights_ignore_the_number_of_steps() {
-    let folder = prepared("network-steps");
-    let restored = |steps: u32| {
-        let args = format!("restore b.npy --weights w.safetensors --steps {steps} -o {steps}.npy");
-        qudi(&folder).args(args.split_whitespace()).assert().success();
-        std::fs::read(folder.join(format!("{steps}.npy"))).unwrap()
+fn networks_are_chosen_by_method_or_weights() {
+    let folder = prepared("network-kinds");
+    let restored = |options: &str| {
+        let args = format!("restore b.npy --device cpu -o out.npy --force {options}");
+        let output = qudi(&folder).args(args.split_whitespace()).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        (std::fs::read(folder.join("out.npy")).unwrap(), said)
     };
-    let one = restored(1);
-    assert!(one == restored(0) && one == restored(3));
+    let (default, _) = restored("");
+    assert!(default == restored("--method qudi").0);
+    let (regression, said) = restored("--method qudi-regression");
+    assert!(default == regression && said.contains("(regression) on cpu"), "{said}");
+    let (diffusion, said) = restored("--method qudi-diffusion");
+    assert!(diffusion != regression && said.contains("(diffusion in 2 steps) on cpu"), "{said}");
+    assert!(diffusion != restored("--method qudi-diffusion --steps 1").0);
+    let (_, said) = restored("--weights w.safetensors");
+    assert!(said.contains("(diffusion in 1 step) on cpu"), "{said}");
+    let with = |options: &str| format!("restore b.npy -o refused.npy {options}");
+    refused(&folder, &with("--method qudi-regression --steps 2"), &["--method qudi-diffusion"]);
+    refused(&folder, &with("--samples 2"), &["--method qudi-diffusion"]);
+    refused(&folder, &with("--seed 2"), &["--method qudi-diffusion"]);
+    refused(&folder, &with("--method qudi-diffusion --steps 0"), &["--steps"]);
+    let other = "--method qudi-regression --weights w.safetensors";
+    refused(&folder, &with(other), &["weights of a diffusion"]);
 }
 
 #[test]
@@ -116,7 +128,7 @@ fn rejects_unfit_weights_and_options_in_three_parts() {
     refused(&folder, &with("--samples 0"), &["--samples"]);
     refused(&folder, &with("--tile 8"), &["--tile"]);
     refused(&folder, &with("--ppp 1e5"), &["the weights were trained for"]);
-    refused(&folder, &with("--deviation d.npy"), &["--samples"]);
+    refused(&folder, &with("--uncertainty d.npy"), &["--samples"]);
     refused(
         &folder,
         &with("").replace("--device cpu", "--device nothing"),
@@ -214,7 +226,7 @@ fn published_weights_restore_what_trained_ones_do() {
 #[test]
 fn processor_passes_selftest() {
     let folder = scratch("network-selftest");
-    let only = "selftest --device cpu --only arithmetic,warp,network";
+    let only = "selftest --device cpu --only arithmetic,warp,regression";
     let output = qudi(&folder).args(only.split(' ')).output().unwrap();
     assert!(output.status.success());
     assert_eq!(String::from_utf8_lossy(&output.stdout).matches(" ok\n").count(), 3);

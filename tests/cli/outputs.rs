@@ -118,7 +118,7 @@ fn record_reproduces_its_burst_from_any_folder() {
         .arg(&record)
         .assert()
         .code(2);
-    assert!(String::from_utf8_lossy(&refused.get_output().stderr).contains("--ppp beside --from"));
+    assert!(String::from_utf8_lossy(&refused.get_output().stderr).contains("--ppp with --from"));
 }
 
 #[test]

@@ -11,7 +11,7 @@ fn prepared(name: &str) -> PathBuf {
         &folder,
         "simulate scene:text --size 32x40 --frames 13 --ppp 9.75 --seed 3 -o b.npy --truth fr -q",
     );
-    let weights = crate::root().join("crates/qudi-cli/weights/small.safetensors");
+    let weights = crate::root().join("crates/qudi-cli/weights/regression.safetensors");
     std::fs::copy(weights, folder.join("w.safetensors")).unwrap();
     folder
 }
@@ -136,9 +136,13 @@ fn rejects_flags_of_another_method() {
         refused(&folder, &format!("eval fr --method average,mle {flag}"), &expected);
         refused(&folder, &format!("bench --size 16x16 --method average {flag}"), &expected);
     }
-    refused(&folder, "restore b.npy -o o --device cpu --samples 2", &["0 steps"]);
+    refused(&folder, "restore b.npy -o o --device cpu --samples 2", &["--method qudi-diffusion"]);
     refused(&folder, "restore b.npy -o o --method mle --seed 3", &["--seed is for method qudi"]);
-    refused(&folder, "restore b.npy -o o --device cpu --seed 3", &["--seed is for diffusion"]);
+    refused(
+        &folder,
+        "restore b.npy -o o --device cpu --seed 3",
+        &["--seed is for method qudi-diffusion"],
+    );
 }
 
 #[test]

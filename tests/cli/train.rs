@@ -10,11 +10,13 @@ use std::path::{Path, PathBuf};
 const QUICK_SETTINGS: &str = "--device cpu -q --set train.steps=4 --set train.checkpoint=2 --set data.crop=32 \
     --set data.frames=3 --set validation.crop=32 --set validation.frames=3 --set validation.every=2";
 
-/// Creates a folder with a small recipe for a network with a reference estimate.
-fn with_reference_recipe(name: &str) -> PathBuf {
+/// Creates a folder with small recipes for a regression and a diffusion.
+fn with_recipes(name: &str) -> PathBuf {
     let folder = scratch(name);
-    let recipe = crate::root().join("tests/golden/tiny.toml");
-    std::fs::copy(recipe, folder.join("reference.toml")).unwrap();
+    for (recipe, to) in [("regression", "regression"), ("tiny", "diffusion")] {
+        let recipe = crate::root().join(format!("tests/golden/{recipe}.toml"));
+        std::fs::copy(recipe, folder.join(format!("{to}.toml"))).unwrap();
+    }
     folder
 }
 
@@ -133,81 +135,77 @@ fn packs_train_without_the_files() {
 
 #[test]
 fn runs_resume_and_are_never_lost() {
-    let folder = with_reference_recipe("train-resume");
-    run(&folder, &format!("train reference.toml -o run {QUICK_SETTINGS}"));
+    let folder = with_recipes("train-resume");
+    run(&folder, &format!("train diffusion.toml -o run {QUICK_SETTINGS}"));
     refused(
         &folder,
-        &format!("train reference.toml -o run {QUICK_SETTINGS}"),
+        &format!("train diffusion.toml -o run {QUICK_SETTINGS}"),
         &["--resume", "--force"],
     );
     refused(
         &folder,
-        &format!("train reference.toml -o nothing --resume {QUICK_SETTINGS}"),
+        &format!("train diffusion.toml -o nothing --resume {QUICK_SETTINGS}"),
         &["no state"],
     );
     // A longer run: its recipe with one key changed.
     run(&folder, "train -o run --resume --device cpu -q --set train.steps=6");
     let metrics = std::fs::read_to_string(folder.join("run/metrics.jsonl")).unwrap();
     assert_eq!(metrics.lines().filter(|line| line.contains("\"kind\":\"step\"")).count(), 6);
-    run(&folder, &format!("train reference.toml -o run --force {QUICK_SETTINGS}"));
+    run(&folder, &format!("train diffusion.toml -o run --force {QUICK_SETTINGS}"));
     let metrics = std::fs::read_to_string(folder.join("run/metrics.jsonl")).unwrap();
     assert_eq!(metrics.lines().filter(|line| line.contains("\"kind\":\"step\"")).count(), 4);
     // A stage that starts from the weights of another run.
     run(
         &folder,
-        &format!("train reference.toml -o stage --init run/weights.safetensors {QUICK_SETTINGS}"),
+        &format!("train diffusion.toml -o stage --init run/weights.safetensors {QUICK_SETTINGS}"),
     );
     let wide = format!(
-        "train reference.toml -o wide --init run/weights.safetensors --set network.unet.width=16 {QUICK_SETTINGS}"
+        "train diffusion.toml -o wide --init run/weights.safetensors --set network.unet.width=16 {QUICK_SETTINGS}"
     );
     refused(&folder, &wide, &["other sizes"]);
-    // One more stage starts from the frames of the others; two more have nothing to start from.
-    let stages = |weights: &str, stages: usize, to: &str| {
-        format!(
-            "train reference.toml -o {to} --init {weights} --set network.pre.stages={stages} {QUICK_SETTINGS}"
-        )
+    let other =
+        format!("train regression.toml -o other --init run/weights.safetensors {QUICK_SETTINGS}");
+    refused(&folder, &other, &["weights of a diffusion"]);
+}
+
+/// The refinement learns first; the uncertainty is learnt without changing the frames.
+#[test]
+fn regression_learns_in_parts() {
+    let folder = with_recipes("train-regression");
+    let train = |to: &str, parts: &str, init: &str| {
+        run(
+            &folder,
+            &format!(
+                "train regression.toml -o {to} --set train.learns={parts} {init} {QUICK_SETTINGS}"
+            ),
+        );
     };
-    refused(&folder, &stages("run/weights.safetensors", 3, "third"), &["other sizes"]);
-    run(&folder, &stages("run/weights.safetensors", 2, "second"));
-    run(&folder, &stages("second/weights.safetensors", 3, "third"));
+    train("first", "[\"refinement\"]", "");
+    train("second", "[\"pre\",\"uncertainty\"]", "--init first/weights.safetensors");
+    train("uncertain", "[\"uncertainty\"]", "--init second/weights.safetensors");
     run(&folder, "simulate scene:text --size 48x32 --frames 3 --sensor qudi-paper -o b.npy -q");
-    let restored = |weights: &str, to: &str| {
+    let restored = |name: &str| {
+        let to = format!("{name}.npy");
+        let weights = format!("{name}/weights.safetensors");
         run(&folder, &format!("restore b.npy --weights {weights} --device cpu -o {to} -q"));
-        std::fs::read(folder.join(to)).unwrap()
-    };
-    let first = restored("run/weights.safetensors", "first.npy");
-    assert!(restored("third/weights.safetensors", "third.npy") != first);
-    // The uncertainty is learnt without changing the other parts.
-    let uncertain =
-        "--set network.pre.uncertainty=true --set train.loss.pre=0 --set train.loss.prediction=0";
-    let uncertain = format!("{uncertain} --set train.loss.flow=0");
-    run(
-        &folder,
-        &format!(
-            "train reference.toml -o uncertain --init run/weights.safetensors {uncertain} {QUICK_SETTINGS}"
-        ),
-    );
-    let [first, same] = ["run", "uncertain"].map(|name| {
-        let weights = format!("{name}/weights.safetensors --steps 0");
-        restored(&weights, &format!("{name}0.npy"))
-    });
-    let values = |npy: &[u8]| -> Vec<f32> {
+        let npy = std::fs::read(folder.join(to)).unwrap();
         let pixels = npy[npy.len() - 3 * 48 * 32 * 4..].chunks_exact(4);
-        pixels.map(|value| f32::from_le_bytes(value.try_into().unwrap())).collect()
+        pixels.map(|value| f32::from_le_bytes(value.try_into().unwrap())).collect::<Vec<_>>()
     };
-    let pairs = values(&first).into_iter().zip(values(&same));
+    let [first, second, same] = ["first", "second", "uncertain"].map(restored);
+    assert!(first != second);
     // Up to rounding in the average of constant weights.
-    assert!(pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-5));
+    assert!(second.into_iter().zip(same).all(|(a, b)| (a - b).abs() < 1e-5));
     let report = std::fs::read_to_string(folder.join("uncertain/report.html")).unwrap();
     assert!(report.contains("predicted uncertainty"));
 }
 
 #[test]
 fn draws_all_bursts_before_training() {
-    let folder = with_reference_recipe("train-draw");
+    let folder = with_recipes("train-draw");
     let parts =
         format!("{QUICK_SETTINGS} --set train.crops={{bursts=5,cached_frames=3,frames=3,side=16}}");
-    run(&folder, &format!("train reference.toml --bursts kept --prepare --workers 2 {parts}"));
+    run(&folder, &format!("train regression.toml --bursts kept --prepare --workers 2 {parts}"));
     let names: Vec<_> = (0..5).map(|number| format!("1-{number:06}.safetensors")).collect();
     assert_eq!(listing(&folder.join("kept")), names);
     // Existing bursts are kept; missing ones are drawn again, the same.
@@ -216,12 +214,13 @@ fn draws_all_bursts_before_training() {
     let written = |number: usize| std::fs::metadata(path(number)).unwrap().modified().unwrap();
     let at = written(4);
     std::fs::remove_file(path(3)).unwrap();
-    run(&folder, &format!("train reference.toml --bursts kept --prepare {parts}"));
+    run(&folder, &format!("train regression.toml --bursts kept --prepare {parts}"));
     assert!(std::fs::read(path(3)).unwrap() == before && written(4) == at);
-    run(&folder, &format!("train reference.toml --bursts kept -o run {parts}"));
+    run(&folder, &format!("train regression.toml --bursts kept -o run {parts}"));
     assert!(std::fs::read(path(4)).unwrap() == kept);
-    refused(&folder, "train reference.toml --bursts kept --prepare", &["train.crops"]);
-    let other = format!("train reference.toml --bursts kept --prepare {parts} --set data.crop=40");
+    refused(&folder, "train regression.toml --bursts kept --prepare", &["train.crops"]);
+    let other =
+        format!("train regression.toml --bursts kept --prepare {parts} --set data.crop=40");
     refused(&folder, &other, &["drawn with other"]);
 }
 
@@ -237,9 +236,7 @@ fn rejects_impossible_recipes_and_folders() {
         ("train tiny -o run --init none.safetensors", &["none.safetensors"]),
         ("train emvd -o run", &["--data"]),
         ("train emvd -o run --data .", &["cups"]),
-        ("train small -o run --data . --backbones .", &["vgg16"]),
-        // Files that a later stage lacks are reported before any file is read.
-        ("train paper-mini -o run --data . --backbones .", &["vgg16"]),
+        ("train paper -o run --data . --backbones .", &["vgg16"]),
         (
             "train tiny -o run --set train.loss.term=lpips-vgg --set train.loss.perceptual=0.3 --backbones .",
             &["vgg16"],
@@ -254,21 +251,20 @@ fn rejects_impossible_recipes_and_folders() {
 /// Stages continue from each other, skip finished ones, and change only the parts that they name.
 #[test]
 fn stages_train_one_after_the_other() {
-    let folder = with_reference_recipe("train-stages");
-    let mut recipe = std::fs::read_to_string(folder.join("reference.toml")).unwrap();
+    let folder = with_recipes("train-stages");
+    let mut recipe = std::fs::read_to_string(folder.join("regression.toml")).unwrap();
     recipe.push_str(
         "
 [[stage]]
 name = \"first\"
-changes = { \"network.pre.stages\" = 1, \"train.loss.prediction\" = 0.0, \"train.loss.flow\" = 0.0 }
+changes = { \"train.learns\" = [\"refinement\"] }
 
 [[stage]]
 name = \"second\"
-changes = { \"network.pre.stages\" = 2, \"train.loss.prediction\" = 0.0, \"train.loss.flow\" = 0.0 }
 
 [[stage]]
 name = \"rest\"
-changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.loss.pre\" = 0.0, \"train.loss.flow\" = 0.0, \"train.seed\" = 7 }
+changes = { \"train.learns\" = [\"uncertainty\"], \"train.seed\" = 7 }
 ",
     );
     std::fs::write(folder.join("stages.toml"), recipe).unwrap();
@@ -278,7 +274,7 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
     let whole = read("run/weights.safetensors");
     assert!(whole == read("run/3-rest/weights.safetensors"));
-    // Only the U-Net has learnt in the last stage.
+    // Only the uncertainty has learnt in the last stage.
     let tensors = |name: &str| {
         let bytes = read(name);
         let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
@@ -290,7 +286,10 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     assert_eq!(before.len(), after.len());
     let changed = after.iter().filter(|(name, values)| before[*name] != **values);
     let changed: Vec<&String> = changed.map(|(name, _)| name).collect();
-    assert!(!changed.is_empty() && changed.iter().all(|n| n.starts_with("unet.")), "{changed:?}");
+    assert!(
+        !changed.is_empty() && changed.iter().all(|n| n.starts_with("uncertainty.")),
+        "{changed:?}"
+    );
     // Killed in the second stage: the rest comes out the same.
     std::fs::remove_dir_all(folder.join("run/3-rest")).unwrap();
     std::fs::remove_file(folder.join("run/weights.safetensors")).unwrap();
@@ -322,8 +321,5 @@ changes = { \"network.pre.stages\" = 2, \"train.learns\" = [\"unet\"], \"train.l
     let learns = format!("train tiny -o other {QUICK_SETTINGS} --set");
     refused(&folder, &format!("{learns} train.learns=[\"unet\"]"), &["train.learns"]);
     refused(&folder, &format!("{learns} train.learns=[\"eyes\"]"), &["eyes"]);
-    // Nothing moves, and no other part learns.
-    let still =
-        "network.ablate=[\"flow\"] --set train.learns=[\"flow\"] --set train.loss.prediction=0";
-    refused(&folder, &format!("{learns} {still} --set train.loss.pre=0"), &["train.learns"]);
+    refused(&folder, &format!("{learns} train.ablate=[\"eyes\"]"), &["eyes"]);
 }

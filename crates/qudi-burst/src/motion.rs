@@ -2,8 +2,8 @@
 
 mod affine;
 pub(crate) mod block_alignment;
-mod block_flow;
 pub(crate) mod constant_velocity;
+mod flow;
 pub(crate) mod global_motion;
 pub(crate) mod grid;
 pub(crate) mod hypotheses;
@@ -15,5 +15,5 @@ pub(crate) mod reference_frames;
 mod velocity_search;
 mod warping_error;
 
-pub use block_flow::estimate_flow;
+pub use flow::estimate_flow;
 pub use warping_error::warping_error;

@@ -1,5 +1,7 @@
 //! The command line: options of every command, and groups of options that several commands share.
 
+pub(crate) mod given;
+mod methods;
 mod network;
 pub(crate) mod number;
 pub(crate) mod reading;
@@ -7,6 +9,7 @@ mod shard;
 mod sum;
 pub(crate) mod tiff_samples;
 
+pub(crate) use methods::methods;
 pub(crate) use network::{Network, Steps};
 pub(crate) use reading::Reading;
 pub(crate) use shard::Shard;
@@ -27,6 +30,7 @@ use crate::commands::restore::args::Restore;
 use crate::commands::selftest::args::Selftest;
 use crate::commands::simulate::args::Simulate;
 use crate::commands::train::args::Train;
+use crate::version;
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
 use qudi_core::atomic_file::Overwrite;
 use std::path::PathBuf;
@@ -45,7 +49,7 @@ errors. A file and the environment may hold keys of other commands; --set may no
 ///
 /// Not related to the laboratory-control suite Qudi (Ulm-IQO/qudi).
 #[derive(Debug, Parser)]
-#[command(name = "qudi", version, propagate_version = true, after_help = EXIT_CODES)]
+#[command(name = "qudi", version, long_version = version::long(), propagate_version = true, after_help = EXIT_CODES)]
 pub(crate) struct Args {
     #[command(flatten)]
     pub(crate) global: Global,
@@ -64,7 +68,7 @@ pub(crate) struct Global {
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub(crate) set: Vec<String>,
     /// Threads to use [default: all cores]
-    #[arg(short = 'j', long, global = true, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MOST_THREADS))]
+    #[arg(short = 'j', long, global = true, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
     pub(crate) threads: Option<usize>,
     /// Print one JSON document instead of text
     #[arg(long, global = true)]
@@ -84,7 +88,7 @@ pub(crate) struct Global {
 }
 
 impl Global {
-    /// Whether existing outputs are overwritten.
+    /// Returns what is done with existing outputs.
     pub(crate) fn overwrite(&self) -> Overwrite {
         if self.force { Overwrite::Yes } else { Overwrite::No }
     }
@@ -123,7 +127,7 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// The name on the command line.
+    /// Returns the name on the command line.
     pub(crate) fn name(&self) -> &'static str {
         match self {
             Self::Simulate(_) => "simulate",

@@ -1,5 +1,5 @@
-//! Captures as commands read them, each value made from the one before: [`Source`], [`OpenedCapture`](source::OpenedCapture),
-//! [`SummedCapture`], [`AlignedCapture`], [`CaptureAcquisition`].
+//! Captures as commands read them, each value made from the one before: [`Source`],
+//! [`OpenedCapture`](source::OpenedCapture), [`SummedCapture`], [`AlignedCapture`], [`CaptureAcquisition`].
 
 mod acquisition;
 mod aligned;

@@ -41,6 +41,7 @@ pub(crate) mod eval {
     mod exposed_clip;
     mod exposing;
     mod html;
+    mod metrics;
     mod perceptual;
     mod plan;
     pub(crate) mod run;

@@ -21,13 +21,13 @@ pub(crate) struct Opened {
 }
 
 impl Opened {
-    /// Whether it computes in the program's own memory.
+    /// Returns true if it computes in the program's own memory.
     pub(crate) fn is_processor(&self) -> bool {
         matches!(self.name.as_str(), "cpu" | "flex" | "ndarray")
     }
 }
 
-/// All devices: the CPU first, then the graphics cards of each backend that was compiled in.
+/// Lists all devices: the CPU first, then the graphics cards of each backend that was compiled in.
 pub(crate) fn list() -> Vec<Listed> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut devices = Vec::new();
@@ -46,7 +46,7 @@ pub(crate) fn list() -> Vec<Listed> {
     devices
 }
 
-/// The feature that this build lacks for a backend.
+/// Returns the feature that this build lacks for a backend.
 fn feature_of(backend: &str) -> Option<&'static str> {
     let features = [
         ("wgpu", cfg!(feature = "wgpu")),
@@ -109,7 +109,7 @@ fn open_new(name: &str) -> Result<Opened> {
     }
 }
 
-/// The first real graphics card, or the processor.
+/// Returns the name of the first real graphics card, or of the processor.
 fn best() -> String {
     // Drivers that compute on the processor are slower than our own way to do so.
     let software = ["llvmpipe", "lavapipe", "swiftshader", "software", "cpu"];
@@ -161,7 +161,7 @@ pub(crate) fn quieten_drivers() {
     }
 }
 
-/// Backends with the names of their cards; looked for once, since drivers talk on standard error.
+/// Returns backends with the names of their cards; searched once, since drivers print to standard error.
 fn all_cards() -> &'static [(&'static str, Vec<String>)] {
     static CARDS: OnceLock<Vec<(&'static str, Vec<String>)>> = OnceLock::new();
     CARDS.get_or_init(find_cards)

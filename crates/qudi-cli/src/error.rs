@@ -2,9 +2,10 @@
 
 pub(crate) mod fields;
 
-use clap::error::{ContextKind, ErrorKind};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use fields::{flags, flags_in_text};
 use qudi_core::Error;
+use qudi_core::nearest::nearest;
 use qudi_model::{MatrixUnits, MatrixUnitsError};
 use std::fmt::Display;
 use std::io;
@@ -37,16 +38,22 @@ impl CliError {
 }
 
 impl CliError {
-    /// A value that a flag cannot have, in the three parts of all errors.
+    /// Returns the error for a value that a flag cannot have, in the three parts of all errors.
     pub(crate) fn of_value(refusal: &clap::Error) -> Option<Self> {
-        if refusal.kind() != ErrorKind::ValueValidation {
-            return None;
-        }
         let text = |kind| refusal.get(kind).map(ToString::to_string);
         let argument = text(ContextKind::InvalidArg)?;
         let flag = argument.split_whitespace().next().unwrap_or_default();
-        let value = text(ContextKind::InvalidValue)?;
-        let help = std::error::Error::source(refusal)?.to_string();
+        let value = text(ContextKind::InvalidValue).filter(|value| !value.is_empty())?;
+        let help = match (refusal.kind(), refusal.get(ContextKind::ValidValue)) {
+            (ErrorKind::ValueValidation, _) => std::error::Error::source(refusal)?.to_string(),
+            (ErrorKind::InvalidValue, Some(ContextValue::Strings(all))) => {
+                let names: Vec<&str> = all.iter().map(String::as_str).collect();
+                let hint = nearest(&value, &names);
+                let hint = hint.map_or(String::new(), |n| format!("did you mean `{n}`?  "));
+                format!("{hint}there are {}", names.join(", "))
+            }
+            _ => return None,
+        };
         Some(Self::new(format!("{flag} is {value}"), flag, help))
     }
 }
@@ -60,7 +67,10 @@ impl From<Error> for CliError {
             }
             _ => Self::Error {
                 what: flags_in_text(&e.to_string()),
-                place: e.place().map(|place| flags(&place)),
+                place: e.place().map(|place| match &e {
+                    Error::Request { .. } => flags(&place),
+                    _ => place,
+                }),
                 help: e.help().map(|help| flags_in_text(&help)),
             },
         }
@@ -83,7 +93,7 @@ impl From<rayon::ThreadPoolBuildError> for CliError {
     }
 }
 
-/// Errors of writing results to standard output.
+/// Returns the error of writing results to standard output.
 pub(crate) fn stdout_error(e: io::Error) -> CliError {
     match e.kind() {
         io::ErrorKind::BrokenPipe => CliError::BrokenPipe,

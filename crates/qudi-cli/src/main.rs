@@ -11,6 +11,7 @@ mod methods;
 mod places;
 mod report;
 mod settings;
+mod version;
 mod weights;
 
 use args::{Args, Command};

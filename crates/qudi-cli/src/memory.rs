@@ -7,7 +7,7 @@ use qudi_core::Size;
 const PURGE_DELAY: i32 = 15;
 
 /// The delay that never comes.
-const KEEP: std::ffi::c_long = -1;
+const NEVER_PURGE: std::ffi::c_long = -1;
 
 /// Growth of the peak since a moment.
 #[derive(Debug)]
@@ -16,7 +16,7 @@ pub(crate) struct PeakMemory {
 }
 
 impl PeakMemory {
-    /// Forgets the peak so far, and gives kept pages back first, those of all threads: they would hide what comes.
+    /// Starts a measurement. Gives back the kept pages of all threads first, which would hide later growth.
     #[allow(unsafe_code)]
     pub(crate) fn start() -> Self {
         // SAFETY: it frees what the calling thread keeps and nobody uses.
@@ -26,19 +26,19 @@ impl PeakMemory {
         set_delay(0);
         rayon::broadcast(|_| collect());
         collect();
-        set_delay(KEEP);
+        set_delay(NEVER_PURGE);
         // 5 resets the peak (proc(5), clear_refs); elsewhere there is no such file.
         let reset = std::fs::write("/proc/self/clear_refs", "5").is_ok();
         Self { before: reset.then(|| field("VmRSS:")).flatten() }
     }
 
-    /// MiB that the peak lies above what was held at the start.
+    /// Returns the growth of the peak since the start, in MiB.
     pub(crate) fn grown_mib(&self) -> Option<f64> {
         Some((field("VmHWM:")? - self.before?).max(0.0))
     }
 }
 
-/// Bytes that the system and this process's control group can still give, where they tell.
+/// Returns the bytes that the system and this process's control group can still give, if they are known.
 pub(crate) fn available_bytes() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
@@ -53,22 +53,23 @@ pub(crate) fn available_bytes() -> Option<u64> {
     }
 }
 
-/// Refuses tiles that memory cannot hold, before the system ends the program for it. `sides` are those of the smallest
-/// tiles and of the tiles wanted, `needed` the bytes that one of a size takes.
+/// Refuses tiles that memory cannot hold, before the system ends the program for it. `sides` are the sides of the
+/// smallest and of the requested tiles, `needed` the bytes that a tile takes.
 pub(crate) fn check_tiles(
     sides: [usize; 2],
     frame: Size,
     available: Option<u64>,
     needed: impl Fn(Size) -> u64,
 ) -> Result<()> {
-    let [smallest, wanted] = sides;
+    let [smallest, requested] = sides;
     let of_side =
         |side: usize| needed(Size { height: frame.height.min(side), width: frame.width.min(side) });
-    let Some(available) = available.filter(|&available| of_side(wanted) > available) else {
+    let Some(available) = available.filter(|&available| of_side(requested) > available) else {
         return Ok(());
     };
-    let what = shortage(&format!("tiles of {wanted} pixels take"), of_side(wanted), available);
-    let mut smaller = (smallest..wanted).rev();
+    let what =
+        shortage(&format!("tiles of {requested} pixels take"), of_side(requested), available);
+    let mut smaller = (smallest..requested).rev();
     let help = match smaller.find(|&side| side % 32 == 0 && of_side(side) <= available) {
         Some(side) => format!("--tile {side} fits"),
         None => "free some memory, or use smaller weights".to_owned(),
@@ -76,13 +77,13 @@ pub(crate) fn check_tiles(
     Err(CliError::new(what, "--tile", help))
 }
 
-/// How a shortage is said: what is needed, about, and what is free.
+/// Formats a shortage: about how much is needed, and how much is free.
 pub(crate) fn shortage(taker: &str, needed: u64, available: u64) -> String {
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     format!("{taker} about {:.1} GiB, {:.1} GiB are free", gib(needed), gib(available))
 }
 
-/// A field of /proc/self/status in MiB.
+/// Reads a field of /proc/self/status in MiB.
 fn field(name: &str) -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix(name))?;
@@ -96,7 +97,7 @@ fn field(name: &str) -> Option<f64> {
 pub(crate) fn keep_freed_pages() {
     // SAFETY: called at the start of `main`, before there are other threads; the value is in the option's
     // range.
-    unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, KEEP) };
+    unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, NEVER_PURGE) };
 }
 
 #[cfg(test)]

@@ -39,7 +39,7 @@ impl Places {
         self
     }
 
-    /// Adds a capture or clip with the record beside it.
+    /// Adds a capture or clip with its record.
     pub(crate) fn reads_burst(self, path: &Path) -> Self {
         let mut record = OsString::from(path);
         record.push(".json");
@@ -114,7 +114,7 @@ fn is_path(path: &Path) -> bool {
     !path.as_os_str().is_empty() && path.as_os_str() != "-"
 }
 
-/// The path with links followed; of what does not exist yet, that of its folder.
+/// Follows links; in a path that does not exist yet, the links of its folder.
 fn resolved(path: &Path) -> PathBuf {
     if let Ok(path) = path.canonicalize() {
         return path;

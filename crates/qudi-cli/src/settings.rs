@@ -25,7 +25,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 use std::path::Path;
 
-/// The origin of values that nobody set.
+/// Origin of values that are not set.
 const DEFAULT: &str = "default";
 
 /// The settings of one command.
@@ -38,7 +38,7 @@ pub(crate) struct Settings {
     recipe: Vec<(String, Value, String)>,
 }
 
-/// Setter of a key.
+/// Origin of a key's value.
 enum Origin<'a> {
     /// A file or the environment, which other commands read as well.
     Shared(&'a str),
@@ -102,7 +102,7 @@ impl Settings {
         Ok(())
     }
 
-    /// `QUDI_SIMULATE_PPP=9.75` sets `simulate.ppp`.
+    /// Adds the environment: `QUDI_SIMULATE_PPP=9.75` sets `simulate.ppp`.
     fn add_environment(&mut self) -> Result<()> {
         let parts = commands::SETTINGS.iter().chain(commands::RECIPE);
         let prefixes: Vec<String> = parts.map(|part| format!("{}_", variable(part))).collect();
@@ -207,7 +207,7 @@ impl Settings {
         })
     }
 
-    /// Returns the value of a key if it was set.
+    /// Returns the value of a key if it is set.
     pub(crate) fn given<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>> {
         if self.find(name).1 == DEFAULT { Ok(None) } else { self.get(name).map(Some) }
     }
@@ -291,7 +291,7 @@ fn parse_value(text: &str) -> Value {
     }
 }
 
-/// Returns a value in TOML notation.
+/// Formats a value in TOML notation.
 pub(crate) fn toml_text(value: &Value) -> String {
     toml::Value::try_from(value).map_or_else(|_| value.to_string(), |value| value.to_string())
 }

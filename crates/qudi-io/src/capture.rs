@@ -1,8 +1,8 @@
 //! Captures of real (and simulated) single-photon cameras, in every format of the field.
 //!
-//! The way of the data: a path is recognised ([`codec::FORMATS`]) and opened as native frames
-//! ([`CountFrames`]); a [`Capture`] turns and crops them, sums them, and repairs bad pixels, so that
-//! nothing downstream sees a raw file. Memory holds a few frames, however long the capture is.
+//! A path is recognised ([`codec::FORMATS`]) and opened as native frames ([`CountFrames`]). A [`Capture`]
+//! turns, crops and sums them and repairs bad pixels, so that nothing downstream sees a raw file. Memory
+//! holds a few frames, however long the capture is.
 
 mod auto_sum;
 mod calibrate;
@@ -12,7 +12,7 @@ mod pixel_map;
 mod summary;
 mod view;
 
-pub use auto_sum::{ENOUGH, SumChoice, SumLimit, choose_sum};
+pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
 pub use summary::{BitOrderCheck, Summary};
 
@@ -39,11 +39,11 @@ pub struct Capture {
     info: CaptureInfo,
     native: Box<dyn CountFrames>,
     view: View,
-    /// Native frames in use; of a pipe, those that have arrived.
+    /// Native frames in use; for a pipe, those that have arrived.
     range: Range<u64>,
-    /// One past the last native frame asked for.
+    /// One past the last requested native frame.
     end: Option<u64>,
-    /// Whether no more frames come.
+    /// True if no more frames arrive.
     complete: bool,
     sum: u32,
     repair: Repair,
@@ -64,15 +64,14 @@ impl std::fmt::Debug for Capture {
 }
 
 impl Capture {
-    /// Opens the capture at `path`. `sensor` is asked for its dark map and its bad pixels, if
-    /// `options` name none.
+    /// Opens the capture at `path`. Its dark map and bad pixels come from `sensor`, if `options` name none.
     ///
     /// # Errors
     /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
         let options = &with_pedestal(options, sensor);
         let (native, info) = codec::open(path, options)?;
-        // A record beside the file may name a sensor with a pedestal; its counts were taken above it.
+        // A record next to the file may name a sensor with a pedestal, above which its counts were taken.
         let recorded = info.sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
         if recorded > 0.0 && options.offset.is_none() && options.threshold.is_none() {
             let options = ReadOptions { offset: Some(recorded), ..options.clone() };
@@ -82,8 +81,8 @@ impl Capture {
         Self::assemble(path, native, info, options, sensor)
     }
 
-    /// The capture that comes out of `reader`: a `.npy`, or raw frames that `options` name. Each frame
-    /// comes once: [`Capture::wait_for`] waits for more, and statistics see the first window.
+    /// Opens a capture from `reader`: a `.npy`, or raw frames that `options` describe. Each frame arrives
+    /// once: [`Capture::wait_for`] waits for more, and statistics see the first window.
     ///
     /// # Errors
     /// As [`Capture::open`].
@@ -153,8 +152,8 @@ impl Capture {
         Ok(capture)
     }
 
-    /// The same capture with `sum` native frames summed into each output frame. `options` and `sensor` are
-    /// those that it was opened with: they say which pixels are repaired.
+    /// Sums `sum` native frames into each output frame. `options` and `sensor` are the ones it was opened
+    /// with: they say which pixels are repaired.
     ///
     /// # Errors
     /// [`Error`] if so many frames do not fit, or the capture cannot be read.
@@ -172,7 +171,7 @@ impl Capture {
         Ok(self)
     }
 
-    /// Output frames of `sensor` that are in memory already, `[frames][height * width]`.
+    /// Creates a capture from output frames of `sensor` in memory, `[frames][height * width]`.
     ///
     /// # Errors
     /// [`Error::Request`] if there are none, or one has another size.
@@ -211,27 +210,27 @@ impl Capture {
         })
     }
 
-    /// What is known about it.
+    /// Returns the description of the capture.
     pub fn info(&self) -> &CaptureInfo {
         &self.info
     }
 
-    /// Where it lies.
+    /// Returns the path of the capture.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Size of the turned and cropped frames.
+    /// Returns the size of the turned and cropped frames.
     pub fn size(&self) -> Size {
         self.view.size
     }
 
-    /// Output frames; of a pipe, those that have arrived.
+    /// Returns the number of output frames; for a pipe, of those that have arrived.
     pub fn frames(&self) -> u64 {
         self.native_frames() / u64::from(self.sum)
     }
 
-    /// Output frames in all; `None` as long as that of a pipe is unknown.
+    /// Returns the number of all output frames; `None` while the length of a pipe is unknown.
     pub fn length(&self) -> Option<u64> {
         let end = match (self.native.length(), self.end) {
             (Some(length), Some(end)) => length.min(end),
@@ -241,7 +240,7 @@ impl Capture {
     }
 
     /// Waits until `frames` output frames have arrived or the input ends, and returns how many have arrived.
-    /// A file has all its frames from the start; a pipe blocks until they come.
+    /// A file has all its frames from the start; a pipe blocks.
     ///
     /// # Errors
     /// [`Error`] if a pipe fails, or ends inside a frame.
@@ -256,12 +255,12 @@ impl Capture {
         Ok(self.frames())
     }
 
-    /// Drops the output frames of a pipe before `frame`: they cannot be read again. Files are not changed.
+    /// Drops the output frames of a pipe before `frame`, which cannot be read again. Files are not changed.
     pub fn discard_before(&mut self, frame: u64) {
         self.native.discard_before(self.range.start + frame * u64::from(self.sum));
     }
 
-    /// Notes whether the end has come, and what is to be said of it.
+    /// Records whether the end has been reached, with notes for the user.
     fn note_end(&mut self) {
         let ended = self.native.length() == Some(self.range.end);
         self.complete = ended || self.end == Some(self.range.end);
@@ -280,27 +279,27 @@ impl Capture {
         }
     }
 
-    /// Native frames in use.
+    /// Returns the number of native frames in use.
     pub fn native_frames(&self) -> u64 {
         self.range.end - self.range.start
     }
 
-    /// Native frames summed into each output frame.
+    /// Returns the number of native frames summed into each output frame.
     pub fn summed(&self) -> u32 {
         self.sum
     }
 
-    /// Largest possible count of an output frame, if known.
+    /// Returns the largest possible count of an output frame, if known.
     pub fn max_count(&self) -> Option<u16> {
         self.info.max_count.map(|max| (u32::from(max) * self.sum) as u16)
     }
 
-    /// The sensor whose output frames these are: `sensor`, summing as many binary frames as one
-    /// count does here.
+    /// Returns the sensor of these output frames: `sensor`, summing as many binary frames as one count does
+    /// here.
     ///
     /// # Errors
-    /// [`Error::Request`] if the depth is unknown or is not that sensor's, or if frames of a
-    /// linear sensor are summed, which no sensor does.
+    /// [`Error::Request`] if the depth is unknown or differs from the sensor's, or if frames of a linear
+    /// sensor are summed, which no sensor does.
     pub fn output_sensor(&self, sensor: &Sensor) -> Result<Sensor> {
         let place = self.path.display();
         let linear = sensor.response == Response::Linear;
@@ -336,22 +335,22 @@ impl Capture {
         }
     }
 
-    /// Output frames per second, if known.
+    /// Returns the output frames per second, if known.
     pub fn fps(&self) -> Option<f64> {
         self.info.fps.map(|fps| fps / f64::from(self.sum))
     }
 
-    /// Dark electrons per native frame of every pixel, if a map is known.
+    /// Returns the dark electrons per native frame of every pixel, if a map is known.
     pub fn dark(&self) -> Option<&[f32]> {
         self.dark.as_deref()
     }
 
-    /// Pixels that are repaired: named ones, or found ones.
+    /// Returns the pixels that are repaired: named ones, or found ones.
     pub fn bad_pixels(&self) -> &BadPixels {
         &self.bad
     }
 
-    /// Whether going back means to start over, or is impossible.
+    /// Returns true if frames cannot be read again, or only by starting over.
     pub fn forward_only(&self) -> bool {
         self.native.forward_only()
     }
@@ -366,7 +365,7 @@ impl Capture {
     }
 
     /// Reads the output frame that begins with native frame `native`, counted from the first in use; sums may
-    /// begin anywhere. Bad pixels are repaired.
+    /// begin at any native frame. Bad pixels are repaired.
     ///
     /// # Errors
     /// As [`Capture::read`].
@@ -400,9 +399,9 @@ impl Capture {
         Ok(())
     }
 
-    /// Copies packed frames as they are, from `first` on: rows of whole bytes, the first pixel in the
-    /// highest bit. `false` if they have to be read one by one: turned, summed, repaired, or stored
-    /// otherwise.
+    /// Copies packed frames as they are, from `first` on: rows of whole bytes, the first pixel in the highest
+    /// bit. Returns false if they have to be read one by one, since they are turned, summed, repaired, or
+    /// stored in another way.
     ///
     /// # Errors
     /// [`Error`] if the file cannot be read.
@@ -426,7 +425,7 @@ impl Capture {
         Ok(())
     }
 
-    /// Sums as they are, turned and cropped only.
+    /// Sums output frames, turned and cropped only.
     fn stored_total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.check(frames.clone())?;
         let native = |frame: u64| self.range.start + frame * u64::from(self.sum);
@@ -453,9 +452,8 @@ impl Capture {
         ))
     }
 
-    /// Output frames to look at for statistics: one from each of equally long stretches, not all at
-    /// the same place in theirs, since lamps flicker; or the first frames, where going through the
-    /// whole file would take long.
+    /// Returns the output frames for statistics: one from each of equally long stretches, at varying places,
+    /// since lamps flicker; or the first frames, where reading the whole file would take long.
     pub fn sample_frames(&self) -> Vec<u64> {
         let sampled = self.frames().min(SAMPLE_FRAMES);
         if self.forward_only() {

@@ -1,7 +1,7 @@
-//! Every format that captures come in: one file and one line each.
+//! Formats of captures: one file and one line each.
 //!
-//! Writers lie in [`writer`](crate::writer): they share the atomic file and the record beside it, and write
-//! few formats.
+//! Writers are in [`writer`](crate::writer): they share the atomic file and the record, and write few
+//! formats.
 
 mod array;
 #[cfg(feature = "hdf5")]
@@ -31,19 +31,19 @@ use std::path::Path;
 /// One way to store a capture.
 #[derive(Debug)]
 pub struct Format {
-    /// The name that the option `format` takes.
+    /// Name for the option `format`.
     pub name: &'static str,
-    /// In words.
+    /// Name in words.
     pub title: &'static str,
-    /// Whether a path is of this format, and why.
+    /// Recognises the format, with reasons.
     probe: fn(&Probe) -> Result<Option<Recognition>>,
-    /// The options that it takes.
+    /// Options that it takes.
     pub options: &'static [FormatOption],
     /// Opens it.
     open: fn(&Probe, &ReadOptions, &mut CaptureInfo) -> Result<Box<dyn CountFrames>>,
 }
 
-/// How sure it is that a path is of a format, and why.
+/// The certainty that a path is of a format, and the reasons.
 pub(crate) struct Recognition {
     certainty: Certainty,
     reasons: Vec<String>,
@@ -55,14 +55,14 @@ impl Recognition {
     }
 }
 
-/// All formats. To add one: a file in `codec/`, a line here, a row in `docs/formats.md`.
+/// All formats. A new one takes a file in `codec/`, a line here, and a row in `docs/formats.md`.
 pub const FORMATS: &[Format] = &[
     npy::FORMAT,
     npy::COMPRESSED,
     npz::FORMAT,
     visionsim::FORMAT,
-    swissspad2::HALF,
-    swissspad2::FULL,
+    swissspad2::HALF_ARRAY,
+    swissspad2::FULL_ARRAY,
     spad512s::BINARY,
     spad512s::BYTES,
     spad512s::WORDS,
@@ -79,7 +79,7 @@ pub const FORMATS: &[Format] = &[
     raw::WORDS,
 ];
 
-/// Opens `path` in the format that `options` name, or in the one it fits best.
+/// Opens `path` in the format that `options` name, or else in the best match.
 pub(crate) fn open(
     path: &Path,
     options: &ReadOptions,
@@ -125,7 +125,7 @@ fn open_as(
 }
 
 /// Options of arrays: axes, packing, colour.
-const ARRAY: &[FormatOption] = &[
+const ARRAY_OPTIONS: &[FormatOption] = &[
     FormatOption::Axes,
     FormatOption::Channel,
     FormatOption::BitOrder,
@@ -137,7 +137,7 @@ const ARRAY: &[FormatOption] = &[
 ];
 
 /// Options of files that hold several arrays.
-const ARRAYS: &[FormatOption] = &[
+const ARRAYS_OPTIONS: &[FormatOption] = &[
     FormatOption::Axes,
     FormatOption::Channel,
     FormatOption::Array,
@@ -150,7 +150,7 @@ const ARRAYS: &[FormatOption] = &[
 ];
 
 /// Options of pictures.
-const PICTURES: &[FormatOption] = &[
+const PICTURE_OPTIONS: &[FormatOption] = &[
     FormatOption::Axes,
     FormatOption::Channel,
     FormatOption::Levels,
@@ -159,7 +159,7 @@ const PICTURES: &[FormatOption] = &[
 ];
 
 /// Options of headerless files of packed bits, whose frame size the format knows.
-const BIT_FILES: &[FormatOption] = &[
+const BIT_FILE_OPTIONS: &[FormatOption] = &[
     FormatOption::BitOrder,
     FormatOption::Header,
     FormatOption::Trailer,
@@ -167,7 +167,7 @@ const BIT_FILES: &[FormatOption] = &[
 ];
 
 /// Options of headerless files of packed bits of any size.
-const SIZED_BIT_FILES: &[FormatOption] = &[
+const SIZED_BIT_FILE_OPTIONS: &[FormatOption] = &[
     FormatOption::BitOrder,
     FormatOption::Size,
     FormatOption::Header,
@@ -189,7 +189,7 @@ fn by_name(name: &str) -> Result<&'static Format> {
 }
 
 /// Formats of other programs, by magic number or extension: their name, and what converts them.
-const FOREIGN: &[(&[u8], &[&str], &str, &str)] = &[
+const FOREIGN_FORMATS: &[(&[u8], &[&str], &str, &str)] = &[
     (
         b"PQTTTR",
         &["ptu", "pt3", "ht3", "phu"],
@@ -236,15 +236,17 @@ const FOREIGN: &[(&[u8], &[&str], &str, &str)] = &[
     ),
 ];
 
-/// What a file of another program's format is, and what to do about it.
+/// Returns the error of a file of another program's format, with the remedy.
 fn foreign(probe: &Probe) -> Option<Error> {
     if probe.is_folder {
         return None;
     }
-    let by_magic =
-        FOREIGN.iter().find(|(magic, ..)| !magic.is_empty() && probe.head.starts_with(magic));
-    let by_name =
-        || FOREIGN.iter().find(|(_, extensions, ..)| extensions.contains(&&*probe.extension));
+    let by_magic = FOREIGN_FORMATS
+        .iter()
+        .find(|(magic, ..)| !magic.is_empty() && probe.head.starts_with(magic));
+    let by_name = || {
+        FOREIGN_FORMATS.iter().find(|(_, extensions, ..)| extensions.contains(&&*probe.extension))
+    };
     let (_, _, what, help) = by_magic.or_else(by_name)?;
     Some(Error::data(*what, &probe.path, *help))
 }
@@ -277,7 +279,7 @@ fn unknown(probe: &Probe) -> Error {
     )
 }
 
-/// Something in a folder that could be a capture.
+/// Returns a file or folder inside that could be a capture.
 fn inside(probe: &Probe) -> Option<String> {
     let files = probe.files(&["npy", "npz", "gz", "tif", "tiff", "h5", "png"]).ok()?;
     let file = files.first().filter(|_| probe.is_folder)?;
@@ -302,7 +304,7 @@ fn ambiguous(probe: &Probe, found: &[(&Format, Recognition)]) -> Error {
     )
 }
 
-/// The map `name` of a MATLAB file, or the only array of two dimensions in it.
+/// Reads the map `name` of a MATLAB file, or its only array of two dimensions.
 pub(crate) fn read_mat_map(path: &Path, name: &str) -> Result<qudi_core::Frame> {
     let arrays = mat::file::arrays(path)?;
     let mut maps = arrays.iter().filter(|a| a.dims.len() == 2 && a.dims.iter().all(|&d| d > 1));

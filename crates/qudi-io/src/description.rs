@@ -1,4 +1,4 @@
-//! What is said about a capture, by its file ([`CaptureInfo`]) and by the user ([`ReadOptions`]).
+//! Descriptions of captures: what files say ([`CaptureInfo`]), and what the user says ([`ReadOptions`]).
 
 mod format_options;
 mod info;

@@ -1,4 +1,4 @@
-//! The record beside every burst: what is needed to read it, and to make it again.
+//! Records of bursts: how to read a burst, and how to make it again.
 
 use crate::description::ReadOptions;
 use crate::writer::BurstFormat;
@@ -24,19 +24,19 @@ pub struct Record {
     pub version: u32,
     /// Program that wrote it.
     pub program: String,
-    /// How the burst lies on disk.
+    /// Layout of the burst on disk.
     pub burst: BurstLayout,
-    /// The light that was found for the request.
+    /// Light that was resolved for the request.
     pub light: Light,
     /// Gain in DN/e-.
     pub gain: f64,
-    /// Statistics of the clip: another value means that the input has changed.
+    /// Statistics of the clip: another value shows that the input has changed.
     pub clip: ClipDigest,
-    /// Everything asked for.
+    /// The request.
     pub simulation: Simulation,
 }
 
-/// How a burst lies on disk.
+/// The layout of a burst on disk.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BurstLayout {
     /// File format.
@@ -52,22 +52,22 @@ pub struct BurstLayout {
     pub bits: u8,
     /// Output frames per second, if the sensor's rate is known.
     pub fps: Option<f64>,
-    /// Whether 8 pixels share a byte.
+    /// True if 8 pixels share a byte.
     pub bitpack: bool,
-    /// The packed axis of `[frames][height][width]`.
+    /// Packed axis of `[frames][height][width]`.
     pub bitpack_dim: Option<u32>,
-    /// `msb`: the first pixel is the highest bit.
+    /// Bit order; `msb` if the first pixel is the highest bit.
     pub bitorder: Option<String>,
 }
 
 impl BurstLayout {
-    /// The layout of a burst of `sensor`.
+    /// Returns the layout of a burst of `sensor`.
     pub fn new(format: BurstFormat, frames: u64, size: Size, sensor: &Sensor) -> Self {
         let fps = sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed));
         Self::of_counts(format, frames, size, sensor.max_count(), fps)
     }
 
-    /// The layout of a burst of counts up to `max_count`.
+    /// Returns the layout of a burst of counts up to `max_count`.
     pub fn of_counts(
         format: BurstFormat,
         frames: u64,
@@ -90,7 +90,7 @@ impl BurstLayout {
     }
 }
 
-/// Identifies the scene that was exposed.
+/// A digest of the scene that was exposed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClipDigest {
     /// Mean image value.
@@ -106,17 +106,17 @@ pub struct Conversion {
     pub version: u32,
     /// Program that wrote it.
     pub program: String,
-    /// How the burst lies on disk.
+    /// Layout of the burst on disk.
     pub burst: BurstLayout,
-    /// Whether counts are sums of `max_count` binary frames.
+    /// True if counts are sums of `max_count` binary frames.
     pub binary: bool,
-    /// The camera preset that the capture's format belongs to.
+    /// Camera preset of the capture's format.
     pub preset: Option<String>,
-    /// The capture.
+    /// Path of the capture.
     pub capture: PathBuf,
-    /// Its format.
+    /// Format of the capture.
     pub format: String,
-    /// How it was read.
+    /// Options with which it was read.
     pub read: ReadOptions,
 }
 
@@ -164,7 +164,7 @@ impl Record {
     }
 }
 
-/// The error of a record that says one thing about the file at `path`, which holds another.
+/// Returns the error of a record that contradicts the file at `path`.
 pub(crate) fn contradiction(recorded: &str, found: &str, path: &Path) -> Error {
     Error::data(
         format!("the record beside it describes {recorded}, and {found}"),

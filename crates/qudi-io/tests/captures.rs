@@ -23,7 +23,7 @@ use qudi_io::capture::Capture;
 use qudi_io::description::{MaskChoice, ReadOptions};
 use std::path::{Path, PathBuf};
 
-/// A folder of its own for each test; gone when dropped.
+/// Creates a folder for a test, deleted when dropped.
 pub(crate) fn scratch() -> tempfile::TempDir {
     tempfile::tempdir().unwrap()
 }
@@ -56,7 +56,7 @@ pub(crate) fn counts(capture: &mut Capture) -> Vec<Vec<u16>> {
         .collect()
 }
 
-/// The message of an expected error: what, and its help.
+/// Returns the message of an expected error, with its remedy.
 pub(crate) fn refusal(result: Result<Capture, Error>) -> String {
     let error = result.expect_err("to be refused");
     format!("{error}; {}", error.help().unwrap_or_default())
@@ -97,7 +97,7 @@ pub(crate) fn pack(frame: &[u16], width: usize, lsb: bool) -> Vec<u8> {
     bytes
 }
 
-/// A `.npy` as NumPy writes it.
+/// Encodes a `.npy` as NumPy writes it.
 pub(crate) fn npy(descr: &str, fortran: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let header =
         format!("{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': {shape}, }}\n");

@@ -1,21 +1,23 @@
 //! Weights in one SafeTensors file that describes itself.
 
 mod description;
-mod model_kind;
+mod former;
 
-use crate::network::{Qudi, former_name, init_parameters, parameter_shapes};
+use crate::config::{NetworkConfig, NetworkKind};
+use crate::diffusion::Diffusion;
+use crate::regression::Regression;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Tensor, f16};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::limits::WEIGHT_BYTES;
 use qudi_core::regular_file::read_limited;
 use qudi_core::{Error, Result};
+use qudi_layers::{init_parameters, parameter_shapes};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::path::Path;
 
-pub use description::Description;
-pub use model_kind::ModelKind;
+pub use description::{Description, Sampling};
 
 /// The key of the description among a file's metadata.
 const KEY: &str = "qudi";
@@ -29,12 +31,39 @@ pub enum Precision {
     Half,
 }
 
+/// A network that weight files hold.
+pub trait Network: Module {
+    /// Kind of the network.
+    const KIND: NetworkKind;
+
+    /// Creates a network of these sizes without weights; none if they are of another kind.
+    fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self>;
+}
+
+impl Network for Regression {
+    const KIND: NetworkKind = NetworkKind::Regression;
+
+    fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self> {
+        let NetworkConfig::Regression(config) = config else { return None };
+        Some(config.uninitialized(device))
+    }
+}
+
+impl Network for Diffusion {
+    const KIND: NetworkKind = NetworkKind::Diffusion;
+
+    fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self> {
+        let NetworkConfig::Diffusion(config) = config else { return None };
+        Some(config.uninitialized(device))
+    }
+}
+
 /// Writes the network's weights, whole or not at all.
 ///
 /// # Errors
 /// [`Error`] if the file cannot be written or the device cannot be read.
-pub fn save(
-    network: &Qudi,
+pub fn save<N: Network>(
+    network: &N,
     description: &Description,
     precision: Precision,
     path: &Path,
@@ -53,9 +82,7 @@ pub fn save(
             "the training that wrote it had failed: use an earlier checkpoint",
         ));
     }
-    let kind = Some(ModelKind::from_zeros(|name| values.is_zero(name)));
-    let description = Description { kind, ..description.clone() };
-    let text = serde_json::to_string(&description).expect("plain data");
+    let text = serde_json::to_string(description).expect("plain data");
     // One entry only: the library writes several in any order, and equal weights should make equal files.
     let metadata = HashMap::from([(KEY.to_owned(), text)]);
     let views = values.list.iter().map(|(name, shape, bytes)| {
@@ -73,47 +100,66 @@ pub fn save(
 /// # Errors
 /// [`Error::Data`] if it is not a weight file of this program.
 pub fn describe(path: &Path) -> Result<Description> {
-    Ok(File::open(path)?.description)
+    describe_bytes(&read_limited(path, WEIGHT_BYTES, "read the weights")?, path)
 }
 
-/// The description of a weight file that is in memory; `place` names it in errors.
+/// Reads the description of a weight file that is in memory; `place` names it in errors.
 ///
 /// # Errors
 /// [`Error::Data`] if it is not a weight file of this program.
 pub fn describe_bytes(bytes: &[u8], place: &Path) -> Result<Description> {
-    description(bytes, place)
+    Ok(describe_layout(bytes, place)?.0)
 }
 
-/// [`load`], from memory.
+/// [`load`]s a network from memory.
 ///
 /// # Errors
 /// As [`load`].
-pub fn load_bytes(bytes: &[u8], place: &Path, device: &Device) -> Result<(Qudi, Description)> {
-    network(bytes, description(bytes, place)?, place, device)
+pub fn load_bytes<N: Network>(
+    bytes: &[u8],
+    place: &Path,
+    device: &Device,
+) -> Result<(N, Description)> {
+    network(bytes, describe_layout(bytes, place)?, place, device)
 }
 
 /// Reads a network onto `device`. Nothing is allocated that the file does not hold.
 ///
 /// # Errors
-/// [`Error::Data`] if the file does not fit its own description, or holds values that are no numbers.
-pub fn load(path: &Path, device: &Device) -> Result<(Qudi, Description)> {
-    let File { bytes, description } = File::open(path)?;
-    network(&bytes, description, path, device)
+/// [`Error::Data`] if the file holds a network of another kind, does not fit its own description, or holds
+/// values that are no numbers.
+pub fn load<N: Network>(path: &Path, device: &Device) -> Result<(N, Description)> {
+    load_bytes(&read_limited(path, WEIGHT_BYTES, "read the weights")?, path, device)
 }
 
-/// The network of a whole file, described by `description`.
-fn network(
+/// The names that a file has for parameters.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Layout {
+    /// The names of this version.
+    Present,
+    /// The names of version 0.1.0.
+    Former,
+}
+
+/// Reads the network of a whole file, described by `description`.
+fn network<N: Network>(
     bytes: &[u8],
-    description: Description,
+    (description, layout): (Description, Layout),
     path: &Path,
     device: &Device,
-) -> Result<(Qudi, Description)> {
+) -> Result<(N, Description)> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| damaged(path, e))?;
-    let network = description.network.uninitialized(device);
+    let Some(network) = N::of_sizes(&description.network, device) else {
+        return Err(other_kind::<N>(&description, layout, path));
+    };
+    let name_of = |name: &str| match layout {
+        Layout::Present => name.to_owned(),
+        Layout::Former => former::name(name),
+    };
     let expected = parameter_shapes(&network);
-    let stored = |name: &str| tensors.tensor(name).or_else(|_| tensors.tensor(&former_name(name)));
     for (name, shape) in &expected {
-        let Ok(tensor) = stored(name) else {
+        let name = name_of(name);
+        let Ok(tensor) = tensors.tensor(&name) else {
             return Err(mismatch(path, format!("`{name}` is missing")));
         };
         if tensor.shape() != shape.as_slice() {
@@ -127,13 +173,17 @@ fn network(
             ));
         }
     }
-    let known = |name: &str| expected.iter().any(|(e, _)| e == name || former_name(e) == name);
+    let removed = |name: &str| {
+        layout == Layout::Former && N::KIND == NetworkKind::Regression && former::is_removed(name)
+    };
+    let known = |name: &str| expected.iter().any(|(e, _)| name_of(e) == name) || removed(name);
     if let Some(name) = tensors.names().into_iter().find(|name| !known(name)) {
         return Err(mismatch(path, format!("`{name}` belongs to no part of the network")));
     }
     let mut broken = None;
     let network = init_parameters(network, |name, shape| {
-        let values = stored(name).map(|tensor| numbers(&tensor)).unwrap_or_default();
+        let stored = tensors.tensor(&name_of(name));
+        let values = stored.map(|tensor| numbers(&tensor)).unwrap_or_default();
         if broken.is_none() && !values.iter().all(|value| value.is_finite()) {
             broken = Some(name.to_owned());
         }
@@ -150,21 +200,17 @@ fn network(
     }
 }
 
-/// A file, its description read.
-struct File {
-    bytes: Vec<u8>,
-    description: Description,
+/// Refuses a network of another kind than the one asked for.
+fn other_kind<N: Network>(description: &Description, layout: Layout, path: &Path) -> Error {
+    let kind = description.network.kind();
+    let what = format!("these are weights of a {kind}, not of a {}", N::KIND);
+    let help = format!("use --method qudi-{kind}, or name other weights");
+    let diffused = layout == Layout::Former && kind == NetworkKind::Regression;
+    let what = if diffused { format!("{what}; {}", former::NO_DIFFUSION) } else { what };
+    Error::data(what, path, help)
 }
 
-impl File {
-    fn open(path: &Path) -> Result<Self> {
-        let bytes = read_limited(path, WEIGHT_BYTES, "read the weights")?;
-        let description = description(&bytes, path)?;
-        Ok(Self { bytes, description })
-    }
-}
-
-fn description(bytes: &[u8], path: &Path) -> Result<Description> {
+fn describe_layout(bytes: &[u8], path: &Path) -> Result<(Description, Layout)> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(path, e))?;
     let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
     let Some(text) = text else {
@@ -174,26 +220,18 @@ fn description(bytes: &[u8], path: &Path) -> Result<Description> {
             "weights of this program say so in their metadata; name a file that `qudi train` wrote",
         ));
     };
-    let description: Description = serde_json::from_str(text)
-        .map_err(|e| mismatch(path, format!("the description cannot be read: {e}")))?;
+    let fault = |what: String| mismatch(path, format!("the description cannot be read: {what}"));
+    let mut value: serde_json::Value =
+        serde_json::from_str(text).map_err(|e| fault(e.to_string()))?;
+    let is_former = former::modernize(&mut value).map_err(fault)?;
+    let description: Description =
+        serde_json::from_value(value).map_err(|e| fault(e.to_string()))?;
     let network = description.network.checked().map_err(|e| mismatch(path, e.to_string()))?;
     if !(3..=1000).contains(&description.window) {
         return Err(mismatch(path, format!("a window of {} frames", description.window)));
     }
-    let kind = match description.kind {
-        Some(kind) => kind,
-        None => inferred_kind(bytes, path)?,
-    };
-    Ok(Description { network, kind: Some(kind), ..description })
-}
-
-/// The kind of a network whose file does not say.
-fn inferred_kind(bytes: &[u8], path: &Path) -> Result<ModelKind> {
-    let tensors = SafeTensors::deserialize(bytes).map_err(|e| damaged(path, e))?;
-    Ok(ModelKind::from_zeros(|name| {
-        let stored = tensors.tensor(name).ok().filter(is_float);
-        stored.is_none_or(|tensor| numbers(&tensor).iter().all(|&value| value == 0.0))
-    }))
+    let layout = if is_former { Layout::Former } else { Layout::Present };
+    Ok((Description { network, ..description }, layout))
 }
 
 fn is_float(tensor: &TensorView<'_>) -> bool {
@@ -255,17 +293,6 @@ struct Values {
     /// The first parameter with values that cannot be written.
     broken: Option<String>,
     error: Option<Error>,
-}
-
-impl Values {
-    /// Whether a parameter is zero as it will be read back.
-    fn is_zero(&self, name: &str) -> bool {
-        let list = self.list.iter().find(|(stored, ..)| stored == name);
-        list.is_none_or(|(_, shape, bytes)| {
-            let view = TensorView::new(self.precision.kind(), shape.clone(), bytes);
-            view.is_ok_and(|view| numbers(&view).iter().all(|&value| value == 0.0))
-        })
-    }
 }
 
 impl ModuleVisitor for Values {

@@ -1,23 +1,26 @@
-//! Quanta Diffusion on Burn: from photon counts to clean video.
+//! The two networks of Quanta Diffusion on Burn: from photon counts to clean video.
 //!
-//! In the order of the data: [`conditioning`] turns counts and reference estimate into named planes. The
-//! [`network`], whose sizes are a [`config`], predicts clean frames from them and from a noisy image.
-//! [`refinement`] aligns a window again on what its first pre-denoisers restore. [`diffusion`] holds the
-//! noise schedule, the sampler and the sensor's forward model. The [`restorer`] restores whole windows, tile
-//! by tile, by regression or by diffusion. Weights are a [`checkpoint`]. The device of a tensor decides the
-//! backend; this crate chooses none.
+//! [`regression`] aligns a window on a reference estimate and corrects it frame by frame: the default method.
+//! [`diffusion`] is the paper's system, which samples from photons alone. They share what describes counts
+//! ([`counts`]) and sensors ([`sensor`]), and the format of weights ([`checkpoint`]), which name their kind
+//! ([`config`]). The device of a tensor decides the backend; this crate chooses none.
 #![warn(missing_docs)]
 
+pub mod aligned;
 #[cfg(test)]
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 pub mod checkpoint;
-pub mod conditioning;
 pub mod config;
-mod cost;
+pub mod counts;
 pub mod diffusion;
-pub mod network;
-pub mod refinement;
+#[cfg(test)]
+mod golden_tests;
+mod initial;
+pub mod regression;
+mod residual_dense;
 pub mod restorer;
+pub mod sensor;
 
 pub use qudi_kernels::{ComputePrecision, MatrixUnits, MatrixUnitsError, with_precision};
+pub use qudi_layers::{init_parameters, parameter_shapes};

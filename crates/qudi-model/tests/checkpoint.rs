@@ -1,19 +1,30 @@
 //! Weight files: what was saved comes back; damaged and hostile files are refused with reasons.
 #![allow(clippy::unwrap_used)]
 
-use burn::tensor::Device;
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::tensor::{Device, Tensor};
 use qudi_core::atomic_file::Overwrite;
 use qudi_layers::Provenance;
-use qudi_model::checkpoint::{Description, ModelKind, Precision, describe, load, load_bytes, save};
+use qudi_model::checkpoint::{Description, Precision, Sampling, describe, load, load_bytes, save};
 use qudi_model::config::NetworkConfig;
-use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
+use qudi_model::diffusion::{Diffusion, DiffusionConfig};
+use qudi_model::regression::Regression;
+use qudi_model::{init_parameters, parameter_shapes};
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+
+fn config() -> DiffusionConfig {
+    let text = include_str!("../../../tests/golden/tiny.toml");
+    let NetworkConfig::Diffusion(config) = NetworkConfig::parse(text, "tiny").unwrap() else {
+        panic!("tiny is a diffusion")
+    };
+    config
+}
 
 fn description() -> Description {
     Description {
         preset: Some("tiny".into()),
-        network: NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
-            .unwrap(),
+        network: NetworkConfig::Diffusion(config()),
         window: 11,
         provenance: Provenance {
             program: "qudi test".into(),
@@ -24,20 +35,16 @@ fn description() -> Description {
             commit: None,
             licence: "MIT OR Apache-2.0".into(),
         },
-        default_steps: None,
-        kind: None,
-        spacing: None,
+        sampling: Some(Sampling::default()),
     }
 }
 
-fn network(seed: u64) -> Qudi {
-    NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
-        .unwrap()
-        .init(seed, &Device::flex())
+fn network(seed: u64) -> Diffusion {
+    config().init(seed, &Device::flex())
 }
 
 /// Values of all parameters by name.
-fn values(network: Qudi) -> Vec<(String, Vec<f32>)> {
+fn values(network: Diffusion) -> Vec<(String, Vec<f32>)> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("w.safetensors");
     save(&network, &description(), Precision::Single, &path, Overwrite::No).unwrap();
@@ -64,7 +71,7 @@ fn saved() -> (tempfile::TempDir, PathBuf) {
 }
 
 fn refused(path: &Path) -> String {
-    let error = load(path, &Device::flex()).unwrap_err();
+    let error = load::<Diffusion>(path, &Device::flex()).unwrap_err();
     assert!(error.help().is_some() && error.place().is_some(), "{error}");
     error.to_string()
 }
@@ -73,8 +80,7 @@ fn refused(path: &Path) -> String {
 fn saved_weights_load_unchanged() {
     let (_folder, path) = saved();
     let (back, description_back) = load(&path, &Device::flex()).unwrap();
-    let kind = Some(ModelKind::Regression);
-    assert_eq!(description_back, Description { kind, ..description() });
+    assert_eq!(description_back, description());
     assert_eq!(values(back), values(network(5)));
     assert_ne!(values(network(6)), values(network(5)));
     let taken =
@@ -102,9 +108,7 @@ fn half_precision_file_is_small_and_accurate() {
 #[test]
 fn initial_weights_are_equal_on_all_backends() {
     #[allow(deprecated)] // asked for by name
-    let ndarray = NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny")
-        .unwrap()
-        .init(5, &Device::ndarray());
+    let ndarray = config().init(5, &Device::ndarray());
     assert_eq!(values(ndarray), values(network(5)));
 }
 
@@ -193,7 +197,7 @@ fn randomly_damaged_files_never_panic() {
         }
         std::fs::write(&path, bytes).unwrap();
         // Some damage changes nothing that counts.
-        if load(&path, &Device::flex()).is_ok() {
+        if load::<Diffusion>(&path, &Device::flex()).is_ok() {
             describe(&path).unwrap();
         }
     }
@@ -208,4 +212,79 @@ fn parameter_names_are_unique() {
     assert_eq!(names.len(), list.len());
     let count: usize = list.iter().map(|(_, shape)| shape.iter().product::<usize>()).sum();
     assert_eq!(count, 182_440); // tests/golden/generate/network.py info tiny
+}
+
+#[test]
+fn kinds_are_not_mistaken_for_each_other() {
+    let (_folder, path) = saved();
+    let error = load::<Regression>(&path, &Device::flex()).unwrap_err();
+    assert!(error.to_string().contains("weights of a diffusion"), "{error}");
+    assert!(error.help().unwrap().contains("--method qudi-diffusion"), "{error}");
+}
+
+/// The metadata of a file in which one network could be both, and its parameters by their names of then.
+fn former(network: &str, parameters: &[(String, Vec<usize>)]) -> Vec<u8> {
+    let description = format!(
+        r#"{{"preset":null,"network":{network},"window":11,"program":"qudi 0.1.0","sensors":[],"ppp":[1.0,2.0],
+        "data":[],"steps":0,"commit":null,"licence":"MIT","default_steps":0,"kind":"regression"}}"#
+    );
+    let bytes: Vec<Vec<u8>> = parameters
+        .iter()
+        .map(|(name, shape)| {
+            let value = if name.starts_with("stages.") { 0.25f32 } else { 0.5 };
+            value.to_le_bytes().repeat(shape.iter().product())
+        })
+        .collect();
+    let views = parameters.iter().zip(&bytes).map(|((name, shape), bytes)| {
+        let dtype = safetensors::Dtype::F32;
+        (name, safetensors::tensor::TensorView::new(dtype, shape.clone(), bytes).unwrap())
+    });
+    let metadata = HashMap::from([("qudi".to_owned(), description)]);
+    safetensors::serialize(views, Some(metadata)).unwrap()
+}
+
+/// A regression of version 0.1.0, with the parts that were on top of it.
+#[test]
+fn reads_former_regressions_and_refuses_their_diffusion() {
+    let text = include_str!("../../../tests/golden/regression.toml");
+    let NetworkConfig::Regression(config) = NetworkConfig::parse(text, "regression").unwrap()
+    else {
+        panic!("not a regression")
+    };
+    let device = Device::flex();
+    let mut list: Vec<_> = parameter_shapes(&config.uninitialized(&device))
+        .into_iter()
+        .map(|(name, shape)| (name.replace("refinement.", "stages.0."), shape))
+        .collect();
+    list.push(("pre.simulated_in.weight".to_owned(), vec![8, 9, 3, 3]));
+    list.push(("unet.out.bias".to_owned(), vec![4]));
+    let sizes = |uncertainty: bool| {
+        format!(
+            r#"{{"fold":2,"pre":{{"width":8,"blocks":2,"growth":4,"neighbours":4,"alignments":3,
+            "weight_channels":4,"stages":2,"uncertainty":{uncertainty}}},"unet":{{}}}}"#
+        )
+    };
+    let bytes = former(&sizes(true), &list);
+    let place = Path::new("former");
+    let (network, description) = load_bytes::<Regression>(&bytes, place, &device).unwrap();
+    assert_eq!(description.network, NetworkConfig::Regression(config));
+    let mut first = Vec::new();
+    network.refinement().visit(&mut FirstValues(&mut first));
+    assert!(first.iter().all(|&value| value == 0.25));
+    network.visit(&mut FirstValues(&mut first));
+    assert!(first.contains(&0.5));
+    let error = load_bytes::<Diffusion>(&bytes, place, &device).unwrap_err().to_string();
+    assert!(error.contains("lesions showed"), "{error}");
+    let bytes = former(&sizes(false), &list);
+    let error = load_bytes::<Regression>(&bytes, place, &device).unwrap_err().to_string();
+    assert!(error.contains("was removed"), "{error}");
+}
+
+/// The first value of every parameter.
+struct FirstValues<'a>(&'a mut Vec<f32>);
+
+impl ModuleVisitor for FirstValues<'_> {
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        self.0.push(qudi_layers::tensor::read(param.val()).unwrap()[0]);
+    }
 }

@@ -1,15 +1,16 @@
-//! Quanta Diffusion as a method: sizes, seeds, samples, tiles, backends, and what it refuses.
+//! Both networks as methods: sizes, seeds, samples, tiles, backends, and what it refuses.
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::Device;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
-use qudi_model::checkpoint::ModelKind;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::sampler::Sampler;
-use qudi_model::network::init_parameters;
-use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
+use qudi_model::diffusion::{DiffusionConfig, DiffusionRestorer, SampleOptions};
+use qudi_model::regression::RegressionRestorer;
+use qudi_model::restorer::Model;
+use qudi_model::{ComputePrecision, init_parameters};
 
 fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
     let sensor = Sensor::load("qudi-paper").unwrap();
@@ -17,26 +18,47 @@ fn acquisition(seed: u64, first_frame: u64) -> Acquisition {
     acquisition.with_seed(seed).with_first_frame(first_frame)
 }
 
-/// A tiny network whose last layers are not zero, so that everything matters.
-fn restorer(options: SampleOptions, device: &Device) -> QudiRestorer {
-    let config =
-        NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap();
-    let network = init_parameters(config.init(2, device), |name, shape| {
-        let count: usize = shape.iter().product();
-        let seed = name.bytes().fold(7u32, |h, b| h.wrapping_mul(31).wrapping_add(b.into()));
-        let bound = if shape.len() > 1 { (1.5 / (count / shape[0]) as f32).sqrt() } else { 0.1 };
-        let norm = shape.len() == 1 && name.ends_with("weight");
-        (0..count as u32)
-            .map(|i| {
-                let z = seed.wrapping_add(i).wrapping_mul(0x9E37_79B9);
-                let z = (z ^ (z >> 15)).wrapping_mul(0x85EB_CA6B);
-                let u = (z >> 8) as f32 / (1 << 23) as f32 - 1.0;
-                if norm { 1.0 + 0.1 * u } else { bound * u }
-            })
-            .collect()
-    });
-    let model = Model { network, config, kind: ModelKind::Diffusion, window: 11 };
-    QudiRestorer::new(model, options, device).unwrap()
+fn config() -> DiffusionConfig {
+    let text = include_str!("../../../tests/golden/tiny.toml");
+    let NetworkConfig::Diffusion(config) = NetworkConfig::parse(text, "tiny").unwrap() else {
+        panic!("tiny is a diffusion")
+    };
+    config
+}
+
+/// Values that are not zero, so that every layer matters.
+fn values(name: &str, shape: &[usize]) -> Vec<f32> {
+    let count: usize = shape.iter().product();
+    let seed = name.bytes().fold(7u32, |h, b| h.wrapping_mul(31).wrapping_add(b.into()));
+    let bound = if shape.len() > 1 { (1.5 / (count / shape[0]) as f32).sqrt() } else { 0.1 };
+    let norm = shape.len() == 1 && name.ends_with("weight");
+    (0..count as u32)
+        .map(|i| {
+            let z = seed.wrapping_add(i).wrapping_mul(0x9E37_79B9);
+            let z = (z ^ (z >> 15)).wrapping_mul(0x85EB_CA6B);
+            let u = (z >> 8) as f32 / (1 << 23) as f32 - 1.0;
+            if norm { 1.0 + 0.1 * u } else { bound * u }
+        })
+        .collect()
+}
+
+/// A tiny diffusion.
+fn restorer(options: SampleOptions, device: &Device) -> DiffusionRestorer {
+    let network = init_parameters(config().init(2, device), values);
+    let model = Model { network, config: config(), window: 11 };
+    DiffusionRestorer::new(model, options, device).unwrap()
+}
+
+/// A tiny regression.
+fn regression(tile: usize) -> qudi_core::Result<RegressionRestorer> {
+    let text = include_str!("../../../tests/golden/regression.toml");
+    let NetworkConfig::Regression(config) = NetworkConfig::parse(text, "regression").unwrap()
+    else {
+        panic!("not a regression")
+    };
+    let network = init_parameters(config.init(2, &Device::flex()), values);
+    let model = Model { network, config, window: 11 };
+    RegressionRestorer::new(model, tile, ComputePrecision::F32, &Device::flex())
 }
 
 fn counts(size: Size, frames: usize) -> Vec<Vec<u16>> {
@@ -76,6 +98,24 @@ fn restores_any_size_and_length() {
             assert!(frame.data.iter().all(|v| (0.0..=1.0).contains(v)), "{size}");
         }
     }
+}
+
+#[test]
+fn regression_restores_frames_and_their_uncertainty() {
+    for (height, width, frames) in [(21, 38, 4), (24, 150, 3)] {
+        let (size, counts) = (Size { height, width }, counts(Size { height, width }, frames));
+        let burst = BurstView { size, frames: &counts };
+        let restored = regression(128).unwrap().restore(burst, &acquisition(1, 0)).unwrap();
+        let std = restored.std.unwrap();
+        assert_eq!((restored.frames.len(), std.len()), (frames, frames));
+        for (frame, std) in restored.frames.iter().zip(&std) {
+            assert_eq!((frame.size, std.size), (size, size));
+            assert!(frame.data.iter().all(|v| (0.0..=1.0).contains(v)), "{size}");
+            assert!(std.data.iter().all(|v| *v > 0.0 && *v <= 0.5), "{size}");
+        }
+    }
+    let error = regression(64).unwrap_err();
+    assert!(error.to_string().contains("64 pixels") && error.help().is_some(), "{error}");
 }
 
 #[test]
@@ -147,18 +187,14 @@ fn rejects_short_bursts_and_impossible_options() {
         .restore(BurstView { size, frames: &two }, &acquisition(1, 0))
         .unwrap_err();
     assert!(error.to_string().contains("2 frames") && error.help().is_some(), "{error}");
-    let config =
-        NetworkConfig::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny").unwrap();
     for options in [
-        SampleOptions { steps: 0, samples: 2, ..quick() },
+        SampleOptions { steps: 0, ..quick() },
         SampleOptions { steps: 1001, ..quick() },
         SampleOptions { samples: 0, ..quick() },
         SampleOptions { tile: 8, ..quick() },
     ] {
-        let (network, config, kind) =
-            (config.init(1, &device), config.clone(), ModelKind::Diffusion);
-        let model = Model { network, config, kind, window: 11 };
-        let error = QudiRestorer::new(model, options, &device).unwrap_err();
+        let model = Model { network: config().init(1, &device), config: config(), window: 11 };
+        let error = DiffusionRestorer::new(model, options, &device).unwrap_err();
         let field = error.place().unwrap();
         assert!(
             ["steps", "samples", "tile"].contains(&field.as_str()) && error.help().is_some(),

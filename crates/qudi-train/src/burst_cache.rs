@@ -7,16 +7,16 @@ mod sampler;
 
 use crate::dataset::{DataConfig, Pack, Sample};
 use crate::parameters::parameters;
-use crate::recipe::{CropsConfig, Recipe, is_default};
+use crate::recipe::{CropsConfig, Recipe};
 use burst::ConditionedBurst;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Frame, Result, Size};
 use qudi_layers::tensor::read as read_tensor;
-use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
-use qudi_model::config::ReferenceKind;
-use qudi_model::refinement::RefinementStage;
+use qudi_model::aligned::{Aligned, AlignedNeighbours};
+use qudi_model::diffusion::Part;
+use qudi_model::regression::{BurstAligner, PreDenoiser};
 use rand::{Rng, RngExt};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -43,14 +43,8 @@ pub struct Files {
 pub(super) struct CachedBurst {
     size: Size,
     sample: Sample,
-    /// Reference estimate, merged frame, and sigma of its noise; none of a network without reference estimate.
-    images: Vec<Vec<f32>>,
-    /// Standardized counts, then expectations; none likewise.
-    standardized: Vec<Vec<i8>>,
+    aligned: Option<Aligned<Vec<f32>, Vec<i8>>>,
 }
-
-/// The planes of a burst that are images.
-const IMAGES: usize = 3;
 
 /// The steps of a byte: a 64th of a standard deviation near zero, wider far from it.
 const STEPS: f32 = 32.0;
@@ -70,14 +64,9 @@ static EXPANDED: LazyLock<[f32; 256]> =
 impl CachedBurst {
     pub(super) fn new(burst: ConditionedBurst) -> Self {
         let ConditionedBurst { size, sample, aligned } = burst;
-        let Some(aligned) = aligned else {
-            return Self { size, sample, images: Vec::new(), standardized: Vec::new() };
-        };
-        let AlignedPlanes { reference, merged, noise_sigma, counts, expected } = aligned;
-        let standardized = counts.into_iter().chain(expected);
-        let standardized = standardized.map(|plane| plane.into_iter().map(compressed).collect());
-        let images = vec![reference, merged, noise_sigma];
-        Self { size, sample, images, standardized: standardized.collect() }
+        let bytes = |plane: &Vec<f32>| plane.iter().copied().map(compressed).collect();
+        let aligned = aligned.map(|planes| planes.map(Vec::clone, bytes));
+        Self { size, sample, aligned }
     }
 
     /// Cuts random frames and a random square, rotated and mirrored at random.
@@ -114,15 +103,7 @@ impl CachedBurst {
             let bytes = range.clone().flat_map(|frame| picked(&plane[place(frame)], &places));
             bytes.map(|byte| table[usize::from(byte as u8)]).collect()
         };
-        let mut counts_and_expected = self.standardized.iter().map(standardized);
-        let neighbours = self.standardized.len() / 2;
-        let aligned = (!self.images.is_empty()).then(|| AlignedPlanes {
-            reference: image(&self.images[0]),
-            merged: image(&self.images[1]),
-            noise_sigma: image(&self.images[2]),
-            counts: counts_and_expected.by_ref().take(1 + neighbours).collect(),
-            expected: counts_and_expected.collect(),
-        });
+        let aligned = self.aligned.as_ref().map(|planes| planes.map(image, standardized));
         ConditionedBurst { size, sample: Sample { truth, counts, acquisition }, aligned }
     }
 }
@@ -140,8 +121,8 @@ pub(super) struct BurstCache {
     key: CacheKey,
     /// Frames, height, width.
     shape: [usize; 3],
-    /// The aligned neighbours; none of a network without reference estimate.
-    neighbours: Option<AlignedNeighbours>,
+    /// Names of the aligned planes.
+    aligned: Option<Aligned<String>>,
 }
 
 /// Everything that decides a burst, its number aside. Files hold it as JSON.
@@ -150,18 +131,27 @@ struct CacheKey {
     program: String,
     data: DataConfig,
     seed: u64,
-    #[serde(alias = "kept")]
     cached_frames: usize,
-    #[serde(default, skip_serializing_if = "is_default")]
-    reference: ReferenceKind,
-    neighbours: usize,
-    #[serde(alias = "motions")]
-    alignments: usize,
-    #[serde(alias = "exposure")]
     mean_level: bool,
-    /// Hashes of the weights of the refinement stages.
-    #[serde(default, alias = "drafts", skip_serializing_if = "Vec::is_empty")]
-    stages: Vec<String>,
+    aligned: Option<AlignedKey>,
+}
+
+/// Everything that decides aligned planes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct AlignedKey {
+    neighbours: usize,
+    alignments: usize,
+    /// Hash of the weights of the refinement; none before it has learnt.
+    refinement: Option<String>,
+}
+
+impl AlignedKey {
+    fn new(aligner: &BurstAligner) -> Result<Self> {
+        let AlignedNeighbours { neighbours, alignments } = aligner.neighbours();
+        let refinement = aligner.refinement().map(|refinement| sha256(refinement.predenoiser()));
+        let (alignments, refinement) = (alignments.count(), refinement.transpose()?);
+        Ok(Self { neighbours, alignments, refinement })
+    }
 }
 
 impl CacheKey {
@@ -175,10 +165,10 @@ impl CacheKey {
     }
 }
 
-/// The hash of the weights of a refinement stage.
-fn sha256(stage: &RefinementStage) -> Result<String> {
+/// Hashes the weights of a pre-denoiser.
+fn sha256(predenoiser: &PreDenoiser) -> Result<String> {
     let mut hash = Sha256::new();
-    for list in parameters(stage.predenoiser()) {
+    for list in parameters(predenoiser) {
         read_tensor(list)?.iter().for_each(|value| hash.update(value.to_le_bytes()));
     }
     Ok(format!("{:x}", hash.finalize()))
@@ -189,7 +179,6 @@ fn sha256(stage: &RefinementStage) -> Result<String> {
 struct Label {
     drawn: String,
     ppp: f64,
-    #[serde(rename = "exposure")]
     mean_level: f64,
     gain: f64,
     sensor: Sensor,
@@ -202,7 +191,11 @@ const KEY: &str = "burst";
 const HEADER: usize = 1 << 16;
 
 impl BurstCache {
-    pub(super) fn new(folder: &Path, recipe: &Recipe, stages: &[RefinementStage]) -> Result<Self> {
+    pub(super) fn new(
+        folder: &Path,
+        recipe: &Recipe,
+        aligner: Option<&BurstAligner>,
+    ) -> Result<Self> {
         let Some(crops) = recipe.train.crops else {
             let what = "the recipe draws every sample anew";
             return Err(Error::request(
@@ -211,17 +204,13 @@ impl BurstCache {
                 "add train.crops, or leave the folder of bursts out",
             ));
         };
-        let neighbours = recipe.network.aligned_neighbours();
         let key = CacheKey {
             program: env!("CARGO_PKG_VERSION").to_owned(),
             data: recipe.data.clone(),
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,
-            reference: recipe.network.reference(),
-            neighbours: neighbours.neighbours,
-            alignments: neighbours.alignments.count(),
-            mean_level: recipe.network.sees_mean_level(),
-            stages: stages.iter().map(sha256).collect::<Result<_>>()?,
+            mean_level: !recipe.train.ablate.removes(Part::MeanLevel),
+            aligned: aligner.map(AlignedKey::new).transpose()?,
         };
         Ok(Self {
             folder: folder.to_owned(),
@@ -232,7 +221,7 @@ impl BurstCache {
                 recipe.data.crop,
                 recipe.data.crop,
             ],
-            neighbours: (recipe.network.reference() != ReferenceKind::None).then_some(neighbours),
+            aligned: aligner.map(|aligner| plane_names(aligner.neighbours())),
         })
     }
 
@@ -243,10 +232,9 @@ impl BurstCache {
     /// Names and types of a file's tensors, each of one value for every pixel of every frame.
     fn tensors(&self) -> Vec<(String, Dtype)> {
         let mut list = vec![("truth".to_owned(), Dtype::F32), ("counts".to_owned(), Dtype::U16)];
-        let Some(neighbours) = self.neighbours else { return list };
-        list.extend((0..IMAGES).map(|i| (format!("image.{i}"), Dtype::F32)));
-        let standardized = neighbours.standardized_planes();
-        list.extend((0..standardized).map(|i| (format!("deviation.{i}"), Dtype::I8)));
+        let Some(names) = &self.aligned else { return list };
+        list.extend(names.images().map(|name| (name.clone(), Dtype::F32)));
+        list.extend(names.standardized().map(|name| (name.clone(), Dtype::I8)));
         list
     }
 
@@ -263,12 +251,12 @@ impl BurstCache {
             |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>();
         let truth = burst.sample.truth.iter().flat_map(|frame| words(&frame.data)).collect();
         let counts = burst.sample.counts.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
-        let images = burst.images.iter().map(|plane| words(plane));
-        let standardized = burst.standardized.iter();
-        let standardized =
-            standardized.map(|plane| plane.iter().flat_map(|v| v.to_le_bytes()).collect());
-        let bytes: Vec<Vec<u8>> =
-            [truth, counts].into_iter().chain(images).chain(standardized).collect();
+        let mut bytes: Vec<Vec<u8>> = vec![truth, counts];
+        if let Some(aligned) = &burst.aligned {
+            bytes.extend(aligned.images().map(|plane| words(plane)));
+            let signed = |plane: &Vec<i8>| plane.iter().flat_map(|v| v.to_le_bytes()).collect();
+            bytes.extend(aligned.standardized().map(signed));
+        }
         let views = self.tensors().into_iter().zip(&bytes).map(|((name, kind), bytes)| {
             Ok((name, TensorView::new(kind, self.shape.to_vec(), bytes).map_err(|e| report(&e))?))
         });
@@ -319,23 +307,22 @@ impl BurstCache {
             return Err(damaged("light and gain are no numbers above 0".to_owned()));
         }
         let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(e.to_string()))?;
-        let mut planes = Vec::new();
         for (name, kind) in self.tensors() {
             let tensor = tensors.tensor(&name).map_err(|e| damaged(e.to_string()))?;
             if tensor.dtype() != kind || tensor.shape() != self.shape {
                 return Err(damaged(format!("`{name}` has another size than the recipe's")));
             }
-            planes.push(tensor.data());
         }
+        let data = |name: &str| tensors.tensor(name).map_or(&[][..], |tensor| tensor.data());
         let [_, height, width] = self.shape;
         let size = Size { height, width };
         let words = |bytes: &[u8]| {
             let words = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
             words.collect::<Vec<_>>()
         };
-        let truth = planes[0].chunks_exact(4 * size.pixels());
+        let truth = data("truth").chunks_exact(4 * size.pixels());
         let truth = truth.map(|bytes| Frame { size, data: words(bytes) }).collect();
-        let counts = planes[1]
+        let counts = data("counts")
             .chunks_exact(2 * size.pixels())
             .map(|bytes| bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect());
         let acquisition = Acquisition {
@@ -348,12 +335,22 @@ impl BurstCache {
             dark: None,
         };
         let sample = Sample { truth, counts: counts.collect(), acquisition };
-        let (images, standardized) = planes[2..].split_at(IMAGES.min(planes.len() - 2));
-        let images = images.iter().map(|plane| words(plane)).collect();
-        let standardized = standardized.iter();
-        let standardized =
-            standardized.map(|plane| plane.iter().map(|&b| b.cast_signed()).collect()).collect();
-        Ok(Some(CachedBurst { size, sample, images, standardized }))
+        let signed = |name: &String| data(name).iter().map(|&b| b.cast_signed()).collect();
+        let aligned = self.aligned.as_ref();
+        let aligned = aligned.map(|names| names.map(|name| words(data(name)), signed));
+        Ok(Some(CachedBurst { size, sample, aligned }))
+    }
+}
+
+/// Names the planes of frames with these neighbours.
+fn plane_names(neighbours: AlignedNeighbours) -> Aligned<String> {
+    let list = |name: &str, count| (0..count).map(|i| format!("{name}.{i}")).collect();
+    Aligned {
+        reference: "reference".to_owned(),
+        merged: "merged".to_owned(),
+        noise_sigma: "noise_sigma".to_owned(),
+        counts: list("standardized", 1 + neighbours.count()),
+        expected: list("expected", neighbours.count()),
     }
 }
 

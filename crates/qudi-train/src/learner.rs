@@ -1,9 +1,9 @@
 //! What the trainer needs of a network, and the networks that have it.
 
 mod baseline;
-mod batch;
 mod bursts;
-mod qudi;
+pub mod diffusion;
+mod regression;
 
 use crate::burst_cache::BurstSampler;
 use crate::loss::lpips::Lpips;
@@ -13,12 +13,12 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::Result;
 use qudi_core::restorer::Restorer;
 use qudi_layers::{Provenance, parameter_shapes};
-use qudi_model::refinement::RefinementStage;
+use qudi_model::regression::BurstAligner;
 use std::fmt::{Debug, Formatter};
 use std::path::Path;
 
-pub use batch::Batch;
 pub use bursts::CountBatch;
+pub use regression::AlignedBatch;
 
 /// A network that can be trained by recipes for it.
 ///
@@ -75,27 +75,49 @@ pub trait Learner: Module + Sync {
         parameter_shapes(self)
     }
 
-    /// The name that an older state has for a parameter.
-    fn former_name(name: &str) -> String {
-        name.to_owned()
-    }
-
     /// Whether each parameter learns.
     fn learns(&self, _recipe: &Recipe) -> Vec<bool> {
         vec![true; self.named_shapes().len()]
     }
 
-    /// The refinement stages that samples are aligned with; none for most networks.
+    /// Creates what aligns samples; none for most networks.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the recipe is for another network.
-    fn refinement_stages(
-        &self,
-        _recipe: &Recipe,
-        _device: &Device,
-    ) -> Result<Vec<RefinementStage>> {
-        Ok(Vec::new())
+    fn aligner(&self, _recipe: &Recipe, _device: &Device) -> Result<Option<BurstAligner>> {
+        Ok(None)
     }
+}
+
+/// A weighted sum of named terms.
+#[derive(Clone, Debug, Default)]
+struct WeightedSum {
+    total: Option<Tensor<1>>,
+    terms: Vec<(&'static str, Tensor<1>)>,
+}
+
+impl WeightedSum {
+    /// Adds a term, `[1]`, times its weight.
+    fn add(&mut self, name: &'static str, weight: f32, term: Tensor<1>) {
+        self.terms.push((name, term.clone()));
+        let term = term * weight;
+        self.total = Some(self.total.take().map_or(term.clone(), |total| total + term));
+    }
+
+    /// Returns the sum.
+    ///
+    /// # Panics
+    /// Without terms.
+    fn total(&self) -> Tensor<1> {
+        self.total.clone().expect("at least one term")
+    }
+}
+
+/// Returns true for each parameter whose part is among those that learn; all learn if none is named.
+fn learning<N: Module>(network: &N, recipe: &Recipe) -> Vec<bool> {
+    let parts = &recipe.train.learns;
+    let learns = |name: &str| parts.is_empty() || parts.iter().any(|part| part.has(name));
+    parameter_shapes(network).iter().map(|(name, _)| learns(name)).collect()
 }
 
 /// What the loss depends on besides network and batch.

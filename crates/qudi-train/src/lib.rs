@@ -1,4 +1,4 @@
-//! Training of the network: data, loss, loop, state, validation.
+//! Training of networks: data, loss, loop, state, validation.
 //!
 //! A [`Recipe`] holds everything that decides the result, and a [`Learner`] is a network that it can be for. A
 //! [`Prefetcher`] draws batches on threads of its own, the [`Trainer`] takes a step with each, and a [`Run`] does so in
@@ -26,7 +26,7 @@ mod trainer;
 mod validate;
 
 pub use burst_cache::{BurstSampler, Files, draw_bursts};
-pub use learner::{Batch, Context, CountBatch, Learner, Loss, Origin};
+pub use learner::{AlignedBatch, Context, CountBatch, Learner, Loss, Origin, diffusion};
 pub use optimizer::{Optimizer, OptimizerKind, learning_rate};
 pub use parameters::{gradients, parameters, with_parameters};
 pub use prefetch::Prefetcher;

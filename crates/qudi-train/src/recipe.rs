@@ -7,13 +7,16 @@ mod rules;
 mod stage;
 
 use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
+use crate::learner::diffusion::TimestepLaw;
+use crate::loss::LossForm;
 use crate::loss::lpips::PerceptualKind;
-use crate::loss::{LossForm, NoiseOn, TimestepLaw};
 use crate::optimizer::OptimizerKind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
 use qudi_kernels::ComputePrecision;
+use qudi_model::checkpoint::Sampling;
+use qudi_model::diffusion::Ablation;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -72,7 +75,8 @@ pub struct TrainConfig {
     pub warmup: u64,
     /// Largest norm of a step's gradient; longer gradients are scaled down.
     pub clip: f64,
-    /// Parts of the network that learn; all if none is named. The others stay as they are, bit for bit.
+    /// Parts of the network that learn; all if none is named. The others stay as they are, bit for bit. Of the
+    /// regression `["refinement"]`, or `pre` and `uncertainty`; of the diffusion all others and `pre`.
     #[serde(default)]
     pub learns: Vec<LearningPart>,
     /// Numbers that convolutions multiply.
@@ -89,17 +93,17 @@ pub struct TrainConfig {
     #[serde(default, skip_serializing_if = "is_default")]
     #[schemars(skip_serializing_if = "never")]
     pub timesteps: TimestepLaw,
-    /// Images that noise is added to.
+    /// Parts that are left out, to measure their value; only of the diffusion. Weights do not keep it.
     #[serde(default, skip_serializing_if = "is_default")]
     #[schemars(skip_serializing_if = "never")]
-    pub noise_on: NoiseOn,
+    pub ablate: Ablation,
     /// Fraction of the samples at the noisiest timestep, where sampling begins; the others follow
-    /// `timesteps`. Not for learned methods of others.
+    /// `timesteps`. Only of the diffusion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub noise_start_fraction: Option<f64>,
     /// Steps between checkpoints.
     pub checkpoint: u64,
-    /// Loss; learned methods of others have their authors'.
+    /// Loss of the diffusion; the other networks have no weights to choose.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub loss: Option<LossConfig>,
     /// Licence of the weights, an SPDX expression.
@@ -107,7 +111,7 @@ pub struct TrainConfig {
 }
 
 impl TrainConfig {
-    /// Returns the loss. All weights are 0 for learned methods of others, whose loss has none to choose.
+    /// Returns the loss; all weights are 0 for networks that have none to choose.
     pub fn loss(&self) -> LossConfig {
         self.loss.unwrap_or(LossConfig {
             form: LossForm::default(),
@@ -176,7 +180,7 @@ pub struct ValidationConfig {
     pub sensor: String,
     /// Photons per pixel and frame.
     pub ppp: Vec<f64>,
-    /// Reverse steps; 0 evaluates the regression. Learned methods of others have none.
+    /// Reverse steps; only of the diffusion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
     /// Spacing of the steps' timesteps, also the default of the weights.
@@ -255,23 +259,23 @@ impl Recipe {
         self.train.crops.map_or(whole, |crops| (crops.frames, crops.side))
     }
 
-    /// Returns the default number of reverse steps of the weights: 0 where only the regression learns.
-    pub(super) fn default_steps(&self) -> usize {
-        if self.train.loss().prediction == 0.0 {
-            return 0;
-        }
-        self.validation.as_ref().map_or(1, |validation| validation.steps.unwrap_or(0))
+    /// Returns the sampling that the weights are made for.
+    pub(super) fn sampling(&self) -> Sampling {
+        let validation = self.validation.as_ref();
+        validation.map_or_else(Sampling::default, |validation| Sampling {
+            steps: validation.steps.unwrap_or(1),
+            spacing: validation.spacing,
+        })
     }
 
-    /// Returns the default spacing of timesteps of the weights.
-    pub(super) fn default_spacing(&self) -> TimestepSpacing {
-        self.validation.as_ref().map_or_else(TimestepSpacing::default, |v| v.spacing)
+    /// Returns the number of frames that validations restore at once.
+    pub(super) fn window(&self) -> usize {
+        self.validation.as_ref().map_or(self.data.frames.max(11), |validation| validation.frames)
     }
 
-    /// Returns true if only the pre-denoiser learns: frame by frame.
-    pub(super) fn learns_frames(&self) -> bool {
-        let loss = self.train.loss();
-        loss.prediction == 0.0 && loss.flow == 0.0 && loss.term == PerceptualKind::None
+    /// Returns true if the first pre-denoiser of the regression learns, and nothing else.
+    pub(super) fn trains_refinement(&self) -> bool {
+        self.train.learns == [LearningPart::Refinement]
     }
 
     /// Returns the validation clips as a source of a pack; none if no clip has files.

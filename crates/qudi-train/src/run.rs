@@ -99,8 +99,8 @@ impl<L: Learner> Run<L> {
             From::State => Trainer::resume(folder, recipe, devices, backbones)?,
         };
         let dataset = Dataset::new(&recipe.data, files.pack)?;
-        let stages = trainer.averaged().refinement_stages(recipe, &devices[0])?;
-        let mut bursts = BurstSampler::new(recipe, dataset, stages);
+        let aligner = trainer.averaged().aligner(recipe, &devices[0])?;
+        let mut bursts = BurstSampler::new(recipe, dataset, aligner);
         if let Some(folder) = &files.bursts {
             bursts = bursts.with_cache(folder, recipe)?;
         }

@@ -1,5 +1,5 @@
-//! What a device must get right: every operation of the network with its gradients, and a small network
-//! whole.
+//! What a device must get right: every operation of the network with its gradients, and two small
+//! networks whole.
 
 use crate::loss::reconstruction;
 use burn::tensor::activation::softmax;
@@ -9,11 +9,14 @@ use qudi_core::Result;
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
 use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
+use qudi_layers::init_parameters;
 use qudi_layers::tensor::read;
-use qudi_model::conditioning::{AlignedTensors, Conditioning, SENSOR_NUMBERS};
-use qudi_model::config::{NetworkConfig, ReferenceKind};
+use qudi_model::aligned::Aligned;
+use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::state::DiffusionState;
-use qudi_model::network::Simulated;
+use qudi_model::diffusion::{Conditioning, Simulated};
+use qudi_model::regression::RegressionConfig;
+use qudi_model::sensor::SENSOR_NUMBERS;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
 pub const TOLERANCE: f32 = 2e-3;
@@ -120,7 +123,8 @@ pub const CHECKS: &[Check] = &[
     Check::reduced("convolution 5x5x5, bf16", ComputePrecision::Bf16, |device| {
         convolution_3d(device, 1)
     }),
-    Check::exact("network", network),
+    Check::exact("regression", regression),
+    Check::exact("diffusion", diffusion),
 ];
 
 /// Repeatable values in [-1, 1).
@@ -229,31 +233,58 @@ fn convolution_3d(device: &Device, stride: usize) -> Result<Vec<Vec<f32>>> {
     with_gradients(output, &[x])
 }
 
-/// A network of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and the
-/// loss's gradient for the noisy image.
-fn network(device: &Device) -> Result<Vec<Vec<f32>>> {
+/// Images in [0, 1) of a burst of four frames.
+fn image(seed: u32, device: &Device) -> Tensor<4> {
+    values(seed, [4, 1, 32, 48], device) * 0.5 + 0.5
+}
+
+/// A small regression: frames, uncertainty, and the loss's gradient for the merged frames.
+fn regression(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
-    let mut config = NetworkConfig::preset("tiny")?;
-    // With all that the default network has.
-    config.reference = ReferenceKind::QbpRefined;
-    config.pre.neighbours = 4;
-    config.flow.registration = true;
-    let network = config.init(1, &device);
-    let image = |seed| values(seed, [4, 1, 32, 48], &device) * 0.5 + 0.5;
-    let neighbours = config.pre.aligned_neighbours().count();
-    let planes = |first: u32, count| {
-        Tensor::cat((0..count).map(|plane| image(first + plane as u32)).collect(), 1)
+    let config = RegressionConfig {
+        fold: 2,
+        width: 16,
+        blocks: 2,
+        growth: 8,
+        neighbours: 4,
+        weight_channels: 4,
     };
+    let neighbours = config.second_neighbours().count() as u32;
+    let planes = |first| (first..).map(|seed| image(seed, &device));
+    let merged = image(30, &device).require_grad();
+    let aligned = Aligned {
+        reference: image(29, &device),
+        merged: merged.clone(),
+        noise_sigma: image(31, &device) * 0.5 + 0.2,
+        counts: planes(32).take(1 + neighbours as usize).collect(),
+        expected: planes(100).take(neighbours as usize).collect(),
+    };
+    // Initial weights change nothing.
+    let network = init_parameters(config.uninitialized(&device), |_, shape| {
+        (0..shape.iter().product()).map(|i: usize| 0.05 * (i as f32).sin()).collect()
+    });
+    let (frames, sigma) = network.predenoise(&aligned);
+    let loss = reconstruction(frames.clone(), image(28, &device));
+    let grads = loss.backward();
+    Ok(vec![
+        read(frames.inner())?,
+        read(sigma.inner())?,
+        merged.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?,
+    ])
+}
+
+/// A diffusion of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and
+/// the loss's gradient for the noisy image.
+fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let NetworkConfig::Diffusion(config) = NetworkConfig::preset("tiny")? else {
+        unreachable!("tiny is a diffusion")
+    };
+    let network = config.init(1, &device);
+    let image = |seed| image(seed, &device);
     let conditioning = Conditioning {
         counts: image(21) * 0.5,
         linear_estimate: image(22),
-        aligned: Some(AlignedTensors {
-            reference: image(29),
-            merged: image(30),
-            noise_sigma: image(31) * 0.5 + 0.2,
-            counts: planes(32, 1 + neighbours),
-            expected: Some(planes(100, neighbours)),
-        }),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
     };

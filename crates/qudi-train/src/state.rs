@@ -115,10 +115,8 @@ impl<L: Learner> Trainer<L> {
         let device = trainer.ema.average[0].device();
         let list = |prefix: &str| {
             let values = names.iter().map(|(name, shape)| {
-                let former = format!("{prefix}/{}", L::former_name(name));
                 let name = format!("{prefix}/{name}");
-                let tensor = tensors.tensor(&name).or_else(|_| tensors.tensor(&former));
-                let tensor = tensor.map_err(|e| damaged(e.to_string()))?;
+                let tensor = tensors.tensor(&name).map_err(|e| damaged(e.to_string()))?;
                 let count = shape.iter().product::<usize>();
                 if tensor.dtype() != Dtype::F32 || tensor.shape() != [count] {
                     return Err(damaged(format!("`{name}` has another size than the recipe's")));

@@ -68,7 +68,7 @@ fn recipe(method: Method, changes: &[(&str, &str)]) -> Recipe {
 }
 
 fn trained(recipe: &Recipe, steps: usize) -> (Trainer<Baseline>, Vec<StepReport>) {
-    let bursts = BurstSampler::new(recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let bursts = BurstSampler::new(recipe, Dataset::new(&recipe.data, None).unwrap(), None);
     let mut prefetcher = Prefetcher::new(recipe, &bursts, 0, 1).unwrap();
     let mut trainer = Trainer::new(recipe, None, &[Device::flex()], None).unwrap();
     let reports = (0..steps).map(|_| trainer.step(&mut prefetcher).unwrap()).collect();
@@ -207,7 +207,7 @@ fn weights_do_not_depend_on_the_number_of_devices() {
     let recipe = recipe(Method::MemDeblur, &changes);
     let of = |devices: &[Device]| {
         let dataset = Dataset::new(&recipe.data, None).unwrap();
-        let bursts = BurstSampler::new(&recipe, dataset, Vec::new());
+        let bursts = BurstSampler::new(&recipe, dataset, None);
         let mut prefetcher = Prefetcher::new(&recipe, &bursts, 0, 1).unwrap();
         let mut trainer = Trainer::<Baseline>::new(&recipe, None, devices, None).unwrap();
         let total = trainer.step(&mut prefetcher).unwrap().loss.total;
@@ -249,7 +249,6 @@ fn wrong_recipes_are_refused_by_key() {
             "train.loss",
         ),
         ("emvd", "train.noise_start_fraction", "0.3", "train.noise_start_fraction"),
-        ("emvd", "train.noise_on", "estimate", "train.noise_on"),
         ("emvd", "validation.steps", "1", "validation.steps"),
         ("quiver", "network.features", "24", "multiples of 16"),
         ("quiver", "network.future", "5", "as many frames"),
@@ -273,7 +272,7 @@ fn wrong_recipes_are_refused_by_key() {
         let recipe = Recipe::load(method.name(), &[]).unwrap();
         assert_eq!(recipe.network.baseline().unwrap().method(), method);
         assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
-        let other: Result<Trainer<qudi_model::network::Qudi>, Error> =
+        let other: Result<Trainer<qudi_model::diffusion::Diffusion>, Error> =
             Trainer::new(&recipe, None, &[Device::flex()], None);
         assert!(other.unwrap_err().to_string().contains(method.name()));
     }

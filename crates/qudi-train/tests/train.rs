@@ -5,10 +5,13 @@
 use burn::tensor::Device;
 use qudi_core::Error;
 use qudi_model::checkpoint::load;
-use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
+use qudi_model::diffusion::Diffusion;
+use qudi_model::regression::Regression;
+use qudi_model::{init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
+use qudi_train::diffusion::Batch;
 use qudi_train::{
-    Batch, BurstSampler, Event, Files, From, Learner, METRICS, Origin, Prefetcher, Recipe, Run,
+    BurstSampler, Event, Files, From, Learner, METRICS, Origin, Prefetcher, Recipe, Run,
     StepReport, Trainer, WEIGHTS, parameters,
 };
 use std::ops::ControlFlow;
@@ -16,6 +19,15 @@ use std::path::Path;
 
 /// The recipe `tiny`, smaller and shorter.
 fn recipe(changes: &[(&str, &str)]) -> Recipe {
+    shortened(include_str!("../../../tests/golden/tiny.toml"), changes)
+}
+
+/// The small regression, as short.
+fn regression(changes: &[(&str, &str)]) -> Recipe {
+    shortened(include_str!("../../../tests/golden/regression.toml"), changes)
+}
+
+fn shortened(text: &str, changes: &[(&str, &str)]) -> Recipe {
     let small = [
         ("data.crop", "32"),
         ("data.frames", "3"),
@@ -28,31 +40,40 @@ fn recipe(changes: &[(&str, &str)]) -> Recipe {
     ];
     let changes: Vec<_> =
         small.iter().chain(changes).map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
-    Recipe::parse(include_str!("../../../tests/golden/tiny.toml"), "tiny", &changes).unwrap()
+    Recipe::parse(text, "tests/golden", &changes).unwrap()
 }
 
-fn init(recipe: &Recipe) -> Qudi {
-    Qudi::init(recipe, &Device::flex()).unwrap()
+fn init(recipe: &Recipe) -> Diffusion {
+    Diffusion::init(recipe, &Device::flex()).unwrap()
 }
 
-fn weights(network: &Qudi) -> Vec<f32> {
+fn weights<L: Learner>(network: &L) -> Vec<f32> {
     let list = parameters(network).into_iter();
     list.flat_map(|v| v.into_data().try_into_vec::<f32>().unwrap()).collect()
 }
 
 fn trained(recipe: &Recipe, devices: &[Device], workers: usize) -> (Vec<f32>, Vec<StepReport>) {
-    let bursts = BurstSampler::new(recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    trained_as::<Diffusion>(recipe, devices, workers)
+}
+
+fn trained_as<L: Learner>(
+    recipe: &Recipe,
+    devices: &[Device],
+    workers: usize,
+) -> (Vec<f32>, Vec<StepReport>) {
+    let mut trainer = Trainer::<L>::new(recipe, None, devices, None).unwrap();
+    let aligner = trainer.averaged().aligner(recipe, &Device::flex()).unwrap();
+    let bursts = BurstSampler::new(recipe, Dataset::new(&recipe.data, None).unwrap(), aligner);
     let mut prefetcher = Prefetcher::new(recipe, &bursts, 0, workers).unwrap();
-    let mut trainer = Trainer::new(recipe, None, devices, None).unwrap();
     let steps = (0..3).map(|_| trainer.step(&mut prefetcher).unwrap()).collect();
     (weights(&trainer.averaged()), steps)
 }
 
-fn open(folder: &Path, recipe: &Recipe, from: From<Qudi>) -> Result<Run<Qudi>, Error> {
+fn open<L: Learner>(folder: &Path, recipe: &Recipe, from: From<L>) -> Result<Run<L>, Error> {
     Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
 }
 
-fn learn(run: &mut Run<Qudi>, stop_after: u64) -> Result<(), Error> {
+fn learn<L: Learner>(run: &mut Run<L>, stop_after: u64) -> Result<(), Error> {
     run.learn(1, &mut |event| match event {
         Event::Step(report) if report.step == stop_after => ControlFlow::Break(()),
         _ => ControlFlow::Continue(()),
@@ -80,8 +101,10 @@ fn weights_do_not_depend_on_the_number_of_devices() {
     let (pair, _) = trained(&accumulated, &[Device::flex(), Device::flex()], 1);
     assert!(turns == pair, "weights differ");
     // A doubled batch has one coin for the first pass: compare a step where both sides agree.
-    let doubled =
-        recipe(&[("train.batch", "2"), ("network.ablate", "[\"physics\", \"self-conditioning\"]")]);
+    let doubled = recipe(&[
+        ("train.batch", "2"),
+        ("train.ablate", "[\"forward-model\", \"self-conditioning\"]"),
+    ]);
     let mut halves = doubled.clone();
     (halves.train.batch, halves.train.accumulate) = (1, 2);
     let (whole, a) = trained(&doubled, &[Device::flex()], 1);
@@ -100,15 +123,15 @@ fn weights_do_not_depend_on_the_number_of_devices() {
 fn resumed_run_equals_undisturbed_run() {
     let recipe = recipe(&[("train.optimizer", "\"muon\"")]);
     let folders = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
-    let mut run = open(folders[0].path(), &recipe, From::Start(None)).unwrap();
+    let mut run = open::<Diffusion>(folders[0].path(), &recipe, From::Start(None)).unwrap();
     learn(&mut run, u64::MAX).unwrap();
     for stop in [1, 4] {
         let from = if stop == 1 { From::Start(None) } else { From::State };
-        let mut run = open(folders[1].path(), &recipe, from).unwrap();
+        let mut run = open::<Diffusion>(folders[1].path(), &recipe, from).unwrap();
         assert!(matches!(learn(&mut run, stop), Err(Error::Interrupted)));
         assert_eq!(run.progress(), [stop, 6]);
     }
-    let mut run = open(folders[1].path(), &recipe, From::State).unwrap();
+    let mut run = open::<Diffusion>(folders[1].path(), &recipe, From::State).unwrap();
     learn(&mut run, u64::MAX).unwrap();
     let read =
         |folder: &tempfile::TempDir, name: &str| std::fs::read(folder.path().join(name)).unwrap();
@@ -136,15 +159,16 @@ fn interrupted_state_write_leaves_a_whole_state() {
     let recipe = recipe(&[]);
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
-    let mut run = open(folder.path(), &recipe, From::Start(None)).unwrap();
+    let mut run = open::<Diffusion>(folder.path(), &recipe, From::Start(None)).unwrap();
     let _ = learn(&mut run, 2);
-    let steps = || open(folder.path(), &recipe, From::State).map(|run| run.progress()[0]);
+    let steps =
+        || open::<Diffusion>(folder.path(), &recipe, From::State).map(|run| run.progress()[0]);
     std::fs::create_dir(at("state.new")).unwrap();
     std::fs::write(at("state.new/tensors.safetensors"), b"half").unwrap();
     assert_eq!(steps().unwrap(), 2);
     std::fs::rename(at("state"), at("state.old")).unwrap();
     assert_eq!(steps().unwrap(), 2);
-    let mut run = open(folder.path(), &recipe, From::State).unwrap();
+    let mut run = open::<Diffusion>(folder.path(), &recipe, From::State).unwrap();
     let _ = learn(&mut run, 4);
     assert_eq!(steps().unwrap(), 4);
     assert!(!at("state.new").exists() && !at("state.old").exists());
@@ -154,105 +178,118 @@ fn interrupted_state_write_leaves_a_whole_state() {
 fn rejects_damaged_states() {
     let recipe = recipe(&[]);
     let folder = tempfile::tempdir().unwrap();
-    let mut run = open(folder.path(), &recipe, From::Start(None)).unwrap();
+    let mut run = open::<Diffusion>(folder.path(), &recipe, From::Start(None)).unwrap();
     let _ = learn(&mut run, 1);
     let path = folder.path().join("state/tensors.safetensors");
     let whole = std::fs::read(&path).unwrap();
     for length in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
         std::fs::write(&path, &whole[..length]).unwrap();
-        let error = open(folder.path(), &recipe, From::State).unwrap_err();
+        let error = open::<Diffusion>(folder.path(), &recipe, From::State).unwrap_err();
         assert!(error.to_string().contains("state"), "{error}");
     }
     std::fs::write(&path, &whole).unwrap();
     let wider = crate::recipe(&[("network.unet.width", "16")]);
-    assert!(open(folder.path(), &wider, From::State).unwrap_err().to_string().contains("size"));
-    open(folder.path(), &recipe, From::State).unwrap();
+    assert!(
+        open::<Diffusion>(folder.path(), &wider, From::State)
+            .unwrap_err()
+            .to_string()
+            .contains("size")
+    );
+    open::<Diffusion>(folder.path(), &recipe, From::State).unwrap();
 }
 
-/// The first stage: the pre-denoiser alone, on single frames of cached bursts. No other weight changes.
+/// First the refinement alone, on single frames of cached bursts. No other weight changes.
 #[test]
-fn first_stage_trains_the_pre_denoiser_on_crops() {
-    let recipe = recipe(&[
+fn refinement_learns_alone_on_crops() {
+    let recipe = regression(&[
         ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }"),
-        (
-            "train.loss",
-            "{ prediction = 0.0, pre = 1.0, perceptual = 0.0, term = \"none\", flow = 0.0 }",
-        ),
+        ("train.learns", "[\"refinement\"]"),
         ("train.steps", "4"),
     ]);
-    let before = weights(&init(&recipe));
-    let (after, reports) = trained(&recipe, &[Device::flex()], 2);
-    assert_eq!(after, trained(&recipe, &[Device::flex()], 1).0, "whoever draws the bursts");
-    assert!(
-        reports
-            .iter()
-            .all(|report| report.loss.term("pre") > 0.0 && report.loss.term("flow") == 0.0)
-    );
-    let count = |part: &str| {
-        let list = parameter_shapes(&init(&recipe));
-        let sizes = list.iter().filter(|(name, _)| name.starts_with(part));
-        sizes.map(|(_, shape)| shape.iter().product::<usize>()).sum::<usize>()
-    };
+    let init = Regression::init(&recipe, &Device::flex()).unwrap();
+    let before = weights(&init);
+    let train = |workers| trained_as::<Regression>(&recipe, &[Device::flex()], workers);
+    let (after, reports) = train(2);
+    assert_eq!(after, train(1).0, "whoever draws the bursts");
+    let term = |report: &StepReport, name| report.loss.term(name);
+    assert!(reports.iter().all(|r| term(r, "pre") > 0.0 && term(r, "uncertainty") == 0.0));
+    let list = parameter_shapes(&init);
+    let sizes = list.iter().filter(|(name, _)| name.starts_with("refinement."));
+    let learning = sizes.map(|(_, shape)| shape.iter().product::<usize>()).sum::<usize>();
     // Averages of equal weights are equal but for rounding.
     let moved = after.iter().zip(&before).filter(|(a, b)| (**a - **b).abs() > 1e-6).count();
-    let pre = count("pre.");
-    assert!(moved > pre / 2 && moved <= pre, "{moved} of {pre} weights moved");
-    for (key, value, word) in [
-        ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }", "3 frames"),
-        ("train.crops", "{ bursts = 0, cached_frames = 3, frames = 3, side = 24 }", "one burst"),
-        (
-            "train.crops",
-            "{ bursts = 3, cached_frames = 3, frames = 3, side = 30 }",
-            "train.crops.side",
-        ),
-        ("train.crops", "{ bursts = 3, cached_frames = 3, frames = 3, side = 40 }", "fit"),
-        ("train.crops", "{ bursts = 3, cached_frames = 2, frames = 3, side = 24 }", "fit"),
+    assert!(moved > learning / 2 && moved <= learning, "{moved} of {learning} weights moved");
+}
+
+#[test]
+fn rejects_crops_that_do_not_fit() {
+    for (value, word) in [
+        ("{ bursts = 3, cached_frames = 2, frames = 1, side = 24 }", "3 frames"),
+        ("{ bursts = 0, cached_frames = 3, frames = 3, side = 24 }", "one burst"),
+        ("{ bursts = 3, cached_frames = 3, frames = 3, side = 30 }", "train.crops.side"),
+        ("{ bursts = 3, cached_frames = 3, frames = 3, side = 40 }", "fit"),
+        ("{ bursts = 3, cached_frames = 2, frames = 3, side = 24 }", "fit"),
     ] {
-        let changes = [("data.crop", "32"), ("data.frames", "3"), (key, value)];
+        let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.crops", value)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
         let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
         assert!(error.contains(word), "{value}: {error}");
     }
 }
 
-/// Weights of earlier stages stay as they were, bit for bit, in the average, too; a resumed run has the same
-/// bursts.
+/// While the second pre-denoiser and the uncertainty learn, the refinement stays as it was, bit for bit, in
+/// the average, too; a resumed run has the same bursts.
 #[test]
-fn refinement_stages_keep_their_weights() {
-    let recipe = recipe(&[("network.pre.stages", "2")]);
-    let start = init(&recipe);
+fn refinement_keeps_its_weights_afterwards() {
+    let recipe = regression(&[]);
+    let start = Regression::init(&recipe, &Device::flex()).unwrap();
     let start = init_parameters(start, |_, shape| {
         let count = shape.iter().product::<usize>();
         (0..count).map(|i| 0.03 * ((i * 37 % 101) as f32 / 50.0 - 1.0)).collect()
     });
-    let split = |network: &Qudi| -> [Vec<f32>; 2] {
+    let split = |network: &Regression| -> [Vec<f32>; 2] {
         let names = parameter_shapes(network).into_iter().map(|(name, _)| name);
         let lists = names.zip(parameters(network)).map(|(name, values)| {
-            (name.starts_with("stages."), values.into_data().try_into_vec::<f32>().unwrap())
+            (name.starts_with("refinement."), values.into_data().try_into_vec::<f32>().unwrap())
         });
-        let (stages, others): (Vec<_>, Vec<_>) = lists.partition(|(is_stage, _)| *is_stage);
-        [stages, others].map(|lists| lists.into_iter().flat_map(|(_, values)| values).collect())
+        let (first, others): (Vec<_>, Vec<_>) = lists.partition(|(is_first, _)| *is_first);
+        [first, others].map(|lists| lists.into_iter().flat_map(|(_, values)| values).collect())
     };
-    let [stages, others] = split(&start);
-    assert!(!stages.is_empty() && stages.len() < others.len());
+    let [first, others] = split(&start);
+    assert!(!first.is_empty() && first.len() < others.len());
     let folders = [0, 1].map(|_| tempfile::tempdir().unwrap());
     let [whole, parts] = [0, 1].map(|i| folders[i].path());
     let from = || From::Start(Some(Box::new(start.clone())));
     learn(&mut open(whole, &recipe, from()).unwrap(), u64::MAX).unwrap();
     assert!(learn(&mut open(parts, &recipe, from()).unwrap(), 2).is_err());
-    learn(&mut open(parts, &recipe, From::State).unwrap(), u64::MAX).unwrap();
-    let [whole, parts] =
-        [whole, parts].map(|folder| load(&folder.join(WEIGHTS), &Device::flex()).unwrap().0);
+    learn(&mut open::<Regression>(parts, &recipe, From::State).unwrap(), u64::MAX).unwrap();
+    let [whole, parts] = [whole, parts]
+        .map(|folder| load::<Regression>(&folder.join(WEIGHTS), &Device::flex()).unwrap().0);
     let [kept, learnt] = split(&whole);
-    assert!(kept == stages && learnt != others);
+    assert!(kept == first && learnt != others);
     assert_eq!(weights(&whole), weights(&parts));
+}
+
+/// The uncertainty learns from the errors of the frames, which learn nothing from it.
+#[test]
+fn uncertainty_learns_without_the_frames() {
+    let recipe = regression(&[("train.learns", "[\"uncertainty\"]")]);
+    let init = Regression::init(&recipe, &Device::flex()).unwrap();
+    let (after, reports) = trained_as::<Regression>(&recipe, &[Device::flex()], 1);
+    assert!(reports.iter().all(|report| report.loss.term("uncertainty") != 0.0));
+    let mut moved = after.iter().zip(weights(&init)).map(|(a, b)| (a - b).abs() > 1e-6);
+    for (name, shape) in parameter_shapes(&init) {
+        let count = shape.iter().product();
+        let any = moved.by_ref().take(count).filter(|moves| *moves).count() > 0;
+        assert!(!any || name.starts_with("uncertainty."), "{name} moved");
+    }
 }
 
 /// A loss that is not finite stops the run before it spoils the state.
 #[test]
 fn nan_loss_stops_the_step_and_names_the_term() {
     let recipe = recipe(&[]);
-    let bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), None);
     let broken = init(&recipe);
     let broken = init_parameters(broken, |_, shape| vec![f32::NAN; shape.iter().product()]);
     let mut trainer = Trainer::new(&recipe, Some(broken), &[Device::flex()], None).unwrap();
@@ -284,7 +321,7 @@ fn rejects_bf16_on_devices_without_it() {
     #[allow(deprecated)] // asked for by name
     let device = Device::ndarray();
     let recipe = recipe(&[("train.precision", "bf16")]);
-    let text = Trainer::<Qudi>::new(&recipe, None, &[device], None).unwrap_err().to_string();
+    let text = Trainer::<Diffusion>::new(&recipe, None, &[device], None).unwrap_err().to_string();
     assert!(text.contains("bf16"), "{text}");
 }
 
@@ -298,8 +335,11 @@ fn rejects_wrong_recipes_by_key() {
         ("train.timesteps", "often", "often"),
         ("train.loss.form", "l3", "l3"),
         ("validation.spacing", "odd", "odd"),
-        ("network.reference", "other", "other"),
-        ("network.pre.neighbours", "4", "network.reference"),
+        ("network.kind", "other", "other"),
+        ("network.pre.neighbours", "4", "neighbours"),
+        ("train.learns", "[\"refinement\"]", "regression"),
+        ("train.loss.prediction", "0", "train.loss.prediction"),
+        ("validation.steps", "0", "validation.steps"),
         ("train.learning", "3", "learning"),
         ("trains.steps", "3", "trains.steps"),
         ("data.crop", "50", "data.crop"),
@@ -317,43 +357,31 @@ fn rejects_wrong_recipes_by_key() {
     assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);
     let recipe = load("data.sensor.0.ppp", "[3.25, 9.75]").unwrap();
     assert_eq!(Recipe::parse(&recipe.text(), "again", &[]).unwrap(), recipe);
-    let mut bursts =
-        BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), Vec::new());
+    let mut bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), None);
     let again = Batch::draw(&recipe, &mut bursts, 3).unwrap();
     assert_eq!(again.len(), 2);
 }
 
-/// Nothing is computed again where the pre-denoiser learns alone.
 #[test]
-fn checkpointing_without_a_prediction_is_refused() {
-    let changes = [("train.gradient_checkpointing", "true"), ("train.loss.prediction", "0")];
-    let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
-    let error = Recipe::load("tiny", &changes).unwrap_err().to_string();
-    assert!(error.contains("train.gradient_checkpointing"), "{error}");
-    assert!(Recipe::load("tiny", &changes[..1]).unwrap().train.gradient_checkpointing);
-}
-
-/// Weights that learn on their own estimates are made for two steps, or for more at all timesteps.
-#[test]
-fn estimates_are_learnt_on_for_two_steps_or_at_all_timesteps() {
-    let load = |more: &[(&str, &str)]| {
-        let changes = [("train.noise_on", "estimate")].iter().chain(more);
-        let changes: Vec<_> =
-            changes.map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
-        Recipe::load("tiny", &changes)
+fn regression_recipes_are_refused_by_key() {
+    let load = |key: &str, value: &str| {
+        let changes = [(key.to_owned(), value.to_owned())];
+        let text = include_str!("../../../tests/golden/regression.toml");
+        Recipe::parse(text, "regression", &changes).unwrap_err().to_string()
     };
-    let two = [("validation.steps", "2"), ("train.timesteps", "log-logistic")];
-    assert!(load(&two).is_ok());
-    let (ten, uniform) = (("validation.steps", "10"), ("train.timesteps", "uniform"));
-    assert!(load(&[ten, uniform]).is_ok());
-    for (more, word) in [
-        (vec![two[1]], "validation.steps is 2 or more"),
-        (vec![ten, two[1]], "train.timesteps"),
-        (vec![two[0], two[1], ("train.loss.prediction", "0")], "prediction has a weight"),
+    for (key, value, word) in [
+        ("train.learns", "[]", "train.learns"),
+        ("train.learns", "[\"refinement\", \"pre\"]", "train.learns"),
+        ("train.learns", "[\"unet\"]", "train.learns"),
+        ("train.ablate", "[\"flow\"]", "train.ablate"),
+        ("train.noise_start_fraction", "0.3", "train.noise_start_fraction"),
+        ("validation.steps", "1", "validation.steps"),
+        ("network.neighbours", "0", "network.neighbours"),
     ] {
-        let error = load(&more).unwrap_err().to_string();
-        assert!(error.contains(word), "{more:?}: {error}");
+        let error = load(key, value);
+        assert!(error.contains(word), "{key}={value}: {error}");
     }
+    assert!(Recipe::load("small", &[]).unwrap().stages().unwrap().len() == 2);
 }
 
 /// The weights of the whole network start one that leaves parts out, which learns as if it had been made so.
@@ -363,11 +391,12 @@ fn whole_weights_start_a_network_without_a_part() {
     let path = folder.path().join("whole.safetensors");
     let whole = recipe(&[]);
     init(&whole).save(&whole, &Origin { steps: 1, commit: None }, &path).unwrap();
-    let without = recipe(&[("network.ablate", "[\"flow\", \"fusion\"]")]);
-    let loaded = Qudi::load(&path, &without, &Device::flex()).unwrap();
-    let third_loss = |recipe: &Recipe, start: Option<Qudi>| {
+    let without = recipe(&[("train.ablate", "[\"flow\", \"fusion\"]")]);
+    let loaded = Diffusion::load(&path, &without, &Device::flex()).unwrap();
+    let third_loss = |recipe: &Recipe, start: Option<Diffusion>| {
         let folder = tempfile::tempdir().unwrap();
-        let mut run = open(folder.path(), recipe, From::Start(start.map(Box::new))).unwrap();
+        let mut run =
+            open::<Diffusion>(folder.path(), recipe, From::Start(start.map(Box::new))).unwrap();
         let mut loss = 0.0;
         let stopped = run.learn(1, &mut |event| match event {
             // A new network's output layers are zero.

@@ -1,4 +1,4 @@
-//! The loss and its gradients: they reach every parameter, one burst can be overfitted, and backends agree.
+//! The loss of the diffusion and its gradients: they reach every parameter, one burst can be overfitted, and backends agree.
 #![allow(clippy::unwrap_used)]
 
 mod moving_disk;
@@ -9,23 +9,30 @@ use burn::tensor::{Device, Gradients, Tensor};
 use moving_disk::{Burst, tiny};
 use qudi_core::Size;
 use qudi_layers::tensor::to_tensor;
+use qudi_model::diffusion::Diffusion;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
-use qudi_model::network::{Qudi, init_parameters, parameter_shapes};
-use qudi_model::{ComputePrecision, with_precision};
-use qudi_train::loss::{
-    LoopOptions, LossForm, LossTerms, LossWeights, SelfConditioning, TimestepLaw, gaussian_nll,
-    loss_terms, reconstruction,
+use qudi_model::{ComputePrecision, init_parameters, parameter_shapes, with_precision};
+use qudi_train::diffusion::{LossTerms, SelfConditioning, TimestepLaw, loss_terms};
+use qudi_train::loss::lpips::PerceptualKind;
+use qudi_train::loss::{LossForm, gaussian_nll, reconstruction};
+use qudi_train::{LossConfig, Optimizer, gradients, parameters, with_parameters};
+
+const WEIGHTS: LossConfig = LossConfig {
+    form: LossForm::Edm,
+    prediction: 1.0,
+    pre: 0.2,
+    perceptual: 0.0,
+    term: PerceptualKind::None,
+    flow: 0.0,
 };
-use qudi_train::{Optimizer, gradients, parameters, with_parameters};
-use std::collections::HashMap;
 
 fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     moving_disk::burst([0.2, 0.9], size, frames, device)
 }
 
 /// The loss of step `number`, at a time and with noise of its own.
-fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
+fn loss(network: &Diffusion, burst: &Burst, number: u64) -> LossTerms {
     let frames = burst.conditioning.frames;
     let noise = Noise::new(number, 1);
     let values = (0..frames as u64).flat_map(|f| noise.frame(f, 0, burst.size.pixels())).collect();
@@ -38,36 +45,13 @@ fn loss(network: &Qudi, burst: &Burst, number: u64) -> LossTerms {
     let example = burst.example(noise, &timesteps);
     let self_conditioning =
         if number.is_multiple_of(2) { SelfConditioning::Off } else { SelfConditioning::On(number) };
-    loss_terms(network, &example, self_conditioning, LossWeights::default(), LoopOptions::ALL, None)
-        .unwrap()
+    loss_terms(network, &example, self_conditioning, WEIGHTS, false, None).unwrap()
 }
 
-/// The first stage computes the same terms of pre-denoiser and flow as the whole network, and nothing else
-/// learns.
-#[test]
-fn first_stage_terms_equal_those_of_the_whole_network() {
-    let device = Device::flex().autodiff();
-    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
-    let network = tiny().init(3, &device);
-    let with = |prediction: f32| {
-        let weights = LossWeights { prediction, pre: 1.0, flow: 0.5, ..LossWeights::default() };
-        let example = burst.example(burst.truth.zeros_like(), &[500]);
-        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
-            .unwrap()
-    };
-    let (part, whole) = (with(0.0), with(1.0));
-    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
-    assert_eq!(value(&part.pre), value(&whole.pre));
-    let flows = [&part, &whole].map(|terms| value(terms.flow.as_ref().unwrap()));
-    assert_eq!(flows[0], flows[1]);
-    assert!((value(&part.total) - value(&part.pre) - 0.5 * flows[0]).abs() < 1e-7);
-    let grads = part.total.backward();
-    let mut missing = MissingGradients { grads: &grads, path: vec![], names: vec![] };
-    network.visit(&mut missing);
-    let idle = |part: &str| missing.names.iter().any(|name| name.starts_with(part));
-    // Other layers of the two lie behind last layers that start at zero.
-    assert!(!idle("pre.out") && !idle("flow.levels.0.layers.4"));
-    assert!(idle("unet.") && idle("fusion.") && idle("low.") && idle("high."));
+/// Returns a term by name.
+fn term(terms: &LossTerms, name: &str) -> f32 {
+    let (_, term) = terms.terms().iter().find(|(term, _)| *term == name).unwrap();
+    term.clone().into_scalar()
 }
 
 /// The paper's form: plain errors in [0, 1], in no unit of any burst.
@@ -76,18 +60,17 @@ fn plain_loss_is_that_of_images() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
     let network = tiny().init(3, &device);
-    let weights = LossWeights { form: LossForm::L2Tv, ..LossWeights::default() };
+    let weights = LossConfig { form: LossForm::L2Tv, ..WEIGHTS };
     let example = burst.example(burst.truth.zeros_like(), &[500]);
     let terms =
-        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None);
-    let terms = terms.unwrap();
-    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
-    let d = network.predenoise(&burst.conditioning).0;
-    let expected = value(&reconstruction(d, burst.truth.clone()));
-    assert!((value(&terms.pre) - expected).abs() < 1e-6 * expected);
-    let total = value(&terms.prediction) + 0.2 * expected;
-    assert!((value(&terms.total) - total).abs() < 1e-5 * total);
-    assert!(value(&terms.prediction) < 0.5, "squared errors of images");
+        loss_terms(&network, &example, SelfConditioning::Off, weights, false, None).unwrap();
+    let value = |term: Tensor<1>| term.into_scalar::<f32>();
+    let d = network.predenoise(&burst.conditioning, None).d;
+    let expected = value(reconstruction(d, burst.truth.clone()));
+    assert!((term(&terms, "pre") - expected).abs() < 1e-6 * expected);
+    let total = term(&terms, "prediction") + 0.2 * expected;
+    assert!((value(terms.total()) - total).abs() < 1e-5 * total);
+    assert!(term(&terms, "prediction") < 0.5, "squared errors of images");
 }
 
 /// Computing pre-denoiser and U-Net again, image by image, changes rounding alone.
@@ -100,11 +83,10 @@ fn recomputed_gradients_equal_kept_ones() {
         (0..count).map(|i| 0.05 * (i as f32).sin() + 0.01).collect()
     });
     let gradients_with = |recomputes: bool| -> Vec<Vec<f32>> {
-        let options = LoopOptions { recomputes, ..LoopOptions::ALL };
-        let weights = LossWeights { flow: 0.5, ..LossWeights::default() };
+        let weights = LossConfig { flow: 0.5, ..WEIGHTS };
         let example = burst.example(burst.truth.clone() * 0.3, &[400]);
-        let terms = loss_terms(&network, &example, SelfConditioning::On(7), weights, options, None);
-        let terms = terms.unwrap();
+        let on = SelfConditioning::On(7);
+        let terms = loss_terms(&network, &example, on, weights, recomputes, None).unwrap();
         let list = terms.gradients(&network, &burst.conditioning);
         list.into_iter().map(|list| list.into_data().try_into_vec().unwrap()).collect()
     };
@@ -117,71 +99,6 @@ fn recomputed_gradients_equal_kept_ones() {
         let again = ["pre.", "unet.inp", "unet.out"].iter().any(|part| name.starts_with(part));
         assert!(!again || largest > 1e-6, "{name} has no gradient");
     }
-}
-
-/// Only the uncertainty head learns from the uncertainty loss.
-#[test]
-fn uncertainty_loss_has_no_gradient_to_the_frames() {
-    let device = Device::flex().autodiff();
-    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
-    let mut config = tiny();
-    config.pre.uncertainty = true;
-    let network = config.init(3, &device);
-    let terms_of = |prediction: f32| {
-        let weights = LossWeights { prediction, pre: 0.0, ..LossWeights::default() };
-        let example = burst.example(burst.truth.zeros_like(), &[500]);
-        loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
-            .unwrap()
-    };
-    let (part, whole) = (terms_of(0.0), terms_of(1.0));
-    let value = |term: &Tensor<1>| term.clone().into_scalar::<f32>();
-    let [first, again] = [&part, &whole].map(|terms| value(terms.uncertainty.as_ref().unwrap()));
-    assert_eq!(first, again);
-    assert_eq!(first, value(&part.total));
-    let grads = part.total.backward();
-    let mut missing = MissingGradients { grads: &grads, path: vec![], names: vec![] };
-    network.visit(&mut missing);
-    let idle = |part: &str| missing.names.iter().any(|name| name.starts_with(part));
-    // What enters lies behind a last layer that starts at zero.
-    assert!(!idle("uncertainty.out") && idle("uncertainty.enter") && idle("pre.out"));
-}
-
-/// The U-Net's corrections scale with the predicted uncertainty; an untrained head leaves them as they are.
-#[test]
-fn predicted_uncertainty_scales_the_prediction_loss() {
-    let device = Device::flex().autodiff();
-    let burst = burst(Size { height: 32, width: 32 }, 4, &device);
-    let prediction = |uncertainty: bool, bias: f32| {
-        let mut config = tiny();
-        config.pre.uncertainty = uncertainty;
-        let mut network = config.init(3, &device);
-        if uncertainty {
-            let biased = |name: &str, shape: &[usize]| {
-                let initial = vec![bias; shape.iter().product()];
-                (name == "uncertainty.out.bias").then_some(initial)
-            };
-            let values = values_by_name(&network);
-            network = init_parameters(network, |name, shape| {
-                biased(name, shape).unwrap_or_else(|| values[name].clone())
-            });
-        }
-        let example = burst.example(burst.truth.ones_like(), &[100]);
-        let weights = LossWeights::default();
-        let terms =
-            loss_terms(&network, &example, SelfConditioning::Off, weights, LoopOptions::ALL, None)
-                .unwrap();
-        terms.prediction.into_scalar::<f32>()
-    };
-    let without_head = prediction(false, 0.0);
-    assert!((prediction(true, 0.0) - without_head).abs() < 1e-5 * without_head);
-    assert!((prediction(true, 1.0) - without_head).abs() > 1e-3 * without_head);
-}
-
-fn values_by_name(network: &Qudi) -> HashMap<String, Vec<f32>> {
-    let names = parameter_shapes(network).into_iter().map(|(name, _)| name);
-    let lists =
-        parameters(network).into_iter().map(|list| list.into_data().try_to_vec::<f32>().unwrap());
-    names.zip(lists).collect()
 }
 
 /// The minimum is 0.5 plus the logarithm of sigma.
@@ -228,18 +145,17 @@ fn gradients_reach_every_parameter() {
     let device = Device::flex().autodiff();
     let burst = burst(Size { height: 32, width: 32 }, 4, &device);
     let mut config = tiny();
-    config.unet.temporal = true;
     config.unet.attention = vec![1];
     let mut network = config.init(3, &device);
     let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
     for number in 0..10 {
-        let grads = loss(&network, &burst, number).total.backward();
+        let grads = loss(&network, &burst, number).total().backward();
         let grads = GradientsParams::from_grads(grads, &network);
         network = optimizer.step(1e-3, network, grads);
     }
     // A step with a first pass: only then the simulated measurement matters. Its time is not the last one.
     let number = (1..).step_by(2).find(|&n| (f64::from(n) * 0.414_214).fract() > 0.2).unwrap();
-    let grads = loss(&network, &burst, number as u64).total.backward();
+    let grads = loss(&network, &burst, number as u64).total().backward();
     let mut missing = MissingGradients { grads: &grads, path: vec![], names: vec![] };
     network.visit(&mut missing);
     assert!(missing.names.is_empty(), "no gradient: {}", missing.names.join(", "));
@@ -251,9 +167,9 @@ fn bf16_gradients_match_f32() {
     let burst = burst(Size { height: 64, width: 64 }, 5, &device);
     let mut network = tiny().init(3, &device);
     let mut optimizer = Optimizer::adam(&parameters(&network));
-    let of = |network: &Qudi, precision| {
+    let of = |network: &Diffusion, precision| {
         with_precision(precision, || {
-            gradients(network, &loss(network, &burst, 10).total.backward())
+            gradients(network, &loss(network, &burst, 10).total().backward())
         })
     };
     for _ in 0..10 {
@@ -281,9 +197,9 @@ fn overfits_a_single_burst() {
     let (mut totals, mut predictions) = (Vec::new(), Vec::new());
     for number in 0..200u32 {
         let terms = loss(&network, &burst, u64::from(number));
-        totals.push(terms.total.clone().into_scalar::<f32>());
-        predictions.push(terms.prediction.into_scalar::<f32>());
-        let gradients = gradients(&network, &terms.total.backward());
+        totals.push(terms.total().into_scalar::<f32>());
+        predictions.push(term(&terms, "prediction"));
+        let gradients = gradients(&network, &terms.total().backward());
         let norm = gradients.iter().map(|g| g.clone().powi_scalar(2).sum().into_scalar::<f32>());
         let norm = f64::from(norm.sum::<f32>().sqrt());
         let rate = 4e-3 * (1.0 - f64::from(number) / 200.0);
@@ -305,10 +221,10 @@ fn step_on_ndarray_matches_flex() {
         let burst = burst(Size { height: 16, width: 16 }, 3, &device);
         let mut network = tiny().init(3, &device);
         let mut optimizer = AdamConfig::new().with_epsilon(1e-8).init();
-        let grads = loss(&network, &burst, 2).total.backward();
+        let grads = loss(&network, &burst, 2).total().backward();
         let grads = GradientsParams::from_grads(grads, &network);
         network = optimizer.step(1e-3, network, grads);
-        loss(&network, &burst, 4).total.into_scalar::<f32>()
+        loss(&network, &burst, 4).total().into_scalar::<f32>()
     });
     assert!((losses[0] / losses[1] - 1.0).abs() < 1e-3, "{losses:?}");
 }

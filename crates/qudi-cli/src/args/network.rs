@@ -1,8 +1,8 @@
 //! Options of commands that may run the network.
 
+use super::given::{DIFFUSION, Given, OWN};
 use super::number;
 use crate::methods::options::NetworkOptions;
-use crate::weights::Weights;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_baselines::import::{METHODS, Method};
 use qudi_layers::TILE;
@@ -11,23 +11,22 @@ use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::{Path, PathBuf};
 
-/// The network, for the method `qudi`.
+/// Options of networks.
 #[derive(Clone, Debug, Default, ClapArgs)]
-#[command(next_help_heading = "Network (method qudi)")]
+#[command(next_help_heading = "Networks (methods qudi, qudi-regression, qudi-diffusion)")]
 pub(crate) struct Network {
-    /// Weights that `qudi train` wrote [default: those that come along]; for learned methods of others
+    /// Weights that `qudi train` wrote [default: built in]; for learned methods of others
     /// METHOD=FILE, as in emvd=emvd.pth,quiver=quiver.pth (no commas in names)
     #[arg(long, value_name = "[METHOD=]FILE,...", value_delimiter = ',', value_hint = ValueHint::FilePath)]
     weights: Vec<WeightsOf>,
-    /// Spacing of the timesteps of these steps [default: what the weights say of themselves, usually
-    /// log-logistic]
-    #[arg(long, value_name = "NAME")]
+    /// qudi-diffusion: spacing of the timesteps [default: as the weights say]
+    #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     spacing: Option<SpacingName>,
-    /// Sampler of these steps [default: ddim]
-    #[arg(long, value_name = "NAME")]
+    /// qudi-diffusion: sampler [default: ddim]
+    #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     sampler: Option<SamplerName>,
-    /// Samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
-    #[arg(long, value_name = "K", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
+    /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
+    #[arg(long, value_name = "K", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info
     /// --devices`) [default: auto]
@@ -38,12 +37,12 @@ pub(crate) struct Network {
     tile: Option<usize>,
     /// Numbers that its convolutions multiply; sums have 32 bits with each [default: bf16 on processors that
     /// multiply it faster, else f32]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", group = OWN)]
     precision: Option<PrecisionName>,
 }
 
 impl Network {
-    /// The weights of the method `qudi`, if they are named.
+    /// Returns the weights of a network of this project, if they are named.
     pub(crate) fn own_weights(&self) -> Option<&Path> {
         self.weights.iter().find(|weights| weights.method.is_none()).map(|w| w.file.as_path())
     }
@@ -53,13 +52,12 @@ impl Network {
         self.weights.iter().map(|weights| &weights.file)
     }
 
-    /// The options for a number of steps, with their defaults filled in.
-    pub(crate) fn options(&self, steps: Option<usize>) -> NetworkOptions {
-        let first = |given: &[(bool, &'static str)]| {
-            given.iter().find(|(given, _)| *given).map(|(_, flag)| *flag)
-        };
+    /// Returns the options for a number of steps, with their defaults filled in; `given` are the flags on the
+    /// command line.
+    pub(crate) fn options(&self, steps: Option<usize>, given: &Given) -> NetworkOptions {
+        let weights = self.own_weights().map(|_| "--weights".to_owned());
         NetworkOptions {
-            weights: Weights::of(self.own_weights()),
+            own_file: self.own_weights().map(Path::to_owned),
             own_files: self.weights.iter().filter(|weights| weights.method.is_none()).count(),
             learned: self
                 .weights
@@ -73,26 +71,14 @@ impl Network {
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),
             tile: self.tile.unwrap_or(TILE),
             precision: self.precision.map(PrecisionName::precision),
-            own_flag: first(&[
-                (self.own_weights().is_some(), "--weights"),
-                (steps.is_some(), "--steps"),
-                (self.spacing.is_some(), "--spacing"),
-                (self.sampler.is_some(), "--sampler"),
-                (self.samples.is_some(), "--samples"),
-                (self.precision.is_some(), "--precision"),
-            ]),
             tile_flag: self.tile.is_some().then_some("--tile"),
             device_flag: self.device.is_some().then_some("--device"),
-            diffusion_flag: first(&[
-                (self.spacing.is_some(), "--spacing"),
-                (self.sampler.is_some(), "--sampler"),
-                (self.samples.is_some_and(|samples| samples > 1), "--samples"),
-            ]),
+            given: Given { own: weights.or_else(|| given.own.clone()), ..given.clone() },
         }
     }
 }
 
-/// Weights, and the learned method that they are of; none for `qudi`.
+/// Weights, and the learned method that they are of; none for the networks of this project.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct WeightsOf {
     method: Option<Method>,
@@ -121,14 +107,13 @@ impl std::str::FromStr for WeightsOf {
     }
 }
 
-/// The number of diffusion steps, for the method `qudi`.
+/// Number of reverse steps of the diffusion.
 #[derive(Clone, Copy, Debug, Default, ClapArgs)]
-#[command(next_help_heading = "Network (method qudi)")]
+#[command(next_help_heading = "Networks (methods qudi, qudi-regression, qudi-diffusion)")]
 pub(crate) struct Steps {
-    /// Reverse diffusion steps. With 0 the frames are a regression: fastest, and closest to the truth on
-    /// average. More steps draw sharper pictures, whose details are invented; the paper takes 10 [default:
-    /// what the weights say of themselves]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
+    /// qudi-diffusion: reverse steps. More steps draw sharper pictures, whose details are invented; the paper
+    /// takes 10 [default: as the weights say]
+    #[arg(long, value_name = "N", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     pub(crate) steps: Option<usize>,
 }
 

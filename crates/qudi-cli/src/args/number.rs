@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 /// The most threads that are started: several times the cores of large machines.
-pub(crate) const MOST_THREADS: u64 = 256;
+pub(crate) const MAX_THREADS: u64 = 256;
 
 /// The most photons per pixel and frame: a million times what a picture needs.
 pub(crate) const PPP: RangeInclusive<f64> = 1e-9..=1e9;
@@ -21,7 +21,7 @@ pub(crate) const EXPOSURE: RangeInclusive<f64> = 1e-6..=1.0;
 pub(crate) const SUM: RangeInclusive<u64> = 1..=1 << 24;
 
 /// Frames per second of what plays.
-pub(crate) const PLAYED: RangeInclusive<f64> = 0.01..=1000.0;
+pub(crate) const PLAYED_FPS: RangeInclusive<f64> = 0.01..=1000.0;
 
 /// Sample values in DN.
 pub(crate) const DN: RangeInclusive<f64> = 0.0..=65_535.0;

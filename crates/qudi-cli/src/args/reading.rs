@@ -10,7 +10,7 @@ use qudi_io::description::{
 use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 
-/// What the user says about a capture that its file does not.
+/// Properties of a capture that its file may not tell.
 #[derive(Clone, Debug, ClapArgs)]
 #[group(skip)]
 #[command(next_help_heading = "Reading captures")]
@@ -88,12 +88,12 @@ pub(crate) struct Reading {
 }
 
 impl Reading {
-    /// How many frames are summed, if that is said.
+    /// Returns the number of frames that are summed, if it is given.
     pub(crate) fn sum(&self) -> Option<Sum> {
         self.sum
     }
 
-    /// Files that are read besides the capture.
+    /// Returns the files that are read in addition to the capture.
     pub(crate) fn files(&self) -> Vec<&Path> {
         let mask = match &self.mask {
             Some(MaskChoice::File(path)) => Some(path),
@@ -102,7 +102,7 @@ impl Reading {
         mask.into_iter().chain(&self.dcr).map(PathBuf::as_path).collect()
     }
 
-    /// The options; without --mask, pixels are treated as `mask` says.
+    /// Returns the options; without --mask, pixels are treated as `mask` says.
     pub(crate) fn options(&self, mask: MaskChoice) -> ReadOptions {
         let given = self.clone();
         // A dark map names its hot pixels; asking for it asks for their repair.
@@ -138,7 +138,7 @@ impl Reading {
     }
 }
 
-/// One of some words, read as the type that serde names so.
+/// Returns a parser for one of some words, read as the type that serde names so.
 pub(crate) fn words<T: DeserializeOwned + Clone + Send + Sync + 'static>(
     all: &'static [&'static str],
 ) -> impl TypedValueParser<Value = T> {

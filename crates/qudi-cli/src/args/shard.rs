@@ -10,12 +10,12 @@ pub(crate) struct Shard {
 }
 
 impl Shard {
-    /// What it locks in the folder that the parts share.
+    /// Returns what it locks in the folder that the parts share.
     pub(crate) fn share(self) -> Share {
         Share::Part { number: self.number, of: self.of }
     }
 
-    /// Its part of `frames`.
+    /// Returns its part of `frames`.
     pub(crate) fn range(self, frames: u64) -> std::ops::Range<u64> {
         let start = |n: u64| (u128::from(frames) * u128::from(n) / u128::from(self.of)) as u64;
         start(self.number - 1)..start(self.number)

@@ -4,7 +4,7 @@ use crate::error::{CliError, Result};
 use qudi_io::writer::TiffSamples;
 use std::path::Path;
 
-/// Samples for the output `path`.
+/// Returns the type of samples for the output `path`.
 pub(crate) fn tiff_samples(float: bool, path: &Path) -> Result<TiffSamples> {
     let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
     match (float, extension.as_str()) {

@@ -13,9 +13,9 @@ use qudi_io::capture::{Capture, Summary};
 pub(crate) struct LightOverrides {
     /// Incident photons per pixel and output frame.
     pub(crate) ppp: Option<f64>,
-    /// DN/e-.
+    /// Gain in DN/e-.
     pub(crate) gain: Option<f64>,
-    /// Image value that receives `ppp` photons, unless the capture is to tell.
+    /// Image value that receives `ppp` photons, unless the capture decides.
     pub(crate) mean_level: Option<f64>,
     pub(crate) seed: u64,
 }
@@ -131,7 +131,7 @@ pub(crate) fn checked_mean_level(mean_level: Option<f64>) -> Result<()> {
 /// Measures the mean level that fits the counts of a capture.
 fn measured_mean_level(capture: &mut Capture, acquisition: &Acquisition) -> Result<f64> {
     let size = capture.size();
-    // Pipes have shown their first frames only.
+    // Only the first frames of a pipe have arrived.
     let first = 2 * LONGEST_HALF as u64 + 1;
     let frames =
         if capture.forward_only() { capture.frames().min(first) } else { capture.frames() };

@@ -1,59 +1,57 @@
-//! Sums that are aligned by themselves: where motion keeps sums short, several of them are added along it.
+//! Sums that are aligned along motion: where motion keeps sums short, several of them are added along it.
 
 use super::{Source, SummedCapture};
 use crate::error::Result;
+use crate::methods::Method;
 use crate::report::Report;
 use qudi_burst::{AlignedSums, choose_count};
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_core::windows::{LONGEST_HALF, Windows};
-use qudi_io::capture::{Capture, ENOUGH, SumChoice, SumLimit};
+use qudi_io::capture::{Capture, SUFFICIENT_DETECTIONS, SumChoice, SumLimit};
 use qudi_io::description::ReadOptions;
 use qudi_io::restore::{Instants, Schedule};
 
-/// Methods that sums are aligned for: those that align frames themselves.
-const METHODS: [&str; 4] = ["qbp", "qbp-bm3d", "qbp-refined", "qudi"];
+/// Pixels that may move within a fine sum.
+const MAX_FINE_MOTION: f64 = 0.5;
 
-/// Pixels that may move within the sums that are shifted.
-const FINE: f64 = 0.5;
-
-/// Detections per pixel of a block, enough for its motion to be found.
-const FOUND: f64 = 1.5;
+/// Detections per pixel of a block that suffice to find its motion.
+const MIN_BLOCK_DETECTIONS: f64 = 1.5;
 
 /// Pixels that may move from one block to the next.
-const FASTEST: f64 = 6.0;
+const MAX_BLOCK_MOTION: f64 = 6.0;
 
-/// Picture distances of which an aligned sum may consist. One is no alignment.
+/// Lengths of an aligned sum in picture distances. One is no alignment.
 const MULTIPLES: [usize; 8] = [1, 2, 3, 5, 8, 12, 18, 27];
 
-/// Fine sums in a picture distance, where it has that many frames, and in an aligned sum: few enough are held back
-/// to choose by, and lengths are met well enough.
-const STEPS: f64 = 8.0;
+/// Fine sums in a picture distance, where it has that many frames, and in an aligned sum: few enough to leave
+/// many frames for the choice, and enough to approximate lengths.
+const FINE_SUMS: f64 = 8.0;
 
-/// Side of the part of the picture that is looked at.
-const SIDE: usize = 160;
+/// Side of the part of the picture that is sampled.
+const SAMPLE_SIDE: usize = 160;
 
-/// Blocks along which motion is taken for even, and sums that methods restore together.
+/// Blocks along which motion counts as even, and sums that methods restore together.
 const WINDOW: usize = 2 * LONGEST_HALF + 1;
 
-/// Native frames of a sum, at most: sums hold 16 bits.
-const LONGEST: u32 = 60_000;
+/// Largest number of native frames of a sum, which holds 16 bits.
+const MAX_SUM: u32 = 60_000;
 
-/// Bytes of the counts of a window, at most.
+/// Largest number of bytes of the counts of a window.
 const WINDOW_BYTES: u64 = 256 << 20;
 
-/// Stretches of the capture that are looked at.
-const PLACES: u64 = 4;
+/// Stretches of the capture that are sampled.
+const SAMPLED_PLACES: u64 = 4;
 
 /// A capture that a method restores: its frames are sums, which may be aligned along motion.
 pub(crate) struct AlignedCapture {
     pub(crate) capture: Capture,
-    /// How its frames, fine sums, are aligned; `None` for plain sums.
+    /// Alignment of its frames, which are fine sums; `None` for plain sums.
     pub(crate) alignment: Option<Alignment>,
 }
 
-/// How the fine sums of a capture, read as its frames, are aligned.
+/// The alignment of the fine sums of a capture, which are its frames.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Alignment {
     /// Native frames in a fine sum.
@@ -62,7 +60,7 @@ pub(crate) struct Alignment {
     step: u64,
     /// Fine sums in a block.
     block: usize,
-    /// Fine sums in an aligned one.
+    /// Fine sums in an aligned sum.
     count: usize,
 }
 
@@ -74,15 +72,16 @@ struct Lengths {
 }
 
 impl Alignment {
-    /// `lengths` in fine sums of a capture that moves by `motion` pixels a native frame, for a picture every
-    /// `distance` native frames. Where sums are longer than that, they are multiples of it: pictures whose
+    /// Creates the alignment with `lengths` for a capture that moves by `motion` pixels a native frame, for a
+    /// picture every `distance` native frames. Longer sums are multiples of the distance: pictures whose
     /// distance is a multiple of a sum are restored together.
     fn new(lengths: Lengths, motion: f64, distance: u32) -> Self {
         let slow = |fine: &u32| {
-            f64::from(*fine) * motion <= FINE && STEPS * f64::from(*fine) <= lengths.sum
+            f64::from(*fine) * motion <= MAX_FINE_MOTION
+                && FINE_SUMS * f64::from(*fine) <= lengths.sum
         };
         let divides = |fine: &u32| distance.is_multiple_of(*fine);
-        let fine = (1..=distance.min(LONGEST)).rev().filter(divides).find(slow).unwrap_or(1);
+        let fine = (1..=distance.min(MAX_SUM)).rev().filter(divides).find(slow).unwrap_or(1);
         let step = (distance / fine) as usize;
         let of = |native: f64| ((native / f64::from(fine)).round() as usize).max(1);
         let mut count = of(lengths.sum);
@@ -92,23 +91,23 @@ impl Alignment {
         Self { fine, step: step as u64, block: of(lengths.block), count }
     }
 
-    /// The pictures that are made.
+    /// Returns the pictures that are made.
     fn instants(self) -> Instants {
         let sum = u64::from(self.fine);
         Instants::Frames { every: self.step * sum, sum }
     }
 
-    /// Native frames in an aligned sum.
+    /// Returns the native frames in an aligned sum.
     pub(crate) fn native_frames(self) -> u64 {
         self.count as u64 * u64::from(self.fine)
     }
 
-    /// Fine sums from one picture to the next.
+    /// Returns the fine sums from one picture to the next.
     pub(crate) fn step(self) -> u64 {
         self.step
     }
 
-    /// What is aligned, in a sentence.
+    /// Describes the alignment in a sentence.
     fn describe(self) -> String {
         format!(
             "motion is followed: each picture is restored from {WINDOW} sums of {} frames, aligned along it; --sum N adds plain sums instead",
@@ -118,18 +117,19 @@ impl Alignment {
 }
 
 impl AlignedCapture {
-    /// Aligns the sums of a capture, if motion keeps them short and `method` can work with aligned ones. Its frames
-    /// then become the fine sums that are shifted. `every` native frames, or every sum, one picture is made.
+    /// Aligns the sums of a capture, if motion keeps them short and `method` works with aligned sums. The
+    /// frames of the capture are then fine sums. One picture is made for every `every` native frames, or for
+    /// every sum.
     pub(crate) fn new(
         summed: SummedCapture,
         source: &Source<'_>,
         sensor: &Sensor,
-        method: Option<&str>,
+        method: Option<&Method>,
         every: Option<u64>,
     ) -> Result<Self> {
         let SummedCapture { capture, choice, .. } = summed;
         let readable = capture.length().is_some() && !capture.forward_only();
-        let aligns = method.is_none_or(|method| METHODS.contains(&method));
+        let aligns = method.is_none_or(|method| method.aligns);
         let known = sensor.dark_per_frame().is_ok();
         let short = |choice: &SumChoice| choice.limit == SumLimit::Motion && !choice.still;
         match choice.filter(short) {
@@ -151,8 +151,8 @@ impl AlignedCapture {
         let (sum, frames) = (choice.frames, capture.native_frames());
         let distance = every.map_or(u64::from(sum), |every| every.min(frames)) as u32;
         let bytes = capture.size().pixels() * size_of::<u16>();
-        let steps = (f64::from(sum) * choice.motion / FINE).ceil();
-        let steps = steps.max(STEPS).clamp(1.0, f64::from(sum));
+        let steps = (f64::from(sum) * choice.motion / MAX_FINE_MOTION).ceil();
+        let steps = steps.max(FINE_SUMS).clamp(1.0, f64::from(sum));
         let fine = (f64::from(sum) / steps).round().max(1.0) as u32;
         let mut capture = capture.summed_by(fine, options, Some(sensor))?;
         let alignment = |lengths| Alignment::new(lengths, choice.motion, distance);
@@ -197,8 +197,8 @@ impl AlignedCapture {
         self.alignment.map_or(1, |alignment| alignment.count as u64)
     }
 
-    /// Returns the windows that `restorer` restores, of which neighbours share `overlap` frames, and the pictures
-    /// made: one for every `every` native frames, or for every frame.
+    /// Returns the windows that `restorer` restores, of which neighbours share `overlap` frames, and the
+    /// pictures made: one for every `every` native frames, or for every frame.
     pub(crate) fn schedule(
         &self,
         restorer: &dyn Restorer,
@@ -215,7 +215,8 @@ impl AlignedCapture {
     }
 }
 
-/// Chooses block and sum for a capture, read in fine sums of which `step` make a plain sum, among those that fit.
+/// Chooses block and sum for a capture, read in fine sums of which `step` make a plain sum, among the lengths
+/// that fit.
 fn choose(
     capture: &mut Capture,
     choice: &SumChoice,
@@ -226,18 +227,18 @@ fn choose(
     let frames = capture.frames() as usize;
     let fine = f64::from(capture.summed());
     let (light, motion) = (choice.detections * fine, choice.motion * fine);
-    let block = ((FOUND / light).ceil() as usize).max(step);
-    let block = block.min((FASTEST / motion) as usize).min(frames / WINDOW);
+    let block = ((MIN_BLOCK_DETECTIONS / light).ceil() as usize).max(step);
+    let block = block.min((MAX_BLOCK_MOTION / motion) as usize).min(frames / WINDOW);
     let lengths = |count: usize| Lengths { sum: count as f64 * fine, block: block as f64 * fine };
-    let wanted = |&count: &usize| {
+    let suits = |&count: &usize| {
         count * WINDOW <= frames
             && count <= block * WINDOW
-            && count as f64 * light <= ENOUGH
-            && count as f64 * fine <= f64::from(LONGEST)
+            && count as f64 * light <= SUFFICIENT_DETECTIONS
+            && count as f64 * fine <= f64::from(MAX_SUM)
             && (count == step || fits(lengths(count)))
     };
     let multiples = MULTIPLES.into_iter().chain([frames / WINDOW / step]);
-    let mut counts: Vec<usize> = multiples.map(|times| times * step).filter(wanted).collect();
+    let mut counts: Vec<usize> = multiples.map(|times| times * step).filter(suits).collect();
     counts.sort_unstable();
     counts.dedup();
     let (Some(&most), true) = (counts.last(), block > 0 && counts.len() > 1) else {
@@ -254,17 +255,17 @@ fn choose(
     Ok(count.filter(|&count| count > step).map(lengths))
 }
 
-/// The size of what is looked at.
+/// Returns the size of the sampled part of the picture.
 fn part(size: Size) -> Size {
-    Size { height: size.height.min(SIDE), width: size.width.min(SIDE) }
+    Size { height: size.height.min(SAMPLE_SIDE), width: size.width.min(SAMPLE_SIDE) }
 }
 
-/// The middle of the picture in stretches of `length` frames all over the capture.
+/// Reads the middle of the picture in stretches of `length` frames all over the capture.
 fn samples(capture: &mut Capture, length: usize) -> Result<Vec<Vec<Vec<u16>>>> {
     let (size, part) = (capture.size(), part(capture.size()));
     let (top, left) = ((size.height - part.height) / 2, (size.width - part.width) / 2);
     let room = capture.frames() - length as u64;
-    let places = PLACES.min(room / length as u64 + 1);
+    let places = SAMPLED_PLACES.min(room / length as u64 + 1);
     let mut counts = vec![0; size.pixels()];
     let mut samples = Vec::new();
     for place in 0..places {

@@ -14,7 +14,7 @@ use std::path::Path;
 pub(crate) struct Source<'a> {
     /// The file or folder; `None` for standard input.
     pub(crate) path: Option<&'a Path>,
-    /// How it is read.
+    /// Options for reading it.
     pub(crate) options: &'a ReadOptions,
     /// The number of frames summed into one, if given.
     pub(crate) sum: Option<Sum>,

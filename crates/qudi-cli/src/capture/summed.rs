@@ -15,13 +15,14 @@ const PIPED_FRAMES: u64 = 256;
 pub(crate) struct SummedCapture {
     pub(crate) capture: Capture,
     pub(crate) sensor: Option<Sensor>,
-    /// How many frames light and motion allow to sum, where no number is given: perhaps one.
+    /// Number of frames that light and motion allow to sum, where no number is given: perhaps one.
     pub(crate) choice: Option<SumChoice>,
 }
 
 impl SummedCapture {
-    /// Sums the frames of `opened` as `source` says. Without a number, the capture chooses one, unless a record
-    /// names its sensor, it holds sums already, or it is a pipe, whose frames are not held back unasked.
+    /// Sums the frames of `opened` as `source` says. Without a number, the capture chooses one, unless a
+    /// record names its sensor, it holds sums already, or it is a pipe, whose frames are not held back
+    /// unasked.
     pub(crate) fn new(opened: OpenedCapture, source: &Source<'_>) -> Result<Self> {
         let OpenedCapture { capture, sensor } = opened;
         let about = capture.info();
@@ -54,8 +55,8 @@ impl SummedCapture {
     }
 }
 
-/// Sums as many frames as the capture chooses, and returns the choice. A capture that cannot choose is refused if
-/// it is `asked` to.
+/// Sums as many frames as the capture chooses, and returns the choice. A capture that cannot choose is
+/// refused if it is `asked` to.
 pub(crate) fn sum_by_itself(
     mut capture: Capture,
     options: &ReadOptions,

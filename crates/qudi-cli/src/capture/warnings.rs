@@ -1,30 +1,30 @@
-//! What makes a result doubtful, and what to do about it.
+//! Warnings: what makes a result doubtful, and the remedy.
 
 use qudi_core::sensor::{Response, Sensor};
 use qudi_io::capture::{Capture, Summary};
 
-/// Chi-square of counts that a result explains.
-const EXPLAINED: std::ops::RangeInclusive<f64> = 0.5..=2.0;
+/// Range of chi-square of a result that explains its counts.
+const CHI_SQUARE_RANGE: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
 /// Share of saturated samples beyond which parts of the picture are lower bounds.
-const SATURATED: f64 = 0.2;
+const MAX_SATURATED_SHARE: f64 = 0.2;
 
 /// Share of ones among binary frames beyond which they tell little of the light.
-const ONES: f64 = 0.9;
+const MAX_ONES_SHARE: f64 = 0.9;
 
-/// Share of bad and doubtful pixels that is more than defects.
-const BAD: f64 = 0.01;
+/// Share of bad and doubtful pixels beyond which they are more than defects.
+const MAX_BAD_SHARE: f64 = 0.01;
 
-/// How far the light of a record and that of the counts may differ.
-const LIGHT: std::ops::RangeInclusive<f64> = 0.5..=2.0;
+/// Range of the ratio between the light of the counts and the recorded light.
+const LIGHT_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
-/// Warnings on a capture itself.
+/// Returns the warnings on a capture itself.
 pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
     let mut warnings = Vec::new();
     warnings.extend(saturation(capture, summary));
     let bad = capture.bad_pixels();
     let share = (bad.len() + bad.doubtful) as f64 / capture.size().pixels() as f64;
-    if share > BAD {
+    if share > MAX_BAD_SHARE {
         warnings.push(format!(
             "{} pixels are repaired, and {} more in clumps are doubtful, hot or small bright things ({:.2} % in all): name those of the camera with --mask FILE or --dcr FILE",
             bad.len(),
@@ -40,7 +40,7 @@ pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
     }
     if let (Some(recorded), Some(found)) = (capture.info().ppp, summary.ppp.incident) {
         let recorded = recorded * f64::from(capture.summed());
-        if !LIGHT.contains(&(found / recorded)) {
+        if !LIGHT_RATIO_RANGE.contains(&(found / recorded)) {
             warnings.push(format!(
                 "the record says {recorded:.4} photons per pixel and frame, and the counts show {found:.4}: remove the record if it belongs to another burst, or give the light with --ppp"
             ));
@@ -49,14 +49,14 @@ pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
     warnings
 }
 
-/// Whether too many samples are at their largest value. A single bit is there as often as it is set.
+/// Warns if too many samples have their largest value. A single bit has it as often as it is set.
 fn saturation(capture: &Capture, summary: &Summary) -> Option<String> {
     let max = capture.max_count()?;
     let binary = capture.info().binary;
     let range = summary.mean / f64::from(max);
     let saturated = summary.saturated.unwrap_or(0.0);
     let single_bits = binary && max == 1;
-    let much = saturated > SATURATED && !single_bits || range > ONES && binary;
+    let much = saturated > MAX_SATURATED_SHARE && !single_bits || range > MAX_ONES_SHARE && binary;
     much.then(|| {
         format!(
             "{:.1} % of the samples are saturated ({:.1} % of the range on average): bright parts are lower bounds; expose shorter, or weaken the light",
@@ -66,9 +66,9 @@ fn saturation(capture: &Capture, summary: &Summary) -> Option<String> {
     })
 }
 
-/// A warning on the chi-square of the counts given the result.
+/// Warns if the chi-square of the counts is outside its usual range.
 pub(crate) fn of_chi_square(chi_square: Option<f64>, sensor: &Sensor) -> Option<String> {
-    let chi_square = chi_square.filter(|chi_square| !EXPLAINED.contains(chi_square))?;
+    let chi_square = chi_square.filter(|chi_square| !CHI_SQUARE_RANGE.contains(chi_square))?;
     let help = match (chi_square < 1.0, sensor.response) {
         (true, Response::Binary) => {
             "the counts vary less than their light allows: check --bits and --levels, and whether frames were averaged or filtered before"

@@ -1,112 +1,37 @@
 //! The command-line flags of the fields that library errors name.
 
-/// Fields of the libraries that have a flag of the same name.
-const FIELDS: &[&str] = &[
-    "array",
-    "axes",
-    "backbones",
-    "bits",
-    "bitorder",
-    "bursts",
-    "cfa",
-    "channel",
-    "crop",
-    "data",
-    "dcr",
-    "device",
-    "end",
-    "every",
-    "exposure",
-    "fps",
-    "format",
-    "frames",
-    "frames_per_file",
-    "frames_per_image",
-    "gain",
-    "header",
-    "instants",
-    "levels",
-    "mask",
-    "method",
-    "motion",
-    "offset",
-    "orient",
-    "overlap",
-    "pack_axis",
-    "ppp",
-    "ppp_def",
-    "preset",
-    "samples",
-    "seed",
-    "sensor",
-    "set",
-    "size",
-    "speed",
-    "start",
-    "steps",
-    "sum",
-    "threshold",
-    "tile",
-    "trailer",
-    "transfer",
-    "white",
-    "window",
-    "workers",
-];
+use crate::args::{Args, Global};
+use crate::commands::info::args::Info;
+use crate::commands::restore::args::Restore;
+use crate::settings::KEYS;
+use clap::{Args as _, Command, CommandFactory};
 
-/// The place of an error as the user knows it: `--ppp-def` for the field `ppp_def`, anything else unchanged.
+/// Returns the place of an error as the user knows it: `--ppp-def` for the field `ppp_def`, anything else
+/// unchanged.
 pub(crate) fn flags(place: &str) -> String {
-    let flag = |part: &str| {
-        if FIELDS.contains(&part) {
-            format!("--{}", part.replace('_', "-"))
-        } else {
-            part.to_owned()
-        }
+    let args = Args::command();
+    let flag = |part: &str| match args.get_subcommands().find_map(|command| flag(command, part)) {
+        Some(flag) => flag,
+        None => part.to_owned(),
     };
     place.split(", ").map(flag).collect::<Vec<_>>().join(", ")
 }
 
-/// Fields that messages name in backquotes, alone or with a value, and that are no keys of sensor files.
-const IN_TEXT: &[&str] = &[
-    "array",
-    "axes",
-    "bitorder",
-    "cfa",
-    "channel",
-    "crop",
-    "dcr",
-    "end",
-    "force",
-    "format",
-    "frames_per_file",
-    "header",
-    "lenient",
-    "offset",
-    "levels",
-    "mask",
-    "orient",
-    "pack_axis",
-    "preview",
-    "sensor",
-    "size",
-    "start",
-    "steps",
-    "sum",
-    "threshold",
-    "tile",
-    "trailer",
-];
-
-/// The text of a library with flags for the fields in it: `--size HxW` for a quoted `size HxW`.
+/// Returns the text of a library with flags for the quoted fields in it: `--size HxW` for `size HxW`. A name
+/// alone may be a key of sensors instead: `bits` is one, `bits 3` is a flag.
 pub(crate) fn flags_in_text(text: &str) -> String {
+    let augment = [Global::augment_args, Info::augment_args, Restore::augment_args];
+    let commands = augment.map(|augment| augment(Command::new("")));
     let parts: Vec<_> = text.split('`').collect();
     let mut out = String::new();
     for (i, part) in parts.iter().enumerate() {
         let quoted = i % 2 == 1 && i + 1 < parts.len();
         let (name, value) = part.split_once(' ').unwrap_or((part, ""));
-        // With a value, `bits` is the depth of a capture; alone, a key of sensors.
-        if quoted && (IN_TEXT.contains(&name) || (name == "bits" && !value.is_empty())) {
-            out += &format!("--{}", name.replace('_', "-"));
+        let is_key = KEYS.iter().any(|key| key.name.strip_prefix("sensor.") == Some(name));
+        let assigns = value.starts_with('=') || value.is_empty() && is_key;
+        let flag = commands.iter().find_map(|command| flag(command, name));
+        if let Some(flag) = flag.filter(|_| quoted && !assigns) {
+            out += &flag;
             out += &part[name.len()..];
             continue;
         }
@@ -115,6 +40,13 @@ pub(crate) fn flags_in_text(text: &str) -> String {
         out += if quoted { "`" } else { "" };
     }
     out
+}
+
+/// Returns the flag of `command` for a field, with its dashes.
+fn flag(command: &Command, field: &str) -> Option<String> {
+    let long = field.replace('_', "-");
+    let is_flag = command.get_arguments().any(|argument| argument.get_long() == Some(&long));
+    is_flag.then(|| format!("--{long}"))
 }
 
 #[cfg(test)]
@@ -128,6 +60,7 @@ mod tests {
             "use --pack-axis none, or --size"
         );
         assert_eq!(flags_in_text("raise `bits` or say `bits 3`"), "raise `bits` or say --bits 3");
+        assert_eq!(flags_in_text("set `bits = 1`"), "set `bits = 1`");
         assert_eq!(
             flags_in_text("`qudi info --formats` lists `size"),
             "`qudi info --formats` lists `size"

@@ -1,10 +1,11 @@
-//! The learned methods of others: their weights, and the memory that they take.
+//! Learned methods of others: weights and memory.
 
 use crate::device;
 use crate::error::Result;
 use crate::memory::{available_bytes, check_tiles};
 use crate::methods::options::NetworkOptions;
 use crate::methods::trained::check;
+use crate::methods::{Built, Kind};
 use crate::weights::{NAME, Weights, sha256};
 use burn::tensor::Device;
 use qudi_baselines::import::{
@@ -12,14 +13,14 @@ use qudi_baselines::import::{
 };
 use qudi_baselines::restorer::{LearnedRestorer, SMALLEST_TILE};
 use qudi_core::Size;
-use qudi_core::restorer::{Acquisition, Restorer};
+use qudi_core::restorer::Acquisition;
 use std::fmt;
 use std::path::Path;
 
-/// EMVD as trained here (docs/notes/engineering/learned-methods.md).
-const EMVD: &[u8] = include_bytes!("../../weights/emvd.safetensors");
+/// Weights of EMVD as trained here (docs/notes/engineering/learned-methods.md).
+pub(super) const EMVD: &[u8] = include_bytes!("../../weights/emvd.safetensors");
 
-/// Where the weights of a learned method are.
+/// Place of the weights of a learned method.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum LearnedWeights<'a> {
     /// In the program.
@@ -29,12 +30,15 @@ pub(crate) enum LearnedWeights<'a> {
 }
 
 impl LearnedWeights<'_> {
-    /// The weights of a method that come along, if there are any.
+    /// Returns the weights of a method that are in the program, if there are any.
     pub(crate) fn built_in(method: Method) -> Option<Self> {
-        (method == Method::Emvd).then_some(Self::BuiltIn(EMVD))
+        match super::Method::of_learned(method)?.kind {
+            Kind::Learned { built_in, .. } => built_in.map(Self::BuiltIn),
+            Kind::Classical(_) | Kind::Network(_) => None,
+        }
     }
 
-    /// What they are of, and what they say of themselves.
+    /// Reads the network's name, sizes and description; none if this is no file of a learned method.
     pub(crate) fn describe(self) -> Result<Option<Contents>> {
         let device = Device::flex();
         Ok(match self {
@@ -50,7 +54,7 @@ impl LearnedWeights<'_> {
         })
     }
 
-    /// SHA-256 of the whole file, in hexadecimal.
+    /// Returns the SHA-256 of the whole file, in hexadecimal.
     pub(crate) fn sha256(self) -> Result<String> {
         match self {
             Self::BuiltIn(bytes) => Ok(sha256(bytes)),
@@ -68,13 +72,13 @@ impl fmt::Display for LearnedWeights<'_> {
     }
 }
 
-/// The restorer of a method, for frames of `size`, and the device that it is on.
+/// Makes the restorer of a method for frames of `size`.
 pub(crate) fn restorer(
     method: Method,
     options: &NetworkOptions,
     acquisition: &Acquisition,
     size: Size,
-) -> Result<(Box<dyn Restorer>, String)> {
+) -> Result<Built> {
     let weights = options.weights_of(method)?;
     let device = device::open(&options.device)?;
     let loaded = weights.load(method, &device.device)?;

@@ -1,52 +1,145 @@
-//! The network behind `--method qudi`: weights, device, options.
+//! The networks of this project behind `--method qudi`, `qudi-regression` and `qudi-diffusion`: weights, device,
+//! options.
 
+use super::Built;
 use super::options::NetworkOptions;
 use super::trained::check;
-use crate::device::{self, Opened};
+use crate::device;
 use crate::error::{CliError, Result};
 use crate::memory::{available_bytes, check_tiles};
+use crate::weights::Weights;
 use qudi_core::Size;
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_model::checkpoint::ModelKind;
-use qudi_model::restorer::{Model, QudiRestorer, SampleOptions};
+use qudi_model::ComputePrecision;
+use qudi_model::checkpoint::{Description, Sampling};
+use qudi_model::config::{NetworkConfig, NetworkKind};
+use qudi_model::diffusion::{Diffusion, DiffusionRestorer, SampleOptions};
+use qudi_model::regression::{Regression, RegressionRestorer};
+use qudi_model::restorer::Model;
+use serde_json::{Value, json};
 
-/// The restorer, and how it makes frames: by regression or diffusion, and on which device.
+/// The network that a method of this project runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum NetworkChoice {
+    /// The network of the named weights, or the best one with built-in weights.
+    Best,
+    /// A network of this kind.
+    Of(NetworkKind),
+}
+
+/// A network of this project with its weights.
+pub(crate) struct OwnNetwork {
+    weights: Weights,
+    pub(crate) description: Description,
+    kind: NetworkKind,
+}
+
+impl OwnNetwork {
+    /// Finds the weights of a method: the named file, or the built-in ones.
+    ///
+    /// # Errors
+    /// [`CliError`] if there are no such weights.
+    pub(crate) fn new(options: &NetworkOptions, choice: NetworkChoice) -> Result<Self> {
+        let weights = match (&options.own_file, choice) {
+            (Some(path), _) => Weights::File(path.clone()),
+            (None, NetworkChoice::Best) => Weights::BuiltIn(NetworkKind::Regression),
+            (None, NetworkChoice::Of(kind)) => Weights::BuiltIn(kind),
+        };
+        let description = weights.describe()?;
+        let kind = match choice {
+            NetworkChoice::Best => description.network.kind(),
+            NetworkChoice::Of(kind) => kind,
+        };
+        Ok(Self { weights, description, kind })
+    }
+
+    /// Returns how frames are made, in words.
+    pub(crate) fn mode(&self, options: &NetworkOptions) -> String {
+        match (self.kind, self.sampling(options).steps) {
+            (NetworkKind::Regression, _) => "regression".to_owned(),
+            (NetworkKind::Diffusion, 1) => "diffusion in 1 step".to_owned(),
+            (NetworkKind::Diffusion, steps) => format!("diffusion in {steps} steps"),
+        }
+    }
+
+    /// Returns the kind of the network. The regression predicts its uncertainty; the diffusion has steps.
+    pub(crate) fn kind(&self) -> NetworkKind {
+        self.kind
+    }
+
+    /// Returns the sampling that is asked for; by default the one that the weights were made for.
+    fn sampling(&self, options: &NetworkOptions) -> Sampling {
+        let default = self.description.sampling.unwrap_or_default();
+        Sampling {
+            steps: options.steps.unwrap_or(default.steps),
+            spacing: options.spacing.unwrap_or(default.spacing),
+        }
+    }
+
+    /// Returns the settings that frames depend on.
+    pub(crate) fn settings(&self, options: &NetworkOptions) -> Result<Value> {
+        let mut settings = json!({
+            "weights": self.weights.to_string(),
+            "weights_sha256": self.weights.sha256()?,
+            "tile": options.tile,
+            "precision": options.precision(&device::open(&options.device)?)?,
+        });
+        if self.kind == NetworkKind::Diffusion {
+            let sampling = self.sampling(options);
+            settings["steps"] = json!(sampling.steps);
+            settings["spacing"] = json!(sampling.spacing);
+            settings["sampler"] = json!(options.sampler_name());
+            settings["samples"] = json!(options.samples);
+        }
+        Ok(settings)
+    }
+}
+
+/// Makes the restorer of a method, and says how it makes frames and on which device.
 pub(crate) fn restorer(
+    choice: NetworkChoice,
     options: &NetworkOptions,
     acquisition: &Acquisition,
     size: Size,
-) -> Result<(Box<dyn Restorer>, String)> {
+) -> Result<Built> {
+    let own = OwnNetwork::new(options, choice)?;
     let device = device::open(&options.device)?;
-    options.check_steps()?;
-    let (network, description) = options.weights.load(&device.device)?;
-    check(&description.provenance, acquisition)?;
+    check(&own.description.provenance, acquisition)?;
     if device.is_processor() {
-        let network = &description.network;
+        let Description { network, window, .. } = &own.description;
         let smallest = 4 * network.multiple();
         check_tiles([smallest, options.tile], size, available_bytes(), |size| {
-            network.memory(size, description.window)
+            network.memory(size, *window)
         })?;
     }
-    let model = Model {
-        network,
-        config: description.network,
-        kind: description.kind.unwrap_or(ModelKind::Diffusion),
-        window: description.window,
+    let precision = options.precision(&device)?;
+    let restorer: Box<dyn Restorer> = match own.kind {
+        NetworkKind::Regression => {
+            let (network, description) = own.weights.load::<Regression>(&device.device)?;
+            let NetworkConfig::Regression(config) = description.network else { unreachable!() };
+            let model = Model { network, config, window: description.window };
+            let tile = options.tile;
+            Box::new(RegressionRestorer::new(model, tile, precision, &device.device)?)
+        }
+        NetworkKind::Diffusion => {
+            let (network, description) = own.weights.load::<Diffusion>(&device.device)?;
+            let NetworkConfig::Diffusion(config) = description.network else { unreachable!() };
+            let model = Model { network, config, window: description.window };
+            let options = sample_options(&own, options, precision);
+            Box::new(DiffusionRestorer::new(model, options, &device.device)?)
+        }
     };
-    let restorer = QudiRestorer::new(model, sample_options(options, &device)?, &device.device)?;
-    let way = options.mode()?;
-    Ok((Box::new(restorer), format!(" ({way}) on {}", device.name)))
+    Ok((restorer, format!(" ({}) on {}", own.mode(options), device.name)))
 }
 
-pub(crate) fn sample_options(options: &NetworkOptions, device: &Opened) -> Result<SampleOptions> {
-    Ok(SampleOptions {
-        steps: options.steps()?,
-        spacing: options.spacing()?,
-        sampler: options.sampler,
-        samples: options.samples,
-        tile: options.tile,
-        precision: options.precision(device)?,
-    })
+fn sample_options(
+    own: &OwnNetwork,
+    options: &NetworkOptions,
+    precision: ComputePrecision,
+) -> SampleOptions {
+    let Sampling { steps, spacing } = own.sampling(options);
+    let NetworkOptions { sampler, samples, tile, .. } = *options;
+    SampleOptions { steps, spacing, sampler, samples, tile, precision }
 }
 
 /// What went wrong on a device, with a way out; `problem` are its own words.

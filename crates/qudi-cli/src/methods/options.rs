@@ -1,30 +1,30 @@
-//! What the method `qudi` is asked for, defaults filled in.
+//! Options of networks, with defaults filled in.
 
+use crate::args::given::Given;
 use crate::device::Opened;
 use crate::error::{CliError, Result};
 use crate::methods::learned::LearnedWeights;
-use crate::weights::Weights;
-use qudi_baselines::import::Method;
+use crate::methods::network::OwnNetwork;
+use crate::methods::{Method, QUDI, QUDI_DIFFUSION};
+use qudi_baselines::import;
 use qudi_model::ComputePrecision;
+use qudi_model::config::NetworkKind;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::PathBuf;
 
-/// The method that these options belong to.
-const METHOD: &str = "qudi";
-
 /// Options of the network.
 #[derive(Clone, Debug)]
 pub(crate) struct NetworkOptions {
-    /// The weights.
-    pub(crate) weights: Weights,
-    /// How many files of weights are named for this network.
+    /// File of weights of a network of this project; none for the built-in ones.
+    pub(crate) own_file: Option<PathBuf>,
+    /// Number of files of weights named for this network.
     pub(crate) own_files: usize,
     /// Files of weights of the learned methods of others.
-    pub(crate) learned: Vec<(Method, PathBuf)>,
-    /// Reverse steps; none for those that the weights were made for.
+    pub(crate) learned: Vec<(import::Method, PathBuf)>,
+    /// Reverse steps; none for the default of the weights.
     pub(crate) steps: Option<usize>,
-    /// The spacing of their timesteps; none for that which the weights were made for.
+    /// Spacing of the timesteps; none for the default of the weights.
     pub(crate) spacing: Option<TimestepSpacing>,
     /// The sampler.
     pub(crate) sampler: Sampler,
@@ -34,45 +34,18 @@ pub(crate) struct NetworkOptions {
     pub(crate) device: String,
     /// Side of the tiles in pixels.
     pub(crate) tile: usize,
-    /// Numbers that convolutions multiply; none for the fastest.
+    /// Precision of convolutions; none for the fastest.
     pub(crate) precision: Option<ComputePrecision>,
-    /// The first flag given that is about the method `qudi` alone.
-    pub(crate) own_flag: Option<&'static str>,
-    /// `--tile`, if given: for any network, as the next one.
+    /// `--tile`, if given; any network takes it, like `--device`.
     pub(crate) tile_flag: Option<&'static str>,
     /// `--device`, if given.
     pub(crate) device_flag: Option<&'static str>,
-    /// The first flag given that is about diffusion steps.
-    pub(crate) diffusion_flag: Option<&'static str>,
+    /// Flags on the command line that not all networks take.
+    pub(crate) given: Given,
 }
 
 impl NetworkOptions {
-    /// Reverse steps: those asked for, or those that the weights were made for.
-    pub(crate) fn steps(&self) -> Result<usize> {
-        match self.steps {
-            Some(steps) => Ok(steps),
-            None => Ok(self.weights.describe()?.reverse_steps()),
-        }
-    }
-
-    /// How the frames are made, in words.
-    pub(crate) fn mode(&self) -> Result<String> {
-        Ok(match self.steps()? {
-            0 => "regression".to_owned(),
-            1 => "diffusion in 1 step".to_owned(),
-            steps => format!("diffusion in {steps} steps"),
-        })
-    }
-
-    /// The spacing of the timesteps: that asked for, or that which the weights were made for.
-    pub(crate) fn spacing(&self) -> Result<TimestepSpacing> {
-        match self.spacing {
-            Some(spacing) => Ok(spacing),
-            None => Ok(self.weights.describe()?.spacing.unwrap_or_default()),
-        }
-    }
-
-    /// Numbers that convolutions multiply on a device.
+    /// Returns the precision of convolutions on a device.
     pub(crate) fn precision(&self, device: &Opened) -> Result<ComputePrecision> {
         let precision = self.precision.unwrap_or_else(|| ComputePrecision::fastest(&device.device));
         if precision.is_supported(&device.device) {
@@ -82,15 +55,7 @@ impl NetworkOptions {
         Err(CliError::new(what, "--precision", "ask for another, or another --device"))
     }
 
-    /// The name of the spacing on the command line.
-    pub(crate) fn spacing_name(&self) -> Result<&'static str> {
-        Ok(match self.spacing()? {
-            TimestepSpacing::Linear => "linear",
-            TimestepSpacing::LogLogistic => "log-logistic",
-        })
-    }
-
-    /// The name of the sampler on the command line.
+    /// Returns the name of the sampler on the command line.
     pub(crate) fn sampler_name(&self) -> &'static str {
         match self.sampler {
             Sampler::Ddim => "ddim",
@@ -98,35 +63,47 @@ impl NetworkOptions {
         }
     }
 
-    /// Whether the network, asked so, predicts its uncertainty without samples.
-    pub(crate) fn predicts_uncertainty(&self) -> Result<bool> {
-        Ok(self.steps()? == 0 && self.weights.describe()?.network.pre.uncertainty)
-    }
-
     /// Refuses these options where none of the methods is the network.
-    pub(crate) fn check_methods<'a>(
-        &self,
-        mut methods: impl Iterator<Item = &'a str>,
-    ) -> Result<()> {
-        let methods: Vec<&str> = methods.by_ref().collect();
-        self.check_weights(&methods)?;
-        let is_own = methods.contains(&METHOD);
-        let is_learned = |method: &&str| Method::by_name(method).is_some();
-        match (self.own_flag, self.tile_flag.or(self.device_flag)) {
+    pub(crate) fn check_methods(&self, methods: &[&Method]) -> Result<()> {
+        self.check_weights(methods)?;
+        self.check_diffusion(methods)?;
+        let is_own = methods.iter().any(|method| method.as_own().is_some());
+        let is_network = methods.iter().any(|method| method.is_network());
+        match (&self.given.own, self.tile_flag.or(self.device_flag)) {
             (Some(flag), _) if !is_own => Err(other_method(flag)),
-            (None, Some(flag)) if !is_own && !methods.iter().any(is_learned) => {
-                let help = "leave it out, or use --method qudi";
+            (None, Some(flag)) if !is_network => {
+                let help = format!("leave it out, or use --method {}", QUDI.name);
                 Err(CliError::new(format!("{flag} is for networks"), flag, help))
             }
             _ => Ok(()),
         }
     }
 
+    /// Refuses options of the diffusion where none of the methods is one.
+    pub(crate) fn check_diffusion(&self, methods: &[&Method]) -> Result<()> {
+        let Some(flag) = &self.given.diffusion else { return Ok(()) };
+        for choice in methods.iter().filter_map(|method| method.as_own()) {
+            if OwnNetwork::new(self, choice)?.kind() == NetworkKind::Diffusion {
+                return Ok(());
+            }
+        }
+        let name = QUDI_DIFFUSION.name;
+        Err(CliError::new(
+            format!("{flag} is for method {name}"),
+            flag,
+            format!("leave it out, or use --method {name}"),
+        ))
+    }
+
     /// Refuses weights of learned methods that are not among `methods`, and two files for one of them.
-    pub(crate) fn check_weights(&self, methods: &[&str]) -> Result<()> {
+    pub(crate) fn check_weights(&self, methods: &[&Method]) -> Result<()> {
         if self.own_files > 1 {
-            let help = "name one, or METHOD=FILE for those of other methods";
-            return Err(CliError::new("several files of weights for `qudi`", "--weights", help));
+            let help = "name one, or METHOD=FILE for weights of other methods";
+            return Err(CliError::new(
+                format!("several files of weights for `{}`", QUDI.name),
+                "--weights",
+                help,
+            ));
         }
         for (number, (method, _)) in self.learned.iter().enumerate() {
             let name = method.name();
@@ -134,7 +111,7 @@ impl NetworkOptions {
                 let what = format!("two files of weights for `{name}`");
                 return Err(CliError::new(what, "--weights", "name one for each method"));
             }
-            if !methods.contains(&name) {
+            if !methods.iter().any(|asked| asked.as_learned() == Some(*method)) {
                 let what = format!("weights of `{name}`, which is not asked for");
                 let help = format!("leave them out, or use --method {name}");
                 return Err(CliError::new(what, "--weights", help));
@@ -143,8 +120,8 @@ impl NetworkOptions {
         Ok(())
     }
 
-    /// A learned method's weights: those named, or those that come along.
-    pub(crate) fn weights_of(&self, method: Method) -> Result<LearnedWeights<'_>> {
+    /// Returns a learned method's weights: the named file, or the built-in ones.
+    pub(crate) fn weights_of(&self, method: import::Method) -> Result<LearnedWeights<'_>> {
         let named = self.learned.iter().find(|(of, _)| *of == method);
         let named = named.map(|(_, file)| LearnedWeights::File(file));
         named.or_else(|| LearnedWeights::built_in(method)).ok_or_else(|| {
@@ -159,35 +136,23 @@ impl NetworkOptions {
         })
     }
 
-    /// What is known of the weights of a learned method that were trained here: their size, and the steps. None of
-    /// other methods, and of weights of others.
-    pub(crate) fn trained_here(&self, method: &str) -> Result<Option<String>> {
-        let Some(method) = Method::by_name(method) else { return Ok(None) };
+    /// Returns size and steps of a learned method's weights if they were trained here; none for other methods and
+    /// for weights of others.
+    pub(crate) fn trained_here(&self, method: &Method) -> Result<Option<String>> {
+        let Some(method) = method.as_learned() else { return Ok(None) };
         let contents = self.weights_of(method)?.describe()?;
         Ok(contents.and_then(|contents| {
             let steps = contents.description?.provenance.steps;
             Some(format!("{}, {steps} steps", contents.sizes))
         }))
     }
-
-    /// Refuses options that are about diffusion steps where there are none.
-    pub(crate) fn check_steps(&self) -> Result<()> {
-        match self.diffusion_flag {
-            Some(flag) if self.steps()? == 0 => Err(CliError::new(
-                format!("{flag} is for diffusion, and there are 0 steps"),
-                flag,
-                "leave it out, or ask for --steps above 0",
-            )),
-            _ => Ok(()),
-        }
-    }
 }
 
-/// A flag of the method `qudi` beside another method.
-pub(crate) fn other_method(flag: &str) -> CliError {
+/// Returns the error for a flag of the method `qudi` with another method.
+fn other_method(flag: &str) -> CliError {
     CliError::new(
-        format!("{flag} is for method {METHOD}"),
+        format!("{flag} is for method {}", QUDI.name),
         flag,
-        format!("leave it out, or use --method {METHOD}"),
+        format!("leave it out, or use --method {}", QUDI.name),
     )
 }

@@ -1,12 +1,14 @@
 //! What weights were trained for, and whether a capture is like it.
 
+use super::network::OwnNetwork;
 use super::options::NetworkOptions;
+use super::{Kind, Method};
 use crate::error::{CliError, Result};
 use crate::weights::Weights;
-use qudi_baselines::import::Method;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::Provenance;
+use qudi_model::config::NetworkKind;
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
 const TOLERATED: f64 = 10.0;
@@ -42,7 +44,7 @@ impl Trained {
 
 /// Why the weights that come along are not for such a capture, if they are not.
 pub(crate) fn unknown_to_built_in(acquisition: &Acquisition) -> Result<Option<String>> {
-    Ok(unknown(&Weights::BuiltIn.describe()?.provenance, acquisition, 1.0))
+    Ok(unknown(&Weights::BuiltIn(NetworkKind::Regression).describe()?.provenance, acquisition, 1.0))
 }
 
 /// Whether the weights that come along were trained for such a capture.
@@ -95,14 +97,14 @@ pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Resul
 }
 
 /// What the weights of a method were trained on; nothing is known of authors' weights.
-pub(crate) fn provenance(method: &str, options: &NetworkOptions) -> Result<Option<Provenance>> {
-    Ok(match Method::by_name(method) {
-        Some(method) => {
+pub(crate) fn provenance(method: &Method, options: &NetworkOptions) -> Result<Option<Provenance>> {
+    Ok(match method.kind {
+        Kind::Learned { method, .. } => {
             let contents = options.weights_of(method)?.describe()?;
             contents.and_then(|contents| contents.description).map(|d| d.provenance)
         }
-        None if method == "qudi" => Some(options.weights.describe()?.provenance),
-        None => None,
+        Kind::Network(choice) => Some(OwnNetwork::new(options, choice)?.description.provenance),
+        Kind::Classical(_) => None,
     })
 }
 

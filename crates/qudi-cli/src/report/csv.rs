@@ -2,9 +2,9 @@
 
 use super::{Cell, Table};
 
-/// The table under the keys of its columns; what is not known stays empty, and a mean loses its interval.
+/// Writes the table under the keys of its columns; unknown cells stay empty, and a mean loses its interval.
 pub(crate) fn table(table: &Table) -> String {
-    let keys: Vec<_> = table.columns.iter().map(|column| column.key).collect();
+    let keys: Vec<_> = table.columns.iter().map(|column| column.key.as_ref()).collect();
     let mut text = keys.join(",") + "\n";
     for row in &table.rows {
         let cells: Vec<_> = row.iter().map(cell).collect();
@@ -24,7 +24,7 @@ fn cell(cell: &Cell) -> String {
     }
 }
 
-/// Text in quotes. Spreadsheets take what starts with one of `= + - @` for a formula, and run it: an
+/// Quotes text. Spreadsheets take what starts with one of `= + - @` for a formula, and run it: an
 /// apostrophe before it makes it text (OWASP, CSV injection).
 fn quoted(text: &str) -> String {
     let apostrophe = if text.starts_with(['=', '+', '-', '@', '\t', '\r']) { "'" } else { "" };

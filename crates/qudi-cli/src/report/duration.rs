@@ -1,6 +1,6 @@
 //! How long something takes, in words.
 
-/// Seconds as people say them.
+/// Formats seconds for people.
 pub(crate) fn duration(seconds: f64) -> String {
     if seconds < 1.5 {
         "1 second".to_owned()

@@ -52,17 +52,18 @@ impl From<&Table> for TableView {
     }
 }
 
-/// A PNG inside the page.
+/// Encodes a PNG for the page.
 pub(crate) fn data_url(png: &[u8]) -> String {
     format!("data:image/png;base64,{}", STANDARD.encode(png))
 }
 
-/// The size of the crop that [`crop`] takes.
+/// Returns the size of the crop that [`crop`] takes.
 pub(crate) fn crop_size(size: Size, largest: usize) -> Size {
     Size { height: size.height.min(largest), width: size.width.min(largest) }
 }
 
-/// The middle of a frame with sides of at most `largest` pixels, as a data URL; 0 is black and 1 is white.
+/// Crops the middle of a frame, at most `largest` pixels to a side, and encodes it as a data URL; 0 is black and
+/// 1 is white.
 pub(crate) fn crop(frame: &Frame, largest: usize) -> String {
     let Size { height, width } = crop_size(frame.size, largest);
     let (top, left) = ((frame.size.height - height) / 2, (frame.size.width - width) / 2);

@@ -5,11 +5,11 @@ use super::{Cell, Table};
 use serde_json::{Map, Value};
 use std::fmt::Write;
 
-/// One object for every row; what is not known is left out.
+/// Returns one object for every row, without unknown cells.
 pub(crate) fn rows(table: &Table) -> Value {
     let object = |row: &Vec<Cell>| {
         let cells = table.columns.iter().zip(row);
-        let known = cells.filter_map(|(column, cell)| Some((column.key.to_owned(), value(cell)?)));
+        let known = cells.filter_map(|(column, cell)| Some((column.key.to_string(), value(cell)?)));
         Value::Object(known.collect::<Map<_, _>>())
     };
     table.rows.iter().map(object).collect()
@@ -24,7 +24,7 @@ fn value(cell: &Cell) -> Option<Value> {
     }
 }
 
-/// The document for a terminal or a pipe: control characters that JSON permits in strings are escaped, too.
+/// Formats a document for a terminal or a pipe: control characters that JSON permits in strings are escaped, too.
 pub(crate) fn document(value: &Value) -> String {
     // A value with text for keys can always be written.
     let text = serde_json::to_string_pretty(value).unwrap_or_else(|e| e.to_string());

@@ -2,7 +2,7 @@
 
 use super::Table;
 
-/// The table, the first column to the left, others to the right.
+/// Writes the table with the first column to the left, others to the right.
 pub(crate) fn table(table: &Table) -> String {
     let (headings, rows) = table.shown();
     let line = |cells: &[String]| {
@@ -14,7 +14,7 @@ pub(crate) fn table(table: &Table) -> String {
     line(&headings) + &rule + &rows
 }
 
-/// Text of one cell: it neither ends the cell nor starts HTML.
+/// Escapes the text of a cell, so that it neither ends the cell nor starts HTML.
 fn escaped(cell: &str) -> String {
     let cell = super::printable(cell).replace(['\n', '\t'], " ");
     cell.replace('|', "\\|").replace('<', "&lt;")

@@ -10,19 +10,19 @@ const MARGIN: [f64; 4] = [58.0, 18.0, 28.0, 48.0];
 const COLOURS: usize = 7;
 
 /// Curves of fewer points show them.
-const FEW: usize = 40;
+const MAX_MARKED_POINTS: usize = 40;
 
 /// Ticks of an axis at most.
-const TICKS: usize = 7;
+const MAX_TICKS: usize = 7;
 
 /// Pixels between marks of different curves, where these have error bars.
-const APART: f64 = 3.0;
+const MIN_SEPARATION: f64 = 3.0;
 
 /// Curves in one coordinate system.
 #[derive(Clone, Debug)]
 pub(crate) struct Plot {
     pub(crate) title: String,
-    /// What is seen, in a sentence.
+    /// Description in a sentence.
     pub(crate) caption: String,
     pub(crate) x: Axis,
     pub(crate) y: Axis,
@@ -38,7 +38,7 @@ pub(crate) struct Axis {
     pub(crate) ticks: Vec<f64>,
 }
 
-/// How values lie on an axis.
+/// Scale of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Scale {
     Linear,
@@ -120,12 +120,12 @@ impl Scale {
         }
     }
 
-    /// Whether the axis has a place for a value.
+    /// Returns true if the axis has a place for a value.
     fn holds(self, value: f64) -> bool {
         value.is_finite() && (self == Self::Linear || value > 0.0)
     }
 
-    /// Round numbers from the last one below `low` to the first one above `high`.
+    /// Returns round numbers from the last one below `low` to the first one above `high`.
     fn ticks(self, low: f64, high: f64) -> Vec<f64> {
         match self {
             Self::Linear => linear_ticks(low, high),
@@ -158,7 +158,7 @@ impl Plot {
         let has_bars = points().any(|p| p.error > 0.0);
         let middle = (self.curves.len() as f64 - 1.0) / 2.0;
         let curves = self.curves.iter().enumerate().map(|(i, curve)| {
-            let shift = if has_bars { APART * (i as f64 - middle) } else { 0.0 };
+            let shift = if has_bars { MIN_SEPARATION * (i as f64 - middle) } else { 0.0 };
             let points: Vec<&Point> = curve.points.iter().filter(drawable).collect();
             let mark = |p: &&Point| {
                 let y = |y: f64| if self.y.scale.holds(y) { tenth(down(y)) } else { bottom };
@@ -177,7 +177,7 @@ impl Plot {
                 name: curve.name.clone(),
                 last: points.last().filter(|_| !has_bars).map(|p| number(p.y)),
                 points: line.join(" "),
-                marks: if marks.len() < FEW { marks } else { Vec::new() },
+                marks: if marks.len() < MAX_MARKED_POINTS { marks } else { Vec::new() },
             }
         });
         let in_sight = |&x: &f64| x >= left && x <= right;
@@ -199,7 +199,7 @@ impl Plot {
     }
 }
 
-/// Least and greatest value; none of nothing.
+/// Returns the least and the greatest value; none without values.
 fn extent(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
     values.fold(None, |extent, v| {
         let [low, high] = extent.unwrap_or([v, v]);
@@ -213,16 +213,16 @@ fn between(value: f64, [low, high]: [f64; 2], [start, end]: [f64; 2]) -> f64 {
     start + part * (end - start)
 }
 
-/// Tenths of a pixel are exact enough.
+/// Rounds to tenths of a pixel.
 fn tenth(pixels: f64) -> f64 {
     (pixels * 10.0).round() / 10.0
 }
 
-/// Multiples of 1, 2 or 5 times a power of ten around the range.
+/// Returns multiples of 1, 2 or 5 times a power of ten around the range.
 fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     // A constant lies in the middle of a range as large as itself.
     let span = if high > low { high - low } else { low.abs().max(1e-9) };
-    let decade = 10f64.powf((span / TICKS as f64).log10().floor());
+    let decade = 10f64.powf((span / MAX_TICKS as f64).log10().floor());
     // Rounding outwards adds up to two steps, so that ten times the decade may still be too fine.
     for multiple in [1.0, 2.0, 5.0, 10.0, 20.0] {
         let step = multiple * decade;
@@ -230,14 +230,14 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
         if first == last {
             (first, last) = (first - 1.0, last + 1.0);
         }
-        if last - first < TICKS as f64 {
+        if last - first < MAX_TICKS as f64 {
             return (0..=(last - first) as usize).map(|n| (first + n as f64) * step).collect();
         }
     }
     vec![low, high]
 }
 
-/// Powers of ten around the range, with their doubles and fivefolds if that leaves few enough.
+/// Returns powers of ten around the range, with their doubles and fivefolds if that leaves few enough.
 fn logarithmic_ticks(low: f64, high: f64) -> Vec<f64> {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
     let all: Vec<f64> = (first..=last)
@@ -245,7 +245,7 @@ fn logarithmic_ticks(low: f64, high: f64) -> Vec<f64> {
         .collect();
     let begin = all.iter().rposition(|&tick| tick <= low * (1.0 + 1e-9)).unwrap_or(0);
     let end = all.iter().position(|&tick| tick >= high * (1.0 - 1e-9)).unwrap_or(all.len() - 1);
-    if end.saturating_sub(begin) < TICKS {
+    if end.saturating_sub(begin) < MAX_TICKS {
         // One value lies in the middle of its neighbours.
         let widened = if begin == end {
             begin.saturating_sub(1)..=(end + 1).min(all.len() - 1)
@@ -254,7 +254,7 @@ fn logarithmic_ticks(low: f64, high: f64) -> Vec<f64> {
         };
         return all[widened].to_vec();
     }
-    let every = ((last - first) as usize).div_ceil(TICKS - 1).max(1);
+    let every = ((last - first) as usize).div_ceil(MAX_TICKS - 1).max(1);
     let powers = (first..).step_by(every).map(|power| 10f64.powi(power));
     let mut ticks = Vec::new();
     for tick in powers {
@@ -266,7 +266,7 @@ fn logarithmic_ticks(low: f64, high: f64) -> Vec<f64> {
     ticks
 }
 
-/// A tick without the noise of its last digits: 0.3, not 0.30000000000000004.
+/// Formats a tick without the noise of its last digits: 0.3, not 0.30000000000000004.
 fn label(value: f64) -> String {
     let size = value.abs();
     if size == 0.0 {
@@ -279,7 +279,7 @@ fn label(value: f64) -> String {
     ((value * unit).round() / unit).to_string()
 }
 
-/// A number with about four digits.
+/// Formats a number with about four digits.
 pub(crate) fn number(value: f64) -> String {
     let size = value.abs();
     if size == 0.0 || !size.is_finite() {
@@ -338,7 +338,7 @@ mod tests {
         );
         let wide = logarithmic_ticks(1e-12, 1e9);
         assert!(
-            wide.len() <= TICKS + 1 && wide[0] <= 1e-12 && wide[wide.len() - 1] >= 1e9,
+            wide.len() <= MAX_TICKS + 1 && wide[0] <= 1e-12 && wide[wide.len() - 1] >= 1e9,
             "{wide:?}"
         );
         assert!(logarithmic_ticks(1.0, 1.0).len() > 1);

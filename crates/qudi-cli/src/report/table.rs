@@ -1,8 +1,9 @@
 //! The table that every exporter writes, and its form for terminals.
 
+use std::borrow::Cow;
 use std::fmt::Write;
 
-/// What stands where nothing is known.
+/// Text of unknown cells.
 const UNKNOWN: &str = "-";
 
 /// Results in rows and columns.
@@ -17,9 +18,9 @@ pub(crate) struct Table {
 #[derive(Clone, Debug)]
 pub(crate) struct Column {
     /// The name in files that programs read.
-    pub(crate) key: &'static str,
+    pub(crate) key: Cow<'static, str>,
     /// The name that people read.
-    pub(crate) title: &'static str,
+    pub(crate) title: Cow<'static, str>,
     /// Unit of the numbers, shown after the title.
     pub(crate) unit: Option<&'static str>,
 }
@@ -45,19 +46,22 @@ pub(crate) enum Cell {
 }
 
 impl Column {
-    pub(crate) const fn new(key: &'static str, title: &'static str) -> Self {
-        Self { key, title, unit: None }
+    pub(crate) fn new(
+        key: impl Into<Cow<'static, str>>,
+        title: impl Into<Cow<'static, str>>,
+    ) -> Self {
+        Self { key: key.into(), title: title.into(), unit: None }
     }
 
-    pub(crate) const fn with_unit(self, unit: &'static str) -> Self {
+    pub(crate) fn with_unit(self, unit: &'static str) -> Self {
         Self { unit: Some(unit), ..self }
     }
 
-    /// Title and unit.
+    /// Returns title and unit.
     pub(crate) fn heading(&self) -> String {
         match self.unit {
             Some(unit) => format!("{} {unit}", self.title),
-            None => self.title.to_owned(),
+            None => self.title.to_string(),
         }
     }
 }
@@ -67,12 +71,12 @@ impl Cell {
         Self::Text(text.into())
     }
 
-    /// A number of so many digits, or nothing.
+    /// Makes a cell of a number with so many digits after the point, or an unknown one.
     pub(crate) fn number(value: impl Into<Option<f64>>, digits: usize) -> Self {
         value.into().map_or(Self::Unknown, |value| Self::Number { value, digits })
     }
 
-    /// As people read it.
+    /// Formats the cell for people.
     pub(crate) fn shown(&self) -> String {
         match self {
             Self::Text(text) => text.clone(),
@@ -89,7 +93,7 @@ impl Table {
         Self { columns, rows: Vec::new() }
     }
 
-    /// Leaves out columns in which nothing is known.
+    /// Removes columns in which all cells are unknown.
     pub(crate) fn without_unknown_columns(mut self) -> Self {
         let known: Vec<bool> = (0..self.columns.len())
             .map(|i| self.rows.iter().any(|row| row[i] != Cell::Unknown))
@@ -104,13 +108,13 @@ impl Table {
         self
     }
 
-    /// Headings, and rows as people read them.
+    /// Returns headings, and rows formatted for people.
     pub(crate) fn shown(&self) -> (Vec<String>, Vec<Vec<String>>) {
         let rows = self.rows.iter().map(|row| row.iter().map(Cell::shown).collect());
         (self.columns.iter().map(Column::heading).collect(), rows.collect())
     }
 
-    /// Aligned columns: the first to the left, others to the right, text columns at the end to the left.
+    /// Formats the table in aligned columns: the first to the left, others to the right, text columns at the end to the left.
     pub(crate) fn to_text(&self) -> String {
         let (headings, rows) = self.shown();
         let width = |i: usize| {
@@ -174,7 +178,7 @@ mod tests {
     #[test]
     fn leaves_out_columns_without_a_known_cell() {
         let table = example().without_unknown_columns();
-        let titles: Vec<_> = table.columns.iter().map(|column| column.title).collect();
+        let titles: Vec<_> = table.columns.iter().map(|column| column.title.as_ref()).collect();
         assert_eq!(titles, ["method", "psnr", "note"]);
         assert!(table.rows.iter().all(|row| row.len() == 3));
     }

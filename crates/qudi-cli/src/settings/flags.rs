@@ -10,7 +10,7 @@ use serde_json::Value;
 pub(crate) struct KeyFlags(pub(super) Vec<(&'static Key, String)>);
 
 impl KeyFlags {
-    /// Returns the first flag that was given, with its dashes.
+    /// Returns the first flag on the command line, with its dashes.
     pub(crate) fn first(&self) -> Option<String> {
         self.0.first().and_then(|(key, _)| key.flag).map(|flag| format!("--{}", flag.long))
     }
@@ -41,7 +41,7 @@ impl clap::Args for KeyFlags {
     }
 }
 
-/// Returns the argument of a key that has a flag.
+/// Makes the argument of a key that has a flag.
 fn argument(key: &'static Key) -> Option<Arg> {
     let flag = key.flag?;
     let default = match &key.documented.default {

@@ -30,7 +30,7 @@ impl Key {
 pub(crate) struct KeyFlag {
     /// Name without dashes.
     pub(crate) long: &'static str,
-    /// What stands for the value in `--help`.
+    /// Placeholder of the value in `--help`.
     pub(crate) value: &'static str,
     /// Heading in `--help`.
     pub(crate) heading: &'static str,

@@ -6,12 +6,23 @@ use qudi_train::{Recipe, recipe_names, recipe_table};
 use serde_json::Value;
 use std::sync::OnceLock;
 
-/// Returns the keys of recipes for this program's own network, each with the built-in recipes that set it.
+/// Returns the keys of recipes for this program's own networks, each with the built-in recipes that set it.
 pub(crate) fn recipe_keys() -> Vec<(Documented, Vec<&'static str>)> {
     let schema = schema_of::<Recipe>();
     let network = variants(&schema["properties"]["network"]).into_iter();
     let own = network.filter(|variant| method(variant).is_none());
-    let mut keys: Vec<_> = own.flat_map(|variant| keys_of(variant, "network.")).collect();
+    let mut keys: Vec<Documented> = Vec::new();
+    for key in own.flat_map(|variant| keys_of(variant, "network.")) {
+        match keys.iter_mut().find(|known| known.name == key.name) {
+            Some(known) if known.values != key.values => known.values += &format!(", {}", key.values),
+            Some(_) => {}
+            None => keys.push(key),
+        }
+    }
+    // Serde's tag of the variants has no documentation of its own.
+    for key in keys.iter_mut().filter(|key| key.name == "network.kind") {
+        key.doc = "Kind of the network".to_owned();
+    }
     let others = keys_of(&schema, "").into_iter();
     keys.extend(others.filter(|key| key.name != "network"));
     let set: Vec<_> = recipe_names().map(|name| (name, set_by(name))).collect();

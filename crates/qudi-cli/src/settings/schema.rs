@@ -75,7 +75,8 @@ fn without_null(schema: &Value) -> &Value {
 
 /// Returns the words of an enum with their meanings.
 fn words(schema: &Value) -> Vec<(&Value, &str)> {
-    let named = schema["enum"].as_array().into_iter().flatten().map(|word| (word, ""));
+    let named = schema["enum"].as_array().into_iter().flatten().chain(schema.get("const"));
+    let named = named.map(|word| (word, ""));
     let meant = schema["oneOf"].as_array().into_iter().flatten().flat_map(|variant| {
         let doc = variant["description"].as_str().unwrap_or_default();
         let several = variant["enum"].as_array().into_iter().flatten();
@@ -117,7 +118,8 @@ fn is_text(schema: &Value) -> bool {
 /// Returns the documentation of a field in one line, with the meanings of its words.
 fn meaning(field: &Value, inner: &Value) -> String {
     let mut doc = line(field["description"].as_str().unwrap_or_default());
-    for (word, meaning) in words(inner).into_iter().filter(|(_, meaning)| !meaning.is_empty()) {
+    let entries = if inner["items"].is_object() { &inner["items"] } else { inner };
+    for (word, meaning) in words(entries).into_iter().filter(|(_, meaning)| !meaning.is_empty()) {
         doc += &format!(". `{}`: {}", toml_text(word), line(meaning));
     }
     doc

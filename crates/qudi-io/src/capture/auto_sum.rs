@@ -1,18 +1,18 @@
-//! How many frames to sum: as many as motion allows, until the light is enough.
+//! The number of frames to sum: as many as motion allows, until the light suffices.
 //!
 //! The speed of a scene shows in how much two neighbouring sums differ beyond their noise, compared with the
-//! gradients of the picture: a shift by `d` changes it by `d` times its gradient (Lucas and Kanade 1981). Both
-//! are sums over all pixels of products of independent counts, so that noise leaves no bias.
+//! gradients of the picture: a shift by `d` changes it by `d` times its gradient (Lucas and Kanade 1981).
+//! Both are sums over all pixels of products of independent counts, so that noise leaves no bias.
 
 use super::Capture;
 use qudi_core::{Result, Size};
 use serde::Serialize;
 
 /// Detections per pixel and sum beyond which more light is not worth the loss of frame rate.
-pub const ENOUGH: f64 = 20.0;
+pub const SUFFICIENT_DETECTIONS: f64 = 20.0;
 
-/// Noise falls with a power of the light and blur grows with one of the motion, so that the best sum is
-/// `FACTOR * motion^-0.6 * detections^-0.4` frames. Fitted to simulated captures (docs/notes/burst/sums.md).
+/// Factor of the best sum, `FACTOR * motion^-0.6 * detections^-0.4` frames: noise falls with a power of the
+/// light, and blur grows with one of the motion. Fitted to simulated captures (docs/notes/burst/sums.md).
 const FACTOR: f64 = 0.455;
 const MOTION_POWER: f64 = -0.6;
 const LIGHT_POWER: f64 = -0.4;
@@ -20,35 +20,35 @@ const LIGHT_POWER: f64 = -0.4;
 /// Sums that methods restore together.
 const WINDOW: u64 = 11;
 
-/// Places of the capture that are looked at.
-const PLACES: u64 = 6;
+/// Places of the capture that are sampled.
+const SAMPLED_PLACES: u64 = 6;
 
 /// Standard errors beyond which two sums differ.
-const SURE: f64 = 6.0;
+const Z_SCORE_THRESHOLD: f64 = 6.0;
 
 /// Side of the tiles whose scatter gives the standard error.
 const TILE: usize = 32;
 
-/// A number of frames to sum, and why.
+/// A number of frames to sum, and the reason.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SumChoice {
     /// Native frames summed into one.
     pub frames: u32,
     /// Detections per pixel and native frame.
     pub detections: f64,
-    /// Pixels that the scene moves per native frame; an upper bound if it seems to stand still.
+    /// Pixels that the scene moves per native frame; an upper bound if no motion is seen.
     pub motion: f64,
-    /// Whether it seems to stand still.
+    /// True if no motion is seen.
     pub still: bool,
-    /// What set the limit.
+    /// Limit of the sum.
     pub limit: SumLimit,
 }
 
-/// What limits a sum.
+/// The limit of a sum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SumLimit {
-    /// The light is enough.
+    /// The light suffices.
     Light,
     /// More frames would blur what moves.
     Motion,
@@ -57,7 +57,7 @@ pub enum SumLimit {
 }
 
 impl SumChoice {
-    /// The choice in a sentence, without the frame rate.
+    /// Describes the choice in a sentence, without the frame rate.
     pub fn reason(&self) -> String {
         let detections = f64::from(self.frames) * self.detections;
         let motion = f64::from(self.frames) * self.motion;
@@ -73,8 +73,8 @@ impl SumChoice {
     }
 }
 
-/// Chooses how many native frames of `capture` to sum. `None` where sums are not called for: the depth is
-/// unknown, frames count photons in more than 4 bits, or they are no binary frames.
+/// Chooses how many native frames of `capture` to sum. `None` where sums do not apply: the depth is unknown,
+/// frames count photons in more than 4 bits, or are not binary.
 ///
 /// # Errors
 /// [`Error`](qudi_core::Error) if the capture cannot be read.
@@ -91,7 +91,7 @@ pub fn choose_sum(capture: &mut Capture) -> Result<Option<SumChoice>> {
         return Ok(None);
     }
     let (motion, still) = look.motion(detections)?;
-    let of_light = (ENOUGH / detections).ceil();
+    let of_light = (SUFFICIENT_DETECTIONS / detections).ceil();
     let of_motion = FACTOR * motion.powf(MOTION_POWER) * detections.powf(LIGHT_POWER);
     let of_motion = if still { f64::INFINITY } else { of_motion.round() };
     let of_length = (frames / WINDOW) as f64;
@@ -114,19 +114,19 @@ struct Look<'a> {
     max_count: u16,
 }
 
-/// Sums over pixels, with the scatter of tiles.
+/// Sums over pixels, with their scatter between tiles.
 #[derive(Clone, Copy, Debug, Default)]
 struct Energy {
     /// Squared differences beyond noise.
     difference: f64,
-    /// Its standard error.
+    /// Standard error of the difference.
     error: f64,
     /// Squared gradients.
     gradient: f64,
 }
 
 impl Look<'_> {
-    /// Mean detections per pixel and native frame, the response inverted.
+    /// Measures the mean detections per pixel and native frame, with the response inverted.
     fn detections(&mut self) -> Result<f64> {
         let sampled = self.capture.sample_frames();
         let mut sums = vec![0u32; self.capture.size().pixels()];
@@ -141,16 +141,17 @@ impl Look<'_> {
         Ok(total / sums.len() as f64 * f64::from(self.max_count))
     }
 
-    /// Pixels per native frame that the scene moves, and whether that is only a bound.
+    /// Measures the motion in pixels per native frame; the second value is true if it is only a bound.
     fn motion(&mut self, detections: f64) -> Result<(f64, bool)> {
         let frames = self.capture.frames();
-        let longest = (frames / 2).min((8.0 * ENOUGH / detections).ceil() as u64).max(1);
+        let longest =
+            (frames / 2).min((8.0 * SUFFICIENT_DETECTIONS / detections).ceil() as u64).max(1);
         // Below a tenth of a detection a sum shows nothing anyway.
         let mut length = ((0.1 / detections).floor() as u64).clamp(1, longest);
         loop {
             let Energy { difference, error, gradient } = self.energy(length)?;
             let pixels = |energy: f64| (2.0 * energy.max(0.0) / gradient).sqrt() / length as f64;
-            let sure = difference > SURE * error && gradient > 0.0;
+            let sure = difference > Z_SCORE_THRESHOLD * error && gradient > 0.0;
             if sure || length == longest {
                 let moves = if sure { difference } else { difference.max(0.0) + 2.0 * error };
                 let motion = if gradient > 0.0 { pixels(moves) } else { 0.0 };
@@ -160,12 +161,12 @@ impl Look<'_> {
         }
     }
 
-    /// How two neighbouring sums of `length` frames differ, over some places of the capture.
+    /// Measures how neighbouring sums of `length` frames differ, at some places of the capture.
     fn energy(&mut self, length: u64) -> Result<Energy> {
         let size = self.capture.size();
         let frames = self.capture.frames();
         let room = frames - (2 * length).min(frames);
-        let places = if self.capture.forward_only() { 1 } else { PLACES.min(room + 1) };
+        let places = if self.capture.forward_only() { 1 } else { SAMPLED_PLACES.min(room + 1) };
         let mut sums = [vec![0u32; size.pixels()], vec![0u32; size.pixels()]];
         let mut tiles = Vec::new();
         let mut gradient = 0.0;
@@ -186,7 +187,7 @@ impl Look<'_> {
     }
 }
 
-/// Adds the energy of the difference of each tile, noise subtracted, and gives that of the gradient.
+/// Adds the energy of the difference of each tile, noise subtracted, and returns the energy of the gradient.
 fn add_place(sums: &[Vec<u32>; 2], size: Size, trials: f64, tiles: &mut Vec<f64>) -> f64 {
     let value = |half: usize, x: usize, y: usize| f64::from(sums[half][y * size.width + x]);
     // Unbiased variance of a binomial count; of a single trial nothing but its mean is known.
@@ -228,7 +229,7 @@ mod tests {
 
     const SIZE: Size = Size { height: 64, width: 96 };
 
-    /// Binary frames of texture that moves by `speed` pixels a frame.
+    /// Makes binary frames of texture that moves by `speed` pixels a frame.
     fn capture(frames: u64, detections: f64, speed: f64) -> Capture {
         let sensor = Sensor::load("swissspad2").unwrap();
         let light = |x: f64, y: f64| {

@@ -6,19 +6,19 @@ use qudi_core::bad_pixels::BadPixels;
 use qudi_core::sensor::{CountLaw, Response, Sensor};
 use qudi_core::{Error, Result};
 
-/// A hot pixel is this many times darker than the array's bulk, unless a threshold is given.
+/// Ratio of a hot pixel's dark rate to the array's bulk, unless a threshold is given.
 const HOT_FACTOR: f64 = 10.0;
 
-/// ... and by this many standard deviations of its counts.
+/// Standard deviations of its counts by which a hot pixel exceeds the bulk, in addition.
 const HOT_SIGMAS: f64 = 6.0;
 
 /// Frames summed at once: 16-bit counts of so many frames fit into 32 bits.
-const CHUNK: u64 = 4096;
+const CHUNK_FRAMES: u64 = 4096;
 
-/// Read noise is looked for between these values, in e-.
-const READ_NOISE: (f64, f64) = (0.01, 30.0);
+/// Range in which read noise is fitted, in e-.
+const READ_NOISE_RANGE: (f64, f64) = (0.01, 30.0);
 
-/// What a dark capture says about a camera.
+/// Dark rates, hot pixels and read noise of a camera.
 #[derive(Clone, Debug)]
 pub struct Calibration {
     /// Size of the maps.
@@ -27,11 +27,11 @@ pub struct Calibration {
     pub frames: u64,
     /// Dark electrons per native frame, `[height * width]`.
     pub dark: Vec<f32>,
-    /// Their median; where most pixels never fired, the mean of the darkest nine tenths.
+    /// Median of the dark rates; where most pixels never fired, the mean of the darkest nine tenths.
     pub bulk: f64,
     /// Hot pixels.
     pub bad: BadPixels,
-    /// Dark rate beyond which a pixel was called hot, per native frame.
+    /// Dark rate per native frame beyond which a pixel is hot.
     pub threshold: f64,
     /// Read noise in e- of the ordinary pixels, for linear sensors.
     pub read_noise: Option<f64>,
@@ -63,11 +63,11 @@ pub fn calibrate(
     let mut sums = vec![0u64; size.pixels()];
     let mut piece = vec![0u32; size.pixels()];
     let frames = capture.frames();
-    for first in (0..frames).step_by(CHUNK as usize) {
+    for first in (0..frames).step_by(CHUNK_FRAMES as usize) {
         if on(first, frames).is_break() {
             return Err(Error::Interrupted);
         }
-        capture.total(first..(first + CHUNK).min(frames), &mut piece)?;
+        capture.total(first..(first + CHUNK_FRAMES).min(frames), &mut piece)?;
         for (sum, &piece) in sums.iter_mut().zip(&piece) {
             *sum += u64::from(piece);
         }
@@ -92,7 +92,7 @@ pub fn calibrate(
     finish(capture, size, frames, &rates, trials, hot, Some(read_noise))
 }
 
-/// Detections of each mean, by interpolation in a table of means.
+/// Returns the detections for each mean count, by interpolation in a table.
 fn invert(law: &CountLaw, means: &[f64]) -> Vec<f64> {
     const STEPS: usize = 2048;
     let highest = means.iter().copied().fold(0.0, f64::max);
@@ -151,8 +151,8 @@ fn finish(
     })
 }
 
-/// Maximum-likelihood read noise of the ordinary pixels: those whose mean lies in the middle, so
-/// that one dark rate describes them all.
+/// Fits the read noise of the ordinary pixels by maximum likelihood. Their means lie in the middle, so that
+/// one dark rate describes them all.
 fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f64]) -> Result<f64> {
     let mut sorted = means.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -188,10 +188,10 @@ fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f6
         let log = |(&n, p): (&u64, &f64)| if n > 0 { n as f64 * p.max(1e-300).ln() } else { 0.0 };
         -histogram.iter().zip(&probabilities).map(log).sum::<f64>()
     };
-    Ok(minimum(unlikelihood, READ_NOISE.0.ln(), READ_NOISE.1.ln()).exp())
+    Ok(minimum(unlikelihood, READ_NOISE_RANGE.0.ln(), READ_NOISE_RANGE.1.ln()).exp())
 }
 
-/// Golden-section search.
+/// Finds the minimum of `f` by golden-section search.
 fn minimum(f: impl Fn(f64) -> f64, mut low: f64, mut high: f64) -> f64 {
     let golden = 0.5 * (5f64.sqrt() - 1.0);
     let (mut a, mut b) = (high - golden * (high - low), low + golden * (high - low));

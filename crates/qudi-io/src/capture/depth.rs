@@ -1,9 +1,9 @@
-//! The depth of counts: who states it, and which sums fit into it.
+//! The depth of counts, and the sums that fit into it.
 
 use crate::description::{CaptureInfo, ReadOptions};
 use qudi_core::{Error, Result};
 
-/// What the user says of the depth, unless the file knows better.
+/// Sets the depth that the user gives, unless the file contradicts it.
 pub(super) fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     if !(1..=16).contains(&bits) {
         return Err(Error::request(format!("{bits} bits"), "bits", "counts have 1 to 16 bits"));
@@ -22,7 +22,7 @@ pub(super) fn state_depth(info: &mut CaptureInfo, bits: u8) -> Result<()> {
     }
 }
 
-/// Who says how deep the counts of a capture are.
+/// Returns the source of the depth of a capture.
 pub(super) fn depth_source(options: &ReadOptions, info: &CaptureInfo) -> &'static str {
     if options.levels.is_some() {
         "`levels`"
@@ -35,7 +35,7 @@ pub(super) fn depth_source(options: &ReadOptions, info: &CaptureInfo) -> &'stati
     }
 }
 
-/// Refuses sums of no frames, of more than there are, and those that 16 bits do not hold.
+/// Refuses sums of no frames, of more frames than there are, and sums that do not fit into 16 bits.
 pub(super) fn check_sum(sum: u32, frames: u64, info: &CaptureInfo) -> Result<()> {
     if sum == 0 || u64::from(sum) > frames {
         return Err(Error::request(

@@ -1,10 +1,10 @@
-//! Captures behind a colour filter array: the plane that is read, and pictures that look like a mosaic.
+//! Captures behind a colour filter array: the plane that is read, and the detection of a mosaic.
 
 use crate::description::{CaptureInfo, MosaicPlane, ReadOptions};
 use qudi_core::{Error, Result, Size};
 use std::path::Path;
 
-/// The pixels of a mosaic that are read; `None` where there is none.
+/// Returns the pixels of the mosaic that are read; `None` for captures without one.
 pub(super) fn mosaic_plane(
     info: &mut CaptureInfo,
     options: &ReadOptions,
@@ -42,28 +42,28 @@ pub(super) fn mosaic_plane(
     Ok(plane)
 }
 
-/// Side of the blocks that are asked whether they show a mosaic.
-const BLOCK: usize = 32;
+/// Side of the blocks that are tested for a mosaic.
+const BLOCK_SIDE: usize = 32;
 
-/// Blocks that must be lit for an answer.
-const LEAST_BLOCKS: usize = 12;
+/// Least number of lit blocks for an answer.
+const MIN_BLOCKS: usize = 12;
 
-/// Share of the blocks that must agree on which pixels are the brighter ones.
-const AGREED: f64 = 0.9;
+/// Least share of the blocks that agree on which pixels are brighter.
+const MIN_AGREEMENT: f64 = 0.9;
 
-/// Contrast between the pixels of a tile that is more than uneven readout.
-const CONTRAST: f64 = 0.02;
+/// Least contrast between the pixels of a tile; uneven readout has less.
+const MIN_CONTRAST: f64 = 0.02;
 
-/// By how much the pixels of tiles of 2 x 2 differ all over the picture `sums`, as a share of their mean, if it
-/// looks like that of a colour filter array: the two diagonals differ, or rows and columns both. Stripes along
-/// one axis are readout.
+/// Returns by how much the pixels of tiles of 2 x 2 differ, as a share of their mean, if the picture `sums`
+/// looks like a mosaic: the two diagonals differ everywhere, or rows and columns both. Stripes along one axis
+/// come from readout.
 pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<f64> {
     let mut contrasts: [Vec<f64>; 3] = Default::default();
-    for top in (0..size.height.saturating_sub(BLOCK - 1)).step_by(BLOCK) {
-        for left in (0..size.width.saturating_sub(BLOCK - 1)).step_by(BLOCK) {
+    for top in (0..size.height.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
+        for left in (0..size.width.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
             let mut phases = [[0.0; 2]; 2];
-            for y in top..top + BLOCK {
-                for x in left..left + BLOCK {
+            for y in top..top + BLOCK_SIDE {
+                for x in left..left + BLOCK_SIDE {
                     phases[y % 2][x % 2] += f64::from(sums[y * size.width + x]);
                 }
             }
@@ -81,16 +81,17 @@ pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<f64> {
     diagonal.or(rows.and(columns))
 }
 
-/// The median of contrasts that nearly all have the same sign and are large enough.
+/// Returns the median of the contrasts, if nearly all have the same sign and it is large enough.
 fn agreed_contrast(mut contrasts: Vec<f64>) -> Option<f64> {
     let positive = contrasts.iter().filter(|&&contrast| contrast > 0.0).count();
-    let agree = positive.max(contrasts.len() - positive) as f64 >= AGREED * contrasts.len() as f64;
-    if contrasts.len() < LEAST_BLOCKS || !agree {
+    let agree =
+        positive.max(contrasts.len() - positive) as f64 >= MIN_AGREEMENT * contrasts.len() as f64;
+    if contrasts.len() < MIN_BLOCKS || !agree {
         return None;
     }
     contrasts.sort_unstable_by(f64::total_cmp);
     let median = contrasts[contrasts.len() / 2].abs();
-    (median > CONTRAST).then_some(median)
+    (median > MIN_CONTRAST).then_some(median)
 }
 
 #[cfg(test)]
@@ -98,7 +99,7 @@ mod tests {
     use super::*;
     use qudi_core::random::{Domain, Streams, uniform};
 
-    /// A picture with gradients and noise, seen through filters.
+    /// Measures a picture with gradients and noise, seen through filters.
     fn seen(filters: [[f64; 2]; 2]) -> Option<f64> {
         let size = Size { height: 128, width: 160 };
         let mut rng = Streams::new(5).row(Domain::Photons, 0, 0);

@@ -1,4 +1,4 @@
-//! Which pixels of a capture are bad, and how dark each one is: from files, or from the capture.
+//! Bad pixels and dark rates of a capture: from files, or from the capture itself.
 
 use super::Capture;
 use crate::codec::read_mat_map;
@@ -14,10 +14,10 @@ use qudi_core::{Error, Result};
 use qudi_sim::clip::read_still;
 use std::path::Path;
 
-/// Pixels darker than this are called hot where a map says no more (Ma et al. 2020 use 50 to 100).
+/// Dark rate beyond which a pixel of a map is hot, if the map does not say (Ma et al. 2020 use 50 to 100).
 const HOT_PER_SECOND: f32 = 100.0;
 
-/// Finds out what is to be repaired, and the dark rates.
+/// Determines the pixels to repair, and the dark rates.
 pub(crate) fn plan(
     capture: &mut Capture,
     options: &ReadOptions,
@@ -67,7 +67,7 @@ pub(crate) fn plan(
     Ok(())
 }
 
-/// Notes once that dark rates are not subtracted: maps are planned anew where frames are summed.
+/// Notes once that dark rates are not subtracted; the maps are determined again when frames are summed.
 fn note_unknown_rate(info: &mut CaptureInfo) {
     let note = "the frame rate is unknown: dark rates name hot pixels, but are not subtracted (a `sensor` knows its rate)";
     if !info.notes.iter().any(|earlier| earlier == note) {
@@ -75,7 +75,7 @@ fn note_unknown_rate(info: &mut CaptureInfo) {
     }
 }
 
-/// Looks for hot and dead pixels in the capture itself.
+/// Finds hot and dead pixels in the capture itself.
 fn find(capture: &mut Capture) -> Result<BadPixels> {
     let size = capture.size();
     let mut sums = vec![0u32; size.pixels()];
@@ -97,7 +97,7 @@ fn nonzero(map: &Frame) -> BadPixels {
     BadPixels { hot, ..BadPixels::default() }
 }
 
-/// A map of the frames in use; one of the stored frames is turned and cropped like them.
+/// Loads a map of the frames in use; a map of the stored frames is turned and cropped as they are.
 fn load(capture: &Capture, path: &Path) -> Result<Frame> {
     let map = read(path)?;
     let (size, stored) = (capture.size(), capture.native.size());

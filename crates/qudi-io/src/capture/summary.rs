@@ -3,7 +3,7 @@
 use super::Capture;
 use super::mosaic::mosaic_contrast;
 use crate::description::{BitOrder, PackAxis};
-use crate::recognition::{SURE, bit_order_z_score};
+use crate::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_core::PppDefinition;
 use qudi_core::Result;
 use qudi_core::sensor::{CountLaw, DarkRate, Response, Sensor};
@@ -13,22 +13,22 @@ use serde::Serialize;
 /// Statistics of at most [`SAMPLE_FRAMES`](qudi_core::limits::SAMPLE_FRAMES) output frames.
 #[derive(Clone, Debug)]
 pub struct Summary {
-    /// Frames looked at.
+    /// Frames measured.
     pub sampled: u64,
     /// Mean count per pixel and output frame, bad pixels repaired.
     pub mean: f64,
-    /// Samples of each count; the last entry counts the largest seen.
+    /// Samples of each count; the last entry belongs to the largest count seen.
     pub histogram: Vec<u64>,
     /// Fraction of samples at the largest possible count, if that is known.
     pub saturated: Option<f64>,
     /// Photons per pixel and output frame: incident, detected, DN. Absent without a known sensor.
     pub ppp: Ppp,
-    /// Whether the picture agrees with the bit order in use; packed captures only.
+    /// Agreement of the picture with the bit order in use; packed captures only.
     pub bit_order: Option<BitOrderCheck>,
-    /// By how much the pixels of tiles of 2 x 2 differ, where the picture looks like that of a colour filter
-    /// array that nobody has named.
+    /// Difference between the pixels of tiles of 2 x 2, where the picture looks like an unnamed colour filter
+    /// array.
     pub mosaic: Option<f64>,
-    /// Sum of the frames looked at, repaired.
+    /// Sum of the measured frames, repaired.
     pub sums: Vec<u32>,
 }
 
@@ -44,7 +44,7 @@ pub struct Ppp {
 }
 
 impl Ppp {
-    /// One of them.
+    /// Returns the value of one definition.
     pub fn get(&self, definition: PppDefinition) -> Option<f64> {
         match definition {
             PppDefinition::Incident => self.incident,
@@ -54,19 +54,19 @@ impl Ppp {
     }
 }
 
-/// What the picture says about the order of bits.
+/// The bit order, judged by the picture.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct BitOrderCheck {
-    /// How well the picture fits the order in use, in standard errors; negative: it fits the other better.
+    /// Standard errors by which the picture fits the order in use; negative if it fits the other better.
     #[serde(rename = "evidence")]
     pub z_score: f64,
-    /// The order that the picture shows, if it shows one.
+    /// Order that the picture shows, if it shows one.
     pub seen: Option<BitOrder>,
 }
 
 impl Summary {
-    /// Looks at `capture`. `sensor` turns counts into photons; `gain` is its gain in DN/e-, for
-    /// sensors whose own rule follows the light.
+    /// Measures `capture`. `sensor` turns counts into photons; `gain` is its gain in DN/e-, for sensors whose
+    /// own rule follows the light.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the file cannot be read.
@@ -109,7 +109,7 @@ impl Summary {
         })
     }
 
-    /// The mean picture in linear light, response inverted and dark counts subtracted where
+    /// Returns the mean picture in linear light, with the response inverted and dark counts subtracted if
     /// `sensor` is known; white is the 99.5th percentile.
     pub fn picture(&self, capture: &Capture, sensor: Option<&Sensor>, gain: Option<f64>) -> Frame {
         let size = capture.size();
@@ -131,8 +131,8 @@ impl Summary {
     }
 }
 
-/// The sensor of native frames: `sensor`, or an ideal binary one if no more is known; summing as
-/// many binary frames as the capture's counts do.
+/// Returns the sensor of native frames: `sensor`, or an ideal binary one if it is unknown, summing as many
+/// binary frames as the capture's counts do.
 fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
     let info = &capture.info;
     let known = match sensor {
@@ -146,13 +146,13 @@ fn native_sensor(capture: &Capture, sensor: Option<&Sensor>) -> Option<Sensor> {
     };
     match (known.response, info.max_count) {
         (Response::Binary, Some(max)) => Some(Sensor { frames_summed: u32::from(max), ..known }),
-        // How many frames a count sums is not known: no light follows from it.
+        // No light follows from an unknown number of frames per count.
         (Response::Binary, None) => None,
         (Response::Linear, _) => Some(known),
     }
 }
 
-/// Compares pixels across byte boundaries, in the frames as they are stored.
+/// Compares pixels across byte boundaries in the stored frames.
 fn check_bit_order(capture: &mut Capture, sampled: &[u64]) -> Result<Option<BitOrderCheck>> {
     let Some(packing) = capture.info.packing else { return Ok(None) };
     let stored = capture.native.size();
@@ -172,14 +172,14 @@ fn check_bit_order(capture: &mut Capture, sampled: &[u64]) -> Result<Option<BitO
         _ => bit_order_z_score(&sums, stored),
     };
     let seen = match z_score {
-        e if e > SURE => Some(packing.order),
-        e if e < -SURE => Some(packing.order.reversed()),
+        e if e > Z_SCORE_THRESHOLD => Some(packing.order),
+        e if e < -Z_SCORE_THRESHOLD => Some(packing.order.reversed()),
         _ => None,
     };
     Ok(Some(BitOrderCheck { z_score, seen }))
 }
 
-/// Photons per pixel and output frame.
+/// Computes the photons per pixel and output frame.
 fn ppp(
     capture: &Capture,
     sums: &[u32],
@@ -199,7 +199,7 @@ fn ppp(
         let light = |mean: f64| -n * (-(mean * sampled).min(trials - 0.5) / trials).ln_1p();
         Some(light_of_blocks(sums, capture.size(), sampled, light))
     } else {
-        // Counts beyond the sensor's full scale are another sensor's.
+        // Counts beyond the full scale belong to another sensor.
         let largest = sums.iter().copied().max().unwrap_or(0);
         let fits = f64::from(largest) <= f64::from(native.max_count()) * per_frame * sampled;
         gain.or(native.fixed_gain()).filter(|_| fits).map(|gain| {
@@ -219,8 +219,8 @@ fn ppp(
     Ok(Ppp { incident, detected, dn })
 }
 
-/// Mean light over the picture: the response of binary pixels bends, so that bright and dark parts
-/// are unbent apart; block by block, since single pixels have counted too little.
+/// Computes the mean light over the picture, block by block: the response of binary pixels is not linear, so
+/// that bright and dark parts are inverted separately, and single pixels have counted too little.
 fn light_of_blocks(sums: &[u32], size: Size, sampled: f64, light: impl Fn(f64) -> f64) -> f64 {
     const BLOCK: usize = 8;
     let (down, across) = (size.height.div_ceil(BLOCK), size.width.div_ceil(BLOCK));

@@ -1,4 +1,4 @@
-//! Turning and cropping frames: where each pixel of the result comes from.
+//! Turned and cropped frames: the stored pixel of each pixel of the result.
 
 use crate::description::{Crop, MosaicPlane, Orientation};
 use qudi_core::Size;
@@ -8,13 +8,13 @@ use qudi_core::{Error, Result};
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct View {
     pub(crate) size: Size,
-    /// Stored pixel of each pixel; absent if they are the same.
+    /// Stored pixel of each pixel; `None` if they are the same.
     pub(crate) from: Option<Vec<u32>>,
 }
 
 impl View {
-    /// `vendor` is what [`Orientation::Vendor`] means for this format; of a mosaic, only the pixels of
-    /// `plane` are seen.
+    /// Creates the view. `vendor` is the meaning of [`Orientation::Vendor`] for this format; of a mosaic,
+    /// only the pixels of `plane` are seen.
     pub(crate) fn new(
         stored: Size,
         plane: Option<MosaicPlane>,
@@ -71,7 +71,7 @@ impl View {
         Ok(Self { size, from: Some(from) })
     }
 
-    /// The view of a stored image.
+    /// Applies the view to a stored image.
     pub(crate) fn apply<T: Copy>(&self, stored: &[T], out: &mut [T]) {
         match &self.from {
             None => out.copy_from_slice(stored),
@@ -97,7 +97,7 @@ mod tests {
         out.chunks(view.size.width).map(<[u8]>::to_vec).collect()
     }
 
-    /// numpy: rot90([[a,b,c],[d,e,f]]) is [[c,f],[b,e],[a,d]].
+    /// In NumPy, rot90([[a,b,c],[d,e,f]]) is [[c,f],[b,e],[a,d]].
     #[test]
     fn quarter_turns_match_numpy() {
         assert_eq!(turn(Orientation::Raw, None), [b"abc", b"def"]);

@@ -1,4 +1,4 @@
-//! Arrays of counts, whatever file they lie in: axes, packing, colour.
+//! Arrays of counts in any file: axes, packing, colour.
 
 mod colour;
 mod spool;
@@ -22,11 +22,11 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::PathBuf;
 
-/// Where the data of an array lie.
+/// The place of the data of an array.
 pub(crate) enum Place {
-    /// In place, `available` bytes from byte `start` on, with the checksum that the container notes.
+    /// In place: `available` bytes from byte `start` on, with the container's checksum.
     File { start: u64, available: u64, checksum: Option<Checksum> },
-    /// Compressed; the opener stands at the first byte of the data.
+    /// Compressed; the opener begins at the first byte of the data.
     Stream(Opener),
     /// Fetched in groups of frames.
     #[cfg_attr(not(feature = "hdf5"), expect(dead_code, reason = "only HDF5 is read so"))]
@@ -41,29 +41,29 @@ pub(crate) enum Place {
 pub(crate) struct Array {
     pub(crate) path: PathBuf,
     pub(crate) sample: Sample,
-    /// Extents as the file's own language prints them.
+    /// Extents, as the file's own language prints them.
     pub(crate) shape: Vec<usize>,
-    /// Whether the first axis is the fastest.
+    /// True if the first axis is the fastest.
     pub(crate) fortran: bool,
     /// Axes of the array unless said otherwise.
     pub(crate) axes: Axes,
     pub(crate) place: Place,
 }
 
-/// What lies beside an array and describes it.
+/// Descriptions stored with an array.
 #[derive(Default)]
 pub(crate) struct Hints {
     pub(crate) stored: Stored,
     /// True frame size.
     pub(crate) size: Option<Size>,
-    /// What a record of ours says.
+    /// Layout in a record of ours.
     pub(crate) recorded: Option<BurstLayout>,
 }
 
-/// What samples are.
+/// The meaning of samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Stored {
-    /// Nobody says.
+    /// Unknown.
     #[default]
     Unsaid,
     /// Counts.
@@ -82,7 +82,7 @@ impl From<Option<Packing>> for Stored {
 const SAMPLE_BYTES: usize = 1 << 20;
 
 impl Array {
-    /// The frames of this array.
+    /// Opens the frames of this array.
     pub(crate) fn open(
         mut self,
         options: &ReadOptions,
@@ -271,7 +271,7 @@ impl Array {
         }
     }
 
-    /// Refuses a record that belongs to another array, with what both say.
+    /// Refuses a record that belongs to another array, with the difference.
     fn check_record(
         &self,
         hints: &Hints,
@@ -311,7 +311,7 @@ impl Array {
         Ok(())
     }
 
-    /// Some bytes of the data: from the middle where that is possible.
+    /// Reads some bytes of the data: from the middle where that is possible.
     fn sample_bytes(
         &mut self,
         frames: u64,
@@ -330,7 +330,7 @@ impl Array {
             }
             Place::Stream(opener) => {
                 let read = opener()?.take(SAMPLE_BYTES as u64).read_to_end(&mut bytes);
-                // What is damaged further on shows when it is read.
+                // Damage further on is found when it is read.
                 if let Err(e) = read
                     && bytes.is_empty()
                 {
@@ -382,7 +382,7 @@ impl Array {
                 }
                 counted.0
             }
-            // Of a pipe, nobody knows before its end.
+            // The length of a pipe is unknown before its end.
             Place::Stream(_) | Place::Fetch { .. } | Place::Pipe(_) => promised.unwrap_or(0),
         };
         let whole = (available / frame_bytes as u64).min(frames);
@@ -430,7 +430,7 @@ impl Array {
     }
 }
 
-/// Whether options say what stored values mean.
+/// Returns true if options give the meaning of stored values.
 fn asks_for_values(options: &ReadOptions) -> bool {
     options.levels.is_some() || options.offset.is_some() || options.threshold.is_some()
 }
@@ -450,7 +450,7 @@ fn refuse_values(options: &ReadOptions) -> Result<()> {
     ))
 }
 
-/// What is said where only whole bytes tell the length of packed rows.
+/// Returns the remedy where only whole bytes tell the length of packed rows.
 fn whole_bytes(size: Size, axis: PackAxis) -> String {
     let (length, what) = match axis {
         PackAxis::Height => (size.height, "columns are"),

@@ -17,7 +17,7 @@ use std::path::Path;
 pub(crate) const FORMAT: Format = Format {
     name: "hdf5",
     title: "HDF5 or MATLAB 7.3",
-    options: super::ARRAYS,
+    options: super::ARRAYS_OPTIONS,
     probe: |probe| {
         let magic = b"\x89HDF\r\n\x1a\n";
         let found = [0, 512, 1024, 2048]
@@ -150,7 +150,7 @@ fn numbered_frames(
     }
 }
 
-/// Ubicept's description of the camera.
+/// Reads Ubicept's description of the camera.
 fn metadata(
     file: &Hdf5,
     dataset: &str,
@@ -183,7 +183,7 @@ fn metadata(
     Ok(())
 }
 
-/// Frame rate and depth in attributes of the data set, its groups or the file, by their usual names.
+/// Reads frame rate and depth from attributes of the dataset, its groups or the file, by their usual names.
 fn attributes(file: &Hdf5, dataset: &str, info: &mut CaptureInfo) {
     let number = |names: &[&str]| {
         let found = names.iter().find_map(|name| file.number(dataset, name));
@@ -200,7 +200,7 @@ fn attributes(file: &Hdf5, dataset: &str, info: &mut CaptureInfo) {
     }
 }
 
-/// What a file of single photons with time stamps is, and what to do about it (Photon-HDF5, Ingargiola et al. 2016).
+/// Returns the error of a file of single photons with time stamps (Photon-HDF5, Ingargiola et al. 2016).
 fn photon_hdf5(found: &[(Candidate, hdf5_pure::Dataset)], path: &Path) -> Result<()> {
     let stamps =
         found.iter().any(|(c, _)| c.path.contains("photon_data") && c.path.ends_with("timestamps"));
@@ -248,7 +248,7 @@ fn choose(found: &[&Candidate], options: &ReadOptions, path: &Path) -> Result<us
     }
 }
 
-/// Samples that could be counts. Booleans are stored as an enumeration of bytes.
+/// Returns the sample type, if it could be a count. Booleans are stored as an enumeration of bytes.
 fn sample(datatype: &Datatype) -> Option<Sample> {
     let big = |order: &DatatypeByteOrder| match order {
         DatatypeByteOrder::LittleEndian => Some(false),

@@ -20,22 +20,23 @@ use std::path::{Path, PathBuf};
 pub(crate) const FORMAT: Format = Format {
     name: "images",
     title: "folder of images",
-    options: super::PICTURES,
+    options: super::PICTURE_OPTIONS,
     probe: |probe| {
         if probe.path.join("burst.json").is_file() {
             return Ok(Some(Recognition::new(Certainty::Certain, &["burst.json in the folder"])));
         }
-        let found = !files(probe)?.is_empty() && (probe.is_folder || probe.has_extension(SINGLE));
+        let found = !files(probe)?.is_empty()
+            && (probe.is_folder || probe.has_extension(SINGLE_EXTENSIONS));
         Ok(found.then(|| Recognition::new(Certainty::Likely, &["image files"])))
     },
     open,
 };
 
 const EXTENSIONS: &[&str] = &["png", "tif", "tiff", "jpg", "jpeg"];
-/// A single TIFF is a stack.
-const SINGLE: &[&str] = &["png", "jpg", "jpeg"];
+/// Extensions of a single image; a single TIFF is a stack.
+const SINGLE_EXTENSIONS: &[&str] = &["png", "jpg", "jpeg"];
 
-/// The images themselves; not those in folders below, which are captures of their own.
+/// Lists the images of the folder; folders in it are captures of their own.
 fn files(probe: &Probe) -> Result<Vec<PathBuf>> {
     let mut files = probe.files(EXTENSIONS)?;
     if probe.is_folder {
@@ -77,7 +78,7 @@ fn open(
     }
 }
 
-/// Opens images as frames, in this order.
+/// Opens images as frames, in the given order.
 pub(crate) fn open_files(
     files: Vec<PathBuf>,
     place: &Path,
@@ -110,7 +111,7 @@ pub(crate) fn open_files(
 }
 
 impl Images {
-    /// Whether values are multiples of a step, by a look at a few images.
+    /// Infers the scale from a few images: their values may be multiples of a step.
     fn infer_scale(
         &mut self,
         first: Vec<u16>,
@@ -148,20 +149,20 @@ impl Images {
     }
 }
 
-/// A few frames spread over the capture.
+/// Returns a few frames spread over the capture.
 fn spread(frames: usize) -> impl Iterator<Item = usize> {
     let sampled = frames.min(8);
     (0..sampled).map(move |i| i * frames / sampled)
 }
 
-/// Whether the file is a JPEG, whatever its name says.
+/// Returns true if the file is a JPEG, whatever its name.
 fn lossy(path: &Path) -> bool {
     let mut magic = [0; 3];
     let read = File::open(path).and_then(|mut file| file.read_exact(&mut magic));
     read.is_ok() && magic == [0xff, 0xd8, 0xff]
 }
 
-/// Gray samples of an image, or those of one channel, its size, and full scale.
+/// Reads the gray samples of an image, or of one channel, with its size and full scale.
 fn gray(path: &Path, channel: Option<usize>) -> Result<(Size, Vec<u16>, u16)> {
     let image = decode_image(path)?;
     let size =

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 pub(crate) const FORMAT: Format = Format {
     name: "mat",
     title: "MATLAB arrays (level 5)",
-    options: super::ARRAYS,
+    options: super::ARRAYS_OPTIONS,
     probe: |probe| {
         if probe.is_folder {
             let parts = !parts(probe)?.is_empty();
@@ -32,8 +32,8 @@ pub(crate) const FORMAT: Format = Format {
     open,
 };
 
-/// The variable that converters of SwissSPAD2 write.
-const CUSTOMARY: &str = "OUTPUT";
+/// Variable that converters of SwissSPAD2 write.
+const CUSTOMARY_VARIABLE: &str = "OUTPUT";
 
 fn parts(probe: &Probe) -> Result<Vec<PathBuf>> {
     let mut files = probe.files(&["mat"])?;
@@ -77,7 +77,7 @@ fn open(
     Ok(Box::new(Chain::new(size, &lengths, Box::new(opener))))
 }
 
-/// Compares with what the converter noted.
+/// Compares the frames with the converter's notes.
 fn check_info(
     path: &Path,
     parts: usize,
@@ -99,7 +99,7 @@ fn check_info(
             "copy the missing parts, or read those that are there with `lenient`",
         ));
     }
-    // Some converters note the frames of a part, some those of the capture.
+    // Some converters note the frames of a part, others the frames of the capture.
     let per_part = noted["no_frames"].as_u64().unwrap_or(frames);
     if per_part != frames && per_part != frames / parts as u64 {
         info.notes.push(format!("info.json notes {per_part} frames, the parts hold {frames}"));
@@ -128,7 +128,7 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
         ));
     }
     let captures: Vec<_> = found.iter().filter(|a| a.dims.len() >= 3).collect();
-    let customary = found.iter().find(|a| a.name == CUSTOMARY);
+    let customary = found.iter().find(|a| a.name == CUSTOMARY_VARIABLE);
     match (customary, captures.as_slice()) {
         (Some(array), _) => Ok(array.clone()),
         (None, [one]) => Ok((*one).clone()),

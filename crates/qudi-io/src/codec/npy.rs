@@ -23,7 +23,7 @@ use std::path::Path;
 pub(crate) const FORMAT: Format = Format {
     name: "npy",
     title: "NumPy array",
-    options: super::ARRAY,
+    options: super::ARRAY_OPTIONS,
     probe: |probe| {
         let found = probe.head.starts_with(b"\x93NUMPY");
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["NumPy's magic number"])))
@@ -38,7 +38,7 @@ pub(crate) const FORMAT: Format = Format {
 pub(crate) const COMPRESSED: Format = Format {
     name: "npy-gz",
     title: "gzipped NumPy array",
-    options: super::ARRAY,
+    options: super::ARRAY_OPTIONS,
     probe: |probe| {
         let found =
             probe.head.starts_with(&[0x1f, 0x8b]) && probe.stem().to_lowercase().ends_with(".npy");
@@ -48,7 +48,7 @@ pub(crate) const COMPRESSED: Format = Format {
     open: |probe, options, info| open_gzip(probe, options, info),
 };
 
-/// A `.npy` file as an array; sizes are checked by [`Array::open`].
+/// Opens a `.npy` file as an array; [`Array::open`] checks sizes.
 pub(crate) fn open_array(path: &Path) -> Result<Array> {
     let file = open_regular(path, "open the file")?;
     let length = file.metadata().map_err(|e| Error::io("open", path, e))?.len();
@@ -111,7 +111,7 @@ pub(crate) fn refuse_bomb(header: &Header, compressed: u64, path: &Path) -> Resu
     }
 }
 
-/// What lies beside an array and describes it: our own record.
+/// Returns the hints of our own record next to an array.
 fn hints(path: &Path, info: &mut CaptureInfo) -> Hints {
     let Some(layout) = described(&sidecar::beside(path), info) else { return Hints::default() };
     let packed = layout.format == BurstFormat::NpyPacked;
@@ -119,8 +119,7 @@ fn hints(path: &Path, info: &mut CaptureInfo) -> Hints {
     Hints { stored: packing.into(), size: Some(layout.size), recorded: Some(layout) }
 }
 
-/// What our record at `path` says of its burst, if it exists; what it says about the camera goes
-/// to `about`.
+/// Returns the layout in our record at `path`, if it exists; what it says about the camera goes to `info`.
 pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayout> {
     if !path.is_file() {
         return None;

@@ -19,7 +19,7 @@ use zip::{CompressionMethod, ZipArchive};
 pub(crate) const FORMAT: Format = Format {
     name: "npz",
     title: "NumPy archive",
-    options: super::ARRAYS,
+    options: super::ARRAYS_OPTIONS,
     probe: |probe| {
         let found = probe.head.starts_with(b"PK\x03\x04") && probe.extension == "npz";
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["zip's magic number", "the name"])))
@@ -91,7 +91,7 @@ fn stream(
     Ok(if deflated { Box::new(DeflateDecoder::new(stored)) } else { Box::new(stored) })
 }
 
-/// The arrays of the archive whose samples could be counts.
+/// Lists the arrays of the archive whose samples could be counts.
 fn entries(path: &Path) -> Result<Vec<Entry>> {
     let damaged = |e: zip::result::ZipError| {
         Error::data(
@@ -131,7 +131,7 @@ fn entries(path: &Path) -> Result<Vec<Entry>> {
                 "the file is truncated or damaged: copy or export it again",
             ));
         }
-        // Arrays of text, say, are not what is looked for.
+        // Other arrays, of text for example, are skipped.
         let header = Header::read(&mut stream(path, start, compressed, deflated)?, path);
         if let Ok(header) = header {
             entries.push(Entry { name, start, compressed, deflated, crc32, header });

@@ -1,4 +1,4 @@
-//! Captures through a pipe: NumPy arrays, which say what they are, and raw frames by name.
+//! Captures from a pipe: NumPy arrays, which describe themselves, and raw frames by name.
 
 use super::array::{Hints, Place};
 use super::npy::array;
@@ -11,11 +11,11 @@ use qudi_core::{Error, Result};
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-/// Bytes that tell formats apart.
-const MAGIC: u64 = 16;
+/// Bytes that distinguish formats.
+const MAGIC_BYTES: u64 = 16;
 
-/// What comes through pipes by mistake, and what to do about it.
-const OTHERS: &[(&[u8], &str, &str)] = &[
+/// Streams that are piped by mistake: magic number, and the remedy.
+const FOREIGN_STREAMS: &[(&[u8], &str, &str)] = &[
     (
         b"YUV4MPEG2",
         "a Y4M stream: pictures, not photon counts",
@@ -29,7 +29,7 @@ const OTHERS: &[(&[u8], &str, &str)] = &[
     (b"\x89PNG", "a single picture", "put the frames into a folder and name that"),
 ];
 
-/// Recognises what comes out of `reader`, unless `options` name it.
+/// Opens the stream of `reader`, recognised unless `options` name its format.
 pub(crate) fn open_pipe(
     mut reader: Box<dyn Read + Send>,
     options: &ReadOptions,
@@ -52,9 +52,12 @@ pub(crate) fn open_pipe(
             ))
         });
     }
-    refuse_others(options, super::ARRAY, "npy")?;
+    refuse_others(options, super::ARRAY_OPTIONS, "npy")?;
     let mut start = Vec::new();
-    (&mut reader).take(MAGIC).read_to_end(&mut start).map_err(|e| Error::io("read", place, e))?;
+    (&mut reader)
+        .take(MAGIC_BYTES)
+        .read_to_end(&mut start)
+        .map_err(|e| Error::io("read", place, e))?;
     if start.is_empty() {
         return Err(Error::data(
             "nothing came through the pipe",
@@ -63,7 +66,7 @@ pub(crate) fn open_pipe(
         ));
     }
     if options.format.is_none() && !start.starts_with(b"\x93NUMPY") {
-        let other = OTHERS.iter().find(|(magic, _, _)| start.starts_with(magic));
+        let other = FOREIGN_STREAMS.iter().find(|(magic, _, _)| start.starts_with(magic));
         let (what, help) = other.map_or(
             (
                 "no known format",
@@ -77,7 +80,7 @@ pub(crate) fn open_pipe(
     let header = Header::read(&mut reader, place)?;
     let mut info = CaptureInfo::new("npy", "NumPy array");
     info.reasons.push("NumPy's magic number".to_owned());
-    // How long a frame is follows from the order of the axes.
+    // The length of a frame follows from the order of the axes.
     let tail = Tail { trailer: 0, known: &[], lenient: options.lenient };
     let pipe = Pipe::new(reader, 0, None, tail);
     let frames =

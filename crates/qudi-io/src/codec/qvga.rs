@@ -15,7 +15,7 @@ use qudi_core::{Error, Result};
 pub(crate) const FORMAT: Format = Format {
     name: "qvga",
     title: "Edinburgh QVGA SPAD raw file",
-    options: super::SIZED_BIT_FILES,
+    options: super::SIZED_BIT_FILE_OPTIONS,
     probe: recognise,
     open,
 };
@@ -26,7 +26,7 @@ const HEIGHT: usize = 240;
 /// Frames per second of this sensor's usual configuration.
 const FPS: f64 = 9938.4;
 
-/// The 3 bytes of the MATLAB interface.
+/// The header of the MATLAB interface, 3 bytes.
 struct Header {
     yrange: usize,
     /// Bytes before the first frame.
@@ -44,7 +44,7 @@ impl Header {
         Some(Self { yrange: usize::from(yrange), start: 3 + skipped, rolling: global == 0 })
     }
 
-    /// The header of a file of `length` bytes, if it has one: frames must fill the rest.
+    /// Returns the header of a file of `length` bytes, if it has one: frames must fill the rest.
     fn of(head: &[u8], length: u64) -> Option<Self> {
         let plain = length.is_multiple_of((HEIGHT * WIDTH / 8) as u64);
         let header = Self::parse(head)?;

@@ -1,5 +1,5 @@
 //! Files without header of any camera, as the options `size`, `bitorder`, `header` and `trailer` describe
-//! them. Never guessed.
+//! them. They are never guessed.
 
 pub(super) mod files;
 
@@ -81,7 +81,7 @@ fn size(options: &ReadOptions) -> Result<Size> {
     })
 }
 
-/// The file, or every file of the folder.
+/// Lists the file, or every file of the folder.
 fn files(probe: &Probe) -> Result<Vec<std::path::PathBuf>> {
     let files = probe.files(&["bin", "raw", "dat", ""])?;
     if files.is_empty() {
@@ -94,7 +94,7 @@ fn files(probe: &Probe) -> Result<Vec<std::path::PathBuf>> {
     Ok(files)
 }
 
-/// Frames of so many bytes.
+/// A function that opens frames of a given number of bytes.
 type Source<'a> = dyn FnMut(usize, &mut CaptureInfo) -> Result<FrameBytes> + 'a;
 
 fn from_files<'a>(
@@ -104,7 +104,7 @@ fn from_files<'a>(
     |frame_bytes, info| frame_files(&files(probe)?, frame_bytes, 0, options, info)
 }
 
-/// Frames of the raw format `name` out of a pipe; `None` if there is no such format.
+/// Opens frames of the raw format `name` from a pipe; `None` if there is no such format.
 pub(crate) fn piped(
     name: &str,
     reader: Box<dyn Read + Send>,
@@ -118,7 +118,7 @@ pub(crate) fn piped(
     info.reasons.push("`format`".to_owned());
     let mut reader = Some(reader);
     let mut source = |frame_bytes: usize, _: &mut CaptureInfo| {
-        // Asked once: the reader goes with the frames.
+        // Called once: the reader moves with the frames.
         let mut reader = reader.take().unwrap_or_else(|| Box::new(std::io::empty()));
         let header = options.header.unwrap_or(0);
         std::io::copy(&mut (&mut reader).take(header), &mut std::io::sink())
@@ -136,7 +136,7 @@ pub(crate) fn piped(
     Some(frames.map(|frames| (frames, info)))
 }
 
-/// Whether columns are stored before rows. Frames of raw files come one after the other.
+/// Returns true if columns are stored before rows. Frames of raw files are stored one after the other.
 fn transposed(options: &ReadOptions) -> Result<bool> {
     let axes = options.axes.unwrap_or_default();
     if axes.frame_position() == 0 {

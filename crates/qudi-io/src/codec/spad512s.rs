@@ -19,8 +19,8 @@ use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 
-/// Options of files of one count a pixel.
-const COUNTS: &[FormatOption] = &[
+/// Options of files with one count per sample.
+const COUNT_OPTIONS: &[FormatOption] = &[
     FormatOption::Size,
     FormatOption::Offset,
     FormatOption::Threshold,
@@ -29,16 +29,16 @@ const COUNTS: &[FormatOption] = &[
     FormatOption::FramesPerFile,
 ];
 
-/// Bytes that show the width of rows.
-const LOOKED_AT: u64 = 1 << 20;
+/// Bytes from which the width of rows is measured.
+const SAMPLED_BYTES: u64 = 1 << 20;
 
-/// The whole array; narrower read-outs show by their rows, or are given with `size`.
+/// Size of the whole array; narrower read-outs show by their rows, or are given with `size`.
 const ARRAY: Size = Size { height: 512, width: 512 };
 
 pub(crate) const BINARY: Format = Format {
     name: "spad512s",
     title: "SPAD512S raw files, 1 bit",
-    options: super::SIZED_BIT_FILES,
+    options: super::SIZED_BIT_FILE_OPTIONS,
     probe: |probe| recognise(probe, ByteKind::Packed),
     open: open_binary,
 };
@@ -46,7 +46,7 @@ pub(crate) const BINARY: Format = Format {
 pub(crate) const BYTES: Format = Format {
     name: "spad512s-8",
     title: "SPAD512S raw files, 4 to 8 bits",
-    options: COUNTS,
+    options: COUNT_OPTIONS,
     probe: |probe| recognise(probe, ByteKind::Counts),
     open: |probe, options, info| open_samples(probe, options, info, Sample::U8),
 };
@@ -54,14 +54,14 @@ pub(crate) const BYTES: Format = Format {
 pub(crate) const WORDS: Format = Format {
     name: "spad512s-16",
     title: "SPAD512S raw files, 9 to 12 bits",
-    options: COUNTS,
+    options: COUNT_OPTIONS,
     probe: |probe| recognise(probe, ByteKind::WideCounts),
     open: |probe, options, info| {
         open_samples(probe, options, info, Sample::U16 { big_endian: false })
     },
 };
 
-/// Bytes of a frame of `size`.
+/// Returns the bytes of a frame of `size`.
 fn frame_bytes(size: Size, kind: ByteKind) -> u64 {
     (match kind {
         ByteKind::Packed | ByteKind::Unclear => size.height * size.width.div_ceil(8),
@@ -74,7 +74,7 @@ fn recognise(probe: &Probe, kind: ByteKind) -> Result<Option<Recognition>> {
     let Some(sample) = probe.raw_sample()? else { return Ok(None) };
     let binary = kind == ByteKind::Packed;
     let fits = match sample.kind {
-        // A dark capture could be of any depth; the common one is meant.
+        // A dark capture could have any depth; the common one is assumed.
         ByteKind::Unclear => binary,
         seen => seen == kind,
     };
@@ -115,12 +115,12 @@ fn common(info: &mut CaptureInfo) {
     info.orient = Orientation::Vendor;
 }
 
-/// The size of frames: given, or as their rows show.
+/// Returns the size of frames: given, or as their rows show.
 fn frame_size(probe: &Probe, kind: ByteKind, options: &ReadOptions) -> Result<Size> {
     if let Some(size) = options.size {
         return Ok(size);
     }
-    // A header or a trailer of its own: nobody guesses then.
+    // With a header or a trailer of its own, nothing is inferred.
     if options.header.is_some() || options.trailer.is_some() {
         return Ok(ARRAY);
     }
@@ -129,7 +129,7 @@ fn frame_size(probe: &Probe, kind: ByteKind, options: &ReadOptions) -> Result<Si
     let file = File::open(&first).map_err(io)?;
     let length = file.metadata().map_err(io)?.len();
     let mut bytes = Vec::new();
-    file.take(LOOKED_AT).read_to_end(&mut bytes).map_err(io)?;
+    file.take(SAMPLED_BYTES).read_to_end(&mut bytes).map_err(io)?;
     let body = length - if ends_in_trailer(&first) { length.min(4) } else { 0 };
     let samples: Vec<f32> = match kind {
         ByteKind::Packed | ByteKind::Unclear => {

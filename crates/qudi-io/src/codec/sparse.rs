@@ -1,4 +1,5 @@
-//! SPAD512S sparse mode: 32-bit little-endian indices of fired pixels, a delimiter ends each frame.
+//! SPAD512S sparse mode: 32-bit little-endian indices of fired pixels, with a delimiter at the end of each
+//! frame.
 
 use super::{Format, Recognition};
 use crate::description::{CaptureInfo, Certainty, FormatOption, Orientation, ReadOptions};
@@ -31,7 +32,7 @@ pub(crate) const FORMAT: Format = Format {
         let stream = words.all(|word| word <= ARRAY.pixels() as u32);
         let words: Vec<u32> = middle.chunks_exact(4).map(word).collect();
         let delimiters = words.iter().filter(|&&w| w == ARRAY.pixels() as u32).count();
-        // Indices that jump about, with delimiters between: no picture looks like this.
+        // Indices in no order, with delimiters between them: no picture looks like this.
         let several = words.len() > 4 && delimiters > 0 && words.iter().any(|&w| w > 0xffff);
         let reasons = ["every word is a pixel index or the delimiter"];
         Ok((stream && several).then(|| Recognition::new(Certainty::Certain, &reasons)))
@@ -49,7 +50,7 @@ struct SparseFrames {
     file: File,
     path: PathBuf,
     size: Size,
-    /// Word where each frame starts, and where the last one ends.
+    /// Word at which each frame starts, and the end of the last one.
     starts: Vec<u64>,
     words: Vec<u8>,
 }

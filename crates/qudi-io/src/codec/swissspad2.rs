@@ -9,24 +9,24 @@ use crate::codec::raw::files::frame_files;
 use crate::description::{BitOrder, CaptureInfo, Certainty, PackAxis, Packing, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::packed::{PackedFrames, Placement};
-use crate::recognition::{ByteKind, Convention, Probe, SWISSSPAD_FILE};
+use crate::recognition::{ByteKind, Convention, Probe, SWISSSPAD_FILE_BYTES};
 use qudi_core::Result;
 use qudi_core::Size;
 
-pub(crate) const HALF: Format = Format {
+pub(crate) const HALF_ARRAY: Format = Format {
     name: "swissspad2",
     title: "SwissSPAD2 raw files, half array",
-    options: super::BIT_FILES,
+    options: super::BIT_FILE_OPTIONS,
     probe: |probe| recognise(probe, false),
     open: |probe, options, info| {
         open(probe, options, info, Size { height: 256, width: 512 }, Placement::Straight)
     },
 };
 
-pub(crate) const FULL: Format = Format {
+pub(crate) const FULL_ARRAY: Format = Format {
     name: "swissspad2-full",
     title: "SwissSPAD2 raw files, full array",
-    options: super::BIT_FILES,
+    options: super::BIT_FILE_OPTIONS,
     probe: |probe| recognise(probe, true),
     open: |probe, options, info| {
         let size = Size { height: 512, width: 512 };
@@ -44,7 +44,7 @@ fn recognise(probe: &Probe, full: bool) -> Result<Option<Recognition>> {
         return Ok(None);
     }
     let mut reasons = Vec::new();
-    if sample.length == SWISSSPAD_FILE {
+    if sample.length == SWISSSPAD_FILE_BYTES {
         reasons.push("8 MiB per file");
     }
     if sample.convention == Convention::SwissSpad2 {
@@ -84,7 +84,7 @@ fn open(
     Ok(Box::new(PackedFrames::new(bytes, order, size, placement)))
 }
 
-/// Image byte of every stored byte of a full-array frame.
+/// Returns the image byte of every stored byte of a full-array frame.
 fn zones() -> Vec<u32> {
     let byte = |i: u32| {
         let (row, zone, x) = (i / 128, i / 16 % 8, i % 16);

@@ -26,7 +26,7 @@ use tiff::tags::{ByteOrder, Tag};
 pub(crate) const FORMAT: Format = Format {
     name: "tiff",
     title: "TIFF stack",
-    options: super::PICTURES,
+    options: super::PICTURE_OPTIONS,
     probe: |probe| {
         let magic = [&b"II*\0"[..], b"MM\0*", b"II+\0", b"MM\0+"];
         let found = magic.iter().any(|magic| probe.head.starts_with(magic));
@@ -62,13 +62,13 @@ fn open(
     reordered(frames, options.axes, path)
 }
 
-/// What ImageJ or OME say of the stack.
+/// Reads the description of the stack by ImageJ or OME.
 fn describe(path: &Path) -> Result<Option<Description>> {
     let text = decoder(path)?.find_tag(Tag::ImageDescription).ok().flatten();
     Ok(text.and_then(|value| value.into_string().ok()).as_deref().and_then(Description::parse))
 }
 
-/// The frames of one channel, where channels are pages of their own.
+/// Selects the frames of one channel, where channels are pages of their own.
 fn channel_of(
     frames: Box<dyn CountFrames>,
     description: Option<Description>,
@@ -82,7 +82,7 @@ fn channel_of(
         return Ok(frames);
     };
     if channels == pages && options.channel.is_none() {
-        // Some programs call the frames of a plain stack so.
+        // Some programs call the frames of a plain stack channels.
         info.notes.push(format!(
             "{program}'s description says {channels} channels of one image: taken for frames; `channel` reads one"
         ));
@@ -108,7 +108,7 @@ fn channel_of(
     }
 }
 
-/// The pages in the order of the file.
+/// Opens the pages in the order of the file.
 fn stack(
     probe: &Probe,
     description: Option<&Description>,
@@ -163,7 +163,7 @@ fn refuse_channel(options: &ReadOptions, path: &Path) -> Result<()> {
     }
 }
 
-/// Refuses a record that belongs to another stack, with what both say.
+/// Refuses a record that belongs to another stack, with the difference.
 pub(super) fn check_record(
     recorded: Option<&BurstLayout>,
     frames: &dyn CountFrames,
@@ -183,7 +183,7 @@ pub(super) fn check_record(
     ))
 }
 
-/// ImageJ's block of frames, if this is one.
+/// Returns ImageJ's block of frames, if this is one.
 fn block(probe: &Probe) -> Result<Option<Block>> {
     let path = &probe.path;
     let mut decoder = decoder(path)?;

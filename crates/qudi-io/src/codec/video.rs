@@ -1,4 +1,4 @@
-//! Videos through ffmpeg, for what was stored as one. Lossy compression leaves no photon counts.
+//! Videos through ffmpeg. Lossy compression leaves no photon counts.
 
 use super::{Format, Recognition};
 use crate::description::{CaptureInfo, Certainty, FormatOption, ReadOptions};

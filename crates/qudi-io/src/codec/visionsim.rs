@@ -1,4 +1,4 @@
-//! visionsim datasets: `transforms.json` beside `frames.npy` or a list of images.
+//! visionsim datasets: `transforms.json` next to `frames.npy` or a list of images.
 
 use super::array::{Hints, Stored};
 use super::images::open_files;
@@ -20,7 +20,7 @@ use std::path::{Component, Path, PathBuf};
 pub(crate) const FORMAT: Format = Format {
     name: "visionsim",
     title: "visionsim dataset",
-    options: super::ARRAY,
+    options: super::ARRAY_OPTIONS,
     probe: |probe| {
         let found = document(probe).is_file();
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["transforms.json"])))
@@ -78,14 +78,14 @@ fn open(
             inside(folder, name).ok_or_else(|| fault(format!("its data lie at `{name}`")))?;
         return open_array(&data)?.open(options, &transforms.hints(&path)?, info);
     }
-    refuse_others(options, super::PICTURES, "a data set of images")?;
+    refuse_others(options, super::PICTURE_OPTIONS, "a data set of images")?;
     let files: Option<Vec<PathBuf>> =
         transforms.frames.iter().map(|pose| inside(folder, pose.file_path.as_deref()?)).collect();
     let files = files.ok_or_else(|| fault("frames without file_path".to_owned()))?;
     reordered(open_files(files, &path, false, options, info)?, options.axes, &path)
 }
 
-/// A path inside the data set.
+/// Returns the path of `name` inside the data set.
 fn inside(folder: &Path, name: &str) -> Option<PathBuf> {
     let ordinary = |part| matches!(part, Component::Normal(_) | Component::CurDir);
     Path::new(name).components().all(ordinary).then(|| folder.join(name))

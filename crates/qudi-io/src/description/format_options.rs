@@ -1,4 +1,4 @@
-//! Which options apply to which format: an option that a format does not take is refused by name.
+//! Options that apply to some formats only: a format refuses by name each option that it does not take.
 
 use super::options::{PackAxis, ReadOptions};
 use qudi_core::{Error, Result};
@@ -33,7 +33,7 @@ pub enum FormatOption {
 }
 
 impl FormatOption {
-    /// All of them.
+    /// All options, in the order in which they are checked.
     pub const ALL: [Self; 12] = [
         Self::Axes,
         Self::Channel,
@@ -67,7 +67,7 @@ impl FormatOption {
         }
     }
 
-    /// Whether `options` give it.
+    /// Returns true if `options` give it.
     fn is_given(self, options: &ReadOptions) -> bool {
         match self {
             Self::Axes => options.axes.is_some(),
@@ -86,7 +86,7 @@ impl FormatOption {
     }
 }
 
-/// Refuses the first of `options` that is not among those `taken` by what is called `title`.
+/// Refuses the first of `options` that is not in `taken`; `title` names the format in the message.
 pub(crate) fn refuse_others(
     options: &ReadOptions,
     taken: &[FormatOption],
@@ -103,7 +103,7 @@ pub(crate) fn refuse_others(
     Err(not_applicable(other, title, help))
 }
 
-/// Refuses options on the order and the axis of packed bits where nothing is packed.
+/// Refuses options on packed bits for data that are not packed.
 pub(crate) fn refuse_packing(options: &ReadOptions, title: &str) -> Result<()> {
     let packed = options.pack_axis.is_some_and(|axis| axis != PackAxis::None);
     let option = match (packed, options.bit_order) {

@@ -1,18 +1,18 @@
-//! What is known about a capture, and how it is known.
+//! Descriptions of opened captures: what is known, and from where.
 
 use super::mosaic::Mosaic;
 use super::options::{BitOrder, Orientation, PackAxis};
 use qudi_core::sensor::Sensor;
 use serde::Serialize;
 
-/// Why a format is sure where a record of ours lies beside the file.
+/// Reason for a format that a record of ours next to the file names.
 pub(crate) const RECORD: &str = "the record beside it";
 
-/// How sure a format is.
+/// Certainty of a recognised format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Certainty {
-    /// It could be; so could others.
+    /// It is possible, as other formats are.
     Possible,
     /// Name, size and content agree.
     Likely,
@@ -21,7 +21,7 @@ pub enum Certainty {
 }
 
 impl Certainty {
-    /// As a word.
+    /// Returns the certainty as a word.
     pub fn name(self) -> &'static str {
         match self {
             Self::Possible => "possible",
@@ -31,64 +31,64 @@ impl Certainty {
     }
 }
 
-/// Describes an opened capture: its format, depth, packing, rate and sensor.
+/// An opened capture: its format, depth, packing, rate and sensor.
 #[derive(Clone, Debug, Serialize)]
 pub struct CaptureInfo {
     /// Name of the format.
     pub format: &'static str,
-    /// The format in words.
+    /// Name of the format in words.
     pub title: &'static str,
-    /// How sure that is.
+    /// Certainty of the format.
     pub certainty: Certainty,
-    /// Why the format was chosen.
+    /// Reasons for the format.
     #[serde(rename = "evidence")]
     pub reasons: Vec<String>,
     /// Largest possible count of a native frame, if the file says.
     pub max_count: Option<u16>,
-    /// Whether counts are sums of `max_count` binary frames (or one of them).
+    /// True if counts are sums of `max_count` binary frames (or single ones).
     pub binary: bool,
-    /// How bits are packed, if they are.
+    /// Packing of the bits, if they are packed.
     pub packing: Option<Packing>,
     /// Native frames per second, if the file says.
     pub fps: Option<f64>,
-    /// The orientation that stored frames need to be seen as the camera's own software shows them.
+    /// Orientation in which the camera's own software shows stored frames.
     pub vendor: Orientation,
-    /// The orientation in use.
+    /// Orientation in use.
     pub orient: Orientation,
-    /// The sensor, if a record beside the file names it.
+    /// Sensor, if a record next to the file names it.
     #[serde(skip)]
     pub sensor: Option<Sensor>,
-    /// Its gain in DN/e-, if a record says.
+    /// Gain of the sensor in DN/e-, if a record says.
     pub gain: Option<f64>,
     /// Incident photons per pixel and native frame, if a record says.
     pub ppp: Option<f64>,
     /// Image value that receives `ppp` photons, if a record says.
     pub mean_level: Option<f64>,
-    /// The colour filter array, if the file or the user says.
+    /// Colour filter array, if the file or the user names it.
     pub cfa: Option<Mosaic>,
-    /// The camera preset that this format belongs to.
+    /// Camera preset that this format belongs to.
     pub preset: Option<&'static str>,
-    /// What the user should know.
+    /// Notes for the user.
     #[serde(rename = "remarks")]
     pub notes: Vec<String>,
 }
 
-/// Eight pixels to the byte.
+/// The order of eight pixels in a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct Packing {
-    /// Along which axis.
+    /// Axis along which pixels share a byte.
     pub axis: PackAxis,
-    /// Which pixel comes first.
+    /// Order of the pixels in a byte.
     pub order: BitOrder,
 }
 
 impl CaptureInfo {
-    /// Whether a record beside the file describes it.
+    /// Returns true if a record next to the file describes it.
     pub fn is_recorded(&self) -> bool {
         self.reasons.iter().any(|reason| reason == RECORD)
     }
 
-    /// A description with nothing but names; the rest is filled in by the format.
+    /// Creates a description of a format by name; the format fills in the rest.
     pub(crate) fn new(format: &'static str, title: &'static str) -> Self {
         Self {
             format,

@@ -1,4 +1,4 @@
-//! Colour filter arrays: which pixels of a mosaic see which colour.
+//! Colour filter arrays: the colour of each pixel of a mosaic.
 
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
@@ -25,17 +25,17 @@ pub(crate) struct MosaicPlane {
 const LETTERS: &str = "rgbwcmy";
 
 impl Mosaic {
-    /// The colours of a tile, row by row.
+    /// Returns the colours of a tile, row by row.
     pub fn pattern(&self) -> &str {
         &self.letters
     }
 
-    /// Rows and columns of a tile.
+    /// Returns the number of rows, and of columns, of a tile.
     pub fn side(&self) -> usize {
         if self.letters.len() == 4 { 2 } else { 4 }
     }
 
-    /// The pixels behind letter `index` of the pattern, if it has that many.
+    /// Returns the pixels of letter `index` of the pattern, if it has that many.
     pub(crate) fn plane(&self, index: usize) -> Option<MosaicPlane> {
         let step = self.side();
         let at = |corner: usize, within: usize| (corner + within) % step;
@@ -46,7 +46,7 @@ impl Mosaic {
         })
     }
 
-    /// What to type for each plane, as in "`channel 0` (r), 1 (g)".
+    /// Lists the option for each plane, as in "`channel 0` (r), 1 (g)".
     pub(crate) fn choices(&self) -> String {
         let each = self.letters.chars().enumerate();
         let each: Vec<_> = each.map(|(i, letter)| format!("{i} ({letter})")).collect();

@@ -1,4 +1,4 @@
-//! What the user may say about a capture that its file does not.
+//! Options for reading a capture, where its file does not say.
 
 use super::mosaic::Mosaic;
 use qudi_core::Size;
@@ -7,37 +7,37 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// Overrides for reading a capture. What is left out is read from the file or inferred.
+/// Options for reading a capture. Absent ones are read from the file or inferred.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReadOptions {
     /// Name of a format in [`FORMATS`](crate::codec::FORMATS).
     pub format: Option<String>,
-    /// Which pixel of a packed byte comes first.
+    /// Order of the pixels in a packed byte.
     pub bit_order: Option<BitOrder>,
-    /// The axis along which 8 pixels share a byte.
+    /// Axis along which 8 pixels share a byte.
     pub pack_axis: Option<PackAxis>,
-    /// Frame size: for files without a header, and for packed rows whose width is no multiple of 8.
+    /// Frame size, for files without a header and for packed rows whose width is no multiple of 8.
     pub size: Option<Size>,
-    /// How frames are turned.
+    /// Orientation of the frames.
     pub orient: Option<Orientation>,
     /// Order of the axes, slowest first.
     pub axes: Option<Axes>,
-    /// The colour channel to read, from 0; of a mosaic, the letter of its pattern.
+    /// Colour channel to read, from 0; for a mosaic, the letter of its pattern.
     pub channel: Option<usize>,
-    /// The colour filter array in front of the pixels.
+    /// Colour filter array in front of the pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cfa: Option<Mosaic>,
-    /// The array in a file that holds several.
+    /// Name of the array, in a file that holds several.
     pub array: Option<String>,
-    /// Pixel values are means of so many binary frames: `count = round(value * levels / full scale)`.
+    /// Binary frames averaged into a pixel value: `count = round(value * levels / full scale)`.
     pub levels: Option<u16>,
     /// Bits of a native count, where the file does not say.
     pub bits: Option<u8>,
-    /// Pedestal in DN, subtracted from stored values; what lies below counts 0.
+    /// Pedestal in DN, subtracted from stored values; values below it count 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub offset: Option<f64>,
-    /// Photon counting: a value more than this many DN above the pedestal counts 1, any other 0.
+    /// Threshold in DN above the pedestal: values above it count 1, all others 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub threshold: Option<f64>,
     /// Bytes before the first frame of every raw file.
@@ -50,7 +50,7 @@ pub struct ReadOptions {
     pub start: Option<u64>,
     /// One past the last native frame.
     pub end: Option<u64>,
-    /// The part of the turned frame to keep.
+    /// Part of the turned frame to keep.
     pub crop: Option<Crop>,
     /// Native frames summed into one.
     pub sum: Option<u32>,
@@ -58,20 +58,20 @@ pub struct ReadOptions {
     pub mask: MaskChoice,
     /// Dark rates: a `.npy` or `.mat` map in counts per second, or a sensor file.
     pub dcr: Option<PathBuf>,
-    /// Drop an incomplete last frame instead of refusing the file.
+    /// True to drop an incomplete last frame instead of refusing the file.
     pub lenient: bool,
 }
 
 impl ReadOptions {
-    /// The options of a container: behind a mosaic, the channel is one of its planes and none of an array's
-    /// axes.
+    /// Returns the options for reading a container. The channel of a mosaic is a plane of its pattern, not an
+    /// axis of the array.
     pub(crate) fn of_container(&self, mosaic: bool) -> Self {
         let channel = self.channel.filter(|_| !mosaic);
         Self { channel, ..self.clone() }
     }
 }
 
-/// Which pixel of a packed byte comes first.
+/// Order of the pixels in a packed byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BitOrder {
@@ -82,7 +82,7 @@ pub enum BitOrder {
 }
 
 impl BitOrder {
-    /// The other one.
+    /// Returns the other order.
     #[must_use]
     pub fn reversed(self) -> Self {
         match self {
@@ -113,7 +113,7 @@ pub enum PackAxis {
     None,
 }
 
-/// How stored frames are turned to be upright.
+/// Orientation of stored frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Orientation {
@@ -137,7 +137,7 @@ pub enum Orientation {
 }
 
 impl Orientation {
-    /// Name as on the command line.
+    /// Returns the name of the orientation on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Raw => "raw",
@@ -156,7 +156,7 @@ impl Orientation {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Axes {
-    /// Frames, rows, columns: the usual one.
+    /// Frames, rows, columns: the default.
     #[default]
     Thw,
     /// Frames, columns, rows.
@@ -172,7 +172,7 @@ pub enum Axes {
 }
 
 impl Axes {
-    /// Position of the frame axis.
+    /// Returns the position of the frame axis.
     pub(crate) fn frame_position(self) -> usize {
         match self {
             Self::Thw | Self::Twh => 0,
@@ -181,8 +181,8 @@ impl Axes {
         }
     }
 
-    /// Rows and columns of a frame of an array with these extents, and the product of the extents before the
-    /// frame axis, of that axis, and after it.
+    /// Returns the rows and columns of a frame of an array with extents `dims`, and the products of the
+    /// extents before, at and after the frame axis.
     pub(crate) fn split(self, dims: [usize; 3]) -> ([usize; 2], [usize; 3]) {
         let at = self.frame_position();
         let product = |part: &[usize]| part.iter().fold(1, |n: usize, &d| n.saturating_mul(d));
@@ -195,12 +195,12 @@ impl Axes {
         (if self.transposed() { [fast, slow] } else { [slow, fast] }, layout)
     }
 
-    /// Whether columns are slower than rows.
+    /// Returns true if columns are slower than rows.
     pub(crate) fn transposed(self) -> bool {
         matches!(self, Self::Twh | Self::Wht | Self::Wth)
     }
 
-    /// The same array with its axes named from the fastest.
+    /// Returns the same order, counted from the fastest axis.
     pub(crate) fn reversed(self) -> Self {
         match self {
             Self::Thw => Self::Wht,
@@ -248,14 +248,14 @@ impl std::fmt::Display for Crop {
     }
 }
 
-/// Which pixels are repaired.
+/// The pixels that are repaired.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskChoice {
-    /// Those that a sensor file or a dark map names; else hot pixels found in the capture itself.
+    /// Pixels that a sensor file or a dark map names; otherwise hot pixels found in the capture itself.
     #[default]
     Auto,
-    /// None.
+    /// No pixels.
     None,
     /// A `.npy` or image of the frame's size, nonzero at bad pixels.
     File(PathBuf),
@@ -273,7 +273,7 @@ impl FromStr for MaskChoice {
     }
 }
 
-/// The options, with the pedestal and the threshold of the sensor where they say nothing of either.
+/// Returns `options` with the sensor's pedestal and threshold, if they set neither.
 pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
     let mut options = options.clone();
     if options.offset.is_none()

@@ -4,20 +4,20 @@
 use crate::description::BitOrder;
 use rayon::prelude::*;
 
-/// 512 pixels: one cache line of every frame, so that each line is loaded once.
+/// Words of a block: 512 pixels, one cache line of every frame, so that each line is loaded once.
 const WORDS: usize = 8;
 type Block = [u64; WORDS];
 
-/// Frames added by one tree of full adders: the most that four bits hold.
+/// Frames added by one tree of full adders: the largest number that four bits hold.
 const GROUP: usize = 15;
 
-/// Frames after which byte counters would overflow: 17 groups.
-pub(crate) const MOST_FRAMES: usize = 255;
+/// Largest number of frames that byte counters hold: 17 groups.
+pub(crate) const MAX_FRAMES: usize = 255;
 
 /// Bytes of a frame handled by one task.
-const PIECE: usize = 1024;
+const PIECE_BYTES: usize = 1024;
 
-/// `SPREAD[order][byte]`: the eight pixels of a byte as the eight bytes of a word.
+/// Eight pixels of a byte as the eight bytes of a word, `SPREAD[order][byte]`.
 static SPREAD: [[u64; 256]; 2] = spread();
 
 const fn spread() -> [[u64; 256]; 2] {
@@ -47,14 +47,14 @@ pub(crate) fn spread_table(order: BitOrder) -> &'static [u64; 256] {
     }
 }
 
-/// Adds up to [`MOST_FRAMES`] frames of `frame_bytes` packed bytes to `sums`, 8 per stored byte.
+/// Adds up to [`MAX_FRAMES`] frames of `frame_bytes` packed bytes to `sums`, 8 per stored byte.
 pub(crate) fn add_packed(frames: &[u8], frame_bytes: usize, order: BitOrder, sums: &mut [u32]) {
-    debug_assert!(frames.len() <= MOST_FRAMES * frame_bytes);
+    debug_assert!(frames.len() <= MAX_FRAMES * frame_bytes);
     debug_assert_eq!(sums.len(), frame_bytes * 8);
     let table = spread_table(order);
-    sums.par_chunks_mut(PIECE * 8).enumerate().for_each(|(piece, sums)| {
+    sums.par_chunks_mut(PIECE_BYTES * 8).enumerate().for_each(|(piece, sums)| {
         for (block, sums) in sums.chunks_mut(WORDS * 64).enumerate() {
-            let from = piece * PIECE + block * WORDS * 8;
+            let from = piece * PIECE_BYTES + block * WORDS * 8;
             let line = |frame: &[u8]| load(&frame[from..from + sums.len() / 8]);
             let mut counters = [0u64; WORDS * 8];
             for group in frames.chunks(GROUP * frame_bytes) {
@@ -79,7 +79,7 @@ pub(crate) fn add_packed(frames: &[u8], frame_bytes: usize, order: BitOrder, sum
     });
 }
 
-/// A cache line, or what is left of a frame at its end.
+/// Loads a cache line, or the rest of a frame at its end.
 fn load(bytes: &[u8]) -> Block {
     if let Ok(line) = <&[u8; WORDS * 8]>::try_from(bytes) {
         return words(line);
@@ -97,7 +97,7 @@ fn words(line: &[u8; WORDS * 8]) -> Block {
     block
 }
 
-/// Bitwise sum of three planes: (ones, twos).
+/// Adds three planes bit by bit: (ones, twos).
 fn add_three(a: &Block, b: &Block, c: &Block) -> (Block, Block) {
     let (mut ones, mut twos) = ([0; WORDS], [0; WORDS]);
     for i in 0..WORDS {
@@ -108,7 +108,7 @@ fn add_three(a: &Block, b: &Block, c: &Block) -> (Block, Block) {
     (ones, twos)
 }
 
-/// Bitwise sum of 15 planes: ones, twos, fours, eights.
+/// Adds 15 planes bit by bit: ones, twos, fours, eights.
 fn add_fifteen(x: &[Block; GROUP]) -> [Block; 4] {
     let (ones, a) = add_three(&x[0], &x[1], &x[2]);
     let (ones, b) = add_three(&ones, &x[3], &x[4]);

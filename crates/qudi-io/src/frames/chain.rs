@@ -5,7 +5,7 @@ use qudi_core::Result;
 use qudi_core::Size;
 use std::ops::Range;
 
-/// Opens a part by number.
+/// A function that opens a part by number.
 type OpenPart = Box<dyn Fn(usize) -> Result<Box<dyn CountFrames>> + Send>;
 
 pub(crate) struct Chain {
@@ -25,7 +25,7 @@ impl Chain {
         Self { size, firsts, opener, open: None }
     }
 
-    /// The part that holds `frame`, opened, and the frame's number in it.
+    /// Opens the part that holds `frame`, and returns it with the frame's number in it.
     fn part(&mut self, frame: u64) -> Result<(usize, &mut dyn CountFrames)> {
         let at = self.firsts.partition_point(|&first| first <= frame) - 1;
         if self.open.as_ref().is_none_or(|(open, _)| *open != at) {

@@ -12,7 +12,7 @@ pub(crate) struct ChannelPages {
 }
 
 impl ChannelPages {
-    /// The pages of `channel`, of `channels` of them; `None` if the pages are no multiple of a turn.
+    /// Selects the pages of `channel` out of `channels`; `None` if the pages do not fill whole turns.
     pub(crate) fn new(
         inner: Box<dyn CountFrames>,
         channels: u64,

@@ -30,7 +30,7 @@ impl<R: Read> Read for CrcReader<R> {
     }
 }
 
-/// The error of data whose CRC-32 is `found` instead of `expected`.
+/// Returns the error of data whose CRC-32 is `found` instead of `expected`.
 pub(crate) fn mismatch(found: u32, expected: u32) -> Error {
     let text = format!("their CRC-32 is {found:08x}, the archive notes {expected:08x}");
     Error::new(ErrorKind::InvalidData, text)

@@ -6,16 +6,16 @@ use std::ops::Range;
 
 /// A stack of count images, `[frames][height][width]`.
 pub trait CountFrames: Send {
-    /// Number of frames; of a pipe, those that have arrived.
+    /// Returns the number of frames; for a pipe, of those that have arrived.
     fn frames(&self) -> u64;
 
-    /// Number of frames in all; `None` as long as that of a pipe is unknown.
+    /// Returns the number of all frames; `None` while the length of a pipe is unknown.
     fn length(&self) -> Option<u64> {
         Some(self.frames())
     }
 
-    /// Waits until there are `frames` frames, or no more come; gives how many there are. What the
-    /// user should know of the end goes to `notes`.
+    /// Waits until `frames` frames have arrived or the input ends, and returns how many have arrived. Notes
+    /// for the user about the end are added to the notes.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the pipe ends inside a frame.
@@ -23,10 +23,10 @@ pub trait CountFrames: Send {
         Ok(self.frames())
     }
 
-    /// Says that no frame before `frame` is asked for again.
+    /// Allows to drop the frames before `frame`, which are not read again.
     fn discard_before(&mut self, _frame: u64) {}
 
-    /// Size of every frame.
+    /// Returns the size of every frame.
     fn size(&self) -> Size;
 
     /// Reads frame `frame` into `counts`, row-major.
@@ -50,8 +50,8 @@ pub trait CountFrames: Send {
         Ok(())
     }
 
-    /// Fills `bytes` with frames from `first` on, rows of whole bytes, 8 pixels each, the first in
-    /// the highest bit; `false` if frames are not stored so nearly like that that copying is all.
+    /// Copies packed frames from `first` on into `bytes`: rows of whole bytes, 8 pixels each, the first in
+    /// the highest bit. Returns false if frames are stored in another way.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the file cannot be read.
@@ -59,7 +59,7 @@ pub trait CountFrames: Send {
         Ok(false)
     }
 
-    /// Whether going back means to start over, as in a compressed file, or is impossible.
+    /// Returns true if frames cannot be read again, or only by starting over, as in a compressed file.
     fn forward_only(&self) -> bool {
         false
     }

@@ -1,4 +1,4 @@
-//! Frames whose counts are checked against the depth that is known of them.
+//! Frames whose counts are checked against the known depth.
 
 use super::count_frames::CountFrames;
 use qudi_core::{Error, Result, Size};
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 pub(crate) struct DepthChecked {
     inner: Box<dyn CountFrames>,
     max_count: u16,
-    /// Who says so, as in "`bits`" or "the record beside it".
+    /// Source of the depth, as in "`bits`" or "the file itself".
     source: &'static str,
     path: PathBuf,
 }

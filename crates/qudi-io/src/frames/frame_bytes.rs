@@ -1,5 +1,5 @@
-//! The stored bytes of frames: in files, in a compressed stream, or strewn across an array whose
-//! frame axis is not the slowest. Memory is bounded by a few frames.
+//! Stored bytes of frames: in files, in a compressed stream, or scattered across an array whose frame axis is
+//! not the slowest. Memory is bounded by a few frames.
 
 use crate::frames::pipe::Pipe;
 use qudi_core::{Error, Result};
@@ -17,20 +17,20 @@ pub(crate) struct Segment {
     pub(crate) frames: u64,
 }
 
-/// Opens a stream at its beginning.
+/// A function that opens a stream at its beginning.
 pub(crate) type Opener = Box<dyn Fn() -> Result<Box<dyn Read + Send>> + Send>;
 
-/// Where the bytes of frames come from.
+/// The source of the bytes of frames.
 pub(crate) enum FrameBytes {
     /// Files read in place, not mapped: resident memory stays flat, and a file that shrinks
     /// meanwhile is an error instead of a signal.
     Files(Files),
     /// A stream that can only go forward.
     Stream(Stream),
-    /// Whatever is cheaper by the batch: compressed chunks, an array whose frame axis is not the
-    /// slowest.
+    /// Batches, where one frame costs as much as many: compressed chunks, or an array whose frame axis is not
+    /// the slowest.
     Batched(Batched),
-    /// Frames that come once.
+    /// Frames that arrive once.
     Pipe(Pipe),
     /// Some bytes of each frame.
     Picked(Box<Picked>),
@@ -41,12 +41,12 @@ impl FrameBytes {
         Self::Files(Files::new(segments, frame_bytes))
     }
 
-    /// Frames in an unnamed file.
+    /// Creates a source from an unnamed file.
     pub(crate) fn spool(segment: Segment, file: File, frame_bytes: usize) -> Self {
         Self::Files(Files { open: Some((0, file)), ..Files::new(vec![segment], frame_bytes) })
     }
 
-    /// Frames of a stream; `after` says what its reader does once the last frame is read.
+    /// Creates a source from a stream; `after` says what its reader does once the last frame is read.
     pub(crate) fn stream(
         opener: Opener,
         frames: u64,
@@ -65,13 +65,13 @@ impl FrameBytes {
         })
     }
 
-    /// Frames of one file, checked against a CRC-32 when they are read one after the other.
+    /// Creates a source from one file, which is checked against a CRC-32 when its frames are read in order.
     pub(crate) fn checked(segment: Segment, frame_bytes: usize, checksum: Checksum) -> Self {
         let files = Files::new(vec![segment], frame_bytes);
         Self::Files(Files { checksum: Some(RunningChecksum::new(checksum)), ..files })
     }
 
-    /// Frames that `fetch` gives, in multiples of `group` frames where memory allows.
+    /// Creates a source from `fetch`, in multiples of `group` frames where memory allows.
     pub(crate) fn batched(fetch: Fetch, frames: u64, frame_bytes: usize, group: u64) -> Self {
         let fit = (BATCH_BYTES / frame_bytes).max(1) as u64;
         let at_once = if group <= fit { fit / group * group } else { fit };
@@ -85,12 +85,12 @@ impl FrameBytes {
         })
     }
 
-    /// The same frames, `length` bytes of each from byte `start` on.
+    /// Selects `length` bytes of each frame, from byte `start` on.
     pub(crate) fn part_of_frames(self, start: usize, length: usize) -> Self {
         Self::Picked(Box::new(Picked { inner: self, start, step: 1, length, frame: Vec::new() }))
     }
 
-    /// The same frames, every `step`-th byte of each from byte `start` on.
+    /// Selects every `step`-th byte of each frame, from byte `start` on.
     pub(crate) fn every_byte(self, start: usize, step: usize) -> Self {
         let length = self.frame_bytes() / step;
         Self::Picked(Box::new(Picked { inner: self, start, step, length, frame: Vec::new() }))
@@ -124,7 +124,7 @@ impl FrameBytes {
         }
     }
 
-    /// Frames in all, if that is known.
+    /// Returns the number of all frames, if it is known.
     pub(crate) fn length(&self) -> Option<u64> {
         match self {
             Self::Pipe(pipe) => pipe.length(),
@@ -133,7 +133,7 @@ impl FrameBytes {
         }
     }
 
-    /// Waits for `frames` frames; gives how many there are.
+    /// Waits for `frames` frames, and returns how many there are.
     pub(crate) fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
         match self {
             Self::Pipe(pipe) => pipe.wait_for(frames, notes),
@@ -142,7 +142,7 @@ impl FrameBytes {
         }
     }
 
-    /// No frame before `frame` is asked for again.
+    /// Allows to drop the frames before `frame`.
     pub(crate) fn discard_before(&mut self, frame: u64) {
         match self {
             Self::Pipe(pipe) => pipe.discard_before(frame),
@@ -165,7 +165,7 @@ impl FrameBytes {
     }
 }
 
-/// Some bytes of each frame: one channel of several.
+/// Some bytes of each frame, such as one channel.
 pub(crate) struct Picked {
     inner: FrameBytes,
     start: usize,
@@ -197,15 +197,15 @@ pub(crate) struct Files {
     checksum: Option<RunningChecksum>,
 }
 
-/// The CRC-32 of a part of a file that holds frames, and a header before them.
+/// The CRC-32 of a part of a file, which holds frames after a header.
 #[derive(Clone, Debug)]
 pub(crate) struct Checksum {
     pub(crate) expected: u32,
-    /// The bytes that the checksum covers, in the file.
+    /// Bytes of the file that the checksum covers.
     pub(crate) range: Range<u64>,
 }
 
-/// A checksum that grows while frames are read in turn. Frames read out of turn are not checked.
+/// A checksum that grows while frames are read in order. Frames read out of order are not checked.
 struct RunningChecksum {
     checksum: Checksum,
     hasher: crc32fast::Hasher,
@@ -217,7 +217,7 @@ impl RunningChecksum {
         Self { checksum, hasher: crc32fast::Hasher::new(), next: 0 }
     }
 
-    /// Takes in `bytes`, frames from `first` on, just read from `file`, whose frames are those of `segment`.
+    /// Adds `bytes`, the frames from `first` on, just read from `file` as `segment` places them.
     fn add(
         &mut self,
         first: u64,
@@ -307,16 +307,16 @@ impl Files {
     }
 }
 
-/// What follows the last frame of a stream.
+/// The end of a stream after its last frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum StreamEnd {
-    /// Its end, where decoders compare checksums: it is read to there.
+    /// Reads to the end, where decoders compare checksums.
     Verified,
-    /// Nothing that is asked for, in a stream that is damaged there.
+    /// Stops, since the stream is damaged there.
     Ignored,
 }
 
-/// The error of data that differ from their checksum.
+/// Returns the error of data that differ from their checksum.
 fn damaged(e: &std::io::Error, path: &Path) -> Error {
     Error::data(format!("the stored data are damaged: {e}"), path, "copy or export the file again")
 }
@@ -370,7 +370,7 @@ impl Stream {
     }
 }
 
-/// Fetches frames `first..first + count` whole.
+/// A function that fetches frames `first..first + count` whole.
 pub(crate) type Fetch = Box<dyn FnMut(u64, u64) -> Result<Vec<u8>> + Send>;
 
 /// Frames fetched and kept in batches, where one alone would cost as much as many.
@@ -383,7 +383,7 @@ pub(crate) struct Batched {
     batch: Vec<u8>,
 }
 
-/// Memory for one batch.
+/// Bytes of one batch.
 const BATCH_BYTES: usize = 1 << 25;
 
 impl Batched {

@@ -1,9 +1,9 @@
-//! Pictures of counts: pixel values that are means of N binary frames, scaled to full scale.
+//! Pictures of counts: pixel values that are means of binary frames, scaled to full scale.
 
-/// More levels than this look like an ordinary picture.
-const MOST: u16 = 64;
+/// Largest number of levels; more look like an ordinary picture.
+const MAX_LEVELS: u16 = 64;
 
-/// N, if the distinct `values` (rising) are multiples of `full / N`, rounded or cut off.
+/// Returns N if the distinct `values` (rising) are multiples of `full / N`, rounded or truncated.
 pub(crate) fn infer_levels(values: &[u16], full: u16) -> Option<u16> {
     let nonzero: Vec<u16> = values.iter().copied().filter(|&v| v > 0).collect();
     let smallest = *nonzero.first()?;
@@ -15,7 +15,7 @@ pub(crate) fn infer_levels(values: &[u16], full: u16) -> Option<u16> {
             (f64::from(v) - exact).abs() <= 0.5 || f64::from(v) == exact.floor()
         })
     };
-    let most = MOST.min(full.div_ceil(4));
+    let most = MAX_LEVELS.min(full.div_ceil(4));
     // A single level is full scale, that is, binary; several must fill the ladder.
     (1..=most)
         .filter(|&n| f64::from(smallest) > 0.9 * f64::from(full) / f64::from(n))

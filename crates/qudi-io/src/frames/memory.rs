@@ -1,4 +1,4 @@
-//! Counts that are in memory already, as a capture.
+//! Counts in memory, as frames of a capture.
 
 use super::count_frames::CountFrames;
 use qudi_core::Result;

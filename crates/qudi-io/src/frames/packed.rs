@@ -1,6 +1,6 @@
 //! Binary frames, 8 pixels to the byte.
 
-use super::bit_sums::{MOST_FRAMES, add_packed, spread_table};
+use super::bit_sums::{MAX_FRAMES, add_packed, spread_table};
 use super::count_frames::CountFrames;
 use super::frame_bytes::FrameBytes;
 use crate::description::{BitOrder, PackAxis};
@@ -8,24 +8,24 @@ use qudi_core::Result;
 use qudi_core::Size;
 use std::ops::Range;
 
-/// Stored bits that belong to no pixel.
-pub(crate) const NOWHERE: u32 = u32::MAX;
+/// Place of stored bits that belong to no pixel.
+pub(crate) const NO_PIXEL: u32 = u32::MAX;
 
-/// Bytes read at once while summing: fits the second-level cache with room for the counters.
+/// Bytes read at once while summing: they fit into the second-level cache with the counters.
 const CHUNK_BYTES: usize = 1 << 20;
 
-/// Where the bits of a stored frame go.
+/// The placement of the bits of a stored frame.
 pub(crate) enum Placement {
-    /// Bit after bit, row after row, no padding.
+    /// Bits in order, row by row, without padding.
     Straight,
-    /// The place of each stored byte among the bytes of the image, whose rows are whole bytes.
+    /// Place of each stored byte among the bytes of the image, whose rows are whole bytes.
     Bytes(Vec<u32>),
-    /// The pixel of each stored bit, or [`NOWHERE`].
+    /// Pixel of each stored bit, or [`NO_PIXEL`].
     Map(Vec<u32>),
 }
 
 impl Placement {
-    /// Rows (or columns) padded to whole bytes.
+    /// Creates the placement of rows (or columns) padded to whole bytes.
     pub(crate) fn packed(size: Size, axis: PackAxis, transposed: bool) -> Self {
         let Size { height, width } = size;
         if axis == PackAxis::Width && !transposed && width.is_multiple_of(8) {
@@ -40,14 +40,14 @@ impl Placement {
             for bit in 0..8 {
                 let (y, x) =
                     if along_height { (row * 8 + bit, column) } else { (row, column * 8 + bit) };
-                map.push(if y < height && x < width { (y * width + x) as u32 } else { NOWHERE });
+                map.push(if y < height && x < width { (y * width + x) as u32 } else { NO_PIXEL });
             }
         }
         Self::Map(map)
     }
 }
 
-/// Rows and columns of bytes of a packed frame.
+/// Returns the rows and columns of bytes of a packed frame.
 pub(crate) fn stored_bytes(size: Size, axis: PackAxis) -> (usize, usize) {
     match axis {
         PackAxis::Width => (size.height, size.width.div_ceil(8)),
@@ -108,7 +108,7 @@ impl CountFrames for PackedFrames {
             Placement::Map(map) => {
                 for (places, eight) in map.chunks_exact(8).zip(eights) {
                     for (&place, bit) in places.iter().zip(eight) {
-                        if place != NOWHERE {
+                        if place != NO_PIXEL {
                             counts[place as usize] = u16::from(bit);
                         }
                     }
@@ -120,7 +120,7 @@ impl CountFrames for PackedFrames {
 
     fn add(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
         let frame_bytes = self.bytes.frame_bytes();
-        let at_once = (CHUNK_BYTES / frame_bytes).clamp(15, MOST_FRAMES) / 15 * 15;
+        let at_once = (CHUNK_BYTES / frame_bytes).clamp(15, MAX_FRAMES) / 15 * 15;
         let mut stored = match self.placement {
             Placement::Straight => Vec::new(),
             Placement::Bytes(_) | Placement::Map(_) => vec![0; frame_bytes * 8],
@@ -145,7 +145,7 @@ impl CountFrames for PackedFrames {
             }
             Placement::Map(map) => {
                 for (&place, sum) in map.iter().zip(&stored) {
-                    if place != NOWHERE {
+                    if place != NO_PIXEL {
                         sums[place as usize] += sum;
                     }
                 }

@@ -1,29 +1,29 @@
-//! Frames that come through a pipe: each one once, in order, how many only its end tells. What has
-//! come is kept until it is released, so that the first window can be looked at more than once.
+//! Frames from a pipe: each one once, in order, their number known at the end only. Frames are kept until
+//! they are released, so that the first window can be read more than once.
 
 use qudi_core::{Error, Result};
 use std::collections::VecDeque;
 use std::io::Read;
 use std::path::Path;
 
-/// What messages call the pipe.
+/// Name of the pipe in messages.
 pub(crate) const STDIN: &str = "standard input";
 
-/// Output frames of a pipe that statistics see: one window of the paper's network.
+/// Output frames of a pipe that statistics read: one window of the paper's network.
 pub(crate) const FIRST_WINDOW: u64 = 11;
 
-/// What may follow the last frame.
+/// Bytes that may follow the last frame.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tail<'a> {
-    /// Bytes after it that are no part of a frame.
+    /// Bytes after the last frame that are no part of it.
     pub(crate) trailer: u64,
-    /// Other trailers that are known by their content.
+    /// Other trailers, known by their content.
     pub(crate) known: &'a [&'static [u8]],
-    /// Whether an incomplete frame is dropped rather than refused.
+    /// True to drop an incomplete frame instead of refusing it.
     pub(crate) lenient: bool,
 }
 
-/// Frames of equal length out of a reader.
+/// Frames of equal length from a reader.
 pub(crate) struct Pipe {
     reader: Box<dyn Read + Send>,
     frame_bytes: usize,
@@ -31,10 +31,10 @@ pub(crate) struct Pipe {
     promised: Option<u64>,
     tail: Tail<'static>,
     arrived: u64,
-    /// The latest of the arrived frames.
+    /// The latest frames.
     kept: VecDeque<Vec<u8>>,
-    /// Frames before this one are not kept.
-    wanted_from: u64,
+    /// First frame that is kept.
+    kept_from: u64,
     ended: bool,
 }
 
@@ -46,16 +46,16 @@ impl Pipe {
         tail: Tail<'static>,
     ) -> Self {
         let kept = VecDeque::new();
-        Self { reader, frame_bytes, promised, tail, arrived: 0, kept, wanted_from: 0, ended: false }
+        Self { reader, frame_bytes, promised, tail, arrived: 0, kept, kept_from: 0, ended: false }
     }
 
-    /// Says how long a frame is and how many a header promises, before any has arrived.
+    /// Sets the length of a frame and the number that a header promises, before any has arrived.
     pub(crate) fn lay_out(&mut self, frame_bytes: usize, promised: u64) {
         debug_assert_eq!(self.arrived, 0);
         (self.frame_bytes, self.promised) = (frame_bytes, Some(promised));
     }
 
-    /// Frames that have arrived.
+    /// Returns the number of frames that have arrived.
     pub(crate) fn arrived(&self) -> u64 {
         self.arrived
     }
@@ -64,19 +64,19 @@ impl Pipe {
         self.frame_bytes
     }
 
-    /// Frames in all, if that is known yet.
+    /// Returns the number of all frames, if it is known yet.
     pub(crate) fn length(&self) -> Option<u64> {
         if self.ended { Some(self.arrived) } else { self.promised }
     }
 
-    /// Waits until `frames` frames have arrived, or the pipe ends; gives how many have.
+    /// Waits until `frames` frames have arrived or the pipe ends, and returns how many have.
     pub(crate) fn wait_for(&mut self, frames: u64, notes: &mut Vec<String>) -> Result<u64> {
         while self.arrived < frames && !self.ended {
             if self.promised == Some(self.arrived) {
                 self.ended = true;
                 break;
             }
-            // Grows as bytes come: a header may promise frames larger than memory.
+            // The buffer grows as bytes arrive: a header may promise frames larger than memory.
             let mut frame = Vec::new();
             (&mut self.reader)
                 .take(self.frame_bytes as u64)
@@ -87,14 +87,14 @@ impl Pipe {
                 break;
             }
             self.arrived += 1;
-            if self.arrived > self.wanted_from {
+            if self.arrived > self.kept_from {
                 self.kept.push_back(frame);
             }
         }
         Ok(self.arrived)
     }
 
-    /// The pipe ended after `rest` bytes of a frame.
+    /// Ends the pipe after `rest` bytes of a frame.
     fn end(&mut self, rest: &[u8], notes: &mut Vec<String>) -> Result<()> {
         self.ended = true;
         let (whole, bytes) = (self.arrived, self.frame_bytes);
@@ -127,9 +127,9 @@ impl Pipe {
         ))
     }
 
-    /// Lets go of the frames before `frame`.
+    /// Drops the frames before `frame`.
     pub(crate) fn discard_before(&mut self, frame: u64) {
-        self.wanted_from = self.wanted_from.max(frame);
+        self.kept_from = self.kept_from.max(frame);
         while !self.kept.is_empty() && self.arrived - (self.kept.len() as u64) < frame {
             self.kept.pop_front();
         }
@@ -152,7 +152,7 @@ impl Pipe {
         Ok(())
     }
 
-    /// Bytes of the frames that are kept.
+    /// Returns the bytes of the frames that are kept.
     pub(crate) fn kept_bytes(&self) -> Vec<u8> {
         self.kept.iter().flatten().copied().collect()
     }

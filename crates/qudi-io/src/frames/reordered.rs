@@ -1,4 +1,4 @@
-//! Frames of a stack whose pages are not its frames: rows or columns of all pages together.
+//! Frames of a stack whose pages are not its frames, but the rows or columns of all frames.
 
 use super::count_frames::CountFrames;
 use super::frame_bytes::strewn;
@@ -9,8 +9,8 @@ use qudi_core::{Error, Result, Size};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// The counts of `inner`, an array of pages, rows and columns, with the meaning that `axes` give these three.
-/// All counts are stored in an unnamed file first.
+/// Reorders the counts of `inner`, an array of pages, rows and columns whose meaning `axes` gives. All counts
+/// are stored in an unnamed file first.
 pub(crate) fn reordered(
     mut inner: Box<dyn CountFrames>,
     axes: Option<Axes>,

@@ -9,19 +9,19 @@ use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// How stored values become counts.
+/// The scale of stored values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Scale {
-    /// They are counts.
+    /// Values are counts.
     Counts,
-    /// They are means of `levels` binary frames, `full` standing for all ones.
+    /// Values are means of `levels` binary frames, where `full` stands for all ones.
     Means { levels: u16, full: f32 },
-    /// Counts lie above a pedestal of `offset` DN; with a threshold, one more than that above it counts 1.
+    /// Values are counts above a pedestal of `offset` DN; with a threshold, values above it count 1.
     Pedestal { offset: f32, threshold: Option<f32> },
 }
 
 impl Scale {
-    /// The scale that the options `levels`, `offset` and `threshold` ask for; `full` is the value that
+    /// Returns the scale that the options `levels`, `offset` and `threshold` set; `full` is the value that
     /// stands for all ones.
     pub(crate) fn asked(options: &ReadOptions, full: f32, info: &mut CaptureInfo) -> Option<Self> {
         if options.offset.is_some() || options.threshold.is_some() {
@@ -39,7 +39,7 @@ impl Scale {
         Some(Self::Means { levels, full })
     }
 
-    /// What some values (in any order) show.
+    /// Infers the scale from some values, in any order.
     pub(crate) fn seen(mut values: Vec<u16>, full: u16, info: &mut CaptureInfo) -> Self {
         values.sort_unstable();
         values.dedup();
@@ -51,7 +51,7 @@ impl Scale {
         Self::Means { levels, full: f32::from(full) }
     }
 
-    /// The count that a stored value stands for; `None` if there is none.
+    /// Returns the count of a stored value; `None` if it stands for no count.
     pub(crate) fn count(self, value: f32) -> Option<u16> {
         let count = match self {
             Self::Counts => value,
@@ -62,7 +62,7 @@ impl Scale {
             Self::Means { levels, full } => {
                 let exact = value * f32::from(levels) / full;
                 let count = exact.round_ties_even();
-                // Integer files round the mean, or cut it off.
+                // Integer files round the mean, or truncate it.
                 let slack = if full > 1.0 { f32::from(levels) / full } else { 0.0 };
                 if (exact - count).abs() > slack + 1e-3 {
                     return None;
@@ -75,7 +75,7 @@ impl Scale {
     }
 }
 
-/// Colour channels stored with each pixel, and the one that is read.
+/// Colour channels of each pixel, and the one that is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Channel {
     pub(crate) of: usize,
@@ -96,7 +96,7 @@ pub(crate) struct SampleFrames {
 }
 
 impl SampleFrames {
-    /// Frames of `[height][width][channels]` samples, or `[width][height]` if `transposed`.
+    /// Creates frames from `[height][width][channels]` samples, or `[width][height]` ones if `transposed`.
     pub(crate) fn new(
         bytes: FrameBytes,
         sample: Sample,
@@ -162,7 +162,7 @@ impl CountFrames for SampleFrames {
     }
 }
 
-/// A value that no photon counter gives.
+/// Returns the error of a value that no photon counter gives.
 pub(crate) fn no_count(value: f32, frame: u64, path: &Path) -> Error {
     Error::data(
         format!("frame {frame} holds {value}, and photon counts are whole numbers from 0 to 65535"),

@@ -1,25 +1,25 @@
-//! Which pixel of a packed byte comes first, judged by the picture.
+//! The bit order of packed frames, judged by the picture.
 //!
-//! Reversing the bits of every byte leaves neighbours inside a byte neighbours; only pairs across
-//! a byte boundary change: the right order joins pixels 7 and 8, the wrong one pixels 0 and 15,
-//! which in any picture with structure differ more.
+//! Reversing the bits of every byte keeps neighbours within a byte next to each other. Only pairs across a
+//! byte boundary change: the right order joins pixels 7 and 8, the wrong one pixels 0 and 15, which differ
+//! more in any picture with structure.
 
 use qudi_core::Size;
 
-/// Beyond this many standard errors the answer is taken as sure.
-pub const SURE: f64 = 5.0;
+/// Standard errors beyond which the answer is certain.
+pub const Z_SCORE_THRESHOLD: f64 = 5.0;
 
-/// Rows of one unit: neighbouring rows see the same edges, and do not count twice.
+/// Rows of one unit: neighbouring rows see the same edges and are not independent.
 const BLOCK_ROWS: usize = 16;
 
 /// Pixels averaged on both sides of a boundary: fine ones for many photons, coarse ones for few.
 const SCALES: [usize; 3] = [1, 2, 4];
 
-/// Fewer units than this decide nothing.
-const FEWEST_UNITS: usize = 8;
+/// Least number of units for an answer.
+const MIN_UNITS: usize = 8;
 
-/// Gives how well `sums` fit the order they were unpacked in, in standard errors; negative if the other
-/// order fits better. `sums` is the sum of frames packed along the width, row-major.
+/// Returns how well `sums` fit the order in which they were unpacked, in standard errors; negative if the
+/// other order fits better. `sums` is the sum of frames packed along the width, row-major.
 pub fn bit_order_z_score(sums: &[u32], size: Size) -> f64 {
     // The square root makes the noise of all counts alike.
     let roots: Vec<f32> = sums.iter().map(|&sum| (sum as f32).sqrt()).collect();
@@ -56,9 +56,9 @@ fn z_score_at(roots: &[f32], size: Size, scale: usize) -> Option<f64> {
     standard_errors(&units)
 }
 
-/// Mean of independent `units` in standard errors.
+/// Returns the mean of independent `units` in standard errors.
 pub(crate) fn standard_errors(units: &[f64]) -> Option<f64> {
-    if units.len() < FEWEST_UNITS {
+    if units.len() < MIN_UNITS {
         return None;
     }
     let n = units.len() as f64;

@@ -1,6 +1,6 @@
-//! Whether bytes without a header are packed bits or counts.
+//! Packed bits or counts: the kind of bytes that have no header.
 
-/// What a sample of bytes looks like.
+/// The kind of a sample of bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ByteKind {
     /// Every bit of a byte is set equally often: eight pixels.
@@ -13,15 +13,15 @@ pub(crate) enum ByteKind {
     Unclear,
 }
 
-/// Set bits needed to compare their rates.
-const FEWEST: f64 = 400.0;
+/// Least number of set bits for comparing their rates.
+const MIN_SET_BITS: f64 = 400.0;
 
-/// In packed captures the columns of each bit see the same scene; their rates agree closely.
-const SPREAD: f64 = 0.25;
+/// Largest relative difference between the rates of packed bits, whose columns see the same scene.
+const RATE_TOLERANCE: f64 = 0.25;
 
 impl ByteKind {
     pub(crate) fn of(bytes: &[u8]) -> Self {
-        // How often every value occurs in even and in odd places: one look at what can be many bytes.
+        // Counts every value at even and odd places in one pass over the bytes.
         let mut seen = [[0u64; 256]; 2];
         for (i, &byte) in bytes.iter().enumerate() {
             seen[i % 2][usize::from(byte)] += 1;
@@ -32,12 +32,12 @@ impl ByteKind {
         };
         let rates: Vec<f64> = (0..8).map(|bit| set(bit, 0) + set(bit, 1)).collect();
         let total: f64 = rates.iter().sum();
-        if total < FEWEST {
+        if total < MIN_SET_BITS {
             return Self::Unclear;
         }
         let mean = total / 8.0;
         let noise = 4.0 / mean.sqrt();
-        if rates.iter().all(|rate| (rate / mean - 1.0).abs() < SPREAD + noise) {
+        if rates.iter().all(|rate| (rate / mean - 1.0).abs() < RATE_TOLERANCE + noise) {
             return Self::Packed;
         }
         // Samples of 9 to 12 bits: nothing above bit 3 of the high byte, much in the low byte.

@@ -1,4 +1,4 @@
-//! A first look at a path, shared by all formats that try to recognise it.
+//! Facts about a path, shared by all formats that try to recognise it.
 
 use super::raw_sample::{RawSample, stem};
 use qudi_core::limits::FOLDER_FILES;
@@ -9,35 +9,35 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-/// Bytes looked at from the start of a file.
-const HEAD: u64 = 4096;
+/// Bytes read from the start of a file.
+const HEAD_BYTES: u64 = 4096;
 
-/// Bytes looked at from the middle of a file.
-const SAMPLE: u64 = 1 << 20;
+/// Bytes read from the middle of a file.
+const SAMPLE_BYTES: u64 = 1 << 20;
 
-/// SwissSPAD2 spreads its files over two levels of folders.
-const DEPTH: usize = 3;
+/// Levels of folders that are listed: SwissSPAD2 uses two below the capture.
+const FOLDER_DEPTH: usize = 3;
 
-/// What a path looks like.
+/// Facts about a path.
 #[derive(Debug)]
 pub(crate) struct Probe {
     pub(crate) path: PathBuf,
     pub(crate) is_folder: bool,
-    /// Bytes of a file.
+    /// Length of a file in bytes.
     pub(crate) length: u64,
-    /// Lower case, without the dot.
+    /// Extension in lower case, without the dot.
     pub(crate) extension: String,
-    /// The first bytes of a file.
+    /// First bytes of a file.
     pub(crate) head: Vec<u8>,
-    /// The frame size that the user gives.
+    /// Frame size given by the user.
     pub(crate) size: Option<Size>,
     files: OnceCell<Listing>,
-    /// Filled by [`Probe::raw_sample`], which several formats ask.
+    /// Result of [`Probe::raw_sample`], which several formats call.
     raw_sample: OnceCell<Option<RawSample>>,
 }
 
 impl Probe {
-    /// Looks at `path`, whose frames are said to be of `size`.
+    /// Probes `path`, whose frames are of `size` if it is given.
     ///
     /// # Errors
     /// [`Error::Io`] if it cannot be read.
@@ -46,7 +46,7 @@ impl Probe {
         let found = std::fs::metadata(path).map_err(io)?;
         let mut head = Vec::new();
         if found.is_file() {
-            File::open(path).map_err(io)?.take(HEAD).read_to_end(&mut head).map_err(io)?;
+            File::open(path).map_err(io)?.take(HEAD_BYTES).read_to_end(&mut head).map_err(io)?;
             if head.is_empty() {
                 return Err(Error::data("the file is empty", path, "copy or export it again"));
             }
@@ -69,12 +69,12 @@ impl Probe {
         })
     }
 
-    /// File name without its extension.
+    /// Returns the file name without its extension.
     pub(crate) fn stem(&self) -> String {
         stem(&self.path)
     }
 
-    /// What the `.bin` file, or the first one of the folder, looks like; none if there is none.
+    /// Reads facts about the `.bin` file, or the first one of the folder; `None` if there is none.
     pub(crate) fn raw_sample(&self) -> Result<Option<RawSample>> {
         if let Some(sample) = self.raw_sample.get() {
             return Ok(*sample);
@@ -85,12 +85,12 @@ impl Probe {
         Ok(*self.raw_sample.get_or_init(|| sample))
     }
 
-    /// Whether it is a file with one of these extensions.
+    /// Returns true if it is a file with one of these extensions.
     pub(crate) fn has_extension(&self, extensions: &[&str]) -> bool {
         !self.is_folder && extensions.contains(&self.extension.as_str())
     }
 
-    /// The file itself, or the files of the folder with this extension, in the order of their
+    /// Lists the file itself, or the files of the folder with these extensions, in the order of their
     /// numbers.
     pub(crate) fn files(&self, extensions: &[&str]) -> Result<Vec<PathBuf>> {
         if !self.is_folder {
@@ -98,7 +98,7 @@ impl Probe {
         }
         if self.files.get().is_none() {
             let mut listing = Listing::default();
-            list(&self.path, DEPTH, &mut listing)?;
+            list(&self.path, FOLDER_DEPTH, &mut listing)?;
             let relative =
                 |p: &Path| p.strip_prefix(&self.path).unwrap_or(p).to_string_lossy().into_owned();
             listing.files.sort_by_cached_key(|p| Natural(relative(p)));
@@ -112,7 +112,7 @@ impl Probe {
         Ok(listed.filter(matches).cloned().collect())
     }
 
-    /// What is to be said of the entries of the folder that were passed over.
+    /// Returns a note on the entries of the folder that were skipped.
     pub(crate) fn note_on_skipped(&self) -> Option<String> {
         let skipped = &self.files.get()?.skipped;
         let name = skipped.first()?.file_name()?.to_string_lossy().into_owned();
@@ -122,7 +122,7 @@ impl Probe {
         ))
     }
 
-    /// Bytes from the middle of a file, at a multiple of `align` bytes.
+    /// Reads bytes from the middle of a file, at a multiple of `align` bytes.
     pub(crate) fn middle(&self, align: u64) -> Result<Vec<u8>> {
         let path = if self.is_folder {
             self.files(&["bin"])?.into_iter().next().unwrap_or_default()
@@ -132,15 +132,15 @@ impl Probe {
         let io = |e| Error::io("read", &path, e);
         let mut file = File::open(&path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
-        let from = (length / 2).saturating_sub(SAMPLE / 2) / align * align;
+        let from = (length / 2).saturating_sub(SAMPLE_BYTES / 2) / align * align;
         let mut bytes = Vec::new();
         file.seek(SeekFrom::Start(from)).map_err(io)?;
-        file.take(SAMPLE).read_to_end(&mut bytes).map_err(io)?;
+        file.take(SAMPLE_BYTES).read_to_end(&mut bytes).map_err(io)?;
         Ok(bytes)
     }
 }
 
-/// What lies in a folder and in those below it.
+/// The entries of a folder and of the folders in it.
 #[derive(Debug, Default)]
 struct Listing {
     files: Vec<PathBuf>,
@@ -165,7 +165,7 @@ fn list(folder: &Path, depth: usize, listing: &mut Listing) -> Result<()> {
         } else if path.is_file() {
             listing.files.push(path);
         } else {
-            // A named pipe would keep the reader waiting for ever.
+            // Reading a named pipe would block forever.
             listing.skipped.push(path);
         }
         if listing.files.len() > FOLDER_FILES {

@@ -1,22 +1,22 @@
-//! What headerless `.bin` files of 512-pixel cameras look like: name, length, bits.
+//! Headerless `.bin` files of 512-pixel cameras: facts from name, length and bits.
 
-use super::bit_order::{SURE, bit_order_z_score, standard_errors};
+use super::bit_order::{Z_SCORE_THRESHOLD, bit_order_z_score, standard_errors};
 use super::byte_kind::ByteKind;
 use crate::description::BitOrder;
-use crate::frames::bit_sums::{MOST_FRAMES, add_packed};
+use crate::frames::bit_sums::{MAX_FRAMES, add_packed};
 use qudi_core::Size;
 use qudi_core::{Error, Result};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-/// A frame of 512 x 512 bits; also two half-array frames of 256 x 512.
-pub(crate) const FRAME: usize = 32_768;
+/// Bytes of a frame of 512 x 512 bits, or of two half-array frames of 256 x 512.
+pub(crate) const FRAME_BYTES: usize = 32_768;
 
 /// Length of every SwissSPAD2 file.
-pub(crate) const SWISSSPAD_FILE: u64 = 8 << 20;
+pub(crate) const SWISSSPAD_FILE_BYTES: u64 = 8 << 20;
 
-/// Whose convention a file name follows.
+/// The camera whose naming convention a file follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Convention {
     /// `RAW00000.bin`, or anything in `acq00000/`.
@@ -27,34 +27,34 @@ pub(crate) enum Convention {
     Unknown,
 }
 
-/// What a `.bin` file, or the first one of a folder, looks like.
+/// Facts about a `.bin` file, or about the first one of a folder.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RawSample {
     pub(crate) convention: Convention,
     pub(crate) length: u64,
     pub(crate) kind: ByteKind,
-    /// `Some` if the picture tells which bit comes first.
+    /// Bit order, if the picture shows it.
     pub(crate) order: Option<BitOrder>,
-    /// `Some(true)` if rows alternate as in a full SwissSPAD2 array.
+    /// `Some(true)` if rows alternate as in a full SwissSPAD2 array; `None` if the picture does not show it.
     pub(crate) full_array: Option<bool>,
 }
 
 impl RawSample {
-    /// Looks at a `.bin` file.
+    /// Reads the facts about a `.bin` file.
     pub(crate) fn read(path: &Path) -> Result<Self> {
         let io = |e| Error::io("read", path, e);
         let file = File::open(path).map_err(io)?;
         let length = file.metadata().map_err(io)?.len();
         let mut bytes = Vec::new();
-        file.take(SWISSSPAD_FILE).read_to_end(&mut bytes).map_err(io)?;
-        bytes.truncate(bytes.len() / FRAME * FRAME);
+        file.take(SWISSSPAD_FILE_BYTES).read_to_end(&mut bytes).map_err(io)?;
+        bytes.truncate(bytes.len() / FRAME_BYTES * FRAME_BYTES);
         let (order, full_array) = pictures(&bytes);
         let kind = ByteKind::of(&bytes[..bytes.len().min(1 << 20)]);
         Ok(Self { convention: convention(path), length, kind, order, full_array })
     }
 }
 
-/// The name of a file without its extension.
+/// Returns the name of a file without its extension.
 pub(crate) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
@@ -77,15 +77,19 @@ fn convention(path: &Path) -> Convention {
     }
 }
 
-/// Bit order and arrangement of rows of 64 bytes, from the sum of some frames.
+/// Returns the bit order and whether rows of 64 bytes alternate, from the sum of some frames.
 fn pictures(bytes: &[u8]) -> (Option<BitOrder>, Option<bool>) {
     let size = Size { height: 512, width: 512 };
     let mut sums = vec![0u32; size.pixels()];
-    for frames in bytes.chunks(MOST_FRAMES * FRAME) {
-        add_packed(frames, FRAME, BitOrder::Msb, &mut sums);
+    for frames in bytes.chunks(MAX_FRAMES * FRAME_BYTES) {
+        add_packed(frames, FRAME_BYTES, BitOrder::Msb, &mut sums);
     }
     let msb = bit_order_z_score(&sums, size);
-    let order = (msb.abs() > SURE).then_some(if msb > 0.0 { BitOrder::Msb } else { BitOrder::Lsb });
+    let order = (msb.abs() > Z_SCORE_THRESHOLD).then_some(if msb > 0.0 {
+        BitOrder::Msb
+    } else {
+        BitOrder::Lsb
+    });
     // Next rows against rows after next, in units of 16 rows by 16 columns.
     let roots: Vec<f32> = sums.iter().map(|&sum| (sum as f32).sqrt()).collect();
     let mut units = Vec::new();
@@ -102,11 +106,11 @@ fn pictures(bytes: &[u8]) -> (Option<BitOrder>, Option<bool>) {
         }
     }
     let alternating = standard_errors(&units).unwrap_or(0.0);
-    let full = if alternating > SURE {
+    let full = if alternating > Z_SCORE_THRESHOLD {
         Some(true)
     } else {
         // Without structure neither arrangement shows.
-        (order.is_some() && alternating < 0.5 * SURE).then_some(false)
+        (order.is_some() && alternating < 0.5 * Z_SCORE_THRESHOLD).then_some(false)
     };
     (order, full)
 }

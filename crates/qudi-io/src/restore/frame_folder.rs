@@ -1,5 +1,5 @@
-//! A folder of restored frames that survives being killed: finished frames stay, and a manifest
-//! says how they were made, so that nothing else is mixed in.
+//! A folder of restored frames that survives an interruption: finished frames stay, and a manifest describes
+//! how they were made, so that no other frames are mixed in.
 
 use super::inputs::Inputs;
 use super::lock::{FolderLock, Share};
@@ -16,17 +16,17 @@ use std::io::Write;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// The manifest's name; it also marks a folder as ours.
+/// Name of the manifest, which also marks a folder as ours.
 pub const MANIFEST: &str = "manifest.json";
 
-/// Describes the run that writes a folder, as the manifest notes it.
+/// The run that writes a folder, as the manifest describes it.
 #[derive(Clone, Debug)]
 pub struct FolderRun {
-    /// Everything that decides what the frames look like.
+    /// Settings on which the frames depend.
     pub settings: Value,
-    /// What the run reads.
+    /// Files that the run reads.
     pub inputs: Inputs,
-    /// How much of the work it does.
+    /// Share of the work.
     pub share: Share,
 }
 
@@ -89,7 +89,7 @@ impl FrameFolder {
         Ok(folder)
     }
 
-    /// Refuses to go on with the frames of another run, with what differs.
+    /// Refuses the frames of another run, with the difference.
     fn check(&self, found: &Value) -> Result<()> {
         let refuse = |what: String| {
             Err(Error::data(
@@ -122,17 +122,17 @@ impl FrameFolder {
         Ok(())
     }
 
-    /// The file of a frame.
+    /// Returns the file of a frame.
     pub fn file(&self, frame: u64) -> PathBuf {
         self.path.join(frame_name(frame))
     }
 
-    /// How many frames from the start of `range` on are finished.
+    /// Returns how many frames from the start of `range` on are finished.
     pub fn finished(&self, range: Range<u64>) -> u64 {
         range.clone().take_while(|&frame| self.file(frame).is_file()).count() as u64
     }
 
-    /// Writes a frame, and gives back what a reader of the file will see.
+    /// Writes a frame, and returns it as a reader of the file will see it.
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full.
@@ -164,7 +164,7 @@ impl FrameFolder {
         Ok(image)
     }
 
-    /// Notes in the manifest that all is done, with `results`.
+    /// Marks the run as complete in the manifest, with `results`.
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full.
@@ -187,7 +187,7 @@ impl FrameFolder {
         file.finish()
     }
 
-    /// Removes our own files, and nothing else.
+    /// Removes our own files only.
     fn clear(&self) -> Result<()> {
         let io = |e| Error::io("clear the output", &self.path, e);
         for entry in std::fs::read_dir(&self.path).map_err(io)? {
@@ -220,7 +220,7 @@ fn read_manifest(path: &Path) -> Result<Value> {
     ))
 }
 
-/// The program and its version, as the manifest notes it.
+/// Returns the program and its version, as the manifest notes it.
 fn program() -> String {
     format!("qudi {}", env!("CARGO_PKG_VERSION"))
 }
@@ -229,7 +229,7 @@ fn program() -> String {
 const RENAMED: &[(&str, &str, &str)] =
     &[("method", "guide", "qbp-refined"), ("spacing", "learnt", "log-logistic")];
 
-/// The first key whose value differs, with both values.
+/// Returns the first key whose value differs, with both values.
 fn difference(was: &Value, is: &Value) -> Option<(String, String, String)> {
     match (was, is) {
         (Value::Object(was), Value::Object(is)) => {
@@ -248,7 +248,7 @@ fn difference(was: &Value, is: &Value) -> Option<(String, String, String)> {
                 Some((name, was, is))
             })
         }
-        // A number may come back from text as another kind of number.
+        // A number may be parsed from text as another kind of number.
         (Value::Number(a), Value::Number(b)) if a.as_f64() == b.as_f64() => None,
         (was, is) if was == is => None,
         (was, is) => Some((String::new(), was.to_string(), is.to_string())),

@@ -1,4 +1,4 @@
-//! Fingerprints of what a run reads, so that it is not resumed with other data.
+//! Fingerprints of the files that a run reads, so that it is not resumed with other data.
 
 use crc32fast::Hasher;
 use qudi_core::natural_order::natural_order;
@@ -10,28 +10,28 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
-/// Files up to this size are read whole.
-const WHOLE: u64 = 64 << 20;
+/// Largest size in bytes of files that are read whole.
+const MAX_WHOLE_BYTES: u64 = 64 << 20;
 
-/// Larger files are sampled in this many blocks, evenly spread, the first and the last included.
-const BLOCKS: u64 = 64;
+/// Number of blocks in which larger files are sampled, evenly spread, with the first and the last.
+const SAMPLED_BLOCKS: u64 = 64;
 
 /// Bytes of a block.
-const BLOCK: u64 = 1 << 16;
+const BLOCK_BYTES: u64 = 1 << 16;
 
-/// Folders are followed this deep, as captures are.
-const DEPTH: usize = 3;
+/// Levels of folders that are read, as for captures.
+const FOLDER_DEPTH: usize = 3;
 
-/// Identifies the content of a file, or of all files of a folder.
+/// The content of a file, or of all files of a folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fingerprint {
     /// Size in bytes.
     pub bytes: u64,
-    /// Time of the last change, in seconds since 1970, if the file system knows it.
+    /// Time of the last change in seconds since 1970, if the file system knows it.
     pub modified: Option<u64>,
     /// CRC-32 of the content, or of blocks spread over it.
     pub crc32: u32,
-    /// Whether the CRC-32 covers the whole content.
+    /// True if the CRC-32 covers the whole content.
     pub whole: bool,
 }
 
@@ -45,7 +45,7 @@ impl Fingerprint {
             qudi_core::regular_file::require_regular(path, "read the input")?;
         }
         let mut files = Vec::new();
-        list(path, DEPTH, &mut files)?;
+        list(path, FOLDER_DEPTH, &mut files)?;
         files.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
         let mut hasher = Hasher::new();
         let mut bytes = 0u64;
@@ -62,10 +62,10 @@ impl Fingerprint {
                 hasher.update(&found.len().to_le_bytes());
             }
         }
-        let whole = bytes <= WHOLE;
-        // Of many large files, so many are sampled that the work stays that of one.
-        let every = if whole { 1 } else { files.len().div_ceil(BLOCKS as usize) };
-        let blocks = (BLOCKS / files.len().max(1) as u64).max(1);
+        let whole = bytes <= MAX_WHOLE_BYTES;
+        // Of many large files, only some are sampled, so that the work stays bounded.
+        let every = if whole { 1 } else { files.len().div_ceil(SAMPLED_BLOCKS as usize) };
+        let blocks = (SAMPLED_BLOCKS / files.len().max(1) as u64).max(1);
         for (file, length) in files.iter().zip(lengths).step_by(every) {
             let hashed = if whole {
                 hash_all(file, &mut hasher)
@@ -77,7 +77,7 @@ impl Fingerprint {
         Ok(Self { bytes, modified, crc32: hasher.finalize(), whole })
     }
 
-    /// Whether `other` is of the same content. Times are compared only where the content was sampled.
+    /// Returns true if `other` has the same content. Times are compared only where the content was sampled.
     pub fn agrees(&self, other: &Self) -> bool {
         let content =
             (self.bytes, self.crc32, self.whole) == (other.bytes, other.crc32, other.whole);
@@ -112,7 +112,7 @@ fn list(path: &Path, depth: usize, files: &mut Vec<PathBuf>) -> Result<()> {
 
 fn hash_all(path: &Path, hasher: &mut Hasher) -> std::io::Result<()> {
     let mut file = File::open(path)?;
-    let mut piece = vec![0; BLOCK as usize];
+    let mut piece = vec![0; BLOCK_BYTES as usize];
     loop {
         let n = file.read(&mut piece)?;
         if n == 0 {
@@ -122,10 +122,10 @@ fn hash_all(path: &Path, hasher: &mut Hasher) -> std::io::Result<()> {
     }
 }
 
-/// Takes in `blocks` blocks of a file of `length` bytes.
+/// Hashes `blocks` blocks of a file of `length` bytes.
 fn hash_some(path: &Path, length: u64, blocks: u64, hasher: &mut Hasher) -> std::io::Result<()> {
     let mut file = File::open(path)?;
-    let last = length.saturating_sub(BLOCK);
+    let last = length.saturating_sub(BLOCK_BYTES);
     for block in 0..blocks {
         let at = if blocks > 1 {
             (u128::from(last) * u128::from(block) / u128::from(blocks - 1)) as u64
@@ -134,7 +134,7 @@ fn hash_some(path: &Path, length: u64, blocks: u64, hasher: &mut Hasher) -> std:
         };
         let mut piece = Vec::new();
         file.seek(SeekFrom::Start(at))?;
-        (&mut file).take(BLOCK).read_to_end(&mut piece)?;
+        (&mut file).take(BLOCK_BYTES).read_to_end(&mut piece)?;
         hasher.update(&piece);
     }
     Ok(())
@@ -155,7 +155,7 @@ impl Inputs {
         Ok(())
     }
 
-    /// Returns the first input that differs from those of an earlier run: its name, and what it was and is.
+    /// Returns the first input that differs from an earlier run: its name, and both fingerprints.
     pub(super) fn difference(&self, earlier: &Self) -> Option<(String, String, String)> {
         let words = |found: Option<&Fingerprint>| {
             found.map_or_else(|| "not noted".to_owned(), ToString::to_string)
@@ -203,7 +203,7 @@ mod tests {
     fn large_files_are_sampled_and_compared_by_time_too() {
         let scratch = tempfile::tempdir().unwrap();
         let path = scratch.path().join("large");
-        File::create(&path).unwrap().set_len(WHOLE + 1).unwrap();
+        File::create(&path).unwrap().set_len(MAX_WHOLE_BYTES + 1).unwrap();
         let found = Fingerprint::of(&path).unwrap();
         assert!(!found.whole && found.agrees(&found));
         let later = Fingerprint { modified: found.modified.map(|t| t + 1), ..found };

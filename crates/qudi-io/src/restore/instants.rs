@@ -1,54 +1,54 @@
-//! Which instants of a capture become pictures.
+//! The instants of a capture that become pictures.
 
 use crate::capture::Capture;
 use qudi_core::windows::Windows;
 use qudi_core::{Error, Result};
 
-/// Sums between pictures from which on a window of its own costs no more than windows that follow each other.
-const APART: u64 = 8;
+/// Sums between pictures from which on separate windows cost no more than consecutive ones.
+const MIN_SEPARATE_SUMS: u64 = 8;
 
 /// The pictures that are made of a capture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Instants {
-    /// The output frame nearest before every so many native frames.
+    /// The output frame nearest before every `every` native frames.
     Frames {
         /// Native frames from one picture to the next, no fewer than are summed.
         every: u64,
         /// Native frames of an output frame.
         sum: u64,
     },
-    /// One for every so many native frames, each in the middle of a window of its own: sums may overlap those
-    /// of other pictures.
+    /// One picture for every `every` native frames, each in the middle of a window of its own: sums may
+    /// overlap with the sums of other pictures.
     Centred {
         /// Native frames from one picture to the next.
         every: u64,
     },
 }
 
-/// In which windows which pictures are made.
+/// The windows and the pictures that are made in them.
 #[derive(Clone, Copy, Debug)]
 pub struct Schedule {
-    /// Windows that follow each other.
+    /// Consecutive windows.
     pub windows: Windows,
     /// The pictures.
     pub instants: Instants,
 }
 
 impl Schedule {
-    /// A picture of every output frame.
+    /// Makes a picture of every output frame.
     pub fn all(windows: Windows) -> Self {
         Self { windows, instants: Instants::Frames { every: 1, sum: 1 } }
     }
 }
 
 impl Instants {
-    /// A picture for every `every` native frames of `capture`.
+    /// Makes a picture for every `every` native frames of `capture`.
     ///
     /// # Errors
     /// [`Error::Request`] if a pipe is asked for windows that overlap, or for more than its frames.
     pub fn every(every: u64, capture: &Capture) -> Result<Self> {
         let sum = u64::from(capture.summed());
-        let close = every >= sum && every / sum < APART;
+        let close = every >= sum && every / sum < MIN_SEPARATE_SUMS;
         if close || every >= sum && capture.length().is_none() {
             return Ok(Self::Frames { every, sum });
         }
@@ -64,13 +64,13 @@ impl Instants {
             ),
             Some(_) if capture.forward_only() => fault(
                 "a picture for every so many frames of a compressed file".to_owned(),
-                format!("use {sum} to {}, or unpack the file", APART * sum - 1),
+                format!("use {sum} to {}, or unpack the file", MIN_SEPARATE_SUMS * sum - 1),
             ),
             Some(_) => Ok(Self::Centred { every }),
         }
     }
 
-    /// The output frame of a picture, where pictures are output frames.
+    /// Returns the output frame of a picture, where pictures are output frames.
     pub(super) fn frame_of(self, picture: u64) -> u64 {
         match self {
             Self::Frames { every, sum } => picture.saturating_mul(every) / sum,
@@ -78,7 +78,7 @@ impl Instants {
         }
     }
 
-    /// Pictures that lie before output frame `frame`, where pictures are output frames.
+    /// Returns the number of pictures before output frame `frame`, where pictures are output frames.
     pub(super) fn pictures_before(self, frame: u64) -> u64 {
         match self {
             Self::Frames { every, sum } => frame.saturating_mul(sum).div_ceil(every),
@@ -86,7 +86,7 @@ impl Instants {
         }
     }
 
-    /// The native frame that the sum of `sum` frames of a picture begins with.
+    /// Returns the native frame with which the sum of `sum` frames of a picture begins.
     pub fn begins_at(self, picture: u64, sum: u64) -> u64 {
         match self {
             Self::Frames { .. } => self.frame_of(picture) * sum,
@@ -94,7 +94,7 @@ impl Instants {
         }
     }
 
-    /// The number of pictures of `capture`; `None` as long as the length of a pipe is unknown.
+    /// Returns the number of pictures of `capture`; `None` while the length of a pipe is unknown.
     pub fn pictures(self, capture: &Capture) -> Option<u64> {
         match self {
             Self::Frames { .. } => capture.length().map(|frames| self.pictures_before(frames)),

@@ -1,11 +1,11 @@
-//! Locks that keep two runs from writing the same frames. The system drops them when a process ends, however
-//! it ends.
+//! Locks that keep two runs from writing the same frames. The system releases them when a process ends, for
+//! whatever reason.
 
 use qudi_core::{Error, Result};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
-/// How much of the work one run does.
+/// The share of the work that a run does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Share {
     /// All frames.
@@ -14,21 +14,21 @@ pub enum Share {
     Part {
         /// Number of the part, from 1.
         number: u64,
-        /// Parts in all.
+        /// Number of parts.
         of: u64,
     },
 }
 
-/// Holds the lock of a folder until it is dropped.
+/// The lock of a folder, held until it is dropped.
 #[derive(Debug)]
 pub(super) struct FolderLock {
     _folder: Option<File>,
-    /// The lock of a part, and its file, which is removed afterwards.
+    /// Lock of a part, and its file, which is removed afterwards.
     part: Option<(File, PathBuf)>,
 }
 
 impl FolderLock {
-    /// Locks the folder at `path`: alone for a whole run, beside other parts for a part.
+    /// Locks the folder at `path`: alone for a whole run, together with other parts for a part.
     ///
     /// # Errors
     /// [`Error::Data`] if another run holds it.
@@ -59,7 +59,7 @@ impl Drop for FolderLock {
     }
 }
 
-/// What stands for the folder: itself where folders can be opened, a hidden file in it elsewhere.
+/// Opens the folder itself where folders can be opened, or else a hidden file in it.
 fn handle(path: &Path) -> Option<File> {
     if cfg!(unix) {
         File::open(path).ok()
@@ -68,7 +68,7 @@ fn handle(path: &Path) -> Option<File> {
     }
 }
 
-/// Refuses a lock that another process holds. Some file systems know no locks: there nothing is refused.
+/// Refuses a lock that another process holds. On file systems without locks nothing is refused.
 fn check(
     held: Option<std::result::Result<(), TryLockError>>,
     path: &Path,

@@ -10,9 +10,9 @@ use std::collections::VecDeque;
 use std::ops::{ControlFlow, Range};
 use std::path::Path;
 
-/// What becomes of restored frames.
+/// A receiver of restored frames.
 pub trait RestoreSink {
-    /// Takes frame `number`, restored, with its counts. Frames come in order.
+    /// Takes frame `number`, restored, with its counts. Frames arrive in order.
     ///
     /// # Errors
     /// The sink's own; the run ends with it.
@@ -47,39 +47,39 @@ fn refuse_not_finite(first: u64, frames: &[Frame], path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Restores the pictures `wanted` of `capture`, those of `schedule`, and hands them to `sink`. What a picture
-/// looks like does not depend on which others are wanted, nor on whether it came from a file or a pipe. Memory
-/// holds two windows at most.
+/// Restores the pictures `numbers` of `capture`, scheduled by `schedule`, and hands them to `sink`. A picture
+/// does not depend on which others are restored, nor on whether it came from a file or a pipe. Memory holds
+/// two windows at most.
 ///
 /// # Errors
-/// [`Error`] if the capture cannot be read or the method or the sink fails;
-/// [`Error::Interrupted`] if `on`, which hears how many wanted pictures are done of how many (if that is
-/// known), says so.
+/// [`Error`] if the capture cannot be read or the method or the sink fails; [`Error::Interrupted`] if `on`
+/// says so, which is called with the number of finished pictures and of all (if known).
 pub fn run(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
     schedule: &Schedule,
-    wanted: Range<u64>,
+    numbers: Range<u64>,
     acquisition: &Acquisition,
     sink: &mut dyn RestoreSink,
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
 ) -> Result<()> {
     match schedule.instants {
         Instants::Frames { .. } => {
-            run_windows(restorer, capture, schedule, wanted, acquisition, sink, on)
+            run_windows(restorer, capture, schedule, numbers, acquisition, sink, on)
         }
         Instants::Centred { every } => {
-            run_centred(restorer, capture, every, wanted, acquisition, sink, on)
+            run_centred(restorer, capture, every, numbers, acquisition, sink, on)
         }
     }
 }
 
-/// Each picture in the middle of a window of its own, or as near to it as the ends of the capture let it be.
+/// Restores each picture in the middle of a window of its own, or as near to it as the ends of the capture
+/// allow.
 fn run_centred(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
     every: u64,
-    wanted: Range<u64>,
+    numbers: Range<u64>,
     acquisition: &Acquisition,
     sink: &mut dyn RestoreSink,
     on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
@@ -87,14 +87,14 @@ fn run_centred(
     let (size, sum) = (capture.size(), u64::from(capture.summed()));
     let sums_there = capture.native_frames() / sum;
     let length = (restorer.window() as u64).min(sums_there);
-    for picture in wanted.clone() {
-        if on(picture - wanted.start, Some(wanted.end - wanted.start)).is_break() {
+    for picture in numbers.clone() {
+        if on(picture - numbers.start, Some(numbers.end - numbers.start)).is_break() {
             return Err(Error::Interrupted);
         }
         let instant = picture * every;
         let after = (capture.native_frames() - instant) / sum;
         let most_before = (instant / sum).min(length - 1);
-        // Sums of the window before the picture's own.
+        // Number of sums of the window before the picture's own.
         let before = (length / 2).max(length.saturating_sub(after)).min(most_before);
         let first = instant - before * sum;
         let length = length.min(before + after);
@@ -114,7 +114,7 @@ fn run_centred(
     Ok(())
 }
 
-/// Windows one after the other: those of their frames that become pictures, blended where windows overlap.
+/// Restores windows one after the other, and blends their pictures where they overlap.
 fn run_windows(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
@@ -132,8 +132,8 @@ fn run_windows(
     let mut fade = CrossFade::default();
     let mut uncertainties = CrossFade::default();
     for number in windows.first_with(first).. {
-        // A pipe tells its length at its end. Where this window and the next one lie is sure as soon as
-        // the next one is whole, or no more frames come.
+        // A pipe tells its length at its end. The place of this window and the next one is certain once the
+        // next one is complete, or no more frames arrive.
         let windows = windows.over(capture.wait_for(windows.nominal_end(number + 1))?);
         if number >= windows.count() || windows.restored(number).start >= end {
             break;
@@ -178,12 +178,12 @@ fn run_windows(
         let until = if last { range.end } else { windows.restored(number + 1).start };
         let until = instants.pictures_before(until);
         while let Some((picture, image)) = fade.pop(until) {
-            let wanted = pictures.contains(&picture);
+            let requested = pictures.contains(&picture);
             let frame = instants.frame_of(picture);
-            if wanted {
+            if requested {
                 sink.frame(picture, &image, &counts[(frame - first_held) as usize])?;
             }
-            if let Some((_, uncertainty)) = uncertainties.pop(until).filter(|_| wanted) {
+            if let Some((_, uncertainty)) = uncertainties.pop(until).filter(|_| requested) {
                 sink.uncertainty(picture, &uncertainty)?;
             }
         }

@@ -1,4 +1,4 @@
-//! One writer for all burst formats, chosen by the name of the output.
+//! The writer of all burst formats, chosen by the name of the output.
 
 mod bits;
 mod png_folder;
@@ -15,14 +15,14 @@ use serde::{Deserialize, Serialize};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// The path of the record of the file at `path`: `NAME.npy.json` beside `NAME.npy`.
+/// Returns the path of the record of the file at `path`: `NAME.npy.json` for `NAME.npy`.
 pub fn beside(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".json");
     name.into()
 }
 
-/// How counts lie on disk.
+/// The format of counts on disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BurstFormat {
@@ -39,8 +39,8 @@ pub enum BurstFormat {
 }
 
 impl BurstFormat {
-    /// The format for an output name: `.npy`, `.tif`, `.tiff`, or a folder. Binary `.npy` bursts
-    /// are packed if `packed`.
+    /// Returns the format for an output name: `.npy`, `.tif`, `.tiff`, or a folder. Binary `.npy` bursts are
+    /// packed if `packed`.
     ///
     /// # Errors
     /// [`Error`] for other extensions.
@@ -58,7 +58,7 @@ impl BurstFormat {
         }
     }
 
-    /// The `.npy` format for counts up to `max_count`.
+    /// Returns the `.npy` format for counts up to `max_count`.
     pub fn npy(max_count: u16, packed: bool) -> Self {
         match max_count {
             1 if packed => Self::NpyPacked,
@@ -67,7 +67,7 @@ impl BurstFormat {
         }
     }
 
-    /// Where the record of a burst at `path` goes: beside a file, inside a folder.
+    /// Returns the path of the record of a burst at `path`: next to a file, inside a folder.
     pub fn record_path(self, path: &Path) -> PathBuf {
         if self == Self::Png {
             return path.join(PngFolder::RECORD);
@@ -75,7 +75,7 @@ impl BurstFormat {
         beside(path)
     }
 
-    /// NumPy type and shape of one frame.
+    /// Returns the NumPy type and the shape of one frame.
     fn item(self, size: Size) -> (&'static str, [usize; 2]) {
         match self {
             Self::NpyPacked => ("|u1", [size.height, size.width.div_ceil(8)]),
@@ -84,7 +84,7 @@ impl BurstFormat {
         }
     }
 
-    /// One frame as bytes of the `.npy` formats.
+    /// Encodes one frame as bytes of the `.npy` formats.
     fn encode(self, size: Size, counts: &[u16]) -> Vec<u8> {
         match self {
             Self::NpyPacked => {
@@ -109,7 +109,7 @@ enum Depth {
 
 enum Target {
     Array(ArrayWriter),
-    /// The stack, and the bits of its counts.
+    /// A stack, and the bits of its counts.
     Tiff(TiffStack, Depth),
     Png(PngFolder),
 }
@@ -173,7 +173,7 @@ impl BurstWriter {
         }
     }
 
-    /// Adds packed frames as they are; `false` if the format is not packed `.npy`.
+    /// Adds packed frames as they are; returns false if the format is not packed `.npy`.
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full.
@@ -188,7 +188,7 @@ impl BurstWriter {
         }
     }
 
-    /// Gives the burst its name, and its record beside or inside it.
+    /// Gives the burst its name, and its record next to it or inside it.
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full.
@@ -208,7 +208,7 @@ impl BurstWriter {
     }
 }
 
-/// Writes the `.npy` header of a burst of known length to a pipe, and gives the encoder of frames.
+/// Writes the `.npy` header of a burst of known length to a pipe, and returns the encoder of frames.
 ///
 /// # Errors
 /// The pipe's own.

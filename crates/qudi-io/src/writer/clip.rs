@@ -11,7 +11,7 @@ use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
 use std::path::Path;
 
-/// A folder of frames and nothing else, which begins with the first.
+/// A folder of frames only, recognised by the first.
 const FRAMES: OwnFolder = OwnFolder { marker: "frame_000000.png", is_own_file: is_frame_name };
 
 /// A clip of images as a TIFF stack.
@@ -41,14 +41,14 @@ pub enum ClipWriter {
     Folder {
         /// The folder.
         folder: PendingFolder,
-        /// Frames so far.
+        /// Number of frames so far.
         frames: u64,
     },
 }
 
 impl ClipWriter {
     /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
-    /// extension. `tiff` says what the samples of a `.tif` are, `fps` how fast `.gif` and `.mp4` play.
+    /// extension. `tiff` gives the samples of a `.tif`, `fps` the rate at which `.gif` and `.mp4` play.
     ///
     /// # Errors
     /// [`Error`] for other extensions, or if the name is taken or the folder cannot be written.

@@ -5,7 +5,7 @@ pub(crate) fn frame_name(number: u64) -> String {
     format!("frame_{number:06}.png")
 }
 
-/// Whether `name` is one that [`frame_name`] returns.
+/// Returns true if `name` is one that [`frame_name`] returns.
 pub(crate) fn is_frame_name(name: &str) -> bool {
     let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".png"));
     number.is_some_and(|n| n.len() >= 6 && n.chars().all(|c| c.is_ascii_digit()))

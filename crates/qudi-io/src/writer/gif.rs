@@ -21,14 +21,15 @@ impl std::fmt::Debug for GifWriter {
     }
 }
 
-/// Shortest time of a frame in hundredths of a second: browsers slow down what is faster.
-const SHORTEST_DELAY: f64 = 2.0;
+/// Least time of a frame in hundredths of a second: browsers slow down faster ones.
+const MIN_DELAY: f64 = 2.0;
 
-/// Longer previews would be larger than the data.
+/// Largest number of frames: longer previews would be larger than the data.
 const MAX_FRAMES: usize = 200;
 
 impl GifWriter {
-    /// Starts a preview of frames whose brightest value is `full_scale`, `fps` of them per second (50 at most).
+    /// Starts a preview of frames whose brightest value is `full_scale`, `fps` of them per second (50 at
+    /// most).
     ///
     /// # Errors
     /// [`Error`] if the name is taken, the folder cannot be written, or frames are too large.
@@ -52,7 +53,7 @@ impl GifWriter {
         let mut encoder =
             gif::Encoder::new(file, width, height, &palette).map_err(|e| fault(path, e))?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| fault(path, e))?;
-        let delay = (100.0 / fps).round().max(SHORTEST_DELAY) as u16;
+        let delay = (100.0 / fps).round().max(MIN_DELAY) as u16;
         let full_scale = f32::from(full_scale);
         Ok(Self { encoder, size: (width, height), full_scale, frames: 0, delay })
     }

@@ -14,7 +14,7 @@ use tempfile::NamedTempFile;
 #[derive(Debug)]
 pub struct Mp4Writer {
     child: Child,
-    /// What ffmpeg says; a file, since a full pipe would stop it.
+    /// Messages of ffmpeg; a file, since a full pipe would stop it.
     words: File,
     unfinished: NamedTempFile,
     path: PathBuf,
@@ -88,7 +88,7 @@ impl Mp4Writer {
         if !status.success() {
             return Err(self.failed());
         }
-        // Whoever took the name since the start keeps it.
+        // A file that took the name since the start is kept.
         refuse_taken(&self.path, self.overwrite)?;
         std::fs::rename(self.unfinished.path(), &self.path)
             .map_err(|e| Error::io("write", &self.path, e))

@@ -20,7 +20,7 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// An empty grid.
+    /// Creates an empty grid.
     pub fn new(cell: Size, rows: usize, columns: usize, lines: usize) -> Self {
         let size = Size {
             height: MARGIN + rows * (cell.height + lines * LABEL_HEIGHT + MARGIN),
@@ -29,12 +29,12 @@ impl Picture {
         Self { canvas: Frame::filled(size, 0.13), cell, lines }
     }
 
-    /// One frame alone, without margin or labels.
+    /// Creates a picture of one frame, without margin or labels.
     pub fn single(frame: &Frame) -> Self {
         Self { canvas: frame.clone(), cell: frame.size, lines: 0 }
     }
 
-    /// Puts a frame with its labels into a cell.
+    /// Places a frame with its labels into a cell.
     pub fn place(&mut self, row: usize, column: usize, labels: &[&str], frame: &Frame) {
         let x = MARGIN + column * (self.cell.width + MARGIN);
         let y = MARGIN + row * (self.cell.height + self.lines * LABEL_HEIGHT + MARGIN);
@@ -49,7 +49,7 @@ impl Picture {
         }
     }
 
-    /// The picture as the bytes of an 8-bit gray PNG.
+    /// Encodes the picture as an 8-bit gray PNG.
     ///
     /// # Errors
     /// [`Error`] if it is too large for a PNG.
@@ -72,7 +72,7 @@ impl Picture {
         )
     }
 
-    /// Writes it as an 8-bit gray PNG.
+    /// Writes the picture as an 8-bit gray PNG.
     ///
     /// # Errors
     /// [`Error`] if the name is taken or the folder cannot be written.

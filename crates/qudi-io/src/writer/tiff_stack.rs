@@ -11,13 +11,13 @@ use std::rc::Rc;
 use tiff::encoder::colortype::{self, ColorType};
 use tiff::encoder::{TiffEncoder, TiffValue};
 
-/// Classic TIFF ends at 4 GiB; larger stacks need BigTIFF.
+/// Largest stack in bytes of a classic TIFF, which ends at 4 GiB; larger stacks need BigTIFF.
 const CLASSIC_LIMIT: u64 = 4_000_000_000;
 
-/// Bytes of a page beside its samples, at most.
-const DIRECTORY: usize = 512;
+/// Largest number of bytes of a page besides its samples.
+const MAX_DIRECTORY_BYTES: usize = 512;
 
-/// The encoder keeps its file for good; sharing it gives it back.
+/// A shared file: the encoder never returns the one that it is given.
 struct Shared(Rc<RefCell<PendingFile>>);
 
 impl Write for Shared {
@@ -39,13 +39,13 @@ impl Seek for Shared {
 /// Samples of a stack of images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TiffSamples {
-    /// 16 bit; 65535 is 1, and what lies outside 0 to 1 is clipped.
+    /// 16 bits; 65535 is 1, and values outside 0 to 1 are clipped.
     U16,
-    /// 32-bit float, values as they are.
+    /// 32-bit float; values as they are.
     F32,
 }
 
-/// A growing stack. Every page goes in with the samples that it is given in.
+/// A growing stack. Every page keeps the samples that it is given in.
 pub(crate) struct TiffStack {
     encoder: TiffEncoder<Shared>,
     file: Rc<RefCell<PendingFile>>,
@@ -77,7 +77,7 @@ impl TiffStack {
     where
         [C::Inner]: TiffValue,
     {
-        self.bytes += (size_of_val(samples) + DIRECTORY) as u64;
+        self.bytes += (size_of_val(samples) + MAX_DIRECTORY_BYTES) as u64;
         if self.bytes > CLASSIC_LIMIT {
             return Err(Error::data(
                 "the stack outgrows the 4 GiB of a TIFF file",

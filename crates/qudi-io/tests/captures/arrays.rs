@@ -41,7 +41,7 @@ fn packing_along_the_height_is_read() {
     assert_eq!(frames[0], [1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0]);
 }
 
-/// Saturated counts of 8 bits, or packed bits that are all one: nobody can tell.
+/// Saturated counts of 8 bits, or packed bits that are all one: both are possible.
 #[test]
 fn bytes_that_are_all_one_are_asked_about() {
     let folder = scratch();

@@ -2,7 +2,7 @@
 
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Light, Size};
-use qudi_io::recognition::{SURE, bit_order_z_score};
+use qudi_io::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_sim::clip::{Input, Sampling};
 
 /// Sums of simulated binary frames of a procedural scene, seen in either order.
@@ -32,7 +32,7 @@ fn sums(scene: &str, seed: u64, ppp: f64, lengths: &[u64]) -> Vec<(u64, Vec<u32>
     found
 }
 
-/// The same bits, unpacked in the other order.
+/// Reverses the order of the bits of every byte.
 fn reversed(sums: &[u32]) -> Vec<u32> {
     sums.chunks(8).flat_map(|eight| eight.iter().rev().copied()).collect()
 }
@@ -49,13 +49,14 @@ fn bit_order_of_16_to_1024_frames_is_right_or_unsure() {
             for (frames, sums) in sums(scene, seed, ppp, &lengths) {
                 let right = bit_order_z_score(&sums, size);
                 let wrong = bit_order_z_score(&reversed(&sums), size);
-                assert!(right > -SURE, "{scene} {ppp} {frames}: {right}");
-                assert!(wrong < SURE, "{scene} {ppp} {frames}: {wrong}");
+                assert!(right > -Z_SCORE_THRESHOLD, "{scene} {ppp} {frames}: {right}");
+                assert!(wrong < Z_SCORE_THRESHOLD, "{scene} {ppp} {frames}: {wrong}");
                 all += 2;
-                sure += usize::from(right > SURE) + usize::from(wrong < -SURE);
+                sure += usize::from(right > Z_SCORE_THRESHOLD)
+                    + usize::from(wrong < -Z_SCORE_THRESHOLD);
                 if frames >= 256 {
                     assert!(
-                        right > SURE && wrong < -SURE,
+                        right > Z_SCORE_THRESHOLD && wrong < -Z_SCORE_THRESHOLD,
                         "{scene} {ppp} {frames}: {right} {wrong}"
                     );
                 }
@@ -75,7 +76,7 @@ fn noise_and_darkness_leave_the_bit_order_open() {
         let sums: Vec<u32> =
             noise[0].iter().enumerate().map(|(i, &c)| u32::from(c) * (i as u32 * 7 % 5)).collect();
         let shuffled: Vec<u32> = (0..64 * 64).map(|i| sums[i * 1531 % 4096]).collect();
-        assert!(bit_order_z_score(&shuffled, size).abs() < SURE);
+        assert!(bit_order_z_score(&shuffled, size).abs() < Z_SCORE_THRESHOLD);
     }
     assert_eq!(bit_order_z_score(&[1, 2, 3], Size { height: 1, width: 3 }), 0.0);
 }

@@ -14,7 +14,7 @@ fn plain_npy() -> Vec<u8> {
     npy("|u1", "False", "(20, 32, 64)", &data)
 }
 
-/// The error of reading all frames of a capture that opens.
+/// Returns the error of reading all frames of a capture that opens.
 fn reading_fails(path: &Path, options: &ReadOptions) -> String {
     let mut capture = open(path, options).unwrap();
     let mut one = vec![0; capture.size().pixels()];
@@ -80,7 +80,7 @@ fn rejects_encrypted_npz_entries() {
     assert!(refusal(open(&path, &plain())).contains("`a` is encrypted"));
 }
 
-/// A TIFF of one uncompressed page of single bits, 16 x 2, with FillOrder 2.
+/// Encodes a TIFF of one uncompressed page of single bits, 16 x 2, with FillOrder 2.
 fn lowest_bit_first() -> Vec<u8> {
     let entries: [(u16, u16, u32); 9] = [
         (256, 3, 16),  // ImageWidth
@@ -132,7 +132,7 @@ fn rejects_counts_beyond_the_depth() {
     assert!(capture.read(1, &mut [0; 64]).is_err(), "sums of such counts as well");
 }
 
-/// A record beside an array, as `convert` writes it.
+/// Creates a record of an array, as `convert` writes it.
 fn record(frames: u64, size: (usize, usize), max_count: u16) -> String {
     let (height, width) = size;
     format!(

@@ -28,12 +28,12 @@ fn with(option: FormatOption, base: &ReadOptions) -> ReadOptions {
     }
 }
 
-/// A capture that another program wrote.
+/// Returns the path of a capture that another program wrote.
 fn golden(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/captures").join(name)
 }
 
-/// A file that is opened as `format`; `None` where one takes more than a few bytes to make.
+/// Writes a file that is opened as `format`; `None` if one takes more than a few bytes.
 fn file(format: &str, folder: &Path) -> Option<PathBuf> {
     let frames = scene(4, 16, 24, 9);
     let counts: Vec<u8> = frames.iter().flatten().map(|&c| c as u8).collect();
@@ -114,7 +114,7 @@ fn base(format: &str) -> ReadOptions {
     ReadOptions { format: Some(format.to_owned()), size, ..plain() }
 }
 
-/// What options make of a capture: all counts of its first frame and what is known, or the refusal.
+/// Reads a capture with options: all counts of its first frame and its description, or the refusal.
 fn outcome(path: &Path, options: &ReadOptions) -> String {
     let read = || -> qudi_core::Result<String> {
         let mut capture = Capture::open(path, options, None)?;

@@ -1,8 +1,9 @@
 //! The sensor's forward model: every estimate is measured again, under light that grows as the estimate gets
 //! certain (docs/network.md, "Sampling").
 
-use crate::conditioning::{CountPlanes, CountResponse, dark_per_frame};
+use crate::counts::{CountPlanes, CountResponse};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
+use crate::sensor::dark_per_frame;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::{Defects, FullWell, Gain, Response, Sensor};
 use qudi_core::{Camera, Frame, Light, Result, Size};

@@ -8,8 +8,8 @@ use burn::tensor::Device;
 use qudi_core::{Error, Result};
 use std::ops::ControlFlow;
 
-/// Draws the bursts of a recipe with `train.crops` that its folder lacks, with the refinement stages of
-/// `network`, on `workers` threads. `on` hears how many there are and how many there will be, and says
+/// Draws the bursts of a recipe with `train.crops` that its folder lacks, aligned by `network`, on `workers`
+/// threads. `on` hears how many there are and how many there will be, and says
 /// whether to go on.
 ///
 /// # Errors
@@ -27,7 +27,7 @@ pub fn draw_bursts<L: Learner>(
         return Err(Error::request("no folder for bursts", "bursts", "name one"));
     };
     let dataset = Dataset::new(&recipe.data, files.pack)?;
-    let stages = network.refinement_stages(recipe, device)?;
-    let bursts = BurstSampler::new(recipe, dataset, stages).with_cache(folder, recipe)?;
+    let aligner = network.aligner(recipe, device)?;
+    let bursts = BurstSampler::new(recipe, dataset, aligner).with_cache(folder, recipe)?;
     bursts.draw_all(workers, on)
 }

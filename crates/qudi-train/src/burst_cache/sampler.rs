@@ -6,9 +6,8 @@ use crate::dataset::Dataset;
 use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Error, Result, Size, USUAL_MEAN_LEVEL};
-use qudi_model::conditioning::{AlignedNeighbours, AlignedPlanes};
-use qudi_model::config::ReferenceKind;
-use qudi_model::refinement::{RefinementStage, align};
+use qudi_model::diffusion::Part;
+use qudi_model::regression::BurstAligner;
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use std::ops::ControlFlow;
@@ -23,11 +22,11 @@ pub struct BurstSampler {
     dataset: Dataset,
     seed: u64,
     crop: usize,
-    neighbours: AlignedNeighbours,
-    reference: ReferenceKind,
+    /// True if samples come with the mean level of their scene.
     mean_level: bool,
     crops: Option<(CropsConfig, Cached)>,
-    stages: Vec<RefinementStage>,
+    /// Aligns the samples of the regression.
+    aligner: Option<BurstAligner>,
     cache: Option<Arc<BurstCache>>,
 }
 
@@ -35,8 +34,8 @@ pub struct BurstSampler {
 type Cached = Arc<Vec<OnceLock<CachedBurst>>>;
 
 impl BurstSampler {
-    /// The sampler of a recipe, with the refinement stages of the network that learns.
-    pub fn new(recipe: &Recipe, dataset: Dataset, stages: Vec<RefinementStage>) -> Self {
+    /// Creates the sampler of a recipe, with what aligns the samples of the network that learns.
+    pub fn new(recipe: &Recipe, dataset: Dataset, aligner: Option<BurstAligner>) -> Self {
         let cells = |crops: CropsConfig| {
             let cached = (0..crops.bursts).map(|_| OnceLock::new()).collect();
             (crops, Arc::new(cached))
@@ -45,11 +44,9 @@ impl BurstSampler {
             dataset,
             seed: recipe.train.seed,
             crop: recipe.data.crop,
-            neighbours: recipe.network.aligned_neighbours(),
-            reference: recipe.network.reference(),
-            mean_level: recipe.network.sees_mean_level(),
+            mean_level: !recipe.train.ablate.removes(Part::MeanLevel),
             crops: recipe.train.crops.map(cells),
-            stages,
+            aligner,
             cache: None,
         }
     }
@@ -59,7 +56,7 @@ impl BurstSampler {
     /// # Errors
     /// [`Error`](qudi_core::Error) if the recipe has no `train.crops`.
     pub fn with_cache(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
-        let cache = Some(Arc::new(BurstCache::new(folder, recipe, &self.stages)?));
+        let cache = Some(Arc::new(BurstCache::new(folder, recipe, self.aligner.as_ref())?));
         Ok(Self { cache, ..self })
     }
 
@@ -69,8 +66,8 @@ impl BurstSampler {
     /// [`Error`](qudi_core::Error) if the data cannot be opened again.
     pub fn try_clone(&self) -> Result<Self> {
         let (dataset, cache) = (self.dataset.try_clone()?, self.cache.clone());
-        let (stages, crops) = (self.stages.clone(), self.crops.clone());
-        Ok(Self { dataset, crops, stages, cache, ..*self })
+        let (aligner, crops) = (self.aligner.clone(), self.crops.clone());
+        Ok(Self { dataset, crops, aligner, cache, ..*self })
     }
 
     /// Sample `number`.
@@ -150,13 +147,10 @@ impl BurstSampler {
         let first = random.random_range(0..=all - frames);
         let view = BurstView { size, frames: &sample.counts };
         let range = first..first + frames;
-        let aligned = match self.reference {
-            ReferenceKind::None => None,
-            ReferenceKind::QbpRefined => {
-                let aligned = align(view, &sample.acquisition, &self.stages)?;
-                Some(AlignedPlanes::new(&aligned, self.neighbours, range.clone()))
-            }
-        };
+        let aligner = self.aligner.as_ref();
+        let planes =
+            aligner.map(|aligner| aligner.planes(view, &sample.acquisition, range.clone()));
+        let aligned = planes.transpose()?;
         sample.truth = sample.truth[range.clone()].to_vec();
         sample.counts = sample.counts[range].to_vec();
         Ok(ConditionedBurst { size, sample, aligned })
@@ -167,17 +161,19 @@ impl BurstSampler {
 mod tests {
     use super::*;
     use qudi_layers::TILE;
+    use qudi_model::regression::Refinement;
 
     fn recipe(crops: &str) -> Recipe {
         let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.crops", crops)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
-        let text = include_str!("../../../../tests/golden/tiny.toml");
-        Recipe::parse(text, "tiny", &changes).unwrap_or_else(|e| panic!("{e}"))
+        let text = include_str!("../../../../tests/golden/regression.toml");
+        Recipe::parse(text, "regression", &changes).unwrap_or_else(|e| panic!("{e}"))
     }
 
     fn of(recipe: &Recipe) -> BurstSampler {
         let dataset = Dataset::new(&recipe.data, None).unwrap_or_else(|e| panic!("{e}"));
-        BurstSampler::new(recipe, dataset, Vec::new())
+        let config = recipe.network.regression().unwrap_or_else(|e| panic!("{e}"));
+        BurstSampler::new(recipe, dataset, Some(BurstAligner::first(config)))
     }
 
     fn bursts(crops: &str) -> BurstSampler {
@@ -223,8 +219,8 @@ mod tests {
         let pixels = whole.size.pixels();
         let first = whole.sample.truth.iter().position(|frame| *frame == cached.sample.truth[0]);
         let first = first.unwrap_or_else(|| panic!("no frame of the whole"));
-        let part = |all: &[f32]| all[first * pixels..][..2 * pixels].to_vec();
-        assert!(whole.aligned.map(|planes| planes.map(part)) == cached.aligned);
+        let part = |all: &Vec<f32>| all[first * pixels..][..2 * pixels].to_vec();
+        assert!(whole.aligned.map(|planes| planes.map(part, part)) == cached.aligned);
     }
 
     #[test]
@@ -290,10 +286,10 @@ mod tests {
                 assert!(error.is_some_and(|e| e.place().is_some()), "{} bytes", broken.len());
             }
             let mut dark = bytes.clone();
-            let label = b"exposure = 0.";
+            let label = b"mean_level = 0.";
             let at = dark.windows(label.len()).position(|part| part == label);
-            let at = at.unwrap_or_else(|| panic!("no exposure in the label"));
-            dark[at..at + label.len()].copy_from_slice(b"exposure =-0.");
+            let at = at.unwrap_or_else(|| panic!("no mean level in the label"));
+            dark[at..at + label.len()].copy_from_slice(b"mean_level =-0.");
             std::fs::write(file.path(), dark).unwrap_or_else(|e| panic!("{e}"));
             let error = (0..6).find_map(|number| cached(&recipe).sample(number).err());
             assert!(error.is_some_and(|e| e.to_string().contains("above 0")));
@@ -301,10 +297,10 @@ mod tests {
         }
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
-        let config = recipe.network.qudi().unwrap_or_else(|e| panic!("{e}"));
-        let network = config.init(1, &device).with_stage_added(0);
-        let stages = RefinementStage::all(&network, config, TILE, &device);
-        let refined = BurstSampler { stages, ..of(&recipe) };
+        let config = recipe.network.regression().unwrap_or_else(|e| panic!("{e}"));
+        let refinement = Refinement::new(&config.init(1, &device), config, TILE, &device);
+        let aligner = Some(BurstAligner::second(config, refinement));
+        let refined = BurstSampler { aligner, ..of(&recipe) };
         let mut refined =
             refined.with_cache(folder.path(), &recipe).unwrap_or_else(|e| panic!("{e}"));
         let error = (0..6).find_map(|number| refined.sample(number).err());

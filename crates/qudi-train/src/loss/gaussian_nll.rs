@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 
-/// The mean negative log-likelihood of errors under a normal law of standard deviation `sigma`, without its
+/// Computes the mean negative log-likelihood of errors under a normal law of standard deviation `sigma`, without its
 /// constant (Kendall and Gal 2017, eq. 5). It is least where `sigma` is the size of the errors.
 ///
 /// # Shapes
@@ -11,18 +11,4 @@ use burn::tensor::Tensor;
 pub fn gaussian_nll(error: Tensor<4>, sigma: Tensor<4>) -> Tensor<1> {
     let square = (error / sigma.clone()).powi_scalar(2);
     (square * 0.5 + sigma.log()).mean()
-}
-
-/// The [`gaussian_nll`] of pre-denoised frames, if the network predicts their uncertainty. No gradient flows
-/// into the frames.
-///
-/// # Shapes
-/// - frames, truth, sigma: `[bursts * frames, 1, height, width]` in [0, 1]
-/// - output: `[1]`
-pub(crate) fn uncertainty_loss(
-    frames: &Tensor<4>,
-    truth: &Tensor<4>,
-    sigma: Option<Tensor<4>>,
-) -> Option<Tensor<1>> {
-    sigma.map(|sigma| gaussian_nll(frames.clone().detach() - truth.clone(), sigma))
 }

@@ -1,14 +1,15 @@
-//! The network of a recipe: the diffusion network, or a learned method of others.
+//! The network of a recipe: regression, diffusion, or a learned method of others.
 
 use qudi_baselines::method::{METHODS, Method, Sizes};
 use qudi_core::{Error, Result};
-use qudi_model::conditioning::AlignedNeighbours;
-use qudi_model::config::{NetworkConfig, PRESETS, Part, ReferenceKind};
-use schemars::JsonSchema;
+use qudi_model::config::{NetworkConfig, PRESETS};
+use qudi_model::diffusion::DiffusionConfig;
+use qudi_model::regression::RegressionConfig;
 use serde::de::Error as _;
+use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// Returns the names of all built-in recipes: first those of the diffusion network, smallest first.
+/// Returns the names of all built-in recipes: first our own, smallest first.
 pub fn recipe_names() -> impl Iterator<Item = &'static str> {
     PRESETS.iter().map(|(name, _)| *name).chain(METHODS.map(Method::name))
 }
@@ -19,12 +20,13 @@ pub(super) fn preset(name: &str) -> Option<&'static str> {
     own.or_else(|| Method::by_name(name).map(Method::recipe))
 }
 
-/// The `[network]` table: sizes of the diffusion network, or, with the key `method`, of a learned baseline.
+/// The `[network]` table: the sizes of a network of ours of this `kind`, or, with the key `method`, of a
+/// learned baseline.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(untagged)]
 #[allow(clippy::large_enum_variant)] // one in a recipe
 pub enum NetworkRecipe {
-    /// The diffusion network.
+    /// A network of ours.
     Qudi(NetworkConfig),
     /// A learned method of others.
     Baseline(Sizes),
@@ -43,55 +45,49 @@ impl<'de> Deserialize<'de> for NetworkRecipe {
 }
 
 impl NetworkRecipe {
-    /// The sizes of the diffusion network.
+    /// Returns the sizes of a regression.
     ///
     /// # Errors
-    /// [`Error`] if the recipe is for a learned baseline.
-    pub fn qudi(&self) -> Result<&NetworkConfig> {
+    /// [`Error`] if the recipe is for another network.
+    pub fn regression(&self) -> Result<&RegressionConfig> {
         match self {
-            Self::Qudi(config) => Ok(config),
-            Self::Baseline(sizes) => {
-                let what = format!("the recipe is for {}", sizes.method().name());
-                Err(Error::request(what, "network.method", "name a recipe without this key"))
-            }
+            Self::Qudi(NetworkConfig::Regression(config)) => Ok(config),
+            _ => Err(self.other("the regression")),
         }
     }
 
-    /// The sizes of a learned baseline.
+    /// Returns the sizes of a diffusion.
     ///
     /// # Errors
-    /// [`Error`] if the recipe is for the diffusion network.
+    /// [`Error`] if the recipe is for another network.
+    pub fn diffusion(&self) -> Result<&DiffusionConfig> {
+        match self {
+            Self::Qudi(NetworkConfig::Diffusion(config)) => Ok(config),
+            _ => Err(self.other("the diffusion")),
+        }
+    }
+
+    /// Returns the sizes of a learned baseline.
+    ///
+    /// # Errors
+    /// [`Error`] if the recipe is for another network.
     pub fn baseline(&self) -> Result<Sizes> {
         match self {
             Self::Baseline(sizes) => Ok(*sizes),
-            Self::Qudi(_) => {
-                let what = "the recipe is for the diffusion network";
-                Err(Error::request(what, "network", "name a recipe with network.method"))
-            }
+            Self::Qudi(_) => Err(self.other("a learned baseline")),
         }
     }
 
-    /// What samples are given besides their counts; of baselines nothing.
-    pub(crate) fn reference(&self) -> ReferenceKind {
+    /// Returns the name of the network.
+    pub(super) fn name(&self) -> String {
         match self {
-            Self::Qudi(config) => config.reference,
-            Self::Baseline(_) => ReferenceKind::None,
+            Self::Qudi(config) => format!("the {}", config.kind()),
+            Self::Baseline(sizes) => sizes.method().name().to_owned(),
         }
     }
 
-    /// The neighbours that are aligned with each frame of samples.
-    pub(crate) fn aligned_neighbours(&self) -> AlignedNeighbours {
-        match self {
-            Self::Qudi(config) => config.pre.aligned_neighbours(),
-            Self::Baseline(_) => AlignedNeighbours::NONE,
-        }
-    }
-
-    /// Whether samples come with the mean level of their scene. Restored images of baselines need it.
-    pub(crate) fn sees_mean_level(&self) -> bool {
-        match self {
-            Self::Qudi(config) => !config.ablates(Part::MeanLevel),
-            Self::Baseline(_) => true,
-        }
+    fn other(&self, expected: &str) -> Error {
+        let what = format!("the recipe is for {}, not for {expected}", self.name());
+        Error::request(what, "network", "name another recipe")
     }
 }

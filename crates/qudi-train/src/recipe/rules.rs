@@ -1,10 +1,13 @@
 //! Rules of recipes.
 
-use super::{NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage};
+use super::{
+    LearningPart, NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage,
+};
 use crate::loss::lpips::PerceptualKind;
 use qudi_baselines::method::Sizes;
 use qudi_core::{Error, Result};
-use qudi_model::config::{NetworkConfig, Part};
+use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::DiffusionConfig;
 
 /// A key, true if it keeps the rule, and the rule.
 type Rule<'a> = (&'a str, bool, &'a str);
@@ -18,7 +21,14 @@ impl Recipe {
         };
         let data = self.data.clone().checked()?;
         match &network {
-            NetworkRecipe::Qudi(config) => self.check_qudi(config)?,
+            NetworkRecipe::Qudi(NetworkConfig::Regression(config)) => {
+                self.check_foreign()?;
+                check(&self.sample_rules(1, config.fold))?;
+                check(&[self.regression_rule()])?;
+            }
+            NetworkRecipe::Qudi(NetworkConfig::Diffusion(config)) => {
+                self.check_diffusion(config)?;
+            }
             NetworkRecipe::Baseline(sizes) => self.check_baseline(*sizes)?,
         }
         check(&self.common_rules())?;
@@ -71,25 +81,37 @@ impl Recipe {
                     })
                     && side <= self.data.crop
                     && train.crops.is_none_or(|crops| (1..=1 << 20).contains(&crops.bursts)),
-                "must be of at least one burst, fit into it, and have 3 frames where more than the pre-denoiser learns",
+                "must be of at least one burst, fit into it, and have 3 frames for the diffusion",
             ),
         ]
     }
 
-    fn check_qudi(&self, network: &NetworkConfig) -> Result<()> {
+    /// The rule of the parts of the regression that learn.
+    fn regression_rule(&self) -> Rule<'static> {
+        let learns = &self.train.learns;
+        let second = [LearningPart::Pre, LearningPart::Uncertainty];
+        let is_second = !learns.is_empty() && learns.iter().all(|part| second.contains(part));
+        (
+            "train.learns",
+            self.trains_refinement() || is_second,
+            "must be [\"refinement\"], or of \"pre\" and \"uncertainty\", which learn from what the refinement restores",
+        )
+    }
+
+    fn check_diffusion(&self, network: &DiffusionConfig) -> Result<()> {
         let train = &self.train;
+        let steps = self.validation.as_ref().map(|validation| validation.steps);
         check(&[
             ("train.loss", train.loss.is_some(), "is missing"),
             ("train.noise_start_fraction", train.noise_start_fraction.is_some(), "is missing"),
-            (
-                "validation.steps",
-                self.validation.as_ref().is_none_or(|validation| validation.steps.is_some()),
-                "is missing",
-            ),
+            ("validation.steps", steps.is_none_or(|steps| steps.is_some()), "is missing"),
+            ("validation.steps", steps != Some(Some(0)), "must be at least 1"),
         ])?;
-        check(&self.sample_rules(if self.learns_frames() { 1 } else { 3 }, network.multiple()))?;
+        check(&self.sample_rules(3, network.multiple()))?;
         let weight = |v: f32| v.is_finite() && v >= 0.0;
         let loss = train.loss();
+        let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
+        let others = [LearningPart::Refinement, LearningPart::Uncertainty];
         check(&[
             (
                 "train.noise_start_fraction",
@@ -101,14 +123,47 @@ impl Recipe {
                 [loss.prediction, loss.flow, loss.pre, loss.perceptual].into_iter().all(weight),
                 "must have weights of 0 or more",
             ),
+            ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
             (
                 "train.loss.term",
                 (loss.term == PerceptualKind::None) == (loss.perceptual == 0.0),
                 "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
             ),
-        ])?;
-        check(&stage::noise_rules(self))?;
-        check(&stage::rules(train, !network.ablates(Part::Flow)))
+            (
+                "train.learns",
+                !others.iter().any(|part| train.learns.contains(part)),
+                "names a part that only the regression has",
+            ),
+            (
+                "train.learns",
+                learns(LearningPart::Pre) || (loss.pre == 0.0 && !train.gradient_checkpointing),
+                "must have pre where train.loss.pre has a weight or train.gradient_checkpointing is true",
+            ),
+            (
+                "train.learns",
+                learns(LearningPart::Flow) || loss.flow == 0.0,
+                "must have flow where train.loss.flow has a weight",
+            ),
+        ])
+    }
+
+    /// Refuses keys of the diffusion for another network.
+    fn check_foreign(&self) -> Result<()> {
+        let TrainConfig { timesteps, noise_start_fraction, ablate, loss, .. } = &self.train;
+        let validation = self.validation.as_ref();
+        let foreign = [
+            ("train.loss", loss.is_some()),
+            ("train.timesteps", !is_default(timesteps)),
+            ("train.ablate", !is_default(ablate)),
+            ("train.noise_start_fraction", noise_start_fraction.is_some()),
+            ("train.gradient_checkpointing", self.train.gradient_checkpointing),
+            ("validation.steps", validation.is_some_and(|v| v.steps.is_some())),
+            ("validation.spacing", validation.is_some_and(|v| !is_default(&v.spacing))),
+        ];
+        let Some((key, _)) = foreign.iter().find(|(_, given)| *given) else { return Ok(()) };
+        let what =
+            format!("{key} is for the diffusion, and the recipe for {}", self.network.name());
+        Err(Error::request(what, *key, "correct the recipe: see docs/training.md"))
     }
 
     fn check_baseline(&self, sizes: Sizes) -> Result<()> {
@@ -123,24 +178,10 @@ impl Recipe {
         if let Some(problem) = sizes.problem_of_bursts(frames) {
             return refused(problem, key);
         }
-        let TrainConfig { learns, timesteps, noise_on, noise_start_fraction, loss, .. } =
-            &self.train;
-        let validation = self.validation.as_ref();
-        let foreign = [
-            ("train.loss", loss.is_some()),
-            ("train.learns", !learns.is_empty()),
-            ("train.timesteps", !is_default(timesteps)),
-            ("train.noise_on", !is_default(noise_on)),
-            ("train.noise_start_fraction", noise_start_fraction.is_some()),
-            ("train.gradient_checkpointing", self.train.gradient_checkpointing),
-            ("validation.steps", validation.is_some_and(|v| v.steps.is_some())),
-            ("validation.spacing", validation.is_some_and(|v| !is_default(&v.spacing))),
-        ];
-        if let Some((key, _)) = foreign.iter().find(|(_, given)| *given) {
-            let method = sizes.method().name();
-            let what =
-                format!("{key} is for the diffusion network; {method} has the loss of its authors");
-            return refused(what, key);
+        self.check_foreign()?;
+        if !self.train.learns.is_empty() {
+            let what = format!("train.learns is not for {}", sizes.method().name());
+            return refused(what, "train.learns");
         }
         check(&self.sample_rules(1, sizes.multiple()))
     }

@@ -1,9 +1,7 @@
 //! Stages of a recipe: trainings one after the other, each from the weights of the one before.
 
+use super::Recipe;
 use super::keys::set;
-use super::{Recipe, TrainConfig, is_default};
-use crate::loss::NoiseOn;
-use crate::loss::lpips::PerceptualKind;
 use qudi_core::{Error, Result};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -20,28 +18,31 @@ pub struct StageConfig {
     pub changes: toml::Table,
 }
 
-/// Parts of the network that can learn without the others.
+/// Parts of a network that can learn without the others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LearningPart {
-    /// The pre-denoiser.
+    /// First pre-denoiser of the regression.
+    Refinement,
+    /// Pre-denoiser; the second one of the regression.
     Pre,
-    /// The head that predicts the uncertainty of its frames.
+    /// Uncertainty head of the regression.
     Uncertainty,
     /// Features of all kinds.
     Features,
-    /// The optical flow.
+    /// Optical flow.
     Flow,
-    /// The temporal fusion.
+    /// Temporal fusion.
     Fusion,
-    /// The U-Net.
+    /// U-Net.
     Unet,
 }
 
 impl LearningPart {
-    /// Whether the parameter of this name belongs to it.
+    /// Returns true if the parameter of this name belongs to it.
     pub fn has(self, parameter: &str) -> bool {
         let modules: &[&str] = match self {
+            Self::Refinement => &["refinement"],
             Self::Pre => &["pre"],
             Self::Uncertainty => &["uncertainty"],
             Self::Features => &["low", "high"],
@@ -78,64 +79,7 @@ impl Recipe {
     }
 }
 
-/// What a training must keep to about the noisy images, and the timesteps of them: as [`rules`].
-pub(super) fn noise_rules(recipe: &Recipe) -> [(&'static str, bool, &'static str); 2] {
-    let train = &recipe.train;
-    let on_truth = train.noise_on == NoiseOn::Truth;
-    let steps = |fits: fn(usize) -> bool| {
-        recipe.validation.as_ref().is_none_or(|validation| validation.steps.is_some_and(fits))
-    };
-    let of_two = is_default(&train.timesteps);
-    [
-        (
-            "train.noise_on",
-            on_truth || (steps(|steps| steps >= 2) && train.loss().prediction > 0.0),
-            "must be \"truth\" unless the prediction has a weight and validation.steps is 2 or more",
-        ),
-        (
-            "train.timesteps",
-            on_truth || !of_two || steps(|steps| steps == 2),
-            "must be \"uniform\" where train.noise_on is \"estimate\" and validation.steps is more than 2",
-        ),
-    ]
-}
-
-/// What a training must keep to about the parts that learn, if the network `has_flow`: key, whether it does, and
-/// what it must do.
-pub(super) fn rules(
-    train: &TrainConfig,
-    has_flow: bool,
-) -> [(&'static str, bool, &'static str); 4] {
-    let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
-    let (loss, checkpointing) = (train.loss(), train.gradient_checkpointing);
-    let alone = loss.prediction == 0.0 && loss.term == PerceptualKind::None;
-    let taught = [LearningPart::Pre, LearningPart::Uncertainty, LearningPart::Flow];
-    let is_taught = |part: &LearningPart| has_flow || *part != LearningPart::Flow;
-    [
-        (
-            "train.learns",
-            !alone || taught.into_iter().filter(is_taught).any(learns),
-            "must name a part that the loss teaches: pre, uncertainty or flow where prediction has no weight",
-        ),
-        (
-            "train.learns",
-            learns(LearningPart::Pre) || (loss.pre == 0.0 && !checkpointing),
-            "must have pre where train.loss.pre has a weight or train.gradient_checkpointing is true",
-        ),
-        (
-            "train.learns",
-            learns(LearningPart::Flow) || loss.flow == 0.0,
-            "must have flow where train.loss.flow has a weight",
-        ),
-        (
-            "train.gradient_checkpointing",
-            !checkpointing || !alone,
-            "must be false where pre-denoiser and flow learn alone: nothing is computed again there",
-        ),
-    ]
-}
-
-/// Whether all names can name folders, each its own.
+/// Returns true if all names can name folders, each its own.
 pub(super) fn have_good_names(stages: &[StageConfig]) -> bool {
     let is_good = |name: &str| {
         let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';

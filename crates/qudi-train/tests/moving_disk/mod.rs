@@ -6,10 +6,11 @@ use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_layers::tensor::to_tensor;
-use qudi_model::conditioning::{AlignedPlanes, Conditioning, CountPlanes, sensor_tensor};
 use qudi_model::config::NetworkConfig;
-use qudi_model::refinement::align;
-use qudi_train::loss::Example;
+use qudi_model::counts::CountPlanes;
+use qudi_model::diffusion::{Conditioning, DiffusionConfig};
+use qudi_model::sensor::sensor_tensor;
+use qudi_train::diffusion::Example;
 
 /// Counts of a disk that moves, their truth and their light.
 pub(crate) struct Burst {
@@ -32,8 +33,12 @@ impl Burst {
     }
 }
 
-pub(crate) fn tiny() -> NetworkConfig {
-    NetworkConfig::parse(include_str!("../../../../tests/golden/tiny.toml"), "tiny").unwrap()
+pub(crate) fn tiny() -> DiffusionConfig {
+    let text = include_str!("../../../../tests/golden/tiny.toml");
+    let NetworkConfig::Diffusion(config) = NetworkConfig::parse(text, "tiny").unwrap() else {
+        panic!("tiny is a diffusion")
+    };
+    config
 }
 
 /// A burst of a scene whose values are these, on the ground's upper border and on the disk.
@@ -52,14 +57,10 @@ pub(crate) fn burst([ground, disk]: [f32; 2], size: Size, frames: usize, device:
         truth.iter().enumerate().map(|(t, f)| camera.expose(t as u64, &[f]).unwrap()).collect();
     let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level).unwrap();
     let view = BurstView { size, frames: &counts };
-    let aligned = align(view, &acquisition, &[]).unwrap();
-    let neighbours = tiny().pre.aligned_neighbours();
-    let aligned = AlignedPlanes::new(&aligned, neighbours, 0..view.frames.len());
     let planes = CountPlanes::new(view, &acquisition);
     let conditioning = Conditioning {
         counts: to_tensor(planes.y, size, device),
         linear_estimate: to_tensor(planes.u, size, device),
-        aligned: Some(aligned.into_tensors(size, device)),
         sensor: sensor_tensor(&acquisition, device),
         frames,
     };

@@ -1,6 +1,8 @@
 //! Options of `qudi bench`.
 
-use crate::args::{Network, Steps, number};
+use crate::args::given::Given;
+use crate::args::{Network, Steps, methods, number};
+use crate::methods::{COMPARED, Method};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
 use std::path::PathBuf;
@@ -11,9 +13,11 @@ use std::path::PathBuf;
 /// results with --json, and compare with them later.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Bench {
+    #[command(flatten)]
+    pub(crate) given: Given,
     /// Methods to measure
-    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
-    pub(crate) method: Vec<String>,
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values = COMPARED, value_parser = methods())]
+    pub(crate) method: Vec<&'static Method>,
     /// Frame size, height first
     #[arg(long, value_name = "HxW", default_value = "256x256")]
     pub(crate) size: Size,

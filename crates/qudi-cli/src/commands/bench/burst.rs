@@ -10,7 +10,7 @@ use qudi_sim::scene::{Procedural, ProceduralScene};
 /// The clip's mean image value, close enough for a benchmark.
 const EXPOSURE: f64 = 0.45;
 
-/// Returns the median of times.
+/// Returns the median.
 pub(super) fn median(mut times: Vec<f64>) -> f64 {
     times.sort_by(f64::total_cmp);
     times[times.len() / 2]

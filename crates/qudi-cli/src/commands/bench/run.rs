@@ -6,7 +6,6 @@ use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
-use crate::methods::method;
 use crate::report::Report;
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
@@ -43,8 +42,8 @@ struct Results {
 }
 
 pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
-    let options = args.network.options(args.steps.steps);
-    options.check_methods(args.method.iter().map(String::as_str))?;
+    let options = args.network.options(args.steps.steps, &args.given);
+    options.check_methods(&args.method)?;
     let old = args.compare.as_deref().map(load).transpose()?;
     if args.rounds == 0 || args.frames == 0 {
         return Err(CliError::new(
@@ -57,9 +56,9 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
     let sensor = acquisition.sensor.clone();
     let mut measured = Vec::new();
     let mut bar = report.bar();
-    for name in &args.method {
+    for method in &args.method {
         let mut capture = Capture::in_memory("bench", args.size, counts.clone(), &sensor)?;
-        let (mut restorer, _) = method(name, &mut capture, &acquisition, &options)?;
+        let (mut restorer, _) = method.restorer(&mut capture, &acquisition, &options)?;
         let burst = BurstView { size: args.size, frames: &counts };
         let peak = PeakMemory::start();
         // The first round warms caches up, and compiles kernels where there are any.
@@ -75,7 +74,7 @@ pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
             times.push(start.elapsed().as_secs_f64());
         }
         measured.push(Measured {
-            method: name.clone(),
+            method: method.name.to_owned(),
             fastest: times.iter().copied().fold(f64::MAX, f64::min),
             seconds: median(times),
             peak_mib: peak.grown_mib(),

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 /// Measure dark rates, hot pixels and read noise from a capture with the shutter closed
 ///
-/// Writes a sensor file and two maps beside it (NAME.dark.npy, NAME.bad.npy), used from then on by
+/// Writes a sensor file and two maps next to it (NAME.dark.npy, NAME.bad.npy), used from then on by
 /// --sensor NAME.toml or --dcr NAME.toml.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Calibrate {

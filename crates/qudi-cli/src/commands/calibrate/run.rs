@@ -114,7 +114,7 @@ pub(crate) fn run(
     })
 }
 
-/// The sensor to start from, and its name for `base` if it is a preset.
+/// Returns the sensor to start from, and its name for `base` if it is a preset.
 fn base_sensor(
     args: &Calibrate,
     settings: &Settings,

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 ///
 /// Pixels stay as they are unless --mask or --dcr ask for repair. With --sum N, N frames are
 /// summed into each output frame. OUT is an .npy file (binary frames are packed as photoncube and
-/// visionsim do), a multi-page .tif, or a folder of PNG (no extension), with a record beside it.
+/// visionsim do), a multi-page .tif, or a folder of PNG (no extension), with a record next to it.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Convert {
     /// The capture: a file or a folder, or - for a pipe of .npy or raw frames

@@ -76,7 +76,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
 }
 
-/// The capture, from a file or a pipe, summed as asked.
+/// Opens the capture, from a file or a pipe, summed as requested.
 fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
     let capture = if is_pipe(&args.capture) {
         refuse_terminal("cat burst.npy | qudi convert - -o out.tif")?;
@@ -90,7 +90,7 @@ fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
     }
 }
 
-/// Frames copied without unpacking them: all, or none.
+/// Copies frames without unpacking them: all, or none.
 fn copy_packed(
     capture: &mut Capture,
     format: BurstFormat,
@@ -98,12 +98,12 @@ fn copy_packed(
     bar: &mut Bar,
 ) -> Result<u64> {
     /// Bytes copied at once.
-    const PIECE: usize = 1 << 20;
+    const PIECE_BYTES: usize = 1 << 20;
     if format != BurstFormat::NpyPacked || capture.length().is_none() {
         return Ok(0);
     }
     let frame_bytes = capture.size().height * capture.size().width.div_ceil(8);
-    let at_once = (PIECE / frame_bytes).max(1) as u64;
+    let at_once = (PIECE_BYTES / frame_bytes).max(1) as u64;
     let mut bytes = Vec::new();
     let mut frame = 0;
     while frame < capture.frames() {
@@ -143,7 +143,7 @@ fn conversion(
     })
 }
 
-/// The largest count that can appear: known, or that of the sample type needed for what is there.
+/// Returns the largest count that can appear: known, or the limit of the sample type that the counts need.
 fn largest_count(capture: &mut Capture, args: &Convert) -> Result<u16> {
     if let Some(max) = capture.max_count() {
         return Ok(max);

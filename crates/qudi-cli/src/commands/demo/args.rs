@@ -1,5 +1,6 @@
 //! Options of `qudi demo`.
 
+use crate::args::given::Given;
 use crate::args::{Network, Steps, number};
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
@@ -7,6 +8,8 @@ use std::path::PathBuf;
 /// See what the camera sees, and what every method makes of it: a built-in scene in one picture and one page
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Demo {
+    #[command(flatten)]
+    pub(crate) given: Given,
     /// Picture to write [default: qudi-demo.png, overwritten]
     #[arg(short, long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) output: Option<PathBuf>,

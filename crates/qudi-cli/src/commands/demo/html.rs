@@ -11,7 +11,7 @@ use serde::Serialize;
 struct Page<'a> {
     title: &'a str,
     frames: usize,
-    /// How many times brighter errors are shown.
+    /// Gain of the errors that are shown.
     error_gain: u32,
     picture: String,
     uncertainty: &'a str,
@@ -20,7 +20,7 @@ struct Page<'a> {
     about: &'a str,
 }
 
-/// The whole page around a PNG.
+/// Renders the page around a PNG.
 pub(crate) fn html(
     png: &[u8],
     shown: &[Shown],

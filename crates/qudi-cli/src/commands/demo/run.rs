@@ -7,7 +7,7 @@ use super::shown::{ERROR_GAIN, FRAMES, Shown};
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::methods::network;
+use crate::methods::network::{self, NetworkChoice};
 use crate::methods::trained::built_in_knows;
 use crate::places::Places;
 use crate::report::{Bar, Cell, Column, Output, Report, Table, json};
@@ -34,9 +34,9 @@ const CENTRE: usize = FRAMES / 2;
 const SIZE: Size = Size { height: 256, width: 256 };
 
 /// Bursts drawn from the result for its uncertainty, where the method does not predict one.
-const REDRAWN: u64 = 4;
+const REDRAWN_BURSTS: u64 = 4;
 
-/// Where the uncertainty comes from: for the console, and for the page.
+/// Origin of the uncertainty: for the console, and for the page.
 type Origin = [&'static str; 2];
 const PREDICTED: Origin = [
     "it predicts, without the truth,",
@@ -56,7 +56,7 @@ pub(crate) fn run(
     let path = demo.output.clone().unwrap_or_else(|| PathBuf::from("qudi-demo.png"));
     let page = path.with_extension("html");
     if page == path {
-        let help = "name a .png; the page lies beside it";
+        let help = "name a .png; the page lies next to it";
         return Err(CliError::new("the picture and the page are one file", path.display(), help));
     }
     Places::default()
@@ -93,10 +93,10 @@ pub(crate) fn run(
             how("a burst merged twice, the second time along better motion"),
         ),
     ];
-    let options = demo.network.options(demo.steps.steps);
+    let options = demo.network.options(demo.steps.steps, &demo.given);
     options.check_weights(&[])?;
     if demo.network.own_weights().is_some() || built_in_knows(&acquisition)? {
-        let (restorer, how) = network::restorer(&options, &acquisition, SIZE)?;
+        let (restorer, how) = network::restorer(NetworkChoice::Best, &options, &acquisition, SIZE)?;
         methods.push(("QUDI", restorer, format!("the network{how}")));
     } else {
         report.remark(
@@ -158,7 +158,7 @@ fn render(bar: &mut Bar) -> Vec<Frame> {
     frames.collect()
 }
 
-/// A turning and panning chart behind two lines of text that pass it in opposite directions.
+/// Makes a turning and panning chart behind two lines of text that pass it in opposite directions.
 fn built_in_scene() -> Scene {
     let scene = |kind, speed| Procedural { kind, size: SIZE, seed: 4, speed }.scene();
     let mut chart = scene(ProceduralScene::Chart, 4.0);
@@ -185,7 +185,7 @@ fn redrawn(
 ) -> Result<Frame> {
     let light = Light { ppp: acquisition.ppp, mean_level: acquisition.mean_level };
     let mut sums = vec![[0.0f32; 2]; SIZE.pixels()];
-    for draw in 1..=REDRAWN {
+    for draw in 1..=REDRAWN_BURSTS {
         let mut camera = Camera::new(&acquisition.sensor, SIZE, light, acquisition.seed)?;
         let mut burst = Vec::with_capacity(FRAMES);
         for (t, frame) in (draw * FRAMES as u64..).zip(result) {
@@ -196,10 +196,10 @@ fn redrawn(
         for (sum, value) in sums.iter_mut().zip(&again[CENTRE].data) {
             *sum = [sum[0] + value, sum[1] + value * value];
         }
-        bar.update("drawing photons again", draw, Some(REDRAWN));
+        bar.update("drawing photons again", draw, Some(REDRAWN_BURSTS));
         stop_if_asked()?;
     }
-    let n = REDRAWN as f32;
+    let n = REDRAWN_BURSTS as f32;
     let sigma = |[sum, squares]: &[f32; 2]| ((squares - sum * sum / n).max(0.0) / (n - 1.0)).sqrt();
     Ok(Frame { size: SIZE, data: sums.iter().map(sigma).collect() })
 }
@@ -245,7 +245,7 @@ fn picture(
     picture
 }
 
-/// What every method reaches on the frame in the centre.
+/// Returns the scores of every method on the frame in the centre.
 fn table(shown: &[Shown]) -> Table {
     let mut table = Table::new(vec![
         Column::new("method", "centre frame"),
@@ -285,7 +285,7 @@ fn rms(frame: &Frame) -> f64 {
     (squares / frame.data.len() as f64).sqrt()
 }
 
-/// At the truth's brightness, which counts do not tell.
+/// Scales a frame to the truth's brightness, which counts do not tell.
 fn aligned(frame: &Frame, truth: &Frame) -> Frame {
     let gain = best_gain(frame, truth) as f32;
     Frame { size: SIZE, data: frame.data.iter().map(|e| (e * gain).clamp(0.0, 1.0)).collect() }

@@ -12,7 +12,7 @@ pub(super) const ERROR_GAIN: f32 = 4.0;
 pub(super) struct Shown {
     pub(super) label: &'static str,
     pub(super) name: &'static str,
-    /// How it makes frames.
+    /// Description of the method.
     pub(super) how: String,
     pub(super) frame: Frame,
     pub(super) psnr_a: f64,

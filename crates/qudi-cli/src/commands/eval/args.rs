@@ -1,7 +1,9 @@
 //! Options of `qudi eval`.
 
+use crate::args::given::{DIFFUSION, Given, OWN};
 use crate::args::reading::words;
-use crate::args::{Network, Reading, Shard, number};
+use crate::args::{Network, Reading, Shard, methods, number};
+use crate::methods::{COMPARED, Method};
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_core::PppDefinition;
 use std::path::PathBuf;
@@ -18,6 +20,8 @@ use std::path::PathBuf;
 /// or invents above.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Eval {
+    #[command(flatten)]
+    pub(crate) given: Given,
     /// A clip, a folder of clips, or a capture
     #[arg(value_hint = ValueHint::AnyPath)]
     pub(crate) data: String,
@@ -25,9 +29,9 @@ pub(crate) struct Eval {
     #[arg(long)]
     pub(crate) capture: bool,
     /// Methods to compare
-    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values_t = ["average".to_owned(), "mle".to_owned()])]
-    pub(crate) method: Vec<String>,
-    /// Compare all methods of the paper's table 1 that need no weights or whose --weights are named, beside its
+    #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values = COMPARED, value_parser = methods())]
+    pub(crate) method: Vec<&'static Method>,
+    /// Compare all methods of the paper's table 1 that need no weights or whose --weights are named, with its
     /// figures
     #[arg(long, conflicts_with_all = ["method", "capture"])]
     pub(crate) table1: bool,
@@ -86,17 +90,16 @@ pub(crate) struct Eval {
     /// (docs/training.md says how to get them)
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, conflicts_with = "capture")]
     pub(crate) backbones: Option<PathBuf>,
-    /// Measure how frames look as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, detail beside
-    /// the truth's, in the flattest and the most textured quarter; under the strict protocol also errors
-    /// beside their predicted uncertainty, and what more --steps add, octave by octave, beside what is missing
+    /// Measure appearance as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, detail over the
+    /// truth's in the flattest and the most textured quarter; under the strict protocol also errors over their
+    /// predicted uncertainty, and what more --steps add over what is missing, octave by octave
     #[arg(long, conflicts_with = "capture")]
     pub(crate) appearance: bool,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere
     #[arg(long, value_name = "DB", allow_negative_numbers = true, value_parser = number::real(-1000.0..=1000.0))]
     pub(crate) min_psnr: Option<f64>,
-    /// Numbers of reverse diffusion steps of the method qudi, each evaluated for itself; 0 is a regression
-    /// [default: what the weights say of themselves]
-    #[arg(long, value_name = "N,...", value_delimiter = ',', help_heading = "Network (method qudi)", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=1000))]
+    /// Numbers of reverse steps of qudi-diffusion, each evaluated for itself [default: as the weights say]
+    #[arg(long, value_name = "N,...", value_delimiter = ',', groups = [OWN, DIFFUSION], help_heading = "Networks (methods qudi, qudi-regression, qudi-diffusion)", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     pub(crate) steps: Vec<usize>,
     #[command(flatten)]
     pub(crate) network: Network,
@@ -115,7 +118,7 @@ pub(crate) enum Protocol {
 }
 
 impl Protocol {
-    /// The name on the command line.
+    /// Returns the name on the command line.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Strict => "strict",

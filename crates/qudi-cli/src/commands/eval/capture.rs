@@ -3,13 +3,13 @@
 use super::clip::stem;
 use super::exposing::{FRAMES, SEED};
 use super::html::Pictures;
+use super::metrics::CHI_SQUARE;
 use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
 use crate::capture::{CaptureAcquisition, LightOverrides, Source, SummedCapture, remarks};
 use crate::error::Result;
 use crate::interrupt;
 use crate::memory::PeakMemory;
-use crate::methods::method;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::Frame;
@@ -26,7 +26,7 @@ use std::time::Instant;
 pub(crate) struct Evaluation {
     pub(crate) rows: Vec<Row>,
     pub(crate) pictures: Vec<Pictures>,
-    /// What the figures are, in a sentence.
+    /// Description of the scores in a sentence.
     pub(crate) about: String,
     pub(crate) settings: Value,
 }
@@ -117,7 +117,8 @@ fn score(
     };
     let peak = PeakMemory::start();
     let start = Instant::now();
-    let (mut restorer, how) = method(&contender.method, capture, acquisition, &contender.network)?;
+    let (mut restorer, how) =
+        contender.method.restorer(capture, acquisition, &contender.network)?;
     let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(
@@ -155,8 +156,8 @@ struct Watch<'a> {
 
 impl RestoreSink for Watch<'_> {
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
-        let chi_square = Some(self.consistency.add(restored, counts, self.acquisition)?);
-        self.frames.push(FrameScore { chi_square, ..FrameScore::default() });
+        let chi_square = self.consistency.add(restored, counts, self.acquisition)?;
+        self.frames.push(FrameScore::of_values(&[(&CHI_SQUARE, chi_square)]));
         if number == self.shown {
             self.picture = Some(restored.clone());
         }

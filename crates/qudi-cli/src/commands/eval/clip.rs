@@ -26,7 +26,7 @@ pub(crate) struct Clip {
 }
 
 impl Clip {
-    /// The clips of `data`: itself, or what lies in the folder.
+    /// Finds the clips of `data`: itself, or the clips in the folder.
     pub(crate) fn find(data: &str) -> Result<Vec<Self>> {
         let path = Path::new(data);
         if !path.is_dir() {
@@ -36,7 +36,7 @@ impl Clip {
             };
             if beside(path).is_file() {
                 return Err(CliError::new(
-                    "a burst of counts (its record lies beside it), and clips are pictures",
+                    "a burst of counts (its record lies next to it), and clips are pictures",
                     data,
                     "measure on it without truth with --capture, or name the clip that it was made of",
                 ));
@@ -61,10 +61,10 @@ impl Clip {
         Ok(named.map(|(name, path)| Self::new(name, path.display().to_string())).collect())
     }
 
-    /// Those of `clips` that have one of these names, in the order of `clips`; all without names.
+    /// Selects the clips that have one of these names, in the order of `clips`; all without names.
     ///
     /// # Errors
-    /// [`CliError`] if a name is that of no clip.
+    /// [`CliError`] if no clip has one of the names.
     pub(crate) fn only(clips: Vec<Self>, names: &[String], data: &str) -> Result<Vec<Self>> {
         if names.is_empty() {
             return Ok(clips);
@@ -78,13 +78,13 @@ impl Clip {
         Ok(clips.into_iter().filter(|clip| names.contains(&clip.name)).collect())
     }
 
-    /// The clips' files and folders; none of a scene.
+    /// Returns the clips' files and folders; none for a scene.
     pub(crate) fn places(data: &str) -> Result<Vec<PathBuf>> {
         let clips = if data.starts_with("scene:") { Vec::new() } else { Self::find(data)? };
         Ok(clips.into_iter().map(|clip| PathBuf::from(clip.place)).collect())
     }
 
-    /// Its name.
+    /// Returns its name.
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
@@ -152,7 +152,7 @@ impl Clip {
     }
 }
 
-/// Name of a clip: a file's without its extension, a folder's as it is, dots and all.
+/// Returns the name of a clip: of a file without its extension, of a folder as it is, dots and all.
 pub(crate) fn stem(path: &Path) -> String {
     if path.is_dir() {
         return full_name(path);
@@ -160,7 +160,7 @@ pub(crate) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Names of clips: of files without the extension, of folders in full, since `run.1` and `run.2` are two
+/// Returns the names of clips: of files without the extension, of folders in full, since `run.1` and `run.2` are two
 /// clips. Files that differ in the extension alone keep it.
 fn clip_names(clips: &[PathBuf]) -> Vec<String> {
     let names: Vec<String> = clips.iter().map(|path| stem(path)).collect();
@@ -175,7 +175,7 @@ fn full_name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// FNV-1a: the seed of a clip must not depend on what else lies beside it.
+/// Computes FNV-1a: the seed of a clip must not depend on other clips in its folder.
 fn name_digest(name: &str) -> u32 {
     name.bytes().fold(0x811c_9dc5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
 }

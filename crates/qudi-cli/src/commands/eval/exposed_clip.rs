@@ -1,21 +1,17 @@
 //! One clip, exposed at one light level, scored for every method.
 
-use super::appearance::Appearance;
 use super::args::External;
 use super::html::Pictures;
+use super::metrics::{Compared, aligned, scaled};
 use super::perceptual::Perceptual;
 use super::plan::{Contender, Plan};
 use super::score::{Added, Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
-use crate::methods::{is_network, method};
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;
-use qudi_core::metrics::{
-    Consistency, OCTAVES, best_gain, calibration, gain_aligned_psnr, gaussian_ssim,
-    octave_energies, psnr, ssim,
-};
+use qudi_core::metrics::{Consistency, OCTAVES, best_gain, octave_energies};
 use qudi_core::npy::read_clip;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::windows::Windows;
@@ -35,7 +31,7 @@ pub(super) enum Motion {
     Estimated(Rc<Vec<Flow>>),
 }
 
-/// Name of a clip at a light level, as in `dog-ppp9_75`: no dot, so that a folder may have it.
+/// Returns the name of a clip at a light level, as in `dog-ppp9_75`: no dot, so that a folder may have it.
 pub(super) fn burst_name(clip: &str, ppp: f64) -> String {
     format!("{clip}-ppp{}", ppp.to_string().replace('.', "_"))
 }
@@ -76,13 +72,13 @@ pub(super) struct ExposedClip {
     pub(super) motion: Motion,
     pub(super) acquisition: Acquisition,
     pub(super) perceptual: Option<Rc<Perceptual>>,
-    /// Whether the looks of frames are measured.
+    /// True if appearance is measured.
     pub(super) appearance: bool,
 }
 
 impl ExposedClip {
-    /// Scores a method, and gives the frames that it made. `fewest` are those of the fewest steps, if there are
-    /// any.
+    /// Scores a method, and returns its frames. `fewest` are the frames of the fewest steps, if there
+    /// are any.
     pub(super) fn score_method(
         &self,
         contender: &Contender,
@@ -94,8 +90,8 @@ impl ExposedClip {
             Capture::in_memory(&self.name, self.size, self.photons.counts.clone(), sensor)?;
         let peak = PeakMemory::start();
         let start = Instant::now();
-        let Contender { method: name, network, .. } = contender;
-        let (mut restorer, how) = method(name, &mut capture, &self.acquisition, network)?;
+        let Contender { method, network, .. } = contender;
+        let (mut restorer, how) = method.restorer(&mut capture, &self.acquisition, network)?;
         let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
         let mut sink = Collected::default();
         let all = 0..capture.frames();
@@ -112,23 +108,15 @@ impl ExposedClip {
             seconds_per_frame: start.elapsed().as_secs_f64() / sink.frames.len() as f64,
             peak_mib: peak.grown_mib(),
         };
-        let mut score = self.score(&sink.frames, Some(cost), how)?;
+        let mut score = self.score(&sink.frames, &sink.sigmas, Some(cost), how)?;
         if self.appearance {
-            let pairs = sink.frames.iter().zip(&self.photons.truth).zip(&sink.sigmas);
-            for (score, ((image, truth), sigma)) in score.frames.iter_mut().zip(pairs) {
-                let gain = best_gain(image, truth);
-                let found = calibration(&scaled(image, gain), &times(sigma, gain), truth);
-                score.error_over_sigma = found.map(|found| found.all);
-                score.error_over_sigma_flat = found.map(|found| found.flat);
-                score.error_over_sigma_textured = found.map(|found| found.textured);
-            }
             score.added = fewest.and_then(|fewest| self.added(&sink.frames, fewest));
         }
         Ok((score, sink.frames))
     }
 
-    /// The protocol of QUIVER's public code, seeded: every window of 11 frames, one frame apart, is
-    /// exposed anew with its own mean at `ppp`, and its middle frame scored.
+    /// Scores a method under the protocol of QUIVER's public code, seeded: every window of 11 frames, one frame
+    /// apart, is exposed anew with its own mean at `ppp`, and its middle frame scored.
     pub(super) fn score_windows(&self, contender: &Contender) -> Result<Score> {
         const WINDOW: usize = 11;
         let truth = &self.photons.truth;
@@ -162,18 +150,18 @@ impl ExposedClip {
             let peak = PeakMemory::start();
             let start = Instant::now();
             let mut capture = Capture::in_memory(&self.name, self.size, counts.clone(), sensor)?;
-            let Contender { method: name, network, .. } = contender;
+            let Contender { method, network, .. } = contender;
             let (mut restorer, chosen) = match loaded.take() {
                 Some(loaded) => loaded,
-                None => method(name, &mut capture, &acquisition, network)?,
+                None => method.restorer(&mut capture, &acquisition, network)?,
             };
             how.clone_from(&chosen);
             let burst = BurstView { size: self.size, frames: &counts };
             let restored = restorer.restore(burst, &acquisition)?.frames.swap_remove(WINDOW / 2);
             seconds += start.elapsed().as_secs_f64();
-            loaded = is_network(name).then_some((restorer, chosen));
+            loaded = method.is_network().then_some((restorer, chosen));
             highest = [highest, peak.grown_mib()].into_iter().flatten().reduce(f64::max);
-            frames.push(self.score_frame(&restored, &scene[WINDOW / 2])?);
+            frames.push(FrameScore::of(&self.compared(&restored, &scene[WINDOW / 2]))?);
             middles.push(restored);
         }
         let middle = windows / 2;
@@ -192,31 +180,16 @@ impl ExposedClip {
         })
     }
 
-    fn score_frame(&self, image: &Frame, truth: &Frame) -> Result<FrameScore> {
-        let small = || {
-            CliError::new(
-                format!("frames of {} are smaller than SSIM's window of 11 x 11", self.size),
-                &self.name,
-                "use larger frames",
-            )
-        };
-        let perceptual = self.perceptual.as_ref();
-        let distances = perceptual.map(|p| p.distances(&aligned(image, truth), truth));
-        let [lpips_alex, lpips_vgg] = distances.transpose()?.unwrap_or_default();
-        let appearance = self.appearance.then(|| Appearance::of(&aligned(image, truth), truth));
-        Ok(FrameScore {
-            psnr_a: Some(gain_aligned_psnr(image, truth)),
-            psnr: Some(psnr(image, truth)),
-            ssim: Some(ssim(image, truth).ok_or_else(small)?),
-            ssim_g: Some(gaussian_ssim(image, truth).ok_or_else(small)?),
-            lpips_alex,
-            lpips_vgg,
-            appearance: appearance.transpose()?,
-            ..FrameScore::default()
-        })
+    /// Compares a restored frame with the truth.
+    fn compared<'a>(&'a self, image: &'a Frame, truth: &'a Frame) -> Compared<'a> {
+        Compared {
+            perceptual: self.perceptual.as_deref(),
+            appearance: self.appearance,
+            ..Compared::new(image, truth, &self.name)
+        }
     }
 
-    /// Frames that another program made of the exported photons.
+    /// Scores frames that another program made of the exported photons.
     pub(super) fn score_external(&self, external: &External) -> Result<Score> {
         let name = burst_name(&self.name, self.ppp);
         let array = external.folder.join(format!("{name}.npy"));
@@ -245,17 +218,25 @@ impl ExposedClip {
                 "restore every frame of the burst that --export-photons wrote",
             ));
         }
-        self.score(&frames, None, " (another program)".to_owned())
+        self.score(&frames, &[], None, " (another program)".to_owned())
     }
 
-    fn score(&self, restored: &[Frame], cost: Option<Cost>, how: String) -> Result<Score> {
+    /// Scores all frames; `sigmas` are their predicted standard deviations, if there are any.
+    fn score(
+        &self,
+        restored: &[Frame],
+        sigmas: &[Frame],
+        cost: Option<Cost>,
+        how: String,
+    ) -> Result<Score> {
         let mut consistency = Consistency::new(self.size, &self.acquisition);
         let mut frames = Vec::with_capacity(restored.len());
-        for ((image, truth), counts) in
-            restored.iter().zip(&self.photons.truth).zip(&self.photons.counts)
-        {
+        let pairs = self.photons.truth.iter().zip(&self.photons.counts);
+        for (t, (image, (truth, counts))) in restored.iter().zip(pairs).enumerate() {
             let chi_square = Some(consistency.add(image, counts, &self.acquisition)?);
-            frames.push(FrameScore { chi_square, ..self.score_frame(image, truth)? });
+            let compared =
+                self.compared(image, truth).with_sigma(sigmas.get(t).filter(|_| self.appearance));
+            frames.push(FrameScore::of(&Compared { chi_square, ..compared })?);
         }
         Ok(Score {
             clip: self.name.clone(),
@@ -280,7 +261,7 @@ impl ExposedClip {
 }
 
 impl ExposedClip {
-    /// What the middle frame looks like, and what was seen of it.
+    /// Returns pictures of the middle frame: truth and counts.
     pub(super) fn pictures(&self) -> Pictures {
         let middle = self.photons.truth.len() / 2;
         let full = f32::from(self.acquisition.sensor.max_count());
@@ -290,7 +271,7 @@ impl ExposedClip {
         Pictures::new(self.name.clone(), self.ppp, counts, Some(truth))
     }
 
-    /// What was added to the frames of the fewest steps, and what those missed.
+    /// Measures what was added to the frames of the fewest steps, and what the latter missed.
     fn added(&self, restored: &[Frame], fewest: &[Frame]) -> Option<Added> {
         let (mut added, mut missed) = ([0.0; OCTAVES], [0.0; OCTAVES]);
         for ((image, base), truth) in restored.iter().zip(fewest).zip(&self.photons.truth) {
@@ -327,7 +308,7 @@ impl ExposedClip {
     }
 }
 
-/// What a method made.
+/// Restored frames.
 #[derive(Default)]
 struct Collected {
     frames: Vec<Frame>,
@@ -345,21 +326,4 @@ impl RestoreSink for Collected {
         self.sigmas.push(uncertainty.clone());
         Ok(())
     }
-}
-
-/// A restored frame after the gain that brings it closest to the truth.
-fn aligned(image: &Frame, truth: &Frame) -> Frame {
-    scaled(image, best_gain(image, truth))
-}
-
-/// A frame times a factor, nothing clipped.
-fn times(image: &Frame, factor: f64) -> Frame {
-    let data = image.data.iter().map(|v| v * factor as f32).collect();
-    Frame { size: image.size, data }
-}
-
-fn scaled(image: &Frame, gain: f64) -> Frame {
-    let mut frame = times(image, gain);
-    frame.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
-    frame
 }

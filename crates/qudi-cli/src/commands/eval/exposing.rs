@@ -10,13 +10,13 @@ use qudi_sim::Simulation;
 use qudi_sim::clip::{Input, Sampling};
 use qudi_sim::scene::StillMotion;
 
-/// Frames of a clip unless said otherwise.
+/// Default number of frames of a clip.
 pub(crate) const FRAMES: u64 = 33;
 
-/// The seed unless said otherwise.
+/// Default seed.
 pub(crate) const SEED: u64 = 1;
 
-/// Everything that decides the photons of a clip but the clip and its light.
+/// Everything that determines the photons of a clip, except the clip and its light.
 pub(crate) struct Exposing {
     pub(crate) sensor: Sensor,
     pub(crate) seed: u64,
@@ -30,7 +30,7 @@ pub(crate) struct Exposing {
 }
 
 impl Exposing {
-    /// What flags and settings say.
+    /// Reads flags and settings.
     pub(crate) fn new(plan: &Plan, settings: &Settings) -> Result<Self> {
         if plan.protocol == Protocol::Quiver {
             let unused = ["simulate.instants", "simulate.exposure"];
@@ -78,7 +78,7 @@ impl Exposing {
         })
     }
 
-    /// The simulation of the clip at `place`.
+    /// Returns the simulation of the clip at `place`.
     pub(crate) fn simulation(&self, place: &str, ppp: f64, seed: u64) -> Result<Simulation> {
         let (motion, size) = (self.motion, self.size);
         Ok(Simulation {

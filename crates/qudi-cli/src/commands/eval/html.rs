@@ -1,6 +1,7 @@
 //! The page of `qudi eval`: table, plot, and pictures side by side.
 
-use super::score::{Figure, Row, Score};
+use super::metrics::{CHI_SQUARE, GMSD, LPIPS_ALEX, LPIPS_VGG, Metric, PSNR_A, SSIM};
+use super::score::{Row, Score};
 use super::table::summary;
 use crate::error::Result;
 use crate::report::Table;
@@ -23,7 +24,7 @@ pub(crate) struct Pictures {
     /// Counts of the middle frame, full scale for 1.
     pub(crate) counts: Frame,
     pub(crate) truth: Option<Frame>,
-    /// What methods made of it, and captions that say how.
+    /// Restored frames by method.
     restored: Vec<(String, Frame)>,
     captions: Vec<String>,
 }
@@ -34,14 +35,14 @@ struct Page<'a> {
     title: &'a str,
     about: &'a str,
     table: TableView,
-    /// How frames look, where that was measured.
+    /// Further tables.
     looks: Vec<Looks>,
     plots: Vec<Drawing>,
     has_truth: bool,
     clips: Vec<Clip>,
 }
 
-/// A table of looks.
+/// A further table.
 #[derive(Serialize)]
 struct Looks {
     title: &'static str,
@@ -61,7 +62,7 @@ struct Clip {
     cropped: bool,
     captions: Vec<String>,
     pictures: Vec<Picture>,
-    /// Which pictures are shown at first.
+    /// Numbers of the pictures that are shown first.
     left: usize,
     right: usize,
 }
@@ -77,13 +78,14 @@ impl Pictures {
         Self { clip, ppp, counts, truth, restored: Vec::new(), captions: Vec::new() }
     }
 
-    /// Adds what a method made of the clip.
+    /// Adds the restored frame of a method.
     pub(crate) fn add(&mut self, method: &str, score: &Score) {
-        let middle = score.frames.get(score.frames.len() / 2).copied().unwrap_or_default();
+        let middle = score.frames.get(score.frames.len() / 2);
+        let value = |metric| middle.and_then(|frame| frame.get(metric));
         let mut caption = format!("{method}{}", score.how);
-        if let (Some(psnr_a), Some(ssim)) = (middle.psnr_a, middle.ssim) {
+        if let (Some(psnr_a), Some(ssim)) = (value(&PSNR_A), value(&SSIM)) {
             let _ = write!(caption, ": PSNR {psnr_a:.2} dB after the best gain, SSIM {ssim:.3}");
-        } else if let Some(chi_square) = middle.chi_square {
+        } else if let Some(chi_square) = value(&CHI_SQUARE) {
             let _ = write!(caption, ": chi-square {chi_square:.3}");
         }
         self.captions.push(caption);
@@ -91,7 +93,7 @@ impl Pictures {
     }
 }
 
-/// The whole page.
+/// Renders the page.
 pub(crate) fn html(
     rows: &[Row],
     further: &[(&'static str, Table)],
@@ -119,11 +121,11 @@ pub(crate) fn html(
     )
 }
 
-/// Gain-aligned PSNR against light.
+/// Plots gain-aligned PSNR against light.
 fn quality(rows: &[Row]) -> Plot {
     let mut curves: Vec<Curve> = Vec::new();
     for row in rows {
-        let Some(psnr_a) = row.over_clips(|f| f.psnr_a) else { continue };
+        let Some(psnr_a) = row.over_clips(&PSNR_A) else { continue };
         let point = Point { x: row.ppp, y: psnr_a.mean, error: psnr_a.ci95.unwrap_or(0.0) };
         match curves.iter_mut().find(|curve| curve.name == row.label()) {
             Some(curve) => curve.points.push(point),
@@ -147,20 +149,17 @@ fn quality(rows: &[Row]) -> Plot {
     }
 }
 
-/// How frames look against how close they are to the truth: the numbers of steps of a method as a curve, one for
-/// every light level (Blau and Michaeli 2018). None where looks were not measured.
+/// Plots perception against distortion (Blau and Michaeli 2018): the numbers of steps of a method as a curve, one
+/// for every light level. None where no metric of perception was measured.
 fn perception(rows: &[Row]) -> Option<Plot> {
-    let measures: [(&'static str, Figure); 3] = [
-        ("LPIPS (VGG)", |f| f.lpips_vgg),
-        ("LPIPS (Alex)", |f| f.lpips_alex),
-        ("GMSD", |f| f.appearance.map(|a| a.gmsd)),
-    ];
+    let metrics: [(&'static str, &Metric); 3] =
+        [("LPIPS (VGG)", &LPIPS_VGG), ("LPIPS (Alex)", &LPIPS_ALEX), ("GMSD", &GMSD)];
     let is_known =
-        |(_, figure): &&(_, Figure)| rows.iter().any(|row| row.over_clips(*figure).is_some());
-    let (label, figure) = *measures.iter().find(is_known)?;
+        |(_, metric): &&(_, &Metric)| rows.iter().any(|row| row.over_clips(metric).is_some());
+    let (label, metric) = *metrics.iter().find(is_known)?;
     let mut curves: Vec<Curve> = Vec::new();
     for row in rows {
-        let (Some(x), Some(y)) = (row.over_clips(|f| f.psnr_a), row.over_clips(figure)) else {
+        let (Some(x), Some(y)) = (row.over_clips(&PSNR_A), row.over_clips(metric)) else {
             continue;
         };
         let point = Point { x: x.mean, y: y.mean, error: 0.0 };
@@ -218,7 +217,7 @@ fn clip(clip: &Pictures) -> Clip {
     }
 }
 
-/// Signed errors around middle gray.
+/// Returns signed errors around middle gray.
 fn error(image: &Frame, truth: &Frame) -> Frame {
     let pairs = image.data.iter().zip(&truth.data);
     let data = pairs.map(|(image, truth)| 0.5 + ERROR_GAIN * 0.5 * (image - truth)).collect();
@@ -232,7 +231,7 @@ mod tests {
     use qudi_core::Size;
 
     fn score(clip: &str, size: Size, how: &str) -> Score {
-        let frame = FrameScore { psnr_a: Some(25.0), ssim: Some(0.9), ..FrameScore::default() };
+        let frame = FrameScore::of_values(&[(&PSNR_A, 25.0), (&SSIM, 0.9)]);
         Score {
             clip: clip.to_owned(),
             frames: vec![frame],

@@ -7,16 +7,10 @@ use qudi_layers::tensor::{read, to_tensor};
 use qudi_train::loss::lpips::{Lpips, PerceptualKind};
 use std::path::Path;
 
-/// The distances that are measured, in the order of [`Distances`].
-const KINDS: [PerceptualKind; 2] = [PerceptualKind::LpipsAlex, PerceptualKind::LpipsVgg];
-
-/// LPIPS with AlexNet and with VGG16; none where its weights are missing.
-pub(super) type Distances = [Option<f64>; 2];
-
 /// LPIPS with the weights that there are.
 #[derive(Debug)]
-pub(super) struct Perceptual {
-    nets: [Option<Lpips>; 2],
+pub(crate) struct Perceptual {
+    nets: Vec<(PerceptualKind, Lpips)>,
     device: Device,
 }
 
@@ -26,13 +20,13 @@ impl Perceptual {
     /// # Errors
     /// [`CliError`] if there are none, or they do not fit.
     pub(super) fn load(folder: &Path, device: Device) -> Result<Self> {
-        let mut nets = [None, None];
-        for (net, kind) in nets.iter_mut().zip(KINDS) {
+        let mut nets = Vec::new();
+        for kind in [PerceptualKind::LpipsAlex, PerceptualKind::LpipsVgg] {
             if Lpips::find(kind, Some(folder)).is_ok() {
-                *net = Lpips::load(kind, Some(folder), &device)?;
+                nets.extend(Lpips::load(kind, Some(folder), &device)?.map(|net| (kind, net)));
             }
         }
-        if nets.iter().all(Option::is_none) {
+        if nets.is_empty() {
             return Err(CliError::new(
                 "there are no weights of LPIPS",
                 folder.display(),
@@ -42,20 +36,21 @@ impl Perceptual {
         Ok(Self { nets, device })
     }
 
-    /// The distances of an image from the truth.
+    /// Computes the distance of an image from the truth; none if the weights of `kind` are missing.
     ///
     /// # Errors
     /// [`CliError`] if the frames are too small, or the device fails.
-    pub(super) fn distances(&self, image: &Frame, truth: &Frame) -> Result<Distances> {
-        let mut distances = [None, None];
-        for (distance, net) in distances.iter_mut().zip(&self.nets) {
-            let Some(net) = net else { continue };
-            let small = |e| CliError::new(e, "--backbones", "use larger frames, or leave it out");
-            net.check(truth.size).map_err(small)?;
-            let tensor = |frame: &Frame| to_tensor(frame.data.clone(), frame.size, &self.device);
-            let values = read(net.distances(tensor(image), tensor(truth)))?;
-            *distance = values.first().map(|&value| f64::from(value));
-        }
-        Ok(distances)
+    pub(super) fn distance(
+        &self,
+        kind: PerceptualKind,
+        image: &Frame,
+        truth: &Frame,
+    ) -> Result<Option<f64>> {
+        let Some((_, net)) = self.nets.iter().find(|(of, _)| *of == kind) else { return Ok(None) };
+        let small = |e| CliError::new(e, "--backbones", "use larger frames, or leave it out");
+        net.check(truth.size).map_err(small)?;
+        let tensor = |frame: &Frame| to_tensor(frame.data.clone(), frame.size, &self.device);
+        let values = read(net.distances(tensor(image), tensor(truth)))?;
+        Ok(values.first().map(|&value| f64::from(value)))
     }
 }

@@ -8,23 +8,25 @@ use crate::args::{Shard, Sum};
 use crate::capture::checked_mean_level;
 use crate::device;
 use crate::error::{CliError, Result};
+use crate::methods::Method;
+use crate::methods::network::OwnNetwork;
 use crate::methods::options::NetworkOptions;
 use crate::methods::trained::provenance;
-use crate::methods::{METHODS, is_method};
 use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_layers::Provenance;
+use qudi_model::config::NetworkKind;
 use std::path::PathBuf;
 use std::rc::Rc;
 
 /// A method and how it is asked.
 #[derive(Clone, Debug)]
 pub(super) struct Contender {
-    pub(super) method: String,
+    pub(super) method: &'static Method,
     /// Its weights, if it is a learned method of others that was trained here.
     pub(super) trained: Option<String>,
-    /// What its weights were trained on, where it is left out of what they do not know.
+    /// Training data of its weights, where it is left out of other light and sensors.
     pub(super) provenance: Option<Provenance>,
     /// Its diffusion steps, where there are several numbers of them to compare.
     pub(super) steps: Option<usize>,
@@ -32,9 +34,9 @@ pub(super) struct Contender {
 }
 
 impl Contender {
-    /// Its row at a light level, without scores.
+    /// Makes its row at a light level, without scores.
     pub(super) fn row(&self, ppp: f64) -> Row {
-        let (method, trained) = (self.method.clone(), self.trained.clone());
+        let (method, trained) = (self.method.name.to_owned(), self.trained.clone());
         Row { trained, steps: self.steps, ..Row::new(method, ppp) }
     }
 }
@@ -45,9 +47,9 @@ pub(super) struct Plan {
     /// The clip, the folder of clips, or the capture.
     pub(super) data: String,
     pub(super) contenders: Vec<Contender>,
-    /// Light levels; none for the usual ones of clips, or that of the capture.
+    /// Light levels; none for the default of clips, or the light of the capture.
     pub(super) ppp: Vec<f64>,
-    /// What they count, for clips.
+    /// Meaning of the light levels of clips.
     pub(super) ppp_def: Option<PppDefinition>,
     pub(super) sensor: Option<String>,
     /// The gain of a capture.
@@ -55,7 +57,7 @@ pub(super) struct Plan {
     /// Frames of each clip, or of the capture, at most.
     pub(super) frames: Option<u64>,
     pub(super) protocol: Protocol,
-    /// The clips of the folder that are wanted, by name; none for all.
+    /// Names of the requested clips; none for all.
     pub(super) clips: Vec<String>,
     pub(super) seed: Option<u64>,
     /// The mean level that methods are given.
@@ -65,15 +67,15 @@ pub(super) struct Plan {
     pub(super) export_photons: Option<PathBuf>,
     pub(super) external: Vec<External>,
     pub(super) shard: Option<Shard>,
-    /// Whether pictures are wanted.
+    /// True if pictures are drawn.
     pub(super) pictures: bool,
     /// LPIPS, if it is measured.
     pub(super) perceptual: Option<Rc<Perceptual>>,
-    /// Whether the looks of frames are measured.
+    /// True if appearance is measured.
     pub(super) appearance: bool,
-    /// How a capture is read.
+    /// Options for reading a capture.
     pub(super) read: ReadOptions,
-    /// How many frames are summed, if that is said.
+    /// Number of frames that are summed, if it is given.
     pub(super) sum: Option<Sum>,
     pub(super) overwrite: Overwrite,
 }
@@ -85,26 +87,17 @@ impl Plan {
     /// [`CliError`] for unknown methods and arguments that do not go together.
     pub(super) fn new(args: &Eval, overwrite: Overwrite) -> Result<Self> {
         checked_mean_level(args.mean_level)?;
-        if let Some(unknown) = args.method.iter().find(|name| !is_method(name)) {
-            return Err(CliError::new(
-                format!("no method named `{unknown}`"),
-                "--method",
-                format!("there are {}", METHODS.join(", ")),
-            ));
-        }
         let mut steps = args.steps.clone();
         steps.sort_unstable();
         steps.dedup();
-        let mut network = args.network.options(steps.first().copied());
+        let mut network = args.network.options(steps.first().copied(), &args.given);
         if args.backbones.is_some() {
             // LPIPS is computed there, too.
             network.device_flag = None;
         }
         let methods = if args.table1 { table1::methods(&network) } else { args.method.clone() };
-        network.check_methods(methods.iter().map(String::as_str))?;
+        network.check_methods(&methods)?;
         let contenders = contenders(&methods, &network, &steps, args.table1)?;
-        let mut own = contenders.iter().filter(|contender| contender.method == "qudi");
-        own.try_for_each(|contender| contender.network.check_steps())?;
         if args.table1 && args.protocol == Protocol::Quiver {
             let help = "leave one of them out";
             let what = "the table compares all methods on the same photons";
@@ -148,7 +141,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Whether light and sensor are those of the paper's table.
+    /// Returns true if light and sensor are as in the paper's table.
     pub(super) fn has_light_of_paper(&self) -> bool {
         let incident = self.ppp_def.is_none_or(|definition| definition == PppDefinition::Incident);
         incident && self.sensor.as_deref().is_none_or(|sensor| sensor == "qudi-paper")
@@ -213,20 +206,22 @@ impl Plan {
     }
 }
 
-/// Every method once, and the network once for every number of steps, fewest first.
+/// Returns every method once, and the diffusion once for every number of steps, fewest first.
 fn contenders(
-    methods: &[String],
+    methods: &[&'static Method],
     network: &NetworkOptions,
     steps: &[usize],
     leaves_out: bool,
 ) -> Result<Vec<Contender>> {
     let mut contenders = Vec::new();
-    for method in methods {
+    for &method in methods {
         let trained = network.trained_here(method)?;
         let provenance = if leaves_out { provenance(method, network)? } else { None };
-        let (method, network) = (method.clone(), network.clone());
+        let own = method.as_own().map(|choice| OwnNetwork::new(network, choice)).transpose()?;
+        let diffuses = own.is_some_and(|own| own.kind() == NetworkKind::Diffusion);
+        let network = network.clone();
         let plain = Contender { method, trained, provenance, steps: None, network };
-        if plain.method == "qudi" && steps.len() > 1 {
+        if diffuses && steps.len() > 1 {
             contenders.extend(steps.iter().map(|&steps| Contender {
                 steps: Some(steps),
                 network: NetworkOptions { steps: Some(steps), ..plain.network.clone() },

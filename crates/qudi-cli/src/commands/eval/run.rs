@@ -6,8 +6,9 @@ use super::clip::Clip;
 use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
 use super::html::{Pictures, html};
+use super::metrics::{METRICS, Metric, PSNR_A, Part};
 use super::plan::Plan;
-use super::score::{Figure, FlowKind, LOOKS, Row, Score};
+use super::score::{FlowKind, Row, Score};
 use super::table::{frames, looks, summary};
 use super::table1;
 use crate::args::Global;
@@ -77,10 +78,8 @@ pub(crate) fn run(
     let shown = further.iter().map(|(title, table)| format!("{title}\n{}\n", table.to_text()));
     let text = format!("{}\n{}{about}\n", table.to_text(), shown.collect::<String>());
     report.result(&text, || document(settings, &rows))?;
-    let psnr_a = |row: &Row| row.over_clips(|f| f.psnr_a).map_or(f64::NAN, |s| s.mean);
-    // What is no number passes no bar.
-    let misses =
-        |row: &Row, bar: f64| row.refused.is_none() && (psnr_a(row).is_nan() || psnr_a(row) < bar);
+    let psnr_a = |row: &Row| row.over_clips(&PSNR_A).map_or(f64::NAN, |s| s.mean);
+    let misses = |row: &Row, bar: f64| row.refused.is_none() && PSNR_A.misses(psnr_a(row), bar);
     match args.min_psnr {
         Some(bar) => match rows.iter().find(|row| misses(row, bar)) {
             Some(row) => Err(CliError::Missed(format!(
@@ -214,13 +213,15 @@ fn score_all(
     Ok(())
 }
 
-/// What is not known is left out.
+/// Makes the JSON document, without unknown values.
 fn document(mut settings: Value, rows: &[Row]) -> Value {
     let row = |row: &Row| {
-        let of = |figure: Figure| {
-            Some(
-                json!({"centre": row.centre(figure)?, "all": row.over_clips(figure)?, "frames": row.over_frames(figure)?}),
-            )
+        let of = |metric: &Metric| {
+            Some(json!({
+                "centre": row.centre(metric)?,
+                "all": row.over_clips(metric)?,
+                "frames": row.over_frames(metric)?,
+            }))
         };
         let figures = json!({
             "method": row.method,
@@ -228,10 +229,6 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
             "steps": row.steps,
             "ppp": row.ppp,
             "refused": row.refused,
-            "psnr_a": of(|f| f.psnr_a),
-            "psnr": of(|f| f.psnr),
-            "ssim": of(|f| f.ssim),
-            "ssim_g": of(|f| f.ssim_g),
             "added_over_missed": row.added(),
             "chi_square": row.mean(|s| s.chi_square),
             "flicker": row.mean(|s| s.flicker),
@@ -241,7 +238,8 @@ fn document(mut settings: Value, rows: &[Row]) -> Value {
             "clips": row.scores,
         });
         let Value::Object(mut figures) = figures else { return figures };
-        figures.extend(LOOKS.iter().map(|look| (look.key.to_owned(), json!(of(look.figure)))));
+        let means = METRICS.iter().filter(|metric| metric.part != Part::Frames);
+        figures.extend(means.map(|metric| (metric.key.to_owned(), json!(of(metric)))));
         figures.retain(|_, figure| !figure.is_null());
         Value::Object(figures)
     };

@@ -1,73 +1,82 @@
 //! The tables of `qudi eval`: figures of methods, and of every frame.
 
-use super::score::{Figure, FlowKind, LOOKS, Named, Row};
+use super::metrics::{CHI_SQUARE, GMSD, METRICS, Metric, Part};
+use super::score::{FlowKind, Row};
 use crate::report::{Cell, Column, Table};
 use qudi_core::metrics::Statistics;
 
-/// One row for every method and light level, without columns in which nothing is known.
+/// Returns one row for every method and light level, without columns in which all cells are unknown.
 pub(crate) fn summary(rows: &[Row]) -> Table {
     let flicker = match rows.first().and_then(Row::flow) {
         Some(FlowKind::Estimated) => "flicker (estimated flow)",
         Some(FlowKind::True) | None => "flicker",
     };
-    let mut table = Table::new(vec![
-        Column::new("method", "method"),
-        Column::new("steps", "steps"),
-        Column::new("ppp", "PPP"),
-        Column::new("psnr_a_centre", "psnr-a centre"),
-        Column::new("psnr_a", "psnr-a all"),
-        Column::new("psnr_a_worst5", "worst 5 %"),
-        Column::new("psnr", "psnr all"),
-        Column::new("ssim", "ssim all"),
-        Column::new("ssim_g", "ssim-g all"),
-        Column::new("lpips_alex", "lpips-alex"),
-        Column::new("lpips_vgg", "lpips-vgg"),
+    let first = [("method", "method"), ("steps", "steps"), ("ppp", "PPP")];
+    let mut columns: Vec<Column> = first.map(|(key, title)| Column::new(key, title)).to_vec();
+    for Metric { key, title, part, .. } in METRICS {
+        match part {
+            Part::Lead => columns.extend([
+                Column::new(format!("{key}_centre"), format!("{title} centre")),
+                Column::new(*key, format!("{title} all")),
+                Column::new(format!("{key}_worst5"), "worst 5 %"),
+            ]),
+            Part::Summary => columns.push(Column::new(*key, format!("{title} all"))),
+            Part::Both => columns.push(Column::new(*key, *title)),
+            Part::Appearance | Part::Frames => {}
+        }
+    }
+    columns.extend([
         Column::new("chi_square", "chi-square"),
         Column::new("flicker", flicker),
         Column::new("seconds_per_frame", "s/frame"),
         Column::new("peak_mib", "peak").with_unit("MiB"),
     ]);
+    let mut table = Table::new(columns);
     table.rows = rows.iter().filter(|row| row.refused.is_none()).map(cells).collect();
     table.without_unknown_columns()
 }
 
-/// Estimated light levels have four significant decimals at most.
+/// Rounds light levels to four decimals: estimated ones are no more exact.
 fn light(row: &Row) -> Cell {
     Cell::Exact((row.ppp * 1e4).round() / 1e4)
 }
 
-/// Diffusion steps, where several numbers of them are compared.
+/// Returns diffusion steps, where several numbers of them are compared.
 pub(super) fn steps(row: &Row) -> Cell {
     row.steps.map_or(Cell::Unknown, |steps| Cell::Exact(steps as f64))
 }
 
 fn cells(row: &Row) -> Vec<Cell> {
-    let mean = |statistics: Option<Statistics>, digits: usize| match statistics {
+    let interval = |statistics: Option<Statistics>, digits: usize| match statistics {
         Some(Statistics { mean: value, ci95: Some(ci95), .. }) => {
             Cell::Mean { value, ci95, digits }
         }
         other => Cell::number(other.map(|statistics| statistics.mean), digits),
     };
-    vec![
-        Cell::text(row.name()),
-        steps(row),
-        light(row),
-        mean(row.centre(|f| f.psnr_a), 2),
-        mean(row.over_clips(|f| f.psnr_a), 2),
-        Cell::number(row.over_frames(|f| f.psnr_a).map(|s| s.worst5), 2),
-        mean(row.over_clips(|f| f.psnr), 2),
-        mean(row.over_clips(|f| f.ssim), 3),
-        mean(row.over_clips(|f| f.ssim_g), 3),
-        Cell::number(row.over_clips(|f| f.lpips_alex).map(|s| s.mean), 3),
-        Cell::number(row.over_clips(|f| f.lpips_vgg).map(|s| s.mean), 3),
-        Cell::number(row.mean(|s| s.chi_square), 3),
+    let mut cells = vec![Cell::text(row.name()), steps(row), light(row)];
+    for metric in METRICS {
+        let (all, digits) = (row.over_clips(metric), metric.digits);
+        match metric.part {
+            Part::Lead => cells.extend([
+                interval(row.centre(metric), digits),
+                interval(all, digits),
+                Cell::number(row.over_frames(metric).map(|s| s.worst5), digits),
+            ]),
+            Part::Summary => cells.push(interval(all, digits)),
+            Part::Both => cells.push(Cell::number(all.map(|s| s.mean), digits)),
+            Part::Appearance | Part::Frames => {}
+        }
+    }
+    cells.extend([
+        Cell::number(row.mean(|s| s.chi_square), CHI_SQUARE.digits),
         Cell::number(row.mean(|s| s.flicker), 3),
         Cell::number(row.mean(|s| s.seconds_per_frame), 4),
         Cell::number(row.peak_mib(), 1),
-    ]
+    ]);
+    cells
 }
 
-/// Tables of looks with their titles, as far as they were measured.
+/// Returns tables of appearance with their titles, as far as they were measured.
 pub(crate) fn looks(rows: &[Row]) -> Vec<(&'static str, Table)> {
     let added_title =
         "What more steps added, over what the fewest missed (rms, by size of structure)";
@@ -75,24 +84,25 @@ pub(crate) fn looks(rows: &[Row]) -> Vec<(&'static str, Table)> {
     tables.into_iter().filter_map(|(title, table)| Some((title, table?))).collect()
 }
 
-/// How frames look, one row for every method and light level; none where it was not measured.
+/// Returns metrics of appearance, one row for every method and light level; none where they were not measured.
 fn appearance(rows: &[Row]) -> Option<Table> {
-    rows.iter().find(|row| row.over_clips(|f| f.appearance.map(|a| a.gmsd)).is_some())?;
+    rows.iter().find(|row| row.over_clips(&GMSD).is_some())?;
+    let shown = || METRICS.iter().filter(|metric| metric.is_appearance());
     let mut columns = ["method", "steps", "PPP"].map(|name| Column::new(name, name)).to_vec();
-    columns.extend(LOOKS.iter().map(|look| Column::new(look.key, look.title)));
+    columns.extend(shown().map(|metric| Column::new(metric.key, metric.title)));
     let mut table = Table::new(columns);
     let cells = |row: &Row| {
         let mean =
-            |look: &Named| Cell::number(row.over_clips(look.figure).map(|s| s.mean), look.digits);
+            |metric: &Metric| Cell::number(row.over_clips(metric).map(|s| s.mean), metric.digits);
         let first = [Cell::text(row.name()), steps(row), light(row)];
-        first.into_iter().chain(LOOKS.iter().map(mean)).collect()
+        first.into_iter().chain(shown().map(mean)).collect()
     };
     table.rows = rows.iter().filter(|row| row.refused.is_none()).map(cells).collect();
     Some(table.without_unknown_columns())
 }
 
-/// What more diffusion steps added to the result of the fewest, over what that one misses: in every octave, the
-/// ratio of root mean squares. None where it was not measured.
+/// Returns what more diffusion steps added to the result of the fewest, over what the latter missed: in every
+/// octave, the ratio of root mean squares. None where it was not measured.
 fn added(rows: &[Row]) -> Option<Table> {
     let octaves = ["2-4 pixels", "4-8", "8-16", "16-32", "coarser"];
     let names = ["method", "steps", "PPP"].into_iter().chain(octaves);
@@ -106,25 +116,18 @@ fn added(rows: &[Row]) -> Option<Table> {
     (!table.rows.is_empty()).then_some(table)
 }
 
-/// One row for every method, light level, clip and frame; steps where they are compared, looks where they were
-/// measured.
+/// Returns one row for every method, light level, clip and frame; with steps where they are compared, and metrics
+/// of appearance where they were measured.
 pub(crate) fn frames(rows: &[Row]) -> Table {
-    let usual: [(&str, Figure, usize); 4] = [
-        ("psnr_a", |f| f.psnr_a, 2),
-        ("psnr", |f| f.psnr, 2),
-        ("ssim", |f| f.ssim, 3),
-        ("ssim_g", |f| f.ssim_g, 3),
-    ];
     let all = || rows.iter().flat_map(|row| &row.scores).flat_map(|score| &score.frames);
-    let is_known = |look: &&Named| all().any(|frame| (look.figure)(frame).is_some());
-    // One digit more than means have.
-    let looks = LOOKS.iter().filter(is_known).map(|look| (look.key, look.figure, look.digits + 1));
-    let chi_square: (&str, Figure, usize) = ("chi_square", |f| f.chi_square, 3);
-    let figures: Vec<_> = usual.into_iter().chain(looks).chain([chi_square]).collect();
+    let is_listed = |metric: &&Metric| {
+        !metric.is_appearance() || all().any(|frame| frame.get(metric).is_some())
+    };
+    let metrics: Vec<&Metric> = METRICS.iter().filter(is_listed).collect();
     let compares = rows.iter().any(|row| row.steps.is_some());
     let first = ["method", "steps", "ppp", "clip", "frame"];
     let first = first.into_iter().filter(|key| compares || *key != "steps");
-    let keys = first.chain(figures.iter().map(|f| f.0));
+    let keys = first.chain(metrics.iter().map(|metric| metric.key));
     let mut table = Table::new(keys.map(|key| Column::new(key, key)).collect());
     for row in rows {
         for score in &row.scores {
@@ -133,10 +136,8 @@ pub(crate) fn frames(rows: &[Row]) -> Table {
                 cells.extend(compares.then(|| steps(row)));
                 let place = [Cell::Exact(row.ppp), Cell::text(&score.clip), Cell::Exact(n as f64)];
                 cells.extend(place);
-                let figures = figures.iter();
-                cells.extend(
-                    figures.map(|(_, figure, digits)| Cell::number(figure(frame), *digits)),
-                );
+                let values = metrics.iter();
+                cells.extend(values.map(|metric| Cell::number(frame.get(metric), metric.digits)));
                 table.rows.push(cells);
             }
         }

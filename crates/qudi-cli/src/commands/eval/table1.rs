@@ -1,12 +1,13 @@
-//! The paper's table 1 beside what was measured here.
+//! The paper's table 1, and the same metrics measured here.
 
-use super::score::{Figure, Row};
+use super::metrics::{LPIPS_ALEX, LPIPS_VGG, Metric, PSNR, PSNR_A, SSIM};
+use super::score::Row;
 use super::table::steps;
+use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
 use crate::report::{Cell, Column, Table};
-use qudi_baselines::import::Method;
 
-/// Light levels of the table, and of clips unless said otherwise.
+/// Light levels of the table, and default of clips.
 pub(super) const LEVELS: [f64; 3] = [3.25, 9.75, 26.0];
 
 /// PSNR in dB and SSIM at the three levels (Quanta Diffusion, table 1).
@@ -24,7 +25,7 @@ const PAPER: [(&str, [[f64; 2]; 3]); 11] = [
     ("qudi", [[28.64, 0.811], [30.52, 0.862], [32.55, 0.888]]),
 ];
 
-/// Why the figures differ.
+/// Reasons why the figures differ.
 pub(super) const REASONS: &str = "The paper's figures are not these ones: it scored 31 clips of \
     I2-2000FPS, plain PSNR and SSIM, where nobody says how brightness was found; psnr is plain here, \
     psnr-a is after the best gain. Here every frame counts, and all methods get the same photons; \
@@ -32,17 +33,16 @@ pub(super) const REASONS: &str = "The paper's figures are not these ones: it sco
     Weights of others were trained for one light level and one gain. qudi here is not the authors' \
     network.";
 
-/// The methods of the table that can run: those without weights, and those whose weights are named.
-pub(super) fn methods(network: &NetworkOptions) -> Vec<String> {
-    let can_run = |name: &str| match Method::by_name(name) {
-        Some(method) => network.weights_of(method).is_ok(),
-        None => true,
+/// Returns the methods of the table that can run: without weights, with built-in or with named ones.
+pub(super) fn methods(network: &NetworkOptions) -> Vec<&'static Method> {
+    let can_run = |method: &&Method| {
+        method.as_learned().is_none_or(|learned| network.weights_of(learned).is_ok())
     };
-    let names = PAPER.iter().map(|(name, _)| *name).filter(|name| can_run(name));
-    names.map(str::to_owned).collect()
+    PAPER.iter().filter_map(|(name, _)| Method::by_name(name)).filter(can_run).collect()
 }
 
-/// The table; methods without weights for this light and sensor say so. The paper's figures stand there if the light is the paper's.
+/// Makes the table, with the paper's figures if the light is the paper's. Methods without weights for this light and
+/// sensor say so.
 pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
     let mut table = Table::new(vec![
         Column::new("method", "method"),
@@ -71,8 +71,9 @@ pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
                 mine.push(None);
             }
             for row in mine {
-                let mean = |figure: Figure, digits: usize| {
-                    Cell::number(row.and_then(|row| row.over_clips(figure)).map(|s| s.mean), digits)
+                let mean = |metric: &Metric| {
+                    let mean = row.and_then(|row| row.over_clips(metric)).map(|s| s.mean);
+                    Cell::number(mean, metric.digits)
                 };
                 let note = match row {
                     Some(Row { refused: Some(reason), .. }) => Cell::text(reason.clone()),
@@ -88,15 +89,25 @@ pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
                     Cell::Exact(ppp),
                     of_paper(0, 2),
                     of_paper(1, 3),
-                    mean(|f| f.psnr, 2),
-                    mean(|f| f.psnr_a, 2),
-                    mean(|f| f.ssim, 3),
-                    mean(|f| f.lpips_alex, 3),
-                    mean(|f| f.lpips_vgg, 3),
+                    mean(&PSNR),
+                    mean(&PSNR_A),
+                    mean(&SSIM),
+                    mean(&LPIPS_ALEX),
+                    mean(&LPIPS_VGG),
                     note,
                 ]);
             }
         }
     }
     table.without_unknown_columns()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_methods_of_the_paper_are_here() {
+        assert!(PAPER.iter().all(|(name, _)| Method::by_name(name).is_some()));
+    }
 }

@@ -9,8 +9,8 @@ use std::path::PathBuf;
 #[group(skip)]
 #[command(group(ArgGroup::new("what").required(true)))]
 pub(crate) struct Info {
-    /// A capture (file or folder), a burst or its record, weights (.safetensors, .pth, or `weights` for those
-    /// that come along), a sensor's name or .toml file
+    /// A capture (file or folder), a burst or its record, weights (.safetensors, .pth, or `weights` for the
+    /// built-in ones), a sensor's name or .toml file
     #[arg(group = "what", value_hint = ValueHint::AnyPath)]
     pub(crate) subject: Option<String>,
     /// List the built-in sensors

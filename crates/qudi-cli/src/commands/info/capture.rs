@@ -26,7 +26,7 @@ const BAR: usize = 40;
 /// Counts shown in the histogram; more are grouped.
 const BINS: usize = 8;
 
-/// `record` is the record beside it, and where that lies.
+/// Describes a capture; `record` is its record, with its path.
 pub(crate) fn run(
     path: &Path,
     record: Option<&(Sidecar, PathBuf)>,

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::Path;
 
-/// The record as a JSON document.
+/// Returns the record as a JSON document.
 pub(crate) fn record_document(record: &Sidecar) -> Value {
     match record {
         Sidecar::Simulated(record) => json!(record),
@@ -13,7 +13,7 @@ pub(crate) fn record_document(record: &Sidecar) -> Value {
     }
 }
 
-/// Where a burst comes from, and how to make it again.
+/// Describes where a burst comes from, and how to make it again.
 pub(crate) fn origin(record: &Sidecar, path: &Path) -> String {
     let mut text = String::new();
     let mut line = |key: &str, value: String| {

@@ -5,16 +5,17 @@ use super::capture;
 use super::record::{origin, record_document};
 use crate::args::Global;
 use crate::error::{CliError, Result};
+use crate::methods::learned_names;
 use crate::report::Report;
 use crate::settings::Settings;
 use crate::weights::Weights;
 use burn::tensor::Device;
-use qudi_baselines::import::{Contents, METHODS, Method, describe};
+use qudi_baselines::import::{Contents, describe};
 use qudi_core::sensor::{PRESETS, Response, Sensor, preset};
 use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
 use qudi_layers::Provenance;
-use qudi_model::checkpoint::ModelKind;
+use qudi_model::config::NetworkKind;
 use serde_json::json;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -53,7 +54,7 @@ pub(crate) fn run(
                 None => Err(CliError::new(
                     "weights of no network that is known here",
                     path.display(),
-                    format!("known are {}", METHODS.map(Method::name).join(", ")),
+                    format!("known are {}", learned_names().join(", ")),
                 )),
             }
         }
@@ -71,7 +72,7 @@ pub(crate) fn run(
         _ if preset(subject).is_some() => sensor(subject, settings, report),
         _ if subject == "weights" => {
             settings.refuse(&["sensor."], "for weights")?;
-            weights(&Weights::BuiltIn, report)
+            weights(&Weights::BuiltIn(NetworkKind::Regression), report)
         }
         _ => Err(CliError::new(
             format!("there is no file and no sensor named `{subject}`"),
@@ -109,26 +110,24 @@ fn sensors(report: &Report) -> Result<()> {
     report.result(&text, || json!(sensors))
 }
 
-/// A weight file, as it describes itself.
+/// Describes weights.
 fn weights(weights: &Weights, report: &Report) -> Result<()> {
     let d = weights.describe()?;
     let sizes = d.network.parameters(&Device::flex());
-    let kind = match d.kind {
-        Some(ModelKind::Regression) => "regression",
-        _ => "diffusion, or regression with --steps 0",
-    };
+    let kind = d.network.kind();
+    let steps = d.sampling.map_or(String::new(), |s| format!("; {} steps by default", s.steps));
     let preset = d.preset.as_deref().unwrap_or("own sizes");
     let mut lines = vec![
         ("network", format!("{preset}, {sizes} parameters")),
         ("window", format!("{} frames", d.window)),
-        ("restores by", format!("{kind}; {} steps by default", d.reverse_steps())),
+        ("restores by", format!("{kind}{steps}")),
     ];
     lines.extend(provenance(&d.provenance));
     lines.push(("sha-256", weights.sha256()?));
     report.result(&to_text(&lines), || json!(weights.describe().ok()))
 }
 
-/// What weights were trained on.
+/// Returns lines about the training of weights.
 fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
     let commit = p.commit.as_ref().map_or(String::new(), |c| format!(", commit {c}"));
     let [least, most] = p.ppp;
@@ -141,7 +140,7 @@ fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
     ]
 }
 
-/// Lines of keys and values.
+/// Formats lines of keys and values.
 fn to_text(lines: &[(&str, String)]) -> String {
     let mut text = String::new();
     for (key, value) in lines {
@@ -150,7 +149,7 @@ fn to_text(lines: &[(&str, String)]) -> String {
     text
 }
 
-/// A weight file of a learned method of others.
+/// Describes weights of a learned method of others.
 fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
     let Contents { method, sizes, parameters, description } = contents;
     let sha256 = Weights::File(path.to_owned()).sha256()?;
@@ -187,7 +186,7 @@ fn sensor(name: &str, settings: &Settings, report: &Report) -> Result<()> {
     report.result(&text, || json!(sensor))
 }
 
-/// A record, without its burst.
+/// Describes a record without its burst.
 fn burst(path: &Path, report: &Report) -> Result<()> {
     let record = Sidecar::load(path)?;
     let burst = match &record {
@@ -204,7 +203,7 @@ fn burst(path: &Path, report: &Report) -> Result<()> {
     report.result(&(text + &origin(&record, path)), || record_document(&record))
 }
 
-/// The formats that captures are read from.
+/// Lists the formats that captures are read from.
 fn formats(report: &Report) -> Result<()> {
     let width = FORMATS.iter().map(|format| format.name.len()).max().unwrap_or(0) + 2;
     let lines: Vec<String> =

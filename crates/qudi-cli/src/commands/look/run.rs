@@ -1,13 +1,14 @@
-//! `qudi look`: a capture at a glance.
+//! `qudi look`: an overview of a capture.
 
 use super::args::Look;
+use crate::args::given::Given;
 use crate::args::{Global, Network};
 use crate::capture::{
     CaptureAcquisition, LightOverrides, Source, SummedCapture, unknown_sensor, warnings,
 };
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
-use crate::methods::usual_method;
+use crate::methods::default::default_method;
 use crate::places::Places;
 use crate::report::html::{data_url, render};
 use crate::report::{Output, Report, duration};
@@ -27,8 +28,10 @@ use std::time::Instant;
 /// Sums of the window that one instant is restored from.
 const WINDOW: u64 = 11;
 
-/// Seconds per picture of each method, in units of aligning and merging one instant: rough, for a forecast.
-const COSTS: [(&str, f64); 3] = [("qudi", 6.0), ("qbp-refined", 2.0), ("mle", 0.1)];
+/// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
+///
+/// [`Method::cost`]: crate::methods::Method::cost
+const INSTANT_COST: f64 = 0.065;
 
 pub(crate) fn run(
     args: &Look,
@@ -127,13 +130,13 @@ pub(crate) fn run(
     })
 }
 
-/// `NAME-look.html` in the current folder.
+/// Returns `NAME-look.html`, in the current folder.
 fn default_output(capture: &Path) -> PathBuf {
     let stem = capture.file_stem().unwrap_or(capture.as_os_str()).to_string_lossy().into_owned();
     PathBuf::from(format!("{stem}-look.html"))
 }
 
-/// For binary frames of an unknown camera, a sensor that detects every photon.
+/// Returns a sensor that detects every photon, for binary frames of an unknown camera.
 fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     if !capture.info().binary {
         return Err(unknown_sensor(capture));
@@ -143,7 +146,7 @@ fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     Ok(ideal)
 }
 
-/// The middle of the capture, sums aligned and merged.
+/// Aligns and merges sums around the middle of the capture.
 fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<Frame> {
     let length = capture.frames().min(WINDOW);
     let first = if capture.forward_only() { 0 } else { (capture.frames() - length) / 2 };
@@ -157,24 +160,24 @@ fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<F
     Ok(qbp.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
 }
 
-/// What `qudi restore` would do, and about how long that takes.
+/// Describes what `qudi restore` would do, and about how long that takes.
 fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(String, Value)> {
-    let usual = usual_method(&Network::default().options(None), capture, acquisition)?;
-    let cost = COSTS.iter().find(|(name, _)| *name == usual.name).map_or(2.0, |(_, cost)| *cost);
+    let usual =
+        default_method(&Network::default().options(None, &Given::default()), capture, acquisition)?;
     let pictures = capture.frames();
-    let total = seconds * cost * pictures as f64;
+    let total = seconds * usual.method.cost / INSTANT_COST * pictures as f64;
     let time = duration(total);
     let reason = usual.reason.map_or(String::new(), |reason| format!(" ({reason})"));
     let sensor = &acquisition.sensor.name;
     let words = format!(
         "`qudi restore` makes {pictures} pictures by {}{reason}, sensor {sensor}, in about {time}; --every N makes fewer",
-        usual.name
+        usual.method.name
     );
-    let document = json!({"method": usual.name, "pictures": pictures, "seconds": total});
+    let document = json!({"method": usual.method.name, "pictures": pictures, "seconds": total});
     Ok((words, document))
 }
 
-/// A frame with the tone curve of screens.
+/// Applies the tone curve of screens.
 fn for_the_eye(mut frame: Frame) -> Frame {
     for value in &mut frame.data {
         *value = linear_to_srgb(*value);

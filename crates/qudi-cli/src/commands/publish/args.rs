@@ -3,7 +3,7 @@
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
-/// Write weights in half precision, half the size, with their SHA-256 beside them
+/// Write weights in half precision, half the size, with their SHA-256 next to them
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Publish {
     /// Weights that `qudi train` wrote
@@ -12,7 +12,7 @@ pub(crate) struct Publish {
     /// Where they go: .safetensors
     #[arg(short, long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) output: PathBuf,
-    /// Reverse steps that restoring takes by default; 0 restores by regression [default: those of the weights]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(..=1000))]
+    /// Reverse steps that a diffusion takes by default [default: as the weights say]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1000))]
     pub(crate) steps: Option<u16>,
 }

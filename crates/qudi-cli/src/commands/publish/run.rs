@@ -11,6 +11,9 @@ use qudi_baselines::import::describe;
 use qudi_core::Error;
 use qudi_core::atomic_file::PendingFile;
 use qudi_model::checkpoint::{Precision, save};
+use qudi_model::config::NetworkKind;
+use qudi_model::diffusion::Diffusion;
+use qudi_model::regression::Regression;
 use serde_json::json;
 
 pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()> {
@@ -35,11 +38,28 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
             "publish them as they are: --weights METHOD=FILE reads them",
         ));
     }
-    let (network, mut description) = Weights::File(args.weights.clone()).load(&device)?;
-    // Said from now on, whatever later versions take for granted.
-    let steps = args.steps.map_or_else(|| description.reverse_steps(), usize::from);
-    description.default_steps = Some(steps);
-    save(&network, &description, Precision::Half, path, overwrite)?;
+    let weights = Weights::File(args.weights.clone());
+    let mut description = weights.describe()?;
+    let parameters = description.network.parameters(&device);
+    match (description.network.kind(), args.steps) {
+        (NetworkKind::Regression, Some(_)) => {
+            return Err(CliError::new(
+                "a regression has no reverse steps",
+                "--steps",
+                "leave it out, or publish weights of a diffusion",
+            ));
+        }
+        (NetworkKind::Regression, None) => {
+            let (network, _) = weights.load::<Regression>(&device)?;
+            save(&network, &description, Precision::Half, path, overwrite)?;
+        }
+        (NetworkKind::Diffusion, steps) => {
+            let (network, _) = weights.load::<Diffusion>(&device)?;
+            let sampling = description.sampling.get_or_insert_default();
+            sampling.steps = steps.map_or(sampling.steps, usize::from);
+            save(&network, &description, Precision::Half, path, overwrite)?;
+        }
+    }
     let bytes = std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;
     let hash = sha256(&bytes);
     PendingFile::write_whole(
@@ -47,7 +67,6 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
         format!("{hash}\n").as_bytes(),
         overwrite,
     )?;
-    let parameters = description.network.parameters(&device);
     let text = format!(
         "{}   {parameters} parameters in {} bytes\n  sha-256   {hash}\n",
         path.display(),

@@ -1,6 +1,8 @@
 //! Options of `qudi restore`.
 
-use crate::args::{Network, Reading, Shard, Steps, number};
+use crate::args::given::{DIFFUSION, Given};
+use crate::args::{Network, Reading, Shard, Steps, methods, number};
+use crate::methods::Method;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use std::path::PathBuf;
 
@@ -20,6 +22,8 @@ pub(crate) enum Tonemap {
 /// output. White is 1 = full scale; the scene's mean lands at --exposure.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Restore {
+    #[command(flatten)]
+    pub(crate) given: Given,
     /// The capture: a file or a folder in any format, or - for a pipe of .npy or raw frames (--format raw-u8
     /// --size HxW)
     #[arg(value_hint = ValueHint::AnyPath)]
@@ -27,12 +31,10 @@ pub(crate) struct Restore {
     /// Where the frames go
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
-    /// How: average (11 frames), mle (response inverted, dark counts subtracted, length chosen),
-    /// transform-denoise, bm3d, qbp, qbp-bm3d, qbp-refined (in two passes), or qudi (the network) [default:
-    /// qudi; qbp-refined for sensors and light that the built-in weights do not know, and mle where the dark
-    /// rate is unknown, too]
-    #[arg(long, value_name = "NAME")]
-    pub(crate) method: Option<String>,
+    /// How frames are restored [default: qudi; qbp-refined for sensors and light that the built-in weights do
+    /// not know, and mle where the dark rate is unknown, too]
+    #[arg(long, value_name = "NAME", value_parser = methods())]
+    pub(crate) method: Option<&'static Method>,
     /// Sensor that took it: a name or a .toml file [default: known from record or format]
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) sensor: Option<String>,
@@ -47,7 +49,7 @@ pub(crate) struct Restore {
     #[arg(long = "exposure", value_name = "VALUE", allow_negative_numbers = true, value_parser = number::real(number::EXPOSURE))]
     pub(crate) mean_level: Option<f64>,
     /// Seed of the diffusion [default: 0]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
+    #[arg(long, value_name = "N", group = DIFFUSION, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=u64::MAX))]
     pub(crate) seed: Option<u64>,
     /// Frames that neighbouring windows share, blended
     #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = number::whole::<u64>(0..=1000))]
@@ -62,7 +64,7 @@ pub(crate) struct Restore {
     pub(crate) tonemap: Tonemap,
     /// Frames per second of what plays (.gif, .mp4, Y4M) [default: 25; the capture's own rate is in the
     /// manifest]
-    #[arg(long, value_name = "RATE", allow_negative_numbers = true, value_parser = number::real(number::PLAYED))]
+    #[arg(long, value_name = "RATE", allow_negative_numbers = true, value_parser = number::real(number::PLAYED_FPS))]
     pub(crate) fps: Option<f64>,
     /// Do part I of N (from 1), into the same folder as the other parts
     #[arg(long, value_name = "I/N")]

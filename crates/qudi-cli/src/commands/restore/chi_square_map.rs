@@ -1,4 +1,4 @@
-//! Chi-square of the counts given the restored frames, and frames beside their counts.
+//! Chi-square of the counts given the restored frames, and frames next to their counts.
 
 use crate::error::Result;
 use qudi_core::atomic_file::Overwrite;
@@ -9,16 +9,15 @@ use qudi_io::capture::Capture;
 use qudi_io::writer::{ArrayWriter, Picture};
 use std::path::Path;
 
-/// How well restored frames explain the photons: chi-square of all frames, and three of them beside their
-/// counts.
+/// The misfit of restored frames: chi-square of all frames, and three of them next to their counts.
 pub(super) struct ChiSquareMap {
     consistency: Consistency,
     acquisition: Acquisition,
-    /// Frames to show; of a pipe of unknown length, the first.
+    /// Frames to show; for a pipe of unknown length, the first.
     shown: Vec<u64>,
     /// Frames that are shown: number, counts, restored.
     pictures: Vec<(u64, [Frame; 2])>,
-    /// Whether the latest frame is kept, which may turn out to be the last.
+    /// True if the latest frame is kept, which may be the last.
     keep_latest: bool,
     /// Frames measured so far.
     measured: u64,
@@ -58,8 +57,8 @@ impl ChiSquareMap {
         self.consistency.chi_square()
     }
 
-    /// Counts above, restored frames below: the first, the middle (not of a pipe without length) and
-    /// the last.
+    /// Composes counts above and restored frames below: the first, the middle (not for a pipe without length)
+    /// and the last.
     pub(super) fn side_by_side(&self) -> Option<Picture> {
         let size = self.pictures.first()?.1[0].size;
         let mut picture = Picture::new(size, 2, self.pictures.len(), 1);

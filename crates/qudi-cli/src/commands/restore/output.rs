@@ -1,4 +1,4 @@
-//! Where restored frames go.
+//! Outputs of restored frames.
 
 use super::args::Tonemap;
 use super::chi_square_map::ChiSquareMap;
@@ -15,7 +15,7 @@ use std::borrow::Cow;
 use std::ops::Range;
 use std::path::Path;
 
-/// One place for frames, and the tone curve that they are written with.
+/// An output of frames, and the tone curve with which they are written.
 pub(super) struct Output {
     place: Place,
     tonemap: Tonemap,
@@ -46,7 +46,7 @@ impl Output {
         Ok(Self { place, tonemap: plan.tonemap })
     }
 
-    /// Frames from the start of `range` on that an earlier run finished.
+    /// Returns how many frames from the start of `range` on an earlier run finished.
     pub(super) fn finished(&self, range: Range<u64>) -> u64 {
         match &self.place {
             Place::Folder(folder) => folder.finished(range),
@@ -81,7 +81,7 @@ impl Output {
         }
     }
 
-    /// A frame as it is written.
+    /// Applies the tone curve to a frame.
     fn toned<'a>(&self, frame: &'a Frame) -> Cow<'a, Frame> {
         if self.tonemap == Tonemap::None {
             return Cow::Borrowed(frame);
@@ -90,7 +90,7 @@ impl Output {
         Cow::Owned(Frame { size: frame.size, data })
     }
 
-    /// What was written, as light.
+    /// Inverts the tone curve.
     fn linear(&self, mut frame: Frame) -> Frame {
         if self.tonemap == Tonemap::Srgb {
             for value in &mut frame.data {
@@ -100,7 +100,7 @@ impl Output {
         frame
     }
 
-    /// Writes picture `number`; gives it as a reader of the file sees it, where that is another.
+    /// Writes picture `number`, and returns it as a reader of the file sees it, where that differs.
     fn push(&mut self, number: u64, restored: &Frame) -> qudi_core::Result<Option<Frame>> {
         let frame = self.toned(restored);
         match &mut self.place {
@@ -116,7 +116,7 @@ impl Output {
     }
 }
 
-/// Takes restored frames: writes them, and measures how well they explain the photons.
+/// A sink of restored frames: it writes them and measures their chi-square.
 pub(super) struct Sink<'a> {
     output: &'a mut Output,
     map: Option<&'a mut ChiSquareMap>,
@@ -139,7 +139,7 @@ impl RestoreSink for Sink<'_> {
     }
 
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
-        // What a reader of the file will see is what is measured.
+        // The picture is measured as a reader of the file sees it.
         let seen = self.output.push(number, restored)?;
         match &mut self.map {
             Some(map) => map.add(seen.as_ref().unwrap_or(restored), counts),

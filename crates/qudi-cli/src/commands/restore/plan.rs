@@ -5,6 +5,7 @@ use crate::args::tiff_samples::tiff_samples;
 use crate::args::{Global, Shard, Sum};
 use crate::capture::{LightOverrides, Source, is_pipe, refuse_terminal};
 use crate::error::{CliError, Result};
+use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
 use crate::places::Places;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
@@ -12,31 +13,30 @@ use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::writer::TiffSamples;
 use std::path::{Path, PathBuf};
 
-/// Frames per second of what plays, unless said otherwise: captures of thousands would be over at once.
+/// Default frames per second of played outputs: at the capture's rate, thousands of frames would be over at
+/// once.
 const PLAYED_FPS: f64 = 25.0;
 
-/// Everything that a restoration is asked for.
+/// The checked options of a restoration.
 #[derive(Debug)]
 pub(super) struct Plan {
-    /// The capture; `-` for a pipe.
+    /// Path of the capture; `-` for a pipe.
     pub(super) capture: PathBuf,
-    /// Where the frames go; `-` for standard output.
+    /// Path of the output; `-` for standard output.
     pub(super) output: String,
-    /// The sensor by name, unless record or format say it.
+    /// Name of the sensor, unless record or format give it.
     pub(super) sensor: Option<String>,
     pub(super) read: ReadOptions,
-    /// How many frames are summed, if that is said.
+    /// Number of frames summed, if given.
     pub(super) sum: Option<Sum>,
     /// Native frames from one picture to the next, if not every frame becomes one.
     pub(super) every: Option<u64>,
     pub(super) tonemap: Tonemap,
-    /// Frames per second of what plays.
+    /// Frames per second of played outputs.
     pub(super) played_fps: f64,
     pub(super) light: LightOverrides,
-    /// `--seed`, if given.
-    pub(super) seed_flag: Option<&'static str>,
-    /// The method by name, unless the capture decides.
-    pub(super) method: Option<String>,
+    /// The method, unless the capture decides.
+    pub(super) method: Option<&'static Method>,
     pub(super) network: NetworkOptions,
     /// Frames that neighbouring windows share.
     pub(super) overlap: u64,
@@ -49,7 +49,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    /// Checks the arguments; `json` says that a document goes to standard output.
+    /// Checks the arguments; `json` is true if a document goes to standard output.
     ///
     /// # Errors
     /// [`CliError`] for arguments that do not go together, outputs that are inputs, and outputs that exist.
@@ -82,12 +82,10 @@ impl Plan {
                 "ask for it when all parts are done: the same command without --shard",
             ));
         }
-        let mut network = args.network.options(args.steps.steps);
-        if let Some(method) = &args.method {
-            network.check_methods(std::iter::once(method.as_str()))?;
+        let network = args.network.options(args.steps.steps, &args.given);
+        if let Some(method) = args.method {
+            network.check_methods(&[method])?;
         }
-        let seed_flag = args.seed.is_some().then_some("--seed");
-        network.diffusion_flag = network.diffusion_flag.or(seed_flag);
         let plan = Self {
             capture: args.capture.clone(),
             output: args.output.clone(),
@@ -103,8 +101,7 @@ impl Plan {
                 mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
             },
-            seed_flag,
-            method: args.method.clone(),
+            method: args.method,
             network,
             overlap: args.overlap,
             shard: args.shard,
@@ -128,7 +125,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Whether the output has a frame rate of its own.
+    /// Returns true if the output has a frame rate of its own.
     fn plays(&self) -> bool {
         let extension = Path::new(&self.output).extension();
         let extension = extension.map(|e| e.to_string_lossy().to_lowercase());
@@ -145,12 +142,12 @@ impl Plan {
         }
     }
 
-    /// Whether the capture comes through standard input.
+    /// Returns true if the capture comes through standard input.
     pub(super) fn reads_pipe(&self) -> bool {
         is_pipe(&self.capture)
     }
 
-    /// Refuses a taken name before any work is done. Folders may be resumed.
+    /// Refuses an existing output before any work is done. Folders may be resumed.
     fn check_output(&self) -> Result<()> {
         let folder = Path::new(&self.output).extension().is_none() && self.output != "-";
         if self.shard.is_some() && !folder {
@@ -166,7 +163,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Refuses what needs a capture that can be read again.
+    /// Refuses options that need a capture which can be read again.
     fn check_pipe(&self) -> Result<()> {
         refuse_terminal("cat burst.npy | qudi restore - -o out")?;
         if self.shard.is_some() {
@@ -177,7 +174,7 @@ impl Plan {
             ));
         }
         if self.output != "-" {
-            // Nobody knows whether the same frames come again, so that a folder is not resumed.
+            // The same frames may not come again, so that a folder is not resumed.
             refuse_taken(Path::new(&self.output), self.overwrite)?;
         }
         Ok(())

@@ -12,12 +12,12 @@ use crate::capture::{
 use crate::device;
 use crate::error::Result;
 use crate::interrupt;
-use crate::methods::network::device_failed;
-use crate::methods::options::{NetworkOptions, other_method};
-use crate::methods::{is_network, method, usual_method};
+use crate::methods::default::default_method;
+use crate::methods::network::{OwnNetwork, device_failed};
+use crate::methods::options::NetworkOptions;
+use crate::methods::{Built, Kind, Method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
-use qudi_baselines::import::Method;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_io::capture::Capture;
@@ -51,7 +51,7 @@ pub(crate) fn run(
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
     let mut map = ChiSquareMap::new(job.capture(), &job.acquisition);
     let done = output.finished(part.clone());
-    let mut uncertainty = UncertaintyFile::create(&plan, job.restorer.name(), job.capture(), done)?;
+    let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
         let sink = Sink::new(&mut output, Some(&mut map), &mut uncertainty);
@@ -65,8 +65,9 @@ pub(crate) fn run(
     }
     let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(0);
     let part = part.start..part.end.min(frames);
-    let is_network = job.restorer.name() == "qudi";
-    let mode = is_network.then(|| plan.network.mode()).transpose()?;
+    let own =
+        job.method.as_own().map(|choice| OwnNetwork::new(&plan.network, choice)).transpose()?;
+    let mode = own.map(|own| own.mode(&plan.network));
     let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
     job.warnings.extend(chi_square);
     let results = json!({"chi_square": map.chi_square(), "mode": mode, "warnings": job.warnings});
@@ -108,6 +109,7 @@ struct Job {
     aligned: AlignedCapture,
     acquisition: Acquisition,
     light_source: &'static str,
+    method: &'static Method,
     restorer: Box<dyn Restorer>,
     /// What the method chose for this capture.
     choice: String,
@@ -124,18 +126,26 @@ impl Job {
         let summed = SummedCapture::new(opened, &source)?;
         let sensor = summed.required_sensor()?;
         summed.remark_sum(report);
-        let method = plan.method.as_deref();
-        let mut aligned = AlignedCapture::new(summed, &source, &sensor, method, plan.every)?;
+        let mut aligned = AlignedCapture::new(summed, &source, &sensor, plan.method, plan.every)?;
         aligned.remark_alignment(report);
         let capture = &mut aligned.capture;
         let summary = plan.light.measure(capture, Some(&sensor))?;
         let CaptureAcquisition { acquisition, light_source } =
             CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
         let warnings = warnings::of_capture(capture, &summary);
-        let (restorer, choice) = restorer(plan, &mut aligned, &acquisition, report)?;
+        let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
         let overlap = plan.overlap * aligned.frames_per_sum();
         let schedule = aligned.schedule(restorer.as_ref(), overlap, plan.every)?;
-        Ok(Self { aligned, acquisition, light_source, restorer, choice, schedule, warnings })
+        Ok(Self {
+            aligned,
+            acquisition,
+            light_source,
+            method,
+            restorer,
+            choice,
+            schedule,
+            warnings,
+        })
     }
 
     fn capture(&self) -> &Capture {
@@ -145,7 +155,6 @@ impl Job {
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
     fn settings(&self, plan: &Plan) -> Result<Value> {
         let (capture, acquisition) = (self.capture(), &self.acquisition);
-        let restorer = self.restorer.as_ref();
         let place = if plan.reads_pipe() {
             capture.path().to_owned()
         } else {
@@ -158,12 +167,12 @@ impl Job {
             "frames": capture.length(),
             "height": capture.size().height,
             "width": capture.size().width,
-            "method": restorer.name(),
+            "method": self.method.name,
             "choice": self.choice,
-            "window": restorer.window(),
+            "window": self.restorer.window(),
             "overlap": plan.overlap * self.aligned.frames_per_sum(),
             "seed": plan.light.seed,
-            "network": network_settings(restorer.name(), &plan.network)?,
+            "network": network_settings(self.method, &plan.network)?,
             "ppp": acquisition.ppp,
             "exposure": acquisition.mean_level,
             "gain": acquisition.gain,
@@ -241,7 +250,7 @@ impl Job {
         });
         let (capture, acquisition) = (&mut self.aligned.capture, &self.acquisition);
         let restorer = self.restorer.as_mut();
-        let is_network = is_network(restorer.name());
+        let is_network = self.method.is_network();
         let schedule = &self.schedule;
         let run = || {
             observed(observer, || {
@@ -258,37 +267,35 @@ impl Job {
     }
 }
 
-/// Makes the restorer of the method that is named, or of the usual one, and says what it chose for this capture.
+/// Makes the restorer of the named method, or of the default one, for this capture.
 fn restorer(
     plan: &Plan,
     aligned: &mut AlignedCapture,
     acquisition: &Acquisition,
     report: &Report,
-) -> Result<(Box<dyn Restorer>, String)> {
+) -> Result<(&'static Method, Built)> {
     let seen = aligned.seen_acquisition(acquisition)?;
-    let name = match plan.method.as_deref() {
-        Some(name) => name,
+    let method = match plan.method {
+        Some(method) => method,
         None => announced_method(plan, &aligned.capture, &seen, report)?,
     };
-    if let Some(flag) = plan.seed_flag.filter(|_| name != "qudi") {
-        return Err(other_method(flag));
-    }
-    let (restorer, choice) = method(name, &mut aligned.capture, &seen, &plan.network)?;
-    Ok((aligned.around(restorer), choice))
+    plan.network.check_diffusion(&[method])?;
+    let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
+    Ok((method, (aligned.around(restorer), choice)))
 }
 
-/// The method of those who name none; if it is not the network, the reason is said.
+/// Returns the default method; prints the reason if it is not the network.
 fn announced_method(
     plan: &Plan,
     capture: &Capture,
     acquisition: &Acquisition,
     report: &Report,
-) -> Result<&'static str> {
-    let usual = usual_method(&plan.network, capture, acquisition)?;
+) -> Result<&'static Method> {
+    let usual = default_method(&plan.network, capture, acquisition)?;
     if let Some(reason) = &usual.reason {
-        report.remark(&format!("note: {reason}: restoring by {}", usual.name));
+        report.remark(&format!("note: {reason}: restoring by {}", usual.method.name));
     }
-    Ok(usual.name)
+    Ok(usual.method)
 }
 
 /// Says how long all pictures take, if that is long enough to be worth a line.
@@ -310,28 +317,19 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
 }
 
 /// The settings of the network that frames depend on, where it makes them.
-fn network_settings(method: &str, options: &NetworkOptions) -> Result<Option<Value>> {
-    if let Some(learned) = Method::by_name(method) {
-        let weights = options.weights_of(learned)?;
-        return Ok(Some(json!({
-            "weights": weights.to_string(),
-            "weights_sha256": weights.sha256()?,
-            "tile": options.tile,
-        })));
-    }
-    if method != "qudi" {
-        return Ok(None);
-    }
-    Ok(Some(json!({
-        "weights": options.weights.to_string(),
-        "weights_sha256": options.weights.sha256()?,
-        "steps": options.steps()?,
-        "spacing": options.spacing_name()?,
-        "sampler": options.sampler_name(),
-        "samples": options.samples,
-        "tile": options.tile,
-        "precision": options.precision(&device::open(&options.device)?)?,
-    })))
+fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<Value>> {
+    Ok(match method.kind {
+        Kind::Classical(_) => None,
+        Kind::Learned { method, .. } => {
+            let weights = options.weights_of(method)?;
+            Some(json!({
+                "weights": weights.to_string(),
+                "weights_sha256": weights.sha256()?,
+                "tile": options.tile,
+            }))
+        }
+        Kind::Network(choice) => Some(OwnNetwork::new(options, choice)?.settings(options)?),
+    })
 }
 
 fn describe(
@@ -343,7 +341,7 @@ fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture().size());
-    let (name, choice) = (job.restorer.name(), &job.choice);
+    let (name, choice) = (job.method.name, &job.choice);
     let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");

@@ -1,10 +1,13 @@
-//! The uncertainty of every pixel, written beside the frames: as the network predicts it, or over samples.
+//! The uncertainty of every pixel, written next to the frames: as the network predicts it, or over samples.
 
 use super::plan::Plan;
 use crate::error::{CliError, Result};
+use crate::methods::network::OwnNetwork;
+use crate::methods::{Method, QUDI};
 use qudi_core::Frame;
 use qudi_io::capture::Capture;
 use qudi_io::writer::ArrayWriter;
+use qudi_model::config::NetworkKind;
 
 /// A `.npy` file of uncertainties, float32 `[frames, height, width]`, or none.
 #[derive(Debug)]
@@ -12,23 +15,25 @@ pub(super) struct UncertaintyFile(Option<ArrayWriter>);
 
 impl UncertaintyFile {
     /// Creates the file that the plan asks for. An earlier run that finished some frames wrote no uncertainty
-    /// of them.
+    /// for them.
     pub(super) fn create(
         plan: &Plan,
-        method: &str,
+        method: &Method,
         capture: &Capture,
         finished: u64,
     ) -> Result<Self> {
         let Some(path) = &plan.uncertainty else { return Ok(Self(None)) };
-        if method != "qudi" {
-            let what = format!("{method} does not predict its uncertainty");
-            return Err(CliError::new(what, "--uncertainty", "use --method qudi"));
-        }
-        if plan.network.samples < 2 && !plan.network.predicts_uncertainty()? {
+        let Some(choice) = method.as_own() else {
+            let what = format!("{} does not predict its uncertainty", method.name);
+            let help = format!("use --method {}", QUDI.name);
+            return Err(CliError::new(what, "--uncertainty", help));
+        };
+        let own = OwnNetwork::new(&plan.network, choice)?;
+        if plan.network.samples < 2 && own.kind() == NetworkKind::Diffusion {
             return Err(CliError::new(
                 "one sample has no uncertainty",
                 "--uncertainty",
-                "draw several with --samples K, or use --steps 0 with weights that predict it (`qudi info FILE`)",
+                "draw several with --samples K, or use --method qudi-regression, which predicts it",
             ));
         }
         if path.extension() != Some("npy".as_ref()) {

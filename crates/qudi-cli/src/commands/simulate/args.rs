@@ -12,7 +12,7 @@ use std::path::PathBuf;
 ///
 /// OUT is an .npy file (binary frames are packed, 8 pixels to the byte), a multi-page .tif, a
 /// folder of PNG (no extension), or - for .npy on standard output. A record that makes the burst
-/// again is written beside it: OUT.json, or burst.json in the folder.
+/// again is written next to it: OUT.json, or burst.json in the folder.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Simulate {
     /// What to expose
@@ -21,7 +21,7 @@ pub(crate) struct Simulate {
     /// Where the burst goes
     #[arg(short, long, value_name = "OUT", value_hint = ValueHint::AnyPath)]
     pub(crate) output: String,
-    /// Make the burst of this record again; only outputs may be given beside it
+    /// Make the burst of this record again; only outputs may be given with it
     #[arg(long, value_name = "RECORD", value_hint = ValueHint::FilePath)]
     pub(crate) from: Option<PathBuf>,
 
@@ -43,7 +43,7 @@ pub(crate) struct Simulate {
     /// Write an animated GIF of the counts
     #[arg(long, value_name = "FILE", help_heading = "Outputs", value_hint = ValueHint::FilePath)]
     pub(crate) preview: Option<PathBuf>,
-    /// Write transforms.json beside a packed burst, so that visionsim opens it
+    /// Write transforms.json next to a packed burst, so that visionsim opens it
     #[arg(long, help_heading = "Outputs")]
     pub(crate) visionsim: bool,
 }

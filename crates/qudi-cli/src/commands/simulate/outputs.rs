@@ -18,7 +18,7 @@ const PREVIEW_FPS: f64 = 20.0;
 /// Counts of a frame as the bytes of a stream.
 type FrameEncoder = Box<dyn Fn(&[u16]) -> Vec<u8>>;
 
-/// Where the frames of one simulation go.
+/// Outputs of one simulation.
 pub(super) struct Outputs<'a> {
     plan: &'a OutputPlan,
     burst: Option<BurstWriter>,
@@ -29,7 +29,7 @@ pub(super) struct Outputs<'a> {
 }
 
 impl<'a> Outputs<'a> {
-    /// The outputs of a plan; nothing is opened yet.
+    /// Takes the outputs of a plan; nothing is opened yet.
     pub(super) fn new(plan: &'a OutputPlan) -> Self {
         Self { plan, burst: None, stream: None, truth: None, flow: None, preview: None }
     }
@@ -130,7 +130,7 @@ impl Sink for Outputs<'_> {
     }
 }
 
-/// What visionsim needs to unpack the burst; a camera without pose.
+/// Returns the document that visionsim needs to unpack the burst: a camera without pose.
 fn visionsim_transforms(record: &Record, path: &Path) -> Value {
     let burst = &record.burst;
     let identity = json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);

@@ -28,7 +28,7 @@ pub(super) struct Plan {
 /// The files that a simulation writes.
 #[derive(Debug)]
 pub(super) struct OutputPlan {
-    /// Where the burst goes; `-` for standard output.
+    /// Place of the burst; `-` for standard output.
     pub(super) output: String,
     pub(super) format: BurstFormat,
     /// Full scale of the counts.
@@ -38,7 +38,7 @@ pub(super) struct OutputPlan {
     pub(super) tiff: TiffSamples,
     pub(super) flow: Option<PathBuf>,
     pub(super) preview: Option<PathBuf>,
-    /// The file beside the burst that visionsim looks for.
+    /// The file next to the burst that visionsim looks for.
     pub(super) transforms: Option<PathBuf>,
     pub(super) overwrite: Overwrite,
 }
@@ -119,13 +119,13 @@ impl OutputPlan {
         Ok(())
     }
 
-    /// Whether the burst goes to standard output.
+    /// Returns true if the burst goes to standard output.
     pub(super) fn to_stdout(&self) -> bool {
         self.output == "-"
     }
 }
 
-/// The format of the burst.
+/// Returns the format of the burst.
 fn format(args: &Simulate, max_count: u16) -> Result<BurstFormat> {
     let packed = !args.unpacked;
     let format = if args.output == "-" {
@@ -174,7 +174,7 @@ fn reject_settings_beside_record(args: &Simulate, global: &Global) -> Result<()>
     let given = given.or(global.config.is_some().then(|| "--config".to_owned()));
     let Some(given) = given else { return Ok(()) };
     Err(CliError::new(
-        format!("{given} beside --from: a record says everything about its burst"),
+        format!("{given} with --from: a record says everything about its burst"),
         &given,
         "leave it out, or give the input instead of the record",
     ))

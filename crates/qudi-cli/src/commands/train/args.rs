@@ -33,15 +33,14 @@ pub(crate) struct Train {
     /// Go on from the run's last state
     #[arg(long, conflicts_with_all = ["prepare", "init"])]
     pub(crate) resume: bool,
-    /// Start from these weights instead of random ones: of the same network, or of one with one refinement
-    /// stage less
+    /// Start from these weights of the same network instead of random ones
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) init: Option<PathBuf>,
     /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
     pub(crate) device: Vec<String>,
     /// Threads that draw samples
-    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MOST_THREADS))]
+    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
     pub(crate) workers: usize,
     /// Folder with the weights of LPIPS, made by scripts/convert/lpips.py [default: where Burn keeps them]
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]

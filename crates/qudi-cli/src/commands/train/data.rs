@@ -9,7 +9,7 @@ use qudi_train::Files;
 use qudi_train::dataset::{Pack, write_pack};
 use std::path::Path;
 
-/// The files that the recipe learns from, made first if they are not there.
+/// Returns the files that the recipe learns from, made first if they do not exist.
 pub(super) fn files(plan: &Plan, report: &Report) -> Result<Files> {
     if let Some(folder) = &plan.bursts {
         make_folder(folder, "the folder of bursts", "choose another with --bursts")?;
@@ -23,7 +23,7 @@ pub(super) fn make_folder(folder: &Path, what: &str, help: &str) -> Result<()> {
         .map_err(|e| CliError::new(format!("cannot make {what}: {e}"), folder.display(), help))
 }
 
-/// The recipe's files, decoded; made first if they are not there.
+/// Opens the recipe's decoded files, made first if they do not exist.
 fn pack(plan: &Plan, report: &Report) -> Result<Option<Pack>> {
     if !plan.recipe.data.needs_files() && plan.recipe.validation_data().is_none() {
         return Ok(None);

@@ -1,11 +1,11 @@
-//! What a validation looks like: counts, restored frame and truth of every clip, side by side.
+//! The picture of a validation: counts, restored frame and truth of every clip, side by side.
 
 use qudi_core::Frame;
 use qudi_core::metrics::best_gain;
 use qudi_io::writer::Picture;
 use qudi_train::ValidationClip;
 
-/// One row for every clip at the least light.
+/// Draws one row for every clip at the lowest light level.
 pub(crate) fn strip(clips: &[ValidationClip]) -> Picture {
     let first = clips.first().map_or(0.0, |clip| clip.ppp);
     let clips: Vec<_> = clips.iter().filter(|clip| clip.ppp == first).collect();

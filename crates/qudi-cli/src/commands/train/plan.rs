@@ -8,7 +8,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_train::{RECIPE, Recipe, recipe_names};
 use std::path::PathBuf;
 
-/// What is to be done.
+/// Action of a training run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Action {
     /// Pack the recipe's files, and draw its bursts.

@@ -8,7 +8,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 /// Points of a curve at most: single steps jump, means of neighbours show where it goes.
-const POINTS: usize = 120;
+const MAX_POINTS: usize = 120;
 
 /// Parts of the loss, by their keys in the metrics.
 const LOSSES: [(&str, &str); 14] = [
@@ -55,7 +55,7 @@ struct Page<'a> {
     plots: Vec<Drawing>,
     table: Option<TableView>,
     picture: Option<String>,
-    /// How restored frames were made.
+    /// Description of how frames were restored.
     made: String,
     documents: [Document<'a>; 2],
 }
@@ -66,7 +66,7 @@ struct Document<'a> {
     text: &'a str,
 }
 
-/// The whole page.
+/// Renders the page.
 pub(crate) fn page(source: &Source<'_>) -> Result<String> {
     let lines = source.metrics.lines();
     let lines: Vec<Value> = lines.filter_map(|line| serde_json::from_str(line).ok()).collect();
@@ -89,7 +89,7 @@ pub(crate) fn page(source: &Source<'_>) -> Result<String> {
     )
 }
 
-/// The number of steps, and where their time went.
+/// Summarizes the number of steps and their time.
 fn summary(steps: &[&Value]) -> Vec<String> {
     let Some(last) = steps.last() else { return Vec::new() };
     let sum = |key: &str| steps.iter().filter_map(|line| line[key].as_f64()).sum::<f64>();
@@ -103,7 +103,7 @@ fn summary(steps: &[&Value]) -> Vec<String> {
     ]
 }
 
-/// How the recipe's validation restores frames.
+/// Describes how the recipe's validation restores frames.
 fn made(recipe: &str) -> String {
     let recipe: Option<toml::Table> = recipe.parse().ok();
     let steps =
@@ -130,7 +130,7 @@ fn plots(steps: &[&Value], validations: &[&Value]) -> Vec<Plot> {
         curve.points.iter().all(|p| p.y >= 0.0) && curve.points.iter().any(|p| p.y > 0.0)
     };
     let losses = LOSSES.map(|(key, name)| curve(steps, key, name)).into_iter().filter(on_log_axis);
-    let uncertainty = curve(steps, "error", "uncertainty");
+    let uncertainty = curve(steps, "uncertainty", "uncertainty");
     let has_uncertainty = uncertainty.points.iter().any(|p| p.y != 0.0);
     let mut plots = vec![plot(
         "Loss",
@@ -173,7 +173,7 @@ fn plots(steps: &[&Value], validations: &[&Value]) -> Vec<Plot> {
     plots
 }
 
-/// A number of every step.
+/// Returns a curve of a number of every step.
 fn curve(steps: &[&Value], key: &str, name: &str) -> Curve {
     let point = |line: &&Value| {
         Some(Point { x: line["step"].as_f64()?, y: line[key].as_f64()?, error: 0.0 })
@@ -182,9 +182,9 @@ fn curve(steps: &[&Value], key: &str, name: &str) -> Curve {
     Curve { name: name.to_owned(), points: thinned(&points) }
 }
 
-/// Means of neighbouring points, so that the trend is seen.
+/// Averages neighbouring points, so that the trend is visible.
 fn thinned(points: &[Point]) -> Vec<Point> {
-    let run = points.len().div_ceil(POINTS).max(1);
+    let run = points.len().div_ceil(MAX_POINTS).max(1);
     let mean = |part: &[Point]| {
         let n = part.len() as f64;
         let (x, y) = part.iter().fold((0.0, 0.0), |(x, y), p| (x + p.x, y + p.y));
@@ -193,7 +193,7 @@ fn thinned(points: &[Point]) -> Vec<Point> {
     points.chunks(run).map(mean).collect()
 }
 
-/// A curve for every light level, the mean over clips.
+/// Returns a curve of means over clips for every light level.
 fn quality(validations: &[&Value], key: &str) -> Vec<Curve> {
     let mut curves: Vec<Curve> = Vec::new();
     for validation in validations {
@@ -218,7 +218,7 @@ fn quality(validations: &[&Value], key: &str) -> Vec<Curve> {
     curves
 }
 
-/// A validation, clip by clip.
+/// Returns a validation, clip by clip.
 fn clips(validation: &Value) -> Table {
     let mut table = Table::new(vec![
         Column::new("clip", "clip"),
@@ -288,7 +288,7 @@ not json
         let points: Vec<_> =
             (0..1000).map(|n| Point { x: f64::from(n), y: 2.0, error: 0.0 }).collect();
         let thinned = thinned(&points);
-        assert!(thinned.len() <= POINTS && thinned.iter().all(|p| p.y == 2.0));
+        assert!(thinned.len() <= MAX_POINTS && thinned.iter().all(|p| p.y == 2.0));
         assert_eq!(thinned[0].x, 4.0, "the mean of steps 0 to 8");
     }
 }

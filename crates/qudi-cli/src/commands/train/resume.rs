@@ -8,7 +8,7 @@ use serde_json::Value;
 use std::path::Path;
 
 /// Keys that may change, or the tables they are in: how long, how often, and what fits into memory.
-const MAY_CHANGE: &[&str] = &[
+const CHANGEABLE_KEYS: &[&str] = &[
     "train.steps",
     "train.batch",
     "train.accumulate",
@@ -30,7 +30,7 @@ pub(crate) fn check_recipe(folder: &Path, recipe: &Recipe) -> Result<()> {
     Err(CliError::new(
         format!("`{key}` of this run is {was}, and cannot become {is}"),
         path.display(),
-        format!("start another run; with --resume only {} may change", MAY_CHANGE.join(", ")),
+        format!("start another run; with --resume only {} may change", CHANGEABLE_KEYS.join(", ")),
     ))
 }
 
@@ -56,9 +56,9 @@ pub(crate) fn check_pack(folder: &Path, pack: &Path) -> Result<()> {
     ))
 }
 
-/// The first key whose value differs and may not, with both values.
+/// Finds the first key whose value differs and may not, with both values.
 fn difference(key: &str, was: &Value, is: &Value) -> Option<(String, String, String)> {
-    if MAY_CHANGE.contains(&key) || was == is {
+    if CHANGEABLE_KEYS.contains(&key) || was == is {
         return None;
     }
     if let (Value::Object(first), Value::Object(second)) = (was, is) {

@@ -13,9 +13,12 @@ use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::Report;
 use crate::settings::Settings;
+use crate::version::COMMIT;
 use qudi_baselines::learning::Baseline;
 use qudi_core::atomic_file::Overwrite;
-use qudi_model::network::Qudi;
+use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::Diffusion;
+use qudi_model::regression::Regression;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::Lpips;
 use qudi_train::{
@@ -34,7 +37,8 @@ pub(crate) fn run(
     match plan.action {
         Action::Prepare if plan.bursts.is_none() => pack(&plan, report),
         Action::Prepare => match plan.recipe.network {
-            NetworkRecipe::Qudi(_) => draw::<Qudi>(&plan, report),
+            NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => draw::<Regression>(&plan, report),
+            NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => draw::<Diffusion>(&plan, report),
             NetworkRecipe::Baseline(_) => draw::<Baseline>(&plan, report),
         },
         Action::Start | Action::Resume => match plan.recipe.stages()? {
@@ -63,7 +67,12 @@ pub(super) fn find_backbones(plan: &Plan) -> Result<()> {
 /// Trains to the end of the recipe.
 pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     match plan.recipe.network {
-        NetworkRecipe::Qudi(_) => train_network::<Qudi>(plan, report),
+        NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => {
+            train_network::<Regression>(plan, report)
+        }
+        NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => {
+            train_network::<Diffusion>(plan, report)
+        }
         NetworkRecipe::Baseline(_) => train_network::<Baseline>(plan, report),
     }
 }
@@ -87,7 +96,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
         From::Start(init.transpose()?)
     };
     let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
-    let commit = option_env!("QUDI_COMMIT").map(str::to_owned);
+    let commit = COMMIT.map(str::to_owned);
     let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
     write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
     let mut watch = Watch::new(recipe, folder, report);

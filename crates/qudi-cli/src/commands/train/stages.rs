@@ -68,7 +68,7 @@ pub(super) fn train_stages(
     report.result(&text, || json!({"weights": weights, "stages": count}))
 }
 
-/// The plan of stage `number`, in a folder of its own.
+/// Returns the plan of stage `number`, in a folder of its own.
 fn of_stage(plan: &Plan, (number, (name, recipe)): (usize, (String, Recipe))) -> Plan {
     let own = format!("{}-{name}", number + 1);
     Plan {

@@ -16,7 +16,7 @@ use std::time::Instant;
 /// Folder of pictures in a run's folder.
 const SAMPLES: &str = "samples";
 
-/// Quality at every light, in words.
+/// Formats quality at every light level.
 pub(crate) fn quality_text(means: &[(f64, [f64; 3])]) -> String {
     let one = |(ppp, [psnr_a, _, ssim]): &(f64, [f64; 3])| {
         format!("{ppp} PPP: psnr-a {psnr_a:.2} dB, ssim {ssim:.3}")
@@ -33,7 +33,7 @@ pub(crate) struct Watch<'a> {
     bar: Bar,
     start: Instant,
     taken: u64,
-    /// Of the last step; averaged, single ones jump.
+    /// Moving average of the loss.
     loss: Option<f64>,
     last: Option<Validation>,
     error: Option<CliError>,
@@ -79,7 +79,7 @@ impl<'a> Watch<'a> {
         self.bar.learning(text, step.step, self.steps);
     }
 
-    /// The last validation, or what went wrong while watching.
+    /// Returns the last validation, or the error of watching.
     pub(crate) fn finish(self) -> Result<Option<Validation>> {
         match self.error {
             Some(error) => Err(error),

@@ -1,4 +1,4 @@
-//! The axes of an array in memory: where colour lies, and which of it is read.
+//! The axes of an array in memory: the place of the colour channels, and the one that is read.
 
 use super::{Array, Place};
 use crate::description::{Axes, ReadOptions};
@@ -8,18 +8,18 @@ use qudi_core::{Error, Result};
 pub(super) struct Layout {
     pub(super) dims: [usize; 3],
     pub(super) colours: Colours,
-    /// The channel that is read.
+    /// Index of the channel that is read.
     pub(super) index: usize,
 }
 
-/// Where the channels of a capture lie in memory, and how many there are.
+/// The place of the channels in memory, and their number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Colours {
-    /// Beside each other, pixel by pixel.
+    /// Channels alternate, pixel by pixel.
     Interleaved(usize),
-    /// One plane of a frame after the other.
+    /// Each frame has one plane per channel.
     Planes(usize),
-    /// One capture after the other.
+    /// Each channel is a whole capture.
     Volumes(usize),
 }
 
@@ -31,11 +31,11 @@ impl Colours {
     }
 }
 
-/// More channels than this are an axis of space or time.
-const MOST: usize = 4;
+/// Largest number of channels; a longer axis is one of space or time.
+const MAX_CHANNELS: usize = 4;
 
 impl Array {
-    /// What each extent is; `axes` are those of memory.
+    /// Assigns the extents to axes; `axes` are the ones of memory.
     pub(super) fn layout(&self, axes: Axes, options: &ReadOptions) -> Result<Layout> {
         let mut memory = self.shape.clone();
         if self.fortran {
@@ -53,7 +53,7 @@ impl Array {
             }
             [a, b, c] => ([a, b, c], Colours::Interleaved(1)),
             [a, b, c, d] => {
-                let few = |n: usize| (1..=MOST).contains(&n);
+                let few = |n: usize| (1..=MAX_CHANNELS).contains(&n);
                 let last = ([a, b, c], Colours::Interleaved(d));
                 let second = ([a, c, d], Colours::Planes(b));
                 if self.fortran && few(a) {
@@ -81,7 +81,7 @@ impl Array {
         )
     }
 
-    /// The channel that is read, of so many.
+    /// Returns the channel that is read, out of `channels`.
     fn channel(&self, channels: usize, options: &ReadOptions) -> Result<usize> {
         match (channels, options.channel) {
             (1, None | Some(0)) => Ok(0),
@@ -102,9 +102,9 @@ impl Array {
         }
     }
 
-    /// Goes on with one of several captures that lie one after the other.
+    /// Selects one of several captures that are stored one after the other.
     pub(super) fn choose_volume(&mut self, dims: [usize; 3], index: usize) {
-        // Extents come from a header: what is too large is found missing later.
+        // Extents come from a header: an extent that is too large fails later, when its data are missing.
         let bytes = dims.iter().try_fold(self.sample.bytes() as u64, |bytes, &extent| {
             bytes.checked_mul(extent as u64)
         });

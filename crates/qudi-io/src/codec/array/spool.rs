@@ -1,4 +1,4 @@
-//! Arrays whose frames cannot be read in turn are stored in an unnamed file first.
+//! Storage of arrays in an unnamed file, where frames cannot be read in order.
 
 use super::{Array, Place};
 use qudi_core::limits::DEFLATE_RATIO;
@@ -7,10 +7,10 @@ use std::fs::File;
 use std::io::{Read, Write};
 
 /// Bytes fetched at once.
-const PIECE: u64 = 1 << 25;
+const PIECE_BYTES: u64 = 1 << 25;
 
 impl Array {
-    /// Stores a compressed or chunked array as it lies in memory, so that any part of it can be read.
+    /// Stores a compressed or chunked array as it is in memory, so that any part of it can be read.
     pub(super) fn spool(&mut self) -> Result<()> {
         let bytes = self.shape.iter().try_fold(self.sample.bytes() as u64, |bytes, &extent| {
             bytes.checked_mul(extent as u64)
@@ -57,7 +57,7 @@ impl Array {
                 }
                 let mut file = tempfile::tempfile().map_err(io)?;
                 let rows = self.shape.first().copied().unwrap_or(0) as u64;
-                let fit = (PIECE / (bytes / rows.max(1)).max(1)).max(1);
+                let fit = (PIECE_BYTES / (bytes / rows.max(1)).max(1)).max(1);
                 let at_once = if *group <= fit { fit / *group * *group } else { fit };
                 let mut first = 0;
                 while first < rows {

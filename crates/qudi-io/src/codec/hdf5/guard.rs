@@ -1,4 +1,4 @@
-//! HDF5 files from strangers: what the reader would allocate or walk is bounded here first.
+//! HDF5 files from untrusted sources: allocations and walks of the reader are bounded here first.
 //!
 //! `hdf5-pure` reports damage as errors, but takes extents, chunk sizes and index geometry from the
 //! file at their word. Every read goes through a budget of calls and bytes; chunks are checked
@@ -117,7 +117,7 @@ impl Hdf5 {
         walk(&self.file.root(), "", 0, &mut left, f)
     }
 
-    /// The text that attribute `name` of the dataset at `path`, of a group above or of the file holds.
+    /// Returns the text of attribute `name` of the dataset at `path`, of a group above it or of the file.
     pub(crate) fn attribute(&self, path: &str, name: &str) -> Option<String> {
         use hdf5_pure::AttrValue::{AsciiString, String, VarLenString};
         self.find_attribute(path, name, |value| match value {
@@ -126,7 +126,7 @@ impl Hdf5 {
         })
     }
 
-    /// The number that attribute `name` of the dataset at `path`, of a group above or of the file holds.
+    /// Returns the number of attribute `name` of the dataset at `path`, of a group above it or of the file.
     pub(crate) fn number(&self, path: &str, name: &str) -> Option<f64> {
         use hdf5_pure::AttrValue::{F32, F64, I8, I16, I32, I64, U8, U16, U32, U64};
         self.find_attribute(path, name, |value| match value {
@@ -144,7 +144,7 @@ impl Hdf5 {
         })
     }
 
-    /// What `convert` makes of attribute `name`, of the dataset at `path` or the nearest group that has it.
+    /// Applies `convert` to attribute `name` of the dataset at `path` or of the nearest group that has it.
     fn find_attribute<T>(
         &self,
         path: &str,
@@ -170,7 +170,7 @@ impl Hdf5 {
         })
     }
 
-    /// Checks a dataset's chunks; to be done once, before reading.
+    /// Checks a dataset's chunks. Call once, before reading.
     pub(crate) fn check(&self, dataset: Dataset) -> Words<Checked> {
         self.refill();
         let shape = dataset.shape().map_err(words)?;
@@ -202,7 +202,7 @@ impl Hdf5 {
         Ok(Checked { dataset, shape, row_bytes, group })
     }
 
-    /// Entries `first..first + count` of the first axis, in stored byte order.
+    /// Reads entries `first..first + count` of the first axis, in stored byte order.
     pub(crate) fn rows(&self, checked: &Checked, first: u64, count: u64) -> Words<Vec<u8>> {
         let there = checked.shape.first().copied().unwrap_or(1);
         let bytes =

@@ -1,4 +1,4 @@
-//! MATLAB files of level 5 (`save -v6`, `-v7`): where their arrays lie. Nothing is read but headers.
+//! Headers of MATLAB files of level 5 (`save -v6`, `-v7`), which give the place of their arrays.
 //!
 //! MAT-File Level 5 File Format, The MathWorks, 1999: a 128-byte header, then elements of a tag
 //! (type, bytes) and data; `miMATRIX` holds flags, dimensions, name and samples, and may be
@@ -33,7 +33,7 @@ pub(crate) struct MatArray {
 }
 
 impl MatArray {
-    /// In place: the byte where samples start, and how many there are.
+    /// Returns the byte where the samples start and their number of bytes, if they are not compressed.
     pub(crate) fn in_place(&self) -> Option<(u64, u64)> {
         (!self.compressed).then_some((self.element.0 + self.data, self.bytes))
     }
@@ -82,12 +82,12 @@ fn skip(stream: &mut impl Read, bytes: u64, path: &Path) -> Result<()> {
     if skipped == bytes { Ok(()) } else { Err(damaged("an array ends inside its header", path)) }
 }
 
-/// Whether these are the first bytes of a level-5 file.
+/// Returns true if these are the first bytes of a level-5 file.
 pub(crate) fn is_level_5(head: &[u8]) -> bool {
     head.len() >= 128 && matches!(&head[124..128], [0, 1, b'I', b'M'] | [1, 0, b'M', b'I'])
 }
 
-/// The numeric arrays of a file.
+/// Lists the numeric arrays of a file.
 pub(crate) fn arrays(path: &Path) -> Result<Vec<MatArray>> {
     let io = |e| Error::io("read", path, e);
     let mut file = File::open(path).map_err(io)?;
@@ -159,7 +159,7 @@ impl Elements<'_> {
         Ok(taken)
     }
 
-    /// Type and length of the next element, and its data if they fit into the tag.
+    /// Reads the type and length of the next element, and its data if they fit into the tag.
     fn tag(&mut self) -> Result<(u32, u64, Option<Vec<u8>>)> {
         let tag = self.take(8)?;
         let first = word(&tag[..4], self.big);
@@ -173,7 +173,7 @@ impl Elements<'_> {
         Ok((kind, u64::from(small), Some(data.to_vec())))
     }
 
-    /// A short element as a whole, with its padding.
+    /// Reads a short element whole, with its padding.
     fn short(&mut self) -> Result<(u32, Vec<u8>)> {
         let (kind, bytes, data) = self.tag()?;
         if let Some(data) = data {
@@ -187,7 +187,7 @@ impl Elements<'_> {
         Ok((kind, data))
     }
 
-    /// The array in a matrix element; `None` for text, structures and the like.
+    /// Reads the array in a matrix element; `None` for text, structures and the like.
     fn matrix(&mut self, element: (u64, u64), compressed: bool) -> Result<Option<MatArray>> {
         if compressed {
             let (kind, ..) = self.tag()?;
@@ -226,7 +226,7 @@ impl Elements<'_> {
     }
 }
 
-/// Sample type of a data element: stored types may be narrower than the array's class.
+/// Returns the sample type of a data element; stored types may be narrower than the array's class.
 fn sample(kind: u32, big_endian: bool) -> Option<Sample> {
     let integer = |bytes, signed| Some(Sample::Integer { bytes, signed, big_endian });
     match kind {
@@ -244,7 +244,7 @@ fn sample(kind: u32, big_endian: bool) -> Option<Sample> {
     }
 }
 
-/// Reads a two-dimensional array whole, row-major: a map of the pixels.
+/// Reads a two-dimensional array, row-major: a map of the pixels.
 pub(crate) fn read_map(array: &MatArray, path: &Path) -> Result<qudi_core::Frame> {
     let &[height, width] = array.dims.as_slice() else {
         return Err(damaged(format!("`{}` has extents {:?}", array.name, array.dims), path));

@@ -7,10 +7,10 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-/// What camera servers append to a stream of frames.
+/// Trailers that camera servers append to a stream of frames.
 pub(crate) const TRAILERS: [&[u8]; 2] = [b"DONE", b"ERROR"];
 
-/// The frames of `files`, `frame_bytes` each, after `header` bytes.
+/// Opens the frames of `files`, `frame_bytes` each, after `header` bytes.
 pub(crate) fn frame_files(
     files: &[PathBuf],
     frame_bytes: usize,
@@ -100,7 +100,7 @@ fn segment(
     Ok(Segment { path: path.to_owned(), start: header, frames: body / frame_bytes })
 }
 
-/// Length of a known trailer, if `rest` bytes beyond whole frames are one.
+/// Returns the length of a known trailer, if the `rest` bytes beyond whole frames are one.
 fn trailer(file: &mut File, rest: u64, path: &Path, info: &mut CaptureInfo) -> Result<u64> {
     let Some(known) = TRAILERS.iter().find(|known| known.len() as u64 == rest) else {
         return Ok(0);
@@ -121,7 +121,7 @@ fn trailer(file: &mut File, rest: u64, path: &Path, info: &mut CaptureInfo) -> R
     Ok(rest)
 }
 
-/// Length of the trailer that ends `bytes`, for recognising a format.
+/// Returns true if the file ends in a known trailer.
 pub(crate) fn ends_in_trailer(path: &Path) -> bool {
     let read = || -> std::io::Result<[u8; 4]> {
         let mut end = [0u8; 4];

@@ -1,20 +1,21 @@
-//! Regions of interest: how wide the rows of a read-out are that is no whole array.
+//! Regions of interest: the row width of a read-out that is not a whole array.
 
 use super::ARRAY;
 use qudi_core::{Error, Result, Size};
 use std::path::Path;
 
-/// Rows are this many pixels wide, or a multiple.
-const STEP: usize = 8;
+/// Step of row widths in pixels.
+const WIDTH_STEP: usize = 8;
 
-/// Samples looked at.
-const MOST: usize = 1 << 20;
+/// Largest number of samples that are compared.
+const MAX_SAMPLES: usize = 1 << 20;
 
-/// Widths whose rows fit each other by less than this many standard errors are no better than others.
-const SURE: f64 = 6.0;
+/// Standard errors by which rows of one width must fit better than of others.
+const Z_SCORE_THRESHOLD: f64 = 6.0;
 
-/// The size of frames, where files hold `frame_bytes(size)` for every frame: the whole array, or the region of
-/// interest that `samples` (from the start of a file) show. `body` are the bytes of the first file.
+/// Returns the size of frames, where files hold `frame_bytes(size)` for every frame: the whole array, or the
+/// region of interest that `samples` (from the start of a file) show. `body` is the number of frame bytes in
+/// the first file.
 pub(super) fn frame_size(
     samples: &[f32],
     body: u64,
@@ -23,14 +24,15 @@ pub(super) fn frame_size(
 ) -> Result<Size> {
     let fits = |size: &Size| body > 0 && body.is_multiple_of(frame_bytes(*size));
     let seen = row_width(samples).map(|width| Size { height: ARRAY.height, width });
-    // Whole rows: what is missing at the end is said by its own name.
+    // Only whole rows are compared; an incomplete frame has an error of its own.
     if seen == Some(ARRAY) || fits(&ARRAY) && seen.is_none() {
         return Ok(ARRAY);
     }
     if let Some(size) = seen.filter(fits) {
         return Ok(size);
     }
-    let regions = (1..=ARRAY.width / STEP).rev().map(|n| Size { width: n * STEP, ..ARRAY });
+    let regions =
+        (1..=ARRAY.width / WIDTH_STEP).rev().map(|n| Size { width: n * WIDTH_STEP, ..ARRAY });
     let mut possible: Vec<String> =
         regions.filter(fits).take(6).map(|size| size.to_string()).collect();
     if let Some(Size { width, .. }) = seen {
@@ -55,15 +57,17 @@ pub(super) fn frame_size(
     ))
 }
 
-/// The row length at which pixels below each other fit best, if one does clearly better than those beside it.
+/// Returns the row length at which vertical neighbours fit best, if one does clearly better than the lengths
+/// around it.
 fn row_width(samples: &[f32]) -> Option<usize> {
-    let samples = &samples[..samples.len().min(MOST)];
+    let samples = &samples[..samples.len().min(MAX_SAMPLES)];
     if samples.len() < 4 * ARRAY.width {
         return None;
     }
-    // Pairs of 8 pixels, averaged: noise weighs less.
-    let eights: Vec<f32> = samples.chunks_exact(STEP).map(|eight| eight.iter().sum()).collect();
-    let most = ARRAY.width / STEP;
+    // Groups of 8 pixels are averaged to reduce noise.
+    let eights: Vec<f32> =
+        samples.chunks_exact(WIDTH_STEP).map(|eight| eight.iter().sum()).collect();
+    let most = ARRAY.width / WIDTH_STEP;
     let pairs = eights.len() - most;
     let difference = |lag: usize| -> (f64, f64) {
         let squares = (0..pairs).map(|i| f64::from(eights[i] - eights[i + lag]).powi(2));
@@ -73,14 +77,14 @@ fn row_width(samples: &[f32]) -> Option<usize> {
     };
     let all: Vec<(f64, f64)> = (1..=most).map(difference).collect();
     let (at, best) = all.iter().enumerate().skip(1).min_by(|a, b| a.1.0.total_cmp(&b.1.0))?;
-    // The shortest that fits as well: whole multiples of rows fit, too.
+    // Multiples of the row length fit as well: the shortest counts.
     let alike = |d: &(f64, f64)| d.0 <= best.0 + 3.0 * d.1.max(best.1);
     let at = (1..at).find(|&i| (at + 1).is_multiple_of(i + 1) && alike(&all[i])).unwrap_or(at);
     let neighbours = [at.checked_sub(1), Some(at + 1)].into_iter().flatten();
     let beside = neighbours.filter_map(|i| all.get(i));
     let clear = beside.clone().count() > 0
-        && beside.into_iter().all(|d| d.0 - all[at].0 > SURE * d.1.max(all[at].1));
-    clear.then_some((at + 1) * STEP)
+        && beside.into_iter().all(|d| d.0 - all[at].0 > Z_SCORE_THRESHOLD * d.1.max(all[at].1));
+    clear.then_some((at + 1) * WIDTH_STEP)
 }
 
 #[cfg(test)]

@@ -1,9 +1,9 @@
-//! What ImageJ and OME write into a TIFF's description: order of pages, channels, frame interval.
+//! Descriptions of TIFF stacks by ImageJ and OME: order of pages, channels, frame interval.
 
 /// The axes of a stack beyond rows and columns.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Description {
-    /// Images in all, if it says.
+    /// Number of all images, if known.
     pub(super) images: Option<u64>,
     /// Channels of the stack.
     pub(super) channels: u64,
@@ -11,18 +11,18 @@ pub(super) struct Description {
     pub(super) run: u64,
     /// Frames per second.
     pub(super) fps: Option<f64>,
-    /// Who wrote it.
+    /// Program that wrote it.
     pub(super) program: &'static str,
 }
 
 impl Description {
-    /// Reads the text of the first page.
+    /// Parses the text of the first page.
     pub(super) fn parse(text: &str) -> Option<Self> {
         if text.starts_with("ImageJ=") { Some(imagej(text)) } else { ome(text) }
     }
 }
 
-/// `key=value` lines; pages are ordered channels first, then slices, then frames.
+/// Parses `key=value` lines; pages are ordered channels first, then slices, then frames.
 fn imagej(text: &str) -> Description {
     let value = |key: &str| {
         text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix('=').map(str::trim))
@@ -40,7 +40,7 @@ fn imagej(text: &str) -> Description {
     }
 }
 
-/// The attributes of the first `<Pixels ...>` of OME-XML.
+/// Parses the attributes of the first `<Pixels ...>` of OME-XML.
 fn ome(text: &str) -> Option<Description> {
     let at = text.find("<OME").and_then(|at| Some(at + text[at..].find("Pixels ")?))?;
     let element = &text[at..at + text[at..].find('>')?];

@@ -20,11 +20,11 @@ pub(crate) struct TiffPages {
     size: Size,
     frames: u64,
     scale: Scale,
-    /// Samples of a pixel, and the one that is read.
+    /// Number of samples of a pixel, and the one that is read.
     samples: (usize, usize),
-    /// Rows of single bits, padded to bytes.
+    /// True for rows of single bits, padded to bytes.
     bits: bool,
-    /// Whether the first pixel of a byte is its lowest bit.
+    /// True if the first pixel of a byte is its lowest bit.
     reversed: bool,
 }
 
@@ -46,8 +46,8 @@ pub(crate) fn decoder(path: &Path) -> Result<TiffDecoder> {
     Decoder::new(BufReader::with_capacity(1 << 16, file)).map_err(|e| fault(path, e))
 }
 
-/// Whether the bits of each byte of the current page are stored lowest first (FillOrder 2, TIFF 6.0 section
-/// 8). The decoder does not honour it, so that only uncompressed bytes can be turned round.
+/// Returns true if the bits of each byte of the current page are stored lowest first (FillOrder 2, TIFF 6.0
+/// section 8). The decoder ignores it, so that only uncompressed bytes can be reversed.
 pub(super) fn bits_reversed(decoder: &mut TiffDecoder, path: &Path) -> Result<bool> {
     let mut tag = |tag| -> Result<Option<u16>> {
         let value = decoder.find_tag(tag).map_err(|e| fault(path, e))?;
@@ -70,13 +70,13 @@ pub(super) fn bits_reversed(decoder: &mut TiffDecoder, path: &Path) -> Result<bo
     ))
 }
 
-/// What values mean: 0, where larger ones are darker; the decoder turns those round.
+/// Returns the meaning of values: 0 if larger ones are darker, which the decoder inverts.
 pub(super) fn photometric(decoder: &mut TiffDecoder, path: &Path) -> Result<u16> {
     let tag = decoder.find_tag(Tag::PhotometricInterpretation).map_err(|e| fault(path, e))?;
     Ok(tag.and_then(|value| value.into_u16().ok()).unwrap_or(1))
 }
 
-/// Samples of a pixel, bits of a sample, and whether one of the samples is opacity.
+/// Returns the samples of a pixel, the bits of a sample, and whether one of the samples is opacity.
 fn samples_of(color: ColorType) -> Option<(usize, u8, bool)> {
     match color {
         ColorType::Gray(bits) => Some((1, bits, false)),
@@ -90,7 +90,7 @@ fn samples_of(color: ColorType) -> Option<(usize, u8, bool)> {
     }
 }
 
-/// The sample of a pixel that is read; `of_pages`: channels are pages, and pages are gray.
+/// Returns the sample of a pixel that is read; `of_pages` is true if channels are pages, which are gray.
 fn chosen_sample(
     color: ColorType,
     options: &ReadOptions,
@@ -174,7 +174,7 @@ impl TiffPages {
         Ok(pages)
     }
 
-    /// A truncated file shows on its last frame.
+    /// Drops a last frame that a truncated file cuts off.
     fn drop_unreadable(&mut self, options: &ReadOptions, info: &mut CaptureInfo) -> Result<()> {
         loop {
             match self.page(self.frames - 1) {

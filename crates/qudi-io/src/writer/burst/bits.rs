@@ -1,4 +1,4 @@
-//! Eight binary pixels to the byte, the first in the most significant bit (`numpy.packbits`).
+//! Packing of binary pixels, eight to the byte, the first in the most significant bit (`numpy.packbits`).
 
 /// Packs one row; bits beyond the row's end are 0.
 pub fn pack_row(pixels: &[u16], bytes: &mut [u8]) {

@@ -15,7 +15,7 @@ pub(crate) struct PngFolder {
 }
 
 impl PngFolder {
-    /// The record's name; it also marks the folder as ours.
+    /// Name of the record, which also marks the folder as ours.
     pub(crate) const RECORD: &str = "burst.json";
 
     pub(crate) fn create(

@@ -3,7 +3,7 @@
 use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::conv::{Activation, Options, conv_2d};
-use qudi_model::network::pixel_unshuffle;
+use qudi_layers::resample::pixel_unshuffle;
 
 /// A convolution. Its weights are constants: no gradient is kept for them.
 #[derive(Clone, Debug)]

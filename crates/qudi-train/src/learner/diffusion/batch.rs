@@ -1,0 +1,106 @@
+//! Samples as planes, noise and times, ready to go to a device.
+
+use super::Example;
+use crate::burst_cache::BurstSampler;
+use crate::burst_cache::burst::ConditionedBurst;
+use crate::recipe::Recipe;
+use burn::tensor::{Device, Tensor, TensorData};
+use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::{Result, Size};
+use qudi_layers::tensor::to_tensor;
+use qudi_model::counts::CountPlanes;
+use qudi_model::diffusion::Conditioning;
+use qudi_model::diffusion::noise::Noise;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
+use qudi_model::sensor::{SENSOR_NUMBERS, sensor_numbers};
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
+
+/// The samples of one pass of the diffusion.
+#[derive(Clone, Debug)]
+pub struct Batch {
+    /// The number of the batch in its run.
+    pub number: u64,
+    size: Size,
+    frames: usize,
+    counts: CountPlanes,
+    truth: Vec<f32>,
+    noise: Vec<f32>,
+    numbers: Vec<f32>,
+    acquisitions: Vec<Acquisition>,
+    timesteps: Vec<usize>,
+}
+
+impl Batch {
+    /// Draws batch `number` of a recipe.
+    ///
+    /// # Errors
+    /// [`qudi_core::Error`] if the data cannot be read.
+    pub fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Self> {
+        let count = recipe.train.batch;
+        let (frames, side) = recipe.sample_size();
+        let size = Size { height: side, width: side };
+        let mut batch = Self {
+            number,
+            size,
+            frames,
+            counts: CountPlanes::default(),
+            truth: Vec::new(),
+            noise: Vec::new(),
+            numbers: Vec::new(),
+            acquisitions: Vec::new(),
+            timesteps: Vec::new(),
+        };
+        for sample in (number * count as u64..).take(count) {
+            let ConditionedBurst { sample: drawn, .. } = bursts.sample(sample)?;
+            let view = BurstView { size, frames: &drawn.counts };
+            batch.counts.extend(CountPlanes::new(view, &drawn.acquisition));
+            batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
+            let noise = Noise::new(drawn.acquisition.seed, 0);
+            let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
+            batch.noise.extend(noise);
+            batch.numbers.extend(sensor_numbers(&drawn.acquisition));
+            let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
+            let timesteps = recipe.train.timesteps;
+            let at_start = random.random::<f64>() < recipe.train.noise_start_fraction();
+            let quantile = random.random();
+            let timestep = timesteps.timestep(quantile);
+            batch.timesteps.push(if at_start { NUM_TIMESTEPS - 1 } else { timestep });
+            batch.acquisitions.push(drawn.acquisition);
+        }
+        Ok(batch)
+    }
+
+    /// Returns the number of samples.
+    pub fn len(&self) -> usize {
+        self.acquisitions.len()
+    }
+
+    /// Returns true if there are no samples.
+    pub fn is_empty(&self) -> bool {
+        self.acquisitions.is_empty()
+    }
+
+    /// Copies the conditioning of the batch to `device`.
+    pub(super) fn conditioning(&self, device: &Device) -> Conditioning {
+        let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
+        Conditioning {
+            counts: to_tensor(self.counts.y.clone(), self.size, device),
+            linear_estimate: to_tensor(self.counts.u.clone(), self.size, device),
+            sensor: Tensor::from_data(numbers, device),
+            frames: self.frames,
+        }
+    }
+
+    /// Copies the batch as an example for the loss, on the device of `conditioning`.
+    pub(super) fn example<'a>(&'a self, conditioning: &'a Conditioning) -> Example<'a> {
+        let device = conditioning.linear_estimate.device();
+        Example {
+            conditioning,
+            truth: to_tensor(self.truth.clone(), self.size, &device),
+            acquisitions: &self.acquisitions,
+            noise: to_tensor(self.noise.clone(), self.size, &device),
+            timesteps: &self.timesteps,
+        }
+    }
+}
