@@ -219,8 +219,7 @@ fn draws_all_bursts_before_training() {
     run(&folder, &format!("train regression.toml --bursts kept -o run {parts}"));
     assert!(std::fs::read(path(4)).unwrap() == kept);
     refused(&folder, "train regression.toml --bursts kept --prepare", &["train.crops"]);
-    let other =
-        format!("train regression.toml --bursts kept --prepare {parts} --set data.crop=40");
+    let other = format!("train regression.toml --bursts kept --prepare {parts} --set data.crop=40");
     refused(&folder, &other, &["drawn with other"]);
 }
 

@@ -140,7 +140,7 @@ macro_rules! methods {
 
         impl Method {
             /// Returns the name on the command line, in recipes and in files.
-            pub fn name(self) -> &'static str {
+            pub const fn name(self) -> &'static str {
                 match self { $(Self::$method => $name),+ }
             }
 

@@ -2,6 +2,7 @@
 
 use super::flatten;
 use super::schema::{Documented, keys_of, schema_of, variants};
+use qudi_baselines::import::Method;
 use qudi_train::{Recipe, recipe_names, recipe_table};
 use serde_json::Value;
 use std::sync::OnceLock;
@@ -14,20 +15,26 @@ pub(crate) fn recipe_keys() -> Vec<(Documented, Vec<&'static str>)> {
     let mut keys: Vec<Documented> = Vec::new();
     for key in own.flat_map(|variant| keys_of(variant, "network.")) {
         match keys.iter_mut().find(|known| known.name == key.name) {
-            Some(known) if known.values != key.values => known.values += &format!(", {}", key.values),
+            Some(known) if known.values != key.values => {
+                known.values += &format!(", {}", key.values);
+            }
             Some(_) => {}
             None => keys.push(key),
         }
     }
     // Serde's tag of the variants has no documentation of its own.
     for key in keys.iter_mut().filter(|key| key.name == "network.kind") {
-        key.doc = "Kind of the network".to_owned();
+        "Kind of the network".clone_into(&mut key.doc);
     }
     let others = keys_of(&schema, "").into_iter();
     keys.extend(others.filter(|key| key.name != "network"));
     let set: Vec<_> = recipe_names().map(|name| (name, set_by(name))).collect();
     let with_recipes = |key: Documented| {
-        let sets = |(_, set): &&(&str, Vec<String>)| set.contains(&key.name);
+        let below = format!("{}.", key.name);
+        let own = |name: &str| !key.name.starts_with("network.") || Method::by_name(name).is_none();
+        let sets = |(name, set): &&(&str, Vec<String>)| {
+            own(name) && set.iter().any(|set| *set == key.name || set.starts_with(&below))
+        };
         let recipes = set.iter().filter(sets).map(|(name, _)| *name).collect();
         (key, recipes)
     };

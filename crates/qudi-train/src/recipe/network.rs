@@ -5,8 +5,8 @@ use qudi_core::{Error, Result};
 use qudi_model::config::{NetworkConfig, PRESETS};
 use qudi_model::diffusion::DiffusionConfig;
 use qudi_model::regression::RegressionConfig;
-use serde::de::Error as _;
 use schemars::JsonSchema;
+use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// Returns the names of all built-in recipes: first our own, smallest first.

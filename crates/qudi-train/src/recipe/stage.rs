@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StageConfig {
-    /// The name, which its folder has, too.
+    /// Name of the stage, and of its folder.
     pub name: String,
     /// Keys of the recipe and their values here, such as `"train.steps" = 9000`.
     #[serde(default)]
