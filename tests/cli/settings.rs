@@ -72,7 +72,7 @@ fn every_command_applies_or_rejects_set_keys_by_name() {
 fn files_and_the_environment_are_shared_between_commands() {
     let folder = prepared("settings-shared");
     let all = "[simulate]\nseed = 3\n[sensor]\npitch_um = 5.5\n[train]\nsteps = 3\n\
-        [network]\nwithout = [\"flow\"]\n[[data.source]]\nname = \"a\"\n";
+        ablate = [\"flow\"]\n[[data.source]]\nname = \"a\"\n";
     std::fs::write(folder.join("all.toml"), all).unwrap();
     std::fs::write(folder.join("typo.toml"), "[train]\nstepz = 3\n").unwrap();
     for (command, _) in COMMANDS {
