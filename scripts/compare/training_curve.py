@@ -2,9 +2,9 @@
 # requires-python = ">=3.11"
 # dependencies = ["numpy", "safetensors", "torch"]
 # ///
-"""Train the pre-denoiser of `small` on single frames (its first stage) in PyTorch, to compare with `qudi train`.
+"""Train the refinement of `small` on single frames (its first stage) in PyTorch, to compare with `qudi train`.
 
-    qudi train small --data DATA --pack pack.zip --bursts bursts --backbones WEIGHTS -o run
+    qudi train small --data DATA --pack pack.zip --bursts bursts -o run
     python scripts/compare/training_curve.py bursts/1-refinement --threads 2 --minutes 60 > curve.jsonl
 
 `qudi train` has written the bursts to its cache. Network, initial distribution of the weights, loss, optimizer,
@@ -39,9 +39,10 @@ class Burst:
     def __init__(self, path: Path):
         with safe_open(path, "numpy") as file:
             names = set(file.keys())
-            self.images = np.stack([file.get_tensor(f"image.{k}") for k in range(3)])
-            count = sum(name.startswith("deviation.") for name in names)
-            self.standardized = np.stack([file.get_tensor(f"deviation.{k}") for k in range(count)])
+            self.images = np.stack([file.get_tensor(name) for name in ("reference", "merged", "noise_sigma")])
+            count = sum(name.startswith("expected.") for name in names)
+            planes = [f"standardized.{k}" for k in range(count + 1)] + [f"expected.{k}" for k in range(count)]
+            self.standardized = np.stack([file.get_tensor(name) for name in planes])
             self.truth = file.get_tensor("truth")
 
     def crop(self, rng: np.random.Generator, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,11 +94,11 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     recipe = tomllib.loads((ROOT / "configs/small.toml").read_text())
-    train, pre, fold = recipe["train"], recipe["network"]["pre"], recipe["network"]["fold"]
+    train, pre, fold = recipe["train"], recipe["network"], recipe["network"]["fold"]
     count = args.count or train["crops"]["bursts"]
     bursts = [Burst(path) for path in sorted(args.bursts.glob("*.safetensors"))[:count]]
     sizes = {"width": pre["width"], "blocks": pre["blocks"], "growth": pre["growth"], "neighbours": pre["neighbours"]}
-    sizes |= {"motions": pre["alignments"], "trust": pre["weight_channels"]}
+    sizes |= {"motions": 2, "trust": pre["weight_channels"]}
     model = network.PreDenoiser({"fold": fold, "pre": sizes}).to(memory_format=torch.channels_last)
     initialise(model, train["seed"])
     adam = torch.optim.Adam(model.parameters())

@@ -19,7 +19,7 @@ fn prepared(name: &str) -> PathBuf {
         )
         .assert()
         .success();
-    weights(&folder.join("w.safetensors"), 0.01);
+    weights(&folder.join("w.safetensors"), 0.005);
     folder
 }
 

@@ -157,8 +157,8 @@ fn weights_restore_equal_frames_by_name_and_path() {
     let built_in = frames("", "a.npy");
     assert!(built_in == frames("--weights w.safetensors", "b0.npy"));
     assert!(built_in == frames("--weights p.safetensors", "c.npy"));
-    let said = run(&folder, "restore b.npy --device cpu --steps 2 -o two");
-    assert!(said.contains("by qudi (diffusion in 2 steps) on cpu"), "{said}");
+    let said = run(&folder, "restore b.npy --method qudi-diffusion --device cpu --steps 2 -o two");
+    assert!(said.contains("by qudi-diffusion (diffusion in 2 steps) on cpu"), "{said}");
     let manifest = std::fs::read_to_string(folder.join("two/manifest.json")).unwrap();
     assert!(manifest.contains("\"mode\": \"diffusion in 2 steps\""), "{manifest}");
 }

@@ -320,5 +320,5 @@ changes = { \"train.learns\" = [\"uncertainty\"], \"train.seed\" = 7 }
     let learns = format!("train tiny -o other {QUICK_SETTINGS} --set");
     refused(&folder, &format!("{learns} train.learns=[\"unet\"]"), &["train.learns"]);
     refused(&folder, &format!("{learns} train.learns=[\"eyes\"]"), &["eyes"]);
-    refused(&folder, &format!("{learns} train.ablate=[\"eyes\"]"), &["eyes"]);
+    refused(&folder, &format!("{learns} train.ablate=[\"eyes\"]"), &["train.ablate"]);
 }

@@ -93,7 +93,7 @@ pub(crate) const QUDI_REGRESSION: Method = Method {
 pub(crate) const QUDI_DIFFUSION: Method = Method {
     name: "qudi-diffusion",
     about: "samples from photons alone, as the paper's network does",
-    cost: 1.0,
+    cost: 0.2,
     aligns: false,
     kind: Kind::Network(NetworkChoice::Of(NetworkKind::Diffusion)),
 };

@@ -51,30 +51,9 @@ impl Conv2d {
         }
     }
 
-    /// Inserts `more` inputs of zero weight after the first `at` ones.
-    #[must_use]
-    pub fn with_zero_inputs(self, at: usize, more: usize) -> Self {
-        if more == 0 {
-            return self;
-        }
-        let weight = self.weight.val();
-        let [outputs, inputs, rows, columns] = weight.dims();
-        let zeros = Tensor::zeros([outputs, more, rows, columns], &weight.device());
-        let mut parts = vec![weight.clone().narrow(1, 0, at), zeros];
-        if at < inputs {
-            parts.push(weight.narrow(1, at, inputs - at));
-        }
-        Self { weight: Param::from_tensor(Tensor::cat(parts, 1)), ..self }
-    }
-
     /// Returns the weights, `[outputs, inputs, rows, columns]`.
     pub fn weight(&self) -> Tensor<4> {
         self.weight.val()
-    }
-
-    /// Returns the number of inputs.
-    pub fn inputs(&self) -> usize {
-        self.weight.lazy_shape().as_slice()[1]
     }
 
     /// Applies the convolution to `inputs`, `[images, channels, height, width]`, joined by channel.

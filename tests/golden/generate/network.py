@@ -27,18 +27,11 @@ Flows = tuple[Tensor, Tensor]
 ROOT = Path(__file__).resolve().parents[3]
 
 
-# Keys of `pre`, and their former names, by which golden values and this reference know them.
-FORMER_KEYS = {"alignments": "motions", "weight_channels": "trust", "stages": "rounds", "uncertainty": "error"}
-
-
-def with_former_keys(config: dict) -> dict:
-    """A [network] table by the former names of its keys."""
-    return {**config, "pre": {FORMER_KEYS.get(key, key): value for key, value in config["pre"].items()}}
-
-
 def load(preset: str) -> dict:
-    """The [network] table of a preset."""
-    return with_former_keys(tomllib.loads((ROOT / "configs" / f"{preset}.toml").read_text())["network"])
+    """The [network] table of a diffusion preset, with the switches of this reference, which is also a regression."""
+    config = tomllib.loads((ROOT / "configs" / f"{preset}.toml").read_text())["network"]
+    config["pre"]["neighbours"], config["flow"]["registration"], config["unet"]["temporal"] = 0, False, False
+    return config | {"reference": "none"}
 
 
 def multiple(config: dict) -> int:

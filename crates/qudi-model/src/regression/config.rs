@@ -52,10 +52,11 @@ impl RegressionConfig {
     /// Estimates the bytes that restoring a window of `frames` frames takes on the processor at most, if the
     /// network sees tiles of `size`: inputs and activations of one frame, and planes of the whole window.
     pub fn memory(&self, size: Size, frames: usize) -> u64 {
-        const WIDTHS: usize = 6;
+        const PLANES: usize = 4;
+        const WIDTHS: usize = 14;
         let planes = 4 + self.second_neighbours().standardized_planes();
         let cells = (size.pixels() / (self.fold * self.fold)) as f64;
-        let inputs = (3 * planes * size.pixels()) as f64;
+        let inputs = (PLANES * planes * size.pixels()) as f64;
         let activations = ((self.blocks + WIDTHS) * self.width) as f64 * cells;
         let window = 50.0 * (1 << 20) as f64 + 80.0 * (size.pixels() * frames) as f64;
         (4.0 * (inputs + activations) + window) as u64
