@@ -237,8 +237,10 @@ impl Recipe {
         for (key, text) in changes {
             set(&mut document, key, value(text))?;
         }
-        let mut recipe: Self =
-            document.try_into().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
+        let read = serde_path_to_error::deserialize(toml::Value::Table(document));
+        let mut recipe: Self = read.map_err(|e: serde_path_to_error::Error<toml::de::Error>| {
+            fault(format!("{}: {}", e.path(), e.inner().message()))
+        })?;
         // What is changed here is changed in every stage.
         for stage in &mut recipe.stage {
             for (key, text) in changes.iter().filter(|(key, _)| !key.starts_with("stage.")) {
