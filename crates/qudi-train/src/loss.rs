@@ -1,4 +1,4 @@
-//! The terms of losses; each network adds up its own ([`learner`](crate::learner)). docs/network.md has the
+//! The terms of losses; each network adds up its own, in `learner/`. docs/network.md has the
 //! formulas.
 
 mod gaussian_nll;
