@@ -6,11 +6,12 @@ use burn::module::Module;
 use burn::tensor::Device;
 use qudi_core::{Error, Result, Size};
 use qudi_layers::parameter_shapes;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
 /// Sizes of a network, with its kind.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 #[allow(clippy::large_enum_variant)] // one in a recipe
 pub enum NetworkConfig {

@@ -1,19 +1,19 @@
-//! What recipes must keep to.
+//! Rules of recipes.
 
 use super::{
     LearningPart, NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage,
 };
 use crate::loss::lpips::PerceptualKind;
-use qudi_baselines::sizes::Sizes;
+use qudi_baselines::method::Sizes;
 use qudi_core::{Error, Result};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::DiffusionConfig;
 
-/// A key, whether it is as it must be, and what it must be.
+/// A key, true if it keeps the rule, and the rule.
 type Rule<'a> = (&'a str, bool, &'a str);
 
 impl Recipe {
-    /// The recipe, if it can be trained.
+    /// Returns the recipe, if it can be trained.
     pub(super) fn checked(self) -> Result<Self> {
         let network = match self.network.clone() {
             NetworkRecipe::Qudi(config) => NetworkRecipe::Qudi(config.checked()?),
@@ -44,7 +44,7 @@ impl Recipe {
         Ok(Self { network, data, ..self })
     }
 
-    /// The rules of every network.
+    /// Returns the rules of every network.
     fn common_rules(&self) -> [Rule<'static>; 8] {
         let train = &self.train;
         [
@@ -63,7 +63,7 @@ impl Recipe {
         ]
     }
 
-    /// The rule of samples, which have `fewest` frames and sides of multiples of a number.
+    /// Returns the rules of samples, which have `fewest` frames and sides of multiples of a number.
     fn sample_rules(&self, fewest: usize, multiple: usize) -> [Rule<'static>; 2] {
         let train = &self.train;
         let (frames, side) = self.sample_size();
@@ -170,7 +170,7 @@ impl Recipe {
         let refused = |what: String, key: &str| {
             Err(Error::request(what, key, "correct the recipe: see docs/training.md"))
         };
-        if let Some(problem) = sizes.problem_of_recipe() {
+        if let Some(problem) = sizes.problem_in_recipe() {
             return refused(format!("{problem}; the recipe has {sizes}"), "network");
         }
         let (frames, _) = self.sample_size();

@@ -2,10 +2,11 @@
 
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::timesteps::{NUM_TIMESTEPS, log_logistic_timestep};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The law of the timesteps that the network learns at.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimestepLaw {
     /// All alike (Ho et al. 2020, algorithm 1), as in the paper.
