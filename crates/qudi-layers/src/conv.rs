@@ -72,6 +72,11 @@ impl Conv2d {
         self.weight.val()
     }
 
+    /// Returns the bias, `[outputs]`, zeros where there is none.
+    pub fn bias_or_zeros(&self) -> Tensor<1> {
+        bias_or_zeros(self.bias.as_ref(), &self.weight.val())
+    }
+
     /// Returns the number of inputs.
     pub fn inputs(&self) -> usize {
         self.weight.lazy_shape().as_slice()[1]
