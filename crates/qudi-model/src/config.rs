@@ -2,6 +2,7 @@
 
 use crate::diffusion::DiffusionConfig;
 use crate::regression::RegressionConfig;
+use crate::window::WindowConfig;
 use burn::module::Module;
 use burn::tensor::Device;
 use qudi_core::{Error, Result, Size};
@@ -19,6 +20,8 @@ pub enum NetworkConfig {
     Regression(RegressionConfig),
     /// Diffusion.
     Diffusion(DiffusionConfig),
+    /// Diffusion that encodes a window once.
+    Window(WindowConfig),
 }
 
 /// Kind of a network.
@@ -28,6 +31,15 @@ pub enum NetworkKind {
     Regression,
     /// Diffusion.
     Diffusion,
+    /// Diffusion that encodes a window once.
+    Window,
+}
+
+impl NetworkKind {
+    /// Returns true for networks that predict in reverse steps.
+    pub fn is_diffusion(self) -> bool {
+        self != Self::Regression
+    }
 }
 
 impl fmt::Display for NetworkKind {
@@ -35,6 +47,7 @@ impl fmt::Display for NetworkKind {
         f.write_str(match self {
             Self::Regression => "regression",
             Self::Diffusion => "diffusion",
+            Self::Window => "window",
         })
     }
 }
@@ -88,6 +101,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(_) => NetworkKind::Regression,
             Self::Diffusion(_) => NetworkKind::Diffusion,
+            Self::Window(_) => NetworkKind::Window,
         }
     }
 
@@ -96,6 +110,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => config.multiple(),
             Self::Diffusion(config) => config.multiple(),
+            Self::Window(config) => config.multiple(),
         }
     }
 
@@ -105,6 +120,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => config.memory(size, frames),
             Self::Diffusion(config) => config.memory(size, frames),
+            Self::Window(config) => config.memory(size, frames),
         }
     }
 
@@ -117,6 +133,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => count(&config.uninitialized(device)),
             Self::Diffusion(config) => count(&config.uninitialized(device)),
+            Self::Window(config) => count(&config.uninitialized(device)),
         }
     }
 
@@ -128,6 +145,7 @@ impl NetworkConfig {
         Ok(match self {
             Self::Regression(config) => Self::Regression(config.checked()?),
             Self::Diffusion(config) => Self::Diffusion(config.checked()?),
+            Self::Window(config) => Self::Window(config.checked()?),
         })
     }
 }
