@@ -11,10 +11,6 @@ ci:
 test:
     cargo test --workspace
 
-# Devices of other machines, which the test suite leaves out: half as many crates again
-test-remote:
-    cargo test --release -p qudi-cli --no-default-features --features cpu,remote --test cli remote
-
 # Formatting and lints
 lint:
     cargo fmt --all --check

@@ -15,9 +15,6 @@ mod field;
 mod network;
 #[path = "cli/outputs.rs"]
 mod outputs;
-#[cfg(feature = "remote")]
-#[path = "cli/remote.rs"]
-mod remote;
 #[path = "cli/report.rs"]
 mod report;
 #[path = "cli/restore.rs"]

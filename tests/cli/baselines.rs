@@ -12,9 +12,9 @@ const QUICK_SETTINGS: &str = "--device cpu -q --set network.width=4 --set train.
 fn with_recipe(name: &str) -> PathBuf {
     let folder = scratch(name);
     let text = std::fs::read_to_string(crate::root().join("configs/baselines/emvd.toml")).unwrap();
-    let [files, scenes] = [text.find("# Files").unwrap(), text.rfind("[[data.source]]").unwrap()];
-    let text = format!("{}{}", &text[..files], &text[scenes..]);
-    let text = text.replace("from = [\"val/video\"]", "from = [\"scene:text\"]");
+    let scenes = "[[data.source]]\nname = \"scenes\"\nkind = \"scenes\"\nfrom = [\"dead-leaves\", \"text\"]\n";
+    let text = text.replace("[train]", &format!("{scenes}speed = 5.0\n\n[train]"));
+    let text = text.replace("[validation]", "[validation]\nfrom = [\"scene:text\"]");
     std::fs::write(folder.join("scenes.toml"), text).unwrap();
     folder
 }
@@ -85,7 +85,7 @@ fn emvd_trains_resumes_restores_and_says_what_it_is() {
     let other = format!("train tiny -o other --init run/weights.safetensors {QUICK_SETTINGS}");
     refused(&folder, &other.replace("--set network.width=4 ", ""), &["another program"]);
     let crops = "--set train.crops={bursts=2,cached_frames=4,frames=4,side=16}";
-    run(&folder, &format!("train scenes.toml --bursts kept --draw-only {QUICK_SETTINGS} {crops}"));
+    run(&folder, &format!("train scenes.toml --bursts kept --prepare {QUICK_SETTINGS} {crops}"));
     assert_eq!(listing(&folder.join("kept")).len(), 2);
     let mut recipe = std::fs::read_to_string(folder.join("scenes.toml")).unwrap();
     recipe.push_str(

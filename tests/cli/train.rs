@@ -123,7 +123,7 @@ fn packs_train_without_the_files() {
     std::fs::write(folder.join("mine.toml"), recipe).unwrap();
     run(
         &folder,
-        "train mine.toml --data data --pack p.zip --cache-only -q --set data.crop=32 --set data.frames=3",
+        "train mine.toml --data data --pack p.zip --prepare -q --set data.crop=32 --set data.frames=3",
     );
     std::fs::remove_dir_all(folder.join("data")).unwrap();
     run(&folder, &format!("train mine.toml --pack p.zip -o run {QUICK_SETTINGS}"));
@@ -205,7 +205,7 @@ fn draws_all_bursts_before_training() {
     let folder = with_recipes("train-draw");
     let parts =
         format!("{QUICK_SETTINGS} --set train.crops={{bursts=5,cached_frames=3,frames=3,side=16}}");
-    run(&folder, &format!("train regression.toml --bursts kept --draw-only --workers 2 {parts}"));
+    run(&folder, &format!("train regression.toml --bursts kept --prepare --workers 2 {parts}"));
     let names: Vec<_> = (0..5).map(|number| format!("1-{number:06}.safetensors")).collect();
     assert_eq!(listing(&folder.join("kept")), names);
     // Existing bursts are kept; missing ones are drawn again, the same.
@@ -214,13 +214,12 @@ fn draws_all_bursts_before_training() {
     let written = |number: usize| std::fs::metadata(path(number)).unwrap().modified().unwrap();
     let at = written(4);
     std::fs::remove_file(path(3)).unwrap();
-    run(&folder, &format!("train regression.toml --bursts kept --draw-only {parts}"));
+    run(&folder, &format!("train regression.toml --bursts kept --prepare {parts}"));
     assert!(std::fs::read(path(3)).unwrap() == before && written(4) == at);
     run(&folder, &format!("train regression.toml --bursts kept -o run {parts}"));
     assert!(std::fs::read(path(4)).unwrap() == kept);
-    refused(&folder, "train regression.toml --bursts kept --draw-only", &["train.crops"]);
-    let other =
-        format!("train regression.toml --bursts kept --draw-only {parts} --set data.crop=40");
+    refused(&folder, "train regression.toml --bursts kept --prepare", &["train.crops"]);
+    let other = format!("train regression.toml --bursts kept --prepare {parts} --set data.crop=40");
     refused(&folder, &other, &["drawn with other"]);
 }
 
@@ -301,7 +300,9 @@ changes = { \"train.learns\" = [\"uncertainty\"], \"train.seed\" = 7 }
         &format!("train stages.toml -o run {QUICK_SETTINGS}"),
         &["--resume", "--force"],
     );
-    refused(&folder, "train stages.toml --bursts b --draw-only", &["--draw-only"]);
+    let draws = &["--prepare", "each stage draws its own"];
+    refused(&folder, "train stages.toml --bursts b --prepare", draws);
+    refused(&folder, "train stages.toml --prepare", &["nothing to prepare", "--pack"]);
     let changed = "train -o run --resume --device cpu -q --set train.lr=2e-3";
     refused(&folder, changed, &["train.lr"]);
     // A new run that stops at once must not find the stages of the previous one.

@@ -1,12 +1,14 @@
-//! EMVD: efficient multi-stage video denoising with recurrent spatio-temporal fusion (Maggioni et al., CVPR 2021),
-//! in the form in which it was compared with: frames as four equal channels, three levels of wavelets.
+//! EMVD: efficient multi-stage video denoising with recurrent spatio-temporal fusion (Maggioni et al., CVPR
+//! 2021), in the form in which it was compared with: frames as four equal channels, three levels of wavelets.
 
+mod method;
 mod transform;
 
 use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use transform::{Inverse, Wavelet};
 
@@ -17,7 +19,7 @@ pub const CHANNELS: usize = 4;
 pub const MULTIPLE: usize = 8;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of the layers inside.
@@ -25,8 +27,8 @@ pub struct Sizes {
 }
 
 /// Shot and read noise of raw frames of 12 bits, `a x + b`: constants of the published network.
-const SHOT: f32 = 1.0 / 3855.0;
-const READ: f32 = SHOT * SHOT;
+const SHOT_NOISE: f32 = 1.0 / 3855.0;
+const READ_NOISE: f32 = SHOT_NOISE * SHOT_NOISE;
 
 /// The network: one step of a recurrence over frames.
 #[derive(Module, Debug)]
@@ -62,7 +64,7 @@ struct Head {
     net3: Conv2d,
 }
 
-/// What a step gives.
+/// Results of a step.
 ///
 /// # Shapes
 /// - gamma, omega: `[images, 1, height / 2, width / 2]`
@@ -81,7 +83,7 @@ pub struct Step {
     pub refine: Tensor<4>,
 }
 
-/// What a level hands to the next finer one.
+/// Results of a level, for the next finer one.
 struct Level {
     gamma: Tensor<4>,
     fused: Tensor<4>,
@@ -90,7 +92,7 @@ struct Level {
 }
 
 impl Emvd {
-    /// The network with so many channels inside, all weights zero.
+    /// Makes the network with `width` channels inside, all weights zero.
     pub fn zeros(width: usize, device: &Device) -> Self {
         let colours = || Colours { net1: Conv2d::zeros([4, 4], 1, Bias::No, device) };
         Self {
@@ -136,7 +138,7 @@ impl Emvd {
         }
     }
 
-    /// Restores every frame from itself and those before it.
+    /// Restores every frame from itself and the frames before it.
     ///
     /// # Shapes
     /// - frames, results: `[images, 1, height, width]` each
@@ -145,7 +147,7 @@ impl Emvd {
         self.refined(frames).map(|image| image.mean_dim(1)).collect()
     }
 
-    /// The mean absolute error of every frame's four copies, `[1]`.
+    /// Computes the mean absolute error of every frame's four copies, `[1]`.
     ///
     /// # Shapes
     /// - frames, truth: `[images, 1, height, width]` each
@@ -155,7 +157,7 @@ impl Emvd {
         Tensor::cat(errors.collect(), 0).mean()
     }
 
-    /// The results, frame after frame, of four copies each.
+    /// Returns the results, frame after frame, of four copies each.
     fn refined(&self, frames: Vec<Tensor<4>>) -> impl Iterator<Item = Tensor<4>> {
         let mut fused: Option<Tensor<4>> = None;
         frames.into_iter().map(move |frame| {
@@ -166,7 +168,8 @@ impl Emvd {
         })
     }
 
-    /// How far the transforms are from their inverses, `[1]`: what training adds to the error of the frames.
+    /// Computes the squared distance of the transforms from their inverses, `[1]`, which training adds to the
+    /// error of the frames.
     pub fn transform_loss(&self) -> Tensor<1> {
         let of = |product: Tensor<2>| {
             let [rows, _] = product.dims();
@@ -186,15 +189,16 @@ impl Stage {
         }
     }
 
-    /// `before` and `now` are wavelets of this level, `[images, 16, h, w]`; `coarser` the weight and the denoised
-    /// image of the level below, the image on this level's grid.
+    /// Fuses and denoises one level. `before` and `now` are wavelets of this level, `[images, 16, h, w]`;
+    /// `coarser` the weight and the denoised image of the level below, the image on this level's grid.
     fn forward(
         &self,
         before: &Tensor<4>,
         now: &Tensor<4>,
         coarser: Option<(Tensor<4>, Tensor<4>)>,
     ) -> Level {
-        let variance = |x: &Tensor<4>| x.clone().narrow(1, 0, 1).clamp(0.0, 1.0) * SHOT + READ;
+        let variance =
+            |x: &Tensor<4>| x.clone().narrow(1, 0, 1).clamp(0.0, 1.0) * SHOT_NOISE + READ_NOISE;
         let (variance_before, variance_now) = (variance(before), variance(now));
         let mut inputs = vec![(low(now) - low(before)).abs()];
         if let Some((gamma, _)) = &coarser {
@@ -230,12 +234,12 @@ impl Head {
     }
 }
 
-/// The coarse image in wavelets.
+/// Returns the coarse image in wavelets.
 fn low(wavelets: &Tensor<4>) -> Tensor<4> {
     wavelets.clone().narrow(1, 0, CHANNELS)
 }
 
-/// `a` where the weight is 0, `b` where it is 1.
+/// Mixes `a`, where the weight is 0, and `b`, where it is 1.
 fn mix(a: Tensor<4>, b: Tensor<4>, weight: &Tensor<4>) -> Tensor<4> {
     a * (weight.clone().neg() + 1.0) + b * weight.clone()
 }

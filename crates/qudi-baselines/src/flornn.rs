@@ -1,6 +1,8 @@
-//! FloRNN: unidirectional video denoising by mimicking backward recurrent modules with look-ahead forward ones (Li
-//! et al., ECCV 2022), in the form in which it was compared with: frames as three equal channels, no noise map.
+//! FloRNN: unidirectional video denoising by mimicking backward recurrent modules with look-ahead forward
+//! ones (Li et al., ECCV 2022), in the form in which it was compared with: frames as three equal channels, no
+//! noise map.
 
+mod method;
 mod pwcnet;
 mod splat;
 
@@ -11,6 +13,7 @@ use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor};
 use pwcnet::PwcNet;
 use qudi_layers::{Bias, Conv2d};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use pwcnet::correlation;
@@ -20,7 +23,7 @@ pub use splat::splat_average;
 const FLOW_MULTIPLE: usize = 64;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of images.
@@ -30,13 +33,13 @@ pub struct Sizes {
     pub features: usize,
     /// Residual blocks of a recurrence.
     pub blocks: usize,
-    /// Frames that it looks ahead.
+    /// Later frames that it sees.
     #[serde(skip, default = "published_ahead")]
     pub ahead: usize,
-    /// The strip around images that the look ahead may leave them by, in parts of their sides.
+    /// Width of the strip around images that motion may leave them by, as a fraction of their sides.
     #[serde(skip, default = "published_border")]
     pub border: f64,
-    /// Whether it has PWC-Net, and follows motion. Its authors took weights that others had trained, on other
+    /// True if it has PWC-Net, and follows motion. Its authors took weights that others had trained, on other
     /// images; networks that are trained here have none.
     #[serde(skip)]
     pub flow: bool,
@@ -85,7 +88,7 @@ struct Output {
 }
 
 impl FloRnn {
-    /// The network, all weights zero.
+    /// Makes the network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { channels, features, blocks, ahead, border, flow } = sizes;
         let conv = |sizes| Conv2d::zeros(sizes, 3, Bias::No, device);
@@ -108,12 +111,12 @@ impl FloRnn {
         }
     }
 
-    /// Channels of images.
+    /// Returns the channels of images.
     pub fn channels(&self) -> usize {
         self.channels
     }
 
-    /// The name of a parameter in the authors' files.
+    /// Returns the name of a parameter in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let name = match name.strip_prefix("d.") {
             Some(rest) => {
@@ -124,8 +127,8 @@ impl FloRnn {
         PwcNet::authors_name(&name)
     }
 
-    /// The flow from `from` to `to`, without gradient: `warp(to, flow)` resembles `from`. None of a network without
-    /// PWC-Net.
+    /// Computes the flow from `from` to `to`, without gradient: `warp(to, flow)` resembles `from`. None for a
+    /// network without PWC-Net.
     ///
     /// # Shapes
     /// - from, to: `[images, 3, height, width]`
@@ -137,17 +140,17 @@ impl FloRnn {
         let padded = size.map(|side| side.next_multiple_of(FLOW_MULTIPLE));
         let prepared = |image: &Tensor<4>| resize(image.clone().detach(), padded, Corners::Edges);
         let flow = pwcnet.forward(prepared(from), prepared(to)).detach();
-        let factor = |axis: usize| pwcnet::UNIT * size[axis] as f32 / padded[axis] as f32;
+        let factor = |axis: usize| pwcnet::FLOW_SCALE * size[axis] as f32 / padded[axis] as f32;
         let scale = same_flow([factor(1), factor(0)], &from.device());
         Some(resize(flow, size, Corners::Edges) * scale)
     }
 
-    /// The flows from each frame to the next; none of a network without PWC-Net.
+    /// Computes the flows from each frame to the next; none for a network without PWC-Net.
     pub fn flows(&self, frames: &[Tensor<4>]) -> Vec<Tensor<4>> {
         frames.windows(2).filter_map(|pair| self.flow(&pair[0], &pair[1])).collect()
     }
 
-    /// How many frames it sees to restore the second of them.
+    /// Returns the number of frames that it sees to restore the second of them.
     pub fn window(&self) -> usize {
         self.ahead + 2
     }
@@ -156,7 +159,7 @@ impl FloRnn {
     ///
     /// # Shapes
     /// - window: [`window`](Self::window) frames, `[images, channels, height, width]` each
-    /// - flows: those from each frame to the next, as [`flow`](Self::flow) finds them; none of a network without
+    /// - flows: from each frame to the next, as [`flow`](Self::flow) finds them; none for a network without
     ///   PWC-Net
     /// - result: `[images, channels, height, width]`
     pub fn forward(&self, window: &[Tensor<4>], flows: &[Tensor<4>]) -> Tensor<4> {
@@ -194,7 +197,7 @@ impl FloRnn {
 }
 
 impl Recurrence {
-    /// The next state; the noise map is zero.
+    /// Returns the next state; the noise map is zero.
     fn forward(&self, image: &Tensor<4>, state: Tensor<4>) -> Tensor<4> {
         let x = self.first_conv.linear(&[image.clone(), image.zeros_like(), state]);
         self.resblocks.iter().fold(x, |x, block| block.forward(x))
@@ -207,7 +210,7 @@ impl Output {
     }
 }
 
-/// The loss of training, `[1]`: half the sum of squared errors of the second frame, over bursts.
+/// Computes the loss of training, `[1]`: half the sum of squared errors of the second frame, over bursts.
 ///
 /// # Shapes
 /// - x, truth: `[bursts, channels, height, width]`: second frames

@@ -22,7 +22,7 @@ fn devices() -> [Device; 2] {
     [Device::flex().autodiff(), ndarray.autodiff()]
 }
 
-/// The module with the reference's weights, whose names follow from ours. Both have the same parameters.
+/// Gives a module the reference's weights, whose names follow from ours. Both have the same parameters.
 fn weighted<M: Module>(module: M, case: &Case<'_>, prefix: &str, name: Name) -> M {
     let full = |ours: &str| format!("{prefix}{}", name(ours));
     let shapes = parameter_shapes(&module).into_iter();
@@ -43,7 +43,7 @@ fn weighted<M: Module>(module: M, case: &Case<'_>, prefix: &str, name: Name) -> 
     init_parameters(module, |name, shape| reference_parameter(&full(name), shape))
 }
 
-/// Statistics that layers keep.
+/// Returns names and shapes of the statistics that layers keep.
 fn buffers(case: &Case<'_>) -> Vec<(String, Vec<usize>)> {
     let all = case.about["buffers"].as_object().into_iter().flatten();
     let shape = |shape: &serde_json::Value| {
@@ -52,8 +52,8 @@ fn buffers(case: &Case<'_>) -> Vec<(String, Vec<usize>)> {
     all.map(|(name, about)| (name.clone(), shape(about))).collect()
 }
 
-/// A parameter of the reference: flows of some tenths of a pixel to some pixels need larger weights, and smaller
-/// ones.
+/// Returns a parameter of the reference: flows of some tenths of a pixel to some pixels need larger weights,
+/// and smaller ones.
 fn reference_parameter(name: &str, shape: &[usize]) -> Vec<f32> {
     if name.ends_with(".running_mean") || name.ends_with(".running_var") {
         let (offset, scale) = if name.ends_with("mean") { (0.0, 0.1) } else { (1.0, 0.5) };
@@ -122,7 +122,7 @@ fn check_parameters<M: Module>(
     assert!(unexpected.is_empty(), "no gradients of {unexpected:?}");
 }
 
-/// All parameters have gradients.
+/// Returns false: all parameters have gradients.
 fn none(_: &str) -> bool {
     false
 }
@@ -188,7 +188,7 @@ fn emvd_matches_pytorch() {
     }
 }
 
-/// Checks outputs, and gives the sum whose gradients the file holds.
+/// Checks outputs, and returns the sum whose gradients the file holds.
 fn sum(case: &Case<'_>, outputs: &[(&str, Tensor<4>)]) -> Tensor<1> {
     let parts = outputs.iter().map(|(name, output)| {
         let flat: Tensor<1> = output.clone().flatten(0, 3);
@@ -464,7 +464,7 @@ fn memdeblur_matches_pytorch() {
     }
 }
 
-/// Frames in the order of bursts.
+/// Returns frames in the order of bursts.
 fn folded(x: &Tensor<5>) -> Tensor<4> {
     let [bursts, frames, channels, height, width] = x.dims();
     x.clone().reshape([bursts * frames, channels, height, width])

@@ -1,26 +1,23 @@
-//! What training needs of the learned methods: initial weights, their authors' losses, names of parameters.
+//! Training of the learned methods: initial weights, losses, names of parameters.
 
 mod initial;
-mod losses;
 
-use crate::import::{Method, Network};
-use crate::sizes::Sizes;
-use crate::student_teacher::{ANNEALING, KernelPrediction};
-use burn::module::{Module, list_param_ids};
+use crate::method::{Network, Sizes};
+use crate::parts::frame;
+use burn::module::{Module, ParamId, list_param_ids};
 use burn::tensor::{Device, Tensor};
 use initial::initial_values;
 use qudi_layers::{init_parameters, parameter_shapes};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
-/// The teachers of a student, by what they know.
-const TEACHERS: [&str; 2] = ["motion", "denoising"];
+pub(crate) use initial::{Law, ends_with_any, kaiming};
 
 /// A learned method that learns: the network, and what helps to train it.
 #[derive(Module, Debug)]
 pub struct Baseline {
     network: Network,
-    /// The teachers of a student: of motion without noise, and of noise without motion. They learn at the same time.
-    teachers: Vec<KernelPrediction>,
+    /// Networks that learn at the same time and that it learns from.
+    teachers: Vec<Network>,
 }
 
 /// Bursts to learn from, in units of counts over full scale.
@@ -29,11 +26,11 @@ pub struct Baseline {
 /// - counts, truth, still: `[bursts * frames, 1, height, width]`
 #[derive(Clone, Debug)]
 pub struct Bursts {
-    /// What the sensor counted.
+    /// Counts of the sensor.
     pub counts: Tensor<4>,
-    /// What it would have counted on average, without saturation.
+    /// Expected counts, without saturation.
     pub truth: Tensor<4>,
-    /// Counts of the frame that a student restores, as often as there are frames; for networks with teachers.
+    /// Counts of the frame that is restored, as often as there are frames; for networks with teachers.
     pub still: Option<Tensor<4>>,
     /// Frames of a burst.
     pub frames: usize,
@@ -44,74 +41,103 @@ pub struct Bursts {
 pub struct Losses {
     /// The terms by name, `[1]` each, with their weights: training minimises the sum.
     pub terms: Vec<(&'static str, Tensor<1>)>,
-    /// Values of parameters after the step, by their places in the network, `[values]` each: statistics that it keeps
-    /// of what passes through it.
+    /// Values of parameters after the step, by their places in the network, `[values]` each: statistics that
+    /// it keeps of what passes through it.
     pub statistics: Vec<(usize, Tensor<1>)>,
 }
 
+/// The losses of a network, with the statistics by parameter.
+#[derive(Debug)]
+pub(crate) struct NetworkLosses {
+    pub(crate) terms: Vec<(&'static str, Tensor<1>)>,
+    pub(crate) statistics: HashMap<ParamId, Tensor<1>>,
+}
+
+impl From<Vec<(&'static str, Tensor<1>)>> for NetworkLosses {
+    fn from(terms: Vec<(&'static str, Tensor<1>)>) -> Self {
+        Self { terms, statistics: HashMap::new() }
+    }
+}
+
+impl Bursts {
+    /// Splits bursts into their frames, `[bursts, 1, height, width]` each.
+    pub(crate) fn each(&self, x: &Tensor<4>) -> Vec<Tensor<4>> {
+        (0..self.frames).map(|t| frame(x, self.frames, t)).collect()
+    }
+
+    /// Returns bursts with their frames as channels, `[bursts, frames, height, width]`.
+    pub(crate) fn as_channels(&self, x: &Tensor<4>) -> Tensor<4> {
+        let [images, _, height, width] = x.dims();
+        x.clone().reshape([images / self.frames, self.frames, height, width])
+    }
+
+    /// Returns counts and truth as images of `channels` equal channels.
+    pub(crate) fn copies(&self, channels: usize) -> [Tensor<4>; 2] {
+        [&self.counts, &self.truth].map(|x| x.clone().repeat(&[1, channels, 1, 1]))
+    }
+}
+
 impl Baseline {
-    /// The network without weights: it takes no memory yet.
+    /// Makes the network without weights: it takes no memory yet.
     pub fn uninitialized(sizes: Sizes, device: &Device) -> Self {
-        let teacher = |_| match sizes {
-            Sizes::StudentTeacher(sizes) => Some(KernelPrediction::zeros(sizes, device)),
-            _ => None,
-        };
-        let teachers = TEACHERS.iter().filter_map(teacher).collect();
+        let teachers = sizes.method().teachers().iter().map(|_| sizes.network(device)).collect();
         Self { network: sizes.network(device), teachers }
     }
 
-    /// The network with its initial weights.
+    /// Makes the network with its initial weights.
     pub fn init(sizes: Sizes, seed: u64, device: &Device) -> Self {
         let network = sizes.network(device);
         let name = |ours: &str| sizes.network(device).file_name(ours);
         Self::trained(initialized(network, sizes, seed, &name), sizes, seed, device)
     }
 
-    /// A network with weights. A student's teachers, which files do not hold, have initial weights.
+    /// Takes a network with weights. Teachers, which files do not hold, have initial weights.
     pub fn trained(network: Network, sizes: Sizes, seed: u64, device: &Device) -> Self {
         let Self { teachers, .. } = Self::uninitialized(sizes, device);
-        Self { network, teachers: initialized(teachers, sizes, seed, &teacher_name) }
+        let name = |ours: &str| teacher_name(&network, ours);
+        let teachers = initialized(teachers, sizes, seed, &name);
+        Self { network, teachers }
     }
 
-    /// The network alone, for use.
+    /// Returns the network alone, for use.
     pub fn network(&self) -> &Network {
         &self.network
     }
 
-    /// Names of all parameters, as in files, with their shapes, in the order of the network.
+    /// Returns the names of all parameters, as in files, with their shapes, in the order of the network.
     pub fn parameter_shapes(&self) -> Vec<(String, Vec<usize>)> {
         let name = |ours: &str| match ours.strip_prefix("network.") {
             Some(own) => self.network.file_name(own),
-            None => teacher_name(ours.strip_prefix("teachers.").unwrap_or(ours)),
+            None => teacher_name(&self.network, ours.strip_prefix("teachers.").unwrap_or(ours)),
         };
         parameter_shapes(self).into_iter().map(|(ours, shape)| (name(&ours), shape)).collect()
     }
 
-    /// Whether it learns from frames that are held still, too.
+    /// Returns true if networks of these sizes learn from frames without motion, too.
     pub fn needs_still_frames(sizes: Sizes) -> bool {
-        sizes.method() == Method::StudentTeacher
+        !sizes.method().teachers().is_empty()
     }
 
-    /// The losses of bursts at a step, from 0, of so many `steps`. The network and they are on an autodiff device;
-    /// bursts have a number of frames that its sizes allow.
+    /// Computes the losses of bursts at a step, from 0, of so many `steps`. The network and they are on an
+    /// autodiff device; bursts have a number of frames that its sizes allow.
     pub fn losses(&self, bursts: &Bursts, step: u64, steps: u64) -> Losses {
-        let shrunk = ANNEALING.max(steps) as f64 / steps.max(1) as f64;
-        let step = (step as f64 * shrunk) as u64;
-        let (terms, moved) = losses::losses(&self.network, &self.teachers, bursts, step);
+        let NetworkLosses { terms, statistics } =
+            self.network.losses(&self.teachers, bursts, step, steps);
         let places = list_param_ids(self).into_iter().enumerate();
-        let moved = places.filter_map(|(place, id)| Some((place, moved.get(&id)?.clone())));
+        let moved = places.filter_map(|(place, id)| Some((place, statistics.get(&id)?.clone())));
         Losses { terms, statistics: moved.collect() }
     }
 }
 
-/// The name of a teacher's parameter, of its number and ours.
-fn teacher_name(ours: &str) -> String {
+/// Returns the name of a teacher's parameter from its number and ours.
+fn teacher_name(student: &Network, ours: &str) -> String {
     let (number, own) = ours.split_once('.').unwrap_or(("", ours));
-    let teacher = number.parse().ok().and_then(|number: usize| TEACHERS.get(number));
-    format!("{}.{}", teacher.copied().unwrap_or_default(), KernelPrediction::file_name(own))
+    let teachers = student.method().teachers();
+    let teacher = number.parse().ok().and_then(|number: usize| teachers.get(number));
+    format!("{}.{}", teacher.copied().unwrap_or_default(), student.file_name(own))
 }
 
-/// A module with initial weights; `name` is that of one of our parameters in files.
+/// Gives a module initial weights; `name` is the name of one of our parameters in files.
 fn initialized<M: Module>(module: M, sizes: Sizes, seed: u64, name: &dyn Fn(&str) -> String) -> M {
     let shapes = parameter_shapes(&module).into_iter();
     let shapes: BTreeMap<_, _> = shapes.map(|(ours, shape)| (name(&ours), shape)).collect();

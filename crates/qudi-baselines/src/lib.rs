@@ -1,6 +1,7 @@
 //! The learned methods of the paper's table, written from their papers.
 //!
-//! Parameters have the names of the authors' files, so that these can be read. [`learning`] has what training needs.
+//! Parameters have the names of the authors' files, so that these can be read. [`learning`] has what training
+//! needs.
 #![warn(missing_docs)]
 
 #[cfg(test)]
@@ -14,11 +15,11 @@ mod golden_tests;
 pub mod import;
 pub mod learning;
 pub mod memdeblur;
+pub mod method;
 pub mod parts;
 pub mod quiver;
 pub mod restorer;
 pub mod rvrt;
-pub mod sizes;
 pub mod spk2imgnet;
 pub mod student_teacher;
 pub mod weights;

@@ -5,6 +5,7 @@ mod bank;
 mod batch_norm;
 mod blocks;
 mod encoder;
+mod method;
 
 use crate::parts::{
     ConvTranspose, Corners, bursts_of, charbonnier, dense_blocks_renamed, frame, leaky, renamed,
@@ -16,6 +17,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use encoder::Memory;
 use qudi_layers::{Bias, Conv2d};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use batch_norm::BatchStatistics;
@@ -23,18 +25,18 @@ pub use batch_norm::BatchStatistics;
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 4;
 
-/// How many times smaller the images of each pass are, and every how many frames it stores.
+/// Downscaling of each pass's images, and its stride of frames that are stored.
 const PASSES: [(usize, usize); 3] = [(4, 1), (2, 2), (1, 5)];
 
-/// Every how many frames the pass backward stores, and the first of them in use.
-pub const EVERY_BACK: usize = 5;
-const FIRST_BACK: usize = 2;
+/// Stride of the frames that the pass backward stores, and the first of them in inference.
+pub const BACKWARD_STRIDE: usize = 5;
+const BACKWARD_START: usize = 2;
 
-/// Frames whose positions stay in a memory in use.
-const STORED: usize = 5;
+/// Frames whose positions stay in a memory in inference.
+const MEMORY_FRAMES: usize = 5;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of images.
@@ -44,13 +46,13 @@ pub struct Sizes {
     pub features: usize,
     /// Residual blocks of the passes forward.
     pub forward_blocks: usize,
-    /// Of the pass backward.
+    /// Residual blocks of the pass backward.
     pub backward_blocks: usize,
-    /// Of encoders and decoders.
+    /// Residual blocks of encoders and decoders.
     pub memory_blocks: usize,
     /// Bottlenecks of encoders.
     pub bottlenecks: usize,
-    /// Entries that are read in use.
+    /// Entries that are read in inference.
     #[serde(skip, default = "published_top")]
     pub top: usize,
 }
@@ -74,13 +76,14 @@ fn published_top() -> usize {
     PUBLISHED.top
 }
 
-/// How memories and normalisations work.
+/// Mode of memories and normalisations.
 #[derive(Clone, Copy, Debug)]
 pub enum Mode<'a> {
-    /// As in training: everything stays in memories, and everything is read. Normalisations take the statistics of
-    /// the batch, and move these; the running ones where none are given.
+    /// Training: memories keep and return everything. Normalisations take the statistics of the batch, and
+    /// move these; the running ones where none are given.
     Training(Option<&'a BatchStatistics>),
-    /// As in use: the last frames stay, and the most alike entries are read. Normalisations take running statistics.
+    /// Inference: memories keep the last frames and return the most similar entries. Normalisations take
+    /// running statistics.
     Use,
 }
 
@@ -102,9 +105,9 @@ pub struct MemDeblur {
     forward_resblocks: Residuals,
     backward_resblocks: Residuals,
     fusion: Conv2d,
-    /// In the files, and without use.
+    /// In the files, but not used.
     conv_hr: Conv2d,
-    /// Likewise.
+    /// In the files, but not used.
     conv_last: Conv2d,
     memory: Memory,
     channels: usize,
@@ -138,12 +141,12 @@ struct View {
 }
 
 impl MemDeblur {
-    /// The network, all weights zero.
+    /// Makes the network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { channels, features, .. } = sizes;
         let conv = |sizes, kernel| Conv2d::zeros(sizes, kernel, Bias::Yes, device);
         let own = 16 * channels;
-        // Beside a frame's own features: those of another frame, of the state, and what two memories say.
+        // A frame's own features, another frame's, the state's, and what two memories return.
         let input = |pass: usize| {
             let coarser = if pass > 0 { own } else { 0 };
             conv([2 * own + 4 * features + coarser, features], 3)
@@ -177,12 +180,12 @@ impl MemDeblur {
         }
     }
 
-    /// Channels of images.
+    /// Returns the channels of images.
     pub fn channels(&self) -> usize {
         self.channels
     }
 
-    /// The name of a parameter, or of a running statistic, in the authors' files.
+    /// Returns the name of a parameter, or of a running statistic, in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let name = renamed(
             name,
@@ -206,8 +209,8 @@ impl MemDeblur {
         encoder::authors_name(&Residuals::authors_name(&name))
     }
 
-    /// Restores every frame of bursts at a quarter, at half and at the full size: `[bursts * frames, channels, h,
-    /// w]` with sides rounded up to multiples of 4.
+    /// Restores every frame of bursts at a quarter, at half and at the full size: `[bursts * frames,
+    /// channels, h, w]` with sides rounded up to multiples of 4.
     ///
     /// # Shapes
     /// - x: `[bursts * frames, channels, height, width]`, sides multiples of 4
@@ -216,7 +219,7 @@ impl MemDeblur {
         let views: Vec<View> = views.collect();
         let (top, stored) = match mode {
             Mode::Training(_) => (usize::MAX, usize::MAX),
-            Mode::Use => (self.top, STORED),
+            Mode::Use => (self.top, MEMORY_FRAMES),
         };
         let mut back = Bank::new(top, stored);
         let future = self.backward(&views, &mut back, mode);
@@ -236,7 +239,7 @@ impl MemDeblur {
         View { image, own, key }
     }
 
-    /// The state at every frame of the pass from the last frame to the first.
+    /// Computes the state at every frame in the pass from the last frame to the first.
     fn backward(&self, views: &[View], back: &mut Bank, mode: Mode<'_>) -> Vec<Tensor<4>> {
         let last = views.len() - 1;
         let mut states: Vec<Tensor<4>> = Vec::with_capacity(views.len());
@@ -254,8 +257,8 @@ impl MemDeblur {
             }
             let state = self.backward_resblocks.forward(&inputs);
             let stores = match mode {
-                Mode::Training(_) => i % EVERY_BACK == 0,
-                Mode::Use => i % EVERY_BACK == FIRST_BACK || i == last,
+                Mode::Training(_) => i % BACKWARD_STRIDE == 0,
+                Mode::Use => i % BACKWARD_STRIDE == BACKWARD_START || i == last,
             };
             if stores {
                 let inputs = [view.own.clone(), state.clone()];
@@ -268,7 +271,8 @@ impl MemDeblur {
         states
     }
 
-    /// The frames of the pass at one scale, from the first to the last. The first bank is that of the pass backward.
+    /// Restores the frames at one scale, from the first to the last. The first bank belongs to the pass
+    /// backward.
     fn pass(
         &self,
         (scale, every): (usize, usize),
@@ -344,13 +348,13 @@ impl Upsampling {
     }
 }
 
-/// Zeros of another number of channels.
+/// Returns zeros with another number of channels.
 fn nothing(like: &Tensor<4>, channels: usize) -> Tensor<4> {
     let [images, _, height, width] = like.dims();
     Tensor::zeros([images, channels, height, width], &like.device())
 }
 
-/// The loss of training: Charbonnier's at all three scales, the coarsest first, `[1]` each.
+/// Computes the loss of training: Charbonnier's at all three scales, the coarsest first, `[1]` each.
 ///
 /// # Shapes
 /// - truth: `[bursts * frames, channels, height, width]`

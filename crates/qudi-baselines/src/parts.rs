@@ -27,7 +27,7 @@ pub use warping::{masked_warp, same_flow, warp_zeros};
 use burn::tensor::Tensor;
 use qudi_layers::resample::by_burst;
 
-/// Frame `number` of every burst.
+/// Returns frame `number` of every burst.
 ///
 /// # Shapes
 /// - x: `[bursts * frames, channels, height, width]`
@@ -38,7 +38,7 @@ pub fn frame(x: &Tensor<4>, frames: usize, number: usize) -> Tensor<4> {
     one.reshape([images / frames, channels, height, width])
 }
 
-/// Some frames in a row of every burst.
+/// Returns consecutive frames of every burst.
 ///
 /// # Shapes
 /// - x: `[bursts * frames, channels, height, width]`
@@ -49,7 +49,7 @@ pub fn frames_from(x: &Tensor<4>, frames: usize, first: usize, count: usize) -> 
     some.reshape([images / frames * count, channels, height, width])
 }
 
-/// What `f` makes of every image by itself: of all at once it would take more memory.
+/// Applies `f` to every image by itself: all at once would take more memory.
 ///
 /// # Shapes
 /// - x: `[images, channels, height, width]`
@@ -58,7 +58,7 @@ pub fn one_by_one(x: &Tensor<4>, f: impl Fn(Tensor<4>) -> Tensor<4>) -> Tensor<4
     Tensor::cat((0..images).map(|number| f(x.clone().narrow(0, number, 1))).collect(), 0)
 }
 
-/// The reverse of [`frame`]: bursts of these frames.
+/// Joins frames to bursts: the inverse of [`frame`].
 ///
 /// # Shapes
 /// - frames: `[bursts, channels, height, width]` each

@@ -3,6 +3,7 @@
 pub(crate) mod alignment;
 mod cell;
 mod merge;
+mod method;
 mod predenoiser;
 pub(crate) mod reconstructor;
 
@@ -18,13 +19,14 @@ use merge::Merge;
 use predenoiser::PreDenoiser;
 use qudi_layers::resample::avg_pool2;
 use reconstructor::Reconstructor;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 4;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of features, a multiple of 16.
@@ -58,7 +60,7 @@ pub struct Quiver {
     features: usize,
 }
 
-/// What the network gives.
+/// Results of the network.
 ///
 /// # Shapes
 /// - predenoised: `[bursts * frames, 1, height, width]`
@@ -76,7 +78,7 @@ pub struct Restored {
 }
 
 impl Quiver {
-    /// The network, all weights zero.
+    /// Makes the network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { features, blocks, past, future } = sizes;
         let extractor = || Extractor::zeros(features, device);
@@ -98,12 +100,12 @@ impl Quiver {
         }
     }
 
-    /// Frames before and after the one that is restored.
+    /// Returns the numbers of frames before and after the one that is restored.
     pub fn reach(&self) -> (usize, usize) {
         (self.past, self.future)
     }
 
-    /// The name of a parameter in the authors' files.
+    /// Returns the name of a parameter in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let name = SpyNet::authors_name(name);
         if name.starts_with("spynet.") {
@@ -175,25 +177,25 @@ impl Quiver {
         Restored { predenoised, full, half, quarter }
     }
 
-    /// The terms of the training's loss, `[1]` each, with their weights: of the result, at half and at a quarter of
-    /// the size, and of the frames denoised by themselves.
+    /// Computes the terms of the training's loss, `[1]` each, with their weights: of the result, at half and
+    /// at a quarter of the size, and of the frames denoised by themselves.
     ///
     /// # Shapes
     /// - truth: `[bursts * frames, 1, height, width]`
     pub fn losses(&self, restored: Restored, truth: &Tensor<4>, frames: usize) -> [Tensor<1>; 4] {
         let Restored { predenoised, full, half, quarter } = restored;
         let count = frames - self.past - self.future;
-        let wanted = frames_from(truth, frames, self.past, count);
+        let target = frames_from(truth, frames, self.past, count);
         [
-            gradient_loss(full, wanted.clone()) * 0.85,
-            gradient_loss(half, avg_pool2(wanted.clone())) * 0.1,
-            gradient_loss(quarter, fourth(wanted)) * 0.05,
+            gradient_loss(full, target.clone()) * 0.85,
+            gradient_loss(half, avg_pool2(target.clone())) * 0.1,
+            gradient_loss(quarter, fourth(target)) * 0.05,
             gradient_loss(predenoised, truth.clone()) * 0.2,
         ]
     }
 }
 
-/// Means of the middle 2 x 2 of 4 x 4 pixels: bilinear, without a filter before it.
+/// Returns means of the middle 2 x 2 of 4 x 4 pixels: bilinear, without a filter before it.
 fn fourth(x: Tensor<4>) -> Tensor<4> {
     let [_, _, height, width] = x.dims();
     crate::parts::resize(x, [height / 4, width / 4], crate::parts::Corners::Edges)

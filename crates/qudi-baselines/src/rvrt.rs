@@ -1,7 +1,8 @@
-//! RVRT: recurrent video restoration transformer with guided deformable attention (Liang et al., NeurIPS 2022), in
-//! the size in which it was compared with.
+//! RVRT: recurrent video restoration transformer with guided deformable attention (Liang et al., NeurIPS
+//! 2022), in the size in which it was compared with.
 
 mod guided;
+mod method;
 mod swin;
 mod window;
 
@@ -13,6 +14,7 @@ use burn::tensor::{Device, Tensor};
 use guided::GuidedAttention;
 use qudi_layers::resample::{by_burst, pixel_shuffle};
 use qudi_layers::{Bias, Conv2d};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use swin::{Stage, StageSizes};
 
@@ -30,10 +32,10 @@ const PROPAGATIONS: [(&str, bool); 4] =
     [("backward_1", true), ("forward_1", false), ("backward_2", true), ("forward_2", false)];
 
 /// Channels before the upsampling, and inside the search for offsets.
-const MIDDLE: usize = 64;
+const MIDDLE_WIDTH: usize = 64;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of images: 1 or 3; 1 of networks that are trained here.
@@ -74,12 +76,12 @@ struct Extractor {
     stage: Stage,
 }
 
-/// The flows of two frames to two others, each `[bursts * 2, 2, h, w]`: to the frame of the same place in the clip
-/// before, and to the other one.
+/// The flows of two frames to two others, each `[bursts * 2, 2, h, w]`: to the frame of the same place in the
+/// clip before, and to the other one.
 type Pair = [Tensor<4>; 2];
 
 impl Rvrt {
-    /// The network, all weights zero.
+    /// Makes the network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { channels, features, blocks } = sizes;
         let conv = |sizes, kernel| Conv2d::zeros(sizes, kernel, Bias::Yes, device);
@@ -96,22 +98,23 @@ impl Rvrt {
             },
             backbone: (0..PROPAGATIONS.len()).map(|i| stage(2 + i, CLIP, blocks)).collect(),
             deform_align: PROPAGATIONS
-                .map(|_| GuidedAttention::zeros(features, MIDDLE, device))
+                .map(|_| GuidedAttention::zeros(features, MIDDLE_WIDTH, device))
                 .into(),
             reconstruction: stage(5, 1, 1),
-            conv_before_upsampler: conv([features, MIDDLE], 1),
-            upsampler: [4, 4, 1].map(|more| conv([MIDDLE, more * MIDDLE], 3)).into(),
-            conv_last: conv([MIDDLE, channels], 3),
+            conv_before_upsampler: conv([features, MIDDLE_WIDTH], 1),
+            upsampler: [4, 4, 1].map(|more| conv([MIDDLE_WIDTH, more * MIDDLE_WIDTH], 3)).into(),
+            conv_last: conv([MIDDLE_WIDTH, channels], 3),
             channels,
         }
     }
 
-    /// Channels of images.
+    /// Returns the channels of images.
     pub fn channels(&self) -> usize {
         self.channels
     }
 
-    /// The name of a parameter in the authors' files. Their convolutions have a third axis of one frame.
+    /// Returns the name of a parameter in the authors' files. Their convolutions have a third axis of one
+    /// frame.
     pub fn authors_name(name: &str) -> String {
         let mut name = SpyNet::authors_name(name);
         for (number, (propagation, _)) in PROPAGATIONS.iter().enumerate() {
@@ -148,7 +151,8 @@ impl Rvrt {
     /// Restores every frame of bursts.
     ///
     /// # Shapes
-    /// - x, result: `[bursts * frames, channels, height, width]`; an even number of frames, sides multiples of 4
+    /// - x, result: `[bursts * frames, channels, height, width]`; an even number of frames, sides multiples
+    ///   of 4
     pub fn forward(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         let flows = self.flows(&x, frames);
         let features = self.feat_extract.forward(x.clone());
@@ -173,7 +177,8 @@ impl Rvrt {
         x + self.upsample(self.reconstruction.forward(features, frames))
     }
 
-    /// Backward and forward: from every frame, in the order of visiting, but the first, to the one before.
+    /// Computes flows backward and forward: from every frame but the first, in the order of visiting, to the
+    /// one before.
     fn flows(&self, x: &Tensor<4>, frames: usize) -> [Vec<Tensor<4>>; 2] {
         let small = quarter(x.clone());
         let pairs = frames - 1;
@@ -188,7 +193,7 @@ impl Rvrt {
         [backward, flow(&after, &before)]
     }
 
-    /// One propagation over clips in the order of visiting. `earlier` are the clips of all modules before.
+    /// Propagates over clips in the order of visiting. `earlier` are the clips of all modules before.
     fn propagate(
         &self,
         number: usize,
@@ -239,13 +244,14 @@ impl Extractor {
     }
 }
 
-/// The frames of a clip in reverse.
+/// Returns the frames of a clip in reverse.
 fn turned(clip: &Tensor<4>) -> Tensor<4> {
     let shape = clip.dims();
     by_burst(clip.clone(), CLIP).flip([1]).reshape(shape)
 }
 
-/// Flows of frames 2 and 3 to frames 0 and 1, and to 1 and 0, from those of every frame to the one before.
+/// Chains the flows from every frame to the one before: from frames 2 and 3 to frames 0 and 1, and to 1 and
+/// 0.
 fn pair_of(flows: &[Tensor<4>]) -> Pair {
     let [n01, n12, n23] = [0, 1, 2].map(|k| flows[k].clone());
     let then = |first: &Tensor<4>, second: &Tensor<4>| {

@@ -1,8 +1,9 @@
-//! Spk2ImgNet: learning to reconstruct dynamic scenes from continuous spike streams (Zhao et al., CVPR 2021), in
-//! the size in which it was compared with: ten frames in five blocks of two.
+//! Spk2ImgNet: learning to reconstruct dynamic scenes from continuous spike streams (Zhao et al., CVPR 2021),
+//! in the size in which it was compared with: ten frames in five blocks of two.
 
 mod align;
 mod extractor;
+mod method;
 
 use align::{Align, Levels};
 use burn::module::{Module, Param};
@@ -10,18 +11,19 @@ use burn::tensor::activation::{prelu, sigmoid};
 use burn::tensor::{Device, Tensor};
 use extractor::Extractor;
 use qudi_layers::{Bias, Conv2d, zeros};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Frames that it sees.
 pub const FRAMES: usize = 10;
 
 /// The frame that it restores.
-pub const RESTORED: usize = 5;
+pub const RESTORED_FRAME: usize = 5;
 
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 4;
 
-/// What the network was trained to give is this times the image.
+/// Factor of the images that the network was trained to return.
 pub const SCALE: f32 = 0.6;
 
 /// Frames of a block.
@@ -30,10 +32,10 @@ pub const BLOCK: usize = 2;
 pub const BLOCKS: usize = FRAMES / BLOCK;
 
 /// The block that the others are aligned with.
-const KEY: usize = 2;
+const KEY_BLOCK: usize = 2;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Channels of features.
@@ -60,14 +62,14 @@ pub struct Spk2ImgNet {
     pcd_align: Align,
 }
 
-/// What is known of a block of frames by itself: windows that share it need it once.
+/// Results that depend on a block of frames alone: windows that share it compute it once.
 #[derive(Clone, Debug)]
 pub struct Block {
     estimates: Tensor<4>,
     levels: Levels,
 }
 
-/// How far the aligned features of a block count.
+/// Weight of the aligned features of a block.
 #[derive(Module, Debug)]
 struct Mask {
     conv0: Conv2d,
@@ -84,13 +86,13 @@ struct Slope {
     weight: Param<Tensor<1>>,
 }
 
-/// A convolution of 3 x 3.
+/// Makes a convolution of 3 x 3.
 fn conv(sizes: [usize; 2], device: &Device) -> Conv2d {
     Conv2d::zeros(sizes, 3, Bias::Yes, device)
 }
 
 impl Spk2ImgNet {
-    /// The network, all weights zero.
+    /// Makes the network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { features, groups, .. } = sizes;
         Self {
@@ -103,7 +105,7 @@ impl Spk2ImgNet {
         }
     }
 
-    /// The name of a parameter in the authors' files.
+    /// Returns the name of a parameter in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let name = match name.strip_prefix("masks.") {
             // The key block has none.
@@ -116,7 +118,7 @@ impl Spk2ImgNet {
         Align::authors_name(&Extractor::authors_name(&name))
     }
 
-    /// The image at frame 5 times [`SCALE`], and four estimates of it for every block of frames.
+    /// Computes the image at frame 5 times [`SCALE`], and four estimates of it for every block of frames.
     ///
     /// # Shapes
     /// - frames: `[images, 10, height, width]`, sides multiples of 4
@@ -128,7 +130,7 @@ impl Spk2ImgNet {
         (self.image(blocks.each_ref()), Tensor::stack(estimates, 1))
     }
 
-    /// What is known of a block of frames by itself.
+    /// Computes what depends on a block of frames alone.
     ///
     /// # Shapes
     /// - frames: `[images, 2, height, width]`
@@ -137,30 +139,30 @@ impl Spk2ImgNet {
         Block { estimates, levels: self.pcd_align.levels(features) }
     }
 
-    /// The image at frame 5, times [`SCALE`], of five blocks in a row.
+    /// Computes the image at frame 5, times [`SCALE`], from five consecutive blocks.
     ///
     /// # Shapes
     /// - result: `[images, 1, height, width]`
     pub fn image(&self, blocks: [&Block; BLOCKS]) -> Tensor<4> {
         // All neighbours at once.
         let neighbours: Vec<&Block> =
-            (0..BLOCKS).filter(|&block| block != KEY).map(|block| blocks[block]).collect();
+            (0..BLOCKS).filter(|&block| block != KEY_BLOCK).map(|block| blocks[block]).collect();
         let of = |blocks: &[&Block], level: usize| {
             Tensor::cat(blocks.iter().map(|block| block.levels[level].clone()).collect(), 0)
         };
-        let keys = [blocks[KEY]; BLOCKS - 1];
+        let keys = [blocks[KEY_BLOCK]; BLOCKS - 1];
         let aligned = self.pcd_align.forward(
             [0, 1, 2].map(|level| of(&neighbours, level)),
             [0, 1, 2].map(|level| of(&keys, level)),
         );
-        let key = &blocks[KEY].levels[0];
+        let key = &blocks[KEY_BLOCK].levels[0];
         let images = key.dims()[0];
         let masked = self.masks.iter().enumerate().map(|(number, mask)| {
             let aligned = aligned.clone().narrow(0, number * images, images);
             mask.forward(&aligned, key) * aligned
         });
         let mut joined: Vec<_> = masked.collect();
-        joined.insert(KEY, key.clone());
+        joined.insert(KEY_BLOCK, key.clone());
         let image = self.rec_conv1.relu(&[self.rec_conv0.relu(&joined)]);
         self.rec_conv2.linear(&[image])
     }
@@ -186,8 +188,8 @@ impl Mask {
     }
 }
 
-/// The terms of the training's loss, `[1]` each: the mean absolute error of the image, and a fiftieth of those of the
-/// estimates.
+/// Computes the terms of the training's loss, `[1]` each: the mean absolute error of the image, and a
+/// fiftieth of the estimates' errors.
 ///
 /// # Shapes
 /// - image: `[images, 1, height, width]`
@@ -195,7 +197,7 @@ impl Mask {
 /// - truth: `[images, 10, height, width]`
 pub fn losses(image: Tensor<4>, estimates: Tensor<5>, truth: Tensor<4>) -> [Tensor<1>; 2] {
     let [images, _, height, width] = truth.dims();
-    let main = (image / SCALE - truth.clone().narrow(1, RESTORED, 1)).abs().mean();
+    let main = (image / SCALE - truth.clone().narrow(1, RESTORED_FRAME, 1)).abs().mean();
     // The second frame of every block.
     let blocks: Tensor<5> = truth.reshape([images, BLOCKS, BLOCK, height, width]);
     let difference = estimates / SCALE - blocks.narrow(2, 1, 1);

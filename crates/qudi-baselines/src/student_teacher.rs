@@ -1,9 +1,12 @@
-//! A student and two teachers, after "Dynamic low-light imaging with quanta image sensors" (Chi et al., ECCV 2020).
+//! A student and two teachers, after "Dynamic low-light imaging with quanta image sensors" (Chi et al., ECCV
+//! 2020).
 //!
-//! The authors' program and sizes are not public. This is a network in their spirit: features, and a U-Net that
-//! predicts a kernel for every pixel of every frame (Mildenhall et al., "Burst denoising with kernel prediction
-//! networks", CVPR 2018). The student learns from noisy bursts of moving scenes, and resembles two teachers: one of
-//! motion without noise, one of noise without motion.
+//! The authors' program and sizes are not public. This is a network in their spirit: features, and a U-Net
+//! that predicts a kernel for every pixel of every frame (Mildenhall et al., "Burst denoising with kernel
+//! prediction networks", CVPR 2018). The student learns from noisy bursts of moving scenes, and resembles two
+//! teachers: one of motion without noise, one of noise without motion.
+
+mod method;
 
 use crate::parts::renamed;
 use burn::module::Module;
@@ -11,6 +14,7 @@ use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::resample::{avg_pool2, repeat};
 use qudi_layers::{Bias, Conv2d};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Levels of the U-Net.
@@ -22,18 +26,18 @@ const LAYERS: usize = 4;
 /// Frames have sides that are multiples of this.
 pub const MULTIPLE: usize = 1 << (LEVELS - 1);
 
-/// The weight of the filtered frames' own error at first, and what it is multiplied by at every step.
-const AUXILIARY: f64 = 100.0;
-const DECAY: f64 = 0.9998;
+/// Initial weight of the filtered frames' own error, and its factor at every step.
+const AUXILIARY_WEIGHT: f64 = 100.0;
+const AUXILIARY_DECAY: f64 = 0.9998;
 
-/// Steps until that weight is 0.03. Shorter trainings take them in fewer steps, or it would rule them to the end.
-pub const ANNEALING: u64 = 40_000;
+/// Steps until that weight is 0.03. Shorter trainings count faster, or it would rule them to the end.
+pub const ANNEALING_STEPS: u64 = 40_000;
 
-/// The weight of the distance from a teacher.
-const MATCH: f32 = 0.1;
+/// Weight of the distance from a teacher.
+const TEACHER_WEIGHT: f32 = 0.1;
 
 /// Sizes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sizes {
     /// Frames of a burst.
@@ -64,7 +68,7 @@ struct Double {
     second: Conv2d,
 }
 
-/// What a network gives.
+/// Results of a network.
 ///
 /// # Shapes
 /// - image: `[bursts, 1, height, width]`
@@ -84,7 +88,7 @@ pub struct Restored {
 }
 
 impl KernelPrediction {
-    /// The network, all weights zero.
+    /// Makes the network, all weights zero.
     pub fn zeros(sizes: Sizes, device: &Device) -> Self {
         let Sizes { frames, features, kernel } = sizes;
         let conv = |sizes| Conv2d::zeros(sizes, 3, Bias::Yes, device);
@@ -104,12 +108,12 @@ impl KernelPrediction {
         }
     }
 
-    /// Frames of a burst.
+    /// Returns the frames of a burst.
     pub fn frames(&self) -> usize {
         self.frames
     }
 
-    /// The name of a parameter in files.
+    /// Returns the name of a parameter in files.
     pub fn file_name(name: &str) -> String {
         renamed(name, &[(".first.", ".0."), (".second.", ".2.")])
     }
@@ -145,7 +149,7 @@ impl Double {
     }
 }
 
-/// Every frame filtered by kernels of its own, `[bursts, frames * side * side, height, width]`, zeros outside.
+/// Filters every frame by kernels of its own, `[bursts, frames * side * side, height, width]`, zeros outside.
 fn filtered(burst: Tensor<4>, kernels: Tensor<4>, side: usize) -> Tensor<4> {
     let [bursts, frames, height, width] = burst.dims();
     let kernels: Tensor<5> = kernels.reshape([bursts, frames, side * side, height, width]);
@@ -158,18 +162,19 @@ fn filtered(burst: Tensor<4>, kernels: Tensor<4>, side: usize) -> Tensor<4> {
     (1..side * side).fold(tap(0), |sum, k| sum + tap(k))
 }
 
-/// The terms of the reconstruction's loss at a step, from 0, `[1]` each: the mean squared error of the image, and,
-/// less and less, that of every filtered frame.
+/// Computes the terms of the reconstruction's loss at a step, from 0, `[1]` each: the mean squared error of
+/// the image and, with a falling weight, of every filtered frame.
 ///
 /// # Shapes
 /// - truth: `[bursts, 1, height, width]`
 pub fn reconstruction_losses(restored: &Restored, truth: &Tensor<4>, step: u64) -> [Tensor<1>; 2] {
     let error = |images: &Tensor<4>| (images.clone() - truth.clone()).powi_scalar(2).mean();
-    let weight = AUXILIARY * DECAY.powi(i32::try_from(step).unwrap_or(i32::MAX));
+    let weight = AUXILIARY_WEIGHT * AUXILIARY_DECAY.powi(i32::try_from(step).unwrap_or(i32::MAX));
     [error(&restored.image), error(&restored.frames) * weight]
 }
 
-/// The distance of the student's features from those of both teachers, `[1]`; these learn nothing from it.
+/// Computes the distance of the student's features from both teachers', `[1]`; the teachers learn nothing
+/// from it.
 pub fn matching_loss(student: &Restored, teachers: [&Restored; 2]) -> Tensor<1> {
     let distance =
         |a: &Tensor<4>, b: &Tensor<4>| (a.clone() - b.clone().detach()).powi_scalar(2).mean();
@@ -177,5 +182,5 @@ pub fn matching_loss(student: &Restored, teachers: [&Restored; 2]) -> Tensor<1> 
         distance(&student.extracted, &teacher.extracted)
             + distance(&student.bottom, &teacher.bottom)
     });
-    (motion + denoising) * MATCH
+    (motion + denoising) * TEACHER_WEIGHT
 }

@@ -1,4 +1,4 @@
-//! Weights that were trained here: a SafeTensors file with the keys of the authors, which describes itself.
+//! Files of weights that were trained here: SafeTensors with the authors' keys and a description.
 
 use crate::import::Network;
 use burn::module::{Module, ModuleVisitor, Param};
@@ -14,14 +14,14 @@ use std::path::Path;
 /// The key of the description among a file's metadata.
 const KEY: &str = "qudi-baseline";
 
-/// What a file says about weights that were trained here.
+/// Description of weights that were trained here.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Description {
     /// The name of the method.
     pub method: String,
     /// The number of frames of a burst in training.
     pub frames: usize,
-    /// What it was trained on.
+    /// Data, sensors and licence of its training.
     #[serde(flatten)]
     pub provenance: Provenance,
 }
@@ -66,7 +66,7 @@ pub fn save(
     PendingFile::write_whole(path, &bytes, overwrite)
 }
 
-/// What a file says about itself; none of a file that this program did not write.
+/// Reads the description in a file; none in a file that this program did not write.
 ///
 /// # Errors
 /// [`Error::Data`] if the description cannot be read.
@@ -82,7 +82,7 @@ pub(crate) fn description(file: &StateDict) -> Result<Option<Description>> {
 /// The values of all parameters.
 struct Values {
     list: Vec<Vec<f32>>,
-    /// What the device said in place of values.
+    /// The device's error in place of values.
     problem: Option<String>,
 }
 

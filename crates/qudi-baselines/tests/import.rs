@@ -29,7 +29,7 @@ fn golden(name: &str) -> PathBuf {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden")).join(name)
 }
 
-/// What EMVD makes of two frames.
+/// Restores two frames with EMVD.
 fn image(network: &Emvd) -> Vec<f32> {
     let frame = |name: &str| {
         let values: Vec<f32> = uniform(name, 16 * 24).iter().map(|v| *v as f32).collect();
@@ -135,7 +135,7 @@ fn all_keys_that_do_not_fit_are_listed() {
     }
 }
 
-/// The smallest network of a method, by the names of its files.
+/// Returns the shapes of the smallest network of a method, by the names in its files.
 fn smallest(method: Method) -> BTreeMap<String, Vec<usize>> {
     let device = &Device::flex();
     match method {
@@ -205,8 +205,8 @@ fn every_method_restores_every_frame() {
     }
 }
 
-/// Some frames of a window are restored from the real frames around them, as with all others; but recurrences begin
-/// elsewhere.
+/// Some frames of a window are restored from the real frames around them, as with all others; but recurrences
+/// begin elsewhere.
 #[test]
 fn wanted_frames_equal_those_of_the_whole_window() {
     let folder = tempfile::tempdir().unwrap();

@@ -28,8 +28,6 @@ use crate::commands::look::args::Look;
 use crate::commands::publish::args::Publish;
 use crate::commands::restore::args::Restore;
 use crate::commands::selftest::args::Selftest;
-#[cfg(feature = "remote")]
-use crate::commands::serve::args::Serve;
 use crate::commands::simulate::args::Simulate;
 use crate::commands::train::args::Train;
 use crate::version;
@@ -116,8 +114,6 @@ pub(crate) enum Command {
     Eval(Box<Eval>),
     Bench(Box<Bench>),
     Selftest(Selftest),
-    #[cfg(feature = "remote")]
-    Serve(Serve),
     Convert(Box<Convert>),
     Calibrate(Box<Calibrate>),
     Demo(Demo),
@@ -141,8 +137,6 @@ impl Command {
             Self::Eval(_) => "eval",
             Self::Bench(_) => "bench",
             Self::Selftest(_) => "selftest",
-            #[cfg(feature = "remote")]
-            Self::Serve(_) => "serve",
             Self::Convert(_) => "convert",
             Self::Calibrate(_) => "calibrate",
             Self::Demo(_) => "demo",

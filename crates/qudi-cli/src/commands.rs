@@ -87,13 +87,6 @@ pub(crate) mod selftest {
     pub(crate) mod run;
 }
 
-#[cfg(feature = "remote")]
-pub(crate) mod serve {
-    pub(crate) mod args;
-    pub(crate) mod remote;
-    pub(crate) mod run;
-}
-
 pub(crate) mod simulate {
     pub(crate) mod args;
     mod outputs;

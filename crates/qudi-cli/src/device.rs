@@ -6,9 +6,6 @@ use burn::tensor::Device;
 use burn::tensor::DeviceType;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-/// Prefix of the names of other machines' devices.
-pub(crate) const REMOTE: &str = "ws://";
-
 /// A device that `--device` can name.
 #[derive(Debug)]
 pub(crate) struct Listed {
@@ -70,12 +67,12 @@ pub(crate) fn open(name: &str) -> Result<Opened> {
     if let Some(device) = opened.iter().find(|device| device.name == name) {
         return Ok(device.clone());
     }
-    let device = if name.starts_with(REMOTE) { open_remote(name) } else { open_local(&name) }?;
+    let device = open_new(&name)?;
     opened.push(device.clone());
     Ok(device)
 }
 
-fn open_local(name: &str) -> Result<Opened> {
+fn open_new(name: &str) -> Result<Opened> {
     let (backend, number) = match name.split_once(':') {
         None => (name, Some(0)),
         Some((backend, number)) => (backend, number.parse::<usize>().ok()),
@@ -110,20 +107,6 @@ fn open_local(name: &str) -> Result<Opened> {
             "check its driver with `qudi selftest`, or use --device cpu",
         )),
     }
-}
-
-#[cfg(feature = "remote")]
-fn open_remote(name: String) -> Result<Opened> {
-    Ok(Opened { device: crate::commands::serve::remote::connect(&name)?, name })
-}
-
-#[cfg(not(feature = "remote"))]
-fn open_remote(name: String) -> Result<Opened> {
-    Err(CliError::new(
-        "this build knows no other machines' devices",
-        name,
-        "build it with `--features remote`",
-    ))
 }
 
 /// Returns the name of the first real graphics card, or of the processor.

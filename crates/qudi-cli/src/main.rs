@@ -77,8 +77,6 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Eval(eval) => commands::eval::run::run(eval, &settings, &args.global, report),
         Command::Bench(bench) => commands::bench::run::run(bench, &args.global, report),
         Command::Selftest(selftest) => commands::selftest::run::run(selftest, report),
-        #[cfg(feature = "remote")]
-        Command::Serve(serve) => commands::serve::run::run(serve, report),
         Command::Convert(convert) => commands::convert::run::run(convert, &args.global, report),
         Command::Calibrate(calibrate) => {
             commands::calibrate::run::run(calibrate, &settings, &args.global, report)

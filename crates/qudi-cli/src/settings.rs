@@ -7,13 +7,16 @@ mod commands;
 mod flags;
 mod keys;
 mod recipe_keys;
+mod schema;
+mod simulate;
 
 pub(crate) use flags::KeyFlags;
-pub(crate) use keys::KEYS;
+pub(crate) use keys::keys;
+pub(crate) use recipe_keys::{baseline_keys, recipe_keys};
+pub(crate) use schema::Documented;
 
 use crate::args::Global;
 use crate::error::{CliError, Result};
-use keys::Kind;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::nearest::nearest;
 use qudi_core::regular_file::read_text;
@@ -29,7 +32,7 @@ const DEFAULT: &str = "default";
 #[derive(Debug)]
 pub(crate) struct Settings {
     command: &'static str,
-    /// The value of every key, in the order of [`KEYS`], with its origin.
+    /// The value of every key, in the order of [`keys`], with its origin.
     values: Vec<(Value, String)>,
     /// Keys of a recipe that were set, with value and origin.
     recipe: Vec<(String, Value, String)>,
@@ -54,8 +57,8 @@ impl Origin<'_> {
 impl Settings {
     /// Lays all layers of `command` over each other.
     pub(crate) fn load(global: &Global, command: &'static str) -> Result<Self> {
-        let default = |text: &str| if text.is_empty() { Value::Null } else { parse_value(text) };
-        let values = KEYS.iter().map(|key| (default(key.default), DEFAULT.to_owned())).collect();
+        let default = |key: &keys::Key| (key.documented.default.clone(), DEFAULT.to_owned());
+        let values = keys().iter().map(default).collect();
         let mut settings = Self { command, values, recipe: Vec::new() };
         if let Some(path) = &global.config {
             settings.add_file(path)?;
@@ -78,7 +81,7 @@ impl Settings {
     pub(crate) fn with_flags(mut self, flags: &KeyFlags) -> Result<Self> {
         for (key, text) in &flags.0 {
             let flag = key.flag.map_or(String::new(), |flag| format!("--{}", flag.long));
-            self.set(key.name, parse_value(text), text, &Origin::Own(&flag))?;
+            self.set(key.name(), parse_value(text), text, &Origin::Own(&flag))?;
         }
         Ok(self)
     }
@@ -108,10 +111,10 @@ impl Settings {
             if !prefixes.iter().any(|prefix| name.starts_with(prefix)) {
                 continue;
             }
-            let keys = KEYS.iter().map(|key| key.name);
-            let keys = keys.chain(recipe_keys::names().iter().map(String::as_str));
-            let Some(key) = keys.clone().find(|key| variable(key) == name) else {
-                let names: Vec<String> = keys.map(variable).collect();
+            let all = keys().iter().map(keys::Key::name);
+            let all = all.chain(recipe_keys::names().iter().map(String::as_str));
+            let Some(key) = all.clone().find(|key| variable(key) == name) else {
+                let names: Vec<String> = all.map(variable).collect();
                 let names: Vec<&str> = names.iter().map(String::as_str).collect();
                 return Err(unknown_key(name, &names, "the environment"));
             };
@@ -122,10 +125,10 @@ impl Settings {
 
     /// Sets a key to `value`, which was written as `text`.
     fn set(&mut self, name: &str, value: Value, text: &str, origin: &Origin<'_>) -> Result<()> {
-        let at = KEYS.iter().position(|key| key.name == name);
+        let at = keys().iter().position(|key| key.name() == name);
         let of_recipe = commands::RECIPE.contains(&name.split('.').next().unwrap_or_default());
-        if at.is_none() && !(of_recipe && recipe_keys::is_known(name, &value)) {
-            let names = KEYS.iter().map(|key| key.name);
+        if at.is_none() && !(of_recipe && recipe_keys::is_known(name)) {
+            let names = keys().iter().map(keys::Key::name);
             let recipe = recipe_keys::names().iter().map(String::as_str);
             let names: Vec<_> = if of_recipe { recipe.collect() } else { names.collect() };
             return Err(unknown_key(name, &names, origin.name()));
@@ -149,10 +152,9 @@ impl Settings {
             self.recipe.push((name.to_owned(), value, origin));
             return Ok(());
         };
-        let value = match KEYS[at].kind {
-            Kind::Text if !value.is_string() => Value::String(text.trim().to_owned()),
-            _ => value,
-        };
+        let is_text = keys()[at].documented.is_text;
+        let as_text = is_text && !value.is_string();
+        let value = if as_text { Value::String(text.trim().to_owned()) } else { value };
         self.values[at] = (value, origin);
         Ok(())
     }
@@ -182,9 +184,10 @@ impl Settings {
 
     /// Returns all keys with value and origin.
     pub(crate) fn iter(&self) -> impl Iterator<Item = (&str, &Value, &str)> {
-        KEYS.iter()
+        keys()
+            .iter()
             .zip(&self.values)
-            .map(|(key, (value, origin))| (key.name, value, origin.as_str()))
+            .map(|(key, (value, origin))| (key.name(), value, origin.as_str()))
     }
 
     /// Returns the keys of a recipe that were set, with value and origin.
@@ -226,7 +229,7 @@ impl Settings {
 
     fn find(&self, name: &str) -> (&Value, &str) {
         let (_, value, origin) =
-            self.iter().find(|entry| entry.0 == name).expect("asked for by its name in KEYS");
+            self.iter().find(|entry| entry.0 == name).expect("asked for by the name of a key");
         (value, origin)
     }
 
@@ -265,16 +268,6 @@ impl Settings {
     }
 }
 
-/// Returns the name of the recipe that documents the keys, and its keys with their values.
-pub(crate) fn shown_recipe() -> (&'static str, Vec<(String, Value)>) {
-    (recipe_keys::SHOWN, recipe_keys::of_preset(recipe_keys::SHOWN))
-}
-
-/// Returns recipes of learned methods of others by name, with the sizes of their networks.
-pub(crate) fn baseline_sizes() -> Vec<(&'static str, Vec<(String, Value)>)> {
-    recipe_keys::baseline_sizes()
-}
-
 /// Returns the environment variable that sets a key.
 fn variable(key: &str) -> String {
     format!("QUDI_{}", key.replace('.', "_").to_uppercase())
@@ -303,7 +296,7 @@ pub(crate) fn toml_text(value: &Value) -> String {
     toml::Value::try_from(value).map_or_else(|_| value.to_string(), |value| value.to_string())
 }
 
-/// Leaves of a document by dotted name.
+/// Collects the leaves of a document by dotted name.
 fn flatten(prefix: &str, value: Value, leaves: &mut Vec<(String, Value)>) {
     match value {
         Value::Object(table) => {

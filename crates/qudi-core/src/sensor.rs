@@ -27,10 +27,11 @@ pub use presets::{PRESETS, Preset, preset};
 pub use units::{DarkRate, FullWell, Gain};
 
 use crate::error::{Error, Result};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Response of a pixel to light.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Response {
     /// Counts electrons, adds read noise, digitises.
@@ -40,7 +41,7 @@ pub enum Response {
 }
 
 /// A single-photon (or ordinary) image sensor. Check hand-made ones with [`Sensor::validate`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sensor {
     /// Short name, as in `swissspad2`.
@@ -52,24 +53,25 @@ pub struct Sensor {
     pub response: Response,
     /// Bits per output sample of one native frame; 1 for binary sensors.
     pub bits: u8,
-    /// Electrons (or detections) per photon that falls on the pixel's pitch: PDE with fill factor.
+    /// Detections (or electrons) per photon on the pixel's pitch: PDE with fill factor.
     pub quantum_efficiency: f64,
-    /// Dark electrons per pixel, by native frame or by second.
+    /// Dark electrons per pixel: a number is per native frame, `"7.5/s"` per second.
     pub dark: DarkRate,
-    /// Read noise in e- rms; 0 for binary sensors.
+    /// Read noise, e- rms; 0 for binary sensors.
     #[serde(default)]
     pub read_noise: f64,
-    /// Full-well capacity in e-.
+    /// Full-well capacity, e-; `"unlimited"` for none.
     #[serde(default)]
     pub full_well: FullWell,
-    /// Pedestal in DN that the camera adds to every sample of a linear sensor; subtracted on reading.
+    /// Pedestal of a linear sensor in DN: added by `simulate`, subtracted when captures are read.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub offset: f64,
-    /// Photon counting with an analogue camera: a sample more than this many DN above the pedestal is one
-    /// detection. Binary sensors only.
+    /// Photon counting with an analogue camera: DN above the pedestal beyond which a sample is one detection
+    /// (binary sensors).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub threshold: Option<f64>,
-    /// Gain in DN per e-, or the rule that sets it from the light.
+    /// DN per e-, or a rule: `quiver` (0.5 (2^bits - 1) / PPP), `unit` (1), `fwc` (full scale at full well),
+    /// `auto` (half scale at the mean).
     #[serde(default)]
     pub gain: Gain,
     /// Native frames per second.
@@ -87,8 +89,8 @@ pub struct Sensor {
     /// Binary frames summed into one output frame.
     #[serde(default = "one")]
     pub frames_summed: u32,
-    /// Time from the first row to the last, as a share of a native frame: 0 for a global shutter. Simulated
-    /// only.
+    /// Time from the first row to the last as a share of a native frame, 0 to 1: `simulate` exposes each row
+    /// to the scene at its own time, rounded to `instants`.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub rolling_shutter: f64,
     /// Imperfect pixels; all off by default.

@@ -8,12 +8,13 @@
 use crate::backend::{Switch, is_flex};
 use crate::matrix_units::MatrixUnits;
 use burn::tensor::{DType, Device, FloatDType, Tensor};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::cell::Cell;
 use std::fmt;
 
 /// Precision of the numbers that convolutions multiply.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ComputePrecision {
     /// Single precision (32 bits).

@@ -2,15 +2,17 @@
 
 use crate::diffusion::DiffusionConfig;
 use crate::regression::RegressionConfig;
+use crate::window::WindowConfig;
 use burn::module::Module;
 use burn::tensor::Device;
 use qudi_core::{Error, Result, Size};
 use qudi_layers::parameter_shapes;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
 /// Sizes of a network, with its kind.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 #[allow(clippy::large_enum_variant)] // one in a recipe
 pub enum NetworkConfig {
@@ -18,6 +20,8 @@ pub enum NetworkConfig {
     Regression(RegressionConfig),
     /// Diffusion.
     Diffusion(DiffusionConfig),
+    /// Diffusion that encodes a window once.
+    Window(WindowConfig),
 }
 
 /// Kind of a network.
@@ -27,6 +31,15 @@ pub enum NetworkKind {
     Regression,
     /// Diffusion.
     Diffusion,
+    /// Diffusion that encodes a window once.
+    Window,
+}
+
+impl NetworkKind {
+    /// Returns true for networks that predict in reverse steps.
+    pub fn is_diffusion(self) -> bool {
+        self != Self::Regression
+    }
 }
 
 impl fmt::Display for NetworkKind {
@@ -34,6 +47,7 @@ impl fmt::Display for NetworkKind {
         f.write_str(match self {
             Self::Regression => "regression",
             Self::Diffusion => "diffusion",
+            Self::Window => "window",
         })
     }
 }
@@ -87,6 +101,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(_) => NetworkKind::Regression,
             Self::Diffusion(_) => NetworkKind::Diffusion,
+            Self::Window(_) => NetworkKind::Window,
         }
     }
 
@@ -95,6 +110,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => config.multiple(),
             Self::Diffusion(config) => config.multiple(),
+            Self::Window(config) => config.multiple(),
         }
     }
 
@@ -104,6 +120,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => config.memory(size, frames),
             Self::Diffusion(config) => config.memory(size, frames),
+            Self::Window(config) => config.memory(size, frames),
         }
     }
 
@@ -116,6 +133,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => count(&config.uninitialized(device)),
             Self::Diffusion(config) => count(&config.uninitialized(device)),
+            Self::Window(config) => count(&config.uninitialized(device)),
         }
     }
 
@@ -127,6 +145,7 @@ impl NetworkConfig {
         Ok(match self {
             Self::Regression(config) => Self::Regression(config.checked()?),
             Self::Diffusion(config) => Self::Diffusion(config.checked()?),
+            Self::Window(config) => Self::Window(config.checked()?),
         })
     }
 }

@@ -32,7 +32,7 @@ pub use parameters::{gradients, parameters, with_parameters};
 pub use prefetch::Prefetcher;
 pub use recipe::{
     CropsConfig, LearningPart, LossConfig, NetworkRecipe, Recipe, StageConfig, TrainConfig,
-    ValidationConfig, recipe_names,
+    ValidationConfig, recipe_names, recipe_table,
 };
 pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS, run_exists, steps_taken};
 pub use trainer::{LossValues, StepReport, Trainer};

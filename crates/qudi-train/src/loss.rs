@@ -5,6 +5,7 @@ mod gaussian_nll;
 pub mod lpips;
 mod reconstruction;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use gaussian_nll::gaussian_nll;
@@ -12,7 +13,7 @@ pub use reconstruction::reconstruction;
 pub(crate) use reconstruction::{relative_reconstruction, root_mean_square};
 
 /// How the errors of images count.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LossForm {
     /// Squared error and total variation of the error, in [0, 1], as in the paper.

@@ -1,5 +1,6 @@
-//! Recipes: everything that decides what a training gives, in one TOML document.
+//! Recipes: everything that decides the result of a training, in one TOML document.
 
+mod base;
 mod keys;
 mod network;
 mod rules;
@@ -17,84 +18,92 @@ use qudi_kernels::ComputePrecision;
 use qudi_model::checkpoint::Sampling;
 use qudi_model::diffusion::Ablation;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-use keys::{modern_key, modernize, set, value};
+use base::over_base;
+use keys::{set, value};
 
+pub use base::recipe_table;
 pub use network::{NetworkRecipe, recipe_names};
 pub use stage::{LearningPart, StageConfig};
 
-/// A recipe.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// Recipe of a training.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
     /// The network, with its sizes.
     pub network: NetworkRecipe,
-    /// What it learns from.
+    /// Data to learn from.
     pub data: DataConfig,
-    /// How it learns.
+    /// Optimization and loss.
     pub train: TrainConfig,
-    /// How its progress is measured.
+    /// Measurement of the progress.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub validation: Option<ValidationConfig>,
-    /// Trainings one after the other, each from the weights of the one before; without any, one training.
+    /// Trainings one after the other, each from the weights of the one before; none for one training.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(skip_serializing_if = "never")]
     pub stage: Vec<StageConfig>,
 }
 
-/// How the network learns.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// Optimization and loss.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainConfig {
     /// Seed of weights and samples.
     pub seed: u64,
-    /// Optimisation steps.
+    /// Optimization steps.
     pub steps: u64,
-    /// Samples that go through the network at once.
+    /// Samples that pass the network at once.
     pub batch: usize,
-    /// The crops of cached bursts that are the samples; without it, every sample is a new burst.
-    #[serde(default, alias = "parts", skip_serializing_if = "Option::is_none")]
+    /// Crops of cached bursts to train on; without it, every sample is a new burst.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub crops: Option<CropsConfig>,
-    /// Batches whose gradients make one step.
+    /// Batches whose gradients are summed for one step.
     pub accumulate: usize,
-    /// How weights move along gradients.
+    /// Optimizer.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub optimizer: OptimizerKind,
-    /// The learning rate after the warm-up.
-    #[serde(alias = "rate")]
+    /// Learning rate after the warm-up; a cosine leads from it to `min_lr`.
     pub lr: f64,
-    /// The learning rate of the last step.
-    #[serde(alias = "floor")]
+    /// Learning rate of the last step.
     pub min_lr: f64,
-    /// Number of steps of linear warm-up.
+    /// Steps of linear warm-up.
     pub warmup: u64,
-    /// Largest norm of a step's gradient; longer ones are shortened.
+    /// Largest norm of a step's gradient; longer gradients are scaled down.
     pub clip: f64,
-    /// Parts of the network that learn; all if none is named. Others stay as they are, bit for bit.
+    /// Parts of the network that learn; all if none is named. The others stay as they are, bit for bit. Of the
+    /// regression `["refinement"]`, or `pre` and `uncertainty`; of the diffusion all others and `pre`.
     #[serde(default)]
     pub learns: Vec<LearningPart>,
     /// Numbers that convolutions multiply.
     #[serde(default)]
     pub precision: ComputePrecision,
-    /// Whether the pre-denoiser is computed twice, image by image, to save its memory (gradient
-    /// checkpointing); gradients are the same but for rounding.
+    /// True if pre-denoiser and U-Net are computed twice, image by image, to save memory; gradients are the
+    /// same but for rounding.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub gradient_checkpointing: bool,
-    /// Share of the average of weights that a step keeps.
+    /// Decay of the weights' exponential moving average.
     pub ema: f64,
-    /// Law of the timesteps that the network learns at.
+    /// Law of the timesteps to learn at.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub timesteps: TimestepLaw,
-    /// Parts that are left out, to measure what they are worth; only of the diffusion. Weights do not keep it.
+    /// Parts that are left out, to measure their value; only of the diffusion. Weights do not keep it.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub ablate: Ablation,
-    /// Fraction of the samples at the noisiest timestep, where sampling begins; only of the diffusion.
-    #[serde(default, alias = "start", skip_serializing_if = "Option::is_none")]
+    /// Fraction of the samples at the noisiest timestep, where sampling begins; the others follow
+    /// `timesteps`. Only of the diffusion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub noise_start_fraction: Option<f64>,
     /// Steps between checkpoints.
     pub checkpoint: u64,
-    /// The loss of the diffusion; the other networks have no weights to choose.
+    /// Loss of the diffusion; the other networks have no weights to choose.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub loss: Option<LossConfig>,
     /// Licence of the weights, an SPDX expression.
@@ -102,7 +111,7 @@ pub struct TrainConfig {
 }
 
 impl TrainConfig {
-    /// Returns the loss; all weights are 0 of networks that have none to choose.
+    /// Returns the loss; all weights are 0 for networks that have none to choose.
     pub fn loss(&self) -> LossConfig {
         self.loss.unwrap_or(LossConfig {
             form: LossForm::default(),
@@ -120,15 +129,14 @@ impl TrainConfig {
     }
 }
 
-/// What samples are cut from: reference estimates of whole bursts, which take long to compute and see no
+/// Crops of cached bursts: reference estimates of whole bursts take long to compute, and are worse near
 /// borders.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CropsConfig {
-    /// Bursts that are drawn in all and kept in memory; samples come back to them.
+    /// Bursts that are drawn in all and kept in memory.
     pub bursts: u64,
     /// Consecutive frames of each burst that are kept; the others only help to restore these.
-    #[serde(alias = "kept")]
     pub cached_frames: usize,
     /// Consecutive frames of a sample.
     pub frames: usize,
@@ -137,45 +145,47 @@ pub struct CropsConfig {
 }
 
 /// Form of the loss, and weights of its terms.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct LossConfig {
-    /// How the errors of images count.
+    /// Form of the errors of images.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub form: LossForm,
-    /// The weight of the prediction.
+    /// Weight of the prediction.
     pub prediction: f32,
-    /// The weight of the pre-denoised frames.
+    /// Weight of the pre-denoised frames.
     pub pre: f32,
-    /// The weight of the perceptual term.
+    /// Weight of the perceptual term.
     pub perceptual: f32,
-    /// The kind of the perceptual term.
+    /// Perceptual term: `none`, `lpips-vgg` or `lpips-alex`.
     pub term: PerceptualKind,
-    /// The weight of the warping error of true neighbours along the flows: flow learns from it long before fusion can
-    /// teach it.
+    /// Weight of the warping error of true neighbours along the flows: the flow learns from it long before it
+    /// learns from the fusion.
     #[serde(default)]
     pub flow: f32,
 }
 
-/// How progress is measured.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// Measurement of the progress.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ValidationConfig {
-    /// Videos and folders of frames below the data folder, or procedural scenes as `scene:NAME`.
+    /// Clips that are never trained on: videos and folders of frames below the data folder, or `scene:NAME`.
     pub from: Vec<String>,
     /// Frames of every clip, around its middle.
     pub frames: usize,
-    /// Side of the middle square.
+    /// Side of the middle square in pixels.
     pub crop: usize,
-    /// Sensor.
+    /// Preset's name or sensor file.
     pub sensor: String,
     /// Photons per pixel and frame.
     pub ppp: Vec<f64>,
     /// Reverse steps; only of the diffusion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<usize>,
-    /// Spacing of their timesteps, which the weights keep for restoring.
+    /// Spacing of the steps' timesteps, also the default of the weights.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub spacing: TimestepSpacing,
     /// Training steps between validations.
     pub every: u64,
@@ -185,52 +195,65 @@ pub(super) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
+/// Schemas state all defaults, those too that are not written into files.
+pub(crate) fn never<T>(_: &T) -> bool {
+    false
+}
+
 /// Source of validation clips in packs.
 pub(super) const VALIDATION: &str = "validation";
 
 impl Recipe {
-    /// A preset's recipe, or that of a file, with keys changed: `("train.steps", "100")`.
+    /// Loads a built-in recipe or a file, with keys changed: `("train.steps", "100")`.
     ///
     /// # Errors
     /// [`Error`] if there is none, or a key is unknown or wrong.
     pub fn load(name: &str, changes: &[(String, String)]) -> Result<Self> {
-        let text = match network::preset(name) {
-            Some(text) => text.to_owned(),
-            None => read(name)?,
-        };
-        Self::parse(&text, name, changes)
+        match network::preset(name) {
+            Some(text) => Self::parse(text, name, changes),
+            None => Self::parse_in(Path::new(name).parent(), &read(name)?, name, changes),
+        }
     }
 
-    /// A recipe from its text; `place` names it in errors.
+    /// Reads a recipe from its text; `place` names it in errors.
     ///
     /// # Errors
     /// As [`Self::load`].
     pub fn parse(text: &str, place: &str, changes: &[(String, String)]) -> Result<Self> {
+        Self::parse_in(None, text, place, changes)
+    }
+
+    fn parse_in(
+        folder: Option<&Path>,
+        text: &str,
+        place: &str,
+        changes: &[(String, String)],
+    ) -> Result<Self> {
         let help = "compare with configs/small.toml and docs/training.md";
         let fault = |what: String| Error::request(what, place, help);
-        let mut document: toml::Table =
+        let document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
-        modernize(&mut document, "");
+        let mut document = over_base(document, folder)?;
         for (key, text) in changes {
-            set(&mut document, &modern_key(key), value(text))?;
+            set(&mut document, key, value(text))?;
         }
         let mut recipe: Self =
             document.try_into().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;
         // What is changed here is changed in every stage.
         for stage in &mut recipe.stage {
             for (key, text) in changes.iter().filter(|(key, _)| !key.starts_with("stage.")) {
-                stage.changes.insert(modern_key(key), value(text));
+                stage.changes.insert(key.clone(), value(text));
             }
         }
         recipe.checked()
     }
 
-    /// The recipe as a TOML document.
+    /// Returns the recipe as a TOML document.
     pub fn text(&self) -> String {
         toml::to_string(self).expect("plain data")
     }
 
-    /// Frames of a sample, and the side of one.
+    /// Returns the frames of a sample, and its side.
     pub fn sample_size(&self) -> (usize, usize) {
         let whole = (self.data.frames, self.data.crop);
         self.train.crops.map_or(whole, |crops| (crops.frames, crops.side))
@@ -255,7 +278,7 @@ impl Recipe {
         self.train.learns == [LearningPart::Refinement]
     }
 
-    /// The validation clips as a source of a pack; none if there are none with files.
+    /// Returns the validation clips as a source of a pack; none if no clip has files.
     pub fn validation_data(&self) -> Option<DataConfig> {
         let validation = self.validation.as_ref()?;
         let files = validation.from.iter().filter(|from| !from.starts_with("scene:"));
@@ -263,7 +286,6 @@ impl Recipe {
         (!from.is_empty()).then(|| DataConfig {
             frames: validation.frames,
             crop: validation.crop,
-            instants: 1,
             sensor: vec![SensorMix {
                 name: validation.sensor.clone(),
                 ppp: LightRange::Of(validation.ppp.clone()),

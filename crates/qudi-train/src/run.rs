@@ -24,7 +24,7 @@ pub const METRICS: &str = "metrics.jsonl";
 /// Name of the weights for use.
 pub const WEIGHTS: &str = "weights.safetensors";
 
-/// What a run tells while it goes on.
+/// An event of a run.
 #[derive(Debug)]
 pub enum Event<'a> {
     /// A step is done.
@@ -47,7 +47,7 @@ pub struct Run<L> {
     commit: Option<String>,
 }
 
-/// Where a run starts.
+/// Start of a run.
 #[derive(Debug)]
 pub enum From<L> {
     /// From initial weights, or those given.
@@ -56,12 +56,12 @@ pub enum From<L> {
     State,
 }
 
-/// Whether a folder holds a state to go on from.
+/// Returns true if a folder holds a state to resume from.
 pub fn run_exists(folder: &Path) -> bool {
     state::exists(folder)
 }
 
-/// Steps taken by the state in a folder.
+/// Returns the steps taken by the state in a folder.
 ///
 /// # Errors
 /// [`Error`] if there is none, or it is damaged.
@@ -118,13 +118,13 @@ impl<L: Learner> Run<L> {
         Ok(run)
     }
 
-    /// Steps taken, and in all.
+    /// Returns the steps taken, and all steps.
     pub fn progress(&self) -> [u64; 2] {
         [self.trainer.step_number(), self.recipe.train.steps]
     }
 
-    /// Learns to the end of the recipe, with data drawn on `workers` threads. `on` hears of every step and
-    /// says whether to go on; if not, the state is written and the run stops.
+    /// Learns to the end of the recipe, with data drawn on `workers` threads. `on` receives every event;
+    /// if it returns `Break`, the state is written and the run stops.
     ///
     /// # Errors
     /// [`Error`] if data, device or disk fail, or the loss is not finite; [`Error::Interrupted`] if asked
@@ -204,7 +204,7 @@ impl<L: Learner> Run<L> {
         file.write_all(&text).map_err(|e| self.failed(METRICS, e))
     }
 
-    /// Drops lines of steps that a killed run took after its last state: they come again.
+    /// Drops the lines of steps that a killed run took after its last state: they are taken again.
     fn trim_metrics(&self) -> Result<()> {
         let text = match std::fs::read_to_string(self.folder.join(METRICS)) {
             Ok(text) => text,

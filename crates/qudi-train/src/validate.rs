@@ -1,4 +1,4 @@
-//! Measuring a network on fixed bursts.
+//! Measurement of a network on fixed bursts.
 
 use super::recipe::{Recipe, VALIDATION, ValidationConfig};
 use crate::dataset::Pack;
@@ -47,7 +47,7 @@ pub struct ValidationClip {
 pub struct Validation {
     /// Training steps taken.
     pub step: u64,
-    /// Every clip at every light.
+    /// Every clip at every light level.
     pub clips: Vec<ValidationClip>,
 }
 
@@ -112,12 +112,12 @@ impl Validator {
         Ok(Some(Self { config, clips, sensor }))
     }
 
-    /// Steps between validations.
+    /// Returns the steps between validations.
     pub fn every(&self) -> u64 {
         self.config.every
     }
 
-    /// Restores every clip at every light with `restorer`, after `step` steps.
+    /// Restores every clip at every light level with `restorer`, after `step` steps.
     ///
     /// # Errors
     /// [`Error`] if the device fails.
@@ -164,7 +164,7 @@ impl Validator {
 }
 
 impl Validation {
-    /// Means of gain-aligned PSNR, raw PSNR and SSIM at every light, in the recipe's order.
+    /// Returns the means of gain-aligned PSNR, raw PSNR and SSIM at every light level, in the recipe's order.
     pub fn means(&self) -> Vec<(f64, [f64; 3])> {
         let mut means: Vec<(f64, [f64; 3], usize)> = Vec::new();
         for clip in &self.clips {

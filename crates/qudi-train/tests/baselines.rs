@@ -24,9 +24,10 @@ fn recipe(method: Method, changes: &[(&str, &str)]) -> Recipe {
         method.name()
     ));
     let text = text.unwrap();
-    // The sources with files come first, that of scenes last.
-    let [before, rest] = [text.find("# Files").unwrap(), text.rfind("[[data.source]]").unwrap()];
-    let text = format!("{}{}", &text[..before], &text[rest..]);
+    let scenes =
+        "{ name = \"scenes\", kind = \"scenes\", from = [\"dead-leaves\", \"text\"], speed = 5.0 }";
+    let scenes = format!("source = [{scenes}]\n\n[train]");
+    let text = text.replace("[train]", &scenes);
     let small = [
         ("data.crop", "32"),
         ("train.steps", "4"),

@@ -27,7 +27,7 @@ fn source(name: &str, kind: SourceKind, from: &[&str]) -> SourceConfig {
 fn config(source: Vec<SourceConfig>) -> DataConfig {
     let ppp = LightRange::Between { from: 1.0, to: 30.0 };
     let mix = SensorMix { name: "qudi-paper".into(), ppp, frames_summed: None, weight: 1.0 };
-    DataConfig { frames: 3, crop: 16, instants: 1, sensor: vec![mix], source }.checked().unwrap()
+    DataConfig { frames: 3, crop: 16, sensor: vec![mix], source }.checked().unwrap()
 }
 
 /// A value that tells clip, frame and pixel; at most 140.
@@ -149,44 +149,6 @@ fn mean_level_is_that_of_the_whole_clip() {
     assert!((0.6..0.7).contains(&least) && (1.3..=1.5).contains(&most), "{least} {most}");
 }
 
-/// A flash in the last third of every exposure: it is counted, and the truth shows the middle.
-#[test]
-fn exposures_see_several_instants() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("clips/flash");
-    std::fs::create_dir_all(&path).unwrap();
-    for frame in 0..9 {
-        let level = if frame % 3 == 2 { 220 } else { 40 };
-        GrayImage::from_pixel(24, 20, Luma([level]))
-            .save(path.join(format!("{frame}.png")))
-            .unwrap();
-    }
-    let mut config = config(vec![source("clips", SourceKind::Clips, &["clips/flash"])]);
-    config.instants = 3;
-    config.sensor[0] = SensorMix {
-        name: "spad-qvga".into(),
-        ppp: LightRange::Of(vec![20.0]),
-        frames_summed: Some(300),
-        weight: 1.0,
-    };
-    let path = pack(&config, folder.path()).unwrap();
-    let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
-    for k in 0..10 {
-        let sample = dataset.sample(1, k).unwrap();
-        let mean_level = sample.acquisition.mean_level;
-        assert_eq!((sample.truth.len(), sample.counts.len()), (3, 3));
-        for (truth, counts) in sample.truth.iter().zip(&sample.counts) {
-            assert!((truth.mean() / mean_level - 0.4).abs() < 1e-3, "{}", truth.mean());
-            let sum: f64 = counts.iter().map(|&count| f64::from(count)).sum();
-            // The mean over the exposure is that of the clip: 20 photons, about a tenth of them detected.
-            let sensor = &sample.acquisition.sensor;
-            let detected = sum / counts.len() as f64 - sensor.dark_per_frame().unwrap();
-            let expected = 20.0 * sensor.quantum_efficiency;
-            assert!((0.8..1.2).contains(&(detected / expected)), "{detected} of {expected}");
-        }
-    }
-}
-
 /// Clips become smaller by factors between one and what the recipe says: their slopes steeper.
 #[test]
 fn clips_are_downscaled_up_to_max_downscale() {
@@ -284,7 +246,6 @@ fn rejects_data_that_cannot_be_sampled() {
     assert!(Dataset::new(&config, None).unwrap_err().place().is_some_and(|p| p == "data.source"));
     for (key, broken) in [
         ("frames", DataConfig { frames: 2, ..config.clone() }),
-        ("instants", DataConfig { instants: 4, ..config.clone() }),
         ("crop", DataConfig { crop: 0, ..config.clone() }),
         ("sensor", DataConfig { sensor: vec![], ..config.clone() }),
         ("source", DataConfig { source: vec![], ..config.clone() }),

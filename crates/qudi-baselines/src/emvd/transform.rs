@@ -24,7 +24,7 @@ struct Filters {
 }
 
 impl Filters {
-    /// `[filters, 2]`
+    /// Returns the filters, `[filters, 2]`.
     fn matrix(&self) -> Tensor<2> {
         let weight = self.weight.val();
         let filters = weight.shape().num_elements() / 2;
@@ -37,13 +37,13 @@ impl Wavelet {
         Self { net1: Filters { weight: zeros([2, 1, 1, 2], device) } }
     }
 
-    /// Filters by pixels, `[2, 2]`.
+    /// Returns filters by pixels, `[2, 2]`.
     pub(super) fn matrix(&self) -> Tensor<2> {
         self.net1.matrix()
     }
 
-    /// Bands one after the other: low along both; low along rows and high along columns; the reverse; high along
-    /// both.
+    /// Splits an image into bands, one after the other: low along both; low along rows and high along
+    /// columns; the reverse; high along both.
     ///
     /// # Shapes
     /// - x: `[images, channels, 2 h, 2 w]`
@@ -65,12 +65,12 @@ impl Inverse {
         Self { net1: filters(), net2: filters() }
     }
 
-    /// Bands by pixels, `[2, 2]`.
+    /// Returns bands by pixels, `[2, 2]`.
     pub(super) fn matrix(&self) -> Tensor<2> {
         Tensor::cat(vec![self.net1.matrix(), self.net2.matrix()], 0)
     }
 
-    /// The image of four bands.
+    /// Joins four bands to an image.
     ///
     /// # Shapes
     /// - bands: `[images, 4 * channels, h, w]`
@@ -85,8 +85,8 @@ impl Inverse {
     }
 }
 
-/// The same filters along rows and along columns: from `[2, 2]` to `[4, 4]`, both indices that of the row direction
-/// first.
+/// Applies the same filters along rows and along columns: from `[2, 2]` to `[4, 4]`, both indices with the
+/// row direction first.
 fn square(matrix: Tensor<2>) -> Tensor<2> {
     let along_rows = matrix.clone().reshape([2, 1, 2, 1]);
     let along_columns = matrix.reshape([1, 2, 1, 2]);

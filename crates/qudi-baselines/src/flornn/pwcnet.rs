@@ -7,26 +7,26 @@ use burn::tensor::ops::{ConvOptions, PadMode};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d, zeros};
 
-/// What flow is counted in, in pixels of the full size.
-pub(super) const UNIT: f32 = 20.0;
+/// Scale of the flow, in pixels of the full size.
+pub(super) const FLOW_SCALE: f32 = 20.0;
 
-/// The farthest that features are compared, in cells.
+/// Largest distance of compared features, in cells.
 const RADIUS: usize = 4;
 
-/// Places that they are compared at.
+/// Places where they are compared.
 const PLACES: usize = (2 * RADIUS + 1) * (2 * RADIUS + 1);
 
 /// Names of levels in files, the finest first.
 const LEVELS: [&str; 6] = ["One", "Two", "Thr", "Fou", "Fiv", "Six"];
 
 /// Channels of the features of all levels.
-const PYRAMID: [usize; 6] = [16, 32, 64, 96, 128, 196];
+const PYRAMID_WIDTHS: [usize; 6] = [16, 32, 64, 96, 128, 196];
 
 /// Channels that the dense layers of a decoder add.
-const DENSE: [usize; 5] = [128, 128, 96, 64, 32];
+const DENSE_WIDTHS: [usize; 5] = [128, 128, 96, 64, 32];
 
-/// Channels of the refining layers, and how far apart their taps are.
-const REFINER: [(usize, usize); 7] =
+/// Channels of the refining layers, and their dilations.
+const REFINER_LAYERS: [(usize, usize); 7] =
     [(128, 1), (128, 2), (128, 4), (96, 8), (64, 16), (32, 1), (2, 1)];
 
 /// The flow network.
@@ -71,7 +71,7 @@ impl PwcNet {
         let conv = |sizes| Conv2d::zeros(sizes, 3, Bias::Yes, device);
         let mut inputs = 3;
         let mut extractor = Vec::new();
-        for width in PYRAMID {
+        for width in PYRAMID_WIDTHS {
             let same = || conv([width, width]);
             extractor.push(Features {
                 first: conv([inputs, width]),
@@ -84,9 +84,9 @@ impl PwcNet {
         let mut decoders = Vec::new();
         for level in (1..LEVELS.len()).rev() {
             let up = |size| ConvTranspose::zeros([size, 2], 4, device);
-            let mut size = PLACES + coarser.map_or(0, |_| PYRAMID[level] + 4);
+            let mut size = PLACES + coarser.map_or(0, |_| PYRAMID_WIDTHS[level] + 4);
             let mut dense = Vec::new();
-            for growth in DENSE {
+            for growth in DENSE_WIDTHS {
                 dense.push(conv([size, growth]));
                 size += growth;
             }
@@ -95,13 +95,13 @@ impl PwcNet {
                 upfeat: coarser.map(up),
                 dense,
                 last: conv([size, 2]),
-                scale: UNIT / (2 << level) as f32,
+                scale: FLOW_SCALE / (2 << level) as f32,
             });
             coarser = Some(size);
         }
         let mut inputs = coarser.expect("five decoders");
         let mut refiner = Vec::new();
-        for (width, apart) in REFINER {
+        for (width, apart) in REFINER_LAYERS {
             let weight = zeros([width, inputs, 3, 3], device);
             refiner.push(Dilated { weight, bias: zeros([width], device), apart });
             inputs = width;
@@ -142,7 +142,8 @@ impl PwcNet {
         format!("pwcnet.{name}")
     }
 
-    /// The flow at a quarter of the size, in units of [`UNIT`] pixels of the full one. Sides are multiples of 64.
+    /// Computes the flow at a quarter of the size, in units of [`FLOW_SCALE`] pixels of the full one. Sides
+    /// are multiples of 64.
     pub(super) fn forward(&self, first: Tensor<4>, second: Tensor<4>) -> Tensor<4> {
         let levels = |image: Tensor<4>| {
             let mut levels = Vec::with_capacity(LEVELS.len());
@@ -177,7 +178,7 @@ impl Features {
 }
 
 impl Decoder {
-    /// Flow and features, from those of the coarser level.
+    /// Returns flow and features, from the flow and features of the coarser level.
     fn forward(
         &self,
         first: Tensor<4>,
@@ -209,7 +210,8 @@ impl Dilated {
     }
 }
 
-/// Means over channels of products of `first` and what `second` has up to four cells away, zeros outside: row by row.
+/// Computes means over channels of the products of `first` and of `second` up to four cells away, zeros
+/// outside: row by row.
 ///
 /// # Shapes
 /// - first, second: `[images, channels, height, width]`
@@ -226,14 +228,14 @@ pub fn correlation(first: Tensor<4>, second: Tensor<4>) -> Tensor<4> {
     Tensor::cat((0..PLACES).map(place).collect(), 1)
 }
 
-/// The warp of the network as it was trained: places of pixels and flow differ in convention, so that flow counts
+/// Warps as the network was trained: places of pixels and flow differ in convention, so that flow counts
 /// `N / (N - 1)` of itself on a side of `N` pixels; zero where any part comes from outside.
 fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
-    const WHOLE: f32 = 0.999;
+    const MIN_WEIGHT: f32 = 0.999;
     let [_, _, height, width] = x.dims();
     let factor = |side: usize| side as f32 / (side - 1) as f32;
     let flow = flow * same_flow([factor(width), factor(height)], &x.device());
     let ones = x.clone().narrow(1, 0, 1).ones_like();
-    let inside = warp_zeros(ones, flow.clone()).greater_elem(WHOLE).float();
+    let inside = warp_zeros(ones, flow.clone()).greater_elem(MIN_WEIGHT).float();
     warp_zeros(x, flow) * inside
 }

@@ -1,10 +1,10 @@
-//! Forward warping: averages of the pixels that flow brings (Niklaus and Liu, "Softmax splatting for video frame
-//! interpolation", CVPR 2020).
+//! Forward warping: averages of the pixels that flow brings (Niklaus and Liu, "Softmax splatting for video
+//! frame interpolation", CVPR 2020).
 
 use burn::tensor::{IndexingUpdateOp, Tensor};
 
-/// Every pixel spread over the four around `(column + flow_x, row + flow_y)`, and averages of what arrives; zero
-/// where nothing does. The flow has no gradient.
+/// Spreads every pixel over the four around `(column + flow_x, row + flow_y)`, and averages what arrives;
+/// zero where nothing does. The flow has no gradient.
 ///
 /// # Shapes
 /// - x, result: `[images, channels, height, width]`

@@ -21,7 +21,7 @@ impl Bank {
         Self { top, frames, keys: None, values: Vec::new() }
     }
 
-    /// Adds the positions of a frame; only those of the last frames of its size stay.
+    /// Adds the positions of a frame; only the last frames of its size stay.
     pub(super) fn store(&mut self, key: Tensor<4>, values: Vec<Tensor<4>>) {
         let [_, _, height, width] = key.dims();
         let most = self.frames.saturating_mul(height * width);
@@ -48,7 +48,7 @@ impl Bank {
         self.values = values.into_iter().map(last).collect();
     }
 
-    /// Values for the positions of a query, means of those whose keys are most alike.
+    /// Returns values for the positions of a query: means of the values whose keys are most similar.
     ///
     /// # Panics
     /// If nothing has been stored.

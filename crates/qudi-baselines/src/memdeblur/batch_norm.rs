@@ -1,4 +1,5 @@
-//! Batch normalisation (Ioffe and Szegedy, ICML 2015): statistics of the batch in training, running ones in use.
+//! Batch normalisation (Ioffe and Szegedy, ICML 2015): statistics of the batch in training, running ones in
+//! use.
 
 use burn::module::{Module, Param, ParamId};
 use burn::tensor::{Device, Tensor};
@@ -6,7 +7,7 @@ use qudi_layers::zeros;
 use std::cell::RefCell;
 use std::collections::HashMap;
 
-/// Added to variances.
+/// Term added to variances.
 const EPSILON: f32 = 1e-5;
 
 /// The fraction of a batch's statistics in the running ones after it.
@@ -22,20 +23,20 @@ pub(super) struct BatchNorm {
     running_var: Param<Tensor<1>>,
 }
 
-/// The running statistics of all layers, as batches of training move them. They are parameters of the network, of
-/// which the loss has no gradient: whoever trains puts them there after the step.
+/// The running statistics of all layers, as batches of training move them. They are parameters of the
+/// network, of which the loss has no gradient: whoever trains puts them there after the step.
 #[derive(Debug, Default)]
 pub struct BatchStatistics {
     moved: RefCell<HashMap<ParamId, Tensor<1>>>,
 }
 
 impl BatchStatistics {
-    /// The running statistics that batches have moved, `[channels]` each, outside autodiff.
+    /// Returns the running statistics that batches have moved, `[channels]` each, outside autodiff.
     pub fn into_moved(self) -> HashMap<ParamId, Tensor<1>> {
         self.moved.into_inner()
     }
 
-    /// Moves a running statistic towards that of a batch.
+    /// Moves a running statistic towards a batch's.
     fn move_towards(&self, running: &Param<Tensor<1>>, of_batch: Tensor<1>) {
         let mut moved = self.moved.borrow_mut();
         let before = moved.remove(&running.id).unwrap_or_else(|| running.val().inner());
@@ -50,8 +51,8 @@ impl BatchNorm {
         Self { weight: values(), bias: values(), running_mean: values(), running_var: values() }
     }
 
-    /// With running statistics, or with those of the batch, which move `statistics`; then `x` is on an autodiff
-    /// device.
+    /// Normalises by running statistics, or by the batch's, which move `statistics`; then `x` is on an
+    /// autodiff device.
     ///
     /// # Shapes
     /// - x, result: `[images, channels, height, width]`
@@ -65,7 +66,7 @@ impl BatchNorm {
                 let mean_of_batch = mean(x.clone());
                 let centred = x - mean_of_batch.clone();
                 let variance = mean(centred.clone().powi_scalar(2));
-                // The running variance is that of all images, of which a batch is a sample.
+                // The running variance is for all images, of which a batch is a sample.
                 let count = images * height * width;
                 let of_all = count as f64 / count.saturating_sub(1).max(1) as f64;
                 statistics.move_towards(&self.running_mean, mean_of_batch.reshape([channels]));

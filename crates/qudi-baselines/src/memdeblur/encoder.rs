@@ -1,5 +1,5 @@
-//! Keys and values of frames, and what is read from memory: the beginning of ResNet-50 (He et al., CVPR 2016) after
-//! residual blocks.
+//! Keys and values of frames, and what is read from memory: the beginning of ResNet-50 (He et al., CVPR 2016)
+//! after residual blocks.
 
 use super::Sizes;
 use super::batch_norm::{BatchNorm, BatchStatistics};
@@ -14,7 +14,7 @@ use qudi_layers::resample::pixel_shuffle;
 use qudi_layers::{Bias, Conv2d};
 use std::slice::from_ref;
 
-/// How much more channels a bottleneck gives than it has inside.
+/// Expansion of channels at the end of a bottleneck.
 const EXPANSION: usize = 4;
 
 /// Encoders and decoders of memories.
@@ -94,7 +94,7 @@ impl Memory {
         }
     }
 
-    /// `statistics` are those of batches, in training.
+    /// Encodes; `statistics` are of batches, in training.
     pub(super) fn key(&self, own: Tensor<4>, statistics: Option<&BatchStatistics>) -> Tensor<4> {
         self.key_proj.linear(&[self.key_encoder.forward(&[own], statistics)])
     }
@@ -115,7 +115,7 @@ impl Encoder {
         }
     }
 
-    /// `statistics` are those of batches, in training.
+    /// Encodes; `statistics` are of batches, in training.
     pub(super) fn forward(
         &self,
         inputs: &[Tensor<4>],
@@ -130,7 +130,7 @@ impl Encoder {
 }
 
 impl Decoder {
-    /// Features of a size, of what was read at a quarter of it, rounded up.
+    /// Decodes what was read at a quarter of a size, rounded up, to features of this size.
     pub(super) fn forward(&self, x: Tensor<4>, [height, width]: [usize; 2]) -> Tensor<4> {
         let z = self.forward_resblocks.forward(&[x]);
         let [_, _, h, w] = z.dims();

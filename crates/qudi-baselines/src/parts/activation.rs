@@ -4,12 +4,12 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::leaky_relu;
 use qudi_layers::Conv2d;
 
-/// Negative values count a tenth.
+/// Applies a ReLU with slope 0.1 for negative values.
 pub fn leaky(x: Tensor<4>) -> Tensor<4> {
     leaky_relu(x, 0.1)
 }
 
-/// Layers one after the other, each but the last followed by [`leaky`].
+/// Applies layers one after the other, each but the last followed by [`leaky`].
 ///
 /// # Panics
 /// Without layers.

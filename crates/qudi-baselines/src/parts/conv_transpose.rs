@@ -16,7 +16,7 @@ pub struct ConvTranspose {
 }
 
 impl ConvTranspose {
-    /// The layer, all weights zero. The kernel is 3 or 4.
+    /// Makes the layer, all weights zero. The kernel is 3 or 4.
     pub fn zeros([inputs, outputs]: [usize; 2], kernel: usize, device: &Device) -> Self {
         Self {
             weight: zeros([inputs, outputs, kernel, kernel], device),
@@ -24,7 +24,7 @@ impl ConvTranspose {
         }
     }
 
-    /// Twice the size.
+    /// Applies the layer, which doubles the size.
     ///
     /// # Shapes
     /// - x: `[images, inputs, height, width]`

@@ -6,11 +6,12 @@ use burn::tensor::Tensor;
 /// Taps of a kernel of 3 x 3.
 const TAPS: usize = 9;
 
-/// A convolution of 3 x 3 whose taps look elsewhere, and count as much as a mask says; zeros outside.
+/// Applies a 3 x 3 convolution whose taps have offsets and are weighted by a mask; zeros outside.
 ///
 /// # Shapes
 /// - x: `[images, channels, height, width]`
-/// - offset: `[images, groups * 18, height, width]`: y before x for every tap of every group of channels, in pixels
+/// - offset: `[images, groups * 18, height, width]`: y before x for every tap of every group of channels, in
+///   pixels
 /// - mask: `[images, groups * 9, height, width]`
 /// - weight: `[outputs, channels, 3, 3]`
 /// - bias: `[outputs]`
@@ -40,7 +41,7 @@ pub fn deform_conv(
         + bias.reshape([1, outputs, 1, 1])
 }
 
-/// What the taps of such a convolution see.
+/// Returns what the taps of such a convolution see.
 ///
 /// # Shapes
 /// - x, offset: as of [`deform_conv`]

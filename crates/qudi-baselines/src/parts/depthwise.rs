@@ -13,12 +13,12 @@ pub struct Depthwise {
 }
 
 impl Depthwise {
-    /// The layer, all weights zero.
+    /// Makes the layer, all weights zero.
     pub fn zeros(channels: usize, device: &Device) -> Self {
         Self { weight: zeros([channels, 1, 3, 3], device) }
     }
 
-    /// The sum over nine pixels, zeros outside.
+    /// Applies the layer: sums over nine pixels, zeros outside.
     ///
     /// # Shapes
     /// - x, result: `[images, channels, height, width]`

@@ -4,7 +4,7 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use qudi_layers::zeros;
 
-/// Added to the variance.
+/// Term added to the variance.
 const EPSILON: f32 = 1e-5;
 
 /// Channels of every pixel less their mean, over their standard deviation, times a weight and plus a bias.
@@ -17,12 +17,12 @@ pub struct LayerNorm {
 }
 
 impl LayerNorm {
-    /// The norm, weights zero.
+    /// Makes the norm, weights zero.
     pub fn zeros(channels: usize, device: &Device) -> Self {
         Self { weight: zeros([channels], device), bias: zeros([channels], device) }
     }
 
-    /// The normalised channels.
+    /// Normalises channels.
     ///
     /// # Shapes
     /// - x, result: `[images, channels, height, width]`

@@ -2,13 +2,13 @@
 
 use burn::tensor::Tensor;
 
-/// Charbonnier's: the mean of `sqrt(d^2 + 1e-6)`, `[1]`.
+/// Computes Charbonnier's loss: the mean of `sqrt(d^2 + 1e-6)`, `[1]`.
 pub fn charbonnier<const D: usize>(x: Tensor<D>, truth: Tensor<D>) -> Tensor<1> {
     ((x - truth).powi_scalar(2) + 1e-6).sqrt().mean()
 }
 
-/// The mean absolute error, and half of that of the derivatives by Sobel along rows and columns, borders left out,
-/// `[1]`.
+/// Computes the mean absolute error, and half of the mean absolute error of the derivatives by Sobel along
+/// rows and columns, borders left out, `[1]`.
 ///
 /// # Shapes
 /// - x, truth: `[images, 1, height, width]`

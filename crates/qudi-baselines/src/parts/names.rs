@@ -1,11 +1,11 @@
 //! Names of parameters in files, where they differ from those here.
 
-/// A name with parts of it replaced: for each pair, the first by the second.
+/// Replaces parts of a name: for each pair, the first by the second.
 pub fn renamed(name: &str, pairs: &[(&str, &str)]) -> String {
     pairs.iter().fold(name.to_owned(), |name, (ours, theirs)| name.replace(ours, theirs))
 }
 
-/// A name in which the number after `list` is doubled: files count the activations between layers, too.
+/// Doubles the number after `list` in a name: files count the activations between layers, too.
 pub fn every_second(name: &str, list: &str) -> String {
     let Some((before, after)) = name.split_once(list) else { return name.to_owned() };
     let (number, rest) = after.split_once('.').unwrap_or((after, ""));
@@ -15,7 +15,7 @@ pub fn every_second(name: &str, list: &str) -> String {
     }
 }
 
-/// A name in which dense blocks have the authors' names of their layers.
+/// Gives the layers of dense blocks their authors' names.
 pub fn dense_blocks_renamed(name: &str) -> String {
     let mut theirs = Vec::new();
     let mut parts = name.split('.');

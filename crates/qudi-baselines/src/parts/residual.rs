@@ -13,13 +13,13 @@ pub struct Residual {
 }
 
 impl Residual {
-    /// The block, all weights zero.
+    /// Makes the block, all weights zero.
     pub fn zeros(channels: usize, bias: Bias, device: &Device) -> Self {
         let conv = || Conv2d::zeros([channels, channels], 3, bias, device);
         Self { conv1: conv(), conv2: conv() }
     }
 
-    /// What the layers add to `x`, and `x`.
+    /// Adds the output of the layers to `x`.
     ///
     /// # Shapes
     /// - x, result: `[images, channels, height, width]`

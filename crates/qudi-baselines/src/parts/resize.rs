@@ -11,7 +11,7 @@ pub enum Corners {
     Centres,
 }
 
-/// The image at another size, bilinear between pixels, borders repeated, without a filter before it.
+/// Resizes an image, bilinear between pixels, borders repeated, without a filter before it.
 ///
 /// # Shapes
 /// - x: `[images, channels, height, width]`
@@ -26,7 +26,7 @@ pub fn resize(x: Tensor<4>, size: [usize; 2], corners: Corners) -> Tensor<4> {
     rows.matmul(x).matmul(columns.transpose())
 }
 
-/// A quarter of the size, bicubic (a = -3/4), without a filter before it: four taps on every four pixels.
+/// Resizes to a quarter, bicubic (a = -3/4), without a filter before it: four taps on every four pixels.
 ///
 /// # Shapes
 /// - x: `[images, channels, 4 * height, 4 * width]`
@@ -45,7 +45,7 @@ pub fn quarter(x: Tensor<4>) -> Tensor<4> {
     rows.matmul(x).matmul(columns.transpose())
 }
 
-/// How much every old pixel counts for every new one, `[1, 1, new, old]`.
+/// Returns the weight of every old pixel in every new one, `[1, 1, new, old]`.
 fn matrix(old: usize, new: usize, corners: Corners, device: &Device) -> Tensor<4> {
     let mut values = vec![0.0f32; old * new];
     for (i, row) in values.chunks_exact_mut(old).enumerate() {

@@ -1,4 +1,5 @@
-//! Flow in a pyramid (Ranjan and Black, "Optical flow estimation using a spatial pyramid network", CVPR 2017).
+//! Flow in a pyramid (Ranjan and Black, "Optical flow estimation using a spatial pyramid network", CVPR
+//! 2017).
 
 use super::resize::{Corners, resize};
 use super::same_flow;
@@ -14,7 +15,7 @@ const MULTIPLE: usize = 32;
 /// The flow network.
 #[derive(Module, Debug)]
 pub struct SpyNet {
-    /// The coarsest first.
+    /// Returns a pyramid, the coarsest level first.
     levels: Vec<Layers>,
     /// Mean and standard deviation of every channel that images are made into.
     #[module(skip)]
@@ -22,8 +23,8 @@ pub struct SpyNet {
 }
 
 impl SpyNet {
-    /// The network, all weights zero. Every channel of the images inside is the image less a mean, over a standard
-    /// deviation.
+    /// Makes the network, all weights zero. Every channel of the images inside is the image less a mean, over
+    /// a standard deviation.
     pub fn zeros(
         levels: usize,
         widths: [usize; 4],
@@ -36,14 +37,14 @@ impl SpyNet {
         Self { levels: (0..levels).map(level).collect(), channels }
     }
 
-    /// The name of a parameter in the authors' files.
+    /// Returns the name of a parameter in the authors' files.
     pub fn authors_name(name: &str) -> String {
         let Some((before, after)) = name.split_once("spynet.levels.") else {
             return name.to_owned();
         };
         let name =
             format!("{before}spynet.basic_module.{}", after.replace("layers", "basic_module"));
-        // The last number before weight or bias is that of a layer, which counts activations, too.
+        // The last number before weight or bias is a layer's, which counts activations, too.
         let mut parts: Vec<String> = name.split('.').map(str::to_owned).collect();
         if let Some(layer) = parts.iter_mut().rev().nth(1)
             && let Ok(number) = layer.parse::<usize>()
@@ -53,8 +54,8 @@ impl SpyNet {
         parts.join(".")
     }
 
-    /// The flow from `reference` to `supporting` at the size of the images over each of `scales`, powers of two
-    /// from 1 on: `warp(supporting, flow)` resembles `reference`.
+    /// Computes the flow from `reference` to `supporting` at the size of the images over each of `scales`,
+    /// powers of two from 1 on: `warp(supporting, flow)` resembles `reference`.
     ///
     /// # Shapes
     /// - reference, supporting: `[images, 1, height, width]`
@@ -90,7 +91,7 @@ impl SpyNet {
         finest_first.zip(scales).map(scaled).collect()
     }
 
-    /// The coarsest first.
+    /// Returns a pyramid, the coarsest level first.
     fn pyramid(&self, image: Tensor<4>) -> Vec<Tensor<4>> {
         // An image of one channel serves for all.
         let last = image.dims()[1] - 1;

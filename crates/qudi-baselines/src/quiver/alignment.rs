@@ -14,8 +14,8 @@ const GROUPS: usize = 16;
 /// Taps of their kernels.
 const TAPS: usize = 9;
 
-/// The farthest that offsets go beyond the flow, in pixels.
-const REACH: f32 = 10.0;
+/// Largest offset beyond the flow, in pixels.
+const MAX_OFFSET: f32 = 10.0;
 
 /// Features at three scales.
 #[derive(Module, Debug)]
@@ -71,7 +71,7 @@ impl Alignment {
         }
     }
 
-    /// Every frame but the last of every burst, aligned with the next; nothing comes first.
+    /// Aligns every frame but the last of every burst with the next; zeros come first.
     pub(super) fn frames(&self, x: Tensor<4>, flow: &Tensor<4>, frames: usize) -> Tensor<4> {
         let [images, channels, height, width] = x.dims();
         let before = frames_from(&x, frames, 0, frames - 1);
@@ -93,7 +93,7 @@ impl Alignment {
         let (offsets, masks) = (2 * TAPS * GROUPS, TAPS * GROUPS);
         // Offsets are y before x, flow is x before y.
         let around = flow.flip([1]).repeat(&[1, TAPS * GROUPS, 1, 1]);
-        let offset = tanh(z.clone().narrow(1, 0, offsets)) * REACH + around;
+        let offset = tanh(z.clone().narrow(1, 0, offsets)) * MAX_OFFSET + around;
         let mask = sigmoid(z.narrow(1, offsets, masks));
         deform_conv(x, offset, mask, self.weight.val(), self.bias.val())
     }
@@ -115,7 +115,7 @@ impl GatedFusion {
     }
 }
 
-/// The image at half and at a quarter of its size.
+/// Returns the image at half and at a quarter of its size.
 pub(super) fn smaller(x: &Tensor<4>) -> [Tensor<4>; 2] {
     [avg_pool2(x.clone()), fourth(x.clone())]
 }

@@ -90,7 +90,8 @@ impl Cell {
         renamed(name, &pairs)
     }
 
-    /// The maps of a frame and the next state. `fused` are aligned features at three scales, the finest first.
+    /// Computes the maps of a frame and the next state. `fused` are aligned features at three scales, the
+    /// finest first.
     pub(super) fn forward(
         &self,
         x: &Tensor<4>,

@@ -6,8 +6,8 @@ use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d};
 
-/// The least norm that channels are divided by.
-const LEAST_NORM: f32 = 1e-12;
+/// Smallest norm that channels are divided by.
+const MIN_NORM: f32 = 1e-12;
 
 /// The merge.
 #[derive(Module, Debug)]
@@ -48,7 +48,7 @@ impl Merge {
         renamed(name, &pairs)
     }
 
-    /// The maps of a window, that of interest last.
+    /// Merges the maps of a window, the restored frame's last.
     pub(super) fn forward(&self, window: &[Tensor<4>]) -> Tensor<4> {
         let y = self.conv.linear(window);
         self.conv1x1.linear(&[self.spat_att.forward(y.clone()) + y])
@@ -62,7 +62,7 @@ impl Attention {
         let qkv: Tensor<3> = qkv.reshape([images, 3 * channels, height * width]);
         let third = |number: usize| qkv.clone().narrow(1, number * channels, channels);
         let unit = |x: Tensor<3>| {
-            let norm = x.clone().powi_scalar(2).sum_dim(2).sqrt().clamp_min(LEAST_NORM);
+            let norm = x.clone().powi_scalar(2).sum_dim(2).sqrt().clamp_min(MIN_NORM);
             x / norm
         };
         let weights = softmax(unit(third(0)).matmul(unit(third(1)).transpose()), 2);

@@ -8,7 +8,7 @@ use std::slice::from_ref;
 /// Channels that each layer of the dense block adds.
 const GROWTH: usize = 64;
 
-/// How often the dense block is applied.
+/// Number of times that the dense block is applied.
 const BLOCKS: usize = 5;
 
 /// A residual dense network whose blocks are one and the same.

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor};
 use qudi_layers::{Bias, Conv2d};
 use std::slice::from_ref;
 
-/// How many times fewer channels the attention has inside.
+/// Reduction of channels inside the attention.
 const REDUCTION: usize = 16;
 
 /// The reconstruction of one scale.
@@ -80,7 +80,7 @@ impl Reconstructor {
         name
     }
 
-    /// The image, and what the next finer scale goes on from: features and image at twice the size.
+    /// Returns the image, and the input of the next finer scale: features and image at twice the size.
     pub(crate) fn forward(
         &self,
         h: Tensor<4>,
@@ -94,7 +94,7 @@ impl Reconstructor {
         (image.clone(), self.flast6.forward(f), self.upconv_out.forward(image))
     }
 
-    /// The image alone, and the features that it was made of.
+    /// Returns the image alone, and the features that it was made of.
     pub(crate) fn image(
         &self,
         h: Tensor<4>,

@@ -1,14 +1,15 @@
 //! The brightness that networks trained here give back.
 //!
-//! Their authors trained each network at one light level, where one gain and one dark level lead from counts to
-//! images. At several light levels there is none: the light of a burst, and the mean level of its scene, do not show
-//! in counts over full scale. What counts do show is what they are on average. That is the target here, and
-//! restoring, which knows sensor, light and mean level of the acquisition, goes back to the units of the image.
+//! Their authors trained each network at one light level, where one gain and one dark level lead from counts
+//! to images. At several light levels there is none: the light of a burst, and the mean level of its scene,
+//! do not show in counts over full scale. What counts do show is what they are on average. That is the target
+//! here, and restoring, which knows sensor, light and mean level of the acquisition, goes back to the units
+//! of the image.
 
 use qudi_core::restorer::Acquisition;
 
-/// The largest target, twice full scale: counts say nothing about how much brighter a place is.
-const BRIGHTEST: f32 = 2.0;
+/// Largest target, twice full scale: counts say nothing about brighter places.
+const MAX_TARGET: f32 = 2.0;
 
 /// From image values to expected counts over full scale, where the sensor does not saturate.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,7 +21,7 @@ pub struct ExpectedCounts {
 }
 
 impl ExpectedCounts {
-    /// Those of an acquisition.
+    /// Computes the expected counts of an acquisition.
     pub fn of(acquisition: &Acquisition) -> Self {
         let sensor = &acquisition.sensor;
         let of_electron = acquisition.gain / f64::from(sensor.max_count());
@@ -29,12 +30,12 @@ impl ExpectedCounts {
         Self { black: black as f32, white: (of_white * of_electron) as f32 }
     }
 
-    /// The target for an image value.
+    /// Returns the target for an image value.
     pub fn target(self, value: f32) -> f32 {
-        (self.black + self.white * value).min(BRIGHTEST)
+        (self.black + self.white * value).min(MAX_TARGET)
     }
 
-    /// The image value of a target.
+    /// Returns the image value of a target.
     pub fn image(self, target: f32) -> f32 {
         (target - self.black) / self.white
     }

@@ -17,8 +17,8 @@ const HEADS: usize = 12;
 /// Taps around every place.
 const TAPS: usize = 9;
 
-/// The farthest that offsets go beyond the flow, in pixels.
-const REACH: f32 = 10.0;
+/// Largest offset beyond the flow, in pixels.
+const MAX_OFFSET: f32 = 10.0;
 
 /// The attention.
 #[derive(Module, Debug)]
@@ -48,7 +48,8 @@ impl GuidedAttention {
         }
     }
 
-    /// The clip before where this one has it, and new flows. All clips are `[bursts * 2, channels, height, width]`.
+    /// Aligns the clip before with this one, and returns new flows, too. All clips are `[bursts * 2,
+    /// channels, height, width]`.
     pub(crate) fn forward(
         &self,
         q: Tensor<4>,
@@ -59,7 +60,7 @@ impl GuidedAttention {
     ) -> (Tensor<4>, Pair) {
         let [warped_same, warped_other] = warped;
         let start = vec![q.clone(), warped_same, warped_other, flows[0].clone(), flows[1].clone()];
-        let changes = tanh(leaky_layers(&self.conv_offset, start)) * REACH;
+        let changes = tanh(leaky_layers(&self.conv_offset, start)) * MAX_OFFSET;
         let half = 2 * TAPS * GROUPS;
         let offsets = [0, 1].map(|n: usize| {
             // Offsets are y before x, flow is x before y.
@@ -74,8 +75,8 @@ impl GuidedAttention {
     }
 }
 
-/// Every pixel attends to what the taps see in both frames of the clip before: first in that of the same place,
-/// then in the other.
+/// Lets every pixel attend to what the taps see in both frames of the clip before: first in the one of the
+/// same place, then in the other.
 fn attend(q: Tensor<4>, kv: &Tensor<4>, offsets: &Pair) -> Tensor<4> {
     let [images, channels, height, width] = q.dims();
     let (size, pixels) = (channels / HEADS, height * width);
@@ -94,7 +95,7 @@ fn attend(q: Tensor<4>, kv: &Tensor<4>, offsets: &Pair) -> Tensor<4> {
     mixed.reshape([images, channels, height, width])
 }
 
-/// The mean of all places, as flow.
+/// Returns the mean of all places, as flow.
 fn mean_flow(offset: Tensor<4>) -> Tensor<4> {
     let [images, _, height, width] = offset.dims();
     let places: Tensor<5> = offset.reshape([images, TAPS * GROUPS, 2, height, width]);

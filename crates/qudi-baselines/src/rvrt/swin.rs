@@ -98,7 +98,7 @@ impl Stage {
         name.to_owned()
     }
 
-    /// Features of frames that attend to each other in windows.
+    /// Computes features of frames that attend to each other in windows.
     ///
     /// # Shapes
     /// - x: `[bursts * frames, inputs, height, width]`
@@ -130,7 +130,7 @@ impl SwinLayer {
         }
     }
 
-    /// `x` is `[bursts * frames, channels, height, width]`.
+    /// Applies the layer; `x` is `[bursts * frames, channels, height, width]`.
     pub(crate) fn forward(&self, x: Tensor<4>, frames: usize) -> Tensor<4> {
         let [_, _, height, width] = x.dims();
         let windows = Windows::new([frames, height, width], self.frames, self.shifted);
@@ -159,7 +159,8 @@ impl Attention {
         self.proj.on_channels(windows.join(mixed.reshape([count, channels, cells])))
     }
 
-    /// What positions in a window add to the scores, `[1, heads, cells, cells]`.
+    /// Returns the biases of positions in a window, which are added to the scores, `[1, heads, cells,
+    /// cells]`.
     fn bias(&self, windows: &Windows) -> Tensor<4> {
         let cells = windows.cells();
         let table = self.relative_position_bias_table.val();

@@ -4,8 +4,8 @@ use super::swin::SIDE;
 use burn::tensor::ops::PadMode;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-/// What keeps cells apart that shifting brought together.
-const APART: f32 = -100.0;
+/// Score added for cells that shifting brought together.
+const SHIFT_PENALTY: f32 = -100.0;
 
 /// The windows of bursts.
 #[derive(Clone, Debug)]
@@ -21,8 +21,8 @@ pub(super) struct Windows {
 }
 
 impl Windows {
-    /// Windows of `frames` frames and [`SIDE`] rows and columns, or of as many as there are, shifted by half of them
-    /// where there are more than one.
+    /// Makes windows of `frames` frames and [`SIDE`] rows and columns, or of as many as there are, shifted by
+    /// half of them where there are more than one.
     pub(super) fn new(size: [usize; 3], frames: usize, shifted: bool) -> Self {
         let full = [frames, SIDE, SIDE];
         let window = [0, 1, 2].map(|axis| full[axis].min(size[axis]));
@@ -30,17 +30,17 @@ impl Windows {
         Self { full_frames: frames, size, window, shift: [shift(1), shift(2)] }
     }
 
-    /// Cells of a window.
+    /// Returns the cells of a window.
     pub(super) fn cells(&self) -> usize {
         self.window.iter().product()
     }
 
-    /// Rows and columns with those that fill up the last windows.
+    /// Returns rows and columns, with padding that fills the last windows.
     fn whole(&self) -> [usize; 2] {
         [1, 2].map(|axis| self.size[axis].next_multiple_of(self.window[axis]))
     }
 
-    /// The image, filled up with zeros and shifted.
+    /// Pads the image with zeros and shifts it.
     pub(super) fn padded(&self, x: Tensor<4>) -> Tensor<4> {
         let [height, width] = self.whole();
         let (below, right) = (height - self.size[1], width - self.size[2]);
@@ -52,7 +52,7 @@ impl Windows {
         turned(turned(x, 2, self.shift[0]), 3, self.shift[1])
     }
 
-    /// The reverse of [`Self::padded`].
+    /// Undoes [`Self::padded`].
     pub(super) fn cropped(&self, x: Tensor<4>) -> Tensor<4> {
         let [height, width] = self.whole();
         let back = |length: usize, shift: usize| (length - shift) % length;
@@ -61,8 +61,8 @@ impl Windows {
         x.narrow(2, 0, self.size[1]).narrow(3, 0, self.size[2])
     }
 
-    /// From `[bursts * frames, channels, height, width]` to `[windows, channels, cells]`: cells frame by frame, row
-    /// by row.
+    /// Reshapes from `[bursts * frames, channels, height, width]` to `[windows, channels, cells]`: cells
+    /// frame by frame, row by row.
     pub(super) fn split(&self, x: Tensor<4>) -> Tensor<3> {
         let [images, channels, height, width] = x.dims();
         let [frames, wh, ww] = self.window;
@@ -77,7 +77,7 @@ impl Windows {
         ])
     }
 
-    /// The reverse of [`Self::split`].
+    /// Undoes [`Self::split`].
     pub(super) fn join(&self, x: Tensor<3>) -> Tensor<4> {
         let [count, channels, _] = x.dims();
         let [height, width] = self.whole();
@@ -90,7 +90,7 @@ impl Windows {
         x.permute([0, 1, 3, 2, 4]).reshape([groups * frames, channels, height, width])
     }
 
-    /// Scores `[windows, heads, cells, cells]`, far lower where shifting brought cells together.
+    /// Lowers scores, `[windows, heads, cells, cells]`, where shifting brought cells together.
     pub(super) fn masked(&self, scores: Tensor<4>) -> Tensor<4> {
         if self.shift == [0, 0] {
             return scores;
@@ -111,9 +111,9 @@ impl Windows {
                     3 * row + part(x, width, ww, self.shift[1])
                 });
                 let parts: Vec<usize> = places.collect();
-                let rows = parts
-                    .iter()
-                    .flat_map(|a| parts.iter().map(move |b| if a == b { 0.0 } else { APART }));
+                let rows = parts.iter().flat_map(|a| {
+                    parts.iter().map(move |b| if a == b { 0.0 } else { SHIFT_PENALTY })
+                });
                 values.extend(rows);
             }
         }
@@ -125,8 +125,9 @@ impl Windows {
         (scores + mask).reshape([count, heads, cells, cells])
     }
 
-    /// For every pair of cells, the row of the table of biases, `[cells * cells]`. Smaller windows take the rows of
-    /// the first cells of the full one, whatever these stand for: as in the authors' program.
+    /// Returns the row in the table of biases for every pair of cells, `[cells * cells]`. Smaller windows
+    /// take the rows of the first cells of the full one, whatever these stand for: as in the authors'
+    /// program.
     pub(super) fn offsets(&self, device: &Device) -> Tensor<1, Int> {
         let span = (2 * SIDE - 1) as i64;
         let place = |cell: usize| {
@@ -143,7 +144,7 @@ impl Windows {
     }
 }
 
-/// Rows or columns from number `shift` on, then those before.
+/// Returns rows or columns from number `shift` on, then the others.
 fn turned(x: Tensor<4>, axis: usize, shift: usize) -> Tensor<4> {
     if shift == 0 {
         return x;

@@ -1,5 +1,5 @@
-//! Alignment of features by deformable convolutions on three levels, each refining the one below (Wang et al.,
-//! "EDVR", CVPR workshops 2019).
+//! Alignment of features by deformable convolutions on three levels, each refining the one below (Wang et
+//! al., "EDVR", CVPR workshops 2019).
 
 use super::conv;
 use crate::parts::{deform_conv, leaky, renamed};
@@ -92,7 +92,7 @@ impl Align {
         name.replace("pcd_align.cas.", "pcd_align.cas_")
     }
 
-    /// Features on all levels.
+    /// Computes features on all levels.
     pub(super) fn levels(&self, features: Tensor<4>) -> Levels {
         let below = |x: &Tensor<4>, first: &Conv2d, second: &Conv2d| {
             leaky(second.linear(&[leaky(first.stride2(from_ref(x)))]))
@@ -102,7 +102,7 @@ impl Align {
         [features, middle, coarse]
     }
 
-    /// The features of a neighbour where those of the key are.
+    /// Aligns the features of a neighbour with the key's.
     pub(super) fn forward(&self, neighbour: Levels, key: Levels) -> Tensor<4> {
         let Cascade { l3, l2, l1, cas } = &self.pcd_align;
         let mut below: Option<(Tensor<4>, Tensor<4>)> = None;

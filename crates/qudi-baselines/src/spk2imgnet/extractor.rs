@@ -65,7 +65,7 @@ impl Extractor {
         renamed(name, &pairs)
     }
 
-    /// Four estimates of every block, and its features.
+    /// Computes four estimates of every block, and its features.
     pub(super) fn forward(&self, blocks: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
         let stems = self.conv0.iter().zip(&self.conv1);
         let estimate =

@@ -141,7 +141,6 @@ enum SpacingName {
     /// Evenly, as in the paper
     Linear,
     /// As densely as training drew timesteps, by how much noise there is: sharper pictures in as many steps
-    #[value(alias = "learnt")]
     LogLogistic,
 }
 

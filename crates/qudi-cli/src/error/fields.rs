@@ -3,7 +3,7 @@
 use crate::args::{Args, Global};
 use crate::commands::info::args::Info;
 use crate::commands::restore::args::Restore;
-use crate::settings::KEYS;
+use crate::settings::keys;
 use clap::{Args as _, Command, CommandFactory};
 
 /// Returns the place of an error as the user knows it: `--ppp-def` for the field `ppp_def`, anything else
@@ -27,7 +27,7 @@ pub(crate) fn flags_in_text(text: &str) -> String {
     for (i, part) in parts.iter().enumerate() {
         let quoted = i % 2 == 1 && i + 1 < parts.len();
         let (name, value) = part.split_once(' ').unwrap_or((part, ""));
-        let is_key = KEYS.iter().any(|key| key.name.strip_prefix("sensor.") == Some(name));
+        let is_key = keys().iter().any(|key| key.name().strip_prefix("sensor.") == Some(name));
         let assigns = value.starts_with('=') || value.is_empty() && is_key;
         let flag = commands.iter().find_map(|command| flag(command, name));
         if let Some(flag) = flag.filter(|_| quoted && !assigns) {

@@ -1,4 +1,4 @@
-//! Which keys a command takes; all others it refuses by name.
+//! The keys that each command takes; it refuses all others by name.
 
 /// The parts of a recipe, the keys of `qudi train`.
 pub(super) const RECIPE: &[&str] = &["network", "data", "train", "validation"];

@@ -1,7 +1,9 @@
 //! The flags of `qudi simulate` that set keys, made from the table of keys.
 
-use super::keys::{KEYS, Key};
+use super::keys::{Key, keys};
+use super::toml_text;
 use clap::{Arg, ArgMatches, Command, ValueHint};
+use serde_json::Value;
 
 /// The keys that flags set, with their text.
 #[derive(Clone, Debug, Default)]
@@ -16,7 +18,7 @@ impl KeyFlags {
 
 impl clap::FromArgMatches for KeyFlags {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let given = KEYS.iter().filter_map(|key| {
+        let given = keys().iter().filter_map(|key| {
             let text = matches.get_one::<String>(key.flag?.long)?;
             Some((key, text.clone()))
         });
@@ -31,7 +33,7 @@ impl clap::FromArgMatches for KeyFlags {
 
 impl clap::Args for KeyFlags {
     fn augment_args(command: Command) -> Command {
-        command.args(KEYS.iter().filter_map(argument))
+        command.args(keys().iter().filter_map(argument))
     }
 
     fn augment_args_for_update(command: Command) -> Command {
@@ -42,19 +44,19 @@ impl clap::Args for KeyFlags {
 /// Makes the argument of a key that has a flag.
 fn argument(key: &'static Key) -> Option<Arg> {
     let flag = key.flag?;
-    let default = match key.default.trim_matches('"') {
-        "" => String::new(),
-        default => format!(" [default: {default}]"),
+    let default = match &key.documented.default {
+        Value::Null => String::new(),
+        Value::String(text) => format!(" [default: {text}]"),
+        other => format!(" [default: {}]", toml_text(other)),
     };
-    let mut help: String = key.doc.replace('`', "");
-    help.get_mut(..1)?.make_ascii_uppercase();
+    let help = key.documented.doc.replace('`', "");
     let argument = Arg::new(flag.long)
         .long(flag.long)
         .value_name(flag.value)
         .allow_hyphen_values(true)
         .help(help + &default)
         .help_heading(flag.heading);
-    Some(match key.name {
+    Some(match key.name() {
         "simulate.sensor" => argument.value_hint(ValueHint::AnyPath),
         _ => argument,
     })

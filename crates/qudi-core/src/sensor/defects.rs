@@ -7,34 +7,35 @@ use crate::error::{Error, Result};
 use crate::frame::Size;
 use crate::random::{Domain, Streams, uniform};
 use rand_distr::{Distribution, StandardNormal};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Imperfections of the pixel array. Everything is off by default.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Defects {
     /// Seed of this camera's pixel pattern.
     pub seed: u64,
     /// Standard deviation of ln(dark rate) over the good pixels; the sensor's `dark` is their median.
     pub dark_spread: f64,
-    /// A `.npy` of `[height][width]` dark rates in e-/pixel/native frame, instead of drawn ones.
+    /// `.npy` of `[height][width]` dark rates in e- per pixel and native frame, instead of drawn ones.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dark_map: Option<String>,
-    /// A `.npy` of `[height][width]`, nonzero where a capture's pixels are to be repaired. The
-    /// simulator does not need it: hot pixels are hot in `dark_map`.
+    /// `.npy` of `[height][width]`, nonzero where captures are repaired. The simulator does not need it: hot
+    /// pixels are hot in `dark_map`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bad_pixels: Option<String>,
     /// Fraction of hot pixels.
     pub hot_fraction: f64,
-    /// Dark rate of a hot pixel.
+    /// Dark rate of a hot pixel, as `dark`.
     pub hot_dark: DarkRate,
-    /// Fraction of dead pixels, which always read 0.
+    /// Fraction of dead pixels, which read 0.
     pub dead_fraction: f64,
     /// Probability that a detection also fires a given one of the 4 neighbours.
     pub crosstalk: f64,
     /// Probability that a detection fires the same pixel again in the next binary frame.
     pub afterpulse: f64,
-    /// Non-paralysable dead time of a photon counter in nanoseconds.
+    /// Non-paralysable dead time of a photon counter, ns.
     pub dead_time_ns: f64,
 }
 

@@ -1,10 +1,11 @@
 //! Sensor values that carry a unit or a rule: dark rate, full well, gain.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use std::fmt;
 
 /// A number or a word, as both appear in TOML and on the command line.
-#[derive(Deserialize)]
+#[derive(Deserialize, JsonSchema)]
 #[serde(untagged)]
 enum NumberOrText {
     Number(f64),
@@ -12,7 +13,8 @@ enum NumberOrText {
 }
 
 /// Dark electrons per pixel: `1.6` is per native frame, `"7.5/s"` per second.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, JsonSchema)]
+#[schemars(with = "NumberOrText")]
 pub enum DarkRate {
     /// e- per pixel and native frame.
     PerFrame(f64),
@@ -60,7 +62,8 @@ impl std::str::FromStr for DarkRate {
 }
 
 /// Full-well capacity in electrons; `"unlimited"` for none.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, JsonSchema)]
+#[schemars(with = "NumberOrText")]
 pub struct FullWell(f64);
 
 impl FullWell {
@@ -101,7 +104,8 @@ impl std::str::FromStr for FullWell {
 }
 
 /// Gain in DN per e-, or the rule that sets it from the light.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, JsonSchema)]
+#[schemars(with = "NumberOrText")]
 pub enum Gain {
     /// `0.5 * (2^bits - 1) / PPP`, as in the QUIVER simulator.
     Quiver,

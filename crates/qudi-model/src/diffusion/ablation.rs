@@ -1,9 +1,10 @@
 //! Parts of the method that are left out in training, to measure what they are worth.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A part of the method that can be left out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Part {
     /// Forward model: the measurement of every estimate by the sensor model.
@@ -19,7 +20,7 @@ pub enum Part {
 }
 
 /// The parts that are left out. Parts that are left out still have weights.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
 pub struct Ablation(Vec<Part>);
 

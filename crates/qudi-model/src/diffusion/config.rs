@@ -2,10 +2,11 @@
 
 use crate::config::{Rule, SIZES, are_widths, check};
 use qudi_core::{Result, Size};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Sizes of the whole network (docs/network.md).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DiffusionConfig {
     /// Pixels of a side that become channels before the network and pixels again after it.
@@ -23,7 +24,7 @@ pub struct DiffusionConfig {
 }
 
 /// What the features of the noisy image see.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum NoisyFeatures {
     /// The noisy image itself, as in the paper.
@@ -34,7 +35,7 @@ pub enum NoisyFeatures {
 }
 
 /// What the networks of the flow see of a frame and of its neighbour, warped along the flow so far.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum FlowInputs {
     /// Both images, as in the paper.
@@ -45,7 +46,7 @@ pub enum FlowInputs {
 }
 
 /// The output of the U-Net.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum UNetPrediction {
     /// The clean image itself, as in the paper.
@@ -56,7 +57,7 @@ pub enum UNetPrediction {
 }
 
 /// Sizes of the pre-denoiser.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PreConfig {
     /// Channels.
@@ -68,7 +69,7 @@ pub struct PreConfig {
 }
 
 /// Channels of the spatio-temporal features on three levels.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FeaturesConfig {
     /// Channels of the measurements' features.
@@ -77,11 +78,12 @@ pub struct FeaturesConfig {
     pub high: [usize; 3],
     /// What the noisy image's features see.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub noisy: NoisyFeatures,
 }
 
 /// Sizes of the flow network.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FlowConfig {
     /// Pixels of a side of one cell of the finest flow.
@@ -96,11 +98,12 @@ pub struct FlowConfig {
     pub steps: Vec<usize>,
     /// What the networks see of a frame and its neighbour.
     #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
     pub inputs: FlowInputs,
 }
 
 /// Sizes of the fusion.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FusionConfig {
     /// Level of the recurrent state.
@@ -112,7 +115,7 @@ pub struct FusionConfig {
 }
 
 /// Sizes of the U-Net.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct UNetConfig {
     /// Channels of the first level.
@@ -127,6 +130,11 @@ pub struct UNetConfig {
     pub embedding: usize,
     /// Its output.
     pub predicts: UNetPrediction,
+}
+
+/// Schemas state all defaults, those too that are not written into files.
+fn never<T>(_: &T) -> bool {
+    false
 }
 
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {

@@ -1,6 +1,7 @@
 //! The timesteps of training and sampling.
 
 use super::schedule::NoiseSchedule;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The number of timesteps in training.
@@ -14,7 +15,7 @@ const MEDIAN_NOISE: f64 = 0.08;
 const SCALE: f64 = 0.6;
 
 /// How the timesteps of sampling are spaced.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimestepSpacing {
     /// Evenly, as in the paper: of ten timesteps one is low enough to show what a good start has left wrong.

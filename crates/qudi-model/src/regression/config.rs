@@ -4,6 +4,7 @@ use crate::aligned::AlignedNeighbours;
 use crate::config::{Rule, SIZES, are_widths, check};
 use qudi_burst::Alignments;
 use qudi_core::{Result, Size};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Height and width of padded frames are multiples of this. Another value would change pixels at the right
@@ -11,7 +12,7 @@ use serde::{Deserialize, Serialize};
 const MULTIPLE: usize = 32;
 
 /// Sizes of the regression. Both pre-denoisers have the same, but for the alignments of their neighbours.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RegressionConfig {
     /// Pixels of a side that become channels before the network and pixels again after it.

@@ -5,33 +5,30 @@ use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Result};
 use qudi_sim::scene::{PROCEDURAL, ProceduralScene};
 use rand::Rng;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The `[data]` part of a recipe.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DataConfig {
-    /// Frames of a sample.
+    /// Frames of a drawn burst.
     pub frames: usize,
-    /// Side of a sample in pixels.
+    /// Side of its square in pixels.
     pub crop: usize,
-    /// Instants that one exposure sees, an odd number: more than one lets the scene move within a frame. Of
-    /// clips they are recorded frames.
-    #[serde(default = "one_frame", skip_serializing_if = "is_one")]
-    pub instants: usize,
-    /// Sensors with the light that falls on them.
+    /// Sensors, with their light levels.
     pub sensor: Vec<SensorMix>,
     /// Where scenes come from.
     pub source: Vec<SourceConfig>,
 }
 
 /// A sensor that samples are taken with.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SensorMix {
     /// A preset's name or a sensor file.
     pub name: String,
-    /// Incident photons per pixel and output frame.
+    /// Incident photons per pixel and output frame: `{ from, to }`, log-uniform, or a list.
     pub ppp: LightRange,
     /// Binary frames summed into an output frame, if not as the sensor says.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -41,8 +38,8 @@ pub struct SensorMix {
     pub weight: f64,
 }
 
-/// Light of a sample.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// Light levels of samples.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum LightRange {
     /// Log-uniform between two values.
@@ -56,43 +53,43 @@ pub enum LightRange {
     Of(Vec<f64>),
 }
 
-/// A place that scenes come from.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// A source of scenes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SourceConfig {
     /// Its name in packs, reports and model cards.
     pub name: String,
-    /// What it holds.
+    /// Kind of the scenes.
     pub kind: SourceKind,
     /// Files and folders below the data folder, or names of procedural scenes.
     pub from: Vec<String>,
     /// Share of the samples, relative to the others'.
     #[serde(default = "one")]
     pub weight: f64,
-    /// Longest step through a clip, in its frames: 2 also makes motion twice as fast.
+    /// Largest step through a clip, in its frames: with 2, motion is also twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
-    /// The largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from
-    /// 1 to it.
-    #[serde(default = "one", alias = "shrink")]
+    /// Largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from 1 to
+    /// it.
+    #[serde(default = "one")]
     pub max_downscale: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
     #[serde(default = "usual_speed")]
     pub speed: f64,
-    /// The fraction of the samples from stills in which nothing moves.
-    #[serde(default, alias = "rest")]
+    /// Fraction of the samples from stills without motion.
+    #[serde(default)]
     pub static_fraction: f64,
 }
 
-/// What a source holds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+/// Kind of a source.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum SourceKind {
     /// Videos, and folders of frames.
     Clips,
-    /// Images, set in motion.
+    /// Images that are panned, rotated and zoomed, with cut-outs that move in front.
     Stills,
-    /// Procedural scenes; no files.
+    /// Procedural scenes, without files: `dead-leaves`, `text`, `gratings`, `chart`.
     Scenes,
 }
 
@@ -104,24 +101,19 @@ fn one_frame() -> usize {
     1
 }
 
-#[allow(clippy::trivially_copy_pass_by_ref)] // serde passes a reference
-fn is_one(count: &usize) -> bool {
-    *count == 1
-}
-
 fn usual_speed() -> f64 {
     4.0
 }
 
 impl SourceConfig {
-    /// How many times smaller a sample is made.
+    /// Draws the factor by which a sample is downscaled.
     pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
         if self.max_downscale > 1.0 { self.max_downscale.powf(uniform(random)) } else { 1.0 }
     }
 }
 
 impl LightRange {
-    /// Least and most.
+    /// Returns the lowest and the highest level.
     pub fn bounds(&self) -> [f64; 2] {
         match self {
             Self::Between { from, to } => [*from, *to],
@@ -131,7 +123,7 @@ impl LightRange {
         }
     }
 
-    /// A value for a uniform number in [0, 1).
+    /// Returns the level at a uniform number in [0, 1).
     pub(super) fn at(&self, u: f64) -> f64 {
         match self {
             Self::Between { from, to } => from * (to / from).powf(u),
@@ -141,7 +133,7 @@ impl LightRange {
 }
 
 impl SensorMix {
-    /// The sensor, as it is used.
+    /// Loads the sensor, as it is used.
     ///
     /// # Errors
     /// [`Error`] if there is none of that name, or it cannot exist.
@@ -156,7 +148,7 @@ impl SensorMix {
 }
 
 impl DataConfig {
-    /// The sensors by name; sums of binary frames as `name x frames`.
+    /// Returns the sensors by name; sums of binary frames as `name x frames`.
     pub(crate) fn sensor_names(&self) -> Vec<String> {
         let name = |mix: &SensorMix| match mix.frames_summed {
             None => mix.name.clone(),
@@ -165,18 +157,18 @@ impl DataConfig {
         self.sensor.iter().map(name).collect()
     }
 
-    /// The least and most photons per pixel and frame of all sensors.
+    /// Returns the fewest and the most photons per pixel and frame of all sensors.
     pub(crate) fn light(&self) -> [f64; 2] {
         let bounds = self.sensor.iter().map(|mix| mix.ppp.bounds());
         bounds.fold([f64::INFINITY, 0.0], |[low, high], [from, to]| [low.min(from), high.max(to)])
     }
 
-    /// The names of all sources.
+    /// Returns the names of all sources.
     pub(crate) fn source_names(&self) -> Vec<String> {
         self.source.iter().map(|source| source.name.clone()).collect()
     }
 
-    /// The configuration, if samples can be drawn from it.
+    /// Returns the configuration, if samples can be drawn from it.
     ///
     /// # Errors
     /// [`Error::Request`] with the key that is wrong.
@@ -193,13 +185,6 @@ impl DataConfig {
         }
         if !(16..=4096).contains(&self.crop) {
             return fault("data.crop", format!("is {}", self.crop), "use 16 to 4096 pixels");
-        }
-        if !((1..=99).contains(&self.instants) && self.instants % 2 == 1) {
-            return fault(
-                "data.instants",
-                format!("is {}", self.instants),
-                "use an odd number from 1 to 99: one of them is the middle",
-            );
         }
         if self.sensor.is_empty() || self.source.is_empty() {
             let key = if self.sensor.is_empty() { "data.sensor" } else { "data.source" };
@@ -263,7 +248,7 @@ impl DataConfig {
         Ok(self)
     }
 
-    /// Whether any source reads files.
+    /// Returns true if any source reads files.
     pub fn needs_files(&self) -> bool {
         self.source.iter().any(|source| source.kind != SourceKind::Scenes)
     }

@@ -1,4 +1,4 @@
-//! Finding the clips and stills that a source names.
+//! Search for the clips and stills that a source names.
 
 use super::config::{SourceConfig, SourceKind};
 use qudi_core::natural_order::natural_order;
@@ -13,13 +13,13 @@ pub(super) struct Content {
     pub(super) path: PathBuf,
 }
 
-/// Folders within folders that are looked into.
-const DEEPEST: usize = 4;
+/// Largest depth of folders that are searched.
+const MAX_DEPTH: usize = 4;
 
-/// Extensions of files that are passed over in folders of videos.
-const NO_VIDEO: &[&str] = &["txt", "md", "json", "csv", "zip", "npy", "toml", "html"];
+/// Extensions of files that are skipped in folders of videos.
+const OTHER_EXTENSIONS: &[&str] = &["txt", "md", "json", "csv", "zip", "npy", "toml", "html"];
 
-/// Everything a source names, in the order of names, below `data`.
+/// Returns everything that a source names, in the order of names, below `data`.
 pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content>> {
     let mut list = Vec::new();
     for from in &source.from {
@@ -27,7 +27,7 @@ pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content
         let about = std::fs::metadata(&path)
             .map_err(|e| Error::io(format!("find the source `{}`", source.name), &path, e))?;
         if about.is_dir() {
-            gather(source.kind, &path, DEEPEST, &mut list)?;
+            gather(source.kind, &path, MAX_DEPTH, &mut list)?;
         } else {
             list.push(path);
         }
@@ -48,7 +48,7 @@ pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content
     Ok(names.into_iter().zip(list).map(|(name, path)| Content { name, path }).collect())
 }
 
-/// What lies in a folder: for clips a folder of images is one clip and other files are videos.
+/// Returns the content of a folder: for clips a folder of images is one clip and other files are videos.
 fn gather(kind: SourceKind, folder: &Path, depth: usize, list: &mut Vec<PathBuf>) -> Result<()> {
     let read = |e| Error::io("list the folder", folder, e);
     let mut paths = Vec::new();
@@ -74,7 +74,7 @@ fn gather(kind: SourceKind, folder: &Path, depth: usize, list: &mut Vec<PathBuf>
             }
         } else {
             let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-            if !extension.is_empty() && !NO_VIDEO.contains(&extension.as_str()) {
+            if !extension.is_empty() && !OTHER_EXTENSIONS.contains(&extension.as_str()) {
                 list.push(path);
             }
         }

@@ -1,8 +1,8 @@
-//! A square cut from a frame, turned, mirrored, and made smaller.
+//! Squares cut from frames, turned, mirrored and downscaled.
 
 use qudi_core::{Frame, Size};
 
-/// Where a sample lies in its frames, and how it is turned.
+/// Place of a sample in its frames, and its orientation.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Crop {
     pub(super) left: usize,
@@ -13,7 +13,7 @@ pub(super) struct Crop {
 }
 
 impl Crop {
-    /// The square of a frame that holds it.
+    /// Returns this square of a frame.
     pub(super) fn of(self, frame: &Frame) -> Frame {
         let last = self.side - 1;
         Frame::from_fn(Size { height: self.side, width: self.side }, |x, y| {
@@ -25,7 +25,7 @@ impl Crop {
     }
 }
 
-/// A square picture at another side, not longer than its own: means over areas.
+/// Downscales a square picture to a side: means over areas.
 pub(super) fn shrunk(square: Frame, side: usize) -> Frame {
     let long = square.size.width;
     if side == long {
@@ -45,7 +45,7 @@ pub(super) fn shrunk(square: Frame, side: usize) -> Frame {
     Frame { size: Size { height: side, width: side }, data }
 }
 
-/// The mean over place `x` of `side` equal parts of a row.
+/// Returns the mean over part `x` of `side` equal parts of a row.
 fn mean(row: &[f32], x: usize, side: usize) -> f32 {
     let length = row.len() as f32 / side as f32;
     let (from, to) = (x as f32 * length, (x + 1) as f32 * length);

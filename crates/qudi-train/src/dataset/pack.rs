@@ -19,7 +19,7 @@ pub(super) const VERSION: u32 = 1;
 /// A clip, or a still, in a pack.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Clip {
-    /// The source it belongs to.
+    /// The source that it belongs to.
     pub source: String,
     /// Its name, unique in the source.
     pub name: String,
@@ -32,7 +32,7 @@ pub struct Clip {
 }
 
 impl Clip {
-    /// Name of a frame's image in the archive.
+    /// Returns the name of a frame's image in the archive.
     pub(super) fn entry(&self, frame: usize) -> String {
         format!("{}/{}/{frame:06}.png", self.source, self.name)
     }
@@ -78,7 +78,7 @@ impl Pack {
         Ok(Self { archive, path: path.to_owned(), clips: index.clips })
     }
 
-    /// Another handle to the same pack, for another thread.
+    /// Opens another handle to the same pack, for another thread.
     ///
     /// # Errors
     /// As [`Self::open`].
@@ -86,17 +86,17 @@ impl Pack {
         Self::open(&self.path)
     }
 
-    /// What it holds.
+    /// Returns the clips and stills in it.
     pub fn clips(&self) -> &[Clip] {
         &self.clips
     }
 
-    /// The file.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// A frame of clip `number`.
+    /// Reads a frame of clip `number`.
     ///
     /// # Errors
     /// [`Error`] if the file is damaged there.
@@ -120,7 +120,7 @@ impl Pack {
     }
 }
 
-/// The bytes of an entry; no more are allocated than are there.
+/// Reads the bytes of an entry; no more are allocated than are there.
 fn entry(archive: &mut ZipArchive<BufReader<File>>, name: &str, path: &Path) -> Result<Vec<u8>> {
     let entry = archive.by_name(name).map_err(|e| damaged(path, format!("{name}: {e}")))?;
     let mut bytes = Vec::new();

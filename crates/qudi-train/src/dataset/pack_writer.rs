@@ -1,4 +1,4 @@
-//! Decoding a recipe's sources into a pack.
+//! Decoding of a recipe's sources into a pack.
 
 use super::config::{DataConfig, SourceKind};
 use super::content::contents;
@@ -29,7 +29,7 @@ pub struct PackProgress {
 }
 
 /// Decodes every clip and still that `configs` name, below the folder `data`, into one pack. `most` frames of
-/// a clip are taken at most. `on` hears of every clip and says whether to go on.
+/// a clip are taken at most. `on` receives every clip, and returns `Break` to stop.
 ///
 /// # Errors
 /// [`Error`] if something cannot be read or written; [`Error::Interrupted`] if asked to stop.
@@ -99,7 +99,7 @@ pub fn write_pack(
     zip.finish().map_err(|e| failed(path, e))?.into_inner().finish()
 }
 
-/// A frame as an 8-bit gray PNG.
+/// Encodes a frame as an 8-bit gray PNG.
 fn png(frame: &Frame) -> Result<Vec<u8>> {
     let bytes: Vec<u8> = frame.data.iter().map(|v| (v * 255.0).round() as u8).collect();
     let mut image = Vec::new();
@@ -113,7 +113,7 @@ fn png(frame: &Frame) -> Result<Vec<u8>> {
     Ok(image)
 }
 
-/// Images are compressed already.
+/// Returns the options of entries: images are compressed already.
 fn store<W: Write>(
     zip: &mut ZipWriter<zip::write::StreamWriter<W>>,
     name: &str,

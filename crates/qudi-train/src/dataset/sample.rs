@@ -1,4 +1,4 @@
-//! Drawing samples: a scene, a crop, a sensor, light, and fresh photons.
+//! Drawing of samples: a scene, a crop, a sensor, a light level, and new photons.
 
 use super::config::{DataConfig, SourceConfig, SourceKind};
 use super::crop::{Crop, shrunk};
@@ -12,11 +12,11 @@ use qudi_sim::scene::{Procedural, ProceduralScene, StillMotion, still_scene};
 use rand::Rng;
 use std::f64::consts::TAU;
 
-/// Exposures outside make no picture: all black, or burnt out.
-const EXPOSURES: [f64; 2] = [0.02, 0.95];
+/// Bounds of mean levels; outside, frames are black or saturated.
+const MEAN_LEVELS: [f64; 2] = [0.02, 0.95];
 
-/// Least and most that a scene is made darker or brighter, photons unchanged: users do not know the true
-/// exposure.
+/// Bounds of the factor that a scene is made darker or brighter by, photons unchanged: users do not know the
+/// true exposure.
 const RESCALING: [f64; 2] = [0.6, 1.5];
 
 /// One burst to learn from.
@@ -24,7 +24,7 @@ const RESCALING: [f64; 2] = [0.6, 1.5];
 pub struct Sample {
     /// The clean frames.
     pub truth: Vec<Frame>,
-    /// What the sensor counted, frame by frame.
+    /// Counts of the sensor, frame by frame.
     pub counts: Vec<Vec<u16>>,
     /// Sensor and light; its seed is the sample's own.
     pub acquisition: Acquisition,
@@ -41,7 +41,7 @@ pub struct Dataset {
 }
 
 impl Dataset {
-    /// Samples of `config` from `pack`, which sources with files need.
+    /// Makes a dataset of `config` from `pack`, which sources with files need.
     ///
     /// # Errors
     /// [`Error`] if a sensor is unknown, or the pack lacks a source or holds clips that are too small.
@@ -52,7 +52,7 @@ impl Dataset {
         Ok(Self { config: config.clone(), pack, sensors, clips })
     }
 
-    /// The same for another thread.
+    /// Makes the same dataset for another thread.
     ///
     /// # Errors
     /// As [`Self::new`].
@@ -61,7 +61,7 @@ impl Dataset {
         Self::new(&self.config, pack)
     }
 
-    /// Sample `number` of `seed`.
+    /// Draws sample `number` of `seed`.
     ///
     /// # Errors
     /// [`Error`] if the pack is damaged.
@@ -69,35 +69,35 @@ impl Dataset {
         let mut rng = Streams::new(seed).row(Domain::Training, number, 0);
         let weights: Vec<f64> = self.config.source.iter().map(|source| source.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
-        let (instants, mean_level) = match self.config.source[at].kind {
+        let (frames, mean_level) = match self.config.source[at].kind {
             SourceKind::Clips => self.clip(at, &mut rng)?,
             SourceKind::Stills => self.still(at, &mut rng)?,
             SourceKind::Scenes => self.scene(at, &mut rng),
         };
-        let (instants, mean_level) = rescaled(instants, mean_level, uniform(&mut rng));
+        let (frames, mean_level) = rescaled(frames, mean_level, uniform(&mut rng));
         let weights: Vec<f64> = self.config.sensor.iter().map(|mix| mix.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
         let sensor = self.sensors[at].clone();
         let light = Light { ppp: self.config.sensor[at].ppp.at(uniform(&mut rng)), mean_level };
         let seed = rng.next_u64();
-        let mut camera = Camera::new(&sensor, instants[0].size, light, seed)?;
+        let mut camera = Camera::new(&sensor, frames[0].size, light, seed)?;
         let mut shutter = RollingShutter::new(&sensor);
         let (mut truth, mut counts) = (Vec::new(), Vec::new());
-        for (t, seen) in (0..).zip(instants.chunks(self.config.instants)) {
-            let mut seen = shutter.roll(seen);
-            counts.push(camera.expose(t, &seen.iter().collect::<Vec<_>>())?);
-            truth.push(seen.swap_remove(seen.len() / 2));
+        for (t, frame) in (0..).zip(&frames) {
+            let seen = shutter.roll(std::slice::from_ref(frame)).swap_remove(0);
+            counts.push(camera.expose(t, &[&seen])?);
+            truth.push(seen);
         }
         let acquisition = Acquisition::new(sensor, light.ppp, mean_level)?.with_seed(seed);
         Ok(Sample { truth, counts, acquisition })
     }
 
-    /// The instants of a clip's exposures, one after the other, and the clip's mean.
+    /// Cuts frames from a clip, and returns the clip's mean, too.
     fn clip(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
         let pack = self.pack.as_mut().expect("checked at the start");
         let number = self.clips[source][below(self.clips[source].len(), rng)];
         let clip = pack.clips()[number].clone();
-        let steps = self.config.frames * self.config.instants - 1;
+        let steps = self.config.frames - 1;
         let longest = self.config.source[source].stride.min((clip.frames - 1) / steps.max(1));
         let stride = 1 + below(longest.max(1), rng);
         let first = below(clip.frames - steps * stride, rng);
@@ -120,7 +120,6 @@ impl Dataset {
         let number = self.clips[source][below(self.clips[source].len(), rng)];
         let clip = pack.clips()[number].clone();
         let (side, frames) = (self.config.crop, self.config.frames);
-        let instants = self.config.instants;
         let (angle, speed) = (TAU * uniform(rng), self.config.source[source].speed * uniform(rng));
         let mut motion = StillMotion {
             pan: [speed * angle.cos(), speed * angle.sin()],
@@ -139,7 +138,7 @@ impl Dataset {
         let crop = cut(clip.size, enlarged(part, factor), rng);
         let image = shrunk(crop.of(&pack.frame(number, 0)?), part);
         let scene = still_scene(image, motion, Size { height: side, width: side }, rng.next_u64());
-        Ok((rendered(&scene, frames, instants), clip.mean))
+        Ok((rendered(&scene, frames), clip.mean))
     }
 
     fn scene(&self, source: usize, rng: &mut impl Rng) -> (Vec<Frame>, f64) {
@@ -149,18 +148,18 @@ impl Dataset {
         let kind = ProceduralScene::by_name(name).expect("checked with the recipe");
         let speed = speed * uniform(rng);
         let scene = Procedural { kind, size, seed: rng.next_u64(), speed }.scene();
-        let frames = rendered(&scene, self.config.frames, self.config.instants);
+        let frames = rendered(&scene, self.config.frames);
         let mean = frames.iter().map(Frame::mean).sum::<f64>() / frames.len() as f64;
         (frames, mean)
     }
 }
 
-/// The side that shrinks to `side` by `factor`.
+/// Returns the side that `factor` downscales to `side`.
 fn enlarged(side: usize, factor: f64) -> usize {
     (side as f64 * factor).round() as usize
 }
 
-/// Some square of an image of `size`, of `side` or as much as there is of it, turned somehow.
+/// Draws a square of an image of `size`, with `side` or the largest that fits, and its orientation.
 fn cut(size: Size, side: usize, rng: &mut impl Rng) -> Crop {
     let side = side.min(size.height).min(size.width);
     Crop {
@@ -171,7 +170,7 @@ fn cut(size: Size, side: usize, rng: &mut impl Rng) -> Crop {
     }
 }
 
-/// Clips of the pack that belong to a source and are large enough.
+/// Returns the clips of the pack that belong to a source, all large enough.
 fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> Result<Vec<usize>> {
     if source.kind == SourceKind::Scenes {
         return Ok(Vec::new());
@@ -187,8 +186,7 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
         let help = "make the pack again from this recipe";
         return Err(Error::data(what, pack.path(), help));
     }
-    let exposed = config.frames * config.instants;
-    let frames = if source.kind == SourceKind::Clips { exposed } else { 1 };
+    let frames = if source.kind == SourceKind::Clips { config.frames } else { 1 };
     for &number in &list {
         let clip = &pack.clips()[number];
         let small = clip.size.height.min(clip.size.width) < config.crop;
@@ -199,19 +197,19 @@ fn clips_of(config: &DataConfig, source: &SourceConfig, pack: Option<&Pack>) -> 
                     clip.name, clip.frames, clip.size, config.crop, config.crop
                 ),
                 pack.path(),
-                "lower data.crop, data.frames or data.instants, or leave the clip out",
+                "lower data.crop or data.frames, or leave the clip out",
             ));
         }
     }
     Ok(list)
 }
 
-/// The frames and their exposure times the same factor, drawn with `u`, which takes no value beyond white.
+/// Multiplies frames and their mean level by a factor, drawn with `u`, that takes no value beyond white.
 fn rescaled(mut truth: Vec<Frame>, mean_level: f64, u: f64) -> (Vec<Frame>, f64) {
-    let mean_level = mean_level.clamp(EXPOSURES[0], EXPOSURES[1]);
+    let mean_level = mean_level.clamp(MEAN_LEVELS[0], MEAN_LEVELS[1]);
     let values = truth.iter().flat_map(|frame| &frame.data);
     let brightest = f64::from(values.fold(1e-3f32, |most, &value| most.max(value)));
-    let most = RESCALING[1].min(1.0 / brightest).min(EXPOSURES[1] / mean_level);
+    let most = RESCALING[1].min(1.0 / brightest).min(MEAN_LEVELS[1] / mean_level);
     let factor = RESCALING[0] * (most / RESCALING[0]).powf(u);
     for value in truth.iter_mut().flat_map(|frame| &mut frame.data) {
         *value *= factor as f32;
@@ -219,22 +217,18 @@ fn rescaled(mut truth: Vec<Frame>, mean_level: f64, u: f64) -> (Vec<Frame>, f64)
     (truth, mean_level * factor)
 }
 
-/// The instants of exposures around time 0, as many for each.
-fn rendered(scene: &qudi_sim::scene::Scene, frames: usize, instants: usize) -> Vec<Frame> {
+/// Renders frames around time 0.
+fn rendered(scene: &qudi_sim::scene::Scene, frames: usize) -> Vec<Frame> {
     let middle = (frames / 2) as f64;
-    let time = |k: usize| {
-        let within = ((k % instants) as f64 + 0.5) / instants as f64 - 0.5;
-        (k / instants) as f64 - middle + within
-    };
-    (0..frames * instants).map(|k| scene.render(time(k))).collect()
+    (0..frames).map(|k| scene.render(k as f64 - middle)).collect()
 }
 
-/// A number below `count`, which is positive.
+/// Draws a number below `count`, which is positive.
 fn below(count: usize, rng: &mut impl Rng) -> usize {
     ((uniform(rng) * count as f64) as usize).min(count - 1)
 }
 
-/// The place of `u` in [0, 1) among intervals of these lengths.
+/// Returns the interval that `u` in [0, 1) falls into, among intervals of these lengths.
 fn pick(weights: &[f64], u: f64) -> usize {
     let mut rest = u * weights.iter().sum::<f64>();
     for (i, weight) in weights.iter().enumerate() {

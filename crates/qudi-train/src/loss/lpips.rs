@@ -6,7 +6,6 @@
 
 mod backbone;
 mod convolution;
-mod fetch;
 #[cfg(test)]
 mod golden_tests;
 mod gray;
@@ -17,14 +16,15 @@ use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::nearest::nearest;
 use qudi_core::{Error, Result, Size};
 use qudi_layers::StateDict;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 pub(crate) use backbone::Net;
 pub use weight_files::cache_folder;
 
 /// The perceptual term of a recipe.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "&'static str")]
 pub enum PerceptualKind {
     /// No perceptual term.
@@ -39,13 +39,6 @@ pub enum PerceptualKind {
 pub const PERCEPTUAL_KINDS: &[PerceptualKind] =
     &[PerceptualKind::None, PerceptualKind::LpipsVgg, PerceptualKind::LpipsAlex];
 
-/// Terms of earlier versions, and why they are gone.
-const REMOVED: &[(&str, &str)] = &[
-    ("ms-ssim", "it changed results less than another seed does"),
-    ("oriented", "it changed results less than another seed does"),
-    ("lpips-squeeze", "LPIPS is read with VGG16 and AlexNet alone"),
-];
-
 impl PerceptualKind {
     /// The name of the kind in recipes.
     pub fn name(self) -> &'static str {
@@ -59,17 +52,13 @@ impl PerceptualKind {
     /// The kind of this name.
     ///
     /// # Errors
-    /// [`Error::Request`] that lists the names, or says why a former term was removed.
+    /// [`Error::Request`] that lists the names.
     pub fn by_name(name: &str) -> Result<Self> {
         if let Some(kind) = PERCEPTUAL_KINDS.iter().find(|kind| kind.name() == name) {
             return Ok(*kind);
         }
         let names: Vec<_> = PERCEPTUAL_KINDS.iter().map(|kind| kind.name()).collect();
         let list = format!("use one of {}", names.join(", "));
-        if let Some((_, why)) = REMOVED.iter().find(|(removed, _)| *removed == name) {
-            let what = format!("the perceptual term `{name}` was removed: {why}");
-            return Err(Error::request(what, "train.loss.term", list));
-        }
         let hint =
             nearest(name, &names).map_or(String::new(), |name| format!("did you mean `{name}`?  "));
         let (what, help) = (format!("no perceptual term named `{name}`"), format!("{hint}{list}"));
@@ -211,21 +200,4 @@ impl Lpips {
 fn unit(x: Tensor<4>) -> Tensor<4> {
     let length = (x.clone().powi_scalar(2).sum_dim(1) + SQUARED_FLOOR).sqrt();
     x / length
-}
-
-/// Downloads the weights of a kind into `folder` with the `curl` program, and checks their hashes. Files that
-/// are there already are checked and kept; converted ones (docs/training.md) are enough. Gives the paths: none for
-/// [`PerceptualKind::None`].
-///
-/// # Errors
-/// [`Error`] if curl is missing or fails, or a file is not the published one.
-pub fn fetch(kind: PerceptualKind, folder: &Path) -> Result<Vec<PathBuf>> {
-    let Some(net) = kind.net() else { return Ok(Vec::new()) };
-    let converted = folder.join(weight_files::converted(net));
-    if converted.is_file() {
-        return Ok(vec![converted]);
-    }
-    let files = weight_files::files(net);
-    let files = files.iter();
-    files.map(|file| fetch::fetch(file, file.base, folder)).collect()
 }

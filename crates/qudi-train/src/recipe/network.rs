@@ -1,37 +1,32 @@
 //! The network of a recipe: regression, diffusion, or a learned method of others.
 
-use qudi_baselines::sizes::Sizes;
+use qudi_baselines::method::{METHODS, Method, Sizes};
 use qudi_core::{Error, Result};
 use qudi_model::config::{NetworkConfig, PRESETS};
 use qudi_model::diffusion::DiffusionConfig;
 use qudi_model::regression::RegressionConfig;
+<<<<<<< HEAD
+use schemars::JsonSchema;
+=======
+use qudi_model::window::WindowConfig;
+>>>>>>> fast
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// Names and texts of the recipes of learned baselines.
-const BASELINES: &[(&str, &str)] = &[
-    ("quiver", include_str!("../../../../configs/baselines/quiver.toml")),
-    ("emvd", include_str!("../../../../configs/baselines/emvd.toml")),
-    ("flornn", include_str!("../../../../configs/baselines/flornn.toml")),
-    ("spk2imgnet", include_str!("../../../../configs/baselines/spk2imgnet.toml")),
-    ("memdeblur", include_str!("../../../../configs/baselines/memdeblur.toml")),
-    ("rvrt", include_str!("../../../../configs/baselines/rvrt.toml")),
-    ("student-teacher", include_str!("../../../../configs/baselines/student-teacher.toml")),
-];
-
-/// The names of all recipes that come along: first our own, smallest first.
+/// Returns the names of all built-in recipes: first our own, smallest first.
 pub fn recipe_names() -> impl Iterator<Item = &'static str> {
-    PRESETS.iter().chain(BASELINES).map(|(name, _)| *name)
+    PRESETS.iter().map(|(name, _)| *name).chain(METHODS.map(Method::name))
 }
 
-/// The text of a recipe that comes along.
+/// Returns the text of a built-in recipe.
 pub(super) fn preset(name: &str) -> Option<&'static str> {
-    PRESETS.iter().chain(BASELINES).find(|preset| preset.0 == name).map(|(_, text)| *text)
+    let own = PRESETS.iter().find(|preset| preset.0 == name).map(|(_, text)| *text);
+    own.or_else(|| Method::by_name(name).map(Method::recipe))
 }
 
 /// The `[network]` table: the sizes of a network of ours of this `kind`, or, with the key `method`, of a
 /// learned baseline.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(untagged)]
 #[allow(clippy::large_enum_variant)] // one in a recipe
 pub enum NetworkRecipe {
@@ -73,6 +68,17 @@ impl NetworkRecipe {
         match self {
             Self::Qudi(NetworkConfig::Diffusion(config)) => Ok(config),
             _ => Err(self.other("the diffusion")),
+        }
+    }
+
+    /// Returns the sizes of a diffusion that encodes a window once.
+    ///
+    /// # Errors
+    /// [`Error`] if the recipe is for another network.
+    pub fn window(&self) -> Result<&WindowConfig> {
+        match self {
+            Self::Qudi(NetworkConfig::Window(config)) => Ok(config),
+            _ => Err(self.other("the diffusion that encodes a window once")),
         }
     }
 

@@ -1,19 +1,19 @@
-//! What recipes must keep to.
+//! Rules of recipes.
 
 use super::{
     LearningPart, NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage,
 };
 use crate::loss::lpips::PerceptualKind;
-use qudi_baselines::sizes::Sizes;
+use qudi_baselines::method::Sizes;
 use qudi_core::{Error, Result};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::DiffusionConfig;
 
-/// A key, whether it is as it must be, and what it must be.
+/// A key, true if it keeps the rule, and the rule.
 type Rule<'a> = (&'a str, bool, &'a str);
 
 impl Recipe {
-    /// The recipe, if it can be trained.
+    /// Returns the recipe, if it can be trained.
     pub(super) fn checked(self) -> Result<Self> {
         let network = match self.network.clone() {
             NetworkRecipe::Qudi(config) => NetworkRecipe::Qudi(config.checked()?),
@@ -28,6 +28,31 @@ impl Recipe {
             }
             NetworkRecipe::Qudi(NetworkConfig::Diffusion(config)) => {
                 self.check_diffusion(config)?;
+            }
+            NetworkRecipe::Qudi(NetworkConfig::Window(config)) => {
+                self.check_sampling()?;
+                check(&self.sample_rules(3, config.multiple()))?;
+                let loss = self.train.loss();
+                let weight = |v: f32| v.is_finite() && v >= 0.0;
+                check(&[
+                    (
+                        "train.loss",
+                        weight(loss.flow) && weight(loss.pre),
+                        "must have weights of 0 or more",
+                    ),
+                    ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
+                    (
+                        "train.loss.term",
+                        loss.term == PerceptualKind::None,
+                        "must be \"none\" for this network",
+                    ),
+                    ("train.ablate", is_default(&self.train.ablate), "is for the other diffusion"),
+                    (
+                        "train.gradient_checkpointing",
+                        !self.train.gradient_checkpointing,
+                        "is for the other diffusion",
+                    ),
+                ])?;
             }
             NetworkRecipe::Baseline(sizes) => self.check_baseline(*sizes)?,
         }
@@ -44,7 +69,7 @@ impl Recipe {
         Ok(Self { network, data, ..self })
     }
 
-    /// The rules of every network.
+    /// Returns the rules of every network.
     fn common_rules(&self) -> [Rule<'static>; 8] {
         let train = &self.train;
         [
@@ -63,7 +88,7 @@ impl Recipe {
         ]
     }
 
-    /// The rule of samples, which have `fewest` frames and sides of multiples of a number.
+    /// Returns the rules of samples, which have `fewest` frames and sides of multiples of a number.
     fn sample_rules(&self, fewest: usize, multiple: usize) -> [Rule<'static>; 2] {
         let train = &self.train;
         let (frames, side) = self.sample_size();
@@ -98,26 +123,32 @@ impl Recipe {
         )
     }
 
-    fn check_diffusion(&self, network: &DiffusionConfig) -> Result<()> {
+    /// Checks the keys that every diffusion needs.
+    fn check_sampling(&self) -> Result<()> {
         let train = &self.train;
         let steps = self.validation.as_ref().map(|validation| validation.steps);
         check(&[
             ("train.loss", train.loss.is_some(), "is missing"),
             ("train.noise_start_fraction", train.noise_start_fraction.is_some(), "is missing"),
+            (
+                "train.noise_start_fraction",
+                (0.0..=1.0).contains(&train.noise_start_fraction()),
+                "must be from 0 to 1",
+            ),
             ("validation.steps", steps.is_none_or(|steps| steps.is_some()), "is missing"),
             ("validation.steps", steps != Some(Some(0)), "must be at least 1"),
-        ])?;
+        ])
+    }
+
+    fn check_diffusion(&self, network: &DiffusionConfig) -> Result<()> {
+        let train = &self.train;
+        self.check_sampling()?;
         check(&self.sample_rules(3, network.multiple()))?;
         let weight = |v: f32| v.is_finite() && v >= 0.0;
         let loss = train.loss();
         let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
         let others = [LearningPart::Refinement, LearningPart::Uncertainty];
         check(&[
-            (
-                "train.noise_start_fraction",
-                (0.0..=1.0).contains(&train.noise_start_fraction()),
-                "must be from 0 to 1",
-            ),
             (
                 "train.loss",
                 [loss.prediction, loss.flow, loss.pre, loss.perceptual].into_iter().all(weight),
@@ -170,7 +201,7 @@ impl Recipe {
         let refused = |what: String, key: &str| {
             Err(Error::request(what, key, "correct the recipe: see docs/training.md"))
         };
-        if let Some(problem) = sizes.problem_of_recipe() {
+        if let Some(problem) = sizes.problem_in_recipe() {
             return refused(format!("{problem}; the recipe has {sizes}"), "network");
         }
         let (frames, _) = self.sample_size();

@@ -1,23 +1,25 @@
 //! Stages of a recipe: trainings one after the other, each from the weights of the one before.
 
 use super::Recipe;
-use super::keys::{modern_key, set};
+use super::keys::set;
 use qudi_core::{Error, Result};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// One stage: the recipe with some of its keys changed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StageConfig {
-    /// The name, which its folder has, too.
+    /// Name of the stage, and of its folder.
     pub name: String,
     /// Keys of the recipe and their values here, such as `"train.steps" = 9000`.
     #[serde(default)]
+    #[schemars(with = "serde_json::Map<String, serde_json::Value>")]
     pub changes: toml::Table,
 }
 
 /// Parts of a network that can learn without the others.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LearningPart {
     /// First pre-denoiser of the regression.
@@ -66,8 +68,7 @@ impl Recipe {
             let fault = |what: String| Error::request(what, &place, "correct the recipe");
             let mut document = document.clone();
             for (key, value) in &stage.changes {
-                set(&mut document, &modern_key(key), value.clone())
-                    .map_err(|error| fault(error.to_string()))?;
+                set(&mut document, key, value.clone()).map_err(|error| fault(error.to_string()))?;
             }
             let recipe: Self = document
                 .try_into()

@@ -3,7 +3,8 @@
 use super::args::{Config, ConfigAction};
 use crate::error::Result;
 use crate::report::{Report, print};
-use crate::settings::{KEYS, Settings, baseline_sizes, shown_recipe, toml_text};
+use crate::settings::{Documented, Settings, baseline_keys, keys, recipe_keys, toml_text};
+use qudi_baselines::import::{METHODS, Method};
 use serde_json::{Value, json};
 use std::fmt::Write;
 
@@ -38,7 +39,7 @@ fn show(settings: &Settings, report: &Report) -> Result<()> {
     })
 }
 
-/// Writes the reference of all keys; `configs/README.md` is this text.
+/// Returns the reference of all keys; `configs/README.md` is this text.
 fn docs() -> String {
     let mut text = String::from(
         "# Settings
@@ -57,50 +58,68 @@ Every command reads settings in layers; the later one wins:
 | `sensor.*` | `simulate`, `eval`, `restore`, `info`, `calibrate`, `light`, `demo`: on top of the chosen sensor |
 | `network.*`, `data.*`, `train.*`, `validation.*` | `train`: on top of the chosen recipe |
 
-Unknown keys are errors everywhere. `--set` with a key that the command does not take is an error. A file and the
-environment are shared between commands: there, known keys of other commands are left alone.
+Unknown keys are errors everywhere. `--set` with a key that the command does not take is an error. A file and
+the environment are shared between commands: there, known keys of other commands are ignored.
 
-Sensor files in `sensors/` hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one from a
-preset. This page is the output of `qudi config docs`.
+Sensor files in `sensors/` hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one
+from a preset. This page is the output of `qudi config docs`.
 
 ## Keys of the simulation and the sensor
 
-| key | default | meaning |
-|---|---|---|
+Keys without a default have none, or the value of the chosen sensor.
+
+| key | values | default | meaning |
+|---|---|---|---|
 ",
     );
-    for key in KEYS {
-        let default =
-            if key.default.is_empty() { String::new() } else { format!("`{}`", key.default) };
-        let _ = writeln!(text, "| `{}` | {default} | {} |", key.name, key.doc);
-    }
-    let (preset, keys) = shown_recipe();
-    let _ = write!(
-        text,
-        "
-## Keys of recipes
-
-Keys of `qudi train`, with their values in `{preset}.toml`; numbers in them count the entries of lists. What they mean
-stands in [training](../docs/training.md).
-
-| key | `{preset}` |
-|---|---|
-"
-    );
-    for (key, value) in keys {
-        let _ = writeln!(text, "| `{key}` | `{}` |", toml_text(&value));
+    for Documented { name, values, default, doc, .. } in keys().iter().map(|key| &key.documented) {
+        let _ = writeln!(text, "| `{name}` | {values} | {} | {doc} |", code(default));
     }
     text += "
-Recipes with `network.method` are for [learned methods of others](../docs/training.md#learned-methods-of-others), with
-other keys in `[network]`:
+## Keys of recipes
 
-| recipe | keys of `[network]` besides `method` |
-|---|---|
+A recipe is a TOML file of these keys; [training](../docs/training.md) explains how they work together. `0`
+stands for the number of an entry in a list. `base = \"data/open-clips.toml\"` starts a recipe from another file.
+The last column names the recipes in this folder that set the key; the learned methods are in `baselines/`.
+
+| key | values | default | meaning | set by |
+|---|---|---|---|---|
 ";
-    for (recipe, sizes) in baseline_sizes() {
-        let sizes = sizes.iter().map(|(key, value)| format!("`{key} = {}`", toml_text(value)));
-        let sizes = sizes.collect::<Vec<_>>().join(", ");
-        let _ = writeln!(text, "| `baselines/{recipe}.toml` | {sizes} |");
+    for (key, recipes) in recipe_keys() {
+        let Documented { name, values, default, is_required, doc, .. } = key;
+        let default = if is_required { "required".to_owned() } else { code(&default) };
+        let _ =
+            writeln!(text, "| `{name}` | {values} | {default} | {doc} | {} |", setters(&recipes));
+    }
+    text += "
+Recipes with `network.method` are for [learned methods of others](../docs/training.md#learned-methods-of-others),
+with other keys in `[network]`:
+
+| method | key | values | meaning |
+|---|---|---|---|
+";
+    for (method, keys) in baseline_keys() {
+        for Documented { name, values, doc, .. } in keys {
+            let _ = writeln!(text, "| `{method}` | `{name}` | {values} | {doc} |");
+        }
     }
     text
+}
+
+/// Returns a value in TOML as Markdown; nothing for no value.
+fn code(value: &Value) -> String {
+    if value.is_null() { String::new() } else { format!("`{}`", toml_text(value)) }
+}
+
+/// Returns the names of recipes, with one name for all learned methods together.
+fn setters(recipes: &[&str]) -> String {
+    let is_learned = |name: &&str| Method::by_name(name).is_some();
+    let mut names: Vec<&str> = recipes.iter().copied().filter(|name| !is_learned(name)).collect();
+    let learned: Vec<&str> = recipes.iter().copied().filter(is_learned).collect();
+    if learned.len() == METHODS.len() {
+        names.push("learned methods");
+    } else {
+        names.extend(learned);
+    }
+    names.join(", ")
 }

@@ -80,7 +80,7 @@ pub(crate) struct Restore {
     pub(crate) side_by_side: Option<PathBuf>,
     /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over
     /// --samples K
-    #[arg(long, alias = "deviation", value_name = "FILE", value_hint = ValueHint::FilePath)]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) uncertainty: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) steps: Steps,

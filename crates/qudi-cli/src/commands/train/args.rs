@@ -10,13 +10,12 @@ use std::path::PathBuf;
 /// train.steps=1000. The run's folder gets the recipe, metrics, pictures, weights.safetensors for `qudi
 /// restore --weights`, and the state that --resume goes on from, exactly.
 #[derive(Debug, ClapArgs)]
-#[expect(clippy::struct_excessive_bools, reason = "switches of a command line")]
 pub(crate) struct Train {
     /// The recipe: tiny, small, paper-mini, paper, a learned baseline (quiver, emvd, flornn, spk2imgnet,
     /// memdeblur, rvrt, student-teacher), or a .toml file [default with --resume: the run's own]
     pub(crate) recipe: Option<String>,
     /// Folder of the run
-    #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present_any = ["cache_only", "draw_only"])]
+    #[arg(short, long, value_name = "FOLDER", value_hint = ValueHint::DirPath, required_unless_present = "prepare")]
     pub(crate) output: Option<PathBuf>,
     /// Folder that the recipe's files lie in
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
@@ -28,14 +27,11 @@ pub(crate) struct Train {
     /// drawn again
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
     pub(crate) bursts: Option<PathBuf>,
-    /// Make the pack, and stop
-    #[arg(long, requires = "pack")]
-    pub(crate) cache_only: bool,
-    /// Draw all bursts of a recipe with train.crops into --bursts, and stop
-    #[arg(long, requires = "bursts", conflicts_with_all = ["cache_only", "output"])]
-    pub(crate) draw_only: bool,
+    /// Make the pack, draw the bursts if --bursts is given, and train nothing
+    #[arg(long, conflicts_with = "output")]
+    pub(crate) prepare: bool,
     /// Go on from the run's last state
-    #[arg(long, conflicts_with_all = ["cache_only", "draw_only", "init"])]
+    #[arg(long, conflicts_with_all = ["prepare", "init"])]
     pub(crate) resume: bool,
     /// Start from these weights of the same network instead of random ones
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
@@ -46,10 +42,7 @@ pub(crate) struct Train {
     /// Threads that draw samples
     #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
     pub(crate) workers: usize,
-    /// Download the weights of the recipe's LPIPS term into --backbones first, with curl
-    #[arg(long, requires = "backbones")]
-    pub(crate) fetch: bool,
-    /// Folder with the weights of the LPIPS backbone and heads [default: where Burn keeps them]
+    /// Folder with the weights of LPIPS, made by scripts/convert/lpips.py [default: where Burn keeps them]
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
     pub(crate) backbones: Option<PathBuf>,
 }

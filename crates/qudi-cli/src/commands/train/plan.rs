@@ -11,10 +11,8 @@ use std::path::PathBuf;
 /// Action of a training run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Action {
-    /// Decode the recipe's files into a pack.
-    MakePack,
-    /// Draw all bursts of the recipe.
-    DrawBursts,
+    /// Pack the recipe's files, and draw its bursts.
+    Prepare,
     /// Train from initial weights.
     Start,
     /// Train from the last state.
@@ -39,8 +37,6 @@ pub(super) struct Plan {
     pub(super) devices: Vec<String>,
     /// Threads that draw samples.
     pub(super) workers: usize,
-    /// True if LPIPS weights are downloaded first.
-    pub(super) fetch: bool,
     pub(super) backbones: Option<PathBuf>,
     pub(super) overwrite: Overwrite,
 }
@@ -51,26 +47,28 @@ impl Plan {
     /// # Errors
     /// [`CliError`] if there is no recipe, or a key of it is wrong.
     pub(super) fn new(args: &Train, settings: &Settings, global: &Global) -> Result<Self> {
-        let action = match (args.cache_only, args.draw_only, args.resume) {
-            (true, ..) => Action::MakePack,
-            (_, true, _) => Action::DrawBursts,
-            (.., true) => Action::Resume,
+        let action = match (args.prepare, args.resume) {
+            (true, _) => Action::Prepare,
+            (_, true) => Action::Resume,
             _ => Action::Start,
         };
-        let folder = if action == Action::DrawBursts { &args.bursts } else { &args.output };
+        if args.prepare && args.pack.is_none() && args.bursts.is_none() {
+            let help =
+                "name a pack with --pack or, for a recipe with train.crops, a folder with --bursts";
+            return Err(CliError::new("there is nothing to prepare", "--prepare", help));
+        }
+        let folder = if args.prepare { &args.bursts } else { &args.output };
         let folder = folder.clone().unwrap_or_default();
-        let pack = if action == Action::MakePack { PathBuf::new() } else { folder.clone() };
         Ok(Self {
             action,
             recipe: recipe(args, settings)?,
-            pack: args.pack.clone().unwrap_or_else(|| pack.join("pack.zip")),
+            pack: args.pack.clone().unwrap_or_else(|| folder.join("pack.zip")),
             folder,
             data: args.data.clone(),
             bursts: args.bursts.clone(),
             init: args.init.clone(),
             devices: args.device.clone(),
             workers: args.workers,
-            fetch: args.fetch,
             backbones: args.backbones.clone(),
             overwrite: global.overwrite(),
         })

@@ -19,8 +19,9 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Diffusion;
 use qudi_model::regression::Regression;
+use qudi_model::window::Window;
 use qudi_train::dataset::Pack;
-use qudi_train::loss::lpips::{Lpips, fetch};
+use qudi_train::loss::lpips::Lpips;
 use qudi_train::{
     From, Learner, METRICS, NetworkRecipe, RECIPE, Run, Validation, WEIGHTS, draw_bursts,
     run_exists,
@@ -35,10 +36,11 @@ pub(crate) fn run(
 ) -> Result<()> {
     let plan = Plan::new(args, settings, global)?;
     match plan.action {
-        Action::MakePack => pack(&plan, report),
-        Action::DrawBursts => match plan.recipe.network {
+        Action::Prepare if plan.bursts.is_none() => pack(&plan, report),
+        Action::Prepare => match plan.recipe.network {
             NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => draw::<Regression>(&plan, report),
             NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => draw::<Diffusion>(&plan, report),
+            NetworkRecipe::Qudi(NetworkConfig::Window(_)) => draw::<Window>(&plan, report),
             NetworkRecipe::Baseline(_) => draw::<Baseline>(&plan, report),
         },
         Action::Start | Action::Resume => match plan.recipe.stages()? {
@@ -59,15 +61,9 @@ fn pack(plan: &Plan, report: &Report) -> Result<()> {
     report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}))
 }
 
-/// Checks that the weights of the perceptual term are there, and downloads them first if that was asked for.
-pub(super) fn find_backbones(plan: &Plan, report: &Report) -> Result<()> {
-    let term = plan.recipe.train.loss().term;
-    if let (true, Some(backbones)) = (plan.fetch, &plan.backbones) {
-        for path in fetch(term, backbones)? {
-            report.remark(&format!("{} is there", path.display()));
-        }
-    }
-    Ok(Lpips::find(term, plan.backbones.as_deref())?)
+/// Checks that the weights of the perceptual term are there.
+pub(super) fn find_backbones(plan: &Plan) -> Result<()> {
+    Ok(Lpips::find(plan.recipe.train.loss().term, plan.backbones.as_deref())?)
 }
 
 /// Trains to the end of the recipe.
@@ -79,6 +75,7 @@ pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
         NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => {
             train_network::<Diffusion>(plan, report)
         }
+        NetworkRecipe::Qudi(NetworkConfig::Window(_)) => train_network::<Window>(plan, report),
         NetworkRecipe::Baseline(_) => train_network::<Baseline>(plan, report),
     }
 }
@@ -92,7 +89,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     }
     let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
     make_folder(folder, "the run's folder", "choose another with -o")?;
-    find_backbones(plan, report)?;
+    find_backbones(plan)?;
     let files = files(plan, report)?;
     let from = if plan.action == Action::Resume {
         From::State
@@ -138,15 +135,15 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     report.result(&text, || json!({"weights": weights, "steps": steps, "validation": quality}))
 }
 
-/// Draws all bursts of a recipe, for other programs, or before anything learns from them.
+/// Draws all bursts of a recipe.
 fn draw<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let opened = device::open(plan.devices.first().map_or("auto", String::as_str))?;
     let (folder, recipe) = (&plan.folder, &plan.recipe);
     if !recipe.stage.is_empty() {
         return Err(CliError::new(
             "bursts of a later stage are drawn with what the one before has learnt",
-            "--draw-only",
-            "leave it out: each stage draws its own, and keeps them in --bursts",
+            "--prepare",
+            "leave --bursts out here: each stage draws its own when it trains, and keeps them in --bursts",
         ));
     }
     let files = files(plan, report)?;

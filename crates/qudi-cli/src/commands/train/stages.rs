@@ -34,7 +34,7 @@ pub(super) fn train_stages(
     for stage in stages.iter().filter(|stage| run_exists(&stage.folder)) {
         check_recipe(&stage.folder, &stage.recipe)?;
     }
-    stages.iter().try_for_each(|stage| find_backbones(stage, report))?;
+    stages.iter().try_for_each(find_backbones)?;
     make_folder(folder, "the run's folder", "choose another with -o")?;
     // A run whose files are not there leaves nothing behind.
     files(plan, report)?;

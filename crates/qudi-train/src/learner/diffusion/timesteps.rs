@@ -2,10 +2,11 @@
 
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::timesteps::{NUM_TIMESTEPS, log_logistic_timestep};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The law of the timesteps that the network learns at.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TimestepLaw {
     /// All alike (Ho et al. 2020, algorithm 1), as in the paper.
@@ -29,7 +30,7 @@ impl TimestepLaw {
 
 /// Returns the timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale of their
 /// roots.
-pub(super) fn previous_timestep(timestep: usize) -> usize {
+pub(in crate::learner) fn previous_timestep(timestep: usize) -> usize {
     let all = NUM_TIMESTEPS as f64;
     let share = ((timestep + 1) as f64 / all).sqrt() + 0.1;
     ((all * share * share).round() as usize - 1).min(NUM_TIMESTEPS - 1)
