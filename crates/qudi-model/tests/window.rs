@@ -1,4 +1,5 @@
 //! The diffusion that encodes a window once.
+#![allow(clippy::unwrap_used)]
 
 use burn::module::Module;
 use burn::tensor::{Device, Distribution, Tensor};

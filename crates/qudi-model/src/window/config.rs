@@ -2,6 +2,7 @@
 
 use crate::config::{Rule, SIZES, are_widths, check};
 use qudi_core::{Result, Size};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Pixels of a side that become channels before the network and pixels again after it.
@@ -11,7 +12,7 @@ pub(super) const FOLD: usize = 2;
 pub(super) const LEVELS: usize = 3;
 
 /// Sizes of the network that encodes a window once (docs/network.md).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WindowConfig {
     /// Channels of the pre-denoiser and of the U-Net at half, a quarter and an eighth of the resolution;

@@ -5,11 +5,8 @@ use qudi_core::{Error, Result};
 use qudi_model::config::{NetworkConfig, PRESETS};
 use qudi_model::diffusion::DiffusionConfig;
 use qudi_model::regression::RegressionConfig;
-<<<<<<< HEAD
-use schemars::JsonSchema;
-=======
 use qudi_model::window::WindowConfig;
->>>>>>> fast
+use schemars::JsonSchema;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
