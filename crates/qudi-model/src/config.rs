@@ -62,6 +62,7 @@ struct Document {
 pub const PRESETS: &[(&str, &str)] = &[
     ("tiny", include_str!("../../../configs/tiny.toml")),
     ("small", include_str!("../../../configs/small.toml")),
+    ("window", include_str!("../../../configs/window.toml")),
     ("paper-mini", include_str!("../../../configs/paper-mini.toml")),
     ("paper", include_str!("../../../configs/paper.toml")),
 ];
@@ -178,7 +179,7 @@ mod tests {
             .iter()
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
             .collect();
-        assert_eq!(multiples, [8, 32, 16, 16]);
+        assert_eq!(multiples, [8, 32, 8, 16, 16]);
         assert!(NetworkConfig::preset("huge").unwrap_err().to_string().contains("huge"));
     }
 

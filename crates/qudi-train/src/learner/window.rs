@@ -4,6 +4,7 @@ use super::diffusion::{Batch, Example};
 use super::diffusion::{noisy_images, previous_timestep};
 use super::{Context, Learner, Loss, Origin, WeightedSum, learning, provenance};
 use crate::burst_cache::BurstSampler;
+use crate::loss::robust_square;
 use crate::parameters::gradients;
 use crate::recipe::Recipe;
 use burn::module::Module;
@@ -78,9 +79,9 @@ impl Learner for Window {
         let mut sum = WeightedSum::default();
         // Errors in units of what they usually are: no light level drowns another.
         let error = (prediction.x0 - truth.clone()) / prediction.c_out;
-        sum.add("prediction", weights.prediction, error.powi_scalar(2).mean());
+        sum.add("prediction", weights.prediction, robust_square(error));
         let error = (encoded.restored.clone() * 2.0 - 1.0 - truth) / encoded.error_sigma().clone();
-        sum.add("pre", weights.pre, error.powi_scalar(2).mean());
+        sum.add("pre", weights.pre, robust_square(error));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
         let flow = flows.reduce(Tensor::add).expect("a level");
