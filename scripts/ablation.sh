@@ -1,6 +1,6 @@
 #!/bin/sh
-# Ablation study: trains the last stage of `paper-mini` from one set of weights, whole and without one part, on
-# identical samples for equally many steps. Prints the last validation of each.
+# Ablation study: trains the last stage of `paper-mini` from one set of weights, whole and without one part,
+# on identical samples for equally many steps. Prints the last validation of each.
 #
 #     scripts/ablation.sh PATH/TO/qudi DATA WEIGHTS OUT STEPS [VARIANT...]
 #

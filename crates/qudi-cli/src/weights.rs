@@ -82,7 +82,7 @@ impl fmt::Display for Weights {
 fn built_in(kind: NetworkKind) -> &'static BuiltIn {
     match kind {
         NetworkKind::Regression => &REGRESSION,
-        NetworkKind::Diffusion => &DIFFUSION,
+        NetworkKind::Diffusion | NetworkKind::Window => &DIFFUSION,
     }
 }
 

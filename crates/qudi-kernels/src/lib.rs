@@ -16,6 +16,7 @@ mod flex;
 pub mod group_norm;
 mod matrix_units;
 mod precision;
+mod residual_stack;
 #[cfg(feature = "flex")]
 mod uninitialised;
 mod warp;
@@ -24,4 +25,5 @@ pub use attention::attention;
 pub use backend::{is_flex, with_stock_operations};
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
 pub use precision::{ComputePrecision, with_precision};
+pub use residual_stack::{Stack, residual_stack};
 pub use warp::warp;

@@ -13,3 +13,11 @@ pub(crate) fn fill(length: usize, write: impl FnOnce(&mut [MaybeUninit<f32>])) -
     unsafe { values.set_len(length) };
     values
 }
+
+/// [Fills](fill) values that are written as they are.
+pub(crate) fn written(length: usize, write: impl FnOnce(&mut [f32])) -> Vec<f32> {
+    fill(length, |values| {
+        // SAFETY: `write` writes every value before it reads any, as with `fill`.
+        write(unsafe { std::slice::from_raw_parts_mut(values.as_mut_ptr().cast(), values.len()) });
+    })
+}

@@ -56,6 +56,11 @@ impl Conv2d {
         self.weight.val()
     }
 
+    /// Returns the bias, `[outputs]`, zeros where there is none.
+    pub fn bias_or_zeros(&self) -> Tensor<1> {
+        bias_or_zeros(self.bias.as_ref(), &self.weight.val())
+    }
+
     /// Applies the convolution to `inputs`, `[images, channels, height, width]`, joined by channel.
     pub fn linear(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
         self.call(inputs, Options::default())

@@ -6,6 +6,7 @@ mod former;
 use crate::config::{NetworkConfig, NetworkKind};
 use crate::diffusion::Diffusion;
 use crate::regression::Regression;
+use crate::window::Window;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Tensor, f16};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
@@ -54,6 +55,15 @@ impl Network for Diffusion {
 
     fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self> {
         let NetworkConfig::Diffusion(config) = config else { return None };
+        Some(config.uninitialized(device))
+    }
+}
+
+impl Network for Window {
+    const KIND: NetworkKind = NetworkKind::Window;
+
+    fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self> {
+        let NetworkConfig::Window(config) = config else { return None };
         Some(config.uninitialized(device))
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::diffusion::DiffusionConfig;
 use crate::regression::RegressionConfig;
+use crate::window::WindowConfig;
 use burn::module::Module;
 use burn::tensor::Device;
 use qudi_core::{Error, Result, Size};
@@ -19,6 +20,8 @@ pub enum NetworkConfig {
     Regression(RegressionConfig),
     /// Diffusion.
     Diffusion(DiffusionConfig),
+    /// Diffusion that encodes a window once.
+    Window(WindowConfig),
 }
 
 /// Kind of a network.
@@ -28,6 +31,15 @@ pub enum NetworkKind {
     Regression,
     /// Diffusion.
     Diffusion,
+    /// Diffusion that encodes a window once.
+    Window,
+}
+
+impl NetworkKind {
+    /// Returns true for networks that predict in reverse steps.
+    pub fn is_diffusion(self) -> bool {
+        self != Self::Regression
+    }
 }
 
 impl fmt::Display for NetworkKind {
@@ -35,6 +47,7 @@ impl fmt::Display for NetworkKind {
         f.write_str(match self {
             Self::Regression => "regression",
             Self::Diffusion => "diffusion",
+            Self::Window => "window",
         })
     }
 }
@@ -49,6 +62,7 @@ struct Document {
 pub const PRESETS: &[(&str, &str)] = &[
     ("tiny", include_str!("../../../configs/tiny.toml")),
     ("small", include_str!("../../../configs/small.toml")),
+    ("window", include_str!("../../../configs/window.toml")),
     ("paper-mini", include_str!("../../../configs/paper-mini.toml")),
     ("paper", include_str!("../../../configs/paper.toml")),
 ];
@@ -88,6 +102,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(_) => NetworkKind::Regression,
             Self::Diffusion(_) => NetworkKind::Diffusion,
+            Self::Window(_) => NetworkKind::Window,
         }
     }
 
@@ -96,6 +111,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => config.multiple(),
             Self::Diffusion(config) => config.multiple(),
+            Self::Window(config) => config.multiple(),
         }
     }
 
@@ -105,6 +121,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => config.memory(size, frames),
             Self::Diffusion(config) => config.memory(size, frames),
+            Self::Window(config) => config.memory(size, frames),
         }
     }
 
@@ -117,6 +134,7 @@ impl NetworkConfig {
         match self {
             Self::Regression(config) => count(&config.uninitialized(device)),
             Self::Diffusion(config) => count(&config.uninitialized(device)),
+            Self::Window(config) => count(&config.uninitialized(device)),
         }
     }
 
@@ -128,6 +146,7 @@ impl NetworkConfig {
         Ok(match self {
             Self::Regression(config) => Self::Regression(config.checked()?),
             Self::Diffusion(config) => Self::Diffusion(config.checked()?),
+            Self::Window(config) => Self::Window(config.checked()?),
         })
     }
 }
@@ -160,7 +179,7 @@ mod tests {
             .iter()
             .map(|(name, _)| NetworkConfig::preset(name).unwrap().multiple())
             .collect();
-        assert_eq!(multiples, [8, 32, 16, 16]);
+        assert_eq!(multiples, [8, 32, 8, 16, 16]);
         assert!(NetworkConfig::preset("huge").unwrap_err().to_string().contains("huge"));
     }
 

@@ -7,6 +7,7 @@
 mod ablation;
 mod conditioning;
 mod config;
+mod denoiser;
 pub mod forward_model;
 pub(crate) mod network;
 pub mod noise;
@@ -23,6 +24,7 @@ pub use config::{
     DiffusionConfig, FeaturesConfig, FlowConfig, FlowInputs, FusionConfig, NoisyFeatures,
     PreConfig, UNetConfig, UNetPrediction,
 };
+pub use denoiser::Denoiser;
 pub use network::{
     Diffusion, Encoded, EncodedMeasurement, Flows, Fused, FusedGradient, Predenoised, Prediction,
     Simulated,

@@ -28,7 +28,11 @@ pub(crate) fn initial_values(seed: u64, name: &str, shape: &[usize]) -> Vec<f32>
         return vec![0.0; count];
     }
     let gain = if name.starts_with("unet.") { 3.0 } else { 6.0 };
-    let bound = (gain / (count / shape[0]) as f32).sqrt();
+    uniform(seed, name, count, (gain / (count / shape[0]) as f32).sqrt())
+}
+
+/// Draws `count` values between `-bound` and `bound` for the parameter `name`.
+pub(crate) fn uniform(seed: u64, name: &str, count: usize, bound: f32) -> Vec<f32> {
     // A stream of its own for every name: adding a layer leaves the others as they were.
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(name.bytes().fold(0xCBF2_9CE4_8422_2325, |hash: u64, byte| {

@@ -21,6 +21,7 @@ pub mod regression;
 mod residual_dense;
 pub mod restorer;
 pub mod sensor;
+pub mod window;
 
 pub use qudi_kernels::{ComputePrecision, MatrixUnits, MatrixUnitsError, with_precision};
 pub use qudi_layers::{init_parameters, parameter_shapes};

@@ -7,7 +7,7 @@ use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::sensor::Sensor;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::sampler::Sampler;
-use qudi_model::diffusion::{DiffusionConfig, DiffusionRestorer, SampleOptions};
+use qudi_model::diffusion::{Diffusion, DiffusionConfig, DiffusionRestorer, SampleOptions};
 use qudi_model::regression::RegressionRestorer;
 use qudi_model::restorer::Model;
 use qudi_model::{ComputePrecision, init_parameters};
@@ -43,7 +43,7 @@ fn values(name: &str, shape: &[usize]) -> Vec<f32> {
 }
 
 /// A tiny diffusion.
-fn restorer(options: SampleOptions, device: &Device) -> DiffusionRestorer {
+fn restorer(options: SampleOptions, device: &Device) -> DiffusionRestorer<Diffusion> {
     let network = init_parameters(config().init(2, device), values);
     let model = Model { network, config: config(), window: 11 };
     DiffusionRestorer::new(model, options, device).unwrap()

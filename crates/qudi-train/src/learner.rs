@@ -4,6 +4,7 @@ mod baseline;
 mod bursts;
 pub mod diffusion;
 mod regression;
+mod window;
 
 use crate::burst_cache::BurstSampler;
 use crate::loss::lpips::Lpips;
@@ -78,6 +79,11 @@ pub trait Learner: Module + Sync {
     /// Whether each parameter learns.
     fn learns(&self, _recipe: &Recipe) -> Vec<bool> {
         vec![true; self.named_shapes().len()]
+    }
+
+    /// Returns true if a parameter learns with Adam under every optimizer.
+    fn prefers_adam(_name: &str) -> bool {
+        false
     }
 
     /// Creates what aligns samples; none for most networks.

@@ -1,9 +1,10 @@
-//! The terms of losses; each network adds up its own ([`learner`](crate::learner)). docs/network.md has the
+//! The terms of losses; each network adds up its own, in `learner/`. docs/network.md has the
 //! formulas.
 
 mod gaussian_nll;
 pub mod lpips;
 mod reconstruction;
+mod robust_square;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -11,6 +12,7 @@ use serde::{Deserialize, Serialize};
 pub use gaussian_nll::gaussian_nll;
 pub use reconstruction::reconstruction;
 pub(crate) use reconstruction::{relative_reconstruction, root_mean_square};
+pub(crate) use robust_square::robust_square;
 
 /// How the errors of images count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

@@ -46,12 +46,13 @@ impl Optimizer {
     pub fn new<'a>(
         kind: OptimizerKind,
         values: &[Tensor<1>],
-        shapes: impl IntoIterator<Item = &'a [usize]>,
+        shapes: impl IntoIterator<Item = (&'a str, &'a [usize])>,
+        prefers_adam: fn(&str) -> bool,
     ) -> Self {
         let zeros = || values.iter().map(Tensor::zeros_like).collect();
-        let matrices = shapes.into_iter().map(|shape| match kind {
-            OptimizerKind::Adam => None,
-            OptimizerKind::Muon => muon::matrix(shape),
+        let matrices = shapes.into_iter().map(|(name, shape)| match kind {
+            OptimizerKind::Muon if !prefers_adam(name) => muon::matrix(shape),
+            _ => None,
         });
         Self { mean: zeros(), square: zeros(), steps: 0, matrices: matrices.collect() }
     }
@@ -59,7 +60,8 @@ impl Optimizer {
     /// Adam for all values.
     pub fn adam(values: &[Tensor<1>]) -> Self {
         let vectors: Vec<_> = values.iter().map(Tensor::dims).collect();
-        Self::new(OptimizerKind::Adam, values, vectors.iter().map(<[usize; 1]>::as_slice))
+        let shapes = vectors.iter().map(|shape| ("", shape.as_slice()));
+        Self::new(OptimizerKind::Adam, values, shapes, |_| true)
     }
 
     /// Gives the values after a step along `gradients` times `scale` at learning rate `lr`.

@@ -95,7 +95,7 @@ impl<L: Learner> Trainer<L> {
         learner = with_frozen(learner, &learns);
         let start = parameters(&learner);
         let shapes = learner.named_shapes();
-        let shapes = shapes.iter().map(|(_, shape)| shape.as_slice());
+        let shapes = shapes.iter().map(|(name, shape)| (name.as_str(), shape.as_slice()));
         let (_, side) = recipe.sample_size();
         let mut perceptual = Vec::new();
         for device in &devices {
@@ -106,7 +106,7 @@ impl<L: Learner> Trainer<L> {
         }
         Ok(Self {
             recipe: recipe.clone(),
-            optimizer: Optimizer::new(recipe.train.optimizer, &start, shapes),
+            optimizer: Optimizer::new(recipe.train.optimizer, &start, shapes, L::prefers_adam),
             ema: Ema::new(start, recipe.train.ema),
             network: learner,
             devices,

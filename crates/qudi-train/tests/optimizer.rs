@@ -29,7 +29,7 @@ fn apart<const D: usize>(
     let flat = |tensor: Tensor<D>| tensor.reshape([count]);
     let goal = flat(target.clone()).inner();
     let mut list = vec![Tensor::<1>::from_floats(waves(0.7).as_slice(), &Device::flex())];
-    let mut ours = Optimizer::new(kind, &list, [shape.as_slice()]);
+    let mut ours = Optimizer::new(kind, &list, [("layer", shape.as_slice())], |_| false);
     for step in 0..20 {
         let lr = 0.05 / f64::from(step + 1);
         let loss = (module.values.val() - target.clone()).powi_scalar(2).sum();
@@ -66,7 +66,8 @@ fn muon_moves_matrices_alone() {
     let off = apart(OptimizerKind::Muon, AdamConfig::new().with_epsilon(1e-8).init(), [50]);
     assert!(off < 2e-6, "{off}");
     let list = vec![Tensor::<1>::ones([12], &Device::flex())];
-    let mut optimizer = Optimizer::new(OptimizerKind::Muon, &list, [[3, 2, 2].as_slice()]);
+    let mut optimizer =
+        Optimizer::new(OptimizerKind::Muon, &list, [("layer", [3, 2, 2].as_slice())], |_| false);
     for mean in [0.0, 1e-23] {
         optimizer.mean = vec![Tensor::full([12], mean, &Device::flex())];
         let still = list.iter().map(Tensor::zeros_like).collect();

@@ -16,6 +16,7 @@ use qudi_model::config::{NetworkConfig, NetworkKind};
 use qudi_model::diffusion::{Diffusion, DiffusionRestorer, SampleOptions};
 use qudi_model::regression::{Regression, RegressionRestorer};
 use qudi_model::restorer::Model;
+use qudi_model::window::Window;
 use serde_json::{Value, json};
 
 /// The network that a method of this project runs.
@@ -48,7 +49,11 @@ impl OwnNetwork {
         let description = weights.describe()?;
         let kind = match choice {
             NetworkChoice::Best => description.network.kind(),
-            NetworkChoice::Of(kind) => kind,
+            NetworkChoice::Of(kind) => {
+                let named = description.network.kind();
+                // Files hold a diffusion of either order of computation.
+                if kind.is_diffusion() && named.is_diffusion() { named } else { kind }
+            }
         };
         Ok(Self { weights, description, kind })
     }
@@ -57,8 +62,8 @@ impl OwnNetwork {
     pub(crate) fn mode(&self, options: &NetworkOptions) -> String {
         match (self.kind, self.sampling(options).steps) {
             (NetworkKind::Regression, _) => "regression".to_owned(),
-            (NetworkKind::Diffusion, 1) => "diffusion in 1 step".to_owned(),
-            (NetworkKind::Diffusion, steps) => format!("diffusion in {steps} steps"),
+            (_, 1) => "diffusion in 1 step".to_owned(),
+            (_, steps) => format!("diffusion in {steps} steps"),
         }
     }
 
@@ -84,7 +89,7 @@ impl OwnNetwork {
             "tile": options.tile,
             "precision": options.precision(&device::open(&options.device)?)?,
         });
-        if self.kind == NetworkKind::Diffusion {
+        if self.kind.is_diffusion() {
             let sampling = self.sampling(options);
             settings["steps"] = json!(sampling.steps);
             settings["spacing"] = json!(sampling.spacing);
@@ -124,6 +129,13 @@ pub(crate) fn restorer(
         NetworkKind::Diffusion => {
             let (network, description) = own.weights.load::<Diffusion>(&device.device)?;
             let NetworkConfig::Diffusion(config) = description.network else { unreachable!() };
+            let model = Model { network, config, window: description.window };
+            let options = sample_options(&own, options, precision);
+            Box::new(DiffusionRestorer::new(model, options, &device.device)?)
+        }
+        NetworkKind::Window => {
+            let (network, description) = own.weights.load::<Window>(&device.device)?;
+            let NetworkConfig::Window(config) = description.network else { unreachable!() };
             let model = Model { network, config, window: description.window };
             let options = sample_options(&own, options, precision);
             Box::new(DiffusionRestorer::new(model, options, &device.device)?)

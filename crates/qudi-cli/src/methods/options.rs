@@ -8,7 +8,6 @@ use crate::methods::network::OwnNetwork;
 use crate::methods::{Method, QUDI, QUDI_DIFFUSION};
 use qudi_baselines::import;
 use qudi_model::ComputePrecision;
-use qudi_model::config::NetworkKind;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::PathBuf;
@@ -83,7 +82,7 @@ impl NetworkOptions {
     pub(crate) fn check_diffusion(&self, methods: &[&Method]) -> Result<()> {
         let Some(flag) = &self.given.diffusion else { return Ok(()) };
         for choice in methods.iter().filter_map(|method| method.as_own()) {
-            if OwnNetwork::new(self, choice)?.kind() == NetworkKind::Diffusion {
+            if OwnNetwork::new(self, choice)?.kind().is_diffusion() {
                 return Ok(());
             }
         }

@@ -1,13 +1,14 @@
 //! Restores windows by diffusion: reverse steps from noise, with the sensor's forward model between them.
 
+use super::denoiser::Denoiser;
 use super::forward_model::ForwardModel;
-use super::network::{Diffusion, Encoded, Flows, Simulated};
+use super::network::Simulated;
 use super::noise::Noise;
 use super::sampler::{Sampler, Step, sample};
 use super::schedule::NoiseSchedule;
 use super::state::DiffusionState;
 use super::timesteps::{NUM_TIMESTEPS, TimestepSpacing};
-use super::{Conditioning, DiffusionConfig, Part};
+use super::{Conditioning, Part};
 use crate::counts::CountPlanes;
 use crate::restorer::{Model, check_frames, check_tile};
 use crate::sensor::sensor_tensor;
@@ -51,9 +52,9 @@ impl Default for SampleOptions {
 
 /// Restores windows by sampling.
 #[derive(Debug)]
-pub struct DiffusionRestorer {
-    network: Diffusion,
-    config: DiffusionConfig,
+pub struct DiffusionRestorer<N: Denoiser> {
+    network: N,
+    config: N::Config,
     schedule: NoiseSchedule,
     options: SampleOptions,
     device: Device,
@@ -61,23 +62,23 @@ pub struct DiffusionRestorer {
 }
 
 /// A window, padded.
-struct Window<'a> {
+struct Window<'a, E> {
     acquisition: &'a Acquisition,
     sensor: Tensor<2>,
     counts: CountPlanes,
     frames: usize,
     tiling: Tiling,
     /// The encoded tile, kept for all steps where there is only one: it takes memory.
-    encoded: Option<Encoded>,
+    encoded: Option<E>,
 }
 
-impl DiffusionRestorer {
+impl<N: Denoiser> DiffusionRestorer<N> {
     /// Creates the restorer of a model whose weights are on `device`.
     ///
     /// # Errors
     /// [`Error::Request`] for options that make no sense.
     pub fn new(
-        model: Model<Diffusion, DiffusionConfig>,
+        model: Model<N, N::Config>,
         options: SampleOptions,
         device: &Device,
     ) -> Result<Self> {
@@ -89,7 +90,7 @@ impl DiffusionRestorer {
             return Err(Error::request("no samples at all", "samples", "draw at least 1"));
         }
         let Model { network, config, window } = model;
-        check_tile(options.tile, config.multiple())?;
+        check_tile(options.tile, N::multiple(&config))?;
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         Ok(Self { network, config, schedule, options, device: device.clone(), window })
     }
@@ -108,8 +109,12 @@ impl DiffusionRestorer {
     }
 
     /// Pads a window to the size that the network needs.
-    fn window_of<'a>(&self, burst: BurstView<'_>, acquisition: &'a Acquisition) -> Window<'a> {
-        let tiling = Tiling::new(burst.size, self.config.multiple(), self.options.tile);
+    fn window_of<'a>(
+        &self,
+        burst: BurstView<'_>,
+        acquisition: &'a Acquisition,
+    ) -> Window<'a, N::Encoded> {
+        let tiling = Tiling::new(burst.size, N::multiple(&self.config), self.options.tile);
         let mut window = Window {
             acquisition,
             sensor: sensor_tensor(acquisition, &self.device),
@@ -125,7 +130,7 @@ impl DiffusionRestorer {
     }
 
     /// Draws one sample of a window, padded, in [-1, 1].
-    fn sample(&self, window: &Window<'_>, number: u64) -> Result<Vec<f32>> {
+    fn sample(&self, window: &Window<'_, N::Encoded>, number: u64) -> Result<Vec<f32>> {
         let noise = Noise::new(window.acquisition.seed, number);
         let pixels = window.tiling.size.pixels();
         let noise_of = |step: usize| -> Vec<f32> {
@@ -133,14 +138,14 @@ impl DiffusionRestorer {
             frames.flat_map(|frame| noise.frame(frame, step, pixels)).collect()
         };
         let tiles = &window.tiling.tiles;
-        let mut flows: Vec<Option<Flows>> = vec![None; tiles.count()];
+        let mut flows: Vec<Option<N::Flows>> = vec![None; tiles.count()];
         let SampleOptions { sampler, steps, spacing, .. } = self.options;
         let steps = sampler.steps(&self.schedule, steps, spacing);
         let count = steps.len();
         let predict = |step: &Step, x: &[f32], x0: &[f32]| {
             progress("diffusing", step.number, count)?;
             let simulated = self.simulated(window, step, x0, noise.photon_seed(step.number))?;
-            if self.config.flow.steps.contains(&step.number) {
+            if N::renews_flows(&self.config, step.number) {
                 flows.fill(None);
             }
             let mut prediction = vec![0.0; x.len()];
@@ -160,12 +165,12 @@ impl DiffusionRestorer {
     /// Measures the previous estimate `x0` with the forward model; none at the first step.
     fn simulated(
         &self,
-        window: &Window<'_>,
+        window: &Window<'_, N::Encoded>,
         step: &Step,
         x0: &[f32],
         seed: u64,
     ) -> Result<Option<CountPlanes>> {
-        if step.number == 1 || self.network.ablation().removes(Part::ForwardModel) {
+        if step.number == 1 || !self.network.uses(Part::ForwardModel) {
             return Ok(None);
         }
         let acquisition = window.acquisition;
@@ -178,12 +183,12 @@ impl DiffusionRestorer {
     /// estimate.
     fn predict(
         &self,
-        window: &Window<'_>,
+        window: &Window<'_, N::Encoded>,
         number: usize,
         simulated: Option<&CountPlanes>,
         [x, x0]: [&[f32]; 2],
         step: &Step,
-        flows: &mut Option<Flows>,
+        flows: &mut Option<N::Flows>,
     ) -> Result<Vec<f32>> {
         let tensor = |images: &[f32]| self.tile(window, number, images);
         let fresh;
@@ -198,28 +203,25 @@ impl DiffusionRestorer {
             u: tensor(&planes.u),
             exists: vec![true],
         });
-        let has_previous =
-            step.number > 1 && !self.network.ablation().removes(Part::SelfConditioning);
+        let has_previous = step.number > 1 && self.network.uses(Part::SelfConditioning);
         let state = DiffusionState {
             x_t: tensor(x),
             x0_prev: tensor(x0),
             has_previous: vec![has_previous],
             timesteps: vec![step.timestep],
         };
-        let prediction = self.network.forward(encoded, simulated.as_ref(), &state, flows.take());
-        *flows = Some(prediction.flows);
-        let image = read(prediction.x0)?;
+        let image = read(self.network.denoise(encoded, simulated.as_ref(), &state, flows))?;
         Ok(image.into_iter().map(|value| value.clamp(-1.0, 1.0)).collect())
     }
 
     /// Crops tile `number` of images of the whole frame.
-    fn tile(&self, window: &Window<'_>, number: usize, images: &[f32]) -> Tensor<4> {
+    fn tile(&self, window: &Window<'_, N::Encoded>, number: usize, images: &[f32]) -> Tensor<4> {
         let tiles = &window.tiling.tiles;
         to_tensor(tiles.crop(number, images), tiles.tile, &self.device)
     }
 
     /// Encodes what does not depend on the step, of tile `number`.
-    fn encode(&self, window: &Window<'_>, number: usize) -> Encoded {
+    fn encode(&self, window: &Window<'_, N::Encoded>, number: usize) -> N::Encoded {
         self.network.encode(&Conditioning {
             counts: self.tile(window, number, &window.counts.y),
             linear_estimate: self.tile(window, number, &window.counts.u),
@@ -229,7 +231,7 @@ impl DiffusionRestorer {
     }
 }
 
-impl Restorer for DiffusionRestorer {
+impl<N: Denoiser> Restorer for DiffusionRestorer<N> {
     fn name(&self) -> &'static str {
         "qudi-diffusion"
     }

@@ -28,7 +28,9 @@ use std::path::Path;
 
 pub use batch::Batch;
 pub use inputs::SelfConditioning;
+pub(super) use inputs::noisy_images;
 pub use timesteps::TimestepLaw;
+pub(super) use timesteps::previous_timestep;
 
 /// The least scale that a pixel's error is divided by, in [-1, 1]: half a step of 8 bits.
 const MIN_SCALE: f32 = 0.004;

@@ -7,8 +7,10 @@ use std::path::Path;
 use toml::{Table, Value};
 
 /// Bases inside the program by name.
-const BASES: &[(&str, &str)] =
-    &[("data/open-clips.toml", include_str!("../../../../configs/data/open-clips.toml"))];
+const BASES: &[(&str, &str)] = &[
+    ("data/open-clips.toml", include_str!("../../../../configs/data/open-clips.toml")),
+    ("data/open-scenes.toml", include_str!("../../../../configs/data/open-scenes.toml")),
+];
 
 /// Lays a recipe over the base that it names, if it names one: a file, relative to the recipe's folder, or
 /// else one inside the program. Tables are joined; of everything else, the recipe's value stays.

@@ -5,6 +5,7 @@ use qudi_core::{Error, Result};
 use qudi_model::config::{NetworkConfig, PRESETS};
 use qudi_model::diffusion::DiffusionConfig;
 use qudi_model::regression::RegressionConfig;
+use qudi_model::window::WindowConfig;
 use schemars::JsonSchema;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -64,6 +65,17 @@ impl NetworkRecipe {
         match self {
             Self::Qudi(NetworkConfig::Diffusion(config)) => Ok(config),
             _ => Err(self.other("the diffusion")),
+        }
+    }
+
+    /// Returns the sizes of a diffusion that encodes a window once.
+    ///
+    /// # Errors
+    /// [`Error`] if the recipe is for another network.
+    pub fn window(&self) -> Result<&WindowConfig> {
+        match self {
+            Self::Qudi(NetworkConfig::Window(config)) => Ok(config),
+            _ => Err(self.other("the diffusion that encodes a window once")),
         }
     }
 

@@ -29,6 +29,31 @@ impl Recipe {
             NetworkRecipe::Qudi(NetworkConfig::Diffusion(config)) => {
                 self.check_diffusion(config)?;
             }
+            NetworkRecipe::Qudi(NetworkConfig::Window(config)) => {
+                self.check_sampling()?;
+                check(&self.sample_rules(3, config.multiple()))?;
+                let loss = self.train.loss();
+                let weight = |v: f32| v.is_finite() && v >= 0.0;
+                check(&[
+                    (
+                        "train.loss",
+                        weight(loss.flow) && weight(loss.pre),
+                        "must have weights of 0 or more",
+                    ),
+                    ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
+                    (
+                        "train.loss.term",
+                        loss.term == PerceptualKind::None,
+                        "must be \"none\" for this network",
+                    ),
+                    ("train.ablate", is_default(&self.train.ablate), "is for the other diffusion"),
+                    (
+                        "train.gradient_checkpointing",
+                        !self.train.gradient_checkpointing,
+                        "is for the other diffusion",
+                    ),
+                ])?;
+            }
             NetworkRecipe::Baseline(sizes) => self.check_baseline(*sizes)?,
         }
         check(&self.common_rules())?;
@@ -98,26 +123,32 @@ impl Recipe {
         )
     }
 
-    fn check_diffusion(&self, network: &DiffusionConfig) -> Result<()> {
+    /// Checks the keys that every diffusion needs.
+    fn check_sampling(&self) -> Result<()> {
         let train = &self.train;
         let steps = self.validation.as_ref().map(|validation| validation.steps);
         check(&[
             ("train.loss", train.loss.is_some(), "is missing"),
             ("train.noise_start_fraction", train.noise_start_fraction.is_some(), "is missing"),
+            (
+                "train.noise_start_fraction",
+                (0.0..=1.0).contains(&train.noise_start_fraction()),
+                "must be from 0 to 1",
+            ),
             ("validation.steps", steps.is_none_or(|steps| steps.is_some()), "is missing"),
             ("validation.steps", steps != Some(Some(0)), "must be at least 1"),
-        ])?;
+        ])
+    }
+
+    fn check_diffusion(&self, network: &DiffusionConfig) -> Result<()> {
+        let train = &self.train;
+        self.check_sampling()?;
         check(&self.sample_rules(3, network.multiple()))?;
         let weight = |v: f32| v.is_finite() && v >= 0.0;
         let loss = train.loss();
         let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
         let others = [LearningPart::Refinement, LearningPart::Uncertainty];
         check(&[
-            (
-                "train.noise_start_fraction",
-                (0.0..=1.0).contains(&train.noise_start_fraction()),
-                "must be from 0 to 1",
-            ),
             (
                 "train.loss",
                 [loss.prediction, loss.flow, loss.pre, loss.perceptual].into_iter().all(weight),

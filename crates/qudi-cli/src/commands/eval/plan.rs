@@ -16,7 +16,6 @@ use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_layers::Provenance;
-use qudi_model::config::NetworkKind;
 use std::path::PathBuf;
 use std::rc::Rc;
 
@@ -218,7 +217,7 @@ fn contenders(
         let trained = network.trained_here(method)?;
         let provenance = if leaves_out { provenance(method, network)? } else { None };
         let own = method.as_own().map(|choice| OwnNetwork::new(network, choice)).transpose()?;
-        let diffuses = own.is_some_and(|own| own.kind() == NetworkKind::Diffusion);
+        let diffuses = own.is_some_and(|own| own.kind().is_diffusion());
         let network = network.clone();
         let plain = Contender { method, trained, provenance, steps: None, network };
         if diffuses && steps.len() > 1 {

@@ -14,6 +14,7 @@ use qudi_model::checkpoint::{Precision, save};
 use qudi_model::config::NetworkKind;
 use qudi_model::diffusion::Diffusion;
 use qudi_model::regression::Regression;
+use qudi_model::window::Window;
 use serde_json::json;
 
 pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()> {
@@ -53,11 +54,16 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
             let (network, _) = weights.load::<Regression>(&device)?;
             save(&network, &description, Precision::Half, path, overwrite)?;
         }
-        (NetworkKind::Diffusion, steps) => {
-            let (network, _) = weights.load::<Diffusion>(&device)?;
+        (kind, steps) => {
             let sampling = description.sampling.get_or_insert_default();
             sampling.steps = steps.map_or(sampling.steps, usize::from);
-            save(&network, &description, Precision::Half, path, overwrite)?;
+            if kind == NetworkKind::Window {
+                let (network, _) = weights.load::<Window>(&device)?;
+                save(&network, &description, Precision::Half, path, overwrite)?;
+            } else {
+                let (network, _) = weights.load::<Diffusion>(&device)?;
+                save(&network, &description, Precision::Half, path, overwrite)?;
+            }
         }
     }
     let bytes = std::fs::read(path).map_err(|e| Error::io("read the weights", path, e))?;

@@ -7,7 +7,6 @@ use crate::methods::{Method, QUDI};
 use qudi_core::Frame;
 use qudi_io::capture::Capture;
 use qudi_io::writer::ArrayWriter;
-use qudi_model::config::NetworkKind;
 
 /// A `.npy` file of uncertainties, float32 `[frames, height, width]`, or none.
 #[derive(Debug)]
@@ -29,7 +28,7 @@ impl UncertaintyFile {
             return Err(CliError::new(what, "--uncertainty", help));
         };
         let own = OwnNetwork::new(&plan.network, choice)?;
-        if plan.network.samples < 2 && own.kind() == NetworkKind::Diffusion {
+        if plan.network.samples < 2 && own.kind().is_diffusion() {
             return Err(CliError::new(
                 "one sample has no uncertainty",
                 "--uncertainty",

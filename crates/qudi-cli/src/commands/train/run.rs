@@ -19,6 +19,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Diffusion;
 use qudi_model::regression::Regression;
+use qudi_model::window::Window;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::Lpips;
 use qudi_train::{
@@ -39,6 +40,7 @@ pub(crate) fn run(
         Action::Prepare => match plan.recipe.network {
             NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => draw::<Regression>(&plan, report),
             NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => draw::<Diffusion>(&plan, report),
+            NetworkRecipe::Qudi(NetworkConfig::Window(_)) => draw::<Window>(&plan, report),
             NetworkRecipe::Baseline(_) => draw::<Baseline>(&plan, report),
         },
         Action::Start | Action::Resume => match plan.recipe.stages()? {
@@ -73,6 +75,7 @@ pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
         NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => {
             train_network::<Diffusion>(plan, report)
         }
+        NetworkRecipe::Qudi(NetworkConfig::Window(_)) => train_network::<Window>(plan, report),
         NetworkRecipe::Baseline(_) => train_network::<Baseline>(plan, report),
     }
 }

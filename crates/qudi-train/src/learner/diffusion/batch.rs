@@ -82,7 +82,7 @@ impl Batch {
     }
 
     /// Copies the conditioning of the batch to `device`.
-    pub(super) fn conditioning(&self, device: &Device) -> Conditioning {
+    pub(in crate::learner) fn conditioning(&self, device: &Device) -> Conditioning {
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
         Conditioning {
             counts: to_tensor(self.counts.y.clone(), self.size, device),
@@ -93,7 +93,7 @@ impl Batch {
     }
 
     /// Copies the batch as an example for the loss, on the device of `conditioning`.
-    pub(super) fn example<'a>(&'a self, conditioning: &'a Conditioning) -> Example<'a> {
+    pub(in crate::learner) fn example<'a>(&'a self, conditioning: &'a Conditioning) -> Example<'a> {
         let device = conditioning.linear_estimate.device();
         Example {
             conditioning,

@@ -52,7 +52,11 @@ pub(super) fn network_inputs(
 }
 
 /// Adds noise to clean images in [-1, 1]: the example's noise of these timesteps, one per burst.
-fn noisy_images(example: &Example<'_>, clean: Tensor<4>, timesteps: &[usize]) -> Tensor<4> {
+pub(in crate::learner) fn noisy_images(
+    example: &Example<'_>,
+    clean: Tensor<4>,
+    timesteps: &[usize],
+) -> Tensor<4> {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let level = |f: fn(f64) -> f64| {
         let values = timesteps.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32).collect();

@@ -1,0 +1,138 @@
+//! Stacks of residual blocks at one resolution, with their gradients.
+//!
+//! On processors with a matrix unit for bfloat16 (AMX) a stack is one operation: between its convolutions
+//! activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and bias, ReLU and
+//! shortcut are applied to each tile of sums. Elsewhere, and with 32 bits, a stack is composed of single
+//! convolutions.
+
+#[cfg(all(feature = "flex", target_arch = "x86_64"))]
+mod amx;
+#[cfg(feature = "flex")]
+mod backward;
+#[allow(unreachable_pub)] // the macro wants public traits
+mod extension;
+#[cfg(feature = "flex")]
+mod forward;
+#[cfg(feature = "flex")]
+mod grid;
+#[cfg(feature = "flex")]
+mod layout;
+#[cfg(test)]
+mod tests;
+#[cfg(feature = "flex")]
+mod unit;
+#[cfg(feature = "flex")]
+mod weights;
+
+use crate::backend::is_native;
+use crate::conv::{Activation, Options, conv_2d};
+use crate::matrix_units::MatrixUnits;
+use crate::precision::ComputePrecision;
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+use extension::{INPUTS, StackBackend};
+
+/// The sizes of a stack of residual blocks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Stack {
+    /// Number of images.
+    pub images: usize,
+    /// Rows of an image.
+    pub height: usize,
+    /// Columns of an image.
+    pub width: usize,
+    /// Channels of every input.
+    pub inputs: Vec<usize>,
+    /// Channels of the features: a multiple of 32 for the fused operation.
+    pub features: usize,
+    /// Number of residual blocks.
+    pub blocks: usize,
+}
+
+impl Stack {
+    /// Returns the channels of all inputs together.
+    pub(crate) fn channels(&self) -> usize {
+        self.inputs.iter().sum()
+    }
+
+    /// Returns inputs and outputs of every convolution, in order.
+    pub(crate) fn convolutions(&self) -> impl Iterator<Item = [usize; 2]> {
+        let entry = [self.channels(), self.features];
+        std::iter::once(entry).chain([[self.features; 2]].repeat(2 * self.blocks))
+    }
+}
+
+/// Computes `x = relu(entry(inputs))`, then `x = x + second(relu(first(x)))` for every block.
+///
+/// # Shapes
+/// - inputs: `[images, channels, height, width]` each, joined by channel
+/// - convolutions: weight `[outputs, inputs, 3, 3]` and bias `[outputs]`: the entry, then two for every block
+/// - output: `[images, features, height, width]`
+///
+/// # Panics
+/// If the shapes do not fit.
+pub fn residual_stack(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> Tensor<4> {
+    let stack = stack_of(inputs, convolutions);
+    if is_fused(&inputs[0], &stack) {
+        return fused(inputs, convolutions, stack);
+    }
+    let conv = |inputs: &[Tensor<4>], number: usize, addend, activation| {
+        let (weight, bias) = convolutions[number].clone();
+        conv_2d(inputs, weight, bias, Options { addend, activation, ..Options::default() })
+    };
+    let mut x = conv(inputs, 0, None, Activation::Relu);
+    for block in 0..stack.blocks {
+        let hidden = conv(std::slice::from_ref(&x), 1 + 2 * block, None, Activation::Relu);
+        x = conv(&[hidden], 2 + 2 * block, Some(x), Activation::None);
+    }
+    x
+}
+
+fn stack_of(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> Stack {
+    let [images, _, height, width] = inputs[0].dims();
+    let [features, ..] = convolutions[0].0.dims();
+    let stack = Stack {
+        images,
+        height,
+        width,
+        inputs: inputs.iter().map(|input| input.dims()[1]).collect(),
+        features,
+        blocks: (convolutions.len() - 1) / 2,
+    };
+    assert_eq!(convolutions.len(), 1 + 2 * stack.blocks, "an entry, and two for every block");
+    for (input, &channels) in inputs.iter().zip(&stack.inputs) {
+        assert_eq!(input.dims(), [images, channels, height, width], "inputs of one stack");
+    }
+    for ((weight, bias), [inputs, outputs]) in convolutions.iter().zip(stack.convolutions()) {
+        assert_eq!(weight.dims(), [outputs, inputs, 3, 3], "a weight of the stack");
+        assert_eq!(bias.dims(), [outputs], "one bias for every output channel");
+    }
+    stack
+}
+
+/// Returns true if the stack is computed as one operation.
+fn is_fused(input: &Tensor<4>, stack: &Stack) -> bool {
+    is_native(input)
+        && ComputePrecision::reduces(input)
+        && MatrixUnits::current() == MatrixUnits::Amx
+        && stack.features.is_multiple_of(32)
+        && stack.images * stack.height * stack.width > 0
+}
+
+fn fused(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)], stack: Stack) -> Tensor<4> {
+    if inputs.len() > INPUTS {
+        let joined = Tensor::cat(inputs.to_vec(), 1);
+        let stack = Stack { inputs: vec![stack.channels()], ..stack };
+        return fused(&[joined], convolutions, stack);
+    }
+    let flat = convolutions.iter().flat_map(|(weight, bias)| {
+        let values = weight.shape().num_elements();
+        [weight.clone().reshape([values]), bias.clone()]
+    });
+    let parameters = Tensor::cat(flat.collect(), 0).into_dispatch();
+    let unused = Tensor::<1>::zeros([1], &inputs[0].device()).into_dispatch();
+    let mut list = inputs.iter().map(|input| input.clone().into_dispatch());
+    let [a, b, c, d, e, f]: [_; INPUTS] =
+        std::array::from_fn(|_| list.next().unwrap_or_else(|| unused.clone()));
+    Tensor::from_dispatch(Dispatch::residual_stack(a, b, c, d, e, f, parameters, stack))
+}

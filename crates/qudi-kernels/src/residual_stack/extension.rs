@@ -1,0 +1,182 @@
+//! A fused stack as an operation of Burn's backends, differentiable once.
+
+use super::Stack;
+use burn::backend::autodiff::checkpoint::base::Checkpointer;
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Autodiff, Backend, backend_extension};
+use std::fmt::Debug;
+
+/// Inputs of one call; longer lists are joined first.
+pub(super) const INPUTS: usize = 6;
+
+/// Backends with fused stacks.
+///
+/// Extensions of Burn take no lists of tensors: unused inputs are any tensors; the stack says what counts.
+#[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
+#[allow(clippy::too_many_arguments)]
+pub trait StackBackend: Backend {
+    /// Inputs `[images, channels, height, width]`, and all parameters one after the other.
+    fn residual_stack(
+        a: FloatTensor<Self>,
+        b: FloatTensor<Self>,
+        c: FloatTensor<Self>,
+        d: FloatTensor<Self>,
+        e: FloatTensor<Self>,
+        f: FloatTensor<Self>,
+        parameters: FloatTensor<Self>,
+        stack: Stack,
+    ) -> FloatTensor<Self>;
+}
+
+/// The gradients of fused stacks.
+pub trait StackGradients: Backend {
+    /// What a gradient needs of the forward pass.
+    type Activations: Clone + Send + Sync + Debug + 'static;
+
+    /// The stack, and what its gradient needs.
+    fn residual_stack_kept(
+        inputs: Vec<FloatTensor<Self>>,
+        parameters: FloatTensor<Self>,
+        stack: &Stack,
+    ) -> (FloatTensor<Self>, Self::Activations);
+
+    /// The gradients for every input, and for the parameters.
+    fn residual_stack_gradients(
+        parameters: FloatTensor<Self>,
+        gradient: FloatTensor<Self>,
+        activations: &Self::Activations,
+        stack: &Stack,
+    ) -> (Vec<FloatTensor<Self>>, FloatTensor<Self>);
+}
+
+#[cfg(feature = "flex")]
+mod flex {
+    use super::super::backward::backward;
+    use super::super::forward::{Activations, forward};
+    use super::{Stack, StackBackend, StackGradients};
+    use crate::flex::{contiguous, tensor, values};
+    use burn::backend::Flex;
+    use burn::backend::flex::FlexTensor;
+    use std::sync::Arc;
+
+    impl StackBackend for Flex {
+        fn residual_stack(
+            a: FlexTensor,
+            b: FlexTensor,
+            c: FlexTensor,
+            d: FlexTensor,
+            e: FlexTensor,
+            f: FlexTensor,
+            parameters: FlexTensor,
+            stack: Stack,
+        ) -> FlexTensor {
+            let inputs = [a, b, c, d, e, f].into_iter().take(stack.inputs.len()).collect();
+            Self::residual_stack_kept(inputs, parameters, &stack).0
+        }
+    }
+
+    impl StackGradients for Flex {
+        type Activations = Arc<Activations>;
+
+        fn residual_stack_kept(
+            inputs: Vec<FlexTensor>,
+            parameters: FlexTensor,
+            stack: &Stack,
+        ) -> (FlexTensor, Arc<Activations>) {
+            let inputs: Vec<_> = inputs.into_iter().map(contiguous).collect();
+            let slices: Vec<_> = inputs.iter().map(values).collect();
+            let parameters = contiguous(parameters);
+            let (output, activations) = forward(stack, &slices, values(&parameters));
+            let shape = [stack.images, stack.features, stack.height, stack.width];
+            (tensor(output, shape), activations)
+        }
+
+        fn residual_stack_gradients(
+            parameters: FlexTensor,
+            gradient: FlexTensor,
+            activations: &Arc<Activations>,
+            stack: &Stack,
+        ) -> (Vec<FlexTensor>, FlexTensor) {
+            let (parameters, gradient) = (contiguous(parameters), contiguous(gradient));
+            let (inputs, flat) =
+                backward(stack, activations, values(&parameters), values(&gradient));
+            let parts = inputs.into_iter().zip(&stack.inputs);
+            let parts = parts.map(|(part, &channels)| {
+                tensor(part, [stack.images, channels, stack.height, stack.width])
+            });
+            let count = flat.len();
+            (parts.collect(), tensor(flat, [count]))
+        }
+    }
+}
+
+/// The step behind a stack.
+#[derive(Debug)]
+struct Step;
+
+/// What the step needs.
+#[derive(Clone, Debug)]
+struct State<T, A> {
+    parameters: T,
+    activations: A,
+    stack: Stack,
+}
+
+/// Inputs and parameters.
+const PARENTS: usize = INPUTS + 1;
+
+impl<B: StackBackend + StackGradients> Backward<B, PARENTS> for Step {
+    type State = State<FloatTensor<B>, B::Activations>;
+
+    fn backward(
+        self,
+        ops: Ops<Self::State, PARENTS>,
+        grads: &mut Gradients,
+        _checkpointer: &mut Checkpointer,
+    ) {
+        let gradient = grads.consume::<B>(&ops.node);
+        let State { parameters, activations, stack } = ops.state;
+        let (inputs, flat) =
+            B::residual_stack_gradients(parameters, gradient, &activations, &stack);
+        let used = ops.parents[..stack.inputs.len()].iter().zip(inputs);
+        for (parent, part) in used.chain(std::iter::once((&ops.parents[INPUTS], flat))) {
+            if let Some(node) = parent {
+                grads.register::<B>(node.id, part);
+            }
+        }
+    }
+}
+
+#[allow(clippy::redundant_closure_for_method_calls)] // the tensors' type has no public path
+impl<B: StackBackend + StackGradients, C: CheckpointStrategy> StackBackend for Autodiff<B, C> {
+    fn residual_stack(
+        a: FloatTensor<Self>,
+        b: FloatTensor<Self>,
+        c: FloatTensor<Self>,
+        d: FloatTensor<Self>,
+        e: FloatTensor<Self>,
+        f: FloatTensor<Self>,
+        parameters: FloatTensor<Self>,
+        stack: Stack,
+    ) -> FloatTensor<Self> {
+        let tensors = [a, b, c, d, e, f, parameters];
+        let nodes = tensors.each_ref().map(|tensor| tensor.node());
+        let forward = |tensors: [FloatTensor<Self>; PARENTS], stack: &Stack| {
+            let mut tensors: Vec<_> = tensors.into_iter().map(|t| t.into_primitive()).collect();
+            let parameters = tensors.pop().expect("parameters come last");
+            tensors.truncate(stack.inputs.len());
+            let (output, activations) = B::residual_stack_kept(tensors, parameters.clone(), stack);
+            (output, parameters, activations)
+        };
+        match Step.prepare::<C>(nodes).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let (output, parameters, activations) = forward(tensors, &stack);
+                prep.finish(State { parameters, activations, stack }, output)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(forward(tensors, &stack).0),
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! The fused stack, on a model of the unit, against single convolutions.
+
+use super::*;
+use crate::matrix_units::with_matrix_units;
+use crate::precision::with_precision;
+use burn::tensor::{Device, TensorData};
+
+fn random<const D: usize>(seed: u64, shape: [usize; D], size: f32, device: &Device) -> Tensor<D> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        ((state >> 40) as f32 / (1u64 << 23) as f32 - 1.0) * size
+    };
+    let values = (0..shape.iter().product()).map(|_| next()).collect();
+    Tensor::from_data(TensorData::new::<f32, _>(values, shape), device)
+}
+
+struct Case {
+    images: usize,
+    size: [usize; 2],
+    inputs: Vec<usize>,
+    features: usize,
+    blocks: usize,
+}
+
+/// Output and gradients of all inputs and parameters.
+fn run(case: &Case, units: MatrixUnits) -> Vec<Vec<f32>> {
+    let device = Device::flex().autodiff();
+    let [height, width] = case.size;
+    let inputs: Vec<Tensor<4>> = (0..)
+        .zip(&case.inputs)
+        .map(|(k, &c)| random(k + 1, [case.images, c, height, width], 1.0, &device).require_grad())
+        .collect();
+    let total: usize = case.inputs.iter().sum();
+    let conv = |seed: u64, inputs: usize| {
+        let size = (3.0 / (9 * inputs) as f32).sqrt();
+        let weight = random(seed, [case.features, inputs, 3, 3], size, &device);
+        let bias = random(seed + 1, [case.features], 0.1, &device);
+        (weight.require_grad(), bias.require_grad())
+    };
+    let mut convolutions = vec![conv(100, total)];
+    convolutions.extend((1..=2 * case.blocks as u64).map(|k| conv(100 + 10 * k, case.features)));
+    let run = || with_precision(ComputePrecision::Bf16, || residual_stack(&inputs, &convolutions));
+    let output = with_matrix_units(units, run).unwrap_or_else(|e| panic!("{e}"));
+    let weights = random(7, output.dims(), 1.0, &device);
+    let gradients =
+        with_matrix_units(units, || (output.clone() * weights).sum().backward()).unwrap();
+    let values = |x: Tensor<1>| x.into_data().try_into_vec::<f32>().unwrap();
+    let gradient = |x: &Tensor<4>| {
+        let gradient = x.grad(&gradients).unwrap();
+        let count = gradient.shape().num_elements();
+        values(gradient.reshape([count]))
+    };
+    let count = output.shape().num_elements();
+    let mut all = vec![values(output.inner().reshape([count]))];
+    all.extend(inputs.iter().map(gradient));
+    for (weight, bias) in &convolutions {
+        all.push(gradient(weight));
+        all.push(values(bias.grad(&gradients).unwrap()));
+    }
+    all
+}
+
+/// Several images, odd sizes, inputs that are no multiples of 32, more pixels than a chunk.
+#[test]
+fn fused_stacks_compute_what_single_convolutions_do() {
+    let cases = [
+        Case { images: 1, size: [1, 1], inputs: vec![3], features: 32, blocks: 0 },
+        Case { images: 3, size: [5, 7], inputs: vec![9, 32, 2], features: 32, blocks: 1 },
+        Case { images: 2, size: [16, 33], inputs: vec![32], features: 64, blocks: 2 },
+        Case {
+            images: 1,
+            size: [30, 41],
+            inputs: vec![1, 2, 3, 4, 5, 6, 7],
+            features: 32,
+            blocks: 1,
+        },
+    ];
+    for case in cases {
+        let fused = run(&case, MatrixUnits::Amx);
+        let single = run(&case, MatrixUnits::F32);
+        assert_eq!(fused.len(), single.len());
+        for (number, (fused, single)) in fused.iter().zip(&single).enumerate() {
+            assert_eq!(fused.len(), single.len());
+            let size = single.iter().map(|v| v * v).sum::<f32>().sqrt();
+            let error = fused.iter().zip(single).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt();
+            let share = error / size;
+            // Activations have 8 bits, and ReLUs of tiny sums turn.
+            assert!(share < 0.04, "{:?}, result {number}: {share}", case.size);
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! Stacks of residual blocks of plain 3 x 3 convolutions.
+
+use super::conv::{Bias, Conv2d};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_kernels::residual_stack;
+
+/// An entry convolution with ReLU, then residual blocks: `x + second(relu(first(x)))`.
+#[derive(Module, Debug)]
+pub struct ResidualStack {
+    entry: Conv2d,
+    blocks: Vec<ResidualBlock>,
+}
+
+/// The convolutions of a residual block.
+#[derive(Module, Debug)]
+struct ResidualBlock {
+    first: Conv2d,
+    second: Conv2d,
+}
+
+impl ResidualStack {
+    /// Creates a stack of zeros; [`init_parameters`](crate::init_parameters) gives weights their values by name.
+    pub fn zeros([inputs, features]: [usize; 2], blocks: usize, device: &Device) -> Self {
+        let conv = |inputs| Conv2d::zeros([inputs, features], 3, Bias::Yes, device);
+        let block = |_| ResidualBlock { first: conv(features), second: conv(features) };
+        Self { entry: conv(inputs), blocks: (0..blocks).map(block).collect() }
+    }
+
+    /// Computes the features of `inputs`, which are joined by channel.
+    ///
+    /// # Shapes
+    /// - inputs: `[images, channels, height, width]` each
+    /// - output: `[images, features, height, width]`
+    pub fn forward(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        let blocks = self.blocks.iter().flat_map(|block| [&block.first, &block.second]);
+        let convolutions = std::iter::once(&self.entry).chain(blocks);
+        let convolutions: Vec<_> =
+            convolutions.map(|conv| (conv.weight(), conv.bias_or_zeros())).collect();
+        residual_stack(inputs, &convolutions)
+    }
+}

@@ -1,0 +1,40 @@
+//! The network in the sampler.
+
+use super::{EncodedWindow, Window, WindowConfig};
+use crate::diffusion::schedule::NoiseSchedule;
+use crate::diffusion::state::DiffusionState;
+use crate::diffusion::timesteps::NUM_TIMESTEPS;
+use crate::diffusion::{Conditioning, Denoiser, Part, Simulated};
+use burn::tensor::Tensor;
+
+impl Denoiser for Window {
+    type Config = WindowConfig;
+    type Encoded = EncodedWindow;
+    type Flows = ();
+
+    fn multiple(config: &WindowConfig) -> usize {
+        config.multiple()
+    }
+
+    fn renews_flows(_: &WindowConfig, _: usize) -> bool {
+        false
+    }
+
+    fn uses(&self, part: Part) -> bool {
+        part != Part::ForwardModel
+    }
+
+    fn encode(&self, conditioning: &Conditioning) -> EncodedWindow {
+        Self::encode(self, conditioning)
+    }
+
+    fn denoise(
+        &self,
+        encoded: &EncodedWindow,
+        _: Option<&Simulated>,
+        state: &DiffusionState,
+        _: &mut Option<()>,
+    ) -> Tensor<4> {
+        self.predict(encoded, state, &NoiseSchedule::cosine(NUM_TIMESTEPS)).x0
+    }
+}

@@ -1,0 +1,152 @@
+//! Optical flow between neighbouring frames: soft block matching, corrected by networks from coarse to fine.
+
+use super::config::{FOLD, LEVELS, WindowConfig};
+use super::hourglass::{Pyramid, normalized};
+use super::matching::soft_match;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_kernels::warp;
+use qudi_layers::resample::{avg_pool2, by_burst, shrink, upsample2};
+use qudi_layers::{Bias, Conv2d, ResidualStack};
+
+/// Channels of the features that are compared.
+const COMPARED: usize = 24;
+
+/// Farthest matches at half, a quarter and an eighth of the resolution, in cells; none at half.
+const RADIUS: [usize; LEVELS] = [0, 3, 4];
+
+/// Scale of the differences of frames among the inputs.
+const DIFFERENCE: f32 = 8.0;
+
+/// The network of one level.
+#[derive(Module, Debug)]
+pub(super) struct FlowLevel {
+    compared: Conv2d,
+    stack: ResidualStack,
+    out: Conv2d,
+}
+
+/// The networks of all levels, finest first.
+#[derive(Module, Debug)]
+pub(super) struct Flow {
+    levels: Vec<FlowLevel>,
+}
+
+/// Flow from every frame to its neighbours, on the grid of one level, in its cells.
+#[derive(Clone, Debug)]
+pub struct WindowFlow {
+    /// First every frame but the last to the next one, then every frame but the first to the one before:
+    /// `[2 * bursts * (frames - 1), 2, h, w]`.
+    pub pairs: Tensor<4>,
+    /// Pixels of a side of a cell.
+    pub scale: usize,
+}
+
+impl WindowConfig {
+    pub(super) fn init_flow(&self, device: &Device) -> Flow {
+        let level = |level: usize| {
+            let width = self.flow[level];
+            FlowLevel {
+                compared: Conv2d::zeros([self.widths[level], COMPARED], 1, Bias::Yes, device),
+                stack: ResidualStack::zeros([2 * COMPARED + 5, width], 1, device),
+                out: Conv2d::zeros([width, 2], 3, Bias::Yes, device),
+            }
+        };
+        Flow { levels: (0..LEVELS).map(level).collect() }
+    }
+}
+
+/// Returns frames and their neighbours in the order of [`WindowFlow::pairs`].
+pub(super) fn pairs(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
+    let [images, c, h, w] = x.dims();
+    let count = images / frames * (frames - 1);
+    let part =
+        |first| by_burst(x.clone(), frames).narrow(1, first, frames - 1).reshape([count, c, h, w]);
+    let (early, late) = (part(0), part(1));
+    let references = Tensor::cat(vec![early.clone(), late.clone()], 0);
+    (references, Tensor::cat(vec![late, early], 0))
+}
+
+impl Flow {
+    /// Estimates the flow on all levels, finest first. No gradient reaches the frames.
+    ///
+    /// # Shapes
+    /// - restored: pre-denoised frames, `[bursts * frames, 1, H, W]` in image units
+    pub(super) fn forward(
+        &self,
+        restored: &Tensor<4>,
+        features: &Pyramid,
+        frames: usize,
+    ) -> Vec<WindowFlow> {
+        let mut images = vec![shrink(restored.clone().detach(), FOLD)];
+        for level in 1..LEVELS {
+            images.push(avg_pool2(images[level - 1].clone()));
+        }
+        let mut found: Vec<WindowFlow> = Vec::with_capacity(LEVELS);
+        for level in (0..LEVELS).rev() {
+            let image = images.pop().expect("an image a level");
+            let start = found.last().map(|coarser| upsample2(coarser.pairs.clone()) * 2.0);
+            let pairs = self.levels[level].forward(image, &features[level], start, level, frames);
+            found.push(WindowFlow { pairs, scale: FOLD << level });
+        }
+        found.reverse();
+        found
+    }
+}
+
+impl FlowLevel {
+    fn forward(
+        &self,
+        image: Tensor<4>,
+        features: &Tensor<4>,
+        start: Option<Tensor<4>>,
+        level: usize,
+        frames: usize,
+    ) -> Tensor<4> {
+        let (reference, neighbour) = pairs(image, frames);
+        let compared = normalized(self.compared.linear(std::slice::from_ref(features)));
+        let (compared, other) = pairs(compared, frames);
+        let [count, _, h, w] = reference.dims();
+        let start = start.unwrap_or_else(|| Tensor::zeros([count, 2, h, w], &reference.device()));
+        let mut flow = start.clone();
+        if RADIUS[level] > 0 {
+            let near = warp(neighbour.clone(), start.detach());
+            // Values of no gradient: outside autodiff, then constants of it.
+            let found = soft_match(reference.clone(), near, RADIUS[level]).detach();
+            flow = flow + found;
+        }
+        let warped = warp(Tensor::cat(vec![other, neighbour], 1), flow.clone());
+        let other = warped.clone().narrow(1, 0, COMPARED);
+        let difference = (warped.narrow(1, COMPARED, 1) - reference.clone()) * DIFFERENCE;
+        let motion = flow.clone().detach() * 0.25;
+        let signed = reference * 2.0 - 1.0;
+        let size = difference.clone().abs();
+        let inputs = [compared, other, difference, size, signed, motion];
+        flow + self.out.linear(&[self.stack.forward(&inputs)])
+    }
+}
+
+impl WindowFlow {
+    /// Returns the flow of every burst from frame `frame` to the next one, or to the one before: `[bursts, 2, h, w]`.
+    pub(super) fn of_frame(&self, frame: usize, next: bool, frames: usize) -> Tensor<4> {
+        let [all, _, h, w] = self.pairs.dims();
+        let half = all / 2;
+        let (first, place) = if next { (0, frame) } else { (half, frame - 1) };
+        let part = by_burst(self.pairs.clone().narrow(0, first, half), frames - 1);
+        let bursts = half / (frames - 1);
+        part.narrow(1, place, 1).reshape([bursts, 2, h, w])
+    }
+
+    /// Computes the mean difference between true frames and their neighbours along the flow, `[1]`: the square
+    /// root of squares, smooth at zero.
+    ///
+    /// # Shapes
+    /// - truth: `[bursts * frames, 1, H, W]` in image units
+    pub fn warping_error(&self, truth: &Tensor<4>, frames: usize) -> Tensor<1> {
+        /// Smooths the root.
+        const SMOOTH: f32 = 1e-5;
+        let (reference, neighbour) = pairs(shrink(truth.clone(), self.scale), frames);
+        let difference = warp(neighbour, self.pairs.clone()) - reference;
+        (difference.powi_scalar(2) + SMOOTH).sqrt().mean()
+    }
+}

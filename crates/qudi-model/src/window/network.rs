@@ -1,0 +1,177 @@
+//! The whole network: a window is encoded once, every reverse step predicts from that.
+
+use super::config::{FOLD, WindowConfig};
+use super::flow::{Flow, WindowFlow};
+use super::fusion::{Frames, Fusion};
+use super::hourglass::normalized;
+use super::initial::initial_values;
+use super::input::{MIDDLE, Measurement};
+use super::predenoiser::PreDenoiser;
+use super::unet::{StepImages, UNet};
+use crate::diffusion::Conditioning;
+use crate::diffusion::schedule::NoiseSchedule;
+use crate::diffusion::state::{DiffusionState, per_image};
+use crate::diffusion::timesteps::NUM_TIMESTEPS;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_layers::init_parameters;
+use qudi_layers::resample::pixel_unshuffle;
+
+/// Scale of pre-denoised frames around the middle level among the inputs of the U-Net.
+const SCALE: f32 = 3.0;
+
+/// The largest difference from the base that the U-Net sees, in units of usual errors.
+const MAX_DIFFERENCE: f32 = 6.0;
+
+/// The network that encodes a window once.
+#[derive(Module, Debug)]
+pub struct Window {
+    pre: PreDenoiser,
+    flow: Flow,
+    fusion: Fusion,
+    unet: UNet,
+    #[module(skip)]
+    state: usize,
+}
+
+/// A window as the U-Net sees it in every step.
+#[derive(Clone, Debug)]
+pub struct EncodedWindow {
+    /// Pre-denoised frames in image units, `[bursts * frames, 1, H, W]`.
+    pub restored: Tensor<4>,
+    /// Flow on all levels, finest first.
+    pub flow: Vec<WindowFlow>,
+    features: Vec<Tensor<4>>,
+    sensor: Tensor<4>,
+    error_sigma: Tensor<4>,
+}
+
+/// The prediction of a reverse step.
+#[derive(Clone, Debug)]
+pub struct WindowPrediction {
+    /// The clean image, about in [-1, 1]: `[bursts * frames, 1, H, W]`.
+    pub x0: Tensor<4>,
+    /// Scale of the U-Net's correction (`c_out`, Karras et al. 2022), `[bursts * frames, 1, 1, 1]`.
+    pub c_out: Tensor<4>,
+}
+
+impl WindowConfig {
+    /// Creates the network with initial weights of `seed`, the same on every device. The sizes must be
+    /// [checked](Self::checked).
+    pub fn init(&self, seed: u64, device: &Device) -> Window {
+        let initial = |name: &str, shape: &[usize]| initial_values(seed, name, shape);
+        init_parameters(self.uninitialized(device), initial)
+    }
+
+    /// Creates the network without weights: it takes no memory yet.
+    pub fn uninitialized(&self, device: &Device) -> Window {
+        Window {
+            pre: self.init_predenoiser(device),
+            flow: self.init_flow(device),
+            fusion: self.init_fusion(device),
+            unet: self.init_unet(device),
+            state: self.state,
+        }
+    }
+}
+
+impl EncodedWindow {
+    /// Returns sigma of usual errors in [-1, 1], `[bursts * frames, 1, 1, 1]`.
+    pub fn error_sigma(&self) -> &Tensor<4> {
+        &self.error_sigma
+    }
+
+    /// Returns the same outside autodiff.
+    #[must_use]
+    pub fn inner(&self) -> Self {
+        let inner = |x: &Tensor<4>| x.clone().inner();
+        let flow = |flow: &WindowFlow| WindowFlow { pairs: inner(&flow.pairs), ..*flow };
+        Self {
+            restored: inner(&self.restored),
+            flow: self.flow.iter().map(flow).collect(),
+            features: self.features.iter().map(inner).collect(),
+            sensor: inner(&self.sensor),
+            error_sigma: inner(&self.error_sigma),
+        }
+    }
+}
+
+impl Window {
+    /// Encodes a window.
+    pub fn encode(&self, conditioning: &Conditioning) -> EncodedWindow {
+        let frames = conditioning.frames;
+        let measurement = Measurement::new(conditioning);
+        let (restored, pyramid) = self.pre.forward(&measurement);
+        let flow = self.flow.forward(&restored, &pyramid, frames);
+        let features = normalized(pyramid[0].clone());
+        let folded = pixel_unshuffle(restored.clone(), FOLD);
+        let window = Frames {
+            restored: &folded,
+            linear: &measurement.linear,
+            features: &features,
+            count: frames,
+        };
+        let [earlier, later] = self.fusion.forward(&window, &flow[0], self.state);
+        let image = (folded - MIDDLE) * SCALE;
+        EncodedWindow {
+            restored,
+            flow,
+            features: vec![features, earlier, later, image],
+            sensor: measurement.sensor,
+            error_sigma: measurement.error_sigma,
+        }
+    }
+
+    /// Predicts the clean frames from an encoded window and the noisy image.
+    ///
+    /// At the noisiest timestep the noisy image says nothing and is not looked at: the prediction is the posterior
+    /// mean, whatever the noise.
+    pub fn predict(
+        &self,
+        encoded: &EncodedWindow,
+        state: &DiffusionState,
+        schedule: &NoiseSchedule,
+    ) -> WindowPrediction {
+        let EncodedWindow { restored, features, sensor, error_sigma, .. } = encoded;
+        let images = restored.dims()[0];
+        let device = restored.device();
+        let of_steps = |f: &dyn Fn(f64) -> f64| {
+            let values = state.timesteps.iter().map(|&t| f(schedule.alpha_bar(Some(t))) as f32);
+            per_image(values.collect(), images, &device)
+        };
+        let last = NUM_TIMESTEPS - 1;
+        let seen: Vec<f32> =
+            state.timesteps.iter().map(|&t| f32::from(u8::from(t < last))).collect();
+        let seen = per_image(seen, images, &device);
+        // Noise of the image over its signal, `sigma` of Karras et al. 2022.
+        let noise = of_steps(&|bar| ((1.0 - bar) / bar).sqrt());
+        let signal = of_steps(&|bar| 1.0 / bar.sqrt());
+        let predenoised = restored.clone() * 2.0 - 1.0;
+        let has_previous = state.has_previous_flag();
+        let base = predenoised.clone() * (has_previous.clone() * -1.0 + 1.0) + state.previous();
+        let error_variance = error_sigma.clone().powi_scalar(2);
+        let variance = error_variance.clone() + noise.clone().powi_scalar(2);
+        let c_skip = error_variance / variance.clone() * seen.clone();
+        let c_out =
+            (noise.clone().powi_scalar(2) * error_sigma.clone().powi_scalar(2) / variance).sqrt();
+        let c_out = c_out * seen.clone() + error_sigma.clone() * (seen * -1.0 + 1.0);
+        let difference = (state.x_t.clone() * signal - base.clone()) * c_skip;
+        let clamped =
+            |x: Tensor<4>| (x / error_sigma.clone()).clamp(-MAX_DIFFERENCE, MAX_DIFFERENCE);
+        let step = StepImages {
+            noisy: clamped(difference.clone()),
+            previous: clamped((base.clone() - predenoised) * has_previous),
+        };
+        let log_snr: Vec<f32> = state
+            .timesteps
+            .iter()
+            .map(|&t| {
+                let bar = schedule.alpha_bar(Some(t));
+                ((bar / (1.0 - bar)).ln() as f32).clamp(-10.0, 10.0)
+            })
+            .collect();
+        let correction =
+            self.unet.forward(features, step, sensor.clone(), &log_snr, &state.has_previous);
+        WindowPrediction { x0: base + difference + correction * c_out.clone(), c_out }
+    }
+}

@@ -1,0 +1,110 @@
+//! The diffusion that encodes a window once.
+#![allow(clippy::unwrap_used)]
+
+use burn::module::Module;
+use burn::tensor::{Device, Distribution, Tensor};
+use qudi_core::restorer::Acquisition;
+use qudi_core::sensor::Sensor;
+use qudi_layers::parameter_shapes;
+use qudi_layers::tensor::read;
+use qudi_model::diffusion::Conditioning;
+use qudi_model::diffusion::schedule::NoiseSchedule;
+use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
+use qudi_model::sensor::sensor_tensor;
+use qudi_model::window::{Window, WindowConfig};
+
+const CONFIG: WindowConfig =
+    WindowConfig { widths: [8, 8, 8], flow: [4, 4, 4], state: 8, cell_blocks: 1 };
+
+fn conditioning(frames: usize, device: &Device) -> Conditioning {
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap();
+    let images = || Tensor::random([frames, 1, 16, 24], Distribution::Uniform(0.0, 1.0), device);
+    Conditioning {
+        counts: images(),
+        linear_estimate: images(),
+        sensor: sensor_tensor(&acquisition, device),
+        frames,
+    }
+}
+
+fn state(frames: usize, timestep: usize, device: &Device) -> DiffusionState {
+    let noise = || Tensor::random([frames, 1, 16, 24], Distribution::Normal(0.0, 1.0), device);
+    DiffusionState {
+        x_t: noise(),
+        x0_prev: noise() * 0.1,
+        has_previous: vec![false],
+        timesteps: vec![timestep],
+    }
+}
+
+fn predicted(network: &Window, conditioning: &Conditioning, state: &DiffusionState) -> Vec<f32> {
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+    read(network.predict(&network.encode(conditioning), state, &schedule).x0).unwrap()
+}
+
+#[test]
+fn the_first_step_does_not_depend_on_the_noise_and_later_ones_do() {
+    let device = Device::flex();
+    let network = CONFIG.init(1, &device);
+    let conditioning = conditioning(3, &device);
+    let predict = |timestep| predicted(&network, &conditioning, &state(3, timestep, &device));
+    let last = NUM_TIMESTEPS - 1;
+    assert_eq!(predict(last), predict(last));
+    let (one, other) = (predict(50), predict(50));
+    let difference = one.iter().zip(&other).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(difference > 0.01, "{difference}");
+}
+
+/// With little noise, the noisy image is the answer.
+#[test]
+fn the_prediction_follows_an_image_without_noise() {
+    let device = Device::flex();
+    let network = CONFIG.init(1, &device);
+    let conditioning = conditioning(3, &device);
+    let truth = Tensor::<4>::random([3, 1, 16, 24], Distribution::Uniform(-1.0, 1.0), &device);
+    let signal = NoiseSchedule::cosine(NUM_TIMESTEPS).alpha_bar(Some(0)).sqrt() as f32;
+    let state = DiffusionState { x_t: truth.clone() * signal, ..state(3, 0, &device) };
+    let got = predicted(&network, &conditioning, &state);
+    let worst = got.iter().zip(read(truth).unwrap()).map(|(a, b)| (a - b).abs());
+    let worst = worst.fold(0.0, f32::max);
+    assert!(worst < 0.1, "{worst}");
+}
+
+#[test]
+fn every_parameter_has_a_gradient() {
+    let device = Device::flex().autodiff();
+    let network = CONFIG.init(1, &device);
+    let conditioning = conditioning(4, &device);
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+    let encoded = network.encode(&conditioning);
+    let mut state = state(4, 60, &device);
+    state.has_previous = vec![true];
+    let x0 = network.predict(&encoded, &state, &schedule).x0;
+    let truth = conditioning.linear_estimate.clone();
+    let flow = encoded.flow.iter().map(|flow| flow.warping_error(&truth, 4));
+    let loss = x0.powi_scalar(2).mean() + flow.reduce(Tensor::add).unwrap();
+    let gradients = loss.backward();
+    let lists = largest_gradients(&network, &gradients);
+    for ((name, _), largest) in parameter_shapes(&network).iter().zip(lists) {
+        assert!(largest > 0.0, "{name} has no gradient");
+    }
+}
+
+/// The largest magnitude of every parameter's gradient.
+fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> Vec<f32> {
+    struct Largest<'a>(&'a burn::tensor::Gradients, Vec<f32>);
+    impl burn::module::ModuleVisitor for Largest<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &burn::module::Param<Tensor<D>>) {
+            let largest = param
+                .val()
+                .grad(self.0)
+                .map_or(0.0, |gradient| gradient.abs().max().into_scalar::<f32>());
+            self.1.push(largest);
+        }
+    }
+    let mut largest = Largest(gradients, Vec::new());
+    network.visit(&mut largest);
+    largest.1
+}

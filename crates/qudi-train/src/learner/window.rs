@@ -1,0 +1,158 @@
+//! The diffusion that encodes a window once, as it learns.
+
+use super::diffusion::{Batch, Example};
+use super::diffusion::{noisy_images, previous_timestep};
+use super::{Context, Learner, Loss, Origin, WeightedSum, learning, provenance};
+use crate::burst_cache::BurstSampler;
+use crate::loss::robust_square;
+use crate::parameters::gradients;
+use crate::recipe::Recipe;
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use qudi_core::atomic_file::Overwrite;
+use qudi_core::restorer::Restorer;
+use qudi_core::{Error, Result};
+use qudi_model::checkpoint::{Description, Precision, load, save};
+use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::schedule::NoiseSchedule;
+use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
+use qudi_model::diffusion::{DiffusionRestorer, SampleOptions};
+use qudi_model::restorer::Model;
+use qudi_model::window::{EncodedWindow, Window};
+use rand::rngs::ChaCha8Rng;
+use rand::{Rng, SeedableRng};
+use std::path::Path;
+
+impl Learner for Window {
+    type Batch = Batch;
+
+    fn uninitialized(recipe: &Recipe, device: &Device) -> Result<Self> {
+        Ok(recipe.network.window()?.uninitialized(device))
+    }
+
+    fn init(recipe: &Recipe, device: &Device) -> Result<Self> {
+        Ok(recipe.network.window()?.init(recipe.train.seed, device))
+    }
+
+    fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self> {
+        let sizes = recipe.network.window()?;
+        let (network, description) = load::<Self>(path, device)?;
+        if description.network != NetworkConfig::Window(sizes.clone()) {
+            return Err(Error::data(
+                "these weights are for a network of other sizes than the recipe's",
+                path,
+                "choose the recipe that they were trained with, or its [network] table",
+            ));
+        }
+        Ok(network)
+    }
+
+    fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Batch> {
+        Batch::draw(recipe, bursts, number)
+    }
+
+    fn loss<'a>(&'a self, batch: &'a Batch, context: &Context<'a>) -> Result<Loss<'a>> {
+        let train = &context.recipe.train;
+        let conditioning = batch.conditioning(context.device);
+        let example = batch.example(&conditioning);
+        let mut random = ChaCha8Rng::seed_from_u64(train.seed);
+        random.set_stream(batch.number);
+        // Half of all batches start from nothing, as sampling does.
+        let from_nothing = random.next_u64() & 1 == 0;
+        let encoded = self.encode(&conditioning);
+        let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+        let truth = example.truth.clone() * 2.0 - 1.0;
+        let (x0_prev, has_previous) = if from_nothing {
+            (truth.zeros_like(), vec![false; batch.len()])
+        } else {
+            first_estimate(self, &encoded, &example, truth.clone(), &schedule)
+        };
+        let state = DiffusionState {
+            x_t: noisy_images(&example, truth.clone(), example.timesteps),
+            x0_prev,
+            has_previous,
+            timesteps: example.timesteps.to_vec(),
+        };
+        let prediction = self.predict(&encoded, &state, &schedule);
+        let weights = train.loss();
+        let mut sum = WeightedSum::default();
+        // Errors in units of what they usually are: no light level drowns another.
+        let error = (prediction.x0 - truth.clone()) / prediction.c_out;
+        sum.add("prediction", weights.prediction, robust_square(error));
+        let error = (encoded.restored.clone() * 2.0 - 1.0 - truth) / encoded.error_sigma().clone();
+        sum.add("pre", weights.pre, robust_square(error));
+        let frames = conditioning.frames;
+        let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
+        let flow = flows.reduce(Tensor::add).expect("a level");
+        sum.add("flow", weights.flow, flow);
+        let total = sum.total();
+        Ok(Loss {
+            total: total.clone(),
+            terms: sum.terms,
+            gradients: Box::new(move || gradients(self, &total.backward())),
+            statistics: Vec::new(),
+        })
+    }
+
+    fn restorer(&self, recipe: &Recipe, device: &Device) -> Result<Box<dyn Restorer>> {
+        let sampling = recipe.sampling();
+        let options = SampleOptions {
+            steps: sampling.steps,
+            spacing: sampling.spacing,
+            precision: recipe.train.precision,
+            ..SampleOptions::default()
+        };
+        let config = recipe.network.window()?.clone();
+        let model = Model { network: self.clone(), config, window: recipe.window() };
+        Ok(Box::new(DiffusionRestorer::new(model, options, device)?))
+    }
+
+    fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()> {
+        let network = NetworkConfig::Window(recipe.network.window()?.clone());
+        let description = Description {
+            preset: network.preset_name().map(str::to_owned),
+            network,
+            window: recipe.data.frames.max(11),
+            provenance: provenance(recipe, origin),
+            sampling: Some(recipe.sampling()),
+        };
+        save(self, &description, Precision::Single, path, Overwrite::Yes)
+    }
+
+    fn learns(&self, recipe: &Recipe) -> Vec<bool> {
+        learning(self, recipe)
+    }
+
+    /// Steps of Muon have full size whatever the gradient: outputs and flow, whose gradients are noise at first, would
+    /// walk at random.
+    fn prefers_adam(name: &str) -> bool {
+        name.starts_with("flow.") || name.ends_with("out.weight")
+    }
+}
+
+/// Makes the network's own estimate from noisier images, without gradient; none at the noisiest timestep, where
+/// sampling begins.
+fn first_estimate(
+    network: &Window,
+    encoded: &EncodedWindow,
+    example: &Example<'_>,
+    truth: Tensor<4>,
+    schedule: &NoiseSchedule,
+) -> (Tensor<4>, Vec<bool>) {
+    let timesteps = example.timesteps;
+    let has_previous: Vec<bool> = timesteps.iter().map(|&t| t < NUM_TIMESTEPS - 1).collect();
+    if !has_previous.contains(&true) {
+        return (truth.zeros_like(), has_previous);
+    }
+    let earlier: Vec<usize> = timesteps.iter().map(|&t| previous_timestep(t)).collect();
+    let x_t = noisy_images(example, truth, &earlier).inner();
+    let state = DiffusionState {
+        x0_prev: x_t.zeros_like(),
+        x_t,
+        has_previous: vec![false; timesteps.len()],
+        timesteps: earlier,
+    };
+    let estimate = network.valid().predict(&encoded.inner(), &state, schedule).x0;
+    (Tensor::from_inner(estimate.clamp(-1.0, 1.0)), has_previous)
+}
