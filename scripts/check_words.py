@@ -10,7 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-CHECKED = "README.md CHANGELOG.md docs/notes tests scripts crates/qudi-core crates/qudi-sim crates/qudi-io".split()
+CHECKED = """README.md CHANGELOG.md docs/notes tests scripts crates/qudi-core crates/qudi-sim crates/qudi-io
+    crates/qudi-burst crates/qudi-kernels crates/qudi-model crates/qudi-train crates/qudi-cli""".split()
 COLUMNS = 110
 # Words that only this project used in this sense, and their replacements.
 BANNED = {

@@ -65,7 +65,8 @@ impl Restorer for AlignedSums {
         self.method.window() * self.count
     }
 
-    /// Frames whose distance is a multiple of `count` are restored together, so that their sums share no counts.
+    /// Frames whose distance is a multiple of `count` are restored together, so that their sums share no
+    /// counts.
     fn restore_frames(
         &mut self,
         burst: BurstView<'_>,

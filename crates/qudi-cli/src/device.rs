@@ -61,9 +61,9 @@ fn feature_of(backend: &str) -> Option<&'static str> {
 
 /// Opens a device by name and computes something small on it; once, however often it is asked for.
 pub(crate) fn open(name: &str) -> Result<Opened> {
-    static OPENED: Mutex<Vec<Opened>> = Mutex::new(Vec::new());
+    static OPENED_DEVICES: Mutex<Vec<Opened>> = Mutex::new(Vec::new());
     let name = if name == "auto" { best() } else { name.to_owned() };
-    let mut opened = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut opened = OPENED_DEVICES.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(device) = opened.iter().find(|device| device.name == name) {
         return Ok(device.clone());
     }
@@ -147,8 +147,8 @@ fn card(kind: DeviceType, number: usize) -> Option<Device> {
     Device::enumerate(kind).into_vec().into_iter().nth(number)
 }
 
-/// Keeps drivers of graphics cards from complaining on standard error that there is no desktop session. They look
-/// for sockets below this folder only, and find none.
+/// Keeps drivers of graphics cards from complaining on standard error that there is no desktop session. They
+/// look for sockets below this folder only, and find none.
 ///
 /// To be called before there are threads.
 #[cfg(any(feature = "wgpu", feature = "vulkan"))]

@@ -3,14 +3,14 @@
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-static ASKED: AtomicBool = AtomicBool::new(false);
+static STOP_REQUEST: AtomicBool = AtomicBool::new(false);
 
 /// Exit code of an interrupted command.
 pub(crate) const EXIT_CODE: u8 = 130;
 
 pub(crate) fn install() {
     let installed = ctrlc::set_handler(|| {
-        if ASKED.swap(true, Ordering::Relaxed) {
+        if STOP_REQUEST.swap(true, Ordering::Relaxed) {
             std::process::exit(i32::from(EXIT_CODE));
         }
     });
@@ -21,5 +21,9 @@ pub(crate) fn install() {
 
 /// Breaks once Ctrl-C has been pressed.
 pub(crate) fn check() -> ControlFlow<()> {
-    if ASKED.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    if STOP_REQUEST.load(Ordering::Relaxed) {
+        ControlFlow::Break(())
+    } else {
+        ControlFlow::Continue(())
+    }
 }

@@ -53,8 +53,8 @@ pub(crate) fn available_bytes() -> Option<u64> {
     }
 }
 
-/// Refuses tiles that memory cannot hold, before the system ends the program for it. `sides` are the sides of the
-/// smallest and of the requested tiles, `needed` the bytes that a tile takes.
+/// Refuses tiles that memory cannot hold, before the system ends the program for it. `sides` are the sides of
+/// the smallest and of the requested tiles, `needed` the bytes that a tile takes.
 pub(crate) fn check_tiles(
     sides: [usize; 2],
     frame: Size,

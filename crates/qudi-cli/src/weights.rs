@@ -9,11 +9,11 @@ use sha2::{Digest, Sha256};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// Name of built-in weights in the place of a file.
+/// Name of built-in weights, instead of a file.
 pub(crate) const NAME: &str = "built in";
 
-/// Weights in the program (docs/model-card.md), with their SHA-256: a link to large files or a bad disk is not
-/// taken for them.
+/// Weights in the program (docs/model-card.md), with their SHA-256: a link to large files or a bad disk is
+/// not taken for them.
 struct BuiltIn {
     bytes: &'static [u8],
     sha256: &'static str,

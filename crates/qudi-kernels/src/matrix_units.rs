@@ -63,7 +63,7 @@ impl FromStr for MatrixUnits {
 
 thread_local! {
     /// Units forced on this thread.
-    static FORCED: Cell<Option<MatrixUnits>> = const { Cell::new(None) };
+    static FORCED_UNITS: Cell<Option<MatrixUnits>> = const { Cell::new(None) };
 }
 
 impl MatrixUnits {
@@ -111,7 +111,7 @@ impl MatrixUnits {
 
     /// Returns the units that convolutions on this thread use.
     pub(crate) fn current() -> Self {
-        FORCED.get().unwrap_or_else(|| Self::chosen().unwrap_or(Self::F32))
+        FORCED_UNITS.get().unwrap_or_else(|| Self::chosen().unwrap_or(Self::F32))
     }
 }
 
@@ -126,7 +126,7 @@ pub fn with_matrix_units<T>(
     if !units.is_available() {
         return Err(MatrixUnitsError::Unavailable(units));
     }
-    let _switch = Switch::turn(&FORCED, Some(units));
+    let _switch = Switch::turn(&FORCED_UNITS, Some(units));
     Ok(run())
 }
 

@@ -1,8 +1,8 @@
 //! Stacks of residual blocks at one resolution, with their gradients.
 //!
 //! On processors with a matrix unit for bfloat16 (AMX) a stack is one operation: between its convolutions
-//! activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and bias, ReLU and
-//! shortcut are applied to each tile of sums. Elsewhere, and with 32 bits, a stack is composed of single
+//! activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and bias, ReLU
+//! and shortcut are applied to each tile of sums. Elsewhere, and with 32 bits, a stack is composed of single
 //! convolutions.
 
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]

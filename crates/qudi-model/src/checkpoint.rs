@@ -256,7 +256,7 @@ fn mismatch(path: &Path, what: impl Into<String>) -> Error {
     Error::data(what, path, "the file is damaged, or of another version of the program")
 }
 
-/// The values of a tensor of F32 or F16.
+/// Reads the values of a tensor of F32 or F16.
 fn numbers(tensor: &TensorView<'_>) -> Vec<f32> {
     let bytes = tensor.data();
     if tensor.dtype() == Dtype::F16 {
@@ -276,7 +276,7 @@ impl Precision {
         }
     }
 
-    /// The largest value that can be written.
+    /// Returns the largest value that can be written.
     fn largest(self) -> f32 {
         match self {
             Self::Single => f32::MAX,

@@ -73,7 +73,7 @@ impl<'a> CountResponse<'a> {
         response
     }
 
-    /// The linear estimate from one count, in image units.
+    /// Computes the linear estimate from one count, in image units.
     fn estimate(&self, count: u16, dark: f64) -> f32 {
         let photons = self.sensor.estimate_flux(f64::from(count), 1, self.gain, dark);
         (photons / self.photons_per_unit).min(MAX_IMAGE) as f32
@@ -88,7 +88,8 @@ impl<'a> CountResponse<'a> {
         values().map(|(p, u)| p * (u - mean).powi(2)).sum::<f64>().sqrt()
     }
 
-    /// The entry of a count. Counts above full scale, which no such sensor gives, count as full scale.
+    /// Returns the entry of a count. Counts above full scale, which no such sensor gives, count as full
+    /// scale.
     fn of(&self, count: u16) -> (f32, f32) {
         self.table[usize::from(count).min(self.table.len() - 1)]
     }

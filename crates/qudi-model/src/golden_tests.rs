@@ -22,12 +22,12 @@ fn devices() -> [Device; 2] {
     [Device::flex().autodiff(), ndarray.autodiff()]
 }
 
-/// The large cases: minutes on ndarray.
+/// Returns the device of the large cases, which take minutes on ndarray.
 fn flex() -> Device {
     Device::flex().autodiff()
 }
 
-/// The module with the reference's weights.
+/// Gives a module the reference's weights.
 fn weighted<M: Module>(module: M, prefix: &str) -> M {
     init_parameters(module, |name, shape| reference_parameter(&format!("{prefix}.{name}"), shape))
 }
@@ -36,7 +36,7 @@ fn weighted<M: Module>(module: M, prefix: &str) -> M {
 const REFERENCE_NAMES: [(&str, &str); 3] =
     [("uncertainty", "error"), ("weighting", "trust"), ("weighted_in", "trusted_in")];
 
-/// The name that the reference has for a parameter.
+/// Returns the name that the reference has for a parameter.
 fn reference_name(name: &str) -> String {
     let part = |part: &str| {
         let found = REFERENCE_NAMES.iter().find(|(now, _)| *now == part);
@@ -49,7 +49,7 @@ fn reference_parameter(name: &str, shape: &[usize]) -> Vec<f32> {
     parameter(&reference_name(name), shape)
 }
 
-/// The planes of a reference case: three images, `K + 1` counts, `K` expectations.
+/// Splits the planes of a reference case: three images, `K + 1` counts, `K` expectations.
 fn aligned(planes: &Tensor<4>) -> Aligned<Tensor<4>> {
     let neighbours = (planes.dims()[1] - 4) / 2;
     let plane = |at| planes.clone().narrow(1, at, 1);
@@ -66,7 +66,7 @@ fn normalized(planes: &Tensor<4>) -> NormalizedInput {
     NormalizedInput::new(&aligned(planes))
 }
 
-/// The sizes of a reference case.
+/// Returns the sizes of a reference case.
 fn regression_config(case: &Case<'_>) -> RegressionConfig {
     let config = &case.about["config"];
     let number = |value: &Value| usize::try_from(value.as_u64().unwrap()).unwrap();

@@ -4,7 +4,7 @@ use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
 /// The last layers of residual branches, which start at zero.
-const ZERO_AT_FIRST: [&str; 8] = [
+const ZERO_LAYERS: [&str; 8] = [
     "conv2.weight",
     "project.weight",
     "unet.out.weight",
@@ -15,16 +15,16 @@ const ZERO_AT_FIRST: [&str; 8] = [
     "layers.4.weight",
 ];
 
-/// Draws initial values: uniform with the variance that keeps the size of signals through a ReLU (He et al. 2015)
-/// or a plain layer. The last layer of every residual branch starts at zero: so a deep network starts as its
-/// shortcuts.
+/// Draws initial values: uniform with the variance that keeps the size of signals through a ReLU (He et al.
+/// 2015) or a plain layer. The last layer of every residual branch starts at zero: so a deep network starts
+/// as its shortcuts.
 pub(crate) fn initial_values(seed: u64, name: &str, shape: &[usize]) -> Vec<f32> {
     let count: usize = shape.iter().product();
     if shape.len() == 1 {
         let is_norm = name.ends_with(".weight");
         return vec![if is_norm { 1.0 } else { 0.0 }; count];
     }
-    if ZERO_AT_FIRST.iter().any(|last| name.ends_with(last)) {
+    if ZERO_LAYERS.iter().any(|last| name.ends_with(last)) {
         return vec![0.0; count];
     }
     let gain = if name.starts_with("unet.") { 3.0 } else { 6.0 };

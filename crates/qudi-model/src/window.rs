@@ -1,8 +1,8 @@
 //! The diffusion that encodes a window once.
 //!
 //! Pre-denoiser, flow and fusion see the captured counts alone and run once a window; the U-Net runs in every
-//! reverse step. All of it is wide plain convolutions at half the resolution and below. The paper's order, with
-//! everything in every step, is [`diffusion`](crate::diffusion).
+//! reverse step. All of it is wide plain convolutions at half the resolution and below. The paper's order,
+//! with everything in every step, is [`diffusion`](crate::diffusion).
 
 mod config;
 mod denoiser;

@@ -62,7 +62,7 @@ fn values(network: Diffusion) -> Vec<(String, Vec<f32>)> {
     list
 }
 
-/// A saved network in a folder of its own.
+/// Saves a network in a folder of its own.
 fn saved() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("w.safetensors");
@@ -222,7 +222,8 @@ fn kinds_are_not_mistaken_for_each_other() {
     assert!(error.help().unwrap().contains("--method qudi-diffusion"), "{error}");
 }
 
-/// The metadata of a file in which one network could be both, and its parameters by their names of then.
+/// Writes a file of the former format, in which one network could be both, with parameters by their former
+/// names.
 fn former(network: &str, parameters: &[(String, Vec<usize>)]) -> Vec<u8> {
     let description = format!(
         r#"{{"preset":null,"network":{network},"window":11,"program":"qudi 0.1.0","sensors":[],"ppp":[1.0,2.0],

@@ -42,14 +42,14 @@ fn values(name: &str, shape: &[usize]) -> Vec<f32> {
         .collect()
 }
 
-/// A tiny diffusion.
+/// Returns a tiny diffusion.
 fn restorer(options: SampleOptions, device: &Device) -> DiffusionRestorer<Diffusion> {
     let network = init_parameters(config().init(2, device), values);
     let model = Model { network, config: config(), window: 11 };
     DiffusionRestorer::new(model, options, device).unwrap()
 }
 
-/// A tiny regression.
+/// Returns a tiny regression.
 fn regression(tile: usize) -> qudi_core::Result<RegressionRestorer> {
     let text = include_str!("../../../tests/golden/regression.toml");
     let NetworkConfig::Regression(config) = NetworkConfig::parse(text, "regression").unwrap()

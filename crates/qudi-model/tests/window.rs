@@ -92,7 +92,7 @@ fn every_parameter_has_a_gradient() {
     }
 }
 
-/// The largest magnitude of every parameter's gradient.
+/// Returns the largest magnitude of every parameter's gradient.
 fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> Vec<f32> {
     struct Largest<'a>(&'a burn::tensor::Gradients, Vec<f32>);
     impl burn::module::ModuleVisitor for Largest<'_> {

@@ -159,7 +159,7 @@ impl CacheKey {
         serde_json::to_string(self).expect("plain data")
     }
 
-    /// The key as it is read back from a file: numbers of JSON may differ in the last bit.
+    /// Parses the key as it is read back from a file: numbers of JSON may differ in the last bit.
     fn from_text(text: &str) -> Option<Self> {
         serde_json::from_str(text).ok()
     }

@@ -29,19 +29,19 @@ pub trait Learner: Module + Sync {
     /// Samples that pass at once, as threads draw them.
     type Batch: Send + Sync + 'static;
 
-    /// The network of a recipe without weights: it takes no memory yet.
+    /// Returns the network of a recipe without weights: it takes no memory yet.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the recipe is for another network.
     fn uninitialized(recipe: &Recipe, device: &Device) -> Result<Self>;
 
-    /// The network of a recipe with the initial weights of its seed.
+    /// Returns the network of a recipe with the initial weights of its seed.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the recipe is for another network.
     fn init(recipe: &Recipe, device: &Device) -> Result<Self>;
 
-    /// The network that the training of a recipe starts from, out of a file of weights.
+    /// Loads the network from which the training of a recipe starts, out of a file of weights.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the file does not hold a network that can become the recipe's.
@@ -59,7 +59,7 @@ pub trait Learner: Module + Sync {
     /// [`Error`](qudi_core::Error) if the device fails or a sensor is impossible.
     fn loss<'a>(&'a self, batch: &'a Self::Batch, context: &Context<'a>) -> Result<Loss<'a>>;
 
-    /// The restorer of validations, by a network that is outside autodiff on `device`.
+    /// Returns the restorer of validations, by a network that is outside autodiff on `device`.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the network or the recipe cannot restore.
@@ -76,7 +76,7 @@ pub trait Learner: Module + Sync {
         parameter_shapes(self)
     }
 
-    /// Whether each parameter learns.
+    /// Returns for each parameter whether it learns.
     fn learns(&self, _recipe: &Recipe) -> Vec<bool> {
         vec![true; self.named_shapes().len()]
     }
@@ -147,8 +147,8 @@ pub struct Loss<'a> {
     pub terms: Vec<(&'static str, Tensor<1>)>,
     /// Computes the gradients of the total for all parameters, in the order of the network, `[values]` each.
     pub gradients: Box<dyn FnOnce() -> Vec<Tensor<1>> + 'a>,
-    /// Values of parameters after the step by their places in the network, `[values]` each: statistics that a network
-    /// keeps of what passes through it, and that no gradient moves.
+    /// Values of parameters after the step by their places in the network, `[values]` each: statistics that a
+    /// network keeps of what passes through it, and that no gradient moves.
     pub statistics: Vec<(usize, Tensor<1>)>,
 }
 
@@ -167,7 +167,7 @@ pub struct Origin {
     pub commit: Option<String>,
 }
 
-/// What weights of a recipe say of their training.
+/// Returns the description that weights of a recipe hold of their training.
 fn provenance(recipe: &Recipe, origin: &Origin) -> Provenance {
     Provenance {
         program: format!("qudi {}", env!("CARGO_PKG_VERSION")),

@@ -1,8 +1,8 @@
 //! Training of networks: data, loss, loop, state, validation.
 //!
-//! A [`Recipe`] holds everything that decides the result, and a [`Learner`] is a network that it can be for. A
-//! [`Prefetcher`] draws batches on threads of its own, the [`Trainer`] takes a step with each, and a [`Run`] does so in
-//! a folder from which it can be resumed.
+//! A [`Recipe`] holds everything that decides the result, and a [`Learner`] is a network that it can be for.
+//! A [`Prefetcher`] draws batches on threads of its own, the [`Trainer`] takes a step with each, and a
+//! [`Run`] does so in a folder from which it can be resumed.
 
 #![warn(missing_docs)]
 

@@ -20,8 +20,8 @@ pub(crate) use robust_square::robust_square;
 pub enum LossForm {
     /// Squared error and total variation of the error, in [0, 1], as in the paper.
     L2Tv,
-    /// Squared errors in units of what is unknown of every pixel (Karras et al. 2022, table 1, "EDM": their
-    /// weight `1 / c_out^2`), and of pre-denoised frames in units of their usual error.
+    /// Squared errors in units of the remaining error of every pixel (Karras et al. 2022, table 1, "EDM":
+    /// their weight `1 / c_out^2`), and of pre-denoised frames in units of their usual error.
     #[default]
     Edm,
 }

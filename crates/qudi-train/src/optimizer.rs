@@ -1,5 +1,5 @@
-//! The optimizers, on lists of values, whose state is two more such lists: Adam (Kingma and Ba 2015), and Muon for the
-//! weights of layers.
+//! The optimizers, on lists of values, whose state is two more such lists: Adam (Kingma and Ba 2015), and
+//! Muon for the weights of layers.
 //!
 //! Burn's own keep their state under numbers that change from run to run, and read it back onto the default
 //! device, which a machine without a graphics card does not have; training must go on exactly, anywhere.
@@ -23,8 +23,8 @@ pub enum OptimizerKind {
     /// Adam (Kingma and Ba 2015).
     #[default]
     Adam,
-    /// Steps along orthogonal matrices for the weights of layers (Muon; Jordan et al. 2024), Adam for biases and
-    /// scales.
+    /// Steps along orthogonal matrices for the weights of layers (Muon; Jordan et al. 2024), Adam for biases
+    /// and scales.
     Muon,
 }
 
@@ -42,7 +42,8 @@ pub struct Optimizer {
 }
 
 impl Optimizer {
-    /// The state before the first step, for values that have these shapes in the network, on their device.
+    /// Returns the state before the first step, for values that have these shapes in the network, on their
+    /// device.
     pub fn new<'a>(
         kind: OptimizerKind,
         values: &[Tensor<1>],

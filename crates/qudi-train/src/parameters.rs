@@ -3,27 +3,28 @@
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor};
 
-/// The values of all parameters, `[values]` each, outside autodiff.
+/// Returns the values of all parameters, `[values]` each, outside autodiff.
 pub fn parameters<M: Module>(network: &M) -> Vec<Tensor<1>> {
     let mut collect = Collect { gradients: None, list: Vec::new() };
     network.visit(&mut collect);
     collect.list
 }
 
-/// The gradients for all parameters, `[values]` each; zero for parameters that the loss does not depend on.
+/// Returns the gradients for all parameters, `[values]` each; zero for parameters that the loss does not
+/// depend on.
 pub fn gradients<M: Module>(network: &M, gradients: &Gradients) -> Vec<Tensor<1>> {
     let mut collect = Collect { gradients: Some(gradients), list: Vec::new() };
     network.visit(&mut collect);
     collect.list
 }
 
-/// The network with other values, in the order and with the sizes of [`parameters`].
+/// Returns the network with other values, in the order and with the sizes of [`parameters`].
 #[must_use]
 pub fn with_parameters<M: Module>(network: M, values: Vec<Tensor<1>>) -> M {
     network.map(&mut Replace { values: values.into_iter() })
 }
 
-/// The network with gradients for those parameters alone that learn, in the order of [`parameters`].
+/// Returns the network with gradients for only the parameters that learn, in the order of [`parameters`].
 pub(super) fn with_frozen<M: Module>(network: M, learns: &[bool]) -> M {
     network.map(&mut Freeze { learns: learns.iter() })
 }

@@ -7,7 +7,7 @@ use qudi_core::{Error, Result};
 use std::sync::mpsc::{Receiver, sync_channel};
 
 /// The number of batches that a thread keeps ready.
-const AHEAD: usize = 2;
+const READY_BATCHES: usize = 2;
 
 /// Gives the batches of a network in order; they do not depend on the number of threads.
 #[derive(Debug)]
@@ -24,7 +24,7 @@ impl<L: Learner> Prefetcher<L> {
     pub fn new(recipe: &Recipe, bursts: &BurstSampler, first: u64, workers: usize) -> Result<Self> {
         let count = workers.max(1) as u64;
         let start = |worker: u64| {
-            let (sender, receiver) = sync_channel(AHEAD);
+            let (sender, receiver) = sync_channel(READY_BATCHES);
             let (recipe, mut bursts) = (recipe.clone(), bursts.try_clone()?);
             let work = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.

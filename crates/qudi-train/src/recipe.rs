@@ -75,8 +75,8 @@ pub struct TrainConfig {
     pub warmup: u64,
     /// Largest norm of a step's gradient; longer gradients are scaled down.
     pub clip: f64,
-    /// Parts of the network that learn; all if none is named. The others stay as they are, bit for bit. Of the
-    /// regression `["refinement"]`, or `pre` and `uncertainty`; of the diffusion all others and `pre`.
+    /// Parts of the network that learn; all if none is named. The others stay as they are, bit for bit. Of
+    /// the regression `["refinement"]`, or `pre` and `uncertainty`; of the diffusion all others and `pre`.
     #[serde(default)]
     pub learns: Vec<LearningPart>,
     /// Numbers that convolutions multiply.

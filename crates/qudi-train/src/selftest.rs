@@ -27,7 +27,7 @@ pub const BF16_TOLERANCE: f32 = 2e-2;
 /// How much larger errors are where sums have no more bits than what is multiplied.
 const SUMS: f32 = 10.0;
 
-/// What an error says.
+/// The verdict on an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
     /// Rounding.
@@ -61,12 +61,12 @@ impl Check {
         Self { name, precision, run }
     }
 
-    /// Whether the device has such numbers at all.
+    /// Returns true if the device has such numbers at all.
     pub fn is_possible(&self, device: &Device) -> bool {
         self.precision.is_supported(device)
     }
 
-    /// What an error says.
+    /// Returns the verdict on an error.
     pub fn verdict(&self, error: f32) -> Verdict {
         let (right, rough) = match self.precision {
             ComputePrecision::F32 => (TOLERANCE, TOLERANCE),
@@ -81,8 +81,8 @@ impl Check {
         }
     }
 
-    /// Largest difference between the device's results and those of Burn's stock operations on `reference`,
-    /// in terms of the largest value.
+    /// Computes the largest difference between the device's results and the results of Burn's stock
+    /// operations on `reference`, in terms of the largest value.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if a device fails.
@@ -140,7 +140,7 @@ fn values<const D: usize>(seed: u32, shape: [usize; D], device: &Device) -> Tens
     Tensor::from_data(TensorData::new(values, shape), device)
 }
 
-/// The result, and the gradients of a weighted sum of it.
+/// Returns the result, and the gradients of a weighted sum of it.
 fn with_gradients<const D: usize>(
     output: Tensor<D>,
     inputs: &[Tensor<D>],
@@ -238,7 +238,7 @@ fn image(seed: u32, device: &Device) -> Tensor<4> {
     values(seed, [4, 1, 32, 48], device) * 0.5 + 0.5
 }
 
-/// A small regression: frames, uncertainty, and the loss's gradient for the merged frames.
+/// Runs a small regression: frames, uncertainty, and the loss's gradient for the merged frames.
 fn regression(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
     let config = RegressionConfig {
@@ -273,8 +273,8 @@ fn regression(device: &Device) -> Result<Vec<Vec<f32>>> {
     ])
 }
 
-/// A diffusion of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows, and
-/// the loss's gradient for the noisy image.
+/// Runs a diffusion of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows,
+/// and the loss's gradient for the noisy image.
 fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
     let NetworkConfig::Diffusion(config) = NetworkConfig::preset("tiny")? else {

@@ -136,7 +136,7 @@ impl<L: Learner> Trainer<L> {
     }
 }
 
-/// The last whole state of a run.
+/// Returns the folder of the last whole state of a run.
 fn last(run: &Path) -> PathBuf {
     let [state, _, old] = names(run);
     // Killed between two renames: the old state is the whole one.
@@ -166,7 +166,7 @@ pub(super) fn steps_taken(run: &Path) -> Result<u64> {
     Ok(counters(&last(run))?.step)
 }
 
-/// Whether a folder holds a state to go on from.
+/// Returns true if a folder holds a state to go on from.
 pub(super) fn exists(run: &Path) -> bool {
     let [state, _, old] = names(run);
     state.exists() || old.exists()

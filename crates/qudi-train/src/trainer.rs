@@ -71,8 +71,8 @@ impl<L: Learner> Trainer<L> {
     /// go to them in turn. `backbones` is the folder of the perceptual term's weights.
     ///
     /// # Errors
-    /// [`Error`] if the recipe is for another network, the perceptual term cannot be loaded, or a device lacks the
-    /// numbers of `train.precision`.
+    /// [`Error`] if the recipe is for another network, the perceptual term cannot be loaded, or a device
+    /// lacks the numbers of `train.precision`.
     pub fn new(
         recipe: &Recipe,
         network: Option<L>,
@@ -115,17 +115,17 @@ impl<L: Learner> Trainer<L> {
         })
     }
 
-    /// The number of steps taken.
+    /// Returns the number of steps taken.
     pub fn step_number(&self) -> u64 {
         self.optimizer.steps
     }
 
-    /// The number of batches used.
+    /// Returns the number of batches used.
     pub fn batches(&self) -> u64 {
         self.step_number() * self.recipe.train.accumulate as u64
     }
 
-    /// The network with averaged weights, for use.
+    /// Returns the network with averaged weights, for use.
     pub fn averaged(&self) -> L {
         with_parameters(self.network.valid(), self.ema.average.clone())
     }
@@ -272,7 +272,7 @@ fn unsupported(precision: ComputePrecision, device: &Device) -> Error {
     )
 }
 
-/// The Euclidean norm over all lists.
+/// Computes the Euclidean norm over all lists.
 fn norm(gradients: &[Tensor<1>]) -> Result<f64> {
     let squares = gradients.iter().map(|g| g.clone().powi_scalar(2).sum()).collect();
     let squares = read(Tensor::cat(squares, 0))?;

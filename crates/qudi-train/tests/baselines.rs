@@ -16,7 +16,8 @@ use qudi_train::{
 use std::ops::ControlFlow;
 use std::path::Path;
 
-/// The shipped recipe of a method on procedural scenes, with these sizes, and some steps of some small samples.
+/// Returns the shipped recipe of a method on procedural scenes, with these sizes, and some steps of some
+/// small samples.
 fn recipe(method: Method, changes: &[(&str, &str)]) -> Recipe {
     let text = std::fs::read_to_string(format!(
         "{}/../../configs/baselines/{}.toml",

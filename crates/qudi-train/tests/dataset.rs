@@ -30,12 +30,12 @@ fn config(source: Vec<SourceConfig>) -> DataConfig {
     DataConfig { frames: 3, crop: 16, sensor: vec![mix], source }.checked().unwrap()
 }
 
-/// A value that tells clip, frame and pixel; at most 140.
+/// Returns a value that tells clip, frame and pixel; at most 140.
 fn value(clip: u32, frame: u32, x: u32, y: u32) -> u8 {
     (20 + 7 * clip + 5 * frame + x + 2 * y) as u8
 }
 
-/// The mean of a clip, of 1.
+/// Computes the mean of a clip, as a share of full scale.
 fn clip_mean(clip: u32) -> f64 {
     let row = |t, y| (0..24).map(move |x| f64::from(value(clip, t, x, y)));
     let values = (0..8).flat_map(|t| (0..20).flat_map(move |y| row(t, y)));
@@ -65,7 +65,7 @@ fn all_sources() -> DataConfig {
     ])
 }
 
-/// The files' pack, for `config`.
+/// Packs the files for `config`.
 fn pack(config: &DataConfig, folder: &Path) -> Result<PathBuf, Error> {
     let path = folder.join("pack.zip");
     write_pack(&[config], folder, &path, Overwrite::Yes, &mut |_| ControlFlow::Continue(()))?;
@@ -121,7 +121,7 @@ fn samples_depend_on_seed_and_number_only() {
     }
 }
 
-/// A clip's pixels relative to its exposure are those of the file: rescaling changes both alike.
+/// A clip's pixels relative to its exposure are the same as in the file: rescaling changes both alike.
 #[test]
 fn mean_level_is_that_of_the_whole_clip() {
     let folder = tempfile::tempdir().unwrap();

@@ -11,7 +11,7 @@ struct Values<const D: usize> {
     values: Param<Tensor<D>>,
 }
 
-/// The largest difference after twenty steps towards a target, with our optimizer and with theirs.
+/// Returns the largest difference after twenty steps towards a target, with our optimizer and with theirs.
 fn apart<const D: usize>(
     kind: OptimizerKind,
     mut theirs: ModuleOptimizer,
@@ -59,8 +59,8 @@ fn muon_matches_burn() {
     }
 }
 
-/// Biases have no orthogonal steps: they take Adam's; and a layer without gradient comes to rest, also where the mean of
-/// gradients that it had before is so small that its square is zero.
+/// Biases have no orthogonal steps: they take Adam's; and a layer without gradient no longer changes, also
+/// where the mean of gradients that it had before is so small that its square is zero.
 #[test]
 fn muon_moves_matrices_alone() {
     let off = apart(OptimizerKind::Muon, AdamConfig::new().with_epsilon(1e-8).init(), [50]);

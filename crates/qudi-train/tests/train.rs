@@ -17,12 +17,12 @@ use qudi_train::{
 use std::ops::ControlFlow;
 use std::path::Path;
 
-/// The recipe `tiny`, smaller and shorter.
+/// Returns the recipe `tiny`, smaller and shorter.
 fn recipe(changes: &[(&str, &str)]) -> Recipe {
     shortened(include_str!("../../../tests/golden/tiny.toml"), changes)
 }
 
-/// The small regression, as short.
+/// Returns the small regression, as short.
 fn regression(changes: &[(&str, &str)]) -> Recipe {
     shortened(include_str!("../../../tests/golden/regression.toml"), changes)
 }

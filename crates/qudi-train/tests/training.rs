@@ -1,4 +1,5 @@
-//! The loss of the diffusion and its gradients: they reach every parameter, one burst can be overfitted, and backends agree.
+//! The loss of the diffusion and its gradients: they reach every parameter, one burst can be overfitted, and
+//! backends agree.
 #![allow(clippy::unwrap_used)]
 
 mod moving_disk;
@@ -31,7 +32,7 @@ fn burst(size: Size, frames: usize, device: &Device) -> Burst {
     moving_disk::burst([0.2, 0.9], size, frames, device)
 }
 
-/// The loss of step `number`, at a time and with noise of its own.
+/// Computes the loss of step `number`, at a time and with noise of its own.
 fn loss(network: &Diffusion, burst: &Burst, number: u64) -> LossTerms {
     let frames = burst.conditioning.frames;
     let noise = Noise::new(number, 1);

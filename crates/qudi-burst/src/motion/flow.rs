@@ -1,5 +1,5 @@
-//! Optical flow between two clean frames: for recorded clips, whose true motion is unknown. Patches are aligned as
-//! those of bursts, in both directions.
+//! Optical flow between two clean frames: for recorded clips, whose true motion is unknown. Patches are
+//! aligned in both directions, by the search that aligns bursts.
 
 use super::grid::Grid;
 use super::patch_matching::align;
@@ -19,8 +19,8 @@ const MAX_TWO_WAY: (f32, f32) = (0.01, 0.5);
 /// hidden, and a blurred result would look better than the truth.
 const MAX_CHANGE: f32 = 0.1;
 
-/// Estimates the displacement of every pixel of `now` in `next`; `visible` where the way back leads home, stays
-/// inside the frame, and finds nearly the same value.
+/// Estimates the displacement of every pixel of `now` in `next`; `visible` where the way back leads home,
+/// stays inside the frame, and finds nearly the same value.
 pub fn estimate_flow(now: &Frame, next: &Frame) -> Flow {
     let size = now.size;
     let pyramids =
@@ -86,7 +86,7 @@ mod tests {
     use crate::motion::warping_error;
     use qudi_sim::scene::{PROCEDURAL, Procedural};
 
-    /// A texture of several scales, displaced by (`dx`, `dy`).
+    /// Returns a texture of several scales, displaced by (`dx`, `dy`).
     fn texture(size: Size, dx: f64, dy: f64) -> Frame {
         Frame::from_fn(size, |x, y| {
             let (x, y) = (x as f64 - dx, y as f64 - dy);

@@ -44,7 +44,7 @@ impl Settings {
 /// the noise of the same counts that judge hypotheses found on them. The less constrained a hypothesis is,
 /// the more of that noise it fits, and the merge then averages noise with itself.
 mod penalty {
-    pub(crate) const MATCHED: f32 = 200.0;
+    pub(crate) const MATCHED_PATCHES: f32 = 200.0;
     pub(crate) const CONSTANT: f32 = 200.0;
     pub(crate) const CONSTANT_REFINED: f32 = 150.0;
     pub(crate) const GLOBAL_REFINED: f32 = 100.0;
@@ -98,7 +98,7 @@ pub(crate) fn select_on_estimates(
     let refined = refine_all(burst, references, &constant, reference);
     let rest = vec![vec![[0.0; 2]; burst.grid.len()]; burst.frames.len()];
     let mut hypotheses = vec![
-        (penalty::MATCHED, matched),
+        (penalty::MATCHED_PATCHES, matched),
         (penalty::CONSTANT, constant),
         (penalty::CONSTANT_REFINED, refined),
         (penalty::REST, rest),

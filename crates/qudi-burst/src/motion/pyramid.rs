@@ -4,7 +4,7 @@ use crate::patch::SIDE;
 use qudi_core::{Frame, Size};
 
 /// Coarser levels: the shrink factor from the level before, and the side of the patches matched on it.
-const COARSER: [(usize, usize); 2] = [(2, SIDE), (4, SIDE / 2)];
+const COARSE_LEVELS: [(usize, usize); 2] = [(2, SIDE), (4, SIDE / 2)];
 
 /// Smoothed mean counts, finest level first.
 #[derive(Clone, Debug)]
@@ -26,7 +26,7 @@ impl Pyramid {
     pub(crate) fn new(counts: &Frame) -> Self {
         let mut levels = vec![Level { image: smooth(counts), ratio: 1, side: SIDE }];
         let mut image = counts.clone();
-        for (ratio, side) in COARSER {
+        for (ratio, side) in COARSE_LEVELS {
             let size = Size { height: image.size.height / ratio, width: image.size.width / ratio };
             if size.height.min(size.width) < side {
                 break;

@@ -9,8 +9,8 @@ pub(crate) const OWN: &str = "own";
 /// The group of flags that only diffusion takes.
 pub(crate) const DIFFUSION: &str = "diffusion";
 
-/// The first flag of each group on the command line, with its dashes. Flatten it into a command before the other
-/// arguments: clap takes their values out of the matches.
+/// The first flag of each group on the command line, with its dashes. Flatten it into a command before the
+/// other arguments: clap takes their values out of the matches.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Given {
     pub(crate) own: Option<String>,

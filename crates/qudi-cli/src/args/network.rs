@@ -25,7 +25,8 @@ pub(crate) struct Network {
     /// qudi-diffusion: sampler [default: ddim]
     #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
     sampler: Option<SamplerName>,
-    /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation [default: 1]
+    /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation
+    /// [default: 1]
     #[arg(long, value_name = "K", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
     samples: Option<usize>,
     /// Where it runs: auto, cpu, ndarray, wgpu, vulkan, cuda, metal, or one of several, as wgpu:1 (`qudi info

@@ -64,7 +64,7 @@ mod tests {
     use std::any::TypeId;
 
     /// What every command needs besides its numbers.
-    const NEEDED: &[(&str, &str)] = &[
+    const NEEDED_ARGUMENTS: &[(&str, &str)] = &[
         ("simulate", "scene:text -o o.npy"),
         ("restore", "c.npy -o o"),
         ("train", "tiny -o o"),
@@ -96,7 +96,8 @@ mod tests {
         let mut command = Args::command();
         command.build();
         for verb in command.get_subcommands() {
-            let Some((name, needed)) = NEEDED.iter().find(|(name, _)| *name == verb.get_name())
+            let Some((name, needed)) =
+                NEEDED_ARGUMENTS.iter().find(|(name, _)| *name == verb.get_name())
             else {
                 continue;
             };

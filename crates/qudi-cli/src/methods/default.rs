@@ -1,4 +1,4 @@
-//! The method for those who name none.
+//! The default method: the best one that supports the capture.
 
 use super::options::NetworkOptions;
 use super::trained::unknown_to_built_in;

@@ -1,5 +1,5 @@
-//! The networks of this project behind `--method qudi`, `qudi-regression` and `qudi-diffusion`: weights, device,
-//! options.
+//! The networks of this project behind `--method qudi`, `qudi-regression` and `qudi-diffusion`: weights,
+//! device, options.
 
 use super::Built;
 use super::options::NetworkOptions;
@@ -154,7 +154,7 @@ fn sample_options(
     SampleOptions { steps, spacing, sampler, samples, tile, precision }
 }
 
-/// What went wrong on a device, with a way out; `problem` are its own words.
+/// Returns the error of a device that failed, with what to do; `problem` is the device's own message.
 pub(crate) fn device_failed(problem: &str, options: &NetworkOptions) -> CliError {
     let half = options.tile / 2 / 32 * 32;
     let help = if half >= 64 {

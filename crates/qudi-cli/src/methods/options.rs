@@ -135,8 +135,8 @@ impl NetworkOptions {
         })
     }
 
-    /// Returns size and steps of a learned method's weights if they were trained here; none for other methods and
-    /// for weights of others.
+    /// Returns size and steps of a learned method's weights if they were trained here; none for other methods
+    /// and for weights of others.
     pub(crate) fn trained_here(&self, method: &Method) -> Result<Option<String>> {
         let Some(method) = method.as_learned() else { return Ok(None) };
         let contents = self.weights_of(method)?.describe()?;

@@ -11,7 +11,7 @@ use qudi_layers::Provenance;
 use qudi_model::config::NetworkKind;
 
 /// How far outside the light it was trained for a network may be used: it has not seen such noise.
-const TOLERATED: f64 = 10.0;
+const LIGHT_TOLERANCE: f64 = 10.0;
 
 /// The light and the kind of counts that weights were trained for, of one of their sensors.
 struct Trained {
@@ -35,24 +35,26 @@ impl Trained {
         provenance.sensors.iter().filter_map(trained).collect()
     }
 
-    /// Whether counts of `sensor` are of this kind: the same response, and full scales within a factor of four.
+    /// Returns true if counts of `sensor` are of this kind: the same response, and full scales within a
+    /// factor of four.
     fn is_like(&self, sensor: &Sensor) -> bool {
         let ratio = f64::from(sensor.max_count()) / f64::from(self.sensor.max_count());
         self.sensor.response == sensor.response && (0.25..=4.0).contains(&ratio)
     }
 }
 
-/// Why the weights that come along are not for such a capture, if they are not.
+/// Returns why the bundled weights are not for such a capture, if they are not.
 pub(crate) fn unknown_to_built_in(acquisition: &Acquisition) -> Result<Option<String>> {
     Ok(unknown(&Weights::BuiltIn(NetworkKind::Regression).describe()?.provenance, acquisition, 1.0))
 }
 
-/// Whether the weights that come along were trained for such a capture.
+/// Returns true if the bundled weights were trained for such a capture.
 pub(crate) fn built_in_knows(acquisition: &Acquisition) -> Result<bool> {
     Ok(unknown_to_built_in(acquisition)?.is_none())
 }
 
-/// What of a capture is unknown to weights, if anything. Light may lie outside their range by a factor.
+/// Returns the property of a capture for which weights were not trained, if any. Light may lie outside their
+/// range by the factor `tolerated`.
 fn unknown(provenance: &Provenance, acquisition: &Acquisition, tolerated: f64) -> Option<String> {
     let sensor = &acquisition.sensor;
     let trained = Trained::all(provenance);
@@ -83,7 +85,7 @@ fn unknown(provenance: &Provenance, acquisition: &Acquisition, tolerated: f64) -
 
 /// Why weights are not for a capture: it is far outside what they were trained for.
 pub(crate) fn refusal(provenance: &Provenance, acquisition: &Acquisition) -> Option<String> {
-    unknown(provenance, acquisition, TOLERATED)
+    unknown(provenance, acquisition, LIGHT_TOLERANCE)
 }
 
 /// Refuses a capture far outside what the weights were trained for.
@@ -96,7 +98,7 @@ pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Resul
     ))
 }
 
-/// What the weights of a method were trained on; nothing is known of authors' weights.
+/// Returns the data on which the weights of a method were trained; nothing is known of authors' weights.
 pub(crate) fn provenance(method: &Method, options: &NetworkOptions) -> Result<Option<Provenance>> {
     Ok(match method.kind {
         Kind::Learned { method, .. } => {

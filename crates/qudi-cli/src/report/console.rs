@@ -78,7 +78,7 @@ impl Report {
         if self.volume == Volume::Quiet { Ok(()) } else { print(&printable(text)) }
     }
 
-    /// Prints a remark beside the result.
+    /// Prints a remark to the standard error.
     pub(crate) fn remark(&self, text: &str) {
         if self.volume != Volume::Quiet {
             eprintln!("{}", printable(text));

@@ -62,8 +62,8 @@ pub(crate) fn crop_size(size: Size, largest: usize) -> Size {
     Size { height: size.height.min(largest), width: size.width.min(largest) }
 }
 
-/// Crops the middle of a frame, at most `largest` pixels to a side, and encodes it as a data URL; 0 is black and
-/// 1 is white.
+/// Crops the middle of a frame, at most `largest` pixels to a side, and encodes it as a data URL; 0 is black
+/// and 1 is white.
 pub(crate) fn crop(frame: &Frame, largest: usize) -> String {
     let Size { height, width } = crop_size(frame.size, largest);
     let (top, left) = ((frame.size.height - height) / 2, (frame.size.width - width) / 2);

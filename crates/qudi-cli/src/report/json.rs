@@ -24,7 +24,8 @@ fn value(cell: &Cell) -> Option<Value> {
     }
 }
 
-/// Formats a document for a terminal or a pipe: control characters that JSON permits in strings are escaped, too.
+/// Formats a document for a terminal or a pipe: control characters that JSON permits in strings are escaped,
+/// too.
 pub(crate) fn document(value: &Value) -> String {
     // A value with text for keys can always be written.
     let text = serde_json::to_string_pretty(value).unwrap_or_else(|e| e.to_string());

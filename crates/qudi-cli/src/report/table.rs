@@ -114,7 +114,8 @@ impl Table {
         (self.columns.iter().map(Column::heading).collect(), rows.collect())
     }
 
-    /// Formats the table in aligned columns: the first to the left, others to the right, text columns at the end to the left.
+    /// Formats the table in aligned columns: the first to the left, others to the right, text columns at the
+    /// end to the left.
     pub(crate) fn to_text(&self) -> String {
         let (headings, rows) = self.shown();
         let width = |i: usize| {

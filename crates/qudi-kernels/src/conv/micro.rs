@@ -110,8 +110,9 @@ pub(super) unsafe fn accumulate<S: Simd, P: Products<S>, const M: usize, const V
 /// are `length` values apart, rows of `x` are `step` values apart.
 ///
 /// # Safety
-/// A value has `T`'s size. Each `dy` must be valid for `rows * length` values and every row of `x` for `length` values
-/// from each of the `offsets`; they fill whole vectors. The machine must have the instructions of `P`.
+/// A value has `T`'s size. Each `dy` must be valid for `rows * length` values and every row of `x` for
+/// `length` values from each of the `offsets`; they fill whole vectors. The machine must have the
+/// instructions of `P`.
 #[inline(always)]
 pub(super) unsafe fn correlate<S: Simd, P: Products<S>, T, const M: usize, const K: usize>(
     simd: S,

@@ -78,8 +78,8 @@ pub(super) trait MatrixUnit {
     /// Adds the products of all tiles of planes and all tiles of channels to `sums`.
     ///
     /// # Safety
-    /// The machine must have the unit, configured for groups of [`SIDE`]. All tiles of pixels and gradients, and
-    /// as many sums, must be valid.
+    /// The machine must have the unit, configured for groups of [`SIDE`]. All tiles of pixels and gradients,
+    /// and as many sums, must be valid.
     unsafe fn correlate(&self, what: &Correlation, sums: [[*mut WeightSums; 2]; 2]);
 }
 

@@ -12,7 +12,7 @@ use std::arch::asm;
 struct Configuration([u8; 64]);
 
 impl Configuration {
-    const FULL: Self = {
+    const FULL_TILES: Self = {
         let mut bytes = [0; 64];
         bytes[0] = 1;
         let mut tile = 0;
@@ -25,8 +25,8 @@ impl Configuration {
     };
 }
 
-/// The unit, configured on this thread until it is dropped. Tiles 0 to 3 hold the sums, 4 and 5 what stands on
-/// the left, 6 and 7 what stands on the right.
+/// The unit, configured on this thread until it is dropped. Tiles 0 to 3 hold the sums, 4 and 5 what stands
+/// on the left, 6 and 7 what stands on the right.
 #[derive(Debug)]
 pub(super) struct Amx(());
 
@@ -43,8 +43,8 @@ const SUM_ROW: usize = BLOCK * size_of::<f32>();
 impl Unit for Amx {
     #[inline(always)]
     unsafe fn configured() -> Self {
-        static FULL: Configuration = Configuration::FULL;
-        let configuration = &raw const FULL;
+        static CONFIGURATION: Configuration = Configuration::FULL_TILES;
+        let configuration = &raw const CONFIGURATION;
         // SAFETY: 64 readable bytes; nothing else on this thread uses tiles.
         unsafe { asm!("ldtilecfg [{}]", in(reg) configuration, options(nostack, readonly)) };
         Self(())

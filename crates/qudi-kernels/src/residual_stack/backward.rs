@@ -66,7 +66,7 @@ pub(super) fn backward(
     (inputs, flat.concat())
 }
 
-/// Computes the gradient for the joined inputs of a group, and those of every convolution.
+/// Computes the gradients for the joined inputs of a group and for every convolution.
 fn backward_group(
     stack: &Stack,
     activations: &GroupActivations,

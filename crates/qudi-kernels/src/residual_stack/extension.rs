@@ -36,14 +36,14 @@ pub trait StackGradients: Backend {
     /// What a gradient needs of the forward pass.
     type Activations: Clone + Send + Sync + Debug + 'static;
 
-    /// The stack, and what its gradient needs.
+    /// Applies the stack, and keeps what its gradient needs.
     fn residual_stack_kept(
         inputs: Vec<FloatTensor<Self>>,
         parameters: FloatTensor<Self>,
         stack: &Stack,
     ) -> (FloatTensor<Self>, Self::Activations);
 
-    /// The gradients for every input, and for the parameters.
+    /// Returns the gradients for every input and for the parameters.
     fn residual_stack_gradients(
         parameters: FloatTensor<Self>,
         gradient: FloatTensor<Self>,

@@ -38,7 +38,7 @@ pub(super) struct Parameters<'a> {
     pub(super) sizes: [usize; 2],
 }
 
-/// Splits flat parameters into those of every convolution.
+/// Splits flat parameters by convolution.
 pub(super) fn convolutions<'a>(stack: &Stack, parameters: &'a [f32]) -> Vec<Parameters<'a>> {
     let mut rest = parameters;
     let mut split = |sizes: [usize; 2]| {

@@ -1,8 +1,8 @@
 //! Pixels of many images in one line, with zeros between rows and between images.
 //!
-//! Every row is followed by one zero pixel and every image by one row of zeros, so that a tap of a 3 x 3 kernel
-//! is the same distance from every pixel: a convolution is a product of matrices over the whole line, and so is
-//! the gradient of its weights.
+//! Every row is followed by one zero pixel and every image by one row of zeros, so that a tap of a 3 x 3
+//! kernel is the same distance from every pixel: a convolution is a product of matrices over the whole line,
+//! and so is the gradient of its weights.
 
 use super::Stack;
 

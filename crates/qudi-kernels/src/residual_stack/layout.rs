@@ -57,8 +57,8 @@ impl Line {
         Self { values, channels }
     }
 
-    /// Joins planes, `[images, channels, height, width]` of every input, padded with zero channels to a multiple
-    /// of 32.
+    /// Joins planes, `[images, channels, height, width]` of every input, padded with zero channels to a
+    /// multiple of 32.
     pub(super) fn from_planes(grid: &Grid, inputs: &[(&[f32], usize)]) -> Self {
         let all: usize = inputs.iter().map(|(_, channels)| channels).sum();
         let channels = all.next_multiple_of(CHANNELS);

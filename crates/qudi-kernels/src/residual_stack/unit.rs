@@ -24,7 +24,7 @@ pub(super) struct Products {
     pub(super) right_row: usize,
     /// Number of products.
     pub(super) steps: usize,
-    /// From the tiles of one product to those of the next, left and right.
+    /// Distances from the tiles of one product to the tiles of the next, left and right.
     pub(super) step: [usize; 2],
 }
 

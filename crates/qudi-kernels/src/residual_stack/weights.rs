@@ -27,7 +27,8 @@ impl Tiles {
         })
     }
 
-    /// Packs the weights of the gradient for the inputs: inputs and outputs change places, and so do opposite taps.
+    /// Packs the weights of the gradient for the inputs: inputs and outputs change places, and so do opposite
+    /// taps.
     pub(super) fn backward(weight: &[f32], [inputs, outputs]: [usize; 2]) -> Self {
         Self::packed([outputs, inputs], |input, output, tap| {
             weight[(output * inputs + input) * TAPS + TAPS - 1 - tap]

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 /// The description of a weight file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Description {
-    /// Name of the preset, if the sizes are those of one.
+    /// Name of the preset that has these sizes, if any.
     pub preset: Option<String>,
     /// Kind and sizes of the network.
     pub network: NetworkConfig,

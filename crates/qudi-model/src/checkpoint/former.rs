@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 /// Modules of the diffusion on top of the regression, which was removed.
-const REMOVED: [&str; 5] = ["low", "high", "flow", "fusion", "unet"];
+const REMOVED_MODULES: [&str; 5] = ["low", "high", "flow", "fusion", "unet"];
 
 /// The reason why a regression cannot diffuse.
 pub(super) const NO_DIFFUSION: &str = "the diffusion on top of the regression was removed: lesions showed that it used neither its noise nor the simulated measurement";
@@ -79,5 +79,5 @@ pub(super) fn name(parameter: &str) -> String {
 /// Returns true if a parameter of a former regression is no longer used.
 pub(super) fn is_removed(parameter: &str) -> bool {
     let module = parameter.split('.').next().unwrap_or_default();
-    REMOVED.contains(&module) || parameter.contains("simulated_in.")
+    REMOVED_MODULES.contains(&module) || parameter.contains("simulated_in.")
 }

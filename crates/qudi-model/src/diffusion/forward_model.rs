@@ -8,7 +8,7 @@ use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::{Defects, FullWell, Gain, Response, Sensor};
 use qudi_core::{Camera, Frame, Light, Result, Size};
 
-/// How much more light than that of the capture the last step may use.
+/// Factor by which the light of the last step exceeds the light of the capture.
 const GROWTH: f64 = 10.0;
 
 /// The sensor and the light of the forward model at one timestep.
@@ -19,7 +19,7 @@ pub struct ForwardModel {
 }
 
 impl ForwardModel {
-    /// The forward model at a timestep.
+    /// Returns the forward model at a timestep.
     ///
     /// Light, and with it gain and full well, grow by `GROWTH^(1 - t / T)`, so that nothing saturates that
     /// did not in the capture. Sums of binary frames keep their light and get more frames instead.

@@ -182,7 +182,7 @@ impl Diffusion {
         self.predenoise_encoded(encoded, &input, simulated, conditioning.frames)
     }
 
-    /// Predicts the clean frames. `flows` are those of an earlier step; estimated if there are none.
+    /// Predicts the clean frames. `flows` come from an earlier step; they are estimated if there are none.
     pub fn forward(
         &self,
         encoded: &Encoded,
@@ -254,8 +254,8 @@ impl Diffusion {
         (fused, flows)
     }
 
-    /// Predicts the clean image, about in [-1, 1], and the scale of its correction: sigma of what is unknown
-    /// of the pre-denoised frames.
+    /// Predicts the clean image, about in [-1, 1], and the scale of the U-Net's correction: sigma of the
+    /// remaining error of the pre-denoised frames.
     ///
     /// # Shapes
     /// - results: `[images, 1, height, width]`

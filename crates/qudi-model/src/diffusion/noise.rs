@@ -31,7 +31,7 @@ impl Noise {
         (0..pixels).map(move |_| StandardNormal.sample(&mut random))
     }
 
-    /// A seed for photons of step `step`.
+    /// Returns a seed for the photons of step `step`.
     pub fn photon_seed(&self, step: usize) -> u64 {
         let mut seed = [0; 8];
         seed.copy_from_slice(&self.key[..8]);

@@ -17,7 +17,7 @@ const MAX_LOG_SNR: f32 = 4.0;
 
 /// The network's diffusion inputs, and how its output becomes an image; `[images, 1, H, W]` each.
 ///
-/// The names are those of Karras et al. 2022, table 1.
+/// The names follow Karras et al. 2022, table 1.
 #[derive(Clone, Debug)]
 pub(crate) struct Preconditioned {
     /// The pre-denoised image in [-1, 1]: the mean of what is possible before any noise is seen.
@@ -31,7 +31,7 @@ pub(crate) struct Preconditioned {
     pub(crate) previous: Tensor<4>,
     /// Half the logarithm of the ratio of the mean's errors to the noise.
     pub(crate) log_snr: Tensor<4>,
-    /// Sigma of what is unknown if errors are white.
+    /// Scale of the U-Net's correction: sigma of the remaining error if errors are white.
     pub(crate) c_out: Tensor<4>,
 }
 

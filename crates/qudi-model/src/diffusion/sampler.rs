@@ -32,8 +32,8 @@ pub struct Step {
 }
 
 impl Sampler {
-    /// The reverse steps, first to last: `count`, clamped to `1..=1000`, or fewer where their timesteps would
-    /// be the same. After the last one, `x` is the prediction.
+    /// Returns the reverse steps, first to last: `count`, clamped to `1..=1000`, or fewer where their
+    /// timesteps would be the same. After the last one, `x` is the prediction.
     pub fn steps(
         self,
         schedule: &NoiseSchedule,
@@ -66,7 +66,8 @@ impl Sampler {
 }
 
 impl Step {
-    /// The image after the step; `x0` is clamped to [-1, 1] before anything is derived from it.
+    /// Replaces `x` by the image after the step; `x0` is clamped to [-1, 1] before anything is derived from
+    /// it.
     pub fn advance(&self, x: &mut [f32], x0: &[f32], mut noise: impl Iterator<Item = f32>) {
         let (clean, noisy, sigma) = (self.clean as f32, self.noisy as f32, self.sigma as f32);
         for (x, &x0) in x.iter_mut().zip(x0) {

@@ -16,7 +16,7 @@ pub struct NoiseSchedule {
 }
 
 impl NoiseSchedule {
-    /// The cosine schedule over `timesteps` steps.
+    /// Returns the cosine schedule over `timesteps` steps.
     pub fn cosine(timesteps: usize) -> Self {
         let f = |t: usize| {
             let angle = (t as f64 / timesteps as f64 + OFFSET) / (1.0 + OFFSET)
@@ -34,22 +34,22 @@ impl NoiseSchedule {
         Self { alpha_bar }
     }
 
-    /// The number of timesteps.
+    /// Returns the number of timesteps.
     pub fn len(&self) -> usize {
         self.alpha_bar.len()
     }
 
-    /// Whether there are no timesteps.
+    /// Returns true if there are no timesteps.
     pub fn is_empty(&self) -> bool {
         self.alpha_bar.is_empty()
     }
 
-    /// The share of signal power left at timestep `t`; 1 before the first one (`None`).
+    /// Returns the share of signal power left at timestep `t`; 1 before the first one (`None`).
     pub fn alpha_bar(&self, t: Option<usize>) -> f64 {
         t.map_or(1.0, |t| self.alpha_bar[t])
     }
 
-    /// The first timestep whose noise has at least this sigma, or the last.
+    /// Returns the first timestep whose noise has at least this sigma, or the last.
     pub fn timestep_with_noise(&self, sigma: f64) -> usize {
         let timestep = self.alpha_bar.partition_point(|bar| 1.0 - bar < sigma * sigma);
         timestep.min(self.len() - 1)

@@ -19,7 +19,7 @@ pub struct DiffusionState {
 }
 
 impl DiffusionState {
-    /// The previous estimate, zero where there is none.
+    /// Returns the previous estimate, zero where there is none.
     pub(crate) fn previous(&self) -> Tensor<4> {
         self.x0_prev.clone() * self.has_previous_flag()
     }

@@ -26,7 +26,7 @@ pub enum TimestepSpacing {
     LogLogistic,
 }
 
-/// The timestep at a quantile in (0, 1) of the log-logistic law by which training draws timesteps.
+/// Returns the timestep at a quantile in (0, 1) of the log-logistic law by which training draws timesteps.
 ///
 /// Most lie where noise is about as large as what pre-denoisers leave wrong: much more noise hides all of
 /// that, much less hides nothing.
@@ -34,8 +34,8 @@ pub fn log_logistic_timestep(schedule: &NoiseSchedule, quantile: f64) -> usize {
     schedule.timestep_with_noise(MEDIAN_NOISE * (quantile / (1.0 - quantile)).powf(SCALE))
 }
 
-/// The timesteps that a sampler of `steps` steps visits, noisiest first, each once, and `None` (clean) at the
-/// end.
+/// Returns the timesteps that a sampler of `steps` steps visits, noisiest first, each once, and `None`
+/// (clean) at the end.
 ///
 /// These are the last timestep and quantiles of the log-logistic law, or `T s - 1` for `s` from 1 to 0,
 /// rounded half to even. `steps` is clamped to `1..=T`.

@@ -14,7 +14,7 @@ use crate::diffusion::{DiffusionConfig, Flows};
 use burn::tensor::Tensor;
 use burn::tensor::activation::silu;
 
-/// The sizes of a reference case, without the keys of what was removed.
+/// Returns the sizes of a reference case, without the keys of what was removed.
 pub(super) fn config(case: &Case<'_>) -> DiffusionConfig {
     let mut config = case.about["config"].clone();
     for (table, key) in [("pre", "neighbours"), ("flow", "registration"), ("unet", "temporal")] {
@@ -178,7 +178,7 @@ fn u_net_matches_pytorch() {
     check(&case, &[("x0", x0)], &inputs, &unet, "unet");
 }
 
-/// The share of the residual in the reference's prediction (Karras et al. 2022, table 1).
+/// Returns the share of the residual in the reference's prediction (Karras et al. 2022, table 1).
 fn c_skip(sigma: &Tensor<4>, timesteps: &[usize]) -> Tensor<4> {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let signal = timesteps.iter().map(|&t| schedule.alpha_bar(Some(t)) as f32).collect();

@@ -15,7 +15,7 @@ use qudi_core::Size;
 use qudi_core::restorer::Acquisition;
 use qudi_layers::tensor::{read, to_tensor};
 
-/// The squared error plus 0.01 of the total variation of the error, as the reference computes it.
+/// Computes the squared error plus 0.01 of the total variation of the error, as the reference computes it.
 fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
     let error = p - q;
     let [_, _, height, width] = error.dims();
@@ -162,7 +162,7 @@ fn ten_sampling_steps_match_pytorch() {
     }
 }
 
-/// The numbers of the paper's sensor at its lowest light.
+/// Returns the numbers of the paper's sensor at its lowest light.
 fn paper_numbers() -> [f32; SENSOR_NUMBERS] {
     let sensor = qudi_core::sensor::Sensor::load("qudi-paper").unwrap();
     sensor_numbers(&Acquisition::new(sensor, 3.25, 0.45).unwrap())

@@ -49,8 +49,8 @@ impl NeighbourWeighting {
     /// features that the neighbours have in common.
     ///
     /// # Shapes
-    /// - planes: `[images, (5 + 2 K) * fold^2, h, w]`: those of the frame alone, its counts last, then the
-    ///   counts of `K` neighbours and what is expected of them
+    /// - planes: `[images, (5 + 2 K) * fold^2, h, w]`: the planes of the frame alone, its counts last, then
+    ///   the counts of `K` neighbours and what is expected of them
     /// - result: `[images, 2 fold^2 + width, h, w]`
     pub(super) fn forward(&self, planes: &Tensor<4>) -> Tensor<4> {
         let cells = self.fold * self.fold;

@@ -141,8 +141,9 @@ pub(crate) struct PredenoisedFrames {
     pub(crate) noise_sigmas: Vec<Frame>,
 }
 
-/// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and its
-/// uncertainty if predicted. While the network works on one frame, the next is aligned, if there are threads for it.
+/// Pre-denoises the frames of a window one by one, as what `stage` says. `predenoise` gives the frame, and
+/// its uncertainty if predicted. While the network works on one frame, the next is aligned, if there are
+/// threads for it.
 pub(crate) fn predenoise_frames(
     stage: &'static str,
     burst: &AlignedBurst<'_>,
@@ -180,7 +181,7 @@ pub(crate) fn predenoise_frames(
 }
 
 /// Filters frames that were pre-denoised each for itself over time, and clamps them to [0, `max`].
-/// `noise_sigmas` are those of the merged frames.
+/// `noise_sigmas` belong to the merged frames.
 pub(crate) fn filter_over_time(
     burst: &AlignedBurst<'_>,
     frames: Vec<Frame>,
@@ -221,7 +222,7 @@ mod tests {
         (0..3).map(|t| (0..SIZE.pixels()).map(|i| count(i + 13 * t)).collect()).collect()
     }
 
-    /// A small network whose parameters are not zero.
+    /// Returns a small network whose parameters are not zero.
     fn network() -> (RegressionConfig, Regression) {
         let text = include_str!("../../../../tests/golden/regression.toml");
         let config = NetworkConfig::parse(text, "regression").unwrap_or_else(|e| panic!("{e}"));

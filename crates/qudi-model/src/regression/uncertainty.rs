@@ -34,7 +34,8 @@ impl RegressionConfig {
 }
 
 impl UncertaintyHead {
-    /// Predicts the sigma of the errors in image units, `[images, 1, H, W]`, from the pre-denoiser's `features`.
+    /// Predicts the sigma of the errors in image units, `[images, 1, H, W]`, from the pre-denoiser's
+    /// `features`.
     pub(crate) fn forward(&self, features: Tensor<4>, input: &NormalizedInput) -> Tensor<4> {
         let out = self.out.linear(&[self.enter.relu(&[features])]);
         let [least, most] = LOG_RANGE;

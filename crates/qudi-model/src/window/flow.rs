@@ -127,7 +127,8 @@ impl FlowLevel {
 }
 
 impl WindowFlow {
-    /// Returns the flow of every burst from frame `frame` to the next one, or to the one before: `[bursts, 2, h, w]`.
+    /// Returns the flow of every burst from frame `frame` to the next one, or to the one before:
+    /// `[bursts, 2, h, w]`.
     pub(super) fn of_frame(&self, frame: usize, next: bool, frames: usize) -> Tensor<4> {
         let [all, _, h, w] = self.pairs.dims();
         let half = all / 2;
@@ -137,8 +138,8 @@ impl WindowFlow {
         part.narrow(1, place, 1).reshape([bursts, 2, h, w])
     }
 
-    /// Computes the mean difference between true frames and their neighbours along the flow, `[1]`: the square
-    /// root of squares, smooth at zero.
+    /// Computes the mean difference between true frames and their neighbours along the flow, `[1]`: the
+    /// square root of squares, smooth at zero.
     ///
     /// # Shapes
     /// - truth: `[bursts * frames, 1, H, W]` in image units

@@ -50,8 +50,8 @@ impl Measurement {
     }
 }
 
-/// Sigma of usual errors in [-1, 1] from the variance of the linear estimate's noise in image units. Only a scale:
-/// 25 dB where the noise is 0.36 (3.25 PPP of `qudi-paper`), 33 dB where it is 0.1 (26 PPP).
+/// Sigma of usual errors in [-1, 1] from the variance of the linear estimate's noise in image units. Only a
+/// scale: 25 dB where the noise is 0.36 (3.25 PPP of `qudi-paper`), 33 dB where it is 0.1 (26 PPP).
 fn usual_error(variance: Tensor<4>) -> Tensor<4> {
     const AT_UNIT_NOISE: f32 = 0.2;
     const POWER: f32 = 0.6;

@@ -9,8 +9,8 @@ use qudi_layers::resample::mean_around;
 /// How sharply the best match wins.
 const SHARPNESS: f32 = 20.0;
 
-/// Squared difference, in image units, that noise alone makes between pre-denoised frames. Without it, flat parts
-/// jitter by pixels.
+/// Squared difference, in image units, that noise alone makes between pre-denoised frames. Without it, flat
+/// parts jitter by pixels.
 const NOISE_FLOOR: f32 = 0.008;
 
 /// The share of the mean difference that the floor gains: textures differ more everywhere.
@@ -19,8 +19,8 @@ const MEAN_SHARE: f32 = 0.15;
 /// Radius of the means over which a block is compared, in cells.
 const BLOCK_RADIUS: usize = 4;
 
-/// Estimates the motion of `reference` towards `neighbour` within `radius` cells: the expected displacement under a
-/// softmax of block differences and a prior towards none. No gradient flows through it.
+/// Estimates the motion of `reference` towards `neighbour` within `radius` cells: the expected displacement
+/// under a softmax of block differences and a prior towards none. No gradient flows through it.
 ///
 /// # Shapes
 /// - reference, neighbour: `[pairs, 1, h, w]` in image units

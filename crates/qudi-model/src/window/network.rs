@@ -124,8 +124,8 @@ impl Window {
 
     /// Predicts the clean frames from an encoded window and the noisy image.
     ///
-    /// At the noisiest timestep the noisy image says nothing and is not looked at: the prediction is the posterior
-    /// mean, whatever the noise.
+    /// At the noisiest timestep the noisy image says nothing and is not looked at: the prediction is the
+    /// posterior mean, whatever the noise.
     pub fn predict(
         &self,
         encoded: &EncodedWindow,

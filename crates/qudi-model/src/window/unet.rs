@@ -1,4 +1,5 @@
-//! The U-Net of a reverse step: fused features, the noisy image and the estimate so far in, the clean image out.
+//! The U-Net of a reverse step: fused features, the noisy image and the estimate so far in, the clean image
+//! out.
 
 use super::config::{FOLD, WindowConfig};
 use super::hourglass::{Hourglass, ImageHead};

@@ -1,4 +1,4 @@
-//! Samples of learned baselines: counts, the truth in their units, and frames that are held still.
+//! Samples of learned baselines: counts, the truth in their units, and static frames.
 
 use crate::burst_cache::BurstSampler;
 use crate::burst_cache::burst::ConditionedBurst;
@@ -10,7 +10,7 @@ use qudi_baselines::restorer::ExpectedCounts;
 use qudi_core::{Camera, Light, Result, Size};
 use qudi_layers::tensor::to_tensor;
 
-/// Makes the photons of frames that are held still others than those of the moving scene.
+/// Changes the seed of static frames, so that their photons differ from the photons of the moving scene.
 const STILL: u64 = 0x5EED_0057_1177;
 
 /// The samples of one pass, values over full scale.
@@ -57,7 +57,7 @@ impl CountBatch {
         Ok(batch)
     }
 
-    /// The batch on `device`.
+    /// Copies the batch to `device`.
     pub(super) fn on(&self, device: &Device) -> Bursts {
         let tensor = |values: &Vec<f32>| to_tensor(values.clone(), self.size, device);
         Bursts {

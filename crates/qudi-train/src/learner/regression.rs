@@ -98,8 +98,8 @@ impl Learner for Regression {
         })
     }
 
-    /// Creates the restorer of the whole network. While the refinement learns, the second pre-denoiser changes
-    /// nothing: its last layer is zero.
+    /// Creates the restorer of the whole network. While the refinement learns, the second pre-denoiser
+    /// changes nothing: its last layer is zero.
     fn restorer(&self, recipe: &Recipe, device: &Device) -> Result<Box<dyn Restorer>> {
         let config = recipe.network.regression()?.clone();
         let model = Model { network: self.clone(), config, window: recipe.window() };

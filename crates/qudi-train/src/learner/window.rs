@@ -124,15 +124,15 @@ impl Learner for Window {
         learning(self, recipe)
     }
 
-    /// Steps of Muon have full size whatever the gradient: outputs and flow, whose gradients are noise at first, would
-    /// walk at random.
+    /// Steps of Muon have full size whatever the gradient: outputs and flow, whose gradients are noise at
+    /// first, would walk at random.
     fn prefers_adam(name: &str) -> bool {
         name.starts_with("flow.") || name.ends_with("out.weight")
     }
 }
 
-/// Makes the network's own estimate from noisier images, without gradient; none at the noisiest timestep, where
-/// sampling begins.
+/// Makes the network's own estimate from noisier images, without gradient; none at the noisiest timestep,
+/// where sampling begins.
 fn first_estimate(
     network: &Window,
     encoded: &EncodedWindow,

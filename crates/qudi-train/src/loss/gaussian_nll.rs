@@ -2,8 +2,8 @@
 
 use burn::tensor::Tensor;
 
-/// Computes the mean negative log-likelihood of errors under a normal law of standard deviation `sigma`, without its
-/// constant (Kendall and Gal 2017, eq. 5). It is least where `sigma` is the size of the errors.
+/// Computes the mean negative log-likelihood of errors under a normal law of standard deviation `sigma`,
+/// without its constant (Kendall and Gal 2017, eq. 5). It is least where `sigma` is the size of the errors.
 ///
 /// # Shapes
 /// - error, sigma: `[images, 1, height, width]`

@@ -40,7 +40,7 @@ pub const PERCEPTUAL_KINDS: &[PerceptualKind] =
     &[PerceptualKind::None, PerceptualKind::LpipsVgg, PerceptualKind::LpipsAlex];
 
 impl PerceptualKind {
-    /// The name of the kind in recipes.
+    /// Returns the name of the kind in recipes.
     pub fn name(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -49,7 +49,7 @@ impl PerceptualKind {
         }
     }
 
-    /// The kind of this name.
+    /// Returns the kind of this name.
     ///
     /// # Errors
     /// [`Error::Request`] that lists the names.
@@ -164,7 +164,7 @@ impl Lpips {
         ))
     }
 
-    /// The mean over all images of the distance of `p` from `q`.
+    /// Returns the mean over all images of the distance of `p` from `q`.
     ///
     /// # Shapes
     /// - p, q: `[images, 1, height, width]` in [0, 1], of a size that [`check`](Self::check) accepts, on the
@@ -174,7 +174,7 @@ impl Lpips {
         self.distances(p, q).mean()
     }
 
-    /// The distance of every image of `p` from that of `q`; 0 for equal images.
+    /// Returns the distance of every image of `p` from the image of `q`; 0 for equal images.
     ///
     /// # Shapes
     /// - p, q: as for [`loss`](Self::loss)

@@ -26,7 +26,7 @@ pub fn reconstruction(p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
 }
 
 /// Computes [`reconstruction`] with errors in a unit of their own for every burst. Otherwise a few dark
-/// bursts, whose errors are thirty times those of bright ones, would decide.
+/// bursts, whose errors are thirty times as large as errors of bright ones, would decide.
 ///
 /// # Shapes
 /// - estimate, truth: `[bursts * frames, 1, height, width]` in [0, 1]

@@ -2,12 +2,12 @@
 
 use burn::tensor::Tensor;
 
-/// The error from which on the loss grows linearly: saturated pixels, whose errors are many times the usual one,
-/// would decide otherwise.
+/// The error from which on the loss grows linearly: saturated pixels, whose errors are many times the usual
+/// one, would decide otherwise.
 const LINEAR_FROM: f32 = 4.0;
 
-/// Computes `mean 2 d^2 (sqrt(1 + (e / d)^2) - 1)` of errors in units of their usual size: about `e^2` where it is
-/// small.
+/// Computes `mean 2 d^2 (sqrt(1 + (e / d)^2) - 1)` of errors in units of their usual size: about `e^2` where
+/// it is small.
 ///
 /// # Shapes
 /// - error: `[images, 1, height, width]`

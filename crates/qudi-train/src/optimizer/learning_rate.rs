@@ -3,7 +3,7 @@
 use crate::recipe::TrainConfig;
 use std::f64::consts::PI;
 
-/// The rate of step `step`, from 0.
+/// Returns the rate of step `step`, from 0.
 pub fn learning_rate(config: &TrainConfig, step: u64) -> f64 {
     if step < config.warmup {
         return config.lr * (step + 1) as f64 / config.warmup as f64;

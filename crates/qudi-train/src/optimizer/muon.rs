@@ -1,5 +1,5 @@
-//! Steps along orthogonal matrices (Muon; Jordan et al. 2024): every singular direction of a layer's weights moves by
-//! as much as every other, also those whose gradients are small.
+//! Steps along orthogonal matrices (Muon; Jordan et al. 2024): every singular direction of a layer's weights
+//! moves by as much as every other, also those whose gradients are small.
 
 use burn::tensor::Tensor;
 
@@ -10,7 +10,8 @@ pub(super) const MOMENTUM: f64 = 0.95;
 const NEWTON_SCHULZ: [f64; 3] = [3.4445, -4.7750, 2.0315];
 const ROUNDS: usize = 5;
 
-/// The root mean square of a step at a learning rate of 1: about that of Adam's (Liu et al. 2025, section 2.2).
+/// The root mean square of a step at a learning rate of 1: about as large as with Adam (Liu et al. 2025,
+/// section 2.2).
 const STEP: f64 = 0.2;
 
 /// Rows and columns of the weights of a layer as a matrix, outputs by inputs; nothing for biases and scales.
@@ -20,7 +21,7 @@ pub(super) fn matrix(shape: &[usize]) -> Option<[usize; 2]> {
     (rows > 1 && columns > 1).then_some([rows, columns])
 }
 
-/// The step at a learning rate of 1 for a matrix with these rows and columns.
+/// Returns the step at a learning rate of 1 for a matrix with these rows and columns.
 ///
 /// # Shapes
 /// - momentum: `[rows * columns]`
@@ -35,11 +36,11 @@ pub(super) fn step(momentum: Tensor<1>, [rows, columns]: [usize; 2]) -> Tensor<1
     matrix.reshape([rows * columns])
 }
 
-/// Norms below it count as it, so that a layer without gradient comes to rest: what is left of its mean shrinks until
-/// its squares are zero in 32 bits, and nothing may be divided by their sum.
+/// Lower bound of the norm. Without gradient the mean of a layer shrinks until its squares are zero in 32
+/// bits; the bound prevents a division by zero, and the layer no longer changes.
 const LEAST_NORM: f32 = 1e-7;
 
-/// The matrix, `[rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay zeros.
+/// Returns the matrix, `[rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay zeros.
 fn orthogonalized(matrix: Tensor<2>) -> Tensor<2> {
     let norm = matrix.clone().powi_scalar(2).sum().sqrt().clamp_min(LEAST_NORM);
     let mut x = matrix / norm.reshape([1, 1]);

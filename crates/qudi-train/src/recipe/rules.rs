@@ -111,7 +111,7 @@ impl Recipe {
         ]
     }
 
-    /// The rule of the parts of the regression that learn.
+    /// Returns the rule of the parts of the regression that learn.
     fn regression_rule(&self) -> Rule<'static> {
         let learns = &self.train.learns;
         let second = [LearningPart::Pre, LearningPart::Uncertainty];

@@ -55,7 +55,8 @@ impl LearningPart {
 }
 
 impl Recipe {
-    /// The recipes of all stages, in their order, with the stages' names; none for a recipe without stages.
+    /// Returns the recipes of all stages, in their order, with the stages' names; none for a recipe without
+    /// stages.
     ///
     /// # Errors
     /// [`Error`] if a stage changes a key that is none, or makes a recipe that cannot be.

@@ -15,7 +15,7 @@ pub struct LossValues {
 }
 
 impl LossValues {
-    /// A term by name; 0 of a network that has none of this name.
+    /// Returns a term by name; 0 for a network without a term of this name.
     pub fn term(&self, name: &str) -> f64 {
         self.terms.iter().find(|(term, _)| *term == name).map_or(0.0, |(_, value)| *value)
     }

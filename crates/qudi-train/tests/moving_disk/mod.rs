@@ -41,7 +41,7 @@ pub(crate) fn tiny() -> DiffusionConfig {
     config
 }
 
-/// A burst of a scene whose values are these, on the ground's upper border and on the disk.
+/// Returns a burst of a scene whose values are these, on the ground's upper border and on the disk.
 pub(crate) fn burst([ground, disk]: [f32; 2], size: Size, frames: usize, device: &Device) -> Burst {
     let sensor = Sensor::load("qudi-paper").unwrap();
     let light = Light { ppp: 3.25, mean_level: 0.45 };

@@ -175,8 +175,8 @@ fn light(demo: &Demo, sensor: &Sensor, truths: &[Frame]) -> Result<Light> {
     Ok(resolve_light(sensor, PppDefinition::Incident, demo.ppp, None, &clip, dark)?)
 }
 
-/// How the centre frame of `result` varies where the photons are drawn again, as if it were the truth: what a
-/// capture without truth can tell of its errors (Efron 1979, the parametric bootstrap).
+/// Estimates how the centre frame of `result` varies where the photons are drawn again, as if it were the
+/// truth: what a capture without truth can tell of its errors (Efron 1979, the parametric bootstrap).
 fn redrawn(
     method: &mut dyn Restorer,
     result: &[Frame],

@@ -64,7 +64,8 @@ mod tests {
         })
     }
 
-    /// The values of GMSD, SSIMULACRA 2, butteraugli and detail in the flattest quarter, no gain applied.
+    /// Returns the values of GMSD, SSIMULACRA 2, butteraugli and detail in the flattest quarter, no gain
+    /// applied.
     fn values(image: &Frame, truth: &Frame) -> Result<Vec<f64>> {
         let compared = Compared {
             aligned: image.clone(),

@@ -91,8 +91,8 @@ pub(crate) struct Eval {
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, conflicts_with = "capture")]
     pub(crate) backbones: Option<PathBuf>,
     /// Measure appearance as well, after the best gain: GMSD, SSIMULACRA 2, butteraugli, detail over the
-    /// truth's in the flattest and the most textured quarter; under the strict protocol also errors over their
-    /// predicted uncertainty, and what more --steps add over what is missing, octave by octave
+    /// truth's in the flattest and the most textured quarter; under the strict protocol also errors over
+    /// their predicted uncertainty, and what more --steps add over what is missing, octave by octave
     #[arg(long, conflicts_with = "capture")]
     pub(crate) appearance: bool,
     /// Exit with 1 if a method's mean psnr-a over all frames is lower anywhere

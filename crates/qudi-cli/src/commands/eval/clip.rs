@@ -160,8 +160,8 @@ pub(crate) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Returns the names of clips: of files without the extension, of folders in full, since `run.1` and `run.2` are two
-/// clips. Files that differ in the extension alone keep it.
+/// Returns the names of clips: of files without the extension, of folders in full, since `run.1` and `run.2`
+/// are two clips. Files that differ in the extension alone keep it.
 fn clip_names(clips: &[PathBuf]) -> Vec<String> {
     let names: Vec<String> = clips.iter().map(|path| stem(path)).collect();
     let is_unique = |name: &String| names.iter().filter(|other| *other == name).count() == 1;

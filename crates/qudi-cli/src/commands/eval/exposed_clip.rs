@@ -115,8 +115,8 @@ impl ExposedClip {
         Ok((score, sink.frames))
     }
 
-    /// Scores a method under the protocol of QUIVER's public code, seeded: every window of 11 frames, one frame
-    /// apart, is exposed anew with its own mean at `ppp`, and its middle frame scored.
+    /// Scores a method under the protocol of QUIVER's public code, seeded: every window of 11 frames, one
+    /// frame apart, is exposed anew with its own mean at `ppp`, and its middle frame scored.
     pub(super) fn score_windows(&self, contender: &Contender) -> Result<Score> {
         const WINDOW: usize = 11;
         let truth = &self.photons.truth;

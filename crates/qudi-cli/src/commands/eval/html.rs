@@ -149,8 +149,8 @@ fn quality(rows: &[Row]) -> Plot {
     }
 }
 
-/// Plots perception against distortion (Blau and Michaeli 2018): the numbers of steps of a method as a curve, one
-/// for every light level. None where no metric of perception was measured.
+/// Plots perception against distortion (Blau and Michaeli 2018): the numbers of steps of a method as a curve,
+/// one for every light level. None where no metric of perception was measured.
 fn perception(rows: &[Row]) -> Option<Plot> {
     let metrics: [(&'static str, &Metric); 3] =
         [("LPIPS (VGG)", &LPIPS_VGG), ("LPIPS (Alex)", &LPIPS_ALEX), ("GMSD", &GMSD)];

@@ -174,7 +174,8 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     Ok(Evaluation { rows, pictures, about, settings })
 }
 
-/// Adds the scores of every method on a clip to the rows of its light level, and the pictures to the others of it.
+/// Adds the scores of every method on a clip to the rows of its light level, and the pictures to the others
+/// of it.
 fn score_all(
     plan: &Plan,
     clip: &ExposedClip,

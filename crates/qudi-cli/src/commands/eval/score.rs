@@ -37,8 +37,8 @@ impl Serialize for FrameScore {
     }
 }
 
-/// Energy that diffusion steps added to the result of the fewest ones, and energy that the latter missed: root mean
-/// squares of a pixel in every octave, finest first.
+/// Energy that diffusion steps added to the result of the fewest ones, and energy that the latter missed:
+/// root mean squares of a pixel in every octave, finest first.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(crate) struct Added {
     pub(crate) added: [f64; OCTAVES],

@@ -84,7 +84,8 @@ pub(crate) fn looks(rows: &[Row]) -> Vec<(&'static str, Table)> {
     tables.into_iter().filter_map(|(title, table)| Some((title, table?))).collect()
 }
 
-/// Returns metrics of appearance, one row for every method and light level; none where they were not measured.
+/// Returns metrics of appearance, one row for every method and light level; none where they were not
+/// measured.
 fn appearance(rows: &[Row]) -> Option<Table> {
     rows.iter().find(|row| row.over_clips(&GMSD).is_some())?;
     let shown = || METRICS.iter().filter(|metric| metric.is_appearance());
@@ -116,8 +117,8 @@ fn added(rows: &[Row]) -> Option<Table> {
     (!table.rows.is_empty()).then_some(table)
 }
 
-/// Returns one row for every method, light level, clip and frame; with steps where they are compared, and metrics
-/// of appearance where they were measured.
+/// Returns one row for every method, light level, clip and frame; with steps where they are compared, and
+/// metrics of appearance where they were measured.
 pub(crate) fn frames(rows: &[Row]) -> Table {
     let all = || rows.iter().flat_map(|row| &row.scores).flat_map(|score| &score.frames);
     let is_listed = |metric: &&Metric| {

@@ -41,8 +41,8 @@ pub(super) fn methods(network: &NetworkOptions) -> Vec<&'static Method> {
     PAPER.iter().filter_map(|(name, _)| Method::by_name(name)).filter(can_run).collect()
 }
 
-/// Makes the table, with the paper's figures if the light is the paper's. Methods without weights for this light and
-/// sensor say so.
+/// Makes the table, with the paper's figures if the light is the paper's. Methods without weights for this
+/// light and sensor say so.
 pub(super) fn table(rows: &[Row], has_light_of_paper: bool) -> Table {
     let mut table = Table::new(vec![
         Column::new("method", "method"),

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 
 /// A first look at a capture, in about a second: what it is, its light, a mean, one instant restored
 ///
-/// Prints what `qudi info` does and what `qudi restore` would do, and writes one page: the mean of the capture
-/// next to one instant of it, aligned and merged.
+/// Prints what `qudi info` does and what `qudi restore` would do, and writes one page: the mean of the
+/// capture next to one instant of it, aligned and merged.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Look {
     /// The capture: a file or a folder in any format

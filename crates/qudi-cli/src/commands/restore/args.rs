@@ -58,8 +58,8 @@ pub(crate) struct Restore {
     /// number of frames summed (--sum), sums slide
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     pub(crate) every: Option<u64>,
-    /// Tone curve of what is written: none (values follow the light, as in the clip), or srgb, which brightens
-    /// shadows for the eye
+    /// Tone curve of what is written: none (values follow the light, as in the clip), or srgb, which
+    /// brightens shadows for the eye
     #[arg(long, value_name = "CURVE", default_value = "none")]
     pub(crate) tonemap: Tonemap,
     /// Frames per second of what plays (.gif, .mp4, Y4M) [default: 25; the capture's own rate is in the

@@ -198,7 +198,8 @@ impl Job {
         Ok(settings)
     }
 
-    /// The entries of the manifest of an output folder. Weights are among the settings by their SHA-256.
+    /// Returns the entries of the manifest of an output folder. Weights are among the settings by their
+    /// SHA-256.
     fn folder_run(&self, plan: &Plan, settings: &Value) -> Result<FolderRun> {
         let mut inputs = Inputs::default();
         let to_folder = Path::new(&plan.output).extension().is_none() && plan.output != "-";
@@ -316,7 +317,7 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
     sensor.fps.map(|fps| fps / f64::from(sensor.frames_summed))
 }
 
-/// The settings of the network that frames depend on, where it makes them.
+/// Returns the settings of the network on which the frames depend, if the method is a network.
 fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<Value>> {
     Ok(match method.kind {
         Kind::Classical(_) => None,

@@ -1,7 +1,7 @@
 //! The sinusoidal embedding of timesteps (Vaswani et al. 2017, section 3.5).
 
-/// Computes sines, then cosines, of `t * 10000^(-j / (size / 2 - 1))` for every timestep; in f64, for the angles are
-/// large.
+/// Computes sines, then cosines, of `t * 10000^(-j / (size / 2 - 1))` for every timestep; in f64, for the
+/// angles are large.
 pub(crate) fn sinusoids(timesteps: &[usize], size: usize) -> Vec<f32> {
     let half = size / 2;
     let scale = (half.max(2) - 1) as f64;

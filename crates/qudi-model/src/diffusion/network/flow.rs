@@ -138,8 +138,8 @@ impl Flows {
         Self { to_next, to_prev, scale, coarser: Vec::new() }
     }
 
-    /// Computes the mean absolute difference between warped neighbours and frames, `[1]`, on the grid of every level that
-    /// was kept: the mean over levels.
+    /// Computes the mean absolute difference between warped neighbours and frames, `[1]`, on the grid of
+    /// every level that was kept: the mean over levels.
     ///
     /// # Shapes
     /// - images, the true frames: `[bursts * frames, 1, height, width]`
@@ -168,7 +168,8 @@ impl Flows {
     }
 }
 
-/// Returns the next frame of every frame, or the one before; at the ends the frame itself, where the flow is zero.
+/// Returns the next frame of every frame, or the one before; at the ends the frame itself, where the flow is
+/// zero.
 pub(super) fn shifted(x: Tensor<4>, frames: usize, next: bool) -> Tensor<4> {
     let [images, c, h, w] = x.dims();
     let x = by_burst(x, frames);

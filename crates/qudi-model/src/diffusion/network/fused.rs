@@ -90,8 +90,8 @@ impl Fused {
         }
     }
 
-    /// Computes the sum of the features and the encoded sensors times these gradients: its gradient is what is left to
-    /// do for them.
+    /// Computes the sum of the features and the encoded sensors times these gradients: its gradient is what
+    /// is left to do for them.
     pub fn product(&self, gradient: &FusedGradient) -> Tensor<1> {
         let features = self.pyramid.iter().zip(&gradient.pyramid);
         features
@@ -119,7 +119,8 @@ impl Fused {
 }
 
 impl FusedGradient {
-    /// Joins the gradients for all bursts of `frames` frames from those of their parts, in their order.
+    /// Joins the gradients for all bursts of `frames` frames from the gradients of their parts, in their
+    /// order.
     ///
     /// # Panics
     /// Without parts.

@@ -63,8 +63,8 @@ impl FusionConfig {
 }
 
 impl Fusion {
-    /// Fuses the features of measurements, noisy image and pre-denoiser (level 0), on three levels. With `alone`, no
-    /// frame sees another.
+    /// Fuses the features of measurements, noisy image and pre-denoiser (level 0), on three levels. With
+    /// `alone`, no frame sees another.
     pub(crate) fn forward(
         &self,
         low: Pyramid,
@@ -126,7 +126,7 @@ impl Cell {
             let [bursts, _, c, h, w] = x.dims();
             x.clone().narrow(1, i, 1).reshape([bursts, c, h, w])
         };
-        // Both sweeps run at once: frame i forward beside frame N - 1 - i backward.
+        // Both sweeps run at once: frame i forward with frame N - 1 - i backward.
         let mut state: Option<Tensor<4>> = None;
         let (mut forward, mut backward) = (Vec::new(), Vec::new());
         for i in 0..frames {

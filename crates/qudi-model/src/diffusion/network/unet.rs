@@ -191,8 +191,8 @@ impl UNet {
         self.time_out.forward(silu(self.time_in.forward(angles))) + sensor
     }
 
-    /// Computes the output of the U-Net, `[images, 1, H, W]`. `planes` are images that it sees besides the fused
-    /// features; `timesteps` has one number for each burst; `sensor` is as from [`Self::encode`].
+    /// Computes the output of the U-Net, `[images, 1, H, W]`. `planes` are images that it sees besides the
+    /// fused features; `timesteps` has one number for each burst; `sensor` is as from [`Self::encode`].
     pub(crate) fn forward(
         &self,
         planes: Vec<Tensor<4>>,

@@ -14,8 +14,8 @@ use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{Diffusion, Part, Simulated};
 use rayon::prelude::*;
 
-/// Self-conditioning: a first pass makes the estimate that the network is given, as after the first step of sampling
-/// (Chen et al. 2023, "Analog Bits", section 3.2).
+/// Self-conditioning: a first pass makes the estimate that the network is given, as after the first step of
+/// sampling (Chen et al. 2023, "Analog Bits", section 3.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SelfConditioning {
     /// The network starts from nothing.
@@ -66,8 +66,9 @@ pub(in crate::learner) fn noisy_images(
     clean * signal + example.noise.clone() * noise
 }
 
-/// Makes the network's own estimate from the noisier images `x_t` of the timesteps `previous`, without gradient, and its
-/// simulated measurement. Bursts at the noisiest timestep have neither: there sampling starts.
+/// Makes the network's own estimate from the noisier images `x_t` of the timesteps `previous`, without
+/// gradient, and its simulated measurement. Bursts at the noisiest timestep have neither: there sampling
+/// starts.
 fn first_estimate(
     network: &Diffusion,
     example: &Example<'_>,

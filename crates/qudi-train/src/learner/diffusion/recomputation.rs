@@ -1,5 +1,6 @@
-//! Gradient checkpointing (Chen et al. 2016) of pre-denoiser and U-Net, whose activations take most of the memory:
-//! the forward pass keeps their results alone, and the backward pass computes them again, image by image.
+//! Gradient checkpointing (Chen et al. 2016) of pre-denoiser and U-Net, whose activations take most of the
+//! memory: the forward pass keeps their results alone, and the backward pass computes them again, image by
+//! image.
 
 use crate::parameters::gradients;
 use burn::module::Module;
@@ -36,7 +37,7 @@ pub(super) struct Recomputation {
     pub(super) of_flows: Option<Tensor<1>>,
 }
 
-/// A result of the forward pass that a gradient is wanted for.
+/// Joins the parts of a result of the forward pass into a leaf that gets a gradient.
 fn leaf(parts: Vec<Tensor<4>>) -> Tensor<4> {
     Tensor::from_inner(Tensor::cat(parts, 0)).require_grad()
 }

@@ -28,8 +28,8 @@ impl TimestepLaw {
     }
 }
 
-/// Returns the timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale of their
-/// roots.
+/// Returns the timestep of the estimate before `timestep`: noisier by a tenth of all timesteps, on the scale
+/// of their roots.
 pub(in crate::learner) fn previous_timestep(timestep: usize) -> usize {
     let all = NUM_TIMESTEPS as f64;
     let share = ((timestep + 1) as f64 / all).sqrt() + 0.1;

@@ -22,7 +22,7 @@ impl Net {
         }
     }
 
-    /// The shortest side of an image that reaches the last layer, in pixels.
+    /// Returns the shortest side of an image that reaches the last layer, in pixels.
     pub(super) fn smallest_side(self) -> usize {
         match self {
             Self::Vgg => 16,
@@ -31,7 +31,7 @@ impl Net {
     }
 }
 
-/// A layer by its sizes. Names of weights are those of torchvision's `features`.
+/// A layer by its sizes. Weights have the names of torchvision's `features`.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Layer {
     /// A convolution and a ReLU.
@@ -154,7 +154,7 @@ impl Backbone {
         Ok(Self { steps, taps })
     }
 
-    /// The features at every tap.
+    /// Computes the features at every tap.
     ///
     /// # Shapes
     /// - planes: `[images, 2, height, width]`, as [`super::gray::planes`] gives them

@@ -14,7 +14,7 @@ const SIZE: Size = Size { height: 64, width: 75 };
 
 const NETS: [(&str, Net); 2] = [("vgg", Net::Vgg), ("alex", Net::Alex)];
 
-/// The reference's weights, by its formula.
+/// Returns the reference's weights, by its formula.
 fn weights(net: &str, name: &str, shape: &[usize]) -> Vec<f32> {
     let values = uniform(&format!("{net}.{name}"), shape.iter().product());
     let fan_in: usize = shape.iter().skip(1).product();
@@ -30,7 +30,7 @@ fn weights(net: &str, name: &str, shape: &[usize]) -> Vec<f32> {
     values.into_iter().map(|value| scaled(value) as f32).collect()
 }
 
-/// The distances with the reference's weights, made once on flex: VGG16's take a while.
+/// Returns the distances with the reference's weights, made once on flex: VGG16's take a while.
 fn lpips(name: &str) -> Lpips {
     static ALL: OnceLock<Vec<Lpips>> = OnceLock::new();
     let all = ALL.get_or_init(|| NETS.map(|(name, net)| make(name, net, &Device::flex())).into());

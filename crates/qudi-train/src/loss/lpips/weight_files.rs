@@ -4,8 +4,8 @@ use super::backbone::Net;
 use qudi_core::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Returns the names that the backbone's file may have (torchvision's, Burn's), and those of the heads' file (Burn's,
-/// the authors').
+/// Returns the names that the files may have: of the backbone (torchvision's, Burn's), and of the heads
+/// (Burn's, the authors').
 fn names(net: Net) -> [[&'static str; 2]; 2] {
     match net {
         Net::Vgg => [["vgg16-397923af.pth", "vgg_backbone.pth"], ["vgg_lpips.pth", "vgg.pth"]],
@@ -26,7 +26,8 @@ fn converted(net: Net) -> &'static str {
 /// Returns the paths of backbone and heads, which may be one file, in `folder` or in [`cache_folder`].
 ///
 /// # Errors
-/// [`Error::Request`] that names the missing files, where they were looked for, and the script that makes them.
+/// [`Error::Request`] that names the missing files, where they were looked for, and the script that makes
+/// them.
 pub(super) fn find(net: Net, folder: Option<&Path>) -> Result<[PathBuf; 2]> {
     let folders: Vec<PathBuf> =
         folder.map(Path::to_owned).into_iter().chain(cache_folder()).collect();
@@ -60,8 +61,8 @@ fn locate(net: Net, folders: &[PathBuf]) -> Result<[PathBuf; 2]> {
     ))
 }
 
-/// Returns the folder of Burn's own LPIPS downloads, which is searched after a given one; none if the system names
-/// no home.
+/// Returns the folder of Burn's own LPIPS downloads, which is searched after a given one; none if the system
+/// names no home.
 pub fn cache_folder() -> Option<PathBuf> {
     let variable =
         |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
