@@ -62,6 +62,21 @@ mod flex {
     use burn::backend::flex::FlexTensor;
     use std::sync::Arc;
 
+    /// Computes a stack, and keeps its activations if asked for.
+    fn computed(
+        inputs: Vec<FlexTensor>,
+        parameters: FlexTensor,
+        stack: &Stack,
+        keeps: bool,
+    ) -> (FlexTensor, Arc<Activations>) {
+        let inputs: Vec<_> = inputs.into_iter().map(contiguous).collect();
+        let slices: Vec<_> = inputs.iter().map(values).collect();
+        let parameters = contiguous(parameters);
+        let (output, activations) = forward(stack, &slices, values(&parameters), keeps);
+        let shape = [stack.images, stack.features, stack.height, stack.width];
+        (tensor(output, shape), activations)
+    }
+
     impl StackBackend for Flex {
         fn residual_stack(
             a: FlexTensor,
@@ -74,7 +89,7 @@ mod flex {
             stack: Stack,
         ) -> FlexTensor {
             let inputs = [a, b, c, d, e, f].into_iter().take(stack.inputs.len()).collect();
-            Self::residual_stack_kept(inputs, parameters, &stack).0
+            computed(inputs, parameters, &stack, false).0
         }
     }
 
@@ -86,12 +101,7 @@ mod flex {
             parameters: FlexTensor,
             stack: &Stack,
         ) -> (FlexTensor, Arc<Activations>) {
-            let inputs: Vec<_> = inputs.into_iter().map(contiguous).collect();
-            let slices: Vec<_> = inputs.iter().map(values).collect();
-            let parameters = contiguous(parameters);
-            let (output, activations) = forward(stack, &slices, values(&parameters));
-            let shape = [stack.images, stack.features, stack.height, stack.width];
-            (tensor(output, shape), activations)
+            computed(inputs, parameters, stack, true)
         }
 
         fn residual_stack_gradients(

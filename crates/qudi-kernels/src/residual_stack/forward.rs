@@ -106,11 +106,13 @@ pub(super) fn correlate(grid: &Grid, inputs: &Line, gradient: &Line) -> Gradient
     }
 }
 
-/// Computes the features, `[images, features, height, width]`, and what the gradient needs.
+/// Computes the features, `[images, features, height, width]`, and the activations that the gradient needs, which
+/// are only kept if asked for.
 pub(super) fn forward(
     stack: &Stack,
     inputs: &[&[f32]],
     parameters: &[f32],
+    keeps: bool,
 ) -> (Vec<f32>, Arc<Activations>) {
     let convolutions = convolutions(stack, parameters);
     let tiles: Vec<Tiles> =
@@ -129,10 +131,10 @@ pub(super) fn forward(
             let activations = forward_group(group, &inputs, &convolutions, &tiles);
             let last = &activations.features[stack.blocks];
             last.write_planes(&activations.grid, 0, stack.features, output);
-            activations
+            keeps.then_some(activations)
         };
         let parts = output.par_chunks_mut(group_size).zip(&groups).enumerate();
-        results = parts.map(work).collect();
+        results = parts.filter_map(work).collect();
     });
     (output, Arc::new(Activations(results)))
 }
