@@ -1,6 +1,6 @@
 //! The list of learned methods, and what the folder of each gives to files, training and restoring.
 //!
-//! A new method is a folder with an implementation of [`LearnedMethod`], and a line in [`methods!`].
+//! A new method is a folder with an implementation of `LearnedMethod`, and a line in `methods!`.
 
 use crate::emvd::{self, Emvd};
 use crate::flornn::{self, FloRnn};

@@ -32,7 +32,7 @@ const DEFAULT: &str = "default";
 #[derive(Debug)]
 pub(crate) struct Settings {
     command: &'static str,
-    /// The value of every key, in the order of [`keys`], with its origin.
+    /// The value of every key, in the order of [`keys()`], with its origin.
     values: Vec<(Value, String)>,
     /// Keys of a recipe that were set, with value and origin.
     recipe: Vec<(String, Value, String)>,
