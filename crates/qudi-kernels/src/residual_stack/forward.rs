@@ -106,8 +106,8 @@ pub(super) fn correlate(grid: &Grid, inputs: &Line, gradient: &Line) -> Gradient
     }
 }
 
-/// Computes the features, `[images, features, height, width]`, and the activations that the gradient needs, which
-/// are only kept if asked for.
+/// Computes the features, `[images, features, height, width]`, and the activations that the gradient needs,
+/// if `keeps` says so.
 pub(super) fn forward(
     stack: &Stack,
     inputs: &[&[f32]],
