@@ -37,6 +37,8 @@ mod weight_gradient;
 mod weight_tiles;
 
 pub use geometry::Geometry;
+#[cfg(feature = "flex")]
+pub(crate) use scratch::upper;
 
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 pub(crate) use amx::agrees as tiles_multiply;

@@ -60,7 +60,7 @@ impl Format {
 
 /// Returns the upper half of a value's bits, rounded to the nearest, ties to even.
 #[inline(always)]
-pub(super) fn upper(x: f32) -> u32 {
+pub(crate) fn upper(x: f32) -> u32 {
     let bits = x.to_bits();
     let rounded = bits.wrapping_add(0x7fff + (bits >> 16 & 1));
     // The carry must not turn NaN into another number.

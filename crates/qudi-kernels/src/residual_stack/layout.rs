@@ -2,6 +2,7 @@
 #![allow(unsafe_code)]
 
 use super::grid::{Grid, TILE};
+use crate::conv::upper;
 use rayon::prelude::*;
 
 /// Channels of a block: one row of a tile.
@@ -29,11 +30,10 @@ impl<T> Shared<T> {
     }
 }
 
-/// Rounds to bfloat16, half to even.
+/// Rounds to bfloat16.
 #[inline(always)]
 pub(super) fn narrow(value: f32) -> u16 {
-    let bits = value.to_bits();
-    ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) as u16
+    upper(value) as u16
 }
 
 #[inline(always)]

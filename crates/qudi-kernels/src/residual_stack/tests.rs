@@ -1,9 +1,8 @@
-//! The fused stack, on a model of the unit, against single convolutions.
+//! The fused stack against single convolutions: here on a model of the unit, in `tests/` on the unit.
 
-use super::*;
-use crate::matrix_units::with_matrix_units;
-use crate::precision::with_precision;
-use burn::tensor::{Device, TensorData};
+use super::{ComputePrecision, MatrixUnits, residual_stack};
+use crate::{with_matrix_units, with_precision};
+use burn::tensor::{Device, Tensor, TensorData};
 
 fn random<const D: usize>(seed: u64, shape: [usize; D], size: f32, device: &Device) -> Tensor<D> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
@@ -65,7 +64,12 @@ fn run(case: &Case, units: MatrixUnits, bias: f32) -> Vec<Vec<f32>> {
 
 /// Several images, odd sizes, inputs that are no multiples of 32, more pixels than a chunk.
 #[test]
+#[allow(clippy::print_stderr)]
 fn fused_stacks_compute_what_single_convolutions_do() {
+    if !MatrixUnits::Amx.is_available() {
+        eprintln!("skipped: this machine has no AMX");
+        return;
+    }
     let cases = [
         Case { images: 1, size: [1, 1], inputs: vec![3], features: 32, blocks: 0 },
         Case { images: 3, size: [5, 7], inputs: vec![9, 32, 2], features: 32, blocks: 1 },
