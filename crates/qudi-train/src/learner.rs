@@ -11,9 +11,12 @@ use crate::loss::lpips::Lpips;
 use crate::recipe::Recipe;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use qudi_core::Result;
+use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::Restorer;
+use qudi_core::{Error, Result};
 use qudi_layers::{Provenance, parameter_shapes};
+use qudi_model::checkpoint::{Description, Network, Precision, Sampling, load, save};
+use qudi_model::config::NetworkConfig;
 use qudi_model::regression::BurstAligner;
 use std::fmt::{Debug, Formatter};
 use std::path::Path;
@@ -156,6 +159,44 @@ impl Debug for Loss<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Loss").field("terms", &self.terms).finish_non_exhaustive()
     }
+}
+
+/// Loads a network of the sizes of a recipe.
+///
+/// # Errors
+/// [`Error`] if the file holds another network, or one of other sizes.
+fn load_fitting<N: Network>(path: &Path, sizes: &NetworkConfig, device: &Device) -> Result<N> {
+    let (network, description) = load(path, device)?;
+    if description.network == *sizes {
+        return Ok(network);
+    }
+    Err(Error::data(
+        "these weights are for a network of other sizes than the recipe's",
+        path,
+        "choose the recipe that they were trained with, or its [network] table",
+    ))
+}
+
+/// Writes a network of these sizes, with a description of its training.
+///
+/// # Errors
+/// [`Error`] if the file cannot be written.
+fn save_described<N: Network>(
+    network: &N,
+    sizes: NetworkConfig,
+    sampling: Option<Sampling>,
+    recipe: &Recipe,
+    origin: &Origin,
+    path: &Path,
+) -> Result<()> {
+    let description = Description {
+        preset: sizes.preset_name().map(str::to_owned),
+        network: sizes,
+        window: recipe.data.frames.max(11),
+        provenance: provenance(recipe, origin),
+        sampling,
+    };
+    save(network, &description, Precision::Single, path, Overwrite::Yes)
 }
 
 /// Where weights come from, besides the recipe.

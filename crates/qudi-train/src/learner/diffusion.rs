@@ -5,7 +5,7 @@ mod inputs;
 mod recomputation;
 mod timesteps;
 
-use super::{Context, Learner, Loss, Origin, WeightedSum, learning, provenance};
+use super::{Context, Learner, Loss, Origin, WeightedSum, learning, load_fitting, save_described};
 use crate::burst_cache::BurstSampler;
 use crate::loss::lpips::Lpips;
 use crate::loss::{LossForm, reconstruction, relative_reconstruction};
@@ -13,10 +13,8 @@ use crate::parameters::gradients;
 use crate::recipe::{LossConfig, Recipe};
 use burn::tensor::{Device, Tensor};
 use inputs::network_inputs;
-use qudi_core::atomic_file::Overwrite;
+use qudi_core::Result;
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_core::{Error, Result};
-use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{Conditioning, Diffusion, DiffusionRestorer, Part, SampleOptions};
@@ -52,15 +50,11 @@ impl Learner for Diffusion {
     }
 
     fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self> {
-        let sizes = recipe.network.diffusion()?;
-        let (network, description) = load::<Self>(path, device)?;
-        if description.network != NetworkConfig::Diffusion(sizes.clone()) {
-            return Err(Error::data(
-                "these weights are for a network of other sizes than the recipe's",
-                path,
-                "choose the recipe that they were trained with, or its [network] table",
-            ));
-        }
+        let network: Self = load_fitting(
+            path,
+            &NetworkConfig::Diffusion(recipe.network.diffusion()?.clone()),
+            device,
+        )?;
         Ok(network.ablated(&recipe.train.ablate))
     }
 
@@ -108,15 +102,8 @@ impl Learner for Diffusion {
     }
 
     fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()> {
-        let network = NetworkConfig::Diffusion(recipe.network.diffusion()?.clone());
-        let description = Description {
-            preset: network.preset_name().map(str::to_owned),
-            network,
-            window: recipe.data.frames.max(11),
-            provenance: provenance(recipe, origin),
-            sampling: Some(recipe.sampling()),
-        };
-        save(self, &description, Precision::Single, path, Overwrite::Yes)
+        let sizes = NetworkConfig::Diffusion(recipe.network.diffusion()?.clone());
+        save_described(self, sizes, Some(recipe.sampling()), recipe, origin, path)
     }
 
     fn learns(&self, recipe: &Recipe) -> Vec<bool> {

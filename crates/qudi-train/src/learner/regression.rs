@@ -1,20 +1,18 @@
 //! The regression as it learns: first the refinement, then the second pre-denoiser with the uncertainty.
 
-use super::{Context, Learner, Loss, Origin, WeightedSum, learning, provenance};
+use super::{Context, Learner, Loss, Origin, WeightedSum, learning, load_fitting, save_described};
 use crate::burst_cache::BurstSampler;
 use crate::burst_cache::burst::ConditionedBurst;
 use crate::loss::{gaussian_nll, relative_reconstruction, root_mean_square};
 use crate::parameters::gradients;
 use crate::recipe::Recipe;
 use burn::tensor::Device;
-use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::Restorer;
-use qudi_core::{Error, Result, Size};
+use qudi_core::{Result, Size};
 use qudi_kernels::ComputePrecision;
 use qudi_layers::TILE;
 use qudi_layers::tensor::to_tensor;
 use qudi_model::aligned::Aligned;
-use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::regression::{BurstAligner, Refinement, Regression, RegressionRestorer};
 use qudi_model::restorer::Model;
@@ -57,16 +55,7 @@ impl Learner for Regression {
     }
 
     fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self> {
-        let sizes = recipe.network.regression()?;
-        let (network, description) = load::<Self>(path, device)?;
-        if description.network != NetworkConfig::Regression(sizes.clone()) {
-            return Err(Error::data(
-                "these weights are for a network of other sizes than the recipe's",
-                path,
-                "choose the recipe that they were trained with, or its [network] table",
-            ));
-        }
-        Ok(network)
+        load_fitting(path, &NetworkConfig::Regression(recipe.network.regression()?.clone()), device)
     }
 
     fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<AlignedBatch> {
@@ -107,15 +96,8 @@ impl Learner for Regression {
     }
 
     fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()> {
-        let network = NetworkConfig::Regression(recipe.network.regression()?.clone());
-        let description = Description {
-            preset: network.preset_name().map(str::to_owned),
-            network,
-            window: recipe.data.frames.max(11),
-            provenance: provenance(recipe, origin),
-            sampling: None,
-        };
-        save(self, &description, Precision::Single, path, Overwrite::Yes)
+        let sizes = NetworkConfig::Regression(recipe.network.regression()?.clone());
+        save_described(self, sizes, None, recipe, origin, path)
     }
 
     fn learns(&self, recipe: &Recipe) -> Vec<bool> {

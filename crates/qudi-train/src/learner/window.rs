@@ -1,18 +1,15 @@
 //! The diffusion that encodes a window once, as it learns.
 
-use super::diffusion::{Batch, Example};
-use super::diffusion::{noisy_images, previous_timestep};
-use super::{Context, Learner, Loss, Origin, WeightedSum, learning, provenance};
+use super::diffusion::{Batch, Example, noisy_images, previous_timestep};
+use super::{Context, Learner, Loss, Origin, WeightedSum, learning, load_fitting, save_described};
 use crate::burst_cache::BurstSampler;
 use crate::loss::robust_square;
 use crate::parameters::gradients;
 use crate::recipe::Recipe;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use qudi_core::atomic_file::Overwrite;
+use qudi_core::Result;
 use qudi_core::restorer::Restorer;
-use qudi_core::{Error, Result};
-use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
@@ -36,16 +33,7 @@ impl Learner for Window {
     }
 
     fn load(path: &Path, recipe: &Recipe, device: &Device) -> Result<Self> {
-        let sizes = recipe.network.window()?;
-        let (network, description) = load::<Self>(path, device)?;
-        if description.network != NetworkConfig::Window(sizes.clone()) {
-            return Err(Error::data(
-                "these weights are for a network of other sizes than the recipe's",
-                path,
-                "choose the recipe that they were trained with, or its [network] table",
-            ));
-        }
-        Ok(network)
+        load_fitting(path, &NetworkConfig::Window(recipe.network.window()?.clone()), device)
     }
 
     fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Batch> {
@@ -109,15 +97,8 @@ impl Learner for Window {
     }
 
     fn save(&self, recipe: &Recipe, origin: &Origin, path: &Path) -> Result<()> {
-        let network = NetworkConfig::Window(recipe.network.window()?.clone());
-        let description = Description {
-            preset: network.preset_name().map(str::to_owned),
-            network,
-            window: recipe.data.frames.max(11),
-            provenance: provenance(recipe, origin),
-            sampling: Some(recipe.sampling()),
-        };
-        save(self, &description, Precision::Single, path, Overwrite::Yes)
+        let sizes = NetworkConfig::Window(recipe.network.window()?.clone());
+        save_described(self, sizes, Some(recipe.sampling()), recipe, origin, path)
     }
 
     fn learns(&self, recipe: &Recipe) -> Vec<bool> {
