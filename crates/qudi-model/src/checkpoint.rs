@@ -214,7 +214,8 @@ fn network<N: Network>(
 fn other_kind<N: Network>(description: &Description, layout: Layout, path: &Path) -> Error {
     let kind = description.network.kind();
     let what = format!("these are weights of a {kind}, not of a {}", N::KIND);
-    let help = format!("use --method qudi-{kind}, or name other weights");
+    let method = if kind.is_diffusion() { "qudi-diffusion" } else { "qudi-regression" };
+    let help = format!("use --method {method}, or name other weights");
     let diffused = layout == Layout::Former && kind == NetworkKind::Regression;
     let what = if diffused { format!("{what}; {}", former::NO_DIFFUSION) } else { what };
     Error::data(what, path, help)

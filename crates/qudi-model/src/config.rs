@@ -47,7 +47,7 @@ impl fmt::Display for NetworkKind {
         f.write_str(match self {
             Self::Regression => "regression",
             Self::Diffusion => "diffusion",
-            Self::Window => "window",
+            Self::Window => "window diffusion",
         })
     }
 }

@@ -3,14 +3,18 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Distribution, Tensor};
+use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
-use qudi_layers::parameter_shapes;
 use qudi_layers::tensor::read;
+use qudi_layers::{Provenance, parameter_shapes};
+use qudi_model::checkpoint::{Description, Precision, load, save};
+use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Conditioning;
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
+use qudi_model::regression::Regression;
 use qudi_model::sensor::sensor_tensor;
 use qudi_model::window::{Window, WindowConfig};
 
@@ -107,4 +111,34 @@ fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> V
     let mut largest = Largest(gradients, Vec::new());
     network.visit(&mut largest);
     largest.1
+}
+
+/// Both orders of computation belong to one method: the help of the error must name a method that exists.
+#[test]
+fn weights_of_another_kind_are_refused_with_the_method_that_takes_them() {
+    let device = Device::flex();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("window.safetensors");
+    let description = Description {
+        preset: None,
+        network: NetworkConfig::Window(CONFIG),
+        window: 11,
+        provenance: Provenance {
+            program: "test".into(),
+            sensors: vec!["qudi-paper".into()],
+            ppp: [1.0, 30.0],
+            data: Vec::new(),
+            steps: 1,
+            commit: None,
+            licence: "MIT".into(),
+        },
+        sampling: None,
+    };
+    let network = CONFIG.init(1, &device);
+    save(&network, &description, Precision::Half, &path, Overwrite::Yes).unwrap();
+    let (_, read) = load::<Window>(&path, &device).unwrap();
+    assert_eq!(read.network, description.network);
+    let error = load::<Regression>(&path, &device).unwrap_err();
+    assert!(error.to_string().contains("a window diffusion"), "{error}");
+    assert!(format!("{error:?}").contains("--method qudi-diffusion,"), "{error:?}");
 }
