@@ -162,7 +162,7 @@ impl LossTerms {
 /// `recomputes`, pre-denoiser and U-Net are computed again for their gradients, image by image.
 ///
 /// # Errors
-/// [`Error`] if the device fails or a sensor is impossible.
+/// [`Error`](crate::Error) if the device fails or a sensor is impossible.
 pub fn loss_terms(
     network: &Diffusion,
     example: &Example<'_>,
