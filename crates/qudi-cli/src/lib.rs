@@ -1,9 +1,11 @@
 //! The program `qudi`: simulate, restore and measure video from single-photon cameras.
 //!
-//! [`main`] is the whole program.
+//! [`main`] is the whole program. Other programs [`call`] a command, [`restore`] what they hold, [`open`] a
+//! capture and [`write_frames`].
 #![warn(missing_docs)]
 
 mod args;
+mod calls;
 mod capture;
 mod commands;
 mod device;
@@ -19,12 +21,17 @@ mod weights;
 
 use args::{Args, Command};
 use clap::Parser;
-use error::CliError;
 use qudi_model::MatrixUnits;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
+pub use calls::{call, open, restore, sensor, write_frames};
+pub use capture::Input;
+pub use commands::restore::caller::Receiver;
+pub use error::{Cause, CliError};
 pub use memory::keep_freed_pages;
+pub use report::{Listener, Message};
+pub use version::long as version;
 
 /// Runs the program with the arguments of a process, of which the first is the program's own name. Call
 /// [`keep_freed_pages`] first where mimalloc is the allocator.
@@ -72,6 +79,11 @@ fn run(args: &Args, report: &report::Report) -> error::Result<()> {
     if let Some(threads) = args.global.threads {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global()?;
     }
+    run_command(args, report)
+}
+
+/// Runs the command of `args` on this thread.
+fn run_command(args: &Args, report: &report::Report) -> error::Result<()> {
     MatrixUnits::chosen()?;
     // Loaded for every command, so that none ignores what is set.
     let settings = settings::Settings::load(&args.global, args.command.name())?;
