@@ -114,6 +114,10 @@ impl Report {
                 self.remark(what);
                 ExitCode::from(interrupt::EXIT_CODE)
             }
+            CliError::TimeOver(what) => {
+                self.remark(what);
+                ExitCode::SUCCESS
+            }
             CliError::Missed(what) => {
                 self.remark(what);
                 ExitCode::from(1)

@@ -73,20 +73,27 @@ pub(super) fn forward<B: Backend>(
     bias: FloatTensor<B>,
 ) -> FloatTensor<B> {
     let x = narrow::<B>(joined::<B>(inputs), geometry);
-    let weight = narrow::<B>(weight, geometry);
-    let sum = if geometry.is_deep() {
-        let x = by_burst::<B>(x, geometry.frames);
-        by_image::<B>(B::conv3d(x, weight, None, geometry.deep_options()))
-    } else {
-        let weight = B::float_reshape(weight, geometry.flat_weight());
-        B::conv2d(x, weight, None, geometry.flat_options())
-    };
+    let sum = products::<B>(geometry, x, narrow::<B>(weight, geometry));
     let bias = B::float_reshape(bias, Shape::new([1, geometry.outputs, 1, 1]));
     let mut output = B::float_add(widen::<B>(sum, geometry), bias);
     if let Some(addend) = addend {
         output = B::float_add(output, addend);
     }
     if geometry.relu { B::relu(output) } else { output }
+}
+
+/// Computes the sum of products of a convolution alone.
+fn products<B: Backend>(
+    geometry: &Geometry,
+    x: FloatTensor<B>,
+    weight: FloatTensor<B>,
+) -> FloatTensor<B> {
+    if geometry.is_deep() {
+        let x = by_burst::<B>(x, geometry.frames);
+        return by_image::<B>(B::conv3d(x, weight, None, geometry.deep_options()));
+    }
+    let weight = B::float_reshape(weight, geometry.flat_weight());
+    B::conv2d(x, weight, None, geometry.flat_options())
 }
 
 /// Computes the gradient before the ReLU.
@@ -148,8 +155,7 @@ pub(super) fn weight_gradients<B: Backend>(
     let [height, width] = geometry.output_grid();
     let flat = Shape::new([images, outputs, height * width]);
     let gradient = B::float_reshape(gradient, flat);
-    let sums = B::float_sum_dim(B::float_sum_dim(gradient.clone(), 2), 0);
-    let bias = B::float_reshape(sums, Shape::new([outputs]));
+    let bias = bias_gradient::<B>(gradient.clone(), outputs);
 
     let gradient = narrow::<B>(gradient, geometry);
     let x = padded::<B>(geometry, narrow::<B>(joined::<B>(inputs), geometry));
@@ -168,6 +174,40 @@ pub(super) fn weight_gradients<B: Backend>(
     let weight =
         if slices.len() == 1 { slices.into_iter().next() } else { Some(B::float_cat(slices, 2)) };
     (weight.expect("a kernel of at least one frame"), bias)
+}
+
+/// Computes the gradient of the bias from the output's, `[images, outputs, places]`.
+fn bias_gradient<B: Backend>(gradient: FloatTensor<B>, outputs: usize) -> FloatTensor<B> {
+    let sums = B::float_sum_dim(B::float_sum_dim(gradient, 2), 0);
+    B::float_reshape(sums, Shape::new([outputs]))
+}
+
+/// Computes the gradients of weight and bias by LibTorch's own kernel, which only its record gives: the sum
+/// is computed once more.
+#[cfg(feature = "libtorch")]
+pub(super) fn recorded_weight_gradients(
+    geometry: &Geometry,
+    inputs: Vec<burn::backend::libtorch::TchTensor>,
+    gradient: burn::backend::libtorch::TchTensor,
+    output: Option<burn::backend::libtorch::TchTensor>,
+) -> [burn::backend::libtorch::TchTensor; 2] {
+    use burn::backend::LibTorch;
+    use burn::backend::libtorch::TchTensor;
+    let gradient = uncut::<LibTorch>(gradient, output);
+    let [height, width] = geometry.output_grid();
+    let flat = Shape::new([geometry.images, geometry.outputs, height * width]);
+    let flat = LibTorch::float_reshape(gradient.clone(), flat);
+    let bias = bias_gradient::<LibTorch>(flat, geometry.outputs);
+    let x = narrow::<LibTorch>(joined::<LibTorch>(inputs), geometry);
+    let [depth, rows, columns] = geometry.kernel;
+    let shape = Shape::new([geometry.outputs, geometry.all_channels(), depth, rows, columns]);
+    let zeros = LibTorch::float_zeros(shape, &x.device(), x.dtype().into());
+    let (_, record) = crate::libtorch::recorded(vec![zeros], |leaves| {
+        let weight = TchTensor::new(leaves[0].shallow_clone());
+        products::<LibTorch>(geometry, x, weight).tensor
+    });
+    let weight = record.gradients(&gradient).swap_remove(0);
+    [widen::<LibTorch>(weight, geometry), bias]
 }
 
 /// Pads the images with zeros.

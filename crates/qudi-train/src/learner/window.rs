@@ -40,6 +40,10 @@ impl Learner for Window {
         Batch::draw(recipe, bursts, number)
     }
 
+    fn upload(batch: &mut Batch, device: &Device) {
+        batch.upload(device);
+    }
+
     fn loss<'a>(&'a self, batch: &'a Batch, context: &Context<'a>) -> Result<Loss<'a>> {
         let train = &context.recipe.train;
         let conditioning = batch.conditioning(context.device);

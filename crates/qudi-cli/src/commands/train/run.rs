@@ -105,16 +105,18 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let commit = COMMIT.map(str::to_owned);
     let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
     write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
-    let mut watch = Watch::new(recipe, folder, report);
+    let mut watch = Watch::new(recipe, folder, plan.end, report);
     let learnt =
         device::guarded("training", || run.learn(plan.workers, &mut |event| watch.event(&event)));
     let [step, steps] = run.progress();
+    let is_over = watch.is_over();
     let last = watch.finish()?;
     match learnt {
         Ok(Ok(())) => {}
         Ok(Err(qudi_core::Error::Interrupted)) => {
             let text = format!("stopped after step {step} of {steps}: --resume goes on");
-            return Err(CliError::Stopped(text));
+            let stopped = if is_over { CliError::TimeOver } else { CliError::Stopped };
+            return Err(stopped(text));
         }
         Ok(Err(error)) => return Err(error.into()),
         Err(problem) => {
