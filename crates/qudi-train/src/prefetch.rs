@@ -21,12 +21,12 @@ impl<L: Learner> Prefetcher<L> {
     /// Starts `workers` threads that draw batches from number `first` on.
     ///
     /// # Errors
-    /// [`Error`] if the data cannot be opened.
+    /// [`Error`] if a thread cannot be started.
     pub fn new(recipe: &Recipe, bursts: &BurstSampler, first: u64, workers: usize) -> Result<Self> {
         let count = workers.max(1) as u64;
         let start = |worker: u64| {
             let (sender, receiver) = sync_channel(READY_BATCHES);
-            let (recipe, mut bursts) = (recipe.clone(), bursts.try_clone()?);
+            let (recipe, mut bursts) = (recipe.clone(), bursts.clone());
             let work = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.
                 let mut number = first + worker;

@@ -52,13 +52,16 @@ pub(crate) fn run(
 
 /// Makes the pack of a recipe.
 fn pack(plan: &Plan, report: &Report) -> Result<()> {
-    make_pack(plan, plan.overwrite, report)?;
+    let psnr = make_pack(plan, plan.overwrite, report)?;
     let path = &plan.pack;
-    let pack = Pack::open(path)?;
+    let pack = Pack::open(path, &plan.recipe.packed_sources())?;
     let frames: usize = pack.clips().iter().map(|clip| clip.frames).sum();
     let clips = pack.clips().len();
-    let text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
-    report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}))
+    let mut text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
+    if let Some(psnr) = psnr {
+        text += &format!("; {psnr:.1} dB PSNR of frames for training against their sources");
+    }
+    report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames, "psnr": psnr}))
 }
 
 /// Checks that the weights of the perceptual term are there.
