@@ -31,7 +31,8 @@ pub(super) fn run(recipe: &str, args: &Bench, settings: &Settings, report: &Repo
 
 fn measure<L: Learner>(recipe: &Recipe, args: &Bench, report: &Report) -> Result<()> {
     let opened = device::open(args.network.device().unwrap_or("auto"))?;
-    let pack = args.pack.as_deref().map(Pack::open).transpose()?;
+    let sources = recipe.packed_sources();
+    let pack = args.pack.as_deref().map(|path| Pack::open(path, &sources)).transpose()?;
     let files = Files { pack, bursts: None };
     let mut bar = report.bar();
     let measured = device::guarded(&opened.name, || {
