@@ -58,7 +58,7 @@ train() {
     for one in $devices; do
         note "selftest on $one"
         # Products of 32 bits, as on a processor; training may use fewer.
-        NVIDIA_TF32_OVERRIDE=0 timeout 60 "$qudi" selftest --device "$one" || {
+        NVIDIA_TF32_OVERRIDE=0 timeout 150 "$qudi" selftest --device "$one" || {
             note "$one fails"
             continue
         }
@@ -77,7 +77,7 @@ train() {
 
     # The learning rate falls to its end with the time that is left; 25 s are for validation and the end.
     time=$(($(left) - 25))
-    steps=$(python3 -c "print(max(2, int(0.97 * $best * $time / $batch)))")
+    steps=$(python3 -c "print(max(2, int(0.93 * $best * $time / $batch)))")
     every=$(python3 -c "print(max(1, int($best * 60 / $batch)))")
     note "training on $device: $steps steps of $batch in $time s"
     run=$(mktemp -d)/run
