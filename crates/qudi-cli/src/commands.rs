@@ -4,6 +4,7 @@ pub(crate) mod bench {
     pub(crate) mod args;
     mod burst;
     pub(crate) mod run;
+    mod training;
 }
 
 pub(crate) mod calibrate {

@@ -30,6 +30,8 @@ pub enum CliError {
     Missed(String),
     /// Ctrl-C, after what was done has been saved.
     Stopped(String),
+    /// The time that was asked for is over, and what was done has been saved.
+    TimeOver(String),
     /// Ctrl-C.
     Interrupted,
     /// The reader of our output has gone.

@@ -96,7 +96,7 @@ fn run_command(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Train(train) => commands::train::run::run(train, &settings, &args.global, report),
         Command::Publish(publish) => commands::publish::run::run(publish, &args.global, report),
         Command::Eval(eval) => commands::eval::run::run(eval, &settings, &args.global, report),
-        Command::Bench(bench) => commands::bench::run::run(bench, &args.global, report),
+        Command::Bench(bench) => commands::bench::run::run(bench, &settings, report),
         Command::Selftest(selftest) => commands::selftest::run::run(selftest, report),
         Command::Convert(convert) => commands::convert::run::run(convert, &args.global, report),
         Command::Calibrate(calibrate) => {

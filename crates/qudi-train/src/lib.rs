@@ -21,6 +21,7 @@ mod prefetch;
 mod recipe;
 mod run;
 pub mod selftest;
+mod speed;
 mod state;
 mod trainer;
 mod validate;
@@ -35,5 +36,6 @@ pub use recipe::{
     ValidationConfig, recipe_names, recipe_table,
 };
 pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS, run_exists, steps_taken};
+pub use speed::TrainingSpeed;
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};

@@ -131,6 +131,10 @@ impl Report {
                 self.remark(what);
                 interrupt::EXIT_CODE
             }
+            CliError::TimeOver(what) => {
+                self.remark(what);
+                ExitCode::SUCCESS
+            }
             CliError::Missed(what) => {
                 self.remark(what);
                 1
