@@ -223,3 +223,13 @@ def test_docstrings_and_signatures_are_there():
             kinds = [p.kind for p in inspect.signature(item).parameters.values()]
             assert inspect.Parameter.POSITIONAL_OR_KEYWORD not in kinds, name
     assert json.dumps(qs.open(np.ones((3, 8, 8), bool)).info())
+
+
+def test_the_laboratory_suite_keeps_its_name(tmp_path):
+    """`qudi-core` installs `qudi/core` without `qudi/__init__.py`: a package `qudi` of ours would hide it."""
+    (tmp_path / "qudi" / "core").mkdir(parents=True)
+    (tmp_path / "qudi" / "core" / "__init__.py").write_text("name = 'suite'\n")
+    code = "import qudi_spad, qudi.core; assert qudi.core.name == 'suite' and qudi_spad.methods()"
+    paths = [str(Path(qs.__file__).parents[1]), str(tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)

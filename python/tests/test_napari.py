@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
-napari = pytest.importorskip("napari")
-npe2 = pytest.importorskip("npe2")
+try:
+    import napari
+    import npe2
+    from qtpy.QtWidgets import QApplication
+except ImportError as error:
+    pytest.skip(f"no napari with widgets: {error}", allow_module_level=True)
 
 import qudi_spad as qs  # noqa: E402
 
@@ -25,8 +29,6 @@ def plugins():
 
 @pytest.fixture
 def viewer():
-    from qtpy.QtWidgets import QApplication
-
     application = QApplication.instance() or QApplication([])
     viewer = napari.components.ViewerModel()
     yield viewer
@@ -35,8 +37,6 @@ def viewer():
 
 
 def wait_until(condition, seconds=60):
-    from qtpy.QtWidgets import QApplication
-
     end = time.monotonic() + seconds
     while not condition() and time.monotonic() < end:
         QApplication.instance().processEvents()
