@@ -12,11 +12,11 @@ test:
     cargo test --workspace
 
 # The Python package in this tree: its module, and its tests with the Python of an environment that has
-# python/requirements-test.txt
+# crates/qudi-python/tests/requirements.txt
 test-python python="python3":
     cargo build --workspace --lib --tests
-    cp target/debug/libqudi_python.* python/qudi_spad/_native.abi3.so
-    cd python && QT_QPA_PLATFORM=offscreen {{python}} -m pytest
+    cp target/debug/libqudi_python.* crates/qudi-python/python/qudi_spad/_native.abi3.so
+    cd crates/qudi-python && QT_QPA_PLATFORM=offscreen {{python}} -m pytest
 
 # Formatting and lints
 lint:

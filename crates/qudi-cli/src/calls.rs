@@ -35,7 +35,14 @@ pub fn call(
 ) -> Result<(), CliError> {
     let args = parse(arguments)?;
     refuse_threads(&args)?;
-    interrupt::stoppable(stop, || crate::run_command(&args, &Report::to(listener)))
+    let report = Report::to(listener);
+    match interrupt::stoppable(stop, || crate::run_command(&args, &report)) {
+        Err(CliError::TimeOver(what)) => {
+            report.remark(&what);
+            Ok(())
+        }
+        result => result,
+    }
 }
 
 /// Restores `input`, or the capture that the arguments of `qudi restore` name, and hands its frames to

@@ -2,7 +2,7 @@
 
 use pyo3::create_exception;
 use pyo3::exceptions::{
-    PyFileExistsError, PyKeyboardInterrupt, PyOSError, PyTypeError, PyValueError,
+    PyFileExistsError, PyKeyboardInterrupt, PyOSError, PyTimeoutError, PyTypeError, PyValueError,
 };
 use pyo3::prelude::*;
 use qudi_cli::{Cause, CliError};
@@ -29,6 +29,7 @@ pub(crate) fn exception(error: CliError) -> PyErr {
         CliError::Error { what, place, help, cause } => (what, place, help, cause),
         CliError::Missed(what) => return PyValueError::new_err(what),
         CliError::Interrupted => return PyKeyboardInterrupt::new_err("stopped"),
+        CliError::TimeOver(what) => return PyTimeoutError::new_err(what),
         CliError::Stopped(what) => return PyKeyboardInterrupt::new_err(what),
         CliError::BrokenPipe => return PyOSError::new_err("the reader has gone"),
     };

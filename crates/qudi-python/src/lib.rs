@@ -1,4 +1,4 @@
-//! The native module of the Python package `qudi_spad` (`python/qudi_spad`, docs/python.md).
+//! The native module of the Python package `qudi_spad` (`python/`, docs/python.md).
 //!
 //! Arguments are the flags of the command line; arrays cross as bytes. Everything else is written in Python.
 

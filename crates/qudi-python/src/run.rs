@@ -41,8 +41,8 @@ pub(crate) struct Run {
 
 #[pymethods]
 impl Run {
-    /// Starts a command, given by its arguments. Frames of restorations are messages if `frames` is true; then
-    /// `source` may replace the capture.
+    /// Starts a command, given by its arguments. Frames of restorations are messages if `frames` is true;
+    /// then `source` may replace the capture.
     #[new]
     #[pyo3(signature = (arguments, *, frames=false, source=None))]
     fn new(arguments: Vec<String>, frames: bool, source: Option<Py<Source>>) -> PyResult<Self> {

@@ -133,7 +133,7 @@ impl Report {
             }
             CliError::TimeOver(what) => {
                 self.remark(what);
-                ExitCode::SUCCESS
+                0
             }
             CliError::Missed(what) => {
                 self.remark(what);

@@ -9,7 +9,7 @@ import pytest
 
 import qudi_spad as qs
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_docstrings():

@@ -2,15 +2,18 @@
 
 import os
 import time
+import warnings
 
 import numpy as np
 import pytest
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 try:
-    import napari
-    import npe2
-    from qtpy.QtWidgets import QApplication
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import napari
+        import npe2
+        from qtpy.QtWidgets import QApplication
 except ImportError as error:
     pytest.skip(f"no napari with widgets: {error}", allow_module_level=True)
 

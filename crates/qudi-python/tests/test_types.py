@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("mypy")
-FOLDER = Path(__file__).parents[1]
+FOLDER = Path(__file__).parents[1] / "python"
+CONFIG = str(FOLDER.parent / "pyproject.toml")
 
 
 def run(*arguments):
@@ -16,12 +17,12 @@ def run(*arguments):
 
 
 def test_mypy_is_strict():
-    checked = run("mypy", "--config-file=pyproject.toml")
+    checked = run("mypy", f"--config-file={CONFIG}")
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
 def test_the_stub_describes_the_module():
-    checked = run("mypy.stubtest", "qudi_spad._native", "--mypy-config-file=pyproject.toml")
+    checked = run("mypy.stubtest", "qudi_spad._native", f"--mypy-config-file={CONFIG}")
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
