@@ -233,3 +233,40 @@ def test_the_laboratory_suite_keeps_its_name(tmp_path):
     paths = [str(Path(qs.__file__).parents[1]), str(tmp_path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+def program(text):
+    environment = {**os.environ, "PYTHONPATH": str(Path(qs.__file__).parents[1])}
+    code = "import qudi_spad as qs\nimport numpy as np\n" + text
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120)
+    return run.returncode, run.stdout, run.stderr
+
+
+def test_programs_end_while_something_is_restored():
+    text = """
+def camera():
+    while True:
+        yield np.ones((64, 64), np.uint8)
+stream = qs.restore_iter(camera(), sensor="qudi-paper", ppp=3.0, method="qbp", bits=3)
+print(next(stream).shape)
+"""
+    assert program(text) == (0, "(64, 64)\n", "")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_forked_processes_are_told():
+    text = """
+import os, warnings
+warnings.simplefilter("ignore")
+counts = np.random.default_rng(0).poisson(2, (5, 16, 16)).clip(0, 7)
+qs.restore(counts, sensor="qudi-paper", ppp=3.0, method="mle")
+child = os.fork()
+if child == 0:
+    try:
+        qs.restore(counts, sensor="qudi-paper", ppp=3.0, method="mle")
+    except RuntimeError as error:
+        os._exit(7 if "spawn" in str(error) else 1)
+    os._exit(2)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    assert program(text)[:2] == (0, "7\n")

@@ -31,6 +31,7 @@ def test_users_see_the_types(tmp_path):
     program.write_text(
         "import numpy as np\nimport numpy.typing as npt\nimport qudi_spad as qs\n"
         "frames: npt.NDArray[np.float32] = qs.restore('a.npy', sensor='swissspad2').frames\n"
+        "stream: list[npt.NDArray[np.float32]] = list(qs.restore_iter('a.npy'))\n"
         "shape: tuple[int, int, int] = qs.open('a.npy').shape\n"
     )
     checked = run("mypy", "--strict", "--config-file=", str(program))

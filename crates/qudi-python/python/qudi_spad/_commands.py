@@ -16,7 +16,7 @@ import numpy as np
 from . import _native
 from ._arguments import flags, settings
 from ._capture import Capture
-from ._messages import messages, result
+from ._messages import messages, result, start
 from ._sensor import Sensor
 from ._source import Input, source_of
 
@@ -142,7 +142,7 @@ class TrainingRun:
     def __iter__(self) -> Iterator[dict[str, Any]]:
         metrics = self.output / "metrics.jsonl"
         seen = metrics.stat().st_size if metrics.exists() else 0
-        for _kind, _value in messages(_native.Run(self._arguments), patience=600.0):
+        for _kind, _value in messages(start(self._arguments), patience=600.0):
             if not metrics.exists():
                 continue
             with metrics.open("rb") as lines:

@@ -6,14 +6,14 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from . import _native
 from ._arguments import flags
-from ._messages import messages
+from ._messages import messages, start
 from ._sensor import Sensor
 from ._source import Input, source_of
 
@@ -130,6 +130,12 @@ def restore(
     return Result(frames.array(), sigma.array() if sigma.count else None, manifest)
 
 
+@overload
+def restore_iter(capture: Input, /, *, sigma: Literal[False] = False, **options: Any) -> Iterator[Frames]: ...
+@overload
+def restore_iter(
+    capture: Input, /, *, sigma: Literal[True], **options: Any
+) -> Iterator[tuple[Frames, Frames | None]]: ...
 def restore_iter(capture: Input, /, *, sigma: bool = False, **options: Any) -> Iterator[Any]:
     """Restores a capture frame by frame: each one is yielded when it is done.
 
@@ -185,7 +191,7 @@ def _start(capture: Input, names: dict[str, object], others: dict[str, object]) 
     if isinstance(options.get("sensor"), Sensor):
         options["sensor"] = str(options["sensor"])
     arguments = ["restore", *flags(options), "--output=-", "--", path]
-    return _native.Run(arguments, frames=True, source=source)
+    return start(arguments, frames=True, source=source)
 
 
 def _size(start: tuple[str, int | None]) -> tuple[tuple[int, int], int | None]:
