@@ -1,6 +1,8 @@
 """The plugin, in a real napari without a screen."""
 
 import os
+import subprocess
+import sys
 import time
 import warnings
 
@@ -73,6 +75,21 @@ def test_lazy_captures_are_layers(viewer, npy, counts):
     viewer.dims.set_current_step(0, 4)
     assert layer.data.shape == counts.shape
     assert np.array_equal(np.asarray(layer.data[4]), counts[4])
+
+
+def test_recorded_captures_tell_light_and_sensor(plugins, viewer, tmp_path):
+    run = [sys.executable, "-m", "qudi_spad", "simulate", "scene:text", "--size=64x64", "-oburst.npy"]
+    environment = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(qs.__file__))}
+    subprocess.run(run, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    ((data, options, _),) = npe2.read([str(tmp_path / "burst.npy")], stack=False)
+    viewer.add_image(data, **options)
+    widget = plugins.commands.get("qudi-spad.restore")(viewer)
+    widget._layer.choices = list(viewer.layers)
+    widget._method.value = "mle"
+    assert widget.keywords() == {"method": "mle"}
+    widget._clicked()
+    wait_until(lambda: widget._worker is None)
+    assert viewer.layers["burst restored"].data.shape == (11, 64, 64)
 
 
 def test_samples_are_restored_by_the_widget(plugins, viewer):

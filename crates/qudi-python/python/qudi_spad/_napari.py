@@ -74,7 +74,9 @@ class RestoreWidget(Container):  # type: ignore[type-arg]
     def keywords(self) -> dict[str, Any]:
         """Returns the keyword arguments of `restore` that are set here, or recorded in the layer."""
         layer = self._layer.value
-        recorded = layer.metadata.get("qudi_spad", {}) if layer is not None else {}
+        # An open capture knows its record by itself.
+        told = layer is None or isinstance(layer.data, qs.Capture)
+        recorded = {} if told else layer.metadata.get("qudi_spad", {})
         sensor = recorded.get("sensor")
         options: dict[str, Any] = {
             "method": None if self._method.value == "default" else self._method.value,
