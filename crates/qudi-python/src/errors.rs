@@ -1,5 +1,6 @@
 //! Errors of commands as Python exceptions.
 
+use crate::keywords::keywords;
 use pyo3::create_exception;
 use pyo3::exceptions::{
     PyFileExistsError, PyKeyboardInterrupt, PyOSError, PyTimeoutError, PyTypeError, PyValueError,
@@ -33,61 +34,24 @@ pub(crate) fn exception(error: CliError) -> PyErr {
         CliError::Stopped(what) => return PyKeyboardInterrupt::new_err(what),
         CliError::BrokenPipe => return PyOSError::new_err("the reader has gone"),
     };
-    let mut text = what;
-    if let Some(place) = &place {
-        text += &format!("\n  where: {place}");
-    }
-    if let Some(help) = &help {
-        text += &format!("\n  help: {help}");
-    }
-    let text = keywords(&text);
+    let what = keywords(&what);
+    let help = help.map_or(String::new(), |help| format!("\n  help: {}", keywords(&help)));
+    let found = place.as_deref().map_or(String::new(), |place| {
+        // Files keep their names, flags are keywords.
+        let is_flag = place.starts_with("--");
+        let place = if is_flag { keywords(place).replace('`', "") } else { place.to_owned() };
+        format!("\n  where: {place}")
+    });
+    // Python adds the name of the file to errors of the system.
+    let of_system = |number| (number, format!("{what}{help}\n  where"), place.clone());
+    let text = format!("{what}{found}{help}");
     match cause {
         Cause::Request => PyValueError::new_err(text),
         Cause::Argument => PyTypeError::new_err(text),
         Cause::Data => FormatError::new_err(text),
         Cause::Mismatch => SensorMismatch::new_err(text),
-        Cause::Exists => PyFileExistsError::new_err((EXISTS, text, place)),
-        Cause::System(Some(number)) => PyOSError::new_err((number, text, place)),
+        Cause::Exists => PyFileExistsError::new_err(of_system(EXISTS)),
+        Cause::System(Some(number)) => PyOSError::new_err(of_system(number)),
         Cause::System(None) => PyOSError::new_err(text),
     }
-}
-
-/// Returns a text with keyword arguments in place of flags: `sum=7` for `--sum 7`, `pack_axis` for
-/// `--pack-axis`.
-pub(crate) fn keywords(text: &str) -> String {
-    let mut out = String::new();
-    let text = text.replace("overwrite it with --force", "overwrite it with overwrite=True");
-    let mut rest = text.as_str();
-    while let Some(at) = rest.find("--") {
-        let (before, flag) = rest.split_at(at);
-        out += before;
-        let letters = |c: char| c.is_ascii_lowercase() || c == '-';
-        let name = &flag[2..flag[2..].find(|c| !letters(c)).map_or(flag.len(), |end| end + 2)];
-        // A dash between words, or a rule of dashes, is no flag.
-        if name.is_empty()
-            || name.starts_with('-')
-            || before.ends_with(|c: char| c != ' ' && c != '(' && c != '`')
-        {
-            out += "--";
-            rest = &flag[2..];
-            continue;
-        }
-        out += &name.trim_end_matches('-').replace('-', "_");
-        rest = &flag[2 + name.len()..];
-        let value = rest.strip_prefix(' ').unwrap_or("");
-        let end = value.find([' ', ',', ';', ')', '\n', '`']).unwrap_or(value.len());
-        let value = &value[..end];
-        let is_number = value.parse::<f64>().is_ok();
-        let is_name = value.contains('-') || value.contains(|c: char| c.is_ascii_digit());
-        let is_stand_in = !value.is_empty() && value.chars().all(|c| c.is_ascii_uppercase());
-        if is_number || is_name || is_stand_in {
-            out += &if is_number || is_stand_in {
-                format!("={value}")
-            } else {
-                format!("=\"{value}\"")
-            };
-            rest = &rest[1 + value.len()..];
-        }
-    }
-    out + rest
 }

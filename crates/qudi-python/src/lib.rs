@@ -4,6 +4,7 @@
 
 mod capture;
 mod errors;
+mod keywords;
 mod metrics;
 mod run;
 mod source;

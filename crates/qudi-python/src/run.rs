@@ -1,6 +1,7 @@
 //! A command that runs on a thread of its own, as a stream of messages.
 
-use crate::errors::{exception, keywords};
+use crate::errors::exception;
+use crate::keywords::keywords;
 use crate::source::Source;
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;

@@ -61,6 +61,31 @@ def test_bad_arrays_are_named(array, error, text):
     with pytest.raises(error, match=text) as raised:
         restore(array)
     assert "where:" in str(raised.value) and "help:" in str(raised.value)
+    assert "--" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"sensor": None}, 'sensor="swissspad2" (`qudi info --sensors`)'),
+        ({"ppp": None}, "or the gain with `gain`"),
+        ({"method": "qudi", "ppp": 3e4}, '(sum=N), give `ppp` if the light was estimated wrongly, use method="qbp'),
+        ({"steps": 3}, "`steps` is for method qudi-diffusion\n  where: steps\n"),
+        ({"nonsense": 1}, "unexpected argument 'nonsense' found"),
+        ({"format": "raw-u8"}, "where: format\n"),
+    ],
+)
+def test_messages_name_keywords(frames, options, text):
+    with pytest.raises((ValueError, TypeError)) as raised:
+        restore(frames, **options)
+    assert text in str(raised.value)
+
+
+def test_errors_of_the_system_name_their_file(tmp_path):
+    with pytest.raises(FileNotFoundError) as raised:
+        qs.restore(tmp_path / "missing.npy")
+    assert raised.value.filename == str(tmp_path / "missing.npy")
+    assert "help:" in str(raised.value) and "where: '" in str(raised.value)
 
 
 def test_counts_beyond_the_sensor(frames):
