@@ -137,8 +137,9 @@ impl<L: Learner> Run<L> {
         let train = self.recipe.train.clone();
         let mut prefetcher =
             Prefetcher::<L>::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
-        if let Some(card) = self.trainer.card() {
-            prefetcher = prefetcher.uploading(card)?;
+        let card = self.trainer.card();
+        if let Some(card) = &card {
+            prefetcher = prefetcher.uploading(card.clone())?;
         }
         let mut metrics = self.metrics()?;
         if self.trainer.step_number() == 0
@@ -151,7 +152,11 @@ impl<L: Learner> Run<L> {
         }
         while self.trainer.step_number() < train.steps {
             let mut go_on = ControlFlow::Continue(());
-            if let Some(report) = self.trainer.begin_step(&mut prefetcher)? {
+            let report = match &card {
+                Some(_) => self.trainer.begin_step(&mut prefetcher)?,
+                None => Some(self.trainer.step(&mut prefetcher)?),
+            };
+            if let Some(report) = report {
                 self.log(&mut metrics, &Line::Step(&report))?;
                 go_on = on(Event::Step(&report));
             }
