@@ -75,6 +75,7 @@ pub(crate) mod publish {
 
 pub(crate) mod restore {
     pub(crate) mod args;
+    pub(crate) mod caller;
     mod chi_square_map;
     mod output;
     mod plan;

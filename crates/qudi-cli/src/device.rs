@@ -147,10 +147,7 @@ fn create(backend: &str, number: usize) -> Option<Device> {
         "libtorch-cpu" => Some(Device::libtorch()),
         #[cfg(feature = "libtorch")]
         #[allow(deprecated)]
-        "libtorch" => {
-            qudi_kernels::choose_fast_convolutions();
-            Some(Device::libtorch_cuda(number))
-        }
+        "libtorch" => Some(Device::libtorch_cuda(number)),
         #[cfg(feature = "wgpu")]
         "wgpu" => card(DeviceType::Wgpu, number),
         #[cfg(feature = "vulkan")]

@@ -16,7 +16,7 @@ pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
 pub use summary::{BitOrderCheck, Summary};
 
-use crate::codec;
+use crate::codec::{self, GivenArray};
 use crate::description::{CaptureInfo, ReadOptions, with_pedestal};
 use crate::frames::depth::DepthChecked;
 use crate::frames::pipe::{FIRST_WINDOW, STDIN};
@@ -94,6 +94,21 @@ impl Capture {
         let options = &with_pedestal(options, sensor);
         let (native, info) = codec::open_pipe(Box::new(reader), options)?;
         Self::assemble(Path::new(STDIN), native, info, options, sensor)
+    }
+
+    /// Opens frames that a caller holds. They are read as the same array in a `.npy` file is.
+    ///
+    /// # Errors
+    /// As [`Capture::open`].
+    pub fn from_array(
+        array: GivenArray,
+        options: &ReadOptions,
+        sensor: Option<&Sensor>,
+    ) -> Result<Self> {
+        let options = &with_pedestal(options, sensor);
+        let path = PathBuf::from(&array.name);
+        let (native, info) = array.open(options)?;
+        Self::assemble(&path, native, info, options, sensor)
     }
 
     fn assemble(
@@ -298,25 +313,25 @@ impl Capture {
     /// here.
     ///
     /// # Errors
-    /// [`Error::Request`] if the depth is unknown or differs from the sensor's, or if frames of a linear
+    /// [`Error::Mismatch`] if the depth is unknown or differs from the sensor's, or if frames of a linear
     /// sensor are summed, which no sensor does.
     pub fn output_sensor(&self, sensor: &Sensor) -> Result<Sensor> {
         let place = self.path.display();
         let linear = sensor.response == Response::Linear;
         if linear && self.sum > 1 {
-            return Err(Error::request(
+            return Err(Error::mismatch(
                 format!("sums of {} frames of `{}`, a linear sensor", self.sum, sensor.name),
                 "sum",
                 "only binary frames are summed: leave it out",
             ));
         }
         match self.max_count() {
-            _ if linear && self.info.binary => Err(Error::request(
+            _ if linear && self.info.binary => Err(Error::mismatch(
                 format!("binary frames, and `{}` is a linear sensor", sensor.name),
                 place,
                 "name the sensor that took them, as in `sensor swissspad2`",
             )),
-            Some(max) if linear && max != sensor.max_count() => Err(Error::request(
+            Some(max) if linear && max != sensor.max_count() => Err(Error::mismatch(
                 format!(
                     "counts up to {max}, and those of `{}` reach {}",
                     sensor.name,
@@ -326,7 +341,7 @@ impl Capture {
                 "name the sensor that took them, or the depth with `bits N`",
             )),
             Some(max) if !linear => Ok(Sensor { frames_summed: u32::from(max), ..sensor.clone() }),
-            None if !linear => Err(Error::request(
+            None if !linear => Err(Error::mismatch(
                 "how many binary frames a count sums is not known",
                 place,
                 "say the depth of counts with `bits 3` (for sums of 7), or `levels` for scaled means",

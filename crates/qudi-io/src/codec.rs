@@ -4,6 +4,7 @@
 //! formats.
 
 mod array;
+mod given;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod images;
@@ -20,6 +21,7 @@ mod tiff;
 mod video;
 mod visionsim;
 
+pub use given::{FetchFrames, GivenArray};
 pub(crate) use piped::open_pipe;
 
 use crate::description::{CaptureInfo, Certainty, FormatOption, ReadOptions, refuse_others};

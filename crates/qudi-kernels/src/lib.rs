@@ -5,6 +5,8 @@
 #![warn(missing_docs)]
 // Vector code must be inlined into the functions that are compiled for the machine's vector unit.
 #![allow(clippy::inline_always)]
+// LibTorch is deprecated upstream, where no other backend trains as fast yet.
+#![cfg_attr(feature = "libtorch", allow(deprecated))]
 
 mod attention;
 mod backend;
@@ -27,7 +29,7 @@ mod warp;
 pub use attention::attention;
 pub use backend::{is_flex, is_libtorch, with_stock_operations};
 #[cfg(feature = "libtorch")]
-pub use libtorch::{choose_fast_convolutions, count_libtorch_cards};
+pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
 pub use operations::count_operations;
 pub use precision::{ComputePrecision, with_precision};

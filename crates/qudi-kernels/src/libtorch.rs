@@ -9,7 +9,8 @@ use tch::{Kind, Tensor};
 
 /// An operation that LibTorch has recorded. Its buffers are freed with the gradient: it has one.
 #[derive(Clone, Debug)]
-pub(crate) struct Recorded {
+#[allow(unreachable_pub)] // a type of a public trait
+pub struct Recorded {
     output: TchTensor,
     leaves: Vec<TchTensor>,
     /// Burn changes a tensor in place that nobody else holds; the record needs the values as they were.
@@ -55,9 +56,4 @@ pub(crate) fn channels_last(x: &Tensor) -> Tensor {
 /// Returns the number of NVIDIA cards that LibTorch sees.
 pub fn count_libtorch_cards() -> usize {
     usize::try_from(tch::Cuda::device_count()).unwrap_or_default()
-}
-
-/// Lets cuDNN try its algorithms for every new shape once and keep the fastest.
-pub fn choose_fast_convolutions() {
-    tch::Cuda::cudnn_set_benchmark(true);
 }

@@ -7,6 +7,8 @@ use super::geometry::Geometry;
 use burn::backend::Backend;
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
+#[cfg(feature = "libtorch")]
+use burn::backend::{LibTorch, libtorch::TchTensor};
 use burn::tensor::ops::ConvOptions;
 use burn::tensor::{FloatDType, Shape, Slice};
 
@@ -144,6 +146,7 @@ pub(super) fn input_gradients<B: Backend>(
 }
 
 /// Computes the gradients of weight and bias.
+#[cfg(any(feature = "cube", test))]
 pub(super) fn weight_gradients<B: Backend>(
     geometry: &Geometry,
     inputs: Vec<FloatTensor<B>>,
@@ -155,7 +158,8 @@ pub(super) fn weight_gradients<B: Backend>(
     let [height, width] = geometry.output_grid();
     let flat = Shape::new([images, outputs, height * width]);
     let gradient = B::float_reshape(gradient, flat);
-    let bias = bias_gradient::<B>(gradient.clone(), outputs);
+    let sums = B::float_sum_dim(B::float_sum_dim(gradient.clone(), 2), 0);
+    let bias = B::float_reshape(sums, Shape::new([outputs]));
 
     let gradient = narrow::<B>(gradient, geometry);
     let x = padded::<B>(geometry, narrow::<B>(joined::<B>(inputs), geometry));
@@ -176,41 +180,31 @@ pub(super) fn weight_gradients<B: Backend>(
     (weight.expect("a kernel of at least one frame"), bias)
 }
 
-/// Computes the gradient of the bias from the output's, `[images, outputs, places]`.
-fn bias_gradient<B: Backend>(gradient: FloatTensor<B>, outputs: usize) -> FloatTensor<B> {
-    let sums = B::float_sum_dim(B::float_sum_dim(gradient, 2), 0);
-    B::float_reshape(sums, Shape::new([outputs]))
-}
-
 /// Computes the gradients of weight and bias by LibTorch's own kernel, which only its record gives: the sum
 /// is computed once more.
 #[cfg(feature = "libtorch")]
 pub(super) fn recorded_weight_gradients(
     geometry: &Geometry,
-    inputs: Vec<burn::backend::libtorch::TchTensor>,
-    gradient: burn::backend::libtorch::TchTensor,
-    output: Option<burn::backend::libtorch::TchTensor>,
-) -> [burn::backend::libtorch::TchTensor; 2] {
-    use burn::backend::LibTorch;
-    use burn::backend::libtorch::TchTensor;
+    inputs: Vec<TchTensor>,
+    gradient: TchTensor,
+    output: Option<TchTensor>,
+) -> [TchTensor; 2] {
     let gradient = uncut::<LibTorch>(gradient, output);
-    let [height, width] = geometry.output_grid();
-    let flat = Shape::new([geometry.images, geometry.outputs, height * width]);
-    let flat = LibTorch::float_reshape(gradient.clone(), flat);
-    let bias = bias_gradient::<LibTorch>(flat, geometry.outputs);
+    let bias = gradient.tensor.sum_dim_intlist([0, 2, 3].as_slice(), false, None);
     let x = narrow::<LibTorch>(joined::<LibTorch>(inputs), geometry);
     let [depth, rows, columns] = geometry.kernel;
-    let shape = Shape::new([geometry.outputs, geometry.all_channels(), depth, rows, columns]);
-    let zeros = LibTorch::float_zeros(shape, &x.device(), x.dtype().into());
-    let (_, record) = crate::libtorch::recorded(vec![zeros], |leaves| {
+    let shape = [geometry.outputs, geometry.all_channels(), depth, rows, columns];
+    let zeros = tch::Tensor::zeros(shape.map(|n| n as i64), (x.tensor.kind(), x.tensor.device()));
+    let (_, record) = crate::libtorch::recorded(vec![TchTensor::new(zeros)], |leaves| {
         let weight = TchTensor::new(leaves[0].shallow_clone());
         products::<LibTorch>(geometry, x, weight).tensor
     });
     let weight = record.gradients(&gradient).swap_remove(0);
-    [widen::<LibTorch>(weight, geometry), bias]
+    [widen::<LibTorch>(weight, geometry), TchTensor::new(bias)]
 }
 
 /// Pads the images with zeros.
+#[cfg(any(feature = "cube", test))]
 fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> {
     let [_, rows, columns] = geometry.padding();
     if rows == 0 && columns == 0 {
@@ -229,6 +223,7 @@ fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> 
 }
 
 /// Shifts images by `dt - depth / 2` frames within their bursts, with zeros past the ends.
+#[cfg(any(feature = "cube", test))]
 fn shifted<B: Backend>(
     x: FloatTensor<B>,
     frames: usize,
@@ -254,6 +249,7 @@ fn shifted<B: Backend>(
 }
 
 /// Gathers the pixels that each tap reads for each cell of padded images, `[images, taps * channels, cells]`.
+#[cfg(any(feature = "cube", test))]
 fn neighbourhoods<B: Backend>(geometry: &Geometry, x: &FloatTensor<B>) -> FloatTensor<B> {
     let [_, rows, columns] = geometry.kernel;
     let [height, width] = geometry.output_grid();

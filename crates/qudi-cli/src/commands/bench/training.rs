@@ -31,7 +31,7 @@ pub(super) fn run(recipe: &str, args: &Bench, settings: &Settings, report: &Repo
 
 fn measure<L: Learner>(recipe: &Recipe, args: &Bench, report: &Report) -> Result<()> {
     let opened = device::open(args.network.device().unwrap_or("auto"))?;
-    let sources = recipe.data.packed_sources();
+    let sources = recipe.packed_sources();
     let pack = args.pack.as_deref().map(|path| Pack::open(path, &sources)).transpose()?;
     let files = Files { pack, bursts: None };
     let mut bar = report.bar();
