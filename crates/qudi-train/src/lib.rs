@@ -30,7 +30,7 @@ pub use burst_cache::{BurstSampler, Files, draw_bursts};
 pub use learner::{AlignedBatch, Context, CountBatch, Learner, Loss, Origin, diffusion};
 pub use optimizer::{Optimizer, OptimizerKind, learning_rate};
 pub use parameters::{gradients, parameters, with_parameters};
-pub use prefetch::Prefetcher;
+pub use prefetch::{Prefetcher, default_workers};
 pub use recipe::{
     CropsConfig, LearningPart, LossConfig, NetworkRecipe, Recipe, StageConfig, TrainConfig,
     ValidationConfig, recipe_names, recipe_table,

@@ -74,8 +74,8 @@ pub struct SourceConfig {
     /// Largest step through a clip, in its frames: with 2, motion is also twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
-    /// Largest factor by which packed clips and stills are downscaled; each sample draws one log-uniformly from 1 to
-    /// it.
+    /// Largest factor by which packed clips and stills are downscaled; each sample draws one log-uniformly
+    /// from 1 to it.
     #[serde(default = "one")]
     pub max_downscale: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
