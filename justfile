@@ -11,6 +11,13 @@ ci:
 test:
     cargo test --workspace
 
+# The Python package in this tree: its module, and its tests with the Python of an environment that has
+# crates/qudi-python/tests/requirements.txt
+test-python python="python3":
+    cargo build --workspace --lib --tests
+    cp target/debug/libqudi_python.* crates/qudi-python/python/qudi_spad/_native.abi3.so
+    cd crates/qudi-python && QT_QPA_PLATFORM=offscreen {{python}} -m pytest
+
 # Formatting and lints
 lint:
     cargo fmt --all --check

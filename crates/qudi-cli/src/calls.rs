@@ -7,7 +7,7 @@ use crate::commands::restore::args::Restore;
 use crate::commands::restore::caller::{self, Receiver};
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::methods::QUDI;
+use crate::methods::METHODS;
 use crate::report::{Listener, Report};
 use crate::settings::Settings;
 use clap::Parser;
@@ -35,7 +35,14 @@ pub fn call(
 ) -> Result<(), CliError> {
     let args = parse(arguments)?;
     refuse_threads(&args)?;
-    interrupt::stoppable(stop, || crate::run_command(&args, &Report::to(listener)))
+    let report = Report::to(listener);
+    match interrupt::stoppable(stop, || crate::run_command(&args, &report)) {
+        Err(CliError::TimeOver(what)) => {
+            report.remark(&what);
+            Ok(())
+        }
+        result => result,
+    }
 }
 
 /// Restores `input`, or the capture that the arguments of `qudi restore` name, and hands its frames to
@@ -53,12 +60,12 @@ pub fn restore(
     let (global, settings, restore) = parse_restore(arguments)?;
     let report = Report::to(listener);
     interrupt::stoppable(stop, || {
-        caller::run(&restore, input, &settings, &global, &report, receiver)
+        caller::run(*restore, input, &settings, &global, &report, receiver)
     })
 }
 
-/// Opens `input`, or the capture that the arguments of `qudi restore` name, with its sensor, if that is known.
-/// Pixels are repaired, and frames are summed by themselves, only where that is asked for.
+/// Opens `input`, or the capture that the arguments of `qudi restore` name, with its sensor, if that is
+/// known. Pixels are repaired, and frames are summed by themselves, only where that is asked for.
 ///
 /// # Errors
 /// As the command line.
@@ -77,6 +84,11 @@ pub fn open(
     }
     let SummedCapture { capture, sensor, .. } = SummedCapture::new(opened, &source)?;
     Ok((capture, sensor))
+}
+
+/// Returns the names of all methods, each with a line about it.
+pub fn methods() -> Vec<(&'static str, &'static str)> {
+    METHODS.iter().map(|method| (method.name, method.about)).collect()
 }
 
 /// Loads a sensor by its name, or from a TOML file.
@@ -115,7 +127,7 @@ fn parse(arguments: &[String]) -> Result<Args> {
         CliError::of_value(&refusal).unwrap_or_else(|| {
             let text = refusal.to_string();
             let what = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
-            CliError::new(what, "the arguments", "`qudi help COMMAND` lists what it takes")
+            CliError::argument(what, "the arguments", "`qudi help COMMAND` lists what it takes")
         })
     })
 }
@@ -128,7 +140,7 @@ fn parse_restore(arguments: &[String]) -> Result<(Global, Settings, Box<Restore>
     let settings = Settings::load(&global, command.name())?;
     match command {
         Command::Restore(restore) => Ok((global, settings, restore)),
-        _ => Err(CliError::new("no restoration", QUDI.name, "begin with `restore`")),
+        _ => Err(CliError::new("no restoration", "the arguments", "begin with `restore`")),
     }
 }
 

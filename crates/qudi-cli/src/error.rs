@@ -43,31 +43,39 @@ pub enum CliError {
 pub enum Cause {
     /// Options or values that cannot be.
     Request,
+    /// Options that there are not.
+    Argument,
     /// A file or array that does not hold what it should.
     Data,
     /// A capture that the sensor, or the cameras that weights were trained for, cannot have taken.
     Mismatch,
+    /// An output exists already.
+    Exists,
     /// The operating system refused; with its error number, if there is one.
     System(Option<i32>),
 }
 
 impl CliError {
     pub(crate) fn new(what: impl Display, place: impl Display, help: impl Display) -> Self {
-        Self::Error {
-            what: what.to_string(),
-            place: Some(place.to_string()),
-            help: Some(help.to_string()),
-            cause: Cause::Request,
-        }
+        Self::caused(Cause::Request, what, place, help)
     }
 
     /// Creates the error of a capture that a sensor cannot have taken.
     pub(crate) fn mismatch(what: impl Display, place: impl Display, help: impl Display) -> Self {
+        Self::caused(Cause::Mismatch, what, place, help)
+    }
+
+    /// Creates the error of options that there are not.
+    pub(crate) fn argument(what: impl Display, place: impl Display, help: impl Display) -> Self {
+        Self::caused(Cause::Argument, what, place, help)
+    }
+
+    fn caused(cause: Cause, what: impl Display, place: impl Display, help: impl Display) -> Self {
         Self::Error {
             what: what.to_string(),
             place: Some(place.to_string()),
             help: Some(help.to_string()),
-            cause: Cause::Mismatch,
+            cause,
         }
     }
 }
@@ -111,6 +119,7 @@ impl From<Error> for CliError {
                     Error::Io { source, .. } => Cause::System(source.raw_os_error()),
                     Error::Data { .. } => Cause::Data,
                     Error::Mismatch { .. } => Cause::Mismatch,
+                    Error::Exists { .. } => Cause::Exists,
                     _ => Cause::Request,
                 },
             },

@@ -23,9 +23,8 @@ use args::{Args, Command};
 use clap::Parser;
 use qudi_model::MatrixUnits;
 use std::ffi::OsString;
-use std::process::ExitCode;
 
-pub use calls::{call, open, restore, sensor, write_frames};
+pub use calls::{call, methods, open, restore, sensor, write_frames};
 pub use capture::Input;
 pub use commands::restore::caller::Receiver;
 pub use error::{Cause, CliError};
@@ -33,9 +32,9 @@ pub use memory::keep_freed_pages;
 pub use report::{Listener, Message};
 pub use version::long as version;
 
-/// Runs the program with the arguments of a process, of which the first is the program's own name. Call
-/// [`keep_freed_pages`] first where mimalloc is the allocator.
-pub fn main(arguments: &[OsString]) -> ExitCode {
+/// Runs the program with the arguments of a process, of which the first is the program's own name, and
+/// returns its exit code. Call [`keep_freed_pages`] first where mimalloc is the allocator.
+pub fn main(arguments: &[OsString]) -> u8 {
     #[cfg(any(feature = "wgpu", feature = "vulkan"))]
     device::quieten_drivers();
     if let Err(error) = check_arguments(arguments) {
@@ -50,16 +49,16 @@ pub fn main(arguments: &[OsString]) -> ExitCode {
     };
     let report = report::Report::new(&args.global);
     match run(&args, &report) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => 0,
         Err(error) => report.error(&error),
     }
 }
 
 /// Prints help, version, or what is wrong with the arguments, as clap words it.
-fn refused(refusal: &clap::Error) -> ExitCode {
+fn refused(refusal: &clap::Error) -> u8 {
     // Nothing can be done if standard output is gone.
     let _ = refusal.print();
-    u8::try_from(refusal.exit_code()).map_or(ExitCode::FAILURE, ExitCode::from)
+    u8::try_from(refusal.exit_code()).unwrap_or(1)
 }
 
 /// Refuses names that are no text: they could not be written into records.

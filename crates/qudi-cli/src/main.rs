@@ -9,5 +9,6 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
     qudi_cli::keep_freed_pages();
-    qudi_cli::main(&std::env::args_os().collect::<Vec<OsString>>())
+    let arguments: Vec<OsString> = std::env::args_os().collect();
+    ExitCode::from(qudi_cli::main(&arguments))
 }

@@ -33,6 +33,12 @@ pub enum Error {
         /// What to do about it.
         help: String,
     },
+    /// An output whose name is taken.
+    #[error("the output exists already")]
+    Exists {
+        /// The file or folder.
+        path: PathBuf,
+    },
     /// A sensor that cannot exist.
     #[error("impossible sensor: {what}")]
     Sensor {
@@ -92,7 +98,9 @@ impl Error {
     /// Returns the file, sensor or option that the error concerns.
     pub fn place(&self) -> Option<String> {
         match self {
-            Self::Io { path, .. } | Self::Data { path, .. } => Some(path.display().to_string()),
+            Self::Io { path, .. } | Self::Data { path, .. } | Self::Exists { path } => {
+                Some(path.display().to_string())
+            }
             Self::Sensor { place, .. }
             | Self::Mismatch { place, .. }
             | Self::Request { place, .. } => Some(place.clone()),
@@ -104,6 +112,9 @@ impl Error {
     pub fn help(&self) -> Option<String> {
         match self {
             Self::Io { source, .. } => Some(io_help(source.kind()).to_owned()),
+            Self::Exists { .. } => {
+                Some("choose another name, or overwrite it with `force`".to_owned())
+            }
             Self::Data { help, .. }
             | Self::Sensor { help, .. }
             | Self::Mismatch { help, .. }

@@ -9,7 +9,6 @@ use crate::report::{Listener, Message, duration, printable};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use qudi_core::progress::Progress;
 use std::io::{IsTerminal, Write};
-use std::process::ExitCode;
 use std::time::Instant;
 use tracing_subscriber::EnvFilter;
 
@@ -121,24 +120,24 @@ impl Report {
     }
 
     /// Prints an error and returns the exit code of the program.
-    pub(crate) fn error(&self, error: &CliError) -> ExitCode {
+    pub(crate) fn error(&self, error: &CliError) -> u8 {
         match error {
-            CliError::BrokenPipe => ExitCode::SUCCESS,
+            CliError::BrokenPipe => 0,
             CliError::Interrupted => {
                 self.remark("interrupted: nothing was written");
-                ExitCode::from(interrupt::EXIT_CODE)
+                interrupt::EXIT_CODE
             }
             CliError::Stopped(what) => {
                 self.remark(what);
-                ExitCode::from(interrupt::EXIT_CODE)
+                interrupt::EXIT_CODE
             }
             CliError::TimeOver(what) => {
                 self.remark(what);
-                ExitCode::SUCCESS
+                0
             }
             CliError::Missed(what) => {
                 self.remark(what);
-                ExitCode::from(1)
+                1
             }
             CliError::Error { what, place, help, .. } => {
                 let (red, bold, plain) =
@@ -152,7 +151,7 @@ impl Report {
                 }
                 // Nothing can be done if standard error is gone as well.
                 let _ = std::io::stderr().write_all(text.as_bytes());
-                ExitCode::from(2)
+                2
             }
         }
     }

@@ -31,14 +31,10 @@ fn parent(path: &Path) -> &Path {
 /// Refuses a name that is taken, before any work is done for it.
 ///
 /// # Errors
-/// [`Error::Data`] if it exists and may not be overwritten.
+/// [`Error::Exists`] if it may not be overwritten.
 pub fn refuse_taken(path: &Path, overwrite: Overwrite) -> Result<()> {
     if overwrite == Overwrite::No && path.symlink_metadata().is_ok() {
-        return Err(Error::data(
-            "the output exists already",
-            path,
-            "choose another name, or overwrite it with `force`",
-        ));
+        return Err(Error::Exists { path: path.to_owned() });
     }
     Ok(())
 }

@@ -53,15 +53,15 @@ impl GivenArray {
                 "move the axis of time to the front",
             ));
         }
-        let bytes = self
-            .shape
-            .iter()
-            .skip(1)
-            .try_fold(self.sample.bytes(), |bytes, &extent| bytes.checked_mul(extent));
+        // An array of two axes is a single frame.
+        let rows = if self.shape.len() == 2 { self.shape[0] } else { 1 };
+        let frame = rows.checked_mul(self.sample.bytes());
+        let extents = self.shape.iter().skip(1);
+        let bytes = extents.fold(frame, |bytes, &extent| bytes?.checked_mul(extent));
         let (path, mut fetch) = (PathBuf::from(self.name), self.fetch);
         let name = path.clone();
-        let fetch = move |first, count: u64| {
-            let fetched = fetch(first, count)?;
+        let fetch = move |first: u64, count: u64| {
+            let fetched = fetch(first * rows as u64, count * rows as u64)?;
             let expected = bytes.and_then(|bytes| bytes.checked_mul(count as usize));
             if expected == Some(fetched.len()) { Ok(fetched) } else { Err(changed(&name)) }
         };
@@ -107,6 +107,19 @@ mod tests {
         capture.read(2, &mut counts).unwrap();
         assert!(counts.iter().copied().eq(frame(2).map(u16::from)));
         assert_eq!((capture.frames(), capture.info().format), (3, "array"));
+    }
+
+    #[test]
+    fn two_axes_are_one_frame() {
+        let fetch = |first: u64, rows: u64| {
+            assert_eq!((first, rows), (0, 16));
+            Ok(vec![3; 16 * 8])
+        };
+        let array = array(&[16, 8], Box::new(fetch));
+        let mut capture = Capture::from_array(array, &ReadOptions::default(), None).unwrap();
+        let mut counts = vec![0; 16 * 8];
+        capture.read(0, &mut counts).unwrap();
+        assert_eq!((capture.frames(), counts[127]), (1, 3));
     }
 
     #[test]

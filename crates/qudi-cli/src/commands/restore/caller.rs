@@ -54,17 +54,18 @@ impl RestoreSink for Sink<'_> {
 }
 
 /// Restores `input`, or the capture that `args` name, for `receiver`; returns the document that `--json`
-/// prints.
+/// prints. Of parts of the work, the receiver gets its own alone.
 pub(crate) fn run(
-    args: &Restore,
+    mut args: Restore,
     input: Option<Input>,
     settings: &Settings,
     global: &Global,
     report: &Report,
     receiver: &mut dyn Receiver,
 ) -> Result<Value> {
-    refuse_files(args)?;
-    let plan = Plan::new(args, global, false)?;
+    refuse_files(&args)?;
+    let shard = args.shard.take();
+    let plan = Plan::new(&args, global, false)?;
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
         None => plan.source(),
@@ -72,10 +73,18 @@ pub(crate) fn run(
     let mut job = Job::prepare(&plan, &source, settings, report)?;
     let settings = job.settings(&plan)?;
     let frames = job.schedule.instants.pictures(job.capture());
-    receiver.start(&settings, frames).map_err(CliError::from)?;
+    let part = match (shard, frames) {
+        (Some(shard), Some(frames)) => shard.range(frames),
+        (Some(_), None) => {
+            let help = "store the capture in a file to share the work";
+            return Err(CliError::new("a stream comes once and whole", "--shard", help));
+        }
+        (None, frames) => 0..frames.unwrap_or(u64::MAX),
+    };
+    receiver.start(&settings, frames.map(|_| part.end - part.start))?;
     let map = ChiSquareMap::new(job.capture(), &job.acquisition);
     let mut sink = Sink { receiver, map, tonemap: plan.tonemap };
-    job.run(0..frames.unwrap_or(u64::MAX), &mut sink, &plan.network, report)?;
+    job.run(part, &mut sink, &plan.network, report)?;
     let results = job.results(&plan, sink.map.chi_square())?;
     crate::capture::remarks(job.capture(), report);
     for warning in &job.warnings {

@@ -1,0 +1,39 @@
+//! Writing restored frames.
+
+use crate::errors::exception;
+use pyo3::prelude::*;
+use qudi_core::{Error, Frame, Size};
+use std::path::PathBuf;
+
+/// Writes frames, each the bytes of its float32 values in C order, as `path` says by its extension.
+#[pyfunction]
+#[pyo3(signature = (path, size, frames, *, float, fps, force))]
+pub(crate) fn write_frames(
+    py: Python<'_>,
+    path: PathBuf,
+    size: (usize, usize),
+    frames: &Bound<'_, PyAny>,
+    float: bool,
+    fps: f64,
+    force: bool,
+) -> PyResult<()> {
+    let size = Size::new(size.0, size.1, "shape").map_err(|error| exception(error.into()))?;
+    let mut raised = None;
+    let mut failed = |error: PyErr| {
+        let text = error.to_string();
+        raised.get_or_insert(error);
+        Error::request(text, "frames", "see the exception of the frames")
+    };
+    let mut frames = frames.try_iter()?.map(|frame| {
+        py.check_signals().map_err(&mut failed)?;
+        let bytes: Vec<u8> = frame.and_then(|frame| frame.extract()).map_err(&mut failed)?;
+        let values = bytes.chunks_exact(4).map(|b| f32::from_ne_bytes([b[0], b[1], b[2], b[3]]));
+        Ok(Frame { size, data: values.collect() })
+    });
+    let written = qudi_cli::write_frames(&path, size, float, fps, force, &mut frames);
+    drop(frames);
+    match raised {
+        Some(raised) => Err(raised),
+        None => written.map_err(exception),
+    }
+}
