@@ -334,9 +334,15 @@ pub fn read_image(path: &Path) -> Result<Frame> {
 /// [`Error`] if it cannot be read, has other axes, or holds values that are not finite.
 pub fn read_clip(path: &Path, max_frames: usize) -> Result<Vec<Frame>> {
     let (header, reader) = Header::open(path)?;
-    let (&[frames, height, width], Some(full)) =
-        (header.shape.as_slice(), header.sample.full_scale())
-    else {
+    // An axis of one channel, before or after the picture, holds nothing.
+    let shape = match *header.shape.as_slice() {
+        [frames, 1, height, width] | [frames, height, width, 1] | [frames, height, width] => {
+            Some([frames, height, width])
+        }
+        [height, width] => Some([1, height, width]),
+        _ => None,
+    };
+    let (Some([frames, height, width]), Some(full)) = (shape, header.sample.full_scale()) else {
         return Err(Error::data(
             format!(
                 "an array of shape {:?}, or of wide integers, where a clip is expected",
