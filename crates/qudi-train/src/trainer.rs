@@ -52,6 +52,8 @@ pub struct Trainer<L> {
     pub(super) network: L,
     pub(super) ema: Ema,
     pub(super) optimizer: Optimizer,
+    /// Steps of the last state that was written or read.
+    pub(super) saved: Option<u64>,
     perceptual: Vec<Lpips>,
     /// Whether each parameter learns.
     learns: Vec<bool>,
@@ -108,6 +110,7 @@ impl<L: Learner> Trainer<L> {
             recipe: recipe.clone(),
             optimizer: Optimizer::new(recipe.train.optimizer, &start, shapes, L::prefers_adam),
             ema: Ema::new(start, recipe.train.ema),
+            saved: None,
             network: learner,
             devices,
             perceptual,
@@ -253,13 +256,21 @@ impl<L: Learner> Trainer<L> {
         if value.is_finite() {
             return Ok(());
         }
-        Err(Error::request(
-            format!(
-                "{what} is {value} at step {}: training stopped, the last checkpoint is good",
-                self.step_number() + 1
+        let step = self.step_number() + 1;
+        let (found, help) = match self.saved {
+            Some(saved) => (
+                format!("the checkpoint of step {saved} is good"),
+                "lower train.lr or train.clip, and resume from the checkpoint",
             ),
+            None => (
+                "there is no checkpoint yet".to_owned(),
+                "lower train.lr or train.clip, and start again",
+            ),
+        };
+        Err(Error::request(
+            format!("{what} is {value} at step {step}: training stopped, {found}"),
             what,
-            "lower train.lr or train.clip, and resume from the checkpoint",
+            help,
         ))
     }
 }

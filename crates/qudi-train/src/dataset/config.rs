@@ -106,6 +106,11 @@ fn usual_speed() -> f64 {
 }
 
 impl SourceConfig {
+    /// Returns true if its scenes come from files.
+    pub fn reads_files(&self) -> bool {
+        self.kind != SourceKind::Scenes
+    }
+
     /// Draws the factor by which a sample is downscaled.
     pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
         if self.max_downscale > 1.0 { self.max_downscale.powf(uniform(random)) } else { 1.0 }
@@ -250,6 +255,6 @@ impl DataConfig {
 
     /// Returns true if any source reads files.
     pub fn needs_files(&self) -> bool {
-        self.source.iter().any(|source| source.kind != SourceKind::Scenes)
+        self.source.iter().any(SourceConfig::reads_files)
     }
 }
