@@ -40,7 +40,9 @@ pub(crate) mod eval {
     mod clip;
     mod exposed_clip;
     mod exposing;
+    mod external;
     mod html;
+    mod mark;
     mod metrics;
     mod perceptual;
     mod plan;
@@ -48,6 +50,8 @@ pub(crate) mod eval {
     mod score;
     mod table;
     mod table1;
+
+    pub(crate) use clip::clip_places;
 }
 
 pub(crate) mod info {
@@ -103,6 +107,9 @@ pub(crate) mod train {
     mod report;
     mod resume;
     pub(crate) mod run;
+    mod run_folder;
     mod stages;
     mod watch;
+
+    pub(crate) use run_folder::run_files;
 }

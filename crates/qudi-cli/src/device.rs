@@ -90,7 +90,8 @@ fn open_new(name: &str) -> Result<Opened> {
     };
     let number = number.ok_or_else(missing)?;
     let on_card = || all_cards().iter().any(|(b, cards)| *b == backend && number < cards.len());
-    if !matches!(backend, "cpu" | "flex" | "ndarray") && !on_card() {
+    let on_processor = matches!(backend, "cpu" | "flex" | "ndarray") && number == 0;
+    if !on_processor && !on_card() {
         return Err(missing());
     }
     let opened = guarded(name, || {

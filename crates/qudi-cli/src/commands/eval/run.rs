@@ -6,6 +6,7 @@ use super::clip::Clip;
 use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
 use super::html::{Pictures, html};
+use super::mark::remarks;
 use super::metrics::{METRICS, Metric, PSNR_A, Part};
 use super::plan::Plan;
 use super::score::{FlowKind, Row, Score};
@@ -15,7 +16,6 @@ use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::trained::refusal;
-use crate::places::Places;
 use crate::report::{Output, Report, csv, markdown};
 use crate::settings::Settings;
 use qudi_core::Frame;
@@ -30,18 +30,6 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let overwrite = global.overwrite();
-    let clips = if args.capture { Vec::new() } else { Clip::places(&args.data)? };
-    let outputs = [&args.csv, &args.markdown, &args.html, &args.export_photons];
-    let external = args.external.iter().map(|external| &external.folder);
-    Places::default()
-        .reads(args.capture.then_some(&args.data))
-        .reads(clips)
-        .reads(external)
-        .reads(args.sensor.as_deref())
-        .reads(args.network.weight_files())
-        .reads(&args.backbones)
-        .writes(outputs.into_iter().flatten())
-        .check()?;
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
     let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
     let html_file = output(&args.html)?;
@@ -54,6 +42,15 @@ pub(crate) fn run(
     } else {
         evaluate_clips(&plan, settings, report)?
     };
+    for remark in remarks(&rows) {
+        report.warning(&remark);
+    }
+    for (row, score) in rows.iter().flat_map(|row| row.scores.iter().map(move |s| (row, s))) {
+        if let Some([low, high]) = score.range {
+            let frames = format!("{} of {} at {} PPP", row.method, score.clip, row.ppp);
+            report.remark(&format!("note: values of {frames} run from {low:.4} to {high:.4}"));
+        }
+    }
     csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
     let mut further = looks(&rows);
     let mut about = about;
@@ -78,20 +75,23 @@ pub(crate) fn run(
     let shown = further.iter().map(|(title, table)| format!("{title}\n{}\n", table.to_text()));
     let text = format!("{}\n{}{about}\n", table.to_text(), shown.collect::<String>());
     report.result(&text, || document(settings, &rows))?;
-    let psnr_a = |row: &Row| row.over_clips(&PSNR_A).map_or(f64::NAN, |s| s.mean);
-    let misses = |row: &Row, bar: f64| row.refused.is_none() && PSNR_A.misses(psnr_a(row), bar);
-    match args.min_psnr {
-        Some(bar) => match rows.iter().find(|row| misses(row, bar)) {
-            Some(row) => Err(CliError::Missed(format!(
-                "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
-                row.label(),
-                psnr_a(row),
-                row.ppp
-            ))),
-            None => Ok(()),
-        },
+    match args.min_psnr.and_then(|bar| missed(&rows, bar)) {
+        Some(missed) => Err(CliError::Missed(missed)),
         None => Ok(()),
     }
+}
+
+/// Returns what misses a least psnr-a: the first method that is worse, or was not measured.
+fn missed(rows: &[Row], bar: f64) -> Option<String> {
+    let psnr_a = |row: &Row| row.over_clips(&PSNR_A).map_or(f64::NAN, |s| s.mean);
+    let row = rows.iter().find(|row| row.refused.is_some() || PSNR_A.misses(psnr_a(row), bar))?;
+    let (method, ppp) = (row.label(), row.ppp);
+    Some(match &row.refused {
+        Some(reason) => format!("missed: {method} was not measured at {ppp} PPP: {reason}"),
+        None => {
+            format!("missed: {method} reaches {:.2} dB at {ppp} PPP, below {bar}", psnr_a(row))
+        }
+    })
 }
 
 /// Evaluates every method on every clip at every light level.
@@ -135,6 +135,9 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
                 return Err(CliError::Interrupted);
             }
             let exposed = clip.expose(plan, &exposing, ppp)?;
+            for note in exposed.notes.iter().filter(|_| j == 0) {
+                report.warning(note);
+            }
             if plan.pictures {
                 pictures.push(exposed.pictures());
             }
