@@ -103,6 +103,23 @@ impl Acquisition {
         Ok(Self { seed: 0, first_frame: 0, ppp, mean_level, sensor, gain, dark: None })
     }
 
+    /// Counts the cross-talk and the afterpulses of the sensor as light, as many as there are at the mean
+    /// light.
+    ///
+    /// # Errors
+    /// [`Error`](crate::Error) if the sensor's dark rate is unknown.
+    pub fn without_echoes(mut self) -> Result<Self> {
+        let summed = f64::from(self.sensor.frames_summed);
+        let dark = self.sensor.dark_per_frame()?;
+        let detections = (self.sensor.quantum_efficiency * self.ppp + dark) / summed;
+        let factor = self.sensor.echo_factor(detections);
+        if factor != 1.0 {
+            self.sensor = self.sensor.without_echoes(detections);
+            self.dark = self.dark.map(|map| map.iter().map(|v| v * factor as f32).collect());
+        }
+        Ok(self)
+    }
+
     /// Sets the seed of random draws.
     #[must_use]
     pub fn with_seed(self, seed: u64) -> Self {

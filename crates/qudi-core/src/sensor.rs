@@ -12,6 +12,7 @@ mod count_table;
 mod defects;
 mod document;
 mod draw;
+mod echoes;
 mod law;
 mod moments;
 mod presets;
@@ -187,7 +188,13 @@ impl Sensor {
     /// binary pixel is taken as one detection short of saturation (Ma et al. 2020, eq. 4).
     pub fn estimate_flux(&self, sum: f64, frames: u32, gain: f64, dark_per_frame: f64) -> f64 {
         let detections = match self.response {
-            Response::Linear => sum / (gain * f64::from(frames)),
+            Response::Linear => {
+                let counted = sum / (gain * f64::from(frames));
+                match self.dead_time() {
+                    0.0 => counted,
+                    dead => echoes::detections_of_counted(counted, dead),
+                }
+            }
             Response::Binary => {
                 let n = f64::from(self.frames_summed);
                 let total = n * f64::from(frames);

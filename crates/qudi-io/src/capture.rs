@@ -7,6 +7,9 @@
 mod auto_sum;
 mod calibrate;
 mod depth;
+mod findings;
+mod frame_statistics;
+mod judge;
 mod mosaic;
 mod pixel_map;
 mod summary;
@@ -14,6 +17,7 @@ mod view;
 
 pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
+pub use findings::FrameFindings;
 pub use summary::{BitOrderCheck, Summary};
 
 use crate::codec;
@@ -28,6 +32,7 @@ use qudi_core::bad_pixels::{self, BadPixels, Repair};
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Error, Result};
+use std::collections::BTreeMap;
 use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -48,6 +53,9 @@ pub struct Capture {
     sum: u32,
     repair: Repair,
     bad: BadPixels,
+    findings: FrameFindings,
+    /// Broken native frames, and the good ones that are read instead.
+    stand_ins: BTreeMap<u64, u64>,
     /// Dark electrons per native frame and pixel of the view, if known.
     dark: Option<Vec<f32>>,
     stored: Vec<u16>,
@@ -142,6 +150,8 @@ impl Capture {
             sum,
             repair: Repair::default(),
             bad: BadPixels::default(),
+            findings: FrameFindings::default(),
+            stand_ins: BTreeMap::new(),
             dark: None,
             stored: vec![0; stored.pixels()],
             stored_sums: Vec::new(),
@@ -203,6 +213,8 @@ impl Capture {
             sum: 1,
             repair: Repair::default(),
             bad: BadPixels::default(),
+            findings: FrameFindings::default(),
+            stand_ins: BTreeMap::new(),
             dark: None,
             stored: vec![0; size.pixels()],
             stored_sums: Vec::new(),
@@ -380,7 +392,9 @@ impl Capture {
             ));
         }
         if self.sum == 1 {
-            self.native.read(self.range.start + native, &mut self.stored)?;
+            let stored = self.range.start + native;
+            let stored = self.stand_ins.get(&stored).copied().unwrap_or(stored);
+            self.native.read(stored, &mut self.stored)?;
             self.view.apply(&self.stored, counts);
         } else {
             let mut sums = vec![0; self.size().pixels()];
@@ -406,7 +420,10 @@ impl Capture {
     /// # Errors
     /// [`Error`] if the file cannot be read.
     pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
-        let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.count() == 0;
+        let untouched = self.sum == 1
+            && self.view.from.is_none()
+            && self.repair.count() == 0
+            && self.stand_ins.is_empty();
         if !untouched || self.info.packing.is_none() {
             return Ok(false);
         }
@@ -436,7 +453,13 @@ impl Capture {
     fn stored_sum(&mut self, range: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.stored_sums.clear();
         self.stored_sums.resize(self.stored.len(), 0);
-        self.native.add(range, &mut self.stored_sums)?;
+        let mut first = range.start;
+        for (&broken, &good) in self.stand_ins.range(range.clone()) {
+            self.native.add(first..broken, &mut self.stored_sums)?;
+            self.native.add(good..good + 1, &mut self.stored_sums)?;
+            first = broken + 1;
+        }
+        self.native.add(first..range.end, &mut self.stored_sums)?;
         self.view.apply(&self.stored_sums, sums);
         Ok(())
     }

@@ -4,12 +4,14 @@
 //! formats.
 
 mod array;
+mod companions;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod images;
 mod mat;
 mod npy;
 mod npz;
+mod parts;
 mod piped;
 mod qvga;
 mod raw;
@@ -20,6 +22,7 @@ mod tiff;
 mod video;
 mod visionsim;
 
+pub use companions::files_of;
 pub(crate) use piped::open_pipe;
 
 use crate::description::{CaptureInfo, Certainty, FormatOption, ReadOptions, refuse_others};
@@ -69,6 +72,7 @@ pub const FORMATS: &[Format] = &[
     sparse::FORMAT,
     qvga::FORMAT,
     tiff::FORMAT,
+    parts::FORMAT,
     images::FORMAT,
     mat::FORMAT,
     #[cfg(feature = "hdf5")]

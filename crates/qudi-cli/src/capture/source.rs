@@ -20,6 +20,8 @@ pub(crate) struct Source<'a> {
     pub(crate) sum: Option<Sum>,
     /// The sensor by name, if given.
     pub(crate) sensor: Option<&'a str>,
+    /// Frames that are judged at most, before any is used.
+    pub(crate) judged: u64,
 }
 
 /// A capture with its sensor, if that is known.
@@ -38,13 +40,21 @@ impl Source<'_> {
         }
     }
 
+    /// Opens the capture, and judges its frames.
+    fn open_judged(&self, path: &Path, sensor: Option<&Sensor>) -> Result<Capture> {
+        let mut capture = Capture::open(path, self.options, sensor)?;
+        let known = sensor.or(capture.info().sensor.as_ref()).cloned();
+        capture.judge_frames(self.judged, self.options, known.as_ref())?;
+        Ok(capture)
+    }
+
     fn open_file(
         &self,
         path: &Path,
         named: Option<Sensor>,
         settings: &Settings,
     ) -> Result<OpenedCapture> {
-        let capture = Capture::open(path, self.options, named.as_ref())?;
+        let capture = self.open_judged(path, named.as_ref())?;
         if named.is_some() {
             return Ok(OpenedCapture { capture, sensor: named });
         }
@@ -52,7 +62,7 @@ impl Source<'_> {
             Some(sensor) if settings.overrides_sensor() => {
                 let sensor = settings.adjusted(sensor)?;
                 // Opened again: a dark map that is set decides which pixels are repaired.
-                let capture = Capture::open(path, self.options, Some(&sensor))?;
+                let capture = self.open_judged(path, Some(&sensor))?;
                 Ok(OpenedCapture { capture, sensor: Some(sensor) })
             }
             sensor => Ok(OpenedCapture { capture, sensor }),

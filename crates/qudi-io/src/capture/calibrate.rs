@@ -21,7 +21,7 @@ const READ_NOISE_RANGE: (f64, f64) = (0.01, 30.0);
 /// Dark rates, hot pixels and read noise of a camera.
 #[derive(Clone, Debug)]
 pub struct Calibration {
-    /// Size of the maps.
+    /// Size of the maps: of the stored frames, not turned and not cropped.
     pub size: Size,
     /// Frames used.
     pub frames: u64,
@@ -140,10 +140,16 @@ fn finish(
             rates[i] > threshold && significant
         })
         .collect();
+    // Maps are of the stored frames, so that whoever turns and crops these turns and crops the maps.
+    let stored = capture.native.size();
+    let dark: Vec<f32> = rates.iter().map(|&rate| rate as f32).collect();
+    let hot = BadPixels { hot, ..BadPixels::default() }.mask(size);
+    let hot = capture.view.stored(&hot, stored, false);
+    let hot = (0..hot.len()).filter(|&i| hot[i]).collect();
     Ok(Calibration {
-        size,
+        size: stored,
         frames,
-        dark: rates.iter().map(|&rate| rate as f32).collect(),
+        dark: capture.view.stored(&dark, stored, bulk as f32),
         bulk,
         bad: BadPixels { hot, ..BadPixels::default() },
         threshold,

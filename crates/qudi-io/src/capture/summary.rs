@@ -213,9 +213,12 @@ fn ppp(
         }
         None => native.dark_per_frame()?,
     };
-    let incident = detected
-        .filter(|_| sensor.is_some())
-        .map(|detected| ((detected - dark * per_frame) / native.quantum_efficiency).max(0.0));
+    let of_light = |detected: f64| {
+        let frames = per_frame * f64::from(native.frames_summed);
+        let seen = detected / native.echo_factor_of_seen(detected / frames);
+        ((seen - dark * per_frame) / native.quantum_efficiency).max(0.0)
+    };
+    let incident = detected.filter(|_| sensor.is_some()).map(of_light);
     Ok(Ppp { incident, detected, dn })
 }
 

@@ -70,7 +70,13 @@ pub(crate) fn run(
     let mode = own.map(|own| own.mode(&plan.network));
     let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
     job.warnings.extend(chi_square);
-    let results = json!({"chi_square": map.chi_square(), "mode": mode, "warnings": job.warnings});
+    let results = json!({
+        "chi_square": map.chi_square(),
+        "mode": mode,
+        "warnings": job.warnings,
+        "notes": job.capture().info().notes,
+        "findings": job.capture().findings(),
+    });
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
     uncertainty.finish()?;
@@ -221,7 +227,8 @@ impl Job {
             }
         }
         let share = plan.shard.map_or(Share::Whole, Shard::share);
-        Ok(FolderRun { settings: settings.clone(), inputs, share })
+        let frames = self.schedule.instants.pictures(self.capture());
+        Ok(FolderRun { settings: settings.clone(), inputs, share, frames })
     }
 
     fn run(
