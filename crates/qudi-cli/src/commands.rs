@@ -34,14 +34,17 @@ pub(crate) mod demo {
 }
 
 pub(crate) mod eval {
+    mod about;
     mod appearance;
     pub(crate) mod args;
     mod capture;
     mod clip;
+    mod exact_json;
     mod exposed_clip;
     mod exposing;
     mod external;
     mod html;
+    mod join;
     mod mark;
     mod metrics;
     mod perceptual;

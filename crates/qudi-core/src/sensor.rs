@@ -187,6 +187,18 @@ impl Sensor {
     /// `frames` output frames of one pixel, dark counts subtracted, never negative. A saturated
     /// binary pixel is taken as one detection short of saturation (Ma et al. 2020, eq. 4).
     pub fn estimate_flux(&self, sum: f64, frames: u32, gain: f64, dark_per_frame: f64) -> f64 {
+        self.estimate_signed_flux(sum, frames, gain, dark_per_frame).max(0.0)
+    }
+
+    /// Estimates as [`Self::estimate_flux`], negative where noise leaves less than the dark counts: means over
+    /// pixels have no bias.
+    pub fn estimate_signed_flux(
+        &self,
+        sum: f64,
+        frames: u32,
+        gain: f64,
+        dark_per_frame: f64,
+    ) -> f64 {
         let detections = match self.response {
             Response::Linear => {
                 let counted = sum / (gain * f64::from(frames));
@@ -203,7 +215,7 @@ impl Sensor {
                 -n * (-sum.min(ceiling) / total).ln_1p()
             }
         };
-        ((detections - dark_per_frame) / self.quantum_efficiency).max(0.0)
+        (detections - dark_per_frame) / self.quantum_efficiency
     }
 
     /// Checks every parameter against what a sensor can be.

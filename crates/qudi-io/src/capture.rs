@@ -21,7 +21,7 @@ pub use findings::FrameFindings;
 pub use summary::{BitOrderCheck, Summary};
 
 use crate::codec;
-use crate::description::{CaptureInfo, ReadOptions, with_pedestal};
+use crate::description::{CaptureInfo, ReadOptions, keep_pedestal, with_pedestal};
 use crate::frames::depth::DepthChecked;
 use crate::frames::pipe::{FIRST_WINDOW, STDIN};
 use crate::frames::{CountFrames, memory};
@@ -77,16 +77,21 @@ impl Capture {
     /// # Errors
     /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
-        let options = &with_pedestal(options, sensor);
-        let (native, info) = codec::open(path, options)?;
+        let mut options = with_pedestal(options, sensor);
+        let named = options.offset.is_some() || options.threshold.is_some();
+        let kept = keep_pedestal(&mut options, sensor);
+        let (native, mut info) = codec::open(path, &options)?;
+        info.pedestal = kept;
         // A record next to the file may name a sensor with a pedestal, above which its counts were taken.
         let recorded = info.sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
-        if recorded > 0.0 && options.offset.is_none() && options.threshold.is_none() {
-            let options = ReadOptions { offset: Some(recorded), ..options.clone() };
-            let (native, info) = codec::open(path, &options)?;
+        if recorded > 0.0 && !named {
+            options.offset = Some(recorded);
+            let kept = keep_pedestal(&mut options, info.sensor.as_ref());
+            let (native, mut info) = codec::open(path, &options)?;
+            info.pedestal = kept;
             return Self::assemble(path, native, info, &options, sensor);
         }
-        Self::assemble(path, native, info, options, sensor)
+        Self::assemble(path, native, info, &options, sensor)
     }
 
     /// Opens a capture from `reader`: a `.npy`, or raw frames that `options` describe. Each frame arrives
@@ -99,9 +104,11 @@ impl Capture {
         options: &ReadOptions,
         sensor: Option<&Sensor>,
     ) -> Result<Self> {
-        let options = &with_pedestal(options, sensor);
-        let (native, info) = codec::open_pipe(Box::new(reader), options)?;
-        Self::assemble(Path::new(STDIN), native, info, options, sensor)
+        let mut options = with_pedestal(options, sensor);
+        let kept = keep_pedestal(&mut options, sensor);
+        let (native, mut info) = codec::open_pipe(Box::new(reader), &options)?;
+        info.pedestal = kept;
+        Self::assemble(Path::new(STDIN), native, info, &options, sensor)
     }
 
     fn assemble(

@@ -219,6 +219,12 @@ const FOREIGN_FORMATS: &[(&[u8], &[&str], &str, &str)] = &[
         "export it from ImageJ (Bio-Formats) as a TIFF stack of 8 or 16 bits",
     ),
     (
+        b"LUCAM-RECORDER",
+        &["ser"],
+        "a SER video of an astronomer's camera",
+        "export its frames as a multi-page TIFF or FITS, as PIPP, Siril or `serpy` do, and name that",
+    ),
+    (
         b"% evt",
         &["aedat4", "aedat", "evt", "dat2"],
         "a file of an event camera, which counts no photons",
@@ -256,6 +262,14 @@ fn foreign(probe: &Probe) -> Option<Error> {
 }
 
 fn unknown(probe: &Probe) -> Error {
+    let is_zarr = |name: &str| probe.path.join(name).is_file();
+    if probe.is_folder && [".zarray", ".zgroup", "zarr.json"].into_iter().any(is_zarr) {
+        return Error::data(
+            "a Zarr store",
+            &probe.path,
+            "save one array of it in Python: numpy.save('capture.npy', zarr.open(NAME)[:])",
+        );
+    }
     if let Some(error) = foreign(probe) {
         return error;
     }

@@ -1,5 +1,5 @@
-//! Search of PyTorch files for anything that loading them elsewhere would run. Nothing is run here; but a file
-//! that holds code is not a file of weights, whoever made it.
+//! Search of PyTorch files for anything that loading them elsewhere would run. Nothing is run here; but a
+//! file that holds code is not a file of weights, whoever made it.
 
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::open_regular;
@@ -150,7 +150,7 @@ impl<'a> Pickle<'a> {
         self.strings.push(self.memo.get(&number).cloned().flatten());
     }
 
-    /// Takes one operation; returns false at the end. The operations are those of Python's `pickletools`.
+    /// Takes one operation; returns false at the end. Python's `pickletools` lists the operations.
     fn step(&mut self) -> std::result::Result<bool, String> {
         let operation = self.number(1)? as u8;
         match operation {

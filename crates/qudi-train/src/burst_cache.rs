@@ -371,6 +371,7 @@ impl BurstCache {
             gain: label.gain,
             sensor: label.sensor,
             dark: None,
+            pedestal: 0.0,
         };
         let sample = Sample { truth, counts: counts.collect(), acquisition };
         let signed = |name: &String| data(name).iter().map(|&b| b.cast_signed()).collect();

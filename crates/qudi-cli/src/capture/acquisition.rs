@@ -77,8 +77,10 @@ impl CaptureAcquisition {
             sensor: output_sensor,
             gain,
             dark,
+            pedestal: 0.0,
         }
-        .without_echoes()?;
+        .without_echoes()?
+        .with_pedestal(capture.info().pedestal)?;
         // The recorded level gives what is restored the brightness of the clip.
         let recorded = capture.info().mean_level.filter(|_| overrides.ppp.is_none());
         acquisition.mean_level = match overrides.mean_level.or(recorded) {

@@ -38,6 +38,7 @@ pub(super) fn inputs_of(command: &Command, settings: &Settings, global: &Global)
                 inputs.list.extend(args.reading.files().into_iter().map(Path::to_owned));
                 inputs.sensor_or_setting(sensor);
             }
+            inputs.list.extend(args.join.iter().cloned());
             inputs.list.extend(args.external.iter().map(|external| external.folder.clone()));
             inputs.list.extend(args.backbones.clone());
             inputs.weights(&args.network);

@@ -1,5 +1,5 @@
-//! Detections that other detections cause, cross-talk and afterpulses, and the time after a detection in which
-//! a counter sees nothing: their laws inverted.
+//! Detections that other detections cause, cross-talk and afterpulses, and the time after a detection in
+//! which a counter sees nothing: their laws inverted.
 
 use super::{Response, Sensor};
 

@@ -1,5 +1,5 @@
-//! Frames are judged before they are used: empty, at full scale, repeated, out of family; cuts and steps of the
-//! light.
+//! Frames are judged before they are used: empty, at full scale, repeated, out of family; cuts and steps of
+//! the light.
 
 use super::Capture;
 use super::findings::FrameFindings;
@@ -11,7 +11,7 @@ use qudi_core::Result;
 use qudi_core::sensor::{Response, Sensor};
 
 /// Neighbours on each side whose median a frame is compared with.
-const REACH: usize = 4;
+const NEIGHBOURS: usize = 4;
 
 /// Counts of a usual frame below which an empty one may be chance.
 const MIN_SUM: u64 = 30;
@@ -256,8 +256,8 @@ fn is_far(value: f64, usual: f64, factor: f64) -> bool {
 
 /// Returns the values around number `n`, before and after.
 fn around(values: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
-    let before = values[n.saturating_sub(REACH)..n].to_vec();
-    let after = values[n + 1..(n + 1 + REACH).min(values.len())].to_vec();
+    let before = values[n.saturating_sub(NEIGHBOURS)..n].to_vec();
+    let after = values[n + 1..(n + 1 + NEIGHBOURS).min(values.len())].to_vec();
     match (before.is_empty(), after.is_empty()) {
         (true, _) => (after.clone(), after),
         (_, true) => (before.clone(), before),

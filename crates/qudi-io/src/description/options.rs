@@ -272,16 +272,3 @@ impl FromStr for MaskChoice {
         })
     }
 }
-
-/// Returns `options` with the sensor's pedestal and threshold, if they set neither.
-pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
-    let mut options = options.clone();
-    if options.offset.is_none()
-        && options.threshold.is_none()
-        && let Some(sensor) = sensor
-    {
-        options.offset = (sensor.offset > 0.0).then_some(sensor.offset);
-        options.threshold = sensor.threshold;
-    }
-    options
-}

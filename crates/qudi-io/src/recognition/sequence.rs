@@ -28,7 +28,8 @@ fn pattern(path: &Path) -> (String, Option<(String, u64)>) {
     (pattern + rest, last)
 }
 
-/// Drops files whose names are of another pattern than most, and returns notes on them and on missing numbers.
+/// Drops files whose names are of another pattern than most, and returns notes on them and on missing
+/// numbers.
 pub(crate) fn numbered(files: Vec<PathBuf>) -> (Vec<PathBuf>, Vec<String>) {
     let mut patterns: BTreeMap<String, usize> = BTreeMap::new();
     for file in &files {

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use tiff::ColorType;
 use tiff::decoder::{Decoder, DecodingResult};
 
-/// Returns true if the name ends like that of a TIFF.
+/// Returns true if the name ends like a TIFF's.
 pub(super) fn is_tiff(path: &Path) -> bool {
     path.extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("tif") || e.eq_ignore_ascii_case("tiff"))

@@ -64,6 +64,11 @@ pub(crate) fn run(
     // What was written must be readable.
     Sensor::load(&args.output.to_string_lossy())?;
     remarks(&capture, report);
+    if let Some(correlation) = calibration.picture {
+        report.warning(&format!(
+            "neighbouring pixels have like rates (correlation {correlation:.2}): the capture shows a picture, or the sensor glows; close the shutter and cover it"
+        ));
+    }
     let per_second = |rate: f64| fps.map_or(String::new(), |fps| format!(" ({:.1}/s)", rate * fps));
     let mut text = String::new();
     let _ = writeln!(

@@ -26,6 +26,11 @@ impl Mark {
         is_equal.then_some(Self::Equal)
     }
 
+    /// Returns the mark of a name.
+    pub(crate) fn by_name(name: &str) -> Option<Self> {
+        [Self::Black, Self::Equal].into_iter().find(|mark| mark.name() == name)
+    }
+
     /// Returns its name in CSV and JSON.
     pub(crate) fn name(self) -> &'static str {
         match self {

@@ -1,15 +1,17 @@
 //! `qudi eval`: methods against known truth on the same photons, or on a real capture without one.
 
+use super::about::about;
 use super::args::{Eval, External, Protocol};
 use super::capture::{Evaluation, evaluate_capture};
 use super::clip::Clip;
 use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
 use super::html::{Pictures, html};
+use super::join::join;
 use super::mark::remarks;
 use super::metrics::{METRICS, Metric, PSNR_A, Part};
 use super::plan::Plan;
-use super::score::{FlowKind, Row, Score};
+use super::score::{Row, Score};
 use super::table::{frames, looks, summary};
 use super::table1;
 use crate::args::Global;
@@ -37,7 +39,9 @@ pub(crate) fn run(
         refuse_taken(folder, overwrite)?;
     }
     let plan = Plan::new(args, overwrite)?;
-    let Evaluation { rows, pictures, about, settings } = if args.capture {
+    let Evaluation { rows, pictures, about, settings } = if !args.join.is_empty() {
+        join(&args.join)?
+    } else if args.capture {
         evaluate_capture(&plan, settings, report)?
     } else {
         evaluate_clips(&plan, settings, report)?
@@ -125,8 +129,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     let each = rows.len() / levels.len();
     let mut pictures = Vec::new();
     let mut bar = report.bar();
-    let number = clips.len();
-    let total = (number * levels.len()) as u64;
+    let total = (clips.len() * levels.len()) as u64;
     // By value: what was found out about a clip goes with it.
     for (i, clip) in clips.into_iter().enumerate() {
         for (j, &ppp) in levels.iter().enumerate() {
@@ -145,26 +148,6 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         }
     }
     drop(bar);
-    let flow = match rows.first().and_then(Row::flow) {
-        Some(FlowKind::True) => "; flicker: rms change along the true flow beyond the truth's",
-        Some(FlowKind::Estimated) => {
-            "; flicker: rms change along the estimated flow (on the truth, checked both ways) beyond the truth's"
-        }
-        None => "",
-    };
-    let protocol = plan.protocol.name();
-    let about = format!(
-        "{number} {} ({}), {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before{}",
-        if number == 1 { "clip" } else { "clips" },
-        names.join(", "),
-        exposing.sensor.name,
-        exposing.seed,
-        if plan.appearance && plan.perceptual.is_none() {
-            "; LPIPS was not measured: --backbones names no weights"
-        } else {
-            ""
-        }
-    );
     let settings = json!({
         "protocol": plan.protocol,
         "data": plan.data,
@@ -173,7 +156,9 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         "seed": exposing.seed,
         "exposure": plan.mean_level,
         "overlap": plan.overlap,
+        "lpips_missing": plan.appearance && plan.perceptual.is_none(),
     });
+    let about = about(&settings, &rows);
     Ok(Evaluation { rows, pictures, about, settings })
 }
 

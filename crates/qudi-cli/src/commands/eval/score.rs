@@ -3,10 +3,11 @@
 use super::mark::Mark;
 use super::metrics::{Compared, METRICS, Metric};
 use crate::error::Result;
-use qudi_core::Frame;
 use qudi_core::metrics::{OCTAVES, Statistics};
+use qudi_core::{Frame, Size};
 use serde::ser::SerializeMap;
-use serde::{Serialize, Serializer};
+use serde::{Deserialize, Serialize, Serializer};
+use serde_json::Value;
 
 /// The values of one frame.
 #[derive(Clone, Debug)]
@@ -21,6 +22,14 @@ impl FrameScore {
     pub(crate) fn of(compared: &Compared<'_>) -> Result<Self> {
         let values = METRICS.iter().map(|metric| (metric.value)(compared));
         Ok(Self { values: values.collect::<Result<_>>()?, mark: Mark::of(compared) })
+    }
+
+    /// Reads the values of a frame; none if they are no numbers.
+    fn from_json(value: &Value) -> Option<Self> {
+        let values = value.as_object()?;
+        let mark = values.get("mark").and_then(Value::as_str);
+        let values = METRICS.iter().map(|metric| values.get(metric.key).and_then(Value::as_f64));
+        Some(Self { values: values.collect(), mark: mark.and_then(Mark::by_name) })
     }
 
     /// Takes some values; all others are unknown.
@@ -68,7 +77,7 @@ pub(crate) struct Cost {
 }
 
 /// Origin of the flow that flicker is measured along.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum FlowKind {
     /// The scene is synthetic.
@@ -108,6 +117,26 @@ pub(crate) struct Score {
 }
 
 impl Score {
+    /// Reads the figures of a clip as [`Serialize`] writes them; none if they are no such figures.
+    pub(crate) fn from_json(value: &Value) -> Option<Self> {
+        let frames = value["frames"].as_array()?.iter().map(FrameScore::from_json);
+        let octaves = |key: &str| serde_json::from_value::<[f64; OCTAVES]>(value[key].clone()).ok();
+        let added = octaves("added").zip(octaves("missed"));
+        Some(Self {
+            clip: value["clip"].as_str()?.to_owned(),
+            frames: frames.collect::<Option<_>>()?,
+            chi_square: value["chi_square"].as_f64(),
+            flicker: value["flicker"].as_f64(),
+            flow: serde_json::from_value(value["flow"].clone()).ok(),
+            added: added.map(|(added, missed)| Added { added, missed }),
+            seconds_per_frame: value["seconds_per_frame"].as_f64(),
+            peak_mib: value["peak_mib"].as_f64(),
+            range: serde_json::from_value(value["range"].clone()).ok(),
+            picture: Frame::filled(Size { height: 1, width: 1 }, 0.0),
+            how: String::new(),
+        })
+    }
+
     /// Returns the frames whose truth is not black: a black one says nothing of a method.
     pub(crate) fn lit(&self) -> impl Iterator<Item = &FrameScore> {
         self.frames.iter().filter(|frame| frame.mark != Some(Mark::Black))
