@@ -4,6 +4,7 @@ pub(crate) mod bench {
     pub(crate) mod args;
     mod burst;
     pub(crate) mod run;
+    mod training;
 }
 
 pub(crate) mod calibrate {
@@ -81,6 +82,7 @@ pub(crate) mod publish {
 
 pub(crate) mod restore {
     pub(crate) mod args;
+    pub(crate) mod caller;
     mod chi_square_map;
     mod output;
     mod plan;

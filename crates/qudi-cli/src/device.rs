@@ -23,8 +23,13 @@ pub(crate) struct Opened {
 impl Opened {
     /// Returns true if it computes in the program's own memory.
     pub(crate) fn is_processor(&self) -> bool {
-        matches!(self.name.as_str(), "cpu" | "flex" | "ndarray")
+        is_processor(&self.name)
     }
+}
+
+/// Returns true if a backend of this name computes on the processor.
+fn is_processor(backend: &str) -> bool {
+    matches!(backend, "cpu" | "flex" | "ndarray" | "libtorch-cpu")
 }
 
 /// Lists all devices: the CPU first, then the graphics cards of each backend that was compiled in.
@@ -37,6 +42,9 @@ pub(crate) fn list() -> Vec<Listed> {
     }
     if cfg!(feature = "ndarray") {
         add("ndarray".to_owned(), format!("{cores} cores (ndarray: slow, deprecated upstream)"));
+    }
+    if cfg!(feature = "libtorch") {
+        add("libtorch-cpu".to_owned(), format!("{cores} cores (LibTorch)"));
     }
     for (backend, cards) in all_cards() {
         for (n, card) in cards.iter().enumerate() {
@@ -53,6 +61,8 @@ fn feature_of(backend: &str) -> Option<&'static str> {
         ("vulkan", cfg!(feature = "vulkan")),
         ("metal", cfg!(feature = "metal")),
         ("cuda", cfg!(feature = "cuda")),
+        ("libtorch", cfg!(feature = "libtorch")),
+        ("libtorch-cpu", cfg!(feature = "libtorch")),
         ("ndarray", cfg!(feature = "ndarray")),
     ];
     let lacks = |(name, built): &&(&'static str, bool)| *name == backend && !built;
@@ -82,6 +92,7 @@ fn open_new(name: &str) -> Result<Opened> {
         let names = names.join(", ");
         let help = match feature_of(backend) {
             Some(feature) => {
+                let feature = feature.trim_end_matches("-cpu");
                 format!("this build has {names}; build it with `--features {feature}` for more")
             }
             None => format!("this build and machine have {names}; or use auto"),
@@ -90,7 +101,7 @@ fn open_new(name: &str) -> Result<Opened> {
     };
     let number = number.ok_or_else(missing)?;
     let on_card = || all_cards().iter().any(|(b, cards)| *b == backend && number < cards.len());
-    let on_processor = matches!(backend, "cpu" | "flex" | "ndarray") && number == 0;
+    let on_processor = is_processor(backend) && number == 0;
     if !on_processor && !on_card() {
         return Err(missing());
     }
@@ -131,6 +142,13 @@ fn create(backend: &str, number: usize) -> Option<Device> {
         #[cfg(feature = "ndarray")]
         #[allow(deprecated)] // asked for by name
         "ndarray" => Some(Device::ndarray()),
+        #[cfg(feature = "libtorch")]
+        #[allow(deprecated)]
+        // upstream prefers its own backends, and has none as fast in training yet
+        "libtorch-cpu" => Some(Device::libtorch()),
+        #[cfg(feature = "libtorch")]
+        #[allow(deprecated)]
+        "libtorch" => Some(Device::libtorch_cuda(number)),
         #[cfg(feature = "wgpu")]
         "wgpu" => card(DeviceType::Wgpu, number),
         #[cfg(feature = "vulkan")]
@@ -170,6 +188,8 @@ fn all_cards() -> &'static [(&'static str, Vec<String>)] {
 
 fn find_cards() -> Vec<(&'static str, Vec<String>)> {
     vec![
+        #[cfg(feature = "libtorch")]
+        ("libtorch", libtorch_cards()),
         #[cfg(feature = "cuda")]
         ("cuda", cards(DeviceType::Cuda)),
         #[cfg(feature = "vulkan")]
@@ -179,6 +199,12 @@ fn find_cards() -> Vec<(&'static str, Vec<String>)> {
         #[cfg(feature = "wgpu")]
         ("wgpu", cards(DeviceType::Wgpu)),
     ]
+}
+
+#[cfg(feature = "libtorch")]
+fn libtorch_cards() -> Vec<String> {
+    let count = guarded("", qudi_kernels::count_libtorch_cards).unwrap_or_default();
+    (0..count).map(|number| format!("CUDA card {number} (LibTorch)")).collect()
 }
 
 #[cfg(any(feature = "wgpu", feature = "vulkan", feature = "metal", feature = "cuda"))]

@@ -1,4 +1,4 @@
-//! Errors of the command line: what happened, where, what to do.
+//! Errors of commands: what happened, where, what to do.
 
 pub(crate) mod fields;
 
@@ -14,17 +14,41 @@ pub(crate) type Result<T, E = CliError> = std::result::Result<T, E>;
 
 /// Anything that ends a command early.
 #[derive(Debug)]
-pub(crate) enum CliError {
+pub enum CliError {
     /// Three parts for the user.
-    Error { what: String, place: Option<String>, help: Option<String> },
+    Error {
+        /// What happened.
+        what: String,
+        /// The file, sensor or option that it concerns.
+        place: Option<String>,
+        /// What to do about it.
+        help: Option<String>,
+        /// The kind of cause, for programs.
+        cause: Cause,
+    },
     /// It worked, but a bar that was set has been missed; the results are out already.
     Missed(String),
     /// Ctrl-C, after what was done has been saved.
     Stopped(String),
+    /// The time that was asked for is over, and what was done has been saved.
+    TimeOver(String),
     /// Ctrl-C.
     Interrupted,
     /// The reader of our output has gone.
     BrokenPipe,
+}
+
+/// The kind of what caused an error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cause {
+    /// Options or values that cannot be.
+    Request,
+    /// A file or array that does not hold what it should.
+    Data,
+    /// A capture that the sensor, or the cameras that weights were trained for, cannot have taken.
+    Mismatch,
+    /// The operating system refused; with its error number, if there is one.
+    System(Option<i32>),
 }
 
 impl CliError {
@@ -33,6 +57,17 @@ impl CliError {
             what: what.to_string(),
             place: Some(place.to_string()),
             help: Some(help.to_string()),
+            cause: Cause::Request,
+        }
+    }
+
+    /// Creates the error of a capture that a sensor cannot have taken.
+    pub(crate) fn mismatch(what: impl Display, place: impl Display, help: impl Display) -> Self {
+        Self::Error {
+            what: what.to_string(),
+            place: Some(place.to_string()),
+            help: Some(help.to_string()),
+            cause: Cause::Mismatch,
         }
     }
 }
@@ -68,10 +103,16 @@ impl From<Error> for CliError {
             _ => Self::Error {
                 what: flags_in_text(&e.to_string()),
                 place: e.place().map(|place| match &e {
-                    Error::Request { .. } => flags(&place),
+                    Error::Request { .. } | Error::Mismatch { .. } => flags(&place),
                     _ => place,
                 }),
                 help: e.help().map(|help| flags_in_text(&help)),
+                cause: match &e {
+                    Error::Io { source, .. } => Cause::System(source.raw_os_error()),
+                    Error::Data { .. } => Cause::Data,
+                    Error::Mismatch { .. } => Cause::Mismatch,
+                    _ => Cause::Request,
+                },
             },
         }
     }

@@ -92,11 +92,11 @@ fn field(name: &str) -> Option<f64> {
 }
 
 /// Keeps freed pages for the next allocation. The network's tensors are large and short-lived; giving them
-/// back to the system and faulting them in again costs a tenth of the time.
+/// back to the system and faulting them in again costs a tenth of the time. Call it at the start of a program
+/// whose allocator is mimalloc.
 #[allow(unsafe_code)]
-pub(crate) fn keep_freed_pages() {
-    // SAFETY: called at the start of `main`, before there are other threads; the value is in the option's
-    // range.
+pub fn keep_freed_pages() {
+    // SAFETY: called at the start, while no other thread works; the value is in the option's range.
     unsafe { libmimalloc_sys::mi_option_set(PURGE_DELAY, NEVER_PURGE) };
 }
 

@@ -9,6 +9,7 @@ mod duration;
 pub(crate) mod html;
 pub(crate) mod json;
 pub(crate) mod markdown;
+mod message;
 mod output;
 mod printable;
 pub(crate) mod svg;
@@ -16,6 +17,7 @@ mod table;
 
 pub(crate) use console::{Bar, Report, print};
 pub(crate) use duration::duration;
+pub use message::{Listener, Message};
 pub(crate) use output::Output;
 pub(crate) use printable::printable;
 pub(crate) use table::{Cell, Column, Table};

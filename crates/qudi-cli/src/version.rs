@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 pub(crate) const COMMIT: Option<&str> = option_env!("QUDI_COMMIT");
 
 /// Returns the lines of `qudi --version`; `-V` prints the first alone.
-pub(crate) fn long() -> &'static str {
+pub fn long() -> &'static str {
     static TEXT: LazyLock<String> = LazyLock::new(lines);
     &TEXT
 }

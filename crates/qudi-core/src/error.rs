@@ -43,6 +43,16 @@ pub enum Error {
         /// What to do about it.
         help: String,
     },
+    /// A capture that the named sensor cannot have taken.
+    #[error("{what}")]
+    Mismatch {
+        /// What does not fit, with both numbers.
+        what: String,
+        /// The capture or the option it concerns.
+        place: String,
+        /// What to do about it.
+        help: String,
+    },
     /// A request that contradicts itself or the data.
     #[error("{what}")]
     Request {
@@ -74,11 +84,18 @@ impl Error {
         Self::Request { what: what.into(), place: place.to_string(), help: help.into() }
     }
 
+    /// Creates the error for a capture that the named sensor cannot have taken.
+    pub fn mismatch(what: impl Into<String>, place: impl Display, help: impl Into<String>) -> Self {
+        Self::Mismatch { what: what.into(), place: place.to_string(), help: help.into() }
+    }
+
     /// Returns the file, sensor or option that the error concerns.
     pub fn place(&self) -> Option<String> {
         match self {
             Self::Io { path, .. } | Self::Data { path, .. } => Some(path.display().to_string()),
-            Self::Sensor { place, .. } | Self::Request { place, .. } => Some(place.clone()),
+            Self::Sensor { place, .. }
+            | Self::Mismatch { place, .. }
+            | Self::Request { place, .. } => Some(place.clone()),
             Self::Interrupted => None,
         }
     }
@@ -87,9 +104,10 @@ impl Error {
     pub fn help(&self) -> Option<String> {
         match self {
             Self::Io { source, .. } => Some(io_help(source.kind()).to_owned()),
-            Self::Data { help, .. } | Self::Sensor { help, .. } | Self::Request { help, .. } => {
-                Some(help.clone())
-            }
+            Self::Data { help, .. }
+            | Self::Sensor { help, .. }
+            | Self::Mismatch { help, .. }
+            | Self::Request { help, .. } => Some(help.clone()),
             Self::Interrupted => None,
         }
     }

@@ -24,8 +24,11 @@ pub const RECORD_BYTES: u64 = 1 << 24;
 /// Bytes of a weight file: the paper's network has 0.2 GiB.
 pub const WEIGHT_BYTES: u64 = 4 << 30;
 
-/// Bytes of one entry in a pack of training clips: an image of 64 megapixels has fewer.
-pub const PACK_ENTRY_BYTES: u64 = 64 << 20;
+/// Bytes of the index of a pack of training clips, which has five lines per clip.
+pub const PACK_INDEX_BYTES: u64 = 64 << 20;
+
+/// Pixels of all frames of a pack of training clips, which stay in memory as bytes: 64 GiB.
+pub const PACK_PIXELS: u64 = 1 << 36;
 
 /// Bytes of an index of another program that lists every frame (`transforms.json` of visionsim).
 pub const INDEX_BYTES: u64 = 1 << 28;

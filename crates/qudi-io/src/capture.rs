@@ -1,6 +1,6 @@
 //! Captures of real (and simulated) single-photon cameras, in every format of the field.
 //!
-//! A path is recognised ([`codec::FORMATS`]) and opened as native frames ([`CountFrames`]). A [`Capture`]
+//! A path is recognised ([`FORMATS`](crate::codec::FORMATS)) and opened as native frames ([`CountFrames`]). A [`Capture`]
 //! turns, crops and sums them and repairs bad pixels, so that nothing downstream sees a raw file. Memory
 //! holds a few frames, however long the capture is.
 
@@ -11,6 +11,7 @@ mod findings;
 mod frame_statistics;
 mod judge;
 mod mosaic;
+mod open;
 mod pixel_map;
 mod summary;
 mod view;
@@ -20,10 +21,9 @@ pub use calibrate::{Calibration, calibrate};
 pub use findings::FrameFindings;
 pub use summary::{BitOrderCheck, Summary};
 
-use crate::codec;
-use crate::description::{CaptureInfo, ReadOptions, keep_pedestal, with_pedestal};
+use crate::description::{CaptureInfo, ReadOptions};
 use crate::frames::depth::DepthChecked;
-use crate::frames::pipe::{FIRST_WINDOW, STDIN};
+use crate::frames::pipe::FIRST_WINDOW;
 use crate::frames::{CountFrames, memory};
 use depth::{check_sum, depth_source, state_depth};
 use mosaic::mosaic_plane;
@@ -33,7 +33,6 @@ use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Error, Result};
 use std::collections::BTreeMap;
-use std::io::Read;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use view::View;
@@ -72,45 +71,7 @@ impl std::fmt::Debug for Capture {
 }
 
 impl Capture {
-    /// Opens the capture at `path`. Its dark map and bad pixels come from `sensor`, if `options` name none.
-    ///
-    /// # Errors
-    /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
-    pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
-        let mut options = with_pedestal(options, sensor);
-        let named = options.offset.is_some() || options.threshold.is_some();
-        let kept = keep_pedestal(&mut options, sensor);
-        let (native, mut info) = codec::open(path, &options)?;
-        info.pedestal = kept;
-        // A record next to the file may name a sensor with a pedestal, above which its counts were taken.
-        let recorded = info.sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
-        if recorded > 0.0 && !named {
-            options.offset = Some(recorded);
-            let kept = keep_pedestal(&mut options, info.sensor.as_ref());
-            let (native, mut info) = codec::open(path, &options)?;
-            info.pedestal = kept;
-            return Self::assemble(path, native, info, &options, sensor);
-        }
-        Self::assemble(path, native, info, &options, sensor)
-    }
-
-    /// Opens a capture from `reader`: a `.npy`, or raw frames that `options` describe. Each frame arrives
-    /// once: [`Capture::wait_for`] waits for more, and statistics see the first window.
-    ///
-    /// # Errors
-    /// As [`Capture::open`].
-    pub fn from_pipe(
-        reader: impl Read + Send + 'static,
-        options: &ReadOptions,
-        sensor: Option<&Sensor>,
-    ) -> Result<Self> {
-        let mut options = with_pedestal(options, sensor);
-        let kept = keep_pedestal(&mut options, sensor);
-        let (native, mut info) = codec::open_pipe(Box::new(reader), &options)?;
-        info.pedestal = kept;
-        Self::assemble(Path::new(STDIN), native, info, &options, sensor)
-    }
-
+    /// Turns, crops and sums native frames as `options` say, and plans their repair.
     fn assemble(
         path: &Path,
         mut native: Box<dyn CountFrames>,
@@ -317,25 +278,25 @@ impl Capture {
     /// here.
     ///
     /// # Errors
-    /// [`Error::Request`] if the depth is unknown or differs from the sensor's, or if frames of a linear
+    /// [`Error::Mismatch`] if the depth is unknown or differs from the sensor's, or if frames of a linear
     /// sensor are summed, which no sensor does.
     pub fn output_sensor(&self, sensor: &Sensor) -> Result<Sensor> {
         let place = self.path.display();
         let linear = sensor.response == Response::Linear;
         if linear && self.sum > 1 {
-            return Err(Error::request(
+            return Err(Error::mismatch(
                 format!("sums of {} frames of `{}`, a linear sensor", self.sum, sensor.name),
                 "sum",
                 "only binary frames are summed: leave it out",
             ));
         }
         match self.max_count() {
-            _ if linear && self.info.binary => Err(Error::request(
+            _ if linear && self.info.binary => Err(Error::mismatch(
                 format!("binary frames, and `{}` is a linear sensor", sensor.name),
                 place,
                 "name the sensor that took them, as in `sensor swissspad2`",
             )),
-            Some(max) if linear && max != sensor.max_count() => Err(Error::request(
+            Some(max) if linear && max != sensor.max_count() => Err(Error::mismatch(
                 format!(
                     "counts up to {max}, and those of `{}` reach {}",
                     sensor.name,
@@ -345,7 +306,7 @@ impl Capture {
                 "name the sensor that took them, or the depth with `bits N`",
             )),
             Some(max) if !linear => Ok(Sensor { frames_summed: u32::from(max), ..sensor.clone() }),
-            None if !linear => Err(Error::request(
+            None if !linear => Err(Error::mismatch(
                 "how many binary frames a count sums is not known",
                 place,
                 "say the depth of counts with `bits 3` (for sums of 7), or `levels` for scaled means",

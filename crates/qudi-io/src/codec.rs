@@ -5,6 +5,7 @@
 
 mod array;
 mod companions;
+mod given;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod images;
@@ -23,6 +24,7 @@ mod video;
 mod visionsim;
 
 pub use companions::files_of;
+pub use given::{FetchFrames, GivenArray};
 pub(crate) use piped::open_pipe;
 
 use crate::description::{CaptureInfo, Certainty, FormatOption, ReadOptions, refuse_others};

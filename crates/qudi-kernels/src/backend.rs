@@ -39,6 +39,28 @@ pub(crate) fn is_cube<const D: usize>(tensor: &Tensor<D>) -> bool {
     }
 }
 
+/// Returns true if LibTorch computes tensors of this device, on a processor or on a card.
+pub fn is_libtorch(device: &Device) -> bool {
+    #[cfg(feature = "libtorch")]
+    {
+        use burn::backend::DispatchDevice;
+        match device.as_dispatch() {
+            DispatchDevice::Autodiff(device) => matches!(**device, DispatchDevice::LibTorch(_)),
+            device => matches!(device, DispatchDevice::LibTorch(_)),
+        }
+    }
+    #[cfg(not(feature = "libtorch"))]
+    {
+        let _ = device;
+        false
+    }
+}
+
+/// Returns true if LibTorch computes this tensor with the operations of this crate.
+pub(crate) fn is_recorded<const D: usize>(tensor: &Tensor<D>) -> bool {
+    tensor.dtype() == burn::tensor::DType::F32 && is_libtorch(&tensor.device()) && !STOCK.get()
+}
+
 thread_local! {
     /// True if this thread uses Burn's stock operations only.
     static STOCK: Cell<bool> = const { Cell::new(false) };

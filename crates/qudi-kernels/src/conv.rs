@@ -27,7 +27,7 @@ mod run;
 mod scratch;
 #[cfg(feature = "flex")]
 mod source;
-#[cfg(any(feature = "cube", test))]
+#[cfg(any(feature = "cube", feature = "libtorch", test))]
 mod stock;
 #[cfg(feature = "flex")]
 mod tiles;
@@ -43,7 +43,8 @@ pub(crate) use scratch::upper;
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 pub(crate) use amx::agrees as tiles_multiply;
 
-use crate::backend::{is_cube, is_native};
+use crate::backend::{is_cube, is_native, is_recorded};
+use crate::operations::count;
 use crate::precision::{ComputePrecision, Reduced};
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
@@ -91,7 +92,7 @@ pub fn conv_2d(
     options: Options,
 ) -> Tensor<4> {
     let [outputs, channels, rows, columns] = weight.dims();
-    if is_cube(&inputs[0]) || is_native(&inputs[0]) {
+    if is_extended(&inputs[0]) {
         let weight = weight.reshape([outputs, channels, 1, rows, columns]);
         return extended(inputs, weight, bias, 1, options);
     }
@@ -99,6 +100,7 @@ pub fn conv_2d(
         let sum = |inputs: &[_], weight, zeros, options| conv_2d(inputs, weight, zeros, options);
         return reduced(numbers, inputs, weight, bias, options, sum);
     }
+    count_convolution(&inputs[0], weight.shape().num_elements(), options.stride);
     let stride = [options.stride, options.stride];
     let padding = [rows / 2, columns / 2];
     let stock = ConvOptions::new(stride, padding, [1, 1], 1);
@@ -118,7 +120,7 @@ pub fn conv_3d(
     frames: usize,
     options: Options,
 ) -> Tensor<4> {
-    if is_cube(&inputs[0]) || is_native(&inputs[0]) {
+    if is_extended(&inputs[0]) {
         return extended(inputs, weight, bias, frames, options);
     }
     if let Some(numbers) = Reduced::of(&inputs[0]) {
@@ -126,6 +128,7 @@ pub fn conv_3d(
             |inputs: &[_], weight, zeros, options| conv_3d(inputs, weight, zeros, frames, options);
         return reduced(numbers, inputs, weight, bias, options, sum);
     }
+    count_convolution(&inputs[0], weight.shape().num_elements(), options.stride);
     let [outputs, _, depth, rows, columns] = weight.dims();
     let joined = joined(inputs);
     let [images, channels, height, width] = joined.dims();
@@ -169,6 +172,18 @@ fn finish(mut output: Tensor<4>, options: Options) -> Tensor<4> {
     }
 }
 
+/// Returns true if the backend extension of this crate convolves this tensor.
+fn is_extended(input: &Tensor<4>) -> bool {
+    is_native(input) || is_recorded(input) || is_cube(input)
+}
+
+/// Counts the operations of a convolution of images like `input`.
+fn count_convolution(input: &Tensor<4>, weights: usize, stride: usize) {
+    let [images, _, height, width] = input.dims();
+    let places = images * height.div_ceil(stride) * width.div_ceil(stride);
+    count(weights, places, &input.device());
+}
+
 /// Calls the backend extension of this crate.
 fn extended(
     inputs: &[Tensor<4>],
@@ -180,6 +195,7 @@ fn extended(
     if inputs.len() > MAX_INPUTS {
         return extended(&[joined(inputs)], weight, bias, frames, options);
     }
+    count_convolution(&inputs[0], weight.shape().num_elements(), options.stride);
     let [images, _, height, width] = inputs[0].dims();
     let [outputs, _, depth, rows, columns] = weight.dims();
     let geometry = Geometry {

@@ -1,10 +1,12 @@
 //! Operations that Burn's flex backend lacks or computes slowly, with their gradients.
 //!
-//! Every operation takes tensors of any device. On flex it is computed here; elsewhere it is composed of
-//! Burn's own operations with the same result.
+//! Every operation takes tensors of any device. On flex it is computed here, on LibTorch it is LibTorch's own;
+//! elsewhere it is composed of Burn's own operations with the same result.
 #![warn(missing_docs)]
 // Vector code must be inlined into the functions that are compiled for the machine's vector unit.
 #![allow(clippy::inline_always)]
+// LibTorch is deprecated upstream, where no other backend trains as fast yet.
+#![cfg_attr(feature = "libtorch", allow(deprecated))]
 
 mod attention;
 mod backend;
@@ -14,7 +16,10 @@ mod exp;
 #[cfg(feature = "flex")]
 mod flex;
 pub mod group_norm;
+#[cfg(feature = "libtorch")]
+mod libtorch;
 mod matrix_units;
+mod operations;
 mod precision;
 mod residual_stack;
 #[cfg(feature = "flex")]
@@ -22,8 +27,11 @@ mod uninitialised;
 mod warp;
 
 pub use attention::attention;
-pub use backend::{is_flex, with_stock_operations};
+pub use backend::{is_flex, is_libtorch, with_stock_operations};
+#[cfg(feature = "libtorch")]
+pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
+pub use operations::count_operations;
 pub use precision::{ComputePrecision, with_precision};
 pub use residual_stack::{Stack, residual_stack};
 pub use warp::warp;

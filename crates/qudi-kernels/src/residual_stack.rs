@@ -2,8 +2,8 @@
 //!
 //! On processors with a matrix unit for bfloat16 (AMX) a stack is one operation: between its convolutions
 //! activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and bias, ReLU
-//! and shortcut are applied to each tile of sums. Elsewhere, and with 32 bits, a stack is composed of single
-//! convolutions.
+//! and shortcut are applied to each tile of sums. On LibTorch it is one operation, too, with channels last.
+//! Elsewhere, and on a processor with 32 bits, a stack is composed of single convolutions.
 
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 mod amx;
@@ -19,14 +19,17 @@ mod grid;
 mod layout;
 #[cfg(test)]
 mod tests;
+#[cfg(feature = "libtorch")]
+mod torch;
 #[cfg(feature = "flex")]
 mod unit;
 #[cfg(feature = "flex")]
 mod weights;
 
-use crate::backend::is_native;
+use crate::backend::{is_native, is_recorded};
 use crate::conv::{Activation, Options, conv_2d};
 use crate::matrix_units::MatrixUnits;
+use crate::operations::count;
 use crate::precision::ComputePrecision;
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
@@ -47,6 +50,8 @@ pub struct Stack {
     pub features: usize,
     /// Number of residual blocks.
     pub blocks: usize,
+    /// True if activations have 16 bits (bfloat16).
+    pub bf16: bool,
 }
 
 impl Stack {
@@ -98,6 +103,7 @@ fn stack_of(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> St
         inputs: inputs.iter().map(|input| input.dims()[1]).collect(),
         features,
         blocks: (convolutions.len() - 1) / 2,
+        bf16: ComputePrecision::reduces(&inputs[0]),
     };
     assert_eq!(convolutions.len(), 1 + 2 * stack.blocks, "an entry, and two for every block");
     for (input, &channels) in inputs.iter().zip(&stack.inputs) {
@@ -112,11 +118,13 @@ fn stack_of(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> St
 
 /// Returns true if the stack is computed as one operation.
 fn is_fused(input: &Tensor<4>, stack: &Stack) -> bool {
-    is_native(input)
-        && ComputePrecision::reduces(input)
-        && MatrixUnits::current() == MatrixUnits::Amx
-        && stack.features.is_multiple_of(32)
-        && stack.images * stack.height * stack.width > 0
+    let fits_tiles = || {
+        is_native(input)
+            && stack.bf16
+            && MatrixUnits::current() == MatrixUnits::Amx
+            && stack.features.is_multiple_of(32)
+    };
+    stack.images * stack.height * stack.width > 0 && (is_recorded(input) || fits_tiles())
 }
 
 fn fused(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)], stack: Stack) -> Tensor<4> {
@@ -125,6 +133,8 @@ fn fused(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)], stack: S
         let stack = Stack { inputs: vec![stack.channels()], ..stack };
         return fused(&[joined], convolutions, stack);
     }
+    let weights = convolutions.iter().map(|(weight, _)| weight.shape().num_elements()).sum();
+    count(weights, stack.images * stack.height * stack.width, &inputs[0].device());
     let flat = convolutions.iter().flat_map(|(weight, bias)| {
         let values = weight.shape().num_elements();
         [weight.clone().reshape([values]), bias.clone()]

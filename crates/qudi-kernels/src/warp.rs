@@ -5,7 +5,7 @@ mod extension;
 #[cfg(feature = "flex")]
 mod native;
 
-use crate::backend::is_native;
+use crate::backend::{is_native, is_recorded};
 use burn::backend::Dispatch;
 use burn::tensor::ops::{GridSampleOptions, GridSamplePaddingMode, InterpolateMode};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -21,7 +21,7 @@ use extension::WarpBackend;
 pub fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     let [images, _, height, width] = x.dims();
     assert_eq!(flow.dims(), [images, 2, height, width], "one flow for every pixel");
-    if is_native(&x) {
+    if is_native(&x) || is_recorded(&x) {
         return Tensor::from_dispatch(Dispatch::warp(x.into_dispatch(), flow.into_dispatch()));
     }
     let device = flow.device();

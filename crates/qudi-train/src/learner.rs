@@ -62,6 +62,9 @@ pub trait Learner: Module + Sync {
     /// [`Error`](qudi_core::Error) if the device fails or a sensor is impossible.
     fn loss<'a>(&'a self, batch: &'a Self::Batch, context: &Context<'a>) -> Result<Loss<'a>>;
 
+    /// Copies a batch to the device that its loss is computed on.
+    fn upload(_batch: &mut Self::Batch, _device: &Device) {}
+
     /// Returns the restorer of validations, by a network that is outside autodiff on `device`.
     ///
     /// # Errors

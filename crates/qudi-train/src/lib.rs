@@ -22,6 +22,7 @@ mod prefetch;
 mod recipe;
 mod run;
 pub mod selftest;
+mod speed;
 mod state;
 mod trainer;
 mod validate;
@@ -36,6 +37,7 @@ pub use recipe::{
     ValidationConfig, recipe_names, recipe_table,
 };
 pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
+pub use speed::TrainingSpeed;
 pub use state::{remove_state, run_exists, steps_taken};
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};

@@ -2,17 +2,17 @@
 //! formulas.
 
 mod gaussian_nll;
+mod log_mean_square;
 pub mod lpips;
 mod reconstruction;
-mod robust_square;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use gaussian_nll::gaussian_nll;
+pub(crate) use log_mean_square::log_mean_square;
 pub use reconstruction::reconstruction;
 pub(crate) use reconstruction::{relative_reconstruction, root_mean_square};
-pub(crate) use robust_square::robust_square;
 
 /// How the errors of images count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

@@ -37,8 +37,16 @@ pub struct Optimizer {
     pub square: Vec<Tensor<1>>,
     /// The number of steps taken.
     pub steps: u64,
-    /// Rows and columns of the values that Muon moves.
-    matrices: Vec<Option<[usize; 2]>>,
+    groups: Vec<Group>,
+}
+
+/// Values that move together, as one tensor: a graphics card takes as long for one layer as for all.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Group {
+    /// Rows and columns of each layer that Muon moves; none for values that Adam moves.
+    matrix: Option<[usize; 2]>,
+    /// Places in the list of values.
+    members: Vec<usize>,
 }
 
 impl Optimizer {
@@ -51,47 +59,74 @@ impl Optimizer {
         prefers_adam: fn(&str) -> bool,
     ) -> Self {
         let zeros = || values.iter().map(Tensor::zeros_like).collect();
-        let matrices = shapes.into_iter().map(|(name, shape)| match kind {
-            OptimizerKind::Muon if !prefers_adam(name) => muon::matrix(shape),
-            _ => None,
-        });
-        Self { mean: zeros(), square: zeros(), steps: 0, matrices: matrices.collect() }
+        let mut groups: Vec<Group> = Vec::new();
+        for (place, (name, shape)) in shapes.into_iter().enumerate() {
+            let matrix = match kind {
+                OptimizerKind::Muon if !prefers_adam(name) => muon::matrix(shape),
+                _ => None,
+            };
+            match groups.iter_mut().find(|group| group.matrix == matrix) {
+                Some(group) => group.members.push(place),
+                None => groups.push(Group { matrix, members: vec![place] }),
+            }
+        }
+        Self { mean: zeros(), square: zeros(), steps: 0, groups }
     }
 
-    /// Adam for all values.
+    /// Returns the state of Adam for all values.
     pub fn adam(values: &[Tensor<1>]) -> Self {
         let vectors: Vec<_> = values.iter().map(Tensor::dims).collect();
         let shapes = vectors.iter().map(|shape| ("", shape.as_slice()));
         Self::new(OptimizerKind::Adam, values, shapes, |_| true)
     }
 
-    /// Gives the values after a step along `gradients` times `scale` at learning rate `lr`.
+    /// Returns the values after a step along `gradients` times `scale`, `[1]`, at learning rate `lr`. Nothing
+    /// is read back from the device.
     pub fn step(
         &mut self,
-        values: Vec<Tensor<1>>,
-        gradients: Vec<Tensor<1>>,
-        scale: f64,
+        mut values: Vec<Tensor<1>>,
+        gradients: &[Tensor<1>],
+        scale: &Tensor<1>,
         lr: f64,
     ) -> Vec<Tensor<1>> {
         self.steps += 1;
         let steps = self.steps as f64;
         let bias = BETA.map(|beta| 1.0 - beta.powf(steps));
-        let moments = self.mean.iter_mut().zip(&mut self.square);
-        let moved = values.into_iter().zip(gradients).zip(moments).zip(&self.matrices);
-        moved
-            .map(|(((value, gradient), (mean, square)), matrix)| {
-                let gradient = gradient * scale;
-                let kept = if matrix.is_some() { muon::MOMENTUM } else { BETA[0] };
-                *mean = mean.clone() * kept + gradient.clone() * (1.0 - kept);
-                if let Some(matrix) = *matrix {
-                    // Nesterov's momentum: the mean as the next gradient like this one would make it.
-                    let ahead = mean.clone() * kept + gradient * (1.0 - kept);
-                    return value - muon::step(ahead, matrix) * lr;
-                }
-                *square = square.clone() * BETA[1] + gradient.powi_scalar(2) * (1.0 - BETA[1]);
-                let root = (square.clone() / bias[1]).sqrt() + EPSILON;
-                value - mean.clone() / root * (lr / bias[0])
-            })
-            .collect()
+        for group in &self.groups {
+            let gradient = group.joined(gradients) * scale.clone();
+            let kept = if group.matrix.is_some() { muon::MOMENTUM } else { BETA[0] };
+            let mean = group.joined(&self.mean) * kept + gradient.clone() * (1.0 - kept);
+            group.put(&mut self.mean, &mean);
+            let step = if let Some(matrix) = group.matrix {
+                // Nesterov's momentum: the mean as the next gradient like this one would make it.
+                let ahead = mean * kept + gradient * (1.0 - kept);
+                muon::step(ahead, group.members.len(), matrix) * lr
+            } else {
+                let square = group.joined(&self.square) * BETA[1];
+                let square = square + gradient.powi_scalar(2) * (1.0 - BETA[1]);
+                group.put(&mut self.square, &square);
+                mean / ((square / bias[1]).sqrt() + EPSILON) * (lr / bias[0])
+            };
+            let moved = group.joined(&values) - step;
+            group.put(&mut values, &moved);
+        }
+        values
+    }
+}
+
+impl Group {
+    /// Returns the members of a list, one after the other.
+    fn joined(&self, list: &[Tensor<1>]) -> Tensor<1> {
+        Tensor::cat(self.members.iter().map(|&place| list[place].clone()).collect(), 0)
+    }
+
+    /// Puts the parts of what [`joined`](Self::joined) made back into a list.
+    fn put(&self, list: &mut [Tensor<1>], joined: &Tensor<1>) {
+        let mut first = 0;
+        for &place in &self.members {
+            let [count] = list[place].dims();
+            list[place] = joined.clone().narrow(0, first, count);
+            first += count;
+        }
     }
 }

@@ -3,6 +3,7 @@
 use super::burst_cache::BurstSampler;
 use super::learner::Learner;
 use super::recipe::Recipe;
+use burn::tensor::Device;
 use qudi_core::{Error, Result};
 use std::sync::mpsc::{Receiver, sync_channel};
 
@@ -20,12 +21,12 @@ impl<L: Learner> Prefetcher<L> {
     /// Starts `workers` threads that draw batches from number `first` on.
     ///
     /// # Errors
-    /// [`Error`] if the data cannot be opened.
+    /// [`Error`] if a thread cannot be started.
     pub fn new(recipe: &Recipe, bursts: &BurstSampler, first: u64, workers: usize) -> Result<Self> {
         let count = workers.max(1) as u64;
         let start = |worker: u64| {
             let (sender, receiver) = sync_channel(READY_BATCHES);
-            let (recipe, mut bursts) = (recipe.clone(), bursts.try_clone()?);
+            let (recipe, mut bursts) = (recipe.clone(), bursts.clone());
             let work = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.
                 let mut number = first + worker;
@@ -42,15 +43,45 @@ impl<L: Learner> Prefetcher<L> {
         Ok(Self { workers, next: 0 })
     }
 
+    /// Copies the batches to `device` ahead of their use, on a thread of its own: a graphics card computes on
+    /// meanwhile.
+    ///
+    /// # Errors
+    /// [`Error`] if there is no thread for it.
+    pub fn uploading(self, device: Device) -> Result<Self> {
+        let (sender, receiver) = sync_channel(READY_BATCHES);
+        let Self { workers, mut next } = self;
+        let work = move || {
+            loop {
+                let batch = received(&workers, &mut next).map(|mut batch| {
+                    L::upload(&mut batch, &device);
+                    batch
+                });
+                if sender.send(batch).is_err() {
+                    return;
+                }
+            }
+        };
+        std::thread::Builder::new().name("upload".to_owned()).spawn(work).map_err(|e| {
+            Error::request(format!("no thread for the copies: {e}"), "workers", "use fewer")
+        })?;
+        Ok(Self { workers: vec![receiver], next: 0 })
+    }
+
     /// Waits for the next batch.
     ///
     /// # Errors
     /// [`Error`] if it could not be drawn.
     pub fn next_batch(&mut self) -> Result<L::Batch> {
-        let at = (self.next % self.workers.len() as u64) as usize;
-        self.next += 1;
-        self.workers[at].recv().unwrap_or_else(|_| {
-            Err(Error::request("a data thread has stopped", "the data", "report this"))
-        })
+        received(&self.workers, &mut self.next)
     }
+}
+
+/// Waits for batch `next`, which the workers draw in turn.
+fn received<B>(workers: &[Receiver<Result<B>>], next: &mut u64) -> Result<B> {
+    let at = (*next % workers.len() as u64) as usize;
+    *next += 1;
+    workers[at].recv().unwrap_or_else(|_| {
+        Err(Error::request("a data thread has stopped", "the data", "report this"))
+    })
 }

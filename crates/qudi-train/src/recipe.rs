@@ -6,7 +6,7 @@ mod network;
 mod rules;
 mod stage;
 
-use crate::dataset::{DataConfig, LightRange, SensorMix, SourceConfig, SourceKind};
+use crate::dataset::{ClipWindow, DataConfig, PackedSource, SourceKind};
 use crate::learner::diffusion::TimestepLaw;
 use crate::loss::LossForm;
 use crate::loss::lpips::PerceptualKind;
@@ -280,30 +280,24 @@ impl Recipe {
         self.train.learns == [LearningPart::Refinement]
     }
 
+    /// Returns the sources of the recipe's pack; none if it reads no files.
+    pub fn packed_sources(&self) -> Vec<PackedSource> {
+        let mut sources = self.data.packed_sources();
+        sources.extend(self.validation_source());
+        sources
+    }
+
     /// Returns the validation clips as a source of a pack; none if no clip has files.
-    pub fn validation_data(&self) -> Option<DataConfig> {
+    pub(super) fn validation_source(&self) -> Option<PackedSource> {
         let validation = self.validation.as_ref()?;
         let files = validation.from.iter().filter(|from| !from.starts_with("scene:"));
         let from: Vec<String> = files.cloned().collect();
-        (!from.is_empty()).then(|| DataConfig {
-            frames: validation.frames,
-            crop: validation.crop,
-            sensor: vec![SensorMix {
-                name: validation.sensor.clone(),
-                ppp: LightRange::Of(validation.ppp.clone()),
-                frames_summed: None,
-                weight: 1.0,
-            }],
-            source: vec![SourceConfig {
-                name: VALIDATION.to_owned(),
-                kind: SourceKind::Clips,
-                from,
-                weight: 1.0,
-                stride: 1,
-                max_downscale: 1.0,
-                speed: 0.0,
-                static_fraction: 0.0,
-            }],
+        (!from.is_empty()).then(|| PackedSource {
+            name: VALIDATION.to_owned(),
+            kind: SourceKind::Clips,
+            from,
+            shrink: 1.0,
+            lossless: Some(ClipWindow { frames: validation.frames, crop: validation.crop }),
         })
     }
 }

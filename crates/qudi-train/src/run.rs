@@ -122,6 +122,9 @@ impl<L: Learner> Run<L> {
         self.trim_metrics()?;
         let mut prefetcher =
             Prefetcher::<L>::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
+        if let Some(card) = self.trainer.card() {
+            prefetcher = prefetcher.uploading(card)?;
+        }
         let mut metrics = self.metrics()?;
         if self.trainer.step_number() == 0
             && let Some(validation) = self.validate(0)?
@@ -132,21 +135,31 @@ impl<L: Learner> Run<L> {
             }
         }
         while self.trainer.step_number() < train.steps {
-            let report = self.trainer.step(&mut prefetcher)?;
-            self.log(&mut metrics, &Line::Step(&report))?;
-            let step = report.step;
-            let mut go_on = on(Event::Step(&report));
+            let mut go_on = ControlFlow::Continue(());
+            if let Some(report) = self.trainer.begin_step(&mut prefetcher)? {
+                self.log(&mut metrics, &Line::Step(&report))?;
+                go_on = on(Event::Step(&report));
+            }
+            let step = self.trainer.step_number();
             let last = step == train.steps;
             let every = self.validator.as_ref().map(Validator::every);
-            if every.is_some_and(|every| step.is_multiple_of(every) || last)
-                && let Some(validation) = self.validate(step)?
+            let validates = every.is_some_and(|every| step.is_multiple_of(every) || last);
+            let saves = step.is_multiple_of(train.checkpoint) || last || go_on.is_break();
+            if (validates || saves)
+                && let Some(report) = self.trainer.finish()?
             {
+                self.log(&mut metrics, &Line::Step(&report))?;
+                if on(Event::Step(&report)).is_break() {
+                    go_on = ControlFlow::Break(());
+                }
+            }
+            if validates && let Some(validation) = self.validate(step)? {
                 self.log(&mut metrics, &Line::Validation(&validation))?;
                 if on(Event::Validation(&validation)).is_break() {
                     go_on = ControlFlow::Break(());
                 }
             }
-            if step.is_multiple_of(train.checkpoint) || last || go_on.is_break() {
+            if saves || go_on.is_break() {
                 metrics.sync_data().map_err(|e| self.failed(METRICS, e))?;
                 self.trainer.save_state(&self.folder)?;
                 self.save_weights()?;

@@ -11,7 +11,7 @@ use super::recipe::Recipe;
 use crate::loss::lpips::Lpips;
 use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
-use qudi_kernels::{ComputePrecision, with_precision};
+use qudi_kernels::{ComputePrecision, is_flex, with_precision};
 use qudi_layers::tensor::read;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -19,6 +19,7 @@ use std::path::Path;
 use std::time::Instant;
 
 pub use loss_values::LossValues;
+use loss_values::UnreadLoss;
 
 /// The result of a step.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -57,15 +58,27 @@ pub struct Trainer<L> {
     perceptual: Vec<Lpips>,
     /// Whether each parameter learns.
     learns: Vec<bool>,
+    unread: Option<Unread>,
+    /// True if each part of a step waits for the device, so that its time is the device's.
+    pub(super) waits: bool,
 }
 
 /// The gradients and losses of one batch, and the seconds that they took.
 struct Pass {
     gradients: Vec<Tensor<1>>,
     statistics: Vec<(usize, Tensor<1>)>,
-    loss: LossValues,
+    loss: UnreadLoss,
     forward_s: f64,
     backward_s: f64,
+}
+
+/// A step whose numbers are still on the device.
+#[derive(Debug)]
+struct Unread {
+    losses: Vec<UnreadLoss>,
+    norm: Tensor<1>,
+    /// The report but for loss and norm.
+    report: StepReport,
 }
 
 impl<L: Learner> Trainer<L> {
@@ -115,6 +128,8 @@ impl<L: Learner> Trainer<L> {
             devices,
             perceptual,
             learns,
+            unread: None,
+            waits: false,
         })
     }
 
@@ -128,16 +143,33 @@ impl<L: Learner> Trainer<L> {
         self.step_number() * self.recipe.train.accumulate as u64
     }
 
+    /// Returns the device if it is a single one with memory of its own.
+    pub(super) fn card(&self) -> Option<Device> {
+        let [device] = self.devices.as_slice() else { return None };
+        (!is_flex(device)).then(|| device.clone())
+    }
+
     /// Returns the network with averaged weights, for use.
     pub fn averaged(&self) -> L {
         with_parameters(self.network.valid(), self.ema.average.clone())
     }
 
-    /// Takes one step.
+    /// Takes one step, and waits for its numbers.
     ///
     /// # Errors
     /// [`Error`] if the data or the device fails, or the loss is not finite.
     pub fn step(&mut self, prefetcher: &mut Prefetcher<L>) -> Result<StepReport> {
+        self.finish()?;
+        self.begin_step(prefetcher)?;
+        Ok(self.finish()?.expect("a step has begun"))
+    }
+
+    /// Asks the device for one step, and returns the report of the step before, if that is not out yet. A
+    /// graphics card never waits for the processor: numbers are read when the next step is asked for.
+    ///
+    /// # Errors
+    /// [`Error`] if the data or the device fails, or the loss of the step before was not finite.
+    pub fn begin_step(&mut self, prefetcher: &mut Prefetcher<L>) -> Result<Option<StepReport>> {
         let start = Instant::now();
         let count = self.recipe.train.accumulate;
         let batches = (0..count).map(|_| prefetcher.next_batch()).collect::<Result<Vec<_>>>()?;
@@ -145,12 +177,12 @@ impl<L: Learner> Trainer<L> {
         let passes = self.passes(&batches)?;
         let start = Instant::now();
         let mut sum: Option<Vec<Tensor<1>>> = None;
-        let mut loss = LossValues::default();
+        let mut losses = Vec::with_capacity(count);
         let (mut forward_s, mut backward_s) = (0.0, 0.0);
         let mut statistics: BTreeMap<usize, Tensor<1>> = BTreeMap::new();
         // Summed in the order of the batches: which device had them makes no difference.
         for pass in passes {
-            loss.add(&pass.loss, 1.0 / count as f64);
+            losses.push(pass.loss);
             // All batches of a step start from the same statistics: what they make of them is averaged.
             for (place, values) in pass.statistics {
                 let share = values / count as f32;
@@ -165,29 +197,56 @@ impl<L: Learner> Trainer<L> {
             });
         }
         let gradients = sum.expect("at least one batch");
-        let norm = norm(&gradients)? / count as f64;
-        self.check("gradient norm", norm)?;
+        let norm = norm(&gradients) / count as f64;
         let train = &self.recipe.train;
         let taken = self.step_number();
         let lr = learning_rate(train, taken);
-        let scale = (train.clip / (norm + 1e-12)).min(1.0) / count as f64;
-        let mut moved = self.optimizer.step(parameters(&self.network), gradients, scale, lr);
+        let scale = (norm.clone() + 1e-12).recip() * train.clip;
+        let scale = scale.clamp_max(1.0) / count as f64;
+        let mut moved = self.optimizer.step(parameters(&self.network), &gradients, &scale, lr);
         for (place, values) in statistics {
             moved[place] = values;
         }
         self.ema.update(&moved, &self.learns, taken);
         self.network = with_parameters(self.network.clone(), moved);
-        let optimizer_s = start.elapsed().as_secs_f64();
-        Ok(StepReport {
+        let before = self.finish()?;
+        self.wait(0)?;
+        let report = StepReport {
             step: self.step_number(),
             lr,
-            loss,
-            norm,
+            loss: LossValues::default(),
+            norm: 0.0,
             data_s,
             forward_s,
             backward_s,
-            optimizer_s,
-        })
+            optimizer_s: start.elapsed().as_secs_f64(),
+        };
+        self.unread = Some(Unread { losses, norm, report });
+        Ok(before)
+    }
+
+    /// Waits for the step that was asked for last, and returns its report, if that is not out yet.
+    ///
+    /// # Errors
+    /// [`Error`] if the device fails, or the loss is not finite.
+    pub fn finish(&mut self) -> Result<Option<StepReport>> {
+        let Some(Unread { losses, norm, mut report }) = self.unread.take() else {
+            return Ok(None);
+        };
+        let numbers = losses.iter().map(|loss| loss.numbers.clone()).chain([norm]);
+        let numbers = read(Tensor::cat(numbers.collect(), 0))?;
+        let (norm, numbers) = numbers.split_last().expect("a norm");
+        let mut numbers = numbers.iter().copied().map(f64::from);
+        for loss in &losses {
+            let values = loss.values(&mut numbers);
+            for (name, value) in &values.terms {
+                check(&format!("{name} loss"), *value, report.step, self.saved)?;
+            }
+            report.loss.add(&values, 1.0 / losses.len() as f64);
+        }
+        report.norm = f64::from(*norm);
+        check("gradient norm", report.norm, report.step, self.saved)?;
+        Ok(Some(report))
     }
 
     /// Computes the gradients of all batches, in their order, on the first device.
@@ -223,9 +282,20 @@ impl<L: Learner> Trainer<L> {
             pass.gradients = pass.gradients.into_iter().map(|g| g.to_device(&main)).collect();
             let statistics = pass.statistics.into_iter();
             pass.statistics = statistics.map(|(at, s)| (at, s.to_device(&main))).collect();
+            pass.loss.numbers = pass.loss.numbers.to_device(&main);
             pass
         };
         Ok(lists.into_iter().map(home).collect())
+    }
+
+    /// Waits for device `number`, if parts of a step are to be timed.
+    fn wait(&self, number: usize) -> Result<()> {
+        if !self.waits {
+            return Ok(());
+        }
+        self.devices[number].sync().map_err(|e| {
+            Error::request(format!("the device failed: {e:?}"), "device", "choose another device")
+        })
     }
 
     /// Passes one batch through `network`, on device `number`.
@@ -239,40 +309,38 @@ impl<L: Learner> Trainer<L> {
             perceptual: self.perceptual.get(number),
         };
         let loss = with_precision(precision, || network.loss(batch, &context))?;
+        self.wait(number)?;
         let forward_s = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let Loss { total, terms, gradients, statistics } = loss;
         let gradients = with_precision(precision, gradients);
-        // Reading waits for the device: all numbers at once, when there is nothing left to ask it for.
-        let loss = LossValues::read(&total, &terms)?;
-        for (name, value) in &loss.terms {
-            self.check(&format!("{name} loss"), *value)?;
-        }
+        let loss = UnreadLoss::new(&total, &terms);
+        self.wait(number)?;
         let backward_s = start.elapsed().as_secs_f64();
         Ok(Pass { gradients, statistics, loss, forward_s, backward_s })
     }
+}
 
-    fn check(&self, what: &str, value: f64) -> Result<()> {
-        if value.is_finite() {
-            return Ok(());
-        }
-        let step = self.step_number() + 1;
-        let (found, help) = match self.saved {
-            Some(saved) => (
-                format!("the checkpoint of step {saved} is good"),
-                "lower train.lr or train.clip, and resume from the checkpoint",
-            ),
-            None => (
-                "there is no checkpoint yet".to_owned(),
-                "lower train.lr or train.clip, and start again",
-            ),
-        };
-        Err(Error::request(
-            format!("{what} is {value} at step {step}: training stopped, {found}"),
-            what,
-            help,
-        ))
+/// Checks a number of step `step`; `saved` is the step of the last checkpoint.
+fn check(what: &str, value: f64, step: u64, saved: Option<u64>) -> Result<()> {
+    if value.is_finite() {
+        return Ok(());
     }
+    let (found, help) = match saved {
+        Some(saved) => (
+            format!("the checkpoint of step {saved} is good"),
+            "lower train.lr or train.clip, and resume from the checkpoint",
+        ),
+        None => (
+            "there is no checkpoint yet".to_owned(),
+            "lower train.lr or train.clip, and start again",
+        ),
+    };
+    Err(Error::request(
+        format!("{what} is {value} at step {step}: training stopped, {found}"),
+        what,
+        help,
+    ))
 }
 
 fn unsupported(precision: ComputePrecision, device: &Device) -> Error {
@@ -283,9 +351,7 @@ fn unsupported(precision: ComputePrecision, device: &Device) -> Error {
     )
 }
 
-/// Computes the Euclidean norm over all lists.
-fn norm(gradients: &[Tensor<1>]) -> Result<f64> {
-    let squares = gradients.iter().map(|g| g.clone().powi_scalar(2).sum()).collect();
-    let squares = read(Tensor::cat(squares, 0))?;
-    Ok(squares.into_iter().map(f64::from).sum::<f64>().sqrt())
+/// Computes the Euclidean norm over all lists, `[1]`.
+fn norm(gradients: &[Tensor<1>]) -> Tensor<1> {
+    Tensor::cat(gradients.to_vec(), 0).powi_scalar(2).sum().sqrt()
 }

@@ -69,15 +69,13 @@ impl Validator {
             let frames = (0..config.frames).map(|t| scene.render(t as f64)).collect();
             clips.push((name.to_owned(), frames));
         }
-        if recipe.validation_data().is_some() {
+        if recipe.validation_source().is_some() {
             let Some(pack) = pack else {
                 let help = "give the data folder, or a pack";
                 let what = "the validation clips need files";
                 return Err(Error::request(what, "validation.from", help));
             };
-            let mut pack = pack.try_clone()?;
-            for number in 0..pack.clips().len() {
-                let clip = pack.clips()[number].clone();
+            for (number, clip) in pack.clips().iter().enumerate() {
                 if clip.source != VALIDATION {
                     continue;
                 }
@@ -94,10 +92,10 @@ impl Validator {
                 let first = (clip.frames - config.frames) / 2;
                 let (left, top) = ((width - config.crop) / 2, (height - config.crop) / 2);
                 let frames = (first..first + config.frames).map(|t| {
-                    let frame = pack.frame(number, t)?;
-                    Ok(Frame::from_fn(side, |x, y| frame.data[(top + y) * width + left + x]))
+                    let frame = pack.frame(number, t);
+                    Frame::from_fn(side, |x, y| frame.value(left + x, top + y))
                 });
-                clips.push((clip.name, frames.collect::<Result<_>>()?));
+                clips.push((clip.name.clone(), frames.collect()));
             }
         }
         if clips.is_empty() {

@@ -5,8 +5,10 @@ use image::{GrayImage, Luma};
 use qudi_core::Error;
 use qudi_core::atomic_file::Overwrite;
 use qudi_train::dataset::{
-    DataConfig, Dataset, LightRange, Pack, Sample, SensorMix, SourceConfig, SourceKind, write_pack,
+    ClipWindow, DataConfig, Dataset, LightRange, Pack, PackedSource, Sample, SensorMix,
+    SourceConfig, SourceKind, write_pack,
 };
+use std::io::Write;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -18,6 +20,7 @@ fn source(name: &str, kind: SourceKind, from: &[&str]) -> SourceConfig {
         from,
         weight: 1.0,
         stride: 2,
+        shrink: 1.0,
         max_downscale: 1.0,
         speed: 2.0,
         static_fraction: 0.0,
@@ -65,11 +68,28 @@ fn all_sources() -> DataConfig {
     ])
 }
 
-/// Packs the files for `config`.
-fn pack(config: &DataConfig, folder: &Path) -> Result<PathBuf, Error> {
+/// Packs files.
+fn pack(sources: &[PackedSource], folder: &Path) -> Result<PathBuf, Error> {
     let path = folder.join("pack.zip");
-    write_pack(&[config], folder, &path, Overwrite::Yes, &mut |_| ControlFlow::Continue(()))?;
+    write_pack(sources, folder, &path, Overwrite::Yes, &mut |_| ControlFlow::Continue(()))?;
     Ok(path)
+}
+
+/// Draws from the packed files of `config`.
+fn dataset(config: &DataConfig, folder: &Path) -> Dataset {
+    let sources = config.packed_sources();
+    let path = pack(&sources, folder).unwrap();
+    Dataset::new(config, Some(Pack::open(&path, &sources).unwrap())).unwrap()
+}
+
+/// Draws from files that are packed as validation clips are, without loss.
+fn exact_dataset(config: &DataConfig, folder: &Path) -> Dataset {
+    let mut sources = config.packed_sources();
+    for source in &mut sources {
+        source.lossless = Some(ClipWindow { frames: 100, crop: 100 });
+    }
+    let path = pack(&sources, folder).unwrap();
+    Dataset::new(config, Some(Pack::open(&path, &sources).unwrap())).unwrap()
 }
 
 fn same(a: &Sample, b: &Sample) -> bool {
@@ -77,29 +97,107 @@ fn same(a: &Sample, b: &Sample) -> bool {
 }
 
 #[test]
-fn pack_holds_the_pixels_of_the_files() {
+fn packs_hold_what_files_hold() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
-    let path = pack(&all_sources(), folder.path()).unwrap();
-    let mut pack = Pack::open(&path).unwrap();
-    let names: Vec<_> = pack
-        .clips()
-        .iter()
-        .map(|clip| (clip.source.clone(), clip.name.clone(), clip.frames))
-        .collect();
-    let expected = [("clips", "clips-c0", 8), ("clips", "clips-c1", 8), ("stills", "stills-a", 1)];
-    assert_eq!(names, expected.map(|(s, n, f)| (s.to_owned(), n.to_owned(), f)));
+    let mut sources = all_sources().packed_sources();
+    sources.push(PackedSource {
+        name: "validation".into(),
+        lossless: Some(ClipWindow { frames: 4, crop: 16 }),
+        ..sources[0].clone()
+    });
+    let path = folder.path().join("pack.zip");
+    let go_on = &mut |_: &_| ControlFlow::Continue(());
+    let psnr = write_pack(&sources, folder.path(), &path, Overwrite::No, go_on).unwrap().unwrap();
+    assert!((40.0..60.0).contains(&psnr), "{psnr} dB");
+    let pack = Pack::open(&path, &sources).unwrap();
+    let clips = pack.clips().iter();
+    let names: Vec<_> =
+        clips.map(|clip| (clip.source.as_str(), clip.name.as_str(), clip.frames)).collect();
+    let expected = [
+        ("clips", "clips-c0", 8),
+        ("clips", "clips-c1", 8),
+        ("stills", "stills-a", 1),
+        ("validation", "clips-c0", 4),
+        ("validation", "clips-c1", 4),
+    ];
+    assert_eq!(names, expected);
+    let file = |x: usize, y: usize, clip: usize, frame: usize| {
+        value(clip as u32, frame as u32, x as u32, y as u32)
+    };
     for clip in 0..2 {
-        let mut sum = 0.0;
         for frame in 0..8 {
-            let image = pack.frame(clip, frame).unwrap();
-            for (i, &seen) in image.data.iter().enumerate() {
-                let (x, y) = (i as u32 % 24, i as u32 / 24);
-                assert_eq!(seen, f32::from(value(clip as u32, frame as u32, x, y)) / 255.0);
+            let image = pack.frame(clip, frame);
+            for (i, &seen) in image.values.iter().enumerate() {
+                let source = file(i % 24, i / 24, clip, frame);
+                assert!(seen.abs_diff(source) <= 4, "{seen} for {source}");
             }
-            sum += image.mean();
         }
-        assert!((pack.clips()[clip].mean - sum / 8.0).abs() < 1e-9);
+        assert!((pack.mean(clip) - clip_mean(clip as u32)).abs() < 2e-3);
+        // Four of eight frames, 16 x 16 of 20 x 24 pixels.
+        for frame in 0..4 {
+            let image = pack.frame(3 + clip, frame);
+            assert_eq!((image.size.height, image.size.width), (16, 16));
+            for (i, &seen) in image.values.iter().enumerate() {
+                assert_eq!(seen, file(4 + i % 16, 2 + i / 16, clip, 2 + frame));
+            }
+        }
+    }
+}
+
+#[test]
+fn packs_are_smaller_by_shrink() {
+    let folder = tempfile::tempdir().unwrap();
+    files(folder.path());
+    let mut config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
+    config.source[0].shrink = 1.25;
+    let sources = config.packed_sources();
+    let path = pack(&sources, folder.path()).unwrap();
+    let pack = Pack::open(&path, &sources).unwrap();
+    let frame = pack.frame(0, 2);
+    assert_eq!((frame.size.height, frame.size.width), (16, 19));
+    let mut sum = 0.0;
+    for (i, &seen) in frame.values.iter().enumerate() {
+        let place = |i: usize, short: f64, long: f64| (i as f64 + 0.5) * long / short - 0.5;
+        let level = 37.0 + place(i % 19, 19.0, 24.0) + 2.0 * place(i / 19, 16.0, 20.0);
+        sum += (f64::from(seen) - level).powi(2);
+    }
+    let error = (sum / frame.values.len() as f64).sqrt();
+    assert!(error < 3.0, "{error} levels");
+}
+
+/// A pack says what it was made from: another recipe is refused, part of it is not.
+#[test]
+fn rejects_packs_of_other_recipes() {
+    let folder = tempfile::tempdir().unwrap();
+    files(folder.path());
+    let mut sources = all_sources().packed_sources();
+    sources.push(PackedSource {
+        name: "validation".into(),
+        lossless: Some(ClipWindow { frames: 6, crop: 20 }),
+        ..sources[0].clone()
+    });
+    let path = pack(&sources, folder.path()).unwrap();
+    let open = |change: &dyn Fn(&mut Vec<PackedSource>)| {
+        let mut other = sources.clone();
+        change(&mut other);
+        Pack::open(&path, &other).map(drop)
+    };
+    open(&|_| ()).unwrap();
+    open(&|sources| drop(sources.remove(0))).unwrap();
+    open(&|sources| sources[2].lossless = Some(ClipWindow { frames: 5, crop: 16 })).unwrap();
+    let changes: [(&str, &dyn Fn(&mut Vec<PackedSource>)); 6] = [
+        ("shrink\":1.5", &|sources| sources[0].shrink = 1.5),
+        ("clips/c0", &|sources| sources[0].from = vec!["clips/c0".into()]),
+        ("stills", &|sources| sources[0].kind = SourceKind::Stills),
+        ("no source `films`; it has clips", &|sources| sources[0].name = "films".into()),
+        ("lossless", &|sources| sources[0].lossless = sources[2].lossless),
+        ("21", &|sources| sources[2].lossless = Some(ClipWindow { frames: 6, crop: 21 })),
+    ];
+    for (text, change) in changes {
+        let error = open(change).unwrap_err();
+        assert!(error.to_string().contains(text), "{error}");
+        assert!(error.help().unwrap().contains("--prepare"), "{:?}", error.help());
     }
 }
 
@@ -108,9 +206,8 @@ fn samples_depend_on_seed_and_number_only() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = all_sources();
-    let path = pack(&config, folder.path()).unwrap();
-    let mut one = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
-    let mut other = one.try_clone().unwrap();
+    let one = dataset(&config, folder.path());
+    let other = one.clone();
     let forth: Vec<_> = (0..12).map(|k| one.sample(5, k).unwrap()).collect();
     let mut back: Vec<_> = (0..12).rev().map(|k| other.sample(5, k).unwrap()).collect();
     back.reverse();
@@ -127,8 +224,7 @@ fn mean_level_is_that_of_the_whole_clip() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
-    let path = pack(&config, folder.path()).unwrap();
-    let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
+    let dataset = exact_dataset(&config, folder.path());
     let mean = 255.0 * clip_mean(1);
     let mut factors = Vec::new();
     for k in 0..50 {
@@ -156,8 +252,7 @@ fn clips_are_downscaled_up_to_max_downscale() {
     files(folder.path());
     let mut config = config(vec![source("clips", SourceKind::Clips, &["clips/c1"])]);
     config.source[0].max_downscale = 1.25;
-    let path = pack(&config, folder.path()).unwrap();
-    let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
+    let dataset = exact_dataset(&config, folder.path());
     let mut factors = Vec::new();
     for k in 0..100 {
         let sample = dataset.sample(3, k).unwrap();
@@ -185,8 +280,7 @@ fn static_fraction_of_the_stills_does_not_move() {
     files(folder.path());
     let mut config = config(vec![source("stills", SourceKind::Stills, &["stills"])]);
     config.source[0].static_fraction = 0.3;
-    let path = pack(&config, folder.path()).unwrap();
-    let mut dataset = Dataset::new(&config, Some(Pack::open(&path).unwrap())).unwrap();
+    let dataset = dataset(&config, folder.path());
     let mut resting = 0;
     for k in 0..200 {
         let truth = dataset.sample(4, k).unwrap().truth;
@@ -201,7 +295,7 @@ fn static_fraction_of_the_stills_does_not_move() {
 #[test]
 fn light_is_log_uniform_and_counts_follow_it() {
     let config = config(vec![source("scenes", SourceKind::Scenes, &["dead-leaves"])]);
-    let mut dataset = Dataset::new(&config, None).unwrap();
+    let dataset = Dataset::new(&config, None).unwrap();
     let (mut logs, mut seen, mut expected) = (Vec::new(), 0.0, 0.0);
     for k in 0..400 {
         let sample = dataset.sample(9, k).unwrap();
@@ -230,8 +324,9 @@ fn rejects_data_that_cannot_be_sampled() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
     let config = all_sources();
-    let path = pack(&config, folder.path()).unwrap();
-    let open = || Some(Pack::open(&path).unwrap());
+    let sources = config.packed_sources();
+    let path = pack(&sources, folder.path()).unwrap();
+    let open = || Some(Pack::open(&path, &sources).unwrap());
     let mut large = config.clone();
     large.crop = 32;
     let error = Dataset::new(&large, open()).unwrap_err();
@@ -262,36 +357,97 @@ fn super_config(from: &str) -> DataConfig {
 }
 
 fn pack_in(config: &DataConfig, folder: &Path) -> Result<PathBuf, Error> {
-    let path = folder.join("other.zip");
+    let (path, sources) = (folder.join("other.zip"), config.packed_sources());
     let result =
-        write_pack(&[config], folder, &path, Overwrite::No, &mut |_| ControlFlow::Continue(()));
+        write_pack(&sources, folder, &path, Overwrite::No, &mut |_| ControlFlow::Continue(()));
     assert!(result.is_ok() || !path.exists(), "a failed pack left a file");
-    result.map(|()| path)
+    result.map(|_| path)
 }
 
-/// Damage anywhere gives an error or other pixels, never a panic.
+/// Damage anywhere gives an error, never a panic or other pixels: ZIP and digest know every byte that counts.
 #[test]
 fn rejects_damaged_packs() {
     let folder = tempfile::tempdir().unwrap();
     files(folder.path());
-    let config = super_config("clips/c0");
-    let path = pack(&config, folder.path()).unwrap();
+    let mut sources = super_config("clips/c0").packed_sources();
+    sources.push(PackedSource {
+        name: "validation".into(),
+        lossless: Some(ClipWindow { frames: 2, crop: 20 }),
+        ..sources[0].clone()
+    });
+    let path = pack(&sources, folder.path()).unwrap();
     let whole = std::fs::read(&path).unwrap();
     let look = |bytes: &[u8]| {
         let broken = folder.path().join("broken.zip");
         std::fs::write(&broken, bytes).unwrap();
-        let mut dataset = Dataset::new(&config, Some(Pack::open(&broken)?))?;
-        (0..3).try_for_each(|k| dataset.sample(1, k).map(|_| ()))
+        let pack = Pack::open(&broken, &sources)?;
+        let clips = pack.clips().iter().enumerate();
+        let frames = clips.flat_map(|(n, clip)| (0..clip.frames).map(move |t| (n, t)));
+        Ok::<_, Error>(frames.map(|(n, t)| pack.frame(n, t).values.to_vec()).collect::<Vec<_>>())
     };
-    look(&whole).unwrap();
+    let intact = look(&whole).unwrap();
     for length in (0..whole.len()).step_by(whole.len() / 40) {
         assert!(look(&whole[..length]).is_err(), "{length} bytes of {}", whole.len());
     }
-    for i in 0..300 {
+    for i in 0..600 {
         let mut bytes = whole.clone();
         let at = (i * 7919) % bytes.len();
         bytes[at] ^= 1 << (i % 8);
-        let _ = look(&bytes);
+        if let Ok(frames) = look(&bytes) {
+            assert!(frames == intact, "byte {at} changes frames");
+        }
     }
     assert!(look(b"no archive at all").is_err());
+}
+
+/// Writes a pack with another index, and with the given images, all consistent for ZIP.
+fn forged(path: &Path, index: &str, images: &[(&str, &[u8])]) {
+    let mut zip = zip::ZipWriter::new(std::fs::File::create(path).unwrap());
+    let options = zip::write::SimpleFileOptions::default();
+    for (name, bytes) in [&[("index.json", index.as_bytes())], images].concat() {
+        zip.start_file(name, options).unwrap();
+        zip.write_all(bytes).unwrap();
+    }
+    zip.finish().unwrap();
+}
+
+/// Sizes and counts are checked before anything is allocated for them; old layouts and edited packs are
+/// refused.
+#[test]
+fn rejects_forged_packs() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("forged.zip");
+    let sources = super_config("clips/c0").packed_sources();
+    let source = serde_json::to_string(&sources[0]).unwrap();
+    let index = |frames: &str, height: &str| {
+        format!(
+            "{{\"version\": 2, \"sources\": [{source}], \"clips\": [{{\"source\": \"clips\", \"name\": \"a\",
+            \"file_bytes\": 1, \"frames\": {frames}, \"size\": {{\"height\": {height}, \"width\": 16}}}}],
+            \"sha256\": \"00\"}}"
+        )
+    };
+    let mut image = Vec::new();
+    let mut encoder = image::codecs::jpeg::JpegEncoder::new(&mut image);
+    encoder.encode(&[50; 256], 16, 16, image::ExtendedColorType::L8).unwrap();
+    let name = "clips/a/000000.jpg";
+    for (text, index, images) in [
+        ("layout is 1", "{\"version\": 1, \"clips\": []}".to_owned(), &[][..]),
+        ("index.json", String::new(), &[]),
+        ("cannot be", index("0", "16"), &[]),
+        ("cannot be", index("1", "0"), &[(name, &image[..])]),
+        ("cannot be", index("1", "9999999999999"), &[(name, &image)]),
+        ("names 18446744073709551615 images", index("18446744073709551615", "16"), &[]),
+        ("names 2 images", index("2", "16"), &[(name, &image)]),
+        ("cannot hold 16000000 pixels", index("1", "1000000"), &[(name, &image)]),
+        ("exceeds", index("1", "15"), &[(name, &image)]),
+        ("another size", index("1", "17"), &[(name, &image)]),
+        ("clips/a/000000.jpg", index("1", "16"), &[("clips/b/000000.jpg", &image)]),
+        ("more than", index("1", "16"), &[(name, &[0; 100_000])]),
+        ("digest", index("1", "16"), &[(name, &image)]),
+    ] {
+        forged(&path, &index, images);
+        let error = Pack::open(&path, &sources).unwrap_err();
+        let error = format!("{error}");
+        assert!(error.contains(text) || text == "index.json", "{text}: {error}");
+    }
 }

@@ -35,7 +35,8 @@ fn apart<const D: usize>(
         let loss = (module.values.val() - target.clone()).powi_scalar(2).sum();
         let gradients = GradientsParams::from_grads(loss.backward(), &module);
         let gradient = (list[0].clone() - goal.clone()) * 2.0;
-        list = ours.step(list, vec![gradient * 4.0], 0.25, lr);
+        let scale = Tensor::from_floats([0.25], &Device::flex());
+        list = ours.step(list, &[gradient * 4.0], &scale, lr);
         module = theirs.step(lr, module, gradients);
     }
     let ours = list.remove(0).into_data().try_into_vec::<f32>().unwrap();
@@ -70,8 +71,9 @@ fn muon_moves_matrices_alone() {
         Optimizer::new(OptimizerKind::Muon, &list, [("layer", [3, 2, 2].as_slice())], |_| false);
     for mean in [0.0, 1e-23] {
         optimizer.mean = vec![Tensor::full([12], mean, &Device::flex())];
-        let still = list.iter().map(Tensor::zeros_like).collect();
-        let moved = optimizer.step(list.clone(), still, 1.0, 0.1).remove(0).into_data();
+        let still: Vec<_> = list.iter().map(Tensor::zeros_like).collect();
+        let one = Tensor::ones([1], &Device::flex());
+        let moved = optimizer.step(list.clone(), &still, &one, 0.1).remove(0).into_data();
         assert_eq!(moved.try_into_vec::<f32>().unwrap(), [1.0; 12]);
     }
 }

@@ -175,7 +175,8 @@ fn bf16_gradients_match_f32() {
     };
     for _ in 0..10 {
         let gradients = of(&network, ComputePrecision::F32);
-        let moved = optimizer.step(parameters(&network), gradients, 1.0, 1e-3);
+        let one = Tensor::ones([1], &Device::flex());
+        let moved = optimizer.step(parameters(&network), &gradients, &one, 1e-3);
         network = with_parameters(network, moved);
     }
     let norm = |lists: &[Tensor<1>]| {
@@ -204,7 +205,8 @@ fn overfits_a_single_burst() {
         let norm = gradients.iter().map(|g| g.clone().powi_scalar(2).sum().into_scalar::<f32>());
         let norm = f64::from(norm.sum::<f32>().sqrt());
         let rate = 4e-3 * (1.0 - f64::from(number) / 200.0);
-        let moved = optimizer.step(parameters(&network), gradients, (0.05 / norm).min(1.0), rate);
+        let scale = Tensor::full([1], (0.05 / norm).min(1.0), &Device::flex());
+        let moved = optimizer.step(parameters(&network), &gradients, &scale, rate);
         network = with_parameters(network, moved);
     }
     let drop = |losses: &[f32]| losses[190..].iter().sum::<f32>() / 10.0 / losses[0];

@@ -48,6 +48,11 @@ impl Network {
         self.weights.iter().find(|weights| weights.method.is_none()).map(|w| w.file.as_path())
     }
 
+    /// Returns the device, if it is named.
+    pub(crate) fn device(&self) -> Option<&str> {
+        self.device.as_deref()
+    }
+
     /// All files of weights.
     pub(crate) fn weight_files(&self) -> impl Iterator<Item = &PathBuf> {
         self.weights.iter().map(|weights| &weights.file)

@@ -26,6 +26,9 @@ pub(crate) const PLAYED_FPS: RangeInclusive<f64> = 0.01..=1000.0;
 /// Sample values in DN.
 pub(crate) const DN: RangeInclusive<f64> = 0.0..=65_535.0;
 
+/// Seconds that a command may take.
+pub(crate) const SECONDS: RangeInclusive<f64> = 1.0..=1e7;
+
 /// Numbers of frames, or of bytes.
 pub(crate) const COUNT: RangeInclusive<u64> = 1..=1 << 40;
 

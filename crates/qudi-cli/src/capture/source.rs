@@ -1,5 +1,6 @@
 //! Where a capture comes from, and opening it with its sensor.
 
+use super::Input;
 use crate::args::Sum;
 use crate::error::{CliError, Result};
 use crate::settings::Settings;
@@ -10,10 +11,10 @@ use std::io::IsTerminal;
 use std::path::Path;
 
 /// A capture as a command names it.
-#[derive(Clone, Copy, Debug)]
+#[derive(Debug)]
 pub(crate) struct Source<'a> {
-    /// The file or folder; `None` for standard input.
-    pub(crate) path: Option<&'a Path>,
+    /// What it is read from.
+    pub(crate) input: Input,
     /// Options for reading it.
     pub(crate) options: &'a ReadOptions,
     /// The number of frames summed into one, if given.
@@ -34,27 +35,23 @@ impl Source<'_> {
     /// Opens the capture with the sensor that is named, or else known, all overrides of `[sensor]` applied.
     pub(crate) fn open(&self, settings: &Settings) -> Result<OpenedCapture> {
         let named = self.sensor.map(|name| settings.sensor(name)).transpose()?;
-        match self.path {
-            Some(path) => self.open_file(path, named, settings),
-            None => self.open_pipe(named, settings),
+        if self.input.is_pipe() {
+            self.open_pipe(named, settings)
+        } else {
+            self.open_file(named, settings)
         }
     }
 
     /// Opens the capture, and judges its frames.
-    fn open_judged(&self, path: &Path, sensor: Option<&Sensor>) -> Result<Capture> {
-        let mut capture = Capture::open(path, self.options, sensor)?;
+    fn open_judged(&self, sensor: Option<&Sensor>) -> Result<Capture> {
+        let mut capture = self.input.open(self.options, sensor)?;
         let known = sensor.or(capture.info().sensor.as_ref()).cloned();
         capture.judge_frames(self.judged, self.options, known.as_ref())?;
         Ok(capture)
     }
 
-    fn open_file(
-        &self,
-        path: &Path,
-        named: Option<Sensor>,
-        settings: &Settings,
-    ) -> Result<OpenedCapture> {
-        let capture = self.open_judged(path, named.as_ref())?;
+    fn open_file(&self, named: Option<Sensor>, settings: &Settings) -> Result<OpenedCapture> {
+        let capture = self.open_judged(named.as_ref())?;
         if named.is_some() {
             return Ok(OpenedCapture { capture, sensor: named });
         }
@@ -62,7 +59,7 @@ impl Source<'_> {
             Some(sensor) if settings.overrides_sensor() => {
                 let sensor = settings.adjusted(sensor)?;
                 // Opened again: a dark map that is set decides which pixels are repaired.
-                let capture = self.open_judged(path, Some(&sensor))?;
+                let capture = self.open_judged(Some(&sensor))?;
                 Ok(OpenedCapture { capture, sensor: Some(sensor) })
             }
             sensor => Ok(OpenedCapture { capture, sensor }),
@@ -70,7 +67,7 @@ impl Source<'_> {
     }
 
     fn open_pipe(&self, named: Option<Sensor>, settings: &Settings) -> Result<OpenedCapture> {
-        let capture = Capture::from_pipe(std::io::stdin(), self.options, named.as_ref())?;
+        let capture = self.input.open(self.options, named.as_ref())?;
         let known = named.or(known_sensor(&capture)?);
         let sensor = known.map(|sensor| settings.adjusted(sensor)).transpose()?;
         Ok(OpenedCapture { capture, sensor })

@@ -28,7 +28,7 @@ impl SummedCapture {
         let about = capture.info();
         let recorded = about.sensor.is_some() || about.is_recorded() && about.max_count != Some(1);
         let asked = source.sum == Some(Sum::Auto);
-        let chooses = asked || source.sum.is_none() && source.path.is_some() && !recorded;
+        let chooses = asked || source.sum.is_none() && !source.input.is_pipe() && !recorded;
         if !chooses {
             return Ok(Self { capture, sensor, choice: None });
         }

@@ -91,7 +91,7 @@ pub(crate) fn refusal(provenance: &Provenance, acquisition: &Acquisition) -> Opt
 /// Refuses a capture far outside what the weights were trained for.
 pub(super) fn check(provenance: &Provenance, acquisition: &Acquisition) -> Result<()> {
     let Some(what) = refusal(provenance, acquisition) else { return Ok(()) };
-    Err(CliError::new(
+    Err(CliError::mismatch(
         what,
         "--weights",
         "sum another number of frames (--sum N), give --ppp if the light was estimated wrongly, use --method qbp-refined, or train for this capture",

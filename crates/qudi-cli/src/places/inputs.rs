@@ -165,16 +165,13 @@ impl Inputs<'_> {
     fn recipe(&mut self, recipe: &Recipe, data: Option<&Path>) {
         let stages = recipe.stages().unwrap_or_default();
         for recipe in std::iter::once(recipe).chain(stages.iter().map(|(_, recipe)| recipe)) {
-            let validation = recipe.validation_data();
+            let sources = recipe.packed_sources();
+            let from = sources.iter().flat_map(|source| &source.from);
+            let files = from.flat_map(|from| data.iter().map(move |data| data.join(from)));
+            self.list.extend(files);
+            recipe.data.sensor.iter().for_each(|mix| self.sensor(&mix.name));
             if let Some(validation) = &recipe.validation {
                 self.sensor(&validation.sensor);
-            }
-            for config in std::iter::once(&recipe.data).chain(&validation) {
-                let files = config.source.iter().filter(|source| source.reads_files());
-                let from = files.flat_map(|source| &source.from);
-                self.list
-                    .extend(data.iter().flat_map(|data| from.clone().map(|from| data.join(from))));
-                config.sensor.iter().for_each(|mix| self.sensor(&mix.name));
             }
         }
     }

@@ -5,7 +5,7 @@ use crate::args::{Color, Global};
 use crate::error::{CliError, Result, stdout_error};
 use crate::interrupt;
 use crate::report::json::document;
-use crate::report::{duration, printable};
+use crate::report::{Listener, Message, duration, printable};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use qudi_core::progress::Progress;
 use std::io::{IsTerminal, Write};
@@ -13,12 +13,12 @@ use std::process::ExitCode;
 use std::time::Instant;
 use tracing_subscriber::EnvFilter;
 
-/// Prints what a run has to say, as its options ask.
-#[derive(Debug)]
+/// Prints what a run has to say, as its options ask, or tells it to the program that called.
 pub(crate) struct Report {
     json: bool,
     volume: Volume,
     color: bool,
+    listener: Option<Listener>,
 }
 
 /// The amount of text that a run prints.
@@ -54,12 +54,21 @@ impl Report {
             .without_time()
             .with_target(false)
             .try_init();
-        Self { json: global.json, volume, color }
+        Self { json: global.json, volume, color, listener: None }
     }
 
     /// Makes a report for errors that occur before the options are known.
     pub(crate) fn plain() -> Self {
-        Self { json: false, volume: Volume::Normal, color: false }
+        Self { json: false, volume: Volume::Normal, color: false, listener: None }
+    }
+
+    /// Makes a report that prints nothing and tells `listener` instead.
+    pub(crate) fn to(listener: Listener) -> Self {
+        Self { json: true, volume: Volume::Normal, color: false, listener: Some(listener) }
+    }
+
+    fn tell(&self, message: impl FnOnce() -> Message) -> bool {
+        self.listener.as_ref().inspect(|listener| listener(message())).is_some()
     }
 
     pub(crate) fn json(&self) -> bool {
@@ -72,6 +81,10 @@ impl Report {
         text: &str,
         json: impl FnOnce() -> serde_json::Value,
     ) -> Result<()> {
+        if let Some(listener) = &self.listener {
+            listener(Message::Result(json()));
+            return Ok(());
+        }
         if self.json {
             return print(&document(&json()));
         }
@@ -80,6 +93,9 @@ impl Report {
 
     /// Prints a remark to the standard error.
     pub(crate) fn remark(&self, text: &str) {
+        if self.tell(|| Message::Note(text.trim_start_matches("note: ").to_owned())) {
+            return;
+        }
         if self.volume != Volume::Quiet {
             eprintln!("{}", printable(text));
         }
@@ -87,7 +103,9 @@ impl Report {
 
     /// Prints what makes a result doubtful.
     pub(crate) fn warning(&self, text: &str) {
-        self.remark(&format!("warning: {text}"));
+        if !self.tell(|| Message::Warning(text.to_owned())) {
+            self.remark(&format!("warning: {text}"));
+        }
     }
 
     /// Makes a progress bar, which is hidden off a terminal, under --json and under --quiet; with --verbose,
@@ -99,7 +117,7 @@ impl Report {
         let bar = ProgressBar::with_draw_target(None, target);
         let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}");
         bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Bar { line: bar, tenth: 0, work: Work::default() }
+        Bar { line: bar, tenth: 0, work: Work::default(), listener: self.listener.clone() }
     }
 
     /// Prints an error and returns the exit code of the program.
@@ -114,11 +132,15 @@ impl Report {
                 self.remark(what);
                 ExitCode::from(interrupt::EXIT_CODE)
             }
+            CliError::TimeOver(what) => {
+                self.remark(what);
+                ExitCode::SUCCESS
+            }
             CliError::Missed(what) => {
                 self.remark(what);
                 ExitCode::from(1)
             }
-            CliError::Error { what, place, help } => {
+            CliError::Error { what, place, help, .. } => {
                 let (red, bold, plain) =
                     if self.color { ("\x1b[1;31m", "\x1b[1m", "\x1b[0m") } else { ("", "", "") };
                 let mut text = format!("{red}error:{plain} {}\n", printable(what));
@@ -144,11 +166,11 @@ pub(crate) fn print(text: &str) -> Result<()> {
 }
 
 /// Shows the progress of one command.
-#[derive(Debug)]
 pub(crate) struct Bar {
     line: ProgressBar,
     tenth: u64,
     work: Work,
+    listener: Option<Listener>,
 }
 
 /// The work that a bar shows.
@@ -188,6 +210,9 @@ impl Bar {
             self.line.reset();
             self.tenth = 0;
         }
+        if let Some(listener) = &self.listener {
+            listener(Message::Progress { what: what.to_owned(), done, total });
+        }
         self.work.measure(done, total);
         let speed = self.work.speed.clone();
         self.line.set_message(format!("{what}{speed}"));
@@ -215,6 +240,9 @@ impl Bar {
 
     /// Shows the progress of training, with figures in `words`.
     pub(crate) fn learning(&mut self, words: String, done: u64, total: u64) {
+        if let Some(listener) = &self.listener {
+            listener(Message::Progress { what: words.clone(), done, total: Some(total) });
+        }
         self.line.set_length(total);
         self.line.set_position(done);
         let percent = 100 * done / total.max(1);

@@ -17,6 +17,7 @@ const COMMANDS: &[(&str, &[&[&str]])] = &[
     ("light", &[&["sensor"]]),
     ("demo", &[&["sensor"]]),
     ("train", &[RECIPE]),
+    ("bench", &[RECIPE]),
     ("config", &[SETTINGS, RECIPE]),
 ];
 

@@ -29,7 +29,6 @@ pub(crate) enum Place {
     /// Compressed; the opener begins at the first byte of the data.
     Stream(Opener),
     /// Fetched in groups of frames.
-    #[cfg_attr(not(feature = "hdf5"), expect(dead_code, reason = "only HDF5 is read so"))]
     Fetch { fetch: Fetch, group: u64 },
     /// In an unnamed file, `available` bytes from byte `start` on.
     Spool { file: File, start: u64, available: u64 },

@@ -2,7 +2,6 @@
 
 use super::mosaic::Mosaic;
 use qudi_core::Size;
-use qudi_core::sensor::Sensor;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;

@@ -16,7 +16,12 @@ pub(super) const MAX_INPUTS: usize = 5;
 ///
 /// Extensions of Burn take no lists of tensors. Unused inputs and a missing addend are therefore arbitrary
 /// tensors, which the geometry marks as unused.
-#[backend_extension(Flex: cfg(feature = "flex"), Cube: cfg(feature = "cube"), Autodiff)]
+#[backend_extension(
+    Flex: cfg(feature = "flex"),
+    Cube: cfg(feature = "cube"),
+    LibTorch: cfg(feature = "libtorch"),
+    Autodiff
+)]
 #[allow(clippy::too_many_arguments)]
 pub trait ConvBackend: Backend {
     /// Convolves inputs `[images, channels, height, width]` with the weight
@@ -175,6 +180,52 @@ mod cube {
             geometry: Geometry,
         ) -> (FloatTensor<Self>, FloatTensor<Self>) {
             stock::weight_gradients::<Self>(&geometry, inputs, gradient, output)
+        }
+    }
+}
+
+#[cfg(feature = "libtorch")]
+mod libtorch {
+    use super::super::stock;
+    use super::{ConvBackend, ConvGradients, Geometry};
+    use burn::backend::LibTorch;
+    use burn::backend::libtorch::TchTensor;
+
+    impl ConvBackend for LibTorch {
+        fn conv_frames(
+            a: TchTensor,
+            b: TchTensor,
+            c: TchTensor,
+            d: TchTensor,
+            e: TchTensor,
+            addend: TchTensor,
+            weight: TchTensor,
+            bias: TchTensor,
+            geometry: Geometry,
+        ) -> TchTensor {
+            let inputs = [a, b, c, d, e].into_iter().take(geometry.channels.len()).collect();
+            let addend = geometry.addend.then_some(addend);
+            stock::forward::<Self>(&geometry, inputs, addend, weight, bias)
+        }
+    }
+
+    impl ConvGradients for LibTorch {
+        fn conv_input_gradients(
+            weight: TchTensor,
+            gradient: TchTensor,
+            output: Option<TchTensor>,
+            geometry: Geometry,
+        ) -> Vec<TchTensor> {
+            stock::input_gradients::<Self>(&geometry, weight, gradient, output)
+        }
+
+        fn conv_weight_gradients(
+            inputs: Vec<TchTensor>,
+            gradient: TchTensor,
+            output: Option<TchTensor>,
+            geometry: Geometry,
+        ) -> (TchTensor, TchTensor) {
+            stock::recorded_weight_gradients(&geometry, inputs, gradient, output).into()
         }
     }
 }

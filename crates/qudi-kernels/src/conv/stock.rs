@@ -7,6 +7,8 @@ use super::geometry::Geometry;
 use burn::backend::Backend;
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
+#[cfg(feature = "libtorch")]
+use burn::backend::{LibTorch, libtorch::TchTensor};
 use burn::tensor::ops::ConvOptions;
 use burn::tensor::{FloatDType, Shape, Slice};
 
@@ -73,20 +75,27 @@ pub(super) fn forward<B: Backend>(
     bias: FloatTensor<B>,
 ) -> FloatTensor<B> {
     let x = narrow::<B>(joined::<B>(inputs), geometry);
-    let weight = narrow::<B>(weight, geometry);
-    let sum = if geometry.is_deep() {
-        let x = by_burst::<B>(x, geometry.frames);
-        by_image::<B>(B::conv3d(x, weight, None, geometry.deep_options()))
-    } else {
-        let weight = B::float_reshape(weight, geometry.flat_weight());
-        B::conv2d(x, weight, None, geometry.flat_options())
-    };
+    let sum = products::<B>(geometry, x, narrow::<B>(weight, geometry));
     let bias = B::float_reshape(bias, Shape::new([1, geometry.outputs, 1, 1]));
     let mut output = B::float_add(widen::<B>(sum, geometry), bias);
     if let Some(addend) = addend {
         output = B::float_add(output, addend);
     }
     if geometry.relu { B::relu(output) } else { output }
+}
+
+/// Computes the sum of products of a convolution alone.
+fn products<B: Backend>(
+    geometry: &Geometry,
+    x: FloatTensor<B>,
+    weight: FloatTensor<B>,
+) -> FloatTensor<B> {
+    if geometry.is_deep() {
+        let x = by_burst::<B>(x, geometry.frames);
+        return by_image::<B>(B::conv3d(x, weight, None, geometry.deep_options()));
+    }
+    let weight = B::float_reshape(weight, geometry.flat_weight());
+    B::conv2d(x, weight, None, geometry.flat_options())
 }
 
 /// Computes the gradient before the ReLU.
@@ -137,6 +146,7 @@ pub(super) fn input_gradients<B: Backend>(
 }
 
 /// Computes the gradients of weight and bias.
+#[cfg(any(feature = "cube", test))]
 pub(super) fn weight_gradients<B: Backend>(
     geometry: &Geometry,
     inputs: Vec<FloatTensor<B>>,
@@ -170,7 +180,31 @@ pub(super) fn weight_gradients<B: Backend>(
     (weight.expect("a kernel of at least one frame"), bias)
 }
 
+/// Computes the gradients of weight and bias by LibTorch's own kernel, which only its record gives: the sum
+/// is computed once more.
+#[cfg(feature = "libtorch")]
+pub(super) fn recorded_weight_gradients(
+    geometry: &Geometry,
+    inputs: Vec<TchTensor>,
+    gradient: TchTensor,
+    output: Option<TchTensor>,
+) -> [TchTensor; 2] {
+    let gradient = uncut::<LibTorch>(gradient, output);
+    let bias = gradient.tensor.sum_dim_intlist([0, 2, 3].as_slice(), false, None);
+    let x = narrow::<LibTorch>(joined::<LibTorch>(inputs), geometry);
+    let [depth, rows, columns] = geometry.kernel;
+    let shape = [geometry.outputs, geometry.all_channels(), depth, rows, columns];
+    let zeros = tch::Tensor::zeros(shape.map(|n| n as i64), (x.tensor.kind(), x.tensor.device()));
+    let (_, record) = crate::libtorch::recorded(vec![TchTensor::new(zeros)], |leaves| {
+        let weight = TchTensor::new(leaves[0].shallow_clone());
+        products::<LibTorch>(geometry, x, weight).tensor
+    });
+    let weight = record.gradients(&gradient).swap_remove(0);
+    [widen::<LibTorch>(weight, geometry), TchTensor::new(bias)]
+}
+
 /// Pads the images with zeros.
+#[cfg(any(feature = "cube", test))]
 fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> {
     let [_, rows, columns] = geometry.padding();
     if rows == 0 && columns == 0 {
@@ -189,6 +223,7 @@ fn padded<B: Backend>(geometry: &Geometry, x: FloatTensor<B>) -> FloatTensor<B> 
 }
 
 /// Shifts images by `dt - depth / 2` frames within their bursts, with zeros past the ends.
+#[cfg(any(feature = "cube", test))]
 fn shifted<B: Backend>(
     x: FloatTensor<B>,
     frames: usize,
@@ -214,6 +249,7 @@ fn shifted<B: Backend>(
 }
 
 /// Gathers the pixels that each tap reads for each cell of padded images, `[images, taps * channels, cells]`.
+#[cfg(any(feature = "cube", test))]
 fn neighbourhoods<B: Backend>(geometry: &Geometry, x: &FloatTensor<B>) -> FloatTensor<B> {
     let [_, rows, columns] = geometry.kernel;
     let [height, width] = geometry.output_grid();

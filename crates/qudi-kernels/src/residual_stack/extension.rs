@@ -15,7 +15,11 @@ pub(super) const INPUTS: usize = 6;
 /// Backends with fused stacks.
 ///
 /// Extensions of Burn take no lists of tensors: unused inputs are any tensors; the stack says what counts.
-#[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
+#[backend_extension(
+    Flex: cfg(feature = "flex"),
+    LibTorch: cfg(feature = "libtorch"),
+    Autodiff
+)]
 #[allow(clippy::too_many_arguments)]
 pub trait StackBackend: Backend {
     /// Inputs `[images, channels, height, width]`, and all parameters one after the other.
@@ -119,6 +123,56 @@ mod flex {
             });
             let count = flat.len();
             (parts.collect(), tensor(flat, [count]))
+        }
+    }
+}
+
+#[cfg(feature = "libtorch")]
+mod libtorch {
+    use super::super::torch;
+    use super::{Stack, StackBackend, StackGradients};
+    use crate::libtorch::{Recorded, recorded, unrecorded};
+    use burn::backend::LibTorch;
+    use burn::backend::libtorch::TchTensor;
+
+    impl StackBackend for LibTorch {
+        fn residual_stack(
+            a: TchTensor,
+            b: TchTensor,
+            c: TchTensor,
+            d: TchTensor,
+            e: TchTensor,
+            f: TchTensor,
+            parameters: TchTensor,
+            stack: Stack,
+        ) -> TchTensor {
+            let inputs = [a, b, c, d, e, f].into_iter().take(stack.inputs.len());
+            let all: Vec<_> = inputs.chain([parameters]).collect();
+            unrecorded(&all, |values| torch::forward(values, &stack))
+        }
+    }
+
+    impl StackGradients for LibTorch {
+        type Activations = Recorded;
+
+        fn residual_stack_kept(
+            mut inputs: Vec<TchTensor>,
+            parameters: TchTensor,
+            stack: &Stack,
+        ) -> (TchTensor, Recorded) {
+            inputs.push(parameters);
+            recorded(inputs, |leaves| torch::forward(leaves, stack))
+        }
+
+        fn residual_stack_gradients(
+            _parameters: TchTensor,
+            gradient: TchTensor,
+            record: &Recorded,
+            _stack: &Stack,
+        ) -> (Vec<TchTensor>, TchTensor) {
+            let mut gradients = record.gradients(&gradient);
+            let flat = gradients.pop().expect("parameters come last");
+            (gradients, flat)
         }
     }
 }

@@ -9,7 +9,11 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, backend_extension};
 
 /// Backends with the fused warp.
-#[backend_extension(Flex: cfg(feature = "flex"), Autodiff)]
+#[backend_extension(
+    Flex: cfg(feature = "flex"),
+    LibTorch: cfg(feature = "libtorch"),
+    Autodiff
+)]
 pub trait WarpBackend: Backend {
     /// Computes [`warp`](super::warp).
     fn warp(x: FloatTensor<Self>, flow: FloatTensor<Self>) -> FloatTensor<Self>;
@@ -53,6 +57,45 @@ mod flex {
             let (dx, dflow) =
                 native::gradients(shape, values(&x), values(&flow), values(&gradient));
             [tensor(dx, shape), tensor(dflow, flow.shape().dims::<4>())]
+        }
+    }
+}
+
+#[cfg(feature = "libtorch")]
+mod libtorch {
+    use super::{WarpBackend, WarpGradients};
+    use crate::libtorch::{recorded, unrecorded};
+    use burn::backend::LibTorch;
+    use burn::backend::libtorch::TchTensor;
+    use tch::{Kind, Tensor};
+
+    /// Samples `x` along `flow` by LibTorch's `grid_sampler`: bilinear, border, aligned corners.
+    fn sampled(inputs: &[Tensor]) -> Tensor {
+        const BILINEAR: i64 = 0;
+        const BORDER: i64 = 1;
+        let [x, flow] = inputs else { unreachable!("a tensor and its flow") };
+        let (_, _, height, width) = x.size4().expect("four dimensions");
+        let places = (Kind::Float, x.device());
+        let column = Tensor::arange(width, places).view([1, 1, width]);
+        let row = Tensor::arange(height, places).view([1, height, 1]);
+        // From the first pixel's centre at -1 to the last one's at 1.
+        let unit = |place: Tensor, size: i64| place * (2.0 / (size.max(2) - 1) as f64) - 1.0;
+        let column = unit(flow.select(1, 0) + column, width);
+        let row = unit(flow.select(1, 1) + row, height);
+        x.grid_sampler(&Tensor::stack(&[column, row], 3), BILINEAR, BORDER, true)
+    }
+
+    impl WarpBackend for LibTorch {
+        fn warp(x: TchTensor, flow: TchTensor) -> TchTensor {
+            unrecorded(&[x, flow], sampled)
+        }
+    }
+
+    impl WarpGradients for LibTorch {
+        fn warp_gradients(x: TchTensor, flow: TchTensor, gradient: TchTensor) -> [TchTensor; 2] {
+            let (_, record) = recorded(vec![x, flow], sampled);
+            let mut gradients = record.gradients(&gradient).into_iter();
+            std::array::from_fn(|_| gradients.next().expect("two inputs"))
         }
     }
 }

@@ -74,7 +74,9 @@ impl Fusion {
             let own = frames[frame].clone();
             let (hidden, difference) = match last {
                 Some((neighbour, hidden)) => {
-                    let along = flow.of_frame(frame, neighbour > frame, count);
+                    // The flow learns from true frames: the gradient of what is warped here is mostly
+                    // noise, and a hundred times as large.
+                    let along = flow.of_frame(frame, neighbour > frame, count).detach();
                     let both = Tensor::cat(vec![hidden.clone(), frames[neighbour].clone()], 1);
                     let both = warp(both, along);
                     let aligned = both.clone().narrow(1, state, 2 * IMAGES);

@@ -16,8 +16,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, OnceLock};
 
-/// The source of samples for one thread.
-#[derive(Debug)]
+/// The source of samples. Clones share pack and bursts.
+#[derive(Clone, Debug)]
 pub struct BurstSampler {
     dataset: Dataset,
     seed: u64,
@@ -58,16 +58,6 @@ impl BurstSampler {
     pub fn with_cache(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
         let cache = Some(Arc::new(BurstCache::new(folder, recipe, self.aligner.as_ref())?));
         Ok(Self { cache, ..self })
-    }
-
-    /// Makes the same sampler for another thread.
-    ///
-    /// # Errors
-    /// [`Error`](qudi_core::Error) if the data cannot be opened again.
-    pub fn try_clone(&self) -> Result<Self> {
-        let (dataset, cache) = (self.dataset.try_clone()?, self.cache.clone());
-        let (aligner, crops) = (self.aligner.clone(), self.crops.clone());
-        Ok(Self { dataset, crops, aligner, cache, ..*self })
     }
 
     /// Sample `number`.
@@ -112,7 +102,7 @@ impl BurstSampler {
         let (sender, receiver) = sync_channel(1);
         std::thread::scope(|scope| {
             for _ in 0..workers.max(1) {
-                let (mut bursts, sender, next) = (self.try_clone()?, sender.clone(), &next);
+                let (mut bursts, sender, next) = (self.clone(), sender.clone(), &next);
                 scope.spawn(move || {
                     loop {
                         let number = next.fetch_add(1, Ordering::Relaxed);
@@ -227,7 +217,7 @@ mod tests {
     fn crops_are_crops_of_the_burst_and_reproducible() {
         let mut one = bursts("{ bursts = 1, cached_frames = 3, frames = 3, side = 16 }");
         let whole = pixels(&one.draw(0, None).unwrap_or_else(|e| panic!("{e}")));
-        let mut other = one.try_clone().unwrap_or_else(|e| panic!("{e}"));
+        let mut other = one.clone();
         let mut seen = Vec::new();
         for number in [3, 1, 2] {
             let crop = sample(&mut one, number);

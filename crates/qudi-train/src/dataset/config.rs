@@ -1,5 +1,6 @@
 //! What samples are drawn from, as recipes write it down.
 
+use super::pack_index::PackedSource;
 use qudi_core::random::uniform;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Result};
@@ -66,10 +67,14 @@ pub struct SourceConfig {
     /// Share of the samples, relative to the others'.
     #[serde(default = "one")]
     pub weight: f64,
+    /// Factor by which clips and stills are downscaled when they are packed: packs get smaller, and noise and
+    /// traces of compression of the source, too.
+    #[serde(default = "one")]
+    pub shrink: f64,
     /// Largest step through a clip, in its frames: with 2, motion is also twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
-    /// Largest factor by which clips and stills are downscaled; each sample draws one log-uniformly from 1 to
+    /// Largest factor by which packed clips and stills are downscaled; each sample draws one log-uniformly from 1 to
     /// it.
     #[serde(default = "one")]
     pub max_downscale: f64,
@@ -240,6 +245,10 @@ impl DataConfig {
                 let what = format!("has a max_downscale of {}", source.max_downscale);
                 return fault(&key, what, "use a factor from 1 to 4");
             }
+            if !(1.0..=8.0).contains(&source.shrink) {
+                let what = format!("has a shrink of {}", source.shrink);
+                return fault(&key, what, "use a factor from 1 to 8");
+            }
             if source.kind == SourceKind::Scenes {
                 for name in &source.from {
                     if ProceduralScene::by_name(name).is_none() {
@@ -253,8 +262,17 @@ impl DataConfig {
         Ok(self)
     }
 
-    /// Returns true if any source reads files.
-    pub fn needs_files(&self) -> bool {
-        self.source.iter().any(SourceConfig::reads_files)
+    /// Returns the sources that read files, as a pack holds them.
+    pub fn packed_sources(&self) -> Vec<PackedSource> {
+        let files = self.source.iter().filter(|source| source.reads_files());
+        files
+            .map(|source| PackedSource {
+                name: source.name.clone(),
+                kind: source.kind,
+                from: source.from.clone(),
+                shrink: source.shrink,
+                lossless: None,
+            })
+            .collect()
     }
 }

@@ -1,16 +1,33 @@
 //! Search for the clips and stills that a source names.
 
-use super::config::{SourceConfig, SourceKind};
+use super::config::SourceKind;
+use super::pack_index::PackedSource;
 use qudi_core::natural_order::natural_order;
 use qudi_core::{Error, Result};
 use qudi_sim::clip::is_image;
 use std::path::{Path, PathBuf};
 
-/// One clip or still to read: its name in the pack, and where it is.
+/// One clip or still to read: its name in the pack, where it is, and how large.
 #[derive(Debug)]
 pub(super) struct Content {
     pub(super) name: String,
     pub(super) path: PathBuf,
+}
+
+impl Content {
+    /// Returns the bytes of the file, or of all files in the folder.
+    pub(super) fn bytes(&self) -> Result<u64> {
+        let fault = |e| Error::io("read the size of the source", &self.path, e);
+        let about = std::fs::metadata(&self.path).map_err(fault)?;
+        if !about.is_dir() {
+            return Ok(about.len());
+        }
+        let mut bytes = 0;
+        for file in std::fs::read_dir(&self.path).map_err(fault)? {
+            bytes += file.and_then(|file| file.metadata()).map_err(fault)?.len();
+        }
+        Ok(bytes)
+    }
 }
 
 /// Largest depth of folders that are searched.
@@ -20,7 +37,7 @@ const MAX_DEPTH: usize = 4;
 const OTHER_EXTENSIONS: &[&str] = &["txt", "md", "json", "csv", "zip", "npy", "toml", "html"];
 
 /// Returns everything that a source names, in the order of names, below `data`.
-pub(super) fn contents(source: &SourceConfig, data: &Path) -> Result<Vec<Content>> {
+pub(super) fn contents(source: &PackedSource, data: &Path) -> Result<Vec<Content>> {
     let mut list = Vec::new();
     for from in &source.from {
         let path = data.join(from);

@@ -1,5 +1,6 @@
 //! Squares cut from frames, turned, mirrored and downscaled.
 
+use super::pack::PackedFrame;
 use qudi_core::{Frame, Size};
 
 /// Place of a sample in its frames, and its orientation.
@@ -14,35 +15,37 @@ pub(super) struct Crop {
 
 impl Crop {
     /// Returns this square of a frame.
-    pub(super) fn of(self, frame: &Frame) -> Frame {
+    pub(super) fn of(self, frame: PackedFrame<'_>) -> Frame {
         let last = self.side - 1;
         Frame::from_fn(Size { height: self.side, width: self.side }, |x, y| {
             let (x, y) = if self.turn & 4 == 0 { (x, y) } else { (y, x) };
             let x = if self.turn & 1 == 0 { x } else { last - x };
             let y = if self.turn & 2 == 0 { y } else { last - y };
-            frame.data[(self.top + y) * frame.size.width + self.left + x]
+            frame.value(self.left + x, self.top + y)
         })
     }
 }
 
-/// Downscales a square picture to a side: means over areas.
-pub(super) fn shrunk(square: Frame, side: usize) -> Frame {
-    let long = square.size.width;
-    if side == long {
-        return square;
+/// Downscales a picture: means over areas.
+pub(super) fn shrunk(picture: Frame, size: Size) -> Frame {
+    if size == picture.size {
+        return picture;
     }
-    // Along rows and transposed, twice.
-    let half = |rows: &[f32], count: usize| -> Vec<f32> {
-        let mut data = vec![0.0; side * count];
-        for (y, row) in rows.chunks_exact(long).enumerate() {
-            for x in 0..side {
-                data[x * count + y] = mean(row, x, side);
-            }
+    let data = shrunk_along_rows(&picture.data, picture.size.width, size.width);
+    let data = shrunk_along_rows(&data, picture.size.height, size.height);
+    Frame { size, data }
+}
+
+/// Downscales rows of a length to another, and transposes the picture.
+fn shrunk_along_rows(values: &[f32], long: usize, short: usize) -> Vec<f32> {
+    let count = values.len() / long;
+    let mut data = vec![0.0; short * count];
+    for (y, row) in values.chunks_exact(long).enumerate() {
+        for x in 0..short {
+            data[x * count + y] = mean(row, x, short);
         }
-        data
-    };
-    let data = half(&half(&square.data, long), side);
-    Frame { size: Size { height: side, width: side }, data }
+    }
+    data
 }
 
 /// Returns the mean over part `x` of `side` equal parts of a row.
@@ -62,13 +65,13 @@ mod tests {
 
     #[test]
     fn smaller_pictures_keep_slopes_means_and_white() {
+        let square = |side: usize| Size { height: side, width: side };
         let ramp = |side: usize| {
-            let size = Size { height: side, width: side };
             let place = |i: usize| (i as f32 + 0.5) / side as f32;
-            Frame::from_fn(size, |x, y| 0.25 * place(x) + 0.75 * place(y))
+            Frame::from_fn(square(side), |x, y| 0.25 * place(x) + 0.75 * place(y))
         };
         for (long, side) in [(9, 9), (9, 8), (12, 6), (31, 20), (17, 5)] {
-            let (small, wanted) = (shrunk(ramp(long), side), ramp(side));
+            let (small, wanted) = (shrunk(ramp(long), square(side)), ramp(side));
             assert_eq!(small.size, wanted.size);
             // Parts of a step of the ramp count as that step: up to a quarter of it is lost.
             let most = 0.26 / long as f32;
@@ -77,23 +80,27 @@ mod tests {
             }
             assert!((small.mean() - wanted.mean()).abs() < 1e-4);
         }
-        let white = Frame::from_fn(Size { height: 31, width: 31 }, |_, _| 1.0);
-        assert!(shrunk(white, 19).data.iter().all(|&value| (value - 1.0).abs() < 1e-6));
+        let white = Frame::filled(Size { height: 31, width: 47 }, 1.0);
+        let small = shrunk(white, Size { height: 19, width: 40 });
+        assert_eq!(small.data.len(), 19 * 40);
+        assert!(small.data.iter().all(|&value| (value - 1.0).abs() < 1e-6));
     }
 
     #[test]
     fn eight_turns_differ_and_keep_every_pixel() {
         let size = Size { height: 5, width: 6 };
-        let frame = Frame::from_fn(size, |x, y| (10 * y + x) as f32);
+        let values: Vec<u8> = (0..30).map(|i| 10 * (i / 6) + i % 6).collect();
+        let frame = PackedFrame { size, values: &values };
         let mut seen = Vec::new();
         for turn in 0..8 {
-            let part = Crop { left: 2, top: 1, side: 3, turn }.of(&frame);
-            let mut sorted = part.data.clone();
-            sorted.sort_by(f32::total_cmp);
-            assert_eq!(sorted, [12.0, 13.0, 14.0, 22.0, 23.0, 24.0, 32.0, 33.0, 34.0]);
-            assert!(!seen.contains(&part.data));
-            seen.push(part.data);
+            let part = Crop { left: 2, top: 1, side: 3, turn }.of(frame);
+            let part: Vec<u8> = part.data.iter().map(|v| (v * 255.0).round() as u8).collect();
+            let mut sorted = part.clone();
+            sorted.sort_unstable();
+            assert_eq!(sorted, [12, 13, 14, 22, 23, 24, 32, 33, 34]);
+            assert!(!seen.contains(&part));
+            seen.push(part);
         }
-        assert_eq!(seen[0][..3], [12.0, 13.0, 14.0]);
+        assert_eq!(seen[0][..3], [12, 13, 14]);
     }
 }

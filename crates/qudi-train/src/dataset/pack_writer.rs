@@ -1,23 +1,25 @@
 //! Decoding of a recipe's sources into a pack.
 
-use super::config::{DataConfig, SourceKind};
-use super::content::contents;
-use super::pack::{Clip, INDEX, Index, VERSION};
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
-use qudi_core::Frame;
+use super::config::SourceKind;
+use super::content::{Content, contents};
+use super::crop::shrunk;
+use super::pack_index::{Clip, ClipWindow, INDEX, Index, PackedSource};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
-use qudi_core::{Error, Result};
+use qudi_core::{Error, Frame, Result, Size};
 use qudi_sim::clip::{Input, Sampling};
 use rayon::prelude::*;
+use sha2::{Digest, Sha256};
 use std::io::Write;
 use std::ops::ControlFlow;
 use std::path::Path;
-use zip::write::SimpleFileOptions;
+use zip::write::{SimpleFileOptions, StreamWriter};
 use zip::{CompressionMethod, ZipWriter};
 
 /// Frames encoded at once.
 const BATCH: usize = 16;
+
+/// PSNR of a frame without error, which counts so in means.
+const EXACT_PSNR: f64 = 60.0;
 
 /// A clip that has been packed.
 #[derive(Clone, Debug)]
@@ -28,94 +30,136 @@ pub struct PackProgress {
     pub done: [usize; 2],
 }
 
-/// Decodes every clip and still that `configs` name, below the folder `data`, into one pack. `most` frames of
-/// a clip are taken at most. `on` receives every clip, and returns `Break` to stop.
+/// A frame in its final size: rounded, encoded, and the PSNR of what is decoded from it.
+struct Image {
+    bytes: Vec<u8>,
+    psnr: f64,
+}
+
+/// Decodes every clip and still of `sources`, below the folder `data`, into one pack. Returns the mean PSNR of
+/// training frames, as decoded from the pack, against their downscaled sources. `on` receives every clip, and
+/// returns `Break` to stop.
 ///
 /// # Errors
 /// [`Error`] if something cannot be read or written; [`Error::Interrupted`] if asked to stop.
 pub fn write_pack(
-    configs: &[&DataConfig],
+    sources: &[PackedSource],
     data: &Path,
     path: &Path,
     overwrite: Overwrite,
     on: &mut dyn FnMut(&PackProgress) -> ControlFlow<()>,
-) -> Result<()> {
+) -> Result<Option<f64>> {
     let mut jobs = Vec::new();
-    for source in configs.iter().flat_map(|config| &config.source) {
-        if source.kind != SourceKind::Scenes {
-            let found = contents(source, data)?;
-            jobs.extend(found.into_iter().map(|content| (source, content)));
-        }
+    for source in sources {
+        jobs.extend(contents(source, data)?.into_iter().map(|content| (source, content)));
     }
     let file = PendingFile::create(path, overwrite)?;
     let mut zip = ZipWriter::new_stream(file);
-    let mut clips: Vec<Clip> = Vec::new();
+    let mut index = Index::new(sources.to_vec());
+    let mut digest = Sha256::new();
+    let (mut psnr, mut count) = (0.0, 0);
     let total = jobs.len();
     for (source, content) in jobs {
-        let input = match source.kind {
-            SourceKind::Stills => Input::still(&content.path),
-            _ => Input::clip(&content.path)?,
-        };
-        let frames = (source.kind == SourceKind::Stills).then_some(1);
-        let mut reader = input.open(&Sampling { frames, ..Sampling::default() })?;
-        let mut clip = Clip {
-            source: source.name.clone(),
-            name: content.name,
-            frames: 0,
-            size: reader.info().size,
-            mean: 0.0,
-        };
-        if clips.iter().any(|other| other.source == clip.source && other.name == clip.name) {
+        let (clip, images) = packed(source, &content)?;
+        if index.clips.iter().any(|other| other.source == clip.source && other.name == clip.name) {
             return Err(Error::data(
                 format!("source `{}` holds `{}` twice", clip.source, clip.name),
                 &content.path,
                 "name every file once",
             ));
         }
-        loop {
-            let mut batch = Vec::with_capacity(BATCH);
-            while batch.len() < BATCH {
-                let Some(mean_level) = reader.next()? else { break };
-                batch.push(mean_level.truth().clone());
-            }
-            if batch.is_empty() {
-                break;
-            }
-            let images: Vec<_> = batch.par_iter().map(png).collect();
-            for (frame, image) in batch.iter().zip(images) {
-                store(&mut zip, &clip.entry(clip.frames), &image?, path)?;
-                clip.mean += frame.mean();
-                clip.frames += 1;
-            }
+        for (frame, image) in images.iter().enumerate() {
+            store(&mut zip, &index.entry(&clip, frame), &image.bytes, path)?;
+            digest.update(&image.bytes);
         }
-        clip.mean /= clip.frames.max(1) as f64;
-        clips.push(clip.clone());
-        if on(&PackProgress { clip, done: [clips.len(), total] }).is_break() {
+        if source.lossless.is_none() {
+            psnr += images.iter().map(|image| image.psnr).sum::<f64>();
+            count += images.len();
+        }
+        index.clips.push(clip.clone());
+        if on(&PackProgress { clip, done: [index.clips.len(), total] }).is_break() {
             return Err(Error::Interrupted);
         }
     }
-    let index = serde_json::to_vec_pretty(&Index { version: VERSION, clips }).expect("plain data");
-    store(&mut zip, INDEX, &index, path)?;
-    zip.finish().map_err(|e| failed(path, e))?.into_inner().finish()
+    store(&mut zip, INDEX, &index.signed(digest), path)?;
+    zip.finish().map_err(|e| failed(path, e))?.into_inner().finish()?;
+    Ok((count > 0).then(|| psnr / count as f64))
 }
 
-/// Encodes a frame as an 8-bit gray PNG.
-fn png(frame: &Frame) -> Result<Vec<u8>> {
-    let bytes: Vec<u8> = frame.data.iter().map(|v| (v * 255.0).round() as u8).collect();
-    let mut image = Vec::new();
-    let encoder =
-        PngEncoder::new_with_quality(&mut image, CompressionType::Best, FilterType::Adaptive);
-    let (width, height) = (frame.size.width as u32, frame.size.height as u32);
-    let done = encoder.write_image(&bytes, width, height, ExtendedColorType::L8);
-    done.map_err(|e| {
-        Error::request(format!("a frame cannot be encoded: {e}"), frame.size, "report this")
-    })?;
-    Ok(image)
+/// Reads a clip or a still, and encodes its frames.
+fn packed(source: &PackedSource, content: &Content) -> Result<(Clip, Vec<Image>)> {
+    let still = source.kind == SourceKind::Stills;
+    let input = if still { Input::still(&content.path) } else { Input::clip(&content.path)? };
+    let frames = still.then_some(1);
+    let mut reader = input.open(&Sampling { frames, ..Sampling::default() })?;
+    let mut size = Size { height: 0, width: 0 };
+    let mut images = Vec::new();
+    loop {
+        let mut batch = Vec::with_capacity(BATCH);
+        while batch.len() < BATCH {
+            let Some(exposure) = reader.next()? else { break };
+            batch.push(exposure.truth().clone());
+        }
+        if batch.is_empty() {
+            break;
+        }
+        let frames: Vec<Frame> = batch.into_par_iter().map(|frame| source.part(frame)).collect();
+        size = frames[0].size;
+        let encoded: Result<Vec<_>> = frames.par_iter().map(|frame| image(source, frame)).collect();
+        images.extend(encoded?);
+    }
+    if let Some(ClipWindow { frames, .. }) = source.lossless {
+        images.drain(..images.len().saturating_sub(frames) / 2);
+        images.truncate(frames);
+    }
+    if images.is_empty() {
+        let what = format!("`{}` holds no frame", content.name);
+        return Err(Error::data(what, &content.path, "leave it out of the source"));
+    }
+    let clip = Clip {
+        source: source.name.clone(),
+        name: content.name.clone(),
+        file_bytes: content.bytes()?,
+        frames: images.len(),
+        size,
+    };
+    Ok((clip, images))
 }
 
-/// Returns the options of entries: images are compressed already.
+impl PackedSource {
+    /// Returns a frame as it is packed: downscaled, or its middle.
+    fn part(&self, frame: Frame) -> Frame {
+        let Size { height, width } = frame.size;
+        if let Some(ClipWindow { crop, .. }) = self.lossless {
+            let size = Size { height: height.min(crop), width: width.min(crop) };
+            let (top, left) = ((height - size.height) / 2, (width - size.width) / 2);
+            return Frame::from_fn(size, |x, y| frame.data[(top + y) * width + left + x]);
+        }
+        let short = |side: usize| ((side as f64 / self.shrink).round() as usize).max(1);
+        shrunk(frame, Size { height: short(height), width: short(width) })
+    }
+}
+
+/// Encodes a frame.
+fn image(source: &PackedSource, frame: &Frame) -> Result<Image> {
+    let values: Vec<u8> = frame.data.iter().map(|v| (v * 255.0).round() as u8).collect();
+    let bytes = source.codec().encode(&values, frame.size)?;
+    let mut psnr = EXACT_PSNR;
+    if source.lossless.is_none() {
+        let decoded = source.codec().decode(&bytes, frame.size).map_err(|e| {
+            let what = format!("an encoded frame cannot be decoded: {e}");
+            Error::request(what, &source.name, "report this")
+        })?;
+        let pairs = frame.data.iter().zip(&decoded);
+        let sum: f64 = pairs.map(|(a, &b)| (f64::from(*a) - f64::from(b) / 255.0).powi(2)).sum();
+        psnr = psnr.min(-10.0 * (sum / decoded.len() as f64).log10());
+    }
+    Ok(Image { bytes, psnr })
+}
+
+/// Stores an entry; images are compressed already.
 fn store<W: Write>(
-    zip: &mut ZipWriter<zip::write::StreamWriter<W>>,
+    zip: &mut ZipWriter<StreamWriter<W>>,
     name: &str,
     bytes: &[u8],
     path: &Path,

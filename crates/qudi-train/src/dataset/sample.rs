@@ -30,8 +30,8 @@ pub struct Sample {
     pub acquisition: Acquisition,
 }
 
-/// Draws samples. One for each thread that draws.
-#[derive(Debug)]
+/// Draws samples. Clones share the pack.
+#[derive(Clone, Debug)]
 pub struct Dataset {
     config: DataConfig,
     pack: Option<Pack>,
@@ -52,26 +52,17 @@ impl Dataset {
         Ok(Self { config: config.clone(), pack, sensors, clips })
     }
 
-    /// Makes the same dataset for another thread.
-    ///
-    /// # Errors
-    /// As [`Self::new`].
-    pub fn try_clone(&self) -> Result<Self> {
-        let pack = self.pack.as_ref().map(Pack::try_clone).transpose()?;
-        Self::new(&self.config, pack)
-    }
-
     /// Draws sample `number` of `seed`.
     ///
     /// # Errors
-    /// [`Error`] if the pack is damaged.
-    pub fn sample(&mut self, seed: u64, number: u64) -> Result<Sample> {
+    /// [`Error`] if a sensor cannot be used.
+    pub fn sample(&self, seed: u64, number: u64) -> Result<Sample> {
         let mut rng = Streams::new(seed).row(Domain::Training, number, 0);
         let weights: Vec<f64> = self.config.source.iter().map(|source| source.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
         let (frames, mean_level) = match self.config.source[at].kind {
-            SourceKind::Clips => self.clip(at, &mut rng)?,
-            SourceKind::Stills => self.still(at, &mut rng)?,
+            SourceKind::Clips => self.clip(at, &mut rng),
+            SourceKind::Stills => self.still(at, &mut rng),
             SourceKind::Scenes => self.scene(at, &mut rng),
         };
         let (frames, mean_level) = rescaled(frames, mean_level, uniform(&mut rng));
@@ -93,10 +84,10 @@ impl Dataset {
     }
 
     /// Cuts frames from a clip, and returns the clip's mean, too.
-    fn clip(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
-        let pack = self.pack.as_mut().expect("checked at the start");
+    fn clip(&self, source: usize, rng: &mut impl Rng) -> (Vec<Frame>, f64) {
+        let pack = self.pack.as_ref().expect("checked at the start");
         let number = self.clips[source][below(self.clips[source].len(), rng)];
-        let clip = pack.clips()[number].clone();
+        let clip = &pack.clips()[number];
         let steps = self.config.frames - 1;
         let longest = self.config.source[source].stride.min((clip.frames - 1) / steps.max(1));
         let stride = 1 + below(longest.max(1), rng);
@@ -106,19 +97,19 @@ impl Dataset {
         let crop = cut(clip.size, enlarged(self.config.crop, factor), rng);
         let mut frames = Vec::with_capacity(steps + 1);
         for i in 0..=steps {
-            let frame = crop.of(&pack.frame(number, first + i * stride)?);
-            frames.push(shrunk(frame, self.config.crop));
+            let frame = crop.of(pack.frame(number, first + i * stride));
+            frames.push(shrunk(frame, square(self.config.crop)));
         }
         if backward {
             frames.reverse();
         }
-        Ok((frames, clip.mean))
+        (frames, pack.mean(number))
     }
 
-    fn still(&mut self, source: usize, rng: &mut impl Rng) -> Result<(Vec<Frame>, f64)> {
-        let pack = self.pack.as_mut().expect("checked at the start");
+    fn still(&self, source: usize, rng: &mut impl Rng) -> (Vec<Frame>, f64) {
+        let pack = self.pack.as_ref().expect("checked at the start");
         let number = self.clips[source][below(self.clips[source].len(), rng)];
-        let clip = pack.clips()[number].clone();
+        let clip = &pack.clips()[number];
         let (side, frames) = (self.config.crop, self.config.frames);
         let (angle, speed) = (TAU * uniform(rng), self.config.source[source].speed * uniform(rng));
         let mut motion = StillMotion {
@@ -136,15 +127,15 @@ impl Dataset {
         let part = (side + 2 * way).min(clip.size.height).min(clip.size.width);
         let factor = self.config.source[source].factor(rng);
         let crop = cut(clip.size, enlarged(part, factor), rng);
-        let image = shrunk(crop.of(&pack.frame(number, 0)?), part);
-        let scene = still_scene(image, motion, Size { height: side, width: side }, rng.next_u64());
-        Ok((rendered(&scene, frames), clip.mean))
+        let image = shrunk(crop.of(pack.frame(number, 0)), square(part));
+        let scene = still_scene(image, motion, square(side), rng.next_u64());
+        (rendered(&scene, frames), pack.mean(number))
     }
 
     fn scene(&self, source: usize, rng: &mut impl Rng) -> (Vec<Frame>, f64) {
         let SourceConfig { from, speed, .. } = &self.config.source[source];
         let name = &from[below(from.len(), rng)];
-        let size = Size { height: self.config.crop, width: self.config.crop };
+        let size = square(self.config.crop);
         let kind = ProceduralScene::by_name(name).expect("checked with the recipe");
         let speed = speed * uniform(rng);
         let scene = Procedural { kind, size, seed: rng.next_u64(), speed }.scene();
@@ -152,6 +143,10 @@ impl Dataset {
         let mean = frames.iter().map(Frame::mean).sum::<f64>() / frames.len() as f64;
         (frames, mean)
     }
+}
+
+fn square(side: usize) -> Size {
+    Size { height: side, width: side }
 }
 
 /// Returns the side that `factor` downscales to `side`.

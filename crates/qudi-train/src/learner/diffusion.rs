@@ -62,6 +62,10 @@ impl Learner for Diffusion {
         Batch::draw(recipe, bursts, number)
     }
 
+    fn upload(batch: &mut Batch, device: &Device) {
+        batch.upload(device);
+    }
+
     fn loss<'a>(&'a self, batch: &'a Batch, context: &Context<'a>) -> Result<Loss<'a>> {
         let train = &context.recipe.train;
         let conditioning = batch.conditioning(context.device);
@@ -162,7 +166,7 @@ impl LossTerms {
 /// `recomputes`, pre-denoiser and U-Net are computed again for their gradients, image by image.
 ///
 /// # Errors
-/// [`Error`](crate::Error) if the device fails or a sensor is impossible.
+/// [`Error`](qudi_core::Error) if the device fails or a sensor is impossible.
 pub fn loss_terms(
     network: &Diffusion,
     example: &Example<'_>,

@@ -3,7 +3,7 @@
 use super::diffusion::{Batch, Example, noisy_images, previous_timestep};
 use super::{Context, Learner, Loss, Origin, WeightedSum, learning, load_fitting, save_described};
 use crate::burst_cache::BurstSampler;
-use crate::loss::robust_square;
+use crate::loss::log_mean_square;
 use crate::parameters::gradients;
 use crate::recipe::Recipe;
 use burn::module::Module;
@@ -40,6 +40,10 @@ impl Learner for Window {
         Batch::draw(recipe, bursts, number)
     }
 
+    fn upload(batch: &mut Batch, device: &Device) {
+        batch.upload(device);
+    }
+
     fn loss<'a>(&'a self, batch: &'a Batch, context: &Context<'a>) -> Result<Loss<'a>> {
         let train = &context.recipe.train;
         let conditioning = batch.conditioning(context.device);
@@ -67,9 +71,9 @@ impl Learner for Window {
         let mut sum = WeightedSum::default();
         // Errors in units of what they usually are: no light level drowns another.
         let error = (prediction.x0 - truth.clone()) / prediction.c_out;
-        sum.add("prediction", weights.prediction, robust_square(error));
+        sum.add("prediction", weights.prediction, log_mean_square(error));
         let error = (encoded.restored.clone() * 2.0 - 1.0 - truth) / encoded.error_sigma().clone();
-        sum.add("pre", weights.pre, robust_square(error));
+        sum.add("pre", weights.pre, log_mean_square(error));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
         let flow = flows.reduce(Tensor::add).expect("a level");

@@ -21,32 +21,33 @@ pub(super) fn matrix(shape: &[usize]) -> Option<[usize; 2]> {
     (rows > 1 && columns > 1).then_some([rows, columns])
 }
 
-/// Returns the step at a learning rate of 1 for a matrix with these rows and columns.
+/// Returns the steps at a learning rate of 1 for `count` matrices with these rows and columns.
 ///
 /// # Shapes
-/// - momentum: `[rows * columns]`
+/// - momentum: `[count * rows * columns]`
 /// - output: the same
-pub(super) fn step(momentum: Tensor<1>, [rows, columns]: [usize; 2]) -> Tensor<1> {
-    let matrix = momentum.reshape([rows, columns]);
+pub(super) fn step(momentum: Tensor<1>, count: usize, [rows, columns]: [usize; 2]) -> Tensor<1> {
+    let matrices = momentum.reshape([count, rows, columns]);
     let is_tall = rows > columns;
-    let wide = if is_tall { matrix.transpose() } else { matrix };
+    let wide = if is_tall { matrices.swap_dims(1, 2) } else { matrices };
     let size = STEP * (rows.max(columns) as f64).sqrt();
     let orthogonal = orthogonalized(wide) * size;
-    let matrix = if is_tall { orthogonal.transpose() } else { orthogonal };
-    matrix.reshape([rows * columns])
+    let matrices = if is_tall { orthogonal.swap_dims(1, 2) } else { orthogonal };
+    matrices.reshape([count * rows * columns])
 }
 
 /// Lower bound of the norm. Without gradient the mean of a layer shrinks until its squares are zero in 32
 /// bits; the bound prevents a division by zero, and the layer no longer changes.
 const LEAST_NORM: f32 = 1e-7;
 
-/// Returns the matrix, `[rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay zeros.
-fn orthogonalized(matrix: Tensor<2>) -> Tensor<2> {
-    let norm = matrix.clone().powi_scalar(2).sum().sqrt().clamp_min(LEAST_NORM);
-    let mut x = matrix / norm.reshape([1, 1]);
+/// Returns the matrices, `[count, rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay
+/// zeros.
+fn orthogonalized(matrices: Tensor<3>) -> Tensor<3> {
+    let squares = matrices.clone().powi_scalar(2).sum_dim(2).sum_dim(1);
+    let mut x = matrices / squares.sqrt().clamp_min(LEAST_NORM);
     let [a, b, c] = NEWTON_SCHULZ;
     for _ in 0..ROUNDS {
-        let square = x.clone().matmul(x.clone().transpose());
+        let square = x.clone().matmul(x.clone().swap_dims(1, 2));
         let polynomial = square.clone() * b + square.clone().matmul(square) * c;
         x = x.clone() * a + polynomial.matmul(x);
     }

@@ -88,9 +88,17 @@ mod tests {
                 .iter()
                 .map(|s| (s.name.as_str(), s.from.len(), s.weight))
                 .collect();
-            assert_eq!(sources, [("clips", clips, 5.0), ("stills", 3, 4.0), ("scenes", 2, 1.0)]);
+            let clips_of = |stills: &[(&'static str, usize, f64)]| {
+                [&[("clips", clips, 5.0)], stills, &[("scenes", 2, 1.0)]].concat()
+            };
+            if name == "small" {
+                assert_eq!(sources, clips_of(&[("stills", 3, 4.0)]));
+            } else {
+                assert_eq!(sources, clips_of(&[("stills", 3, 2.7), ("grocery", 1, 1.3)]));
+            }
+            // The pack of the base is smaller than its files; each sample shrinks the rest.
             let clips = &recipe.data.source[0];
-            assert_eq!((clips.stride, clips.max_downscale), (2, 1.5));
+            assert_eq!((clips.stride, clips.shrink * clips.max_downscale), (2, 1.5));
             assert_eq!(clips.from[0], "train/video/cups.mp4");
             assert_eq!(recipe.data.source[1].static_fraction, 0.25);
             let validation = recipe.validation.unwrap();

@@ -1,8 +1,6 @@
 //! The loss of a step in numbers.
 
 use burn::tensor::Tensor;
-use qudi_core::Result;
-use qudi_layers::tensor::read;
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
 /// The loss and its terms, each the mean over a step.
@@ -20,15 +18,6 @@ impl LossValues {
         self.terms.iter().find(|(term, _)| *term == name).map_or(0.0, |(_, value)| *value)
     }
 
-    /// Reads the terms from the device.
-    pub(super) fn read(total: &Tensor<1>, terms: &[(&'static str, Tensor<1>)]) -> Result<Self> {
-        let tensors = std::iter::once(total).chain(terms.iter().map(|(_, term)| term));
-        let numbers = read(Tensor::cat(tensors.cloned().collect(), 0).inner())?;
-        let mut numbers = numbers.into_iter().map(f64::from);
-        let total = numbers.next().unwrap_or_default();
-        Ok(Self { total, terms: terms.iter().map(|(name, _)| *name).zip(numbers).collect() })
-    }
-
     /// Adds a share of the losses of the same network.
     pub(super) fn add(&mut self, other: &Self, share: f64) {
         self.total += share * other.total;
@@ -38,6 +27,30 @@ impl LossValues {
                 None => self.terms.push((name, share * value)),
             }
         }
+    }
+}
+
+/// The loss of one batch, on the device.
+#[derive(Debug)]
+pub(super) struct UnreadLoss {
+    /// The total, then the terms.
+    pub(super) numbers: Tensor<1>,
+    names: Vec<&'static str>,
+}
+
+impl UnreadLoss {
+    pub(super) fn new(total: &Tensor<1>, terms: &[(&'static str, Tensor<1>)]) -> Self {
+        let tensors = std::iter::once(total).chain(terms.iter().map(|(_, term)| term));
+        Self {
+            numbers: Tensor::cat(tensors.cloned().collect(), 0).inner(),
+            names: terms.iter().map(|(name, _)| *name).collect(),
+        }
+    }
+
+    /// Takes as many numbers as the loss has.
+    pub(super) fn values(&self, numbers: &mut impl Iterator<Item = f64>) -> LossValues {
+        let total = numbers.next().unwrap_or_default();
+        LossValues { total, terms: self.names.iter().copied().zip(numbers).collect() }
     }
 }
 

@@ -7,10 +7,11 @@ use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
 use std::path::PathBuf;
 
-/// Measure speed and memory of methods
+/// Measure speed and memory of methods, or the speed of training
 ///
 /// Restores one window of a simulated burst over and over: one round to warm up, then medians. Keep the
-/// results with --json, and compare with them later.
+/// results with --json, and compare with them later. With --train it takes training steps of a recipe, which
+/// --set changes, and forgets them.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Bench {
     #[command(flatten)]
@@ -30,6 +31,21 @@ pub(crate) struct Bench {
     /// Results of an earlier run (--json) to compare with
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) compare: Option<PathBuf>,
+    /// Measure training steps of this recipe instead
+    #[arg(long, value_name = "RECIPE", conflicts_with_all = ["method", "size", "frames", "rounds", "compare"])]
+    pub(crate) train: Option<String>,
+    /// --train: the recipe's decoded data, made by `qudi train --prepare`
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, requires = "train")]
+    pub(crate) pack: Option<PathBuf>,
+    /// --train: how long
+    #[arg(long, value_name = "S", default_value = "60", requires = "train", allow_negative_numbers = true, value_parser = number::real(number::SECONDS))]
+    pub(crate) seconds: f64,
+    /// --train: threads that draw samples
+    #[arg(long, value_name = "N", default_value = "1", requires = "train", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
+    pub(crate) workers: usize,
+    /// --train: folder with the weights of LPIPS, as for `qudi train`
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, requires = "train")]
+    pub(crate) backbones: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) steps: Steps,
     #[command(flatten)]

@@ -2,11 +2,11 @@
 
 use super::args::Bench;
 use super::burst::{burst, median};
-use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
 use crate::report::Report;
+use crate::settings::Settings;
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
 use qudi_core::restorer::BurstView;
@@ -41,7 +41,14 @@ struct Results {
     methods: Vec<Measured>,
 }
 
-pub(crate) fn run(args: &Bench, _: &Global, report: &Report) -> Result<()> {
+pub(crate) fn run(args: &Bench, settings: &Settings, report: &Report) -> Result<()> {
+    if let Some(recipe) = &args.train {
+        return super::training::run(recipe, args, settings, report);
+    }
+    if let Some((key, _, origin)) = settings.recipe_changes().first() {
+        let help = "name a recipe with --train, or leave it out";
+        return Err(CliError::new(format!("`{key}` is for --train"), origin, help));
+    }
     let options = args.network.options(args.steps.steps, &args.given);
     options.check_methods(&args.method)?;
     let old = args.compare.as_deref().map(load).transpose()?;

@@ -120,16 +120,6 @@ pub(crate) enum Protocol {
     Quiver,
 }
 
-impl Protocol {
-    /// Returns the name on the command line.
-    pub(crate) fn name(self) -> &'static str {
-        match self {
-            Self::Strict => "strict",
-            Self::Quiver => "quiver",
-        }
-    }
-}
-
 /// Frames of another program.
 #[derive(Clone, Debug)]
 pub(crate) struct External {

@@ -6,7 +6,7 @@ use super::html::Pictures;
 use super::metrics::CHI_SQUARE;
 use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
-use crate::capture::{CaptureAcquisition, LightOverrides, Source, SummedCapture, remarks};
+use crate::capture::{CaptureAcquisition, Input, LightOverrides, Source, SummedCapture, remarks};
 use crate::error::Result;
 use crate::interrupt;
 use crate::memory::PeakMemory;
@@ -41,7 +41,7 @@ pub(crate) fn evaluate_capture(
     let seed = plan.seed.unwrap_or(SEED);
     let path = Path::new(&plan.data);
     let source = Source {
-        path: Some(path),
+        input: Input::at(Some(path)),
         options: &plan.read,
         sum: plan.sum,
         sensor: plan.sensor.as_deref(),

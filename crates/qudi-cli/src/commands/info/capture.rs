@@ -3,7 +3,7 @@
 use super::args::Info;
 use super::record::{origin, record_document};
 use crate::args::Global;
-use crate::capture::{Source, SummedCapture, describe_sum, warnings};
+use crate::capture::{Input, Source, SummedCapture, describe_sum, warnings};
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
 use crate::report::Report;
@@ -41,7 +41,7 @@ pub(crate) fn run(
     }
     let options = info.reading.options(MaskChoice::Auto);
     let source = Source {
-        path: Some(path),
+        input: Input::at(Some(path)),
         options: &options,
         sum: info.reading.sum(),
         sensor: info.sensor.as_deref(),

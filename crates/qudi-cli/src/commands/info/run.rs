@@ -219,7 +219,7 @@ fn devices(report: &Report) -> Result<()> {
     let devices = crate::device::list();
     let mut text = String::new();
     for device in &devices {
-        let _ = writeln!(text, "{:<10}{}", device.name, device.description);
+        let _ = writeln!(text, "{:<14}{}", device.name, device.description);
     }
     report.result(&text, || {
         devices.iter().map(|d| json!({"device": d.name, "description": d.description})).collect()

@@ -4,7 +4,7 @@ use super::args::Look;
 use crate::args::given::Given;
 use crate::args::{Global, Network};
 use crate::capture::{
-    CaptureAcquisition, LightOverrides, Source, SummedCapture, unknown_sensor, warnings,
+    CaptureAcquisition, Input, LightOverrides, Source, SummedCapture, unknown_sensor, warnings,
 };
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
@@ -54,7 +54,7 @@ pub(crate) fn run(
     let file = Output::open(Some(&output), global.overwrite())?;
     let options = args.reading.options(MaskChoice::Auto);
     let source = Source {
-        path: Some(&args.capture),
+        input: Input::at(Some(&args.capture)),
         options: &options,
         sum: args.reading.sum(),
         sensor: args.sensor.as_deref(),

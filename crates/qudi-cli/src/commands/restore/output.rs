@@ -81,15 +81,6 @@ impl Output {
         }
     }
 
-    /// Applies the tone curve to a frame.
-    fn toned<'a>(&self, frame: &'a Frame) -> Cow<'a, Frame> {
-        if self.tonemap == Tonemap::None {
-            return Cow::Borrowed(frame);
-        }
-        let data = frame.data.iter().map(|value| linear_to_srgb(value.max(0.0))).collect();
-        Cow::Owned(Frame { size: frame.size, data })
-    }
-
     /// Inverts the tone curve.
     fn linear(&self, mut frame: Frame) -> Frame {
         if self.tonemap == Tonemap::Srgb {
@@ -102,7 +93,7 @@ impl Output {
 
     /// Writes picture `number`, and returns it as a reader of the file sees it, where that differs.
     fn push(&mut self, number: u64, restored: &Frame) -> qudi_core::Result<Option<Frame>> {
-        let frame = self.toned(restored);
+        let frame = toned(self.tonemap, restored);
         match &mut self.place {
             Place::Folder(folder) => {
                 let seen = folder.push(number, &frame)?;
@@ -114,6 +105,15 @@ impl Output {
         }
         Ok(None)
     }
+}
+
+/// Applies a tone curve to a frame.
+pub(super) fn toned(tonemap: Tonemap, frame: &Frame) -> Cow<'_, Frame> {
+    if tonemap == Tonemap::None {
+        return Cow::Borrowed(frame);
+    }
+    let data = frame.data.iter().map(|value| linear_to_srgb(value.max(0.0))).collect();
+    Cow::Owned(Frame { size: frame.size, data })
 }
 
 /// A sink of restored frames: it writes them and measures their chi-square.

@@ -3,7 +3,7 @@
 use super::args::{Restore, Tonemap};
 use crate::args::tiff_samples::tiff_samples;
 use crate::args::{Global, Shard, Sum};
-use crate::capture::{LightOverrides, Source, is_pipe, refuse_terminal};
+use crate::capture::{Input, LightOverrides, Source, is_pipe, refuse_terminal};
 use crate::error::{CliError, Result};
 use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
@@ -125,7 +125,7 @@ impl Plan {
     /// Returns the capture as the plan names it.
     pub(super) fn source(&self) -> Source<'_> {
         Source {
-            path: (!self.reads_pipe()).then_some(self.capture.as_path()),
+            input: Input::at((!self.reads_pipe()).then_some(self.capture.as_path())),
             options: &self.read,
             sum: self.sum,
             sensor: self.sensor.as_deref(),

@@ -7,7 +7,7 @@ use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
 use crate::capture::{
-    AlignedCapture, Alignment, CaptureAcquisition, SummedCapture, remarks, warnings,
+    AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
 };
 use crate::device;
 use crate::error::Result;
@@ -22,7 +22,7 @@ use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_io::capture::Capture;
 use qudi_io::description::MaskChoice;
-use qudi_io::restore::{FolderRun, Inputs, Schedule, Share, run as run_method};
+use qudi_io::restore::{FolderRun, Inputs, RestoreSink, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
 use std::cell::RefCell;
 use std::fmt::Write as _;
@@ -41,7 +41,7 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let plan = Plan::new(args, global, report.json())?;
-    let mut job = Job::prepare(&plan, settings, report)?;
+    let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
     let mut output = Output::open(&plan, job.capture(), run)?;
@@ -54,29 +54,18 @@ pub(crate) fn run(
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
-        let sink = Sink::new(&mut output, Some(&mut map), &mut uncertainty);
-        job.run(rest, sink, &plan.network, report)?;
+        let mut sink = Sink::new(&mut output, Some(&mut map), &mut uncertainty);
+        job.run(rest, &mut sink, &plan.network, report)?;
     } else {
         // Frames of an interrupted run are measured with the others, in the same order; but after
         // the rest is made, so that a run that keeps being killed still gets on.
-        let sink = Sink::new(&mut output, None, &mut uncertainty);
-        job.run(rest, sink, &plan.network, report)?;
+        let mut sink = Sink::new(&mut output, None, &mut uncertainty);
+        job.run(rest, &mut sink, &plan.network, report)?;
         output.measure_finished(&mut map, &mut job.aligned.capture, &job.schedule, part.clone())?;
     }
     let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(0);
     let part = part.start..part.end.min(frames);
-    let own =
-        job.method.as_own().map(|choice| OwnNetwork::new(&plan.network, choice)).transpose()?;
-    let mode = own.map(|own| own.mode(&plan.network));
-    let chi_square = warnings::of_chi_square(map.chi_square(), &job.acquisition.sensor);
-    job.warnings.extend(chi_square);
-    let results = json!({
-        "chi_square": map.chi_square(),
-        "mode": mode,
-        "warnings": job.warnings,
-        "notes": job.capture().info().notes,
-        "findings": job.capture().findings(),
-    });
+    let results = job.results(&plan, map.chi_square())?;
     let complete = part == (0..frames) || output.finished(0..frames) == frames;
     output.finish(&results, complete)?;
     uncertainty.finish()?;
@@ -111,28 +100,32 @@ pub(crate) fn run(
 }
 
 /// What a run needs: a capture and its acquisition, the method, and the pictures that it makes.
-struct Job {
+pub(super) struct Job {
     aligned: AlignedCapture,
-    acquisition: Acquisition,
+    pub(super) acquisition: Acquisition,
     light_source: &'static str,
     method: &'static Method,
     restorer: Box<dyn Restorer>,
     /// What the method chose for this capture.
     choice: String,
-    schedule: Schedule,
+    pub(super) schedule: Schedule,
     /// What makes the result doubtful.
-    warnings: Vec<String>,
+    pub(super) warnings: Vec<String>,
 }
 
 impl Job {
     /// Opens the capture, sums its frames, determines its acquisition, and makes the restorer.
-    fn prepare(plan: &Plan, overrides: &Settings, report: &Report) -> Result<Self> {
-        let source = plan.source();
+    pub(super) fn prepare(
+        plan: &Plan,
+        source: &Source<'_>,
+        overrides: &Settings,
+        report: &Report,
+    ) -> Result<Self> {
         let opened = source.open(overrides)?;
-        let summed = SummedCapture::new(opened, &source)?;
+        let summed = SummedCapture::new(opened, source)?;
         let sensor = summed.required_sensor()?;
         summed.remark_sum(report);
-        let mut aligned = AlignedCapture::new(summed, &source, &sensor, plan.method, plan.every)?;
+        let mut aligned = AlignedCapture::new(summed, source, &sensor, plan.method, plan.every)?;
         aligned.remark_alignment(report);
         let capture = &mut aligned.capture;
         let summary = plan.light.measure(capture, Some(&sensor))?;
@@ -154,14 +147,14 @@ impl Job {
         })
     }
 
-    fn capture(&self) -> &Capture {
+    pub(super) fn capture(&self) -> &Capture {
         &self.aligned.capture
     }
 
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
-    fn settings(&self, plan: &Plan) -> Result<Value> {
+    pub(super) fn settings(&self, plan: &Plan) -> Result<Value> {
         let (capture, acquisition) = (self.capture(), &self.acquisition);
-        let place = if plan.reads_pipe() {
+        let place = if plan.reads_pipe() || capture.path() != plan.capture {
             capture.path().to_owned()
         } else {
             std::path::absolute(&plan.capture).unwrap_or_else(|_| plan.capture.clone())
@@ -204,6 +197,24 @@ impl Job {
         Ok(settings)
     }
 
+    /// Returns what is known of the pictures once they are made, and adds what makes them doubtful.
+    pub(super) fn results(&mut self, plan: &Plan, chi_square: Option<f64>) -> Result<Value> {
+        let own = self
+            .method
+            .as_own()
+            .map(|choice| OwnNetwork::new(&plan.network, choice))
+            .transpose()?;
+        let mode = own.map(|own| own.mode(&plan.network));
+        self.warnings.extend(warnings::of_chi_square(chi_square, &self.acquisition.sensor));
+        Ok(json!({
+            "chi_square": chi_square,
+            "mode": mode,
+            "warnings": self.warnings,
+            "notes": self.capture().info().notes,
+            "findings": self.capture().findings(),
+        }))
+    }
+
     /// Returns the entries of the manifest of an output folder. Weights are among the settings by their
     /// SHA-256.
     fn folder_run(&self, plan: &Plan, settings: &Value) -> Result<FolderRun> {
@@ -231,10 +242,10 @@ impl Job {
         Ok(FolderRun { settings: settings.clone(), inputs, share, frames })
     }
 
-    fn run(
+    pub(super) fn run(
         &mut self,
         wanted: Range<u64>,
-        mut sink: Sink<'_>,
+        sink: &mut dyn RestoreSink,
         network: &NetworkOptions,
         report: &Report,
     ) -> Result<()> {
@@ -263,7 +274,7 @@ impl Job {
         let run = || {
             observed(observer, || {
                 let on = &mut progress;
-                run_method(restorer, capture, schedule, wanted, acquisition, &mut sink, on)
+                run_method(restorer, capture, schedule, wanted, acquisition, sink, on)
             })
         };
         if is_network {

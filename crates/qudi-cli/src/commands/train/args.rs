@@ -39,6 +39,9 @@ pub(crate) struct Train {
     /// Where it runs, as for restore; several share the batches, as in cuda:0,cuda:1
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "auto")]
     pub(crate) device: Vec<String>,
+    /// Stop after this time, with the state written, as Ctrl-C does: --resume goes on
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number::real(number::SECONDS), conflicts_with = "prepare")]
+    pub(crate) seconds: Option<f64>,
     /// Threads that draw samples
     #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
     pub(crate) workers: usize,

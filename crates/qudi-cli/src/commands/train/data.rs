@@ -25,17 +25,18 @@ pub(super) fn make_folder(folder: &Path, what: &str, help: &str) -> Result<()> {
 
 /// Opens the recipe's decoded files, made first if they do not exist.
 fn pack(plan: &Plan, report: &Report) -> Result<Option<Pack>> {
-    if !plan.recipe.data.needs_files() && plan.recipe.validation_data().is_none() {
+    let sources = plan.recipe.packed_sources();
+    if sources.is_empty() {
         return Ok(None);
     }
     if !plan.pack.exists() {
         make_pack(plan, Overwrite::No, report)?;
     }
-    Ok(Some(Pack::open(&plan.pack)?))
+    Ok(Some(Pack::open(&plan.pack, &sources)?))
 }
 
-/// Decodes the recipe's files into a pack.
-pub(super) fn make_pack(plan: &Plan, overwrite: Overwrite, report: &Report) -> Result<()> {
+/// Decodes the recipe's files into a pack, and returns the mean PSNR of its frames for training.
+pub(super) fn make_pack(plan: &Plan, overwrite: Overwrite, report: &Report) -> Result<Option<f64>> {
     let Some(data) = &plan.data else {
         return Err(CliError::new(
             "the recipe reads files",
@@ -43,14 +44,11 @@ pub(super) fn make_pack(plan: &Plan, overwrite: Overwrite, report: &Report) -> R
             "name the folder that they lie in, or a pack with --pack",
         ));
     };
-    let validation = plan.recipe.validation_data();
-    let mut configs = vec![&plan.recipe.data];
-    configs.extend(&validation);
     let mut bar = report.bar();
-    write_pack(&configs, data, &plan.pack, overwrite, &mut |progress| {
+    let sources = plan.recipe.packed_sources();
+    Ok(write_pack(&sources, data, &plan.pack, overwrite, &mut |progress| {
         let [done, total] = progress.done;
         bar.update("decoding", done as u64, Some(total as u64));
         interrupt::check()
-    })?;
-    Ok(())
+    })?)
 }

@@ -7,6 +7,7 @@ use crate::settings::{Settings, toml_text};
 use qudi_core::atomic_file::Overwrite;
 use qudi_train::{RECIPE, Recipe, recipe_names};
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
 
 /// Action of a training run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -35,6 +36,8 @@ pub(super) struct Plan {
     /// Weights to start from.
     pub(super) init: Option<PathBuf>,
     pub(super) devices: Vec<String>,
+    /// The time to stop.
+    pub(super) end: Option<Instant>,
     /// Threads that draw samples.
     pub(super) workers: usize,
     pub(super) backbones: Option<PathBuf>,
@@ -68,6 +71,7 @@ impl Plan {
             bursts: args.bursts.clone(),
             init: args.init.clone(),
             devices: args.device.clone(),
+            end: args.seconds.map(|seconds| Instant::now() + Duration::from_secs_f64(seconds)),
             workers: args.workers,
             backbones: args.backbones.clone(),
             overwrite: global.overwrite(),

@@ -51,13 +51,16 @@ pub(crate) fn run(
 
 /// Makes the pack of a recipe.
 fn pack(plan: &Plan, report: &Report) -> Result<()> {
-    make_pack(plan, plan.overwrite, report)?;
+    let psnr = make_pack(plan, plan.overwrite, report)?;
     let path = &plan.pack;
-    let pack = Pack::open(path)?;
+    let pack = Pack::open(path, &plan.recipe.packed_sources())?;
     let frames: usize = pack.clips().iter().map(|clip| clip.frames).sum();
     let clips = pack.clips().len();
-    let text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
-    report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames}))
+    let mut text = format!("{}: {clips} clips and stills, {frames} frames", path.display());
+    if let Some(psnr) = psnr {
+        text += &format!("; {psnr:.1} dB PSNR of frames for training against their sources");
+    }
+    report.result(&text, || json!({"pack": path, "clips": clips, "frames": frames, "psnr": psnr}))
 }
 
 /// Checks that the weights of the perceptual term are there.
@@ -123,16 +126,18 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
         clear(folder)?;
     }
     write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
-    let mut watch = Watch::new(recipe, folder, report);
+    let mut watch = Watch::new(recipe, folder, plan.end, report);
     let learnt =
         device::guarded("training", || run.learn(plan.workers, &mut |event| watch.event(&event)));
     let [step, steps] = run.progress();
+    let is_over = watch.is_over();
     let last = watch.finish()?;
     match learnt {
         Ok(Ok(())) => {}
         Ok(Err(qudi_core::Error::Interrupted)) => {
             let text = format!("stopped after step {step} of {steps}: --resume goes on");
-            return Err(CliError::Stopped(text));
+            let stopped = if is_over { CliError::TimeOver } else { CliError::Stopped };
+            return Err(stopped(text));
         }
         Ok(Err(error)) => return Err(error.into()),
         Err(problem) => {

@@ -44,7 +44,8 @@ pub(super) fn train_stages(
     // A run whose files are not there leaves nothing behind, and no stage is trained for one that cannot be.
     files(plan, report)?;
     for stage in &stages {
-        let pack = plan.pack.exists().then(|| Pack::open(&plan.pack)).transpose()?;
+        let sources = stage.recipe.packed_sources();
+        let pack = (!sources.is_empty()).then(|| Pack::open(&plan.pack, &sources)).transpose()?;
         Validator::new(&stage.recipe, pack.as_ref())?;
         Dataset::new(&stage.recipe.data, pack)?;
     }

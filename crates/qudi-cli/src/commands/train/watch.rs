@@ -40,10 +40,17 @@ pub(crate) struct Watch<'a> {
     loss: Option<f64>,
     last: Option<Validation>,
     error: Option<CliError>,
+    /// The time to stop.
+    end: Option<Instant>,
 }
 
 impl<'a> Watch<'a> {
-    pub(crate) fn new(recipe: &Recipe, folder: &'a Path, report: &'a Report) -> Self {
+    pub(crate) fn new(
+        recipe: &Recipe,
+        folder: &'a Path,
+        end: Option<Instant>,
+        report: &'a Report,
+    ) -> Self {
         Self {
             report,
             folder,
@@ -55,6 +62,7 @@ impl<'a> Watch<'a> {
             loss: None,
             last: None,
             error: None,
+            end,
         }
     }
 
@@ -70,7 +78,15 @@ impl<'a> Watch<'a> {
         if let Err(error) = shown {
             self.error = Some(error);
         }
-        if self.error.is_some() { ControlFlow::Break(()) } else { interrupt::check() }
+        if self.error.is_some() || self.is_over() {
+            return ControlFlow::Break(());
+        }
+        interrupt::check()
+    }
+
+    /// Returns true once the time to stop has come.
+    pub(crate) fn is_over(&self) -> bool {
+        self.end.is_some_and(|end| Instant::now() >= end)
     }
 
     fn step(&mut self, step: &StepReport) {

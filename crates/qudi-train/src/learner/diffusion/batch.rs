@@ -29,6 +29,15 @@ pub struct Batch {
     numbers: Vec<f32>,
     acquisitions: Vec<Acquisition>,
     timesteps: Vec<usize>,
+    uploaded: Option<Box<Uploaded>>,
+}
+
+/// The planes of a batch on the device that computes with them.
+#[derive(Clone, Debug)]
+struct Uploaded {
+    conditioning: Conditioning,
+    truth: Tensor<4>,
+    noise: Tensor<4>,
 }
 
 impl Batch {
@@ -50,6 +59,7 @@ impl Batch {
             numbers: Vec::new(),
             acquisitions: Vec::new(),
             timesteps: Vec::new(),
+            uploaded: None,
         };
         for sample in (number * count as u64..).take(count) {
             let ConditionedBurst { sample: drawn, .. } = bursts.sample(sample)?;
@@ -81,8 +91,18 @@ impl Batch {
         self.acquisitions.is_empty()
     }
 
-    /// Copies the conditioning of the batch to `device`.
+    /// Copies the batch to `device` ahead of its use.
+    pub(in crate::learner) fn upload(&mut self, device: &Device) {
+        let conditioning = self.conditioning(device);
+        let Example { truth, noise, .. } = self.example(&conditioning);
+        self.uploaded = Some(Box::new(Uploaded { conditioning, truth, noise }));
+    }
+
+    /// Returns the conditioning of the batch on `device`.
     pub(in crate::learner) fn conditioning(&self, device: &Device) -> Conditioning {
+        if let Some(uploaded) = self.uploaded_to(device) {
+            return uploaded.conditioning.clone();
+        }
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
         Conditioning {
             counts: to_tensor(self.counts.y.clone(), self.size, device),
@@ -92,14 +112,25 @@ impl Batch {
         }
     }
 
-    /// Copies the batch as an example for the loss, on the device of `conditioning`.
+    fn uploaded_to(&self, device: &Device) -> Option<&Uploaded> {
+        self.uploaded.as_deref().filter(|uploaded| uploaded.truth.device() == *device)
+    }
+
+    /// Returns the batch as an example for the loss, on the device of `conditioning`.
     pub(in crate::learner) fn example<'a>(&'a self, conditioning: &'a Conditioning) -> Example<'a> {
         let device = conditioning.linear_estimate.device();
+        let (truth, noise) = match self.uploaded_to(&device) {
+            Some(uploaded) => (uploaded.truth.clone(), uploaded.noise.clone()),
+            None => {
+                let tensor = |values: &Vec<f32>| to_tensor(values.clone(), self.size, &device);
+                (tensor(&self.truth), tensor(&self.noise))
+            }
+        };
         Example {
             conditioning,
-            truth: to_tensor(self.truth.clone(), self.size, &device),
+            truth,
             acquisitions: &self.acquisitions,
-            noise: to_tensor(self.noise.clone(), self.size, &device),
+            noise,
             timesteps: &self.timesteps,
         }
     }
