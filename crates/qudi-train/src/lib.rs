@@ -12,6 +12,7 @@ mod cases;
 
 mod burst_cache;
 pub mod dataset;
+mod digest;
 mod ema;
 mod learner;
 pub mod loss;
@@ -35,7 +36,8 @@ pub use recipe::{
     CropsConfig, LearningPart, LossConfig, NetworkRecipe, Recipe, StageConfig, TrainConfig,
     ValidationConfig, recipe_names, recipe_table,
 };
-pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS, run_exists, steps_taken};
+pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
 pub use speed::TrainingSpeed;
+pub use state::{remove_state, run_exists, steps_taken};
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};
