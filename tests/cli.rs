@@ -15,12 +15,16 @@ mod field;
 mod network;
 #[path = "cli/outputs.rs"]
 mod outputs;
+#[path = "cli/places.rs"]
+mod places;
 #[path = "cli/report.rs"]
 mod report;
 #[path = "cli/restore.rs"]
 mod restore;
 #[path = "cli/safety.rs"]
 mod safety;
+#[path = "cli/scoring.rs"]
+mod scoring;
 #[path = "cli/settings.rs"]
 mod settings;
 #[path = "cli/support.rs"]

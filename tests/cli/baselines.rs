@@ -95,7 +95,8 @@ fn emvd_trains_resumes_restores_and_says_what_it_is() {
     let quick = QUICK_SETTINGS.replace("--set train.lr=1e-2 ", "");
     run(&folder, &format!("train stages.toml -o stages {quick}"));
     let names = listing(&folder.join("stages"));
-    assert_eq!(names, ["1-coarse", "2-fine", "recipe.toml", "weights.safetensors"]);
+    let files = ["environment.json", "recipe.toml", "weights.safetensors"];
+    assert_eq!(names, [&["1-coarse", "2-fine"][..], &files].concat());
 }
 
 #[test]

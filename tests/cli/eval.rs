@@ -228,6 +228,31 @@ fn parts_of_the_clips_give_the_figures_of_the_whole() {
     let parts = [scores(" --shard 1/2"), scores(" --shard 2/2")];
     assert_eq!(parts.concat(), scores(""));
     assert_eq!(parts.map(|part| part.len()), [1, 2]);
+    // Joined, all figures but times equal one run's, to the last bit.
+    let timeless = |mut document: Value| {
+        for row in document["rows"].as_array_mut().unwrap() {
+            let parts = row["clips"].as_array_mut().unwrap().iter_mut();
+            for part in parts.map(|clip| clip.as_object_mut().unwrap()) {
+                part.retain(|key, _| !["seconds_per_frame", "peak_mib"].contains(&key.as_str()));
+            }
+            row.as_object_mut()
+                .unwrap()
+                .retain(|key, _| !["seconds_per_frame", "peak_mib"].contains(&key.as_str()));
+        }
+        document.to_string()
+    };
+    let args = "clips --method average,mle --ppp 9.75";
+    for part in ["1", "2"] {
+        let document = run(&folder, &format!("eval {args} --json --shard {part}/2"));
+        std::fs::write(folder.join(format!("{part}.json")), document).unwrap();
+    }
+    let joined = eval(&folder, &format!("{args} --join 1.json 2.json"));
+    assert_eq!(timeless(joined), timeless(eval(&folder, args)));
+    crate::support::refused(
+        &folder,
+        &format!("eval {args} --join 1.json 1.json"),
+        &["another part"],
+    );
     let none = "eval clips --method average --shard 1/9";
     crate::support::refused(&folder, none, &["--shard"]);
 }

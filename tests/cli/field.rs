@@ -281,3 +281,43 @@ fn pipes_are_converted() {
     convert("-o raw.npy --format raw-bits --size 32x48", &bytes[bytes.len() - 22 * 32 * 6..]);
     assert_eq!(read("raw.npy"), read("direct.npy"));
 }
+
+/// Noise below the pedestal is not cut off: dark parts keep their mean.
+#[test]
+fn counts_below_the_pedestal_are_signed() {
+    let folder = scratch("field-pedestal");
+    let sensor = "base = \"ideal\"\noffset = 100\ngain = 2\nread_noise = 1.5\n";
+    std::fs::write(folder.join("s.toml"), sensor).unwrap();
+    let (height, width, frames) = (32, 48, 44);
+    let light = |x: usize| if x < width / 2 { 0.05 } else { 0.55 };
+    let mut state = 7u64;
+    let mut uniform = || {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        ((state >> 11) as f64 + 0.5) / (1u64 << 53) as f64
+    };
+    let mut bytes = Vec::new();
+    for i in 0..frames * height * width {
+        let (mut electrons, mut product) = (0.0, uniform());
+        while product > f64::exp(-light(i % width)) {
+            product *= uniform();
+            electrons += 1.0;
+        }
+        let noise = (-2.0 * uniform().ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
+        let value = (100.0 + 2.0 * (electrons + 1.5 * noise)).round();
+        bytes.extend((value as u16).to_le_bytes());
+    }
+    let array = npy_bytes("<u2", "(44, 32, 48)", &bytes);
+    std::fs::write(folder.join("c.npy"), array).unwrap();
+    let args =
+        "restore c.npy --sensor s.toml --method mle --ppp 1 --exposure 1 --mask none -o o.npy";
+    run(&folder, args);
+    let npy = std::fs::read(folder.join("o.npy")).unwrap();
+    let values = npy[npy.len() - 4 * bytes.len() / 2..].chunks_exact(4);
+    let mut sums = [0.0; 2];
+    for (i, value) in values.enumerate() {
+        let value = f64::from(f32::from_le_bytes(value.try_into().unwrap()));
+        sums[i % width * 2 / width] += value / (frames * height * width / 2) as f64;
+    }
+    assert!((sums[0] - 0.05).abs() < 0.03 && (sums[1] - 0.55).abs() < 0.03, "{sums:?}");
+}

@@ -147,7 +147,10 @@ fn rejects_unfit_weights_and_options_in_three_parts() {
         "restore b.npy -o out --weights torn.safetensors",
         &["not a whole SafeTensors file"],
     );
-    weights(&folder.join("nan.safetensors"), f32::NAN);
+    let mut broken = std::fs::read(folder.join("w.safetensors")).unwrap();
+    let end = broken.len();
+    broken[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    std::fs::write(folder.join("nan.safetensors"), broken).unwrap();
     refused(
         &folder,
         "restore b.npy -o out --weights nan.safetensors --device cpu",

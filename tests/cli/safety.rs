@@ -70,12 +70,12 @@ fn force_deletes_no_foreign_file() {
     };
     foreign("m", &[("frame_000000.png", ""), ("notes.tex", "mine")]);
     let simulate = "simulate scene:text --size 32x40 --frames 3 --seed 1 -o s.npy -q -f --truth";
-    refused(&folder, &format!("{simulate} m"), &["notes.tex"]);
+    refused(&folder, &format!("{simulate} m"), &["the output holds", "manifest.json"]);
     assert_eq!(listing(&folder.join("m")), ["frame_000000.png", "notes.tex"]);
     // Also next to frames that this program wrote.
     std::fs::write(folder.join("fr/notes.tex"), "mine").unwrap();
     refused(&folder, &format!("{simulate} fr"), &["notes.tex"]);
-    refused(&folder, "restore b.npy --method average -o fr -f", &["not made by this program"]);
+    refused(&folder, "restore b.npy --method average -o fr -f", &["manifest.json", "restoration"]);
     run(&folder, "restore b.npy --method average -o out -q");
     refused(&folder, "restore b.npy --method average -o out --shard 2/2 -f", &["one part"]);
     #[cfg(unix)]

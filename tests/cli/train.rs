@@ -168,6 +168,20 @@ fn runs_resume_and_are_never_lost() {
     refused(&folder, &other, &["weights of a diffusion"]);
 }
 
+/// The lock is the system's: it ends with the process that holds it.
+#[test]
+fn a_second_training_in_a_folder_is_refused() {
+    let folder = with_recipes("train-lock");
+    let train = format!("train diffusion.toml -o run {QUICK_SETTINGS}");
+    run(&folder, &train);
+    let held = std::fs::File::open(folder.join("run")).unwrap();
+    held.lock().unwrap();
+    refused(&folder, &format!("{train} -f"), &["another run is writing"]);
+    refused(&folder, "train -o run --resume --device cpu -q", &["another run is writing"]);
+    drop(held);
+    run(&folder, &format!("{train} -f"));
+}
+
 /// The refinement learns first; the uncertainty is learnt without changing the frames.
 #[test]
 fn regression_learns_in_parts() {
@@ -269,7 +283,9 @@ changes = { \"train.learns\" = [\"uncertainty\"], \"train.seed\" = 7 }
     std::fs::write(folder.join("stages.toml"), recipe).unwrap();
     run(&folder, &format!("train stages.toml -o run {QUICK_SETTINGS}"));
     let names = listing(&folder.join("run"));
-    assert_eq!(names, ["1-first", "2-second", "3-rest", "recipe.toml", "weights.safetensors"]);
+    let stages = ["1-first", "2-second", "3-rest"];
+    let files = ["environment.json", "recipe.toml", "weights.safetensors"];
+    assert_eq!(names, [&stages[..], &files].concat());
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
     let whole = read("run/weights.safetensors");
     assert!(whole == read("run/3-rest/weights.safetensors"));
@@ -305,13 +321,13 @@ changes = { \"train.learns\" = [\"uncertainty\"], \"train.seed\" = 7 }
     refused(&folder, "train stages.toml --prepare", &["nothing to prepare", "--pack"]);
     let changed = "train -o run --resume --device cpu -q --set train.lr=2e-3";
     refused(&folder, changed, &["train.lr"]);
-    // A new run that stops at once must not find the stages of the previous one.
+    // A refused run loses nothing.
     refused(
         &folder,
         &format!("train stages.toml -o run --force --init none {QUICK_SETTINGS}"),
         &["none"],
     );
-    assert!(!folder.join("run/2-second/state").exists());
+    assert!(folder.join("run/2-second/state").exists());
     let recipe = std::fs::read_to_string(folder.join("stages.toml")).unwrap();
     for (good, bad) in [("\"first\"", "\"../first\""), ("train.seed", "train.seeds")] {
         std::fs::write(folder.join("bad.toml"), recipe.replace(good, bad)).unwrap();

@@ -77,7 +77,8 @@ pub fn open(
     let options = args.reading.options(MaskChoice::None);
     let sum = args.reading.sum();
     let input = input.unwrap_or_else(|| Input::at(Some(&args.capture)));
-    let source = Source { input, options: &options, sum, sensor: args.sensor.as_deref() };
+    let sensor = args.sensor.as_deref();
+    let source = Source { input, options: &options, sum, sensor, judged: u64::MAX };
     let opened = source.open(&settings)?;
     if sum != Some(Sum::Auto) {
         return Ok((opened.capture, opened.sensor));

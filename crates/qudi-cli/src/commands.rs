@@ -35,13 +35,18 @@ pub(crate) mod demo {
 }
 
 pub(crate) mod eval {
+    mod about;
     mod appearance;
     pub(crate) mod args;
     mod capture;
     mod clip;
+    mod exact_json;
     mod exposed_clip;
     mod exposing;
+    mod external;
     mod html;
+    mod join;
+    mod mark;
     mod metrics;
     mod perceptual;
     mod plan;
@@ -49,6 +54,8 @@ pub(crate) mod eval {
     mod score;
     mod table;
     mod table1;
+
+    pub(crate) use clip::clip_places;
 }
 
 pub(crate) mod info {
@@ -105,6 +112,9 @@ pub(crate) mod train {
     mod report;
     mod resume;
     pub(crate) mod run;
+    mod run_folder;
     mod stages;
     mod watch;
+
+    pub(crate) use run_folder::run_files;
 }

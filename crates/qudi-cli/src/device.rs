@@ -101,7 +101,8 @@ fn open_new(name: &str) -> Result<Opened> {
     };
     let number = number.ok_or_else(missing)?;
     let on_card = || all_cards().iter().any(|(b, cards)| *b == backend && number < cards.len());
-    if !is_processor(backend) && !on_card() {
+    let on_processor = is_processor(backend) && number == 0;
+    if !on_processor && !on_card() {
         return Err(missing());
     }
     let opened = guarded(name, || {

@@ -86,6 +86,7 @@ fn run_command(args: &Args, report: &report::Report) -> error::Result<()> {
     MatrixUnits::chosen()?;
     // Loaded for every command, so that none ignores what is set.
     let settings = settings::Settings::load(&args.global, args.command.name())?;
+    places::check(&args.command, &settings, &args.global)?;
     match &args.command {
         Command::Simulate(simulate) => {
             commands::simulate::run::run(simulate, settings, &args.global, report)

@@ -29,7 +29,7 @@ use std::path::Path;
 const DEFAULT: &str = "default";
 
 /// The settings of one command.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Settings {
     command: &'static str,
     /// The value of every key, in the order of [`keys()`], with its origin.
@@ -173,10 +173,10 @@ impl Settings {
         CliError::new(what, place, format!("{own}; {part}.* is for {}", takers.join(", ")))
     }
 
-    /// Refuses keys of `--set` that begin so, since this run has no use for them.
+    /// Refuses flags and keys of `--set` that begin so, since this run has no use for them.
     pub(crate) fn refuse(&self, prefixes: &[&str], why: &str) -> Result<()> {
         let meant = |name: &str| prefixes.iter().any(|prefix| name.starts_with(prefix));
-        let given = self.iter().find(|(name, _, origin)| *origin == "--set" && meant(name));
+        let given = self.iter().find(|(name, _, origin)| origin.starts_with("--") && meant(name));
         given.map_or(Ok(()), |(name, _, origin)| {
             Err(CliError::new(format!("`{name}` is not used {why}"), origin, "leave it out"))
         })

@@ -2,9 +2,11 @@
 //! ffmpeg.
 
 pub mod atomic_file;
+mod atomic_folder;
 mod ffmpeg;
 pub mod natural_order;
 pub mod npy;
 pub mod regular_file;
+mod unnamed_file;
 
 pub use ffmpeg::ffmpeg;

@@ -55,13 +55,14 @@ pub struct ClipStatistics {
     checksum: Checksum,
     /// Count and sum of the values in each of 4096 equal bins.
     bins: Vec<(u64, f64)>,
+    largest: f32,
 }
 
 const BINS: usize = 4096;
 
 impl Default for ClipStatistics {
     fn default() -> Self {
-        Self { checksum: Checksum::default(), bins: vec![(0, 0.0); BINS] }
+        Self { checksum: Checksum::default(), bins: vec![(0, 0.0); BINS], largest: 0.0 }
     }
 }
 
@@ -72,6 +73,7 @@ impl ClipStatistics {
             let bin = &mut self.bins[((value * BINS as f32) as usize).min(BINS - 1)];
             bin.0 += 1;
             bin.1 += f64::from(value);
+            self.largest = self.largest.max(value);
         }
         self.checksum.add(values);
     }
@@ -79,6 +81,11 @@ impl ClipStatistics {
     /// Returns the CRC-32 of all values so far.
     pub fn crc32(&self) -> u32 {
         self.checksum.crc32()
+    }
+
+    /// Returns the largest value of the clip; 0 if it is empty.
+    pub fn largest(&self) -> f32 {
+        self.largest
     }
 
     /// Returns the mean value of the clip; 0 if it is empty.

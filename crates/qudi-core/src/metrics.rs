@@ -14,6 +14,6 @@ pub use chi_square::Consistency;
 pub use detail::{Detail, detail};
 pub use gmsd::gmsd;
 pub use octaves::{OCTAVES, octave_energies};
-pub use psnr::{best_gain, gain_aligned_psnr, psnr};
+pub use psnr::{MAX_PSNR, best_gain, gain_aligned_psnr, psnr};
 pub use ssim::{gaussian_ssim, ssim};
 pub use statistics::Statistics;

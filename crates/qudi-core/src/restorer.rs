@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::frame::{Frame, Size};
-use crate::sensor::Sensor;
+use crate::sensor::{DarkRate, Sensor};
 
 /// Counts of consecutive frames, `[frames][height][width]`.
 #[derive(Clone, Copy, Debug)]
@@ -30,6 +30,8 @@ pub struct Acquisition {
     pub gain: f64,
     /// Dark electrons per frame of every pixel, where a map is known.
     pub dark: Option<Vec<f32>>,
+    /// DN of every count that are pedestal, which the sensor's dark rate includes.
+    pub pedestal: f64,
 }
 
 /// The restored frames of a window.
@@ -100,7 +102,42 @@ impl Acquisition {
     /// [`Error`](crate::Error) if the sensor has no gain at this light.
     pub fn new(sensor: Sensor, ppp: f64, mean_level: f64) -> Result<Self> {
         let gain = sensor.gain_at(ppp)?;
-        Ok(Self { seed: 0, first_frame: 0, ppp, mean_level, sensor, gain, dark: None })
+        let (seed, first_frame, dark, pedestal) = (0, 0, None, 0.0);
+        Ok(Self { seed, first_frame, ppp, mean_level, sensor, gain, dark, pedestal })
+    }
+
+    /// Counts the cross-talk and the afterpulses of the sensor as light, as many as there are at the mean
+    /// light.
+    ///
+    /// # Errors
+    /// [`Error`](crate::Error) if the sensor's dark rate is unknown.
+    pub fn without_echoes(mut self) -> Result<Self> {
+        let summed = f64::from(self.sensor.frames_summed);
+        let dark = self.sensor.dark_per_frame()?;
+        let detections = (self.sensor.quantum_efficiency * self.ppp + dark) / summed;
+        let factor = self.sensor.echo_factor(detections);
+        if factor != 1.0 {
+            self.sensor = self.sensor.without_echoes(detections);
+            self.dark = self.dark.map(|map| map.iter().map(|v| v * factor as f32).collect());
+        }
+        Ok(self)
+    }
+
+    /// Counts a pedestal of `dn` per count as dark electrons, which all methods subtract, in place of as much
+    /// of the read noise.
+    ///
+    /// # Errors
+    /// [`Error`](crate::Error) if the sensor's dark rate is unknown.
+    pub fn with_pedestal(mut self, dn: f64) -> Result<Self> {
+        if dn > 0.0 {
+            let electrons = dn / self.gain;
+            self.sensor.dark = DarkRate::PerFrame(self.sensor.dark_per_frame()? + electrons);
+            let noise = self.sensor.read_noise.powi(2) - electrons;
+            self.sensor.read_noise = noise.max(0.0).sqrt();
+            self.dark = self.dark.map(|map| map.iter().map(|v| v + electrons as f32).collect());
+            self.pedestal = dn;
+        }
+        Ok(self)
     }
 
     /// Sets the seed of random draws.

@@ -12,6 +12,7 @@ mod count_table;
 mod defects;
 mod document;
 mod draw;
+mod echoes;
 mod law;
 mod moments;
 mod presets;
@@ -186,8 +187,26 @@ impl Sensor {
     /// `frames` output frames of one pixel, dark counts subtracted, never negative. A saturated
     /// binary pixel is taken as one detection short of saturation (Ma et al. 2020, eq. 4).
     pub fn estimate_flux(&self, sum: f64, frames: u32, gain: f64, dark_per_frame: f64) -> f64 {
+        self.estimate_signed_flux(sum, frames, gain, dark_per_frame).max(0.0)
+    }
+
+    /// Estimates as [`Self::estimate_flux`], negative where noise leaves less than the dark counts: means over
+    /// pixels have no bias.
+    pub fn estimate_signed_flux(
+        &self,
+        sum: f64,
+        frames: u32,
+        gain: f64,
+        dark_per_frame: f64,
+    ) -> f64 {
         let detections = match self.response {
-            Response::Linear => sum / (gain * f64::from(frames)),
+            Response::Linear => {
+                let counted = sum / (gain * f64::from(frames));
+                match self.dead_time() {
+                    0.0 => counted,
+                    dead => echoes::detections_of_counted(counted, dead),
+                }
+            }
             Response::Binary => {
                 let n = f64::from(self.frames_summed);
                 let total = n * f64::from(frames);
@@ -196,7 +215,7 @@ impl Sensor {
                 -n * (-sum.min(ceiling) / total).ln_1p()
             }
         };
-        ((detections - dark_per_frame) / self.quantum_efficiency).max(0.0)
+        (detections - dark_per_frame) / self.quantum_efficiency
     }
 
     /// Checks every parameter against what a sensor can be.

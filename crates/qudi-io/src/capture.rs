@@ -1,25 +1,29 @@
 //! Captures of real (and simulated) single-photon cameras, in every format of the field.
 //!
-//! A path is recognised ([`codec::FORMATS`]) and opened as native frames ([`CountFrames`]). A [`Capture`]
+//! A path is recognised ([`FORMATS`](crate::codec::FORMATS)) and opened as native frames ([`CountFrames`]). A [`Capture`]
 //! turns, crops and sums them and repairs bad pixels, so that nothing downstream sees a raw file. Memory
 //! holds a few frames, however long the capture is.
 
 mod auto_sum;
 mod calibrate;
 mod depth;
+mod findings;
+mod frame_statistics;
+mod judge;
 mod mosaic;
+mod open;
 mod pixel_map;
 mod summary;
 mod view;
 
 pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
+pub use findings::FrameFindings;
 pub use summary::{BitOrderCheck, Summary};
 
-use crate::codec::{self, GivenArray};
-use crate::description::{CaptureInfo, ReadOptions, with_pedestal};
+use crate::description::{CaptureInfo, ReadOptions};
 use crate::frames::depth::DepthChecked;
-use crate::frames::pipe::{FIRST_WINDOW, STDIN};
+use crate::frames::pipe::FIRST_WINDOW;
 use crate::frames::{CountFrames, memory};
 use depth::{check_sum, depth_source, state_depth};
 use mosaic::mosaic_plane;
@@ -28,7 +32,7 @@ use qudi_core::bad_pixels::{self, BadPixels, Repair};
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Error, Result};
-use std::io::Read;
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use view::View;
@@ -48,6 +52,9 @@ pub struct Capture {
     sum: u32,
     repair: Repair,
     bad: BadPixels,
+    findings: FrameFindings,
+    /// Broken native frames, and the good ones that are read instead.
+    stand_ins: BTreeMap<u64, u64>,
     /// Dark electrons per native frame and pixel of the view, if known.
     dark: Option<Vec<f32>>,
     stored: Vec<u16>,
@@ -64,53 +71,7 @@ impl std::fmt::Debug for Capture {
 }
 
 impl Capture {
-    /// Opens the capture at `path`. Its dark map and bad pixels come from `sensor`, if `options` name none.
-    ///
-    /// # Errors
-    /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
-    pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
-        let options = &with_pedestal(options, sensor);
-        let (native, info) = codec::open(path, options)?;
-        // A record next to the file may name a sensor with a pedestal, above which its counts were taken.
-        let recorded = info.sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
-        if recorded > 0.0 && options.offset.is_none() && options.threshold.is_none() {
-            let options = ReadOptions { offset: Some(recorded), ..options.clone() };
-            let (native, info) = codec::open(path, &options)?;
-            return Self::assemble(path, native, info, &options, sensor);
-        }
-        Self::assemble(path, native, info, options, sensor)
-    }
-
-    /// Opens a capture from `reader`: a `.npy`, or raw frames that `options` describe. Each frame arrives
-    /// once: [`Capture::wait_for`] waits for more, and statistics see the first window.
-    ///
-    /// # Errors
-    /// As [`Capture::open`].
-    pub fn from_pipe(
-        reader: impl Read + Send + 'static,
-        options: &ReadOptions,
-        sensor: Option<&Sensor>,
-    ) -> Result<Self> {
-        let options = &with_pedestal(options, sensor);
-        let (native, info) = codec::open_pipe(Box::new(reader), options)?;
-        Self::assemble(Path::new(STDIN), native, info, options, sensor)
-    }
-
-    /// Opens frames that a caller holds. They are read as the same array in a `.npy` file is.
-    ///
-    /// # Errors
-    /// As [`Capture::open`].
-    pub fn from_array(
-        array: GivenArray,
-        options: &ReadOptions,
-        sensor: Option<&Sensor>,
-    ) -> Result<Self> {
-        let options = &with_pedestal(options, sensor);
-        let path = PathBuf::from(&array.name);
-        let (native, info) = array.open(options)?;
-        Self::assemble(&path, native, info, options, sensor)
-    }
-
+    /// Turns, crops and sums native frames as `options` say, and plans their repair.
     fn assemble(
         path: &Path,
         mut native: Box<dyn CountFrames>,
@@ -157,6 +118,8 @@ impl Capture {
             sum,
             repair: Repair::default(),
             bad: BadPixels::default(),
+            findings: FrameFindings::default(),
+            stand_ins: BTreeMap::new(),
             dark: None,
             stored: vec![0; stored.pixels()],
             stored_sums: Vec::new(),
@@ -218,6 +181,8 @@ impl Capture {
             sum: 1,
             repair: Repair::default(),
             bad: BadPixels::default(),
+            findings: FrameFindings::default(),
+            stand_ins: BTreeMap::new(),
             dark: None,
             stored: vec![0; size.pixels()],
             stored_sums: Vec::new(),
@@ -395,7 +360,9 @@ impl Capture {
             ));
         }
         if self.sum == 1 {
-            self.native.read(self.range.start + native, &mut self.stored)?;
+            let stored = self.range.start + native;
+            let stored = self.stand_ins.get(&stored).copied().unwrap_or(stored);
+            self.native.read(stored, &mut self.stored)?;
             self.view.apply(&self.stored, counts);
         } else {
             let mut sums = vec![0; self.size().pixels()];
@@ -421,7 +388,10 @@ impl Capture {
     /// # Errors
     /// [`Error`] if the file cannot be read.
     pub fn copy_packed(&mut self, first: u64, bytes: &mut [u8]) -> Result<bool> {
-        let untouched = self.sum == 1 && self.view.from.is_none() && self.repair.count() == 0;
+        let untouched = self.sum == 1
+            && self.view.from.is_none()
+            && self.repair.count() == 0
+            && self.stand_ins.is_empty();
         if !untouched || self.info.packing.is_none() {
             return Ok(false);
         }
@@ -451,7 +421,13 @@ impl Capture {
     fn stored_sum(&mut self, range: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.stored_sums.clear();
         self.stored_sums.resize(self.stored.len(), 0);
-        self.native.add(range, &mut self.stored_sums)?;
+        let mut first = range.start;
+        for (&broken, &good) in self.stand_ins.range(range.clone()) {
+            self.native.add(first..broken, &mut self.stored_sums)?;
+            self.native.add(good..good + 1, &mut self.stored_sums)?;
+            first = broken + 1;
+        }
+        self.native.add(first..range.end, &mut self.stored_sums)?;
         self.view.apply(&self.stored_sums, sums);
         Ok(())
     }

@@ -4,6 +4,7 @@
 //! formats.
 
 mod array;
+mod companions;
 mod given;
 #[cfg(feature = "hdf5")]
 mod hdf5;
@@ -11,6 +12,7 @@ mod images;
 mod mat;
 mod npy;
 mod npz;
+mod parts;
 mod piped;
 mod qvga;
 mod raw;
@@ -21,6 +23,7 @@ mod tiff;
 mod video;
 mod visionsim;
 
+pub use companions::files_of;
 pub use given::{FetchFrames, GivenArray};
 pub(crate) use piped::open_pipe;
 
@@ -71,6 +74,7 @@ pub const FORMATS: &[Format] = &[
     sparse::FORMAT,
     qvga::FORMAT,
     tiff::FORMAT,
+    parts::FORMAT,
     images::FORMAT,
     mat::FORMAT,
     #[cfg(feature = "hdf5")]
@@ -217,6 +221,12 @@ const FOREIGN_FORMATS: &[(&[u8], &[&str], &str, &str)] = &[
         "export it from ImageJ (Bio-Formats) as a TIFF stack of 8 or 16 bits",
     ),
     (
+        b"LUCAM-RECORDER",
+        &["ser"],
+        "a SER video of an astronomer's camera",
+        "export its frames as a multi-page TIFF or FITS, as PIPP, Siril or `serpy` do, and name that",
+    ),
+    (
         b"% evt",
         &["aedat4", "aedat", "evt", "dat2"],
         "a file of an event camera, which counts no photons",
@@ -254,6 +264,14 @@ fn foreign(probe: &Probe) -> Option<Error> {
 }
 
 fn unknown(probe: &Probe) -> Error {
+    let is_zarr = |name: &str| probe.path.join(name).is_file();
+    if probe.is_folder && [".zarray", ".zgroup", "zarr.json"].into_iter().any(is_zarr) {
+        return Error::data(
+            "a Zarr store",
+            &probe.path,
+            "save one array of it in Python: numpy.save('capture.npy', zarr.open(NAME)[:])",
+        );
+    }
     if let Some(error) = foreign(probe) {
         return error;
     }

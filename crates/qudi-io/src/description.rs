@@ -4,6 +4,7 @@ mod format_options;
 mod info;
 mod mosaic;
 mod options;
+mod pedestal;
 
 pub use format_options::FormatOption;
 pub(crate) use format_options::{refuse_others, refuse_packing};
@@ -11,5 +12,5 @@ pub(crate) use info::RECORD;
 pub use info::{CaptureInfo, Certainty, Packing};
 pub use mosaic::Mosaic;
 pub(crate) use mosaic::MosaicPlane;
-pub(crate) use options::with_pedestal;
 pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
+pub(crate) use pedestal::{keep_pedestal, with_pedestal};

@@ -9,5 +9,5 @@ mod run;
 pub use frame_folder::{FolderRun, FrameFolder, MANIFEST};
 pub use inputs::{Fingerprint, Inputs};
 pub use instants::{Instants, Schedule};
-pub use lock::Share;
+pub use lock::{FolderLock, Share};
 pub use run::{RestoreSink, run};

@@ -178,6 +178,8 @@ fn read_file(path: &Path) -> Result<Vec<u8>> {
 }
 
 fn parse<T: serde::de::DeserializeOwned>(bytes: &[u8], path: &Path) -> Result<T> {
+    // Editors may begin a file with a byte order mark.
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     serde_json::from_slice(bytes).map_err(|e| {
         Error::data(
             format!("not the record of a burst: {e}"),

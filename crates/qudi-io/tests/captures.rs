@@ -9,6 +9,8 @@ mod bit_order;
 mod cameras;
 #[path = "captures/damage.rs"]
 mod damage;
+#[path = "captures/folders.rs"]
+mod folders;
 #[path = "captures/foreign.rs"]
 mod foreign;
 #[path = "captures/options.rs"]

@@ -12,6 +12,7 @@ mod group_norm;
 mod layers;
 mod linear;
 mod parameters;
+mod pickle;
 mod provenance;
 pub mod resample;
 mod residual_stack;

@@ -7,9 +7,10 @@
 //! names of networks trained on several devices begin with `module.`. These prefixes are removed from the
 //! names here.
 
+use crate::pickle::refuse_code;
 use burn::tensor::{bf16, f16};
 use pytorch_reader::{DType, PytorchReader};
-use qudi_core::regular_file::read_limited;
+use qudi_core::regular_file::{read_limited, require_regular};
 use qudi_core::{Error, Result};
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::collections::BTreeMap;
@@ -48,14 +49,15 @@ impl StateDict {
         if path.extension().is_some_and(|extension| extension == "safetensors") {
             return Self::of_bytes(read_limited(path, MAX_FILE_BYTES, "read the weights")?, path);
         }
-        // The reader's error for a missing file does not name it.
-        let about = std::fs::metadata(path).map_err(|e| Error::io("read the weights", path, e))?;
+        // A named pipe would wait for a writer, and code is refused before anything is read.
+        let length = require_regular(path, "read the weights")?;
+        refuse_code(path)?;
         let reader = PytorchReader::new(path).map_err(|e| {
             let help =
                 "name a state dictionary that PyTorch's `torch.save` wrote, or download it again";
             Error::data(format!("not a readable file of weights: {e}"), path, help)
         })?;
-        Ok(Self::new(path, Reader::Pytorch(reader), about.len()))
+        Ok(Self::new(path, Reader::Pytorch(reader), length))
     }
 
     /// Reads the names of a SafeTensors file in memory; `path` is used in errors only.
@@ -219,6 +221,7 @@ mod tests {
 
     use super::StateDict;
     use crate::cases::uniform;
+    use std::io::Write;
     use std::path::{Path, PathBuf};
 
     fn golden(name: &str) -> PathBuf {
@@ -264,6 +267,20 @@ mod tests {
         let file =
             StateDict::open(&golden("code.pth")).and_then(|file| file.read("a.weight", &[2, 3]));
         assert!(file.is_err());
+    }
+
+    /// A pickle that nothing reads calls a program: the file is no file of weights, though nothing runs.
+    #[test]
+    fn refuses_code_in_surplus_entries() {
+        let mut bytes = std::io::Cursor::new(std::fs::read(golden("zip.pth")).unwrap());
+        let mut archive = zip::ZipWriter::new_append(&mut bytes).unwrap();
+        let stored = zip::write::SimpleFileOptions::default();
+        archive.start_file("zip/extra.pkl", stored).unwrap();
+        archive.write_all(b"\x80\x02cos\nsystem\nX\x04\0\0\0true\x85R.").unwrap();
+        archive.finish().unwrap();
+        let error = open(bytes.get_ref()).unwrap_err().to_string();
+        assert!(error.contains("zip/extra.pkl") && error.contains("os.system"), "{error}");
+        assert!(open(&std::fs::read(golden("zip.pth")).unwrap()).is_ok());
     }
 
     fn open(bytes: &[u8]) -> qudi_core::Result<StateDict> {

@@ -87,7 +87,10 @@ pub fn save<N: Network>(
     }
     if let Some(name) = values.broken {
         return Err(Error::data(
-            format!("`{name}` holds values beyond {:e}", precision.largest()),
+            format!(
+                "`{name}` holds values that are not finite, or beyond {:e}",
+                precision.largest()
+            ),
             path,
             "the training that wrote it had failed: use an earlier checkpoint",
         ));
@@ -319,9 +322,8 @@ impl ModuleVisitor for Values {
         match qudi_layers::tensor::read(param.val()) {
             Ok(values) => {
                 let largest = self.precision.largest();
-                if self.broken.is_none()
-                    && values.iter().any(|value| value.is_finite() && value.abs() > largest)
-                {
+                let is_written = |value: &f32| value.abs() <= largest;
+                if self.broken.is_none() && !values.iter().all(is_written) {
                     self.broken = Some(self.path.join("."));
                 }
                 let bytes = self.precision.bytes(&values);

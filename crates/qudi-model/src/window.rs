@@ -12,6 +12,7 @@ mod hourglass;
 mod initial;
 mod input;
 mod matching;
+mod merging;
 mod network;
 mod predenoiser;
 mod unet;

@@ -176,9 +176,15 @@ fn rejects_weights_that_are_not_finite() {
     });
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("nan.safetensors");
-    save(&broken, &description(), Precision::Single, &path, Overwrite::No).unwrap();
-    let message = refused(&path);
-    assert!(message.contains("unet.norm.bias"), "{message}");
+    let error = save(&broken, &description(), Precision::Single, &path, Overwrite::No);
+    let message = error.unwrap_err().to_string();
+    assert!(message.contains("unet.norm.bias") && !path.exists(), "{message}");
+    let (_folder, path) = saved();
+    let mut bytes = std::fs::read(&path).unwrap();
+    let end = bytes.len();
+    bytes[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    std::fs::write(&path, bytes).unwrap();
+    assert!(refused(&path).contains("not finite"));
 }
 
 #[test]

@@ -11,10 +11,11 @@ mod npy;
 mod ppm;
 mod recorded;
 mod synthetic;
+mod tiff_pages;
 mod video;
 mod y4m;
 
-pub use image_file::{decode_image, is_image, read_still};
+pub use image_file::{AssumedWhite, decode_image, is_image, read_still};
 pub use input::{Input, Sampling};
 pub use video::Video;
 
@@ -29,6 +30,8 @@ pub struct ClipInfo {
     pub size: Size,
     /// Number of exposures, if known.
     pub frames: Option<u64>,
+    /// White of deep samples, if it is assumed.
+    pub assumed_white: AssumedWhite,
 }
 
 /// The scene during one output frame.
@@ -66,6 +69,14 @@ pub trait FrameReader {
 
     /// Returns the number of frames, if known.
     fn frames(&self) -> Option<u64>;
+
+    /// Returns the white of deep samples, if it is assumed.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the file cannot be read.
+    fn assumed_white(&mut self) -> Result<AssumedWhite> {
+        Ok(None)
+    }
 
     /// Reads the next frame; `None` at the end.
     ///

@@ -2,14 +2,14 @@
 //!
 //! Memory holds one exposure at a time, however long the clip.
 
-use crate::clip::{Input, Sampling};
+use crate::clip::{AssumedWhite, Input, Sampling};
 use qudi_core::Checksum;
 use qudi_core::flow::Flow;
 use qudi_core::sensor::{PixelMaps, Sensor};
 use qudi_core::{Camera, RollingShutter};
 use qudi_core::{ClipStatistics, Light, PppDefinition, resolve_light};
 use qudi_core::{Error, Result};
-use qudi_core::{Frame, Size};
+use qudi_core::{Frame, Size, Transfer, linear_to_srgb};
 use serde::{Deserialize, Serialize};
 use std::ops::ControlFlow;
 
@@ -104,6 +104,8 @@ pub struct Summary {
     pub saturated: f64,
     /// Hot and dead pixels of the array.
     pub hot_and_dead: (usize, usize),
+    /// What makes the clip doubtful.
+    pub notes: Vec<String>,
 }
 
 /// Runs a simulation. `on` is called for every frame and may stop it.
@@ -140,6 +142,14 @@ pub fn simulate(
         ));
     }
 
+    let notes = check_white(input, sampling.transfer, clip.largest(), info.assumed_white)?;
+    if clip.largest() <= 0.0 && simulation.mean_level.is_none() {
+        return Err(Error::request(
+            "the clip is black: there is no light to distribute photons over",
+            input.place(),
+            "leave it out, or give the image value that receives PPP photons, `exposure`",
+        ));
+    }
     let maps = PixelMaps::draw(sensor, info.size)?;
     let mean_dark = maps.mean_dark(sensor)?;
     let light = resolve_light(
@@ -189,7 +199,41 @@ pub fn simulate(
         mean_count: sum as f64 / pixels,
         saturated: saturated as f64 / pixels,
         hot_and_dead: (camera.maps().hot.len(), camera.maps().dead.len()),
+        notes,
     })
+}
+
+/// Share of white that a clip exceeds somewhere, if its white is right: 12 bits in 16 reach a sixteenth.
+const MIN_BRIGHTEST: f32 = 0.0625;
+
+/// Share of white that 14 bits in 16 do not exceed.
+const FOURTEEN_BITS: f32 = 0.25;
+
+/// Refuses a clip of deep samples whose white is assumed and cannot be right, and describes other dark ones.
+fn check_white(
+    input: &Input,
+    transfer: Transfer,
+    largest: f32,
+    assumed: AssumedWhite,
+) -> Result<Vec<String>> {
+    // As it is stored.
+    let largest = if transfer == Transfer::Srgb { linear_to_srgb(largest) } else { largest };
+    let Some(full) = assumed.filter(|_| largest > 0.0 && largest <= FOURTEEN_BITS) else {
+        let dark = largest > 0.0 && largest < MIN_BRIGHTEST;
+        let note = || format!("the clip never exceeds {largest:.3} of white: {}", input.place());
+        return Ok(dark.then(note).into_iter().collect());
+    };
+    let brightest = (largest * full).round();
+    let bits = (brightest + 1.0).log2().ceil();
+    let what =
+        format!("the brightest value is {brightest} of {full}, as in samples of {bits} bits");
+    if largest > MIN_BRIGHTEST {
+        return Ok(vec![format!("{what}: give the value of white if it is not {full}")]);
+    }
+    let white = 2f32.powf(bits) - 1.0;
+    let help =
+        format!("give the value of white: `white {white}`, or {full} if the clip is that dark");
+    Err(Error::request(what, input.place(), help))
 }
 
 fn changed(input: &Input) -> Error {

@@ -6,10 +6,12 @@ mod draw;
 mod sampler;
 
 use crate::dataset::{DataConfig, Pack, Sample};
+use crate::digest::Digest;
 use crate::parameters::parameters;
 use crate::recipe::{CropsConfig, Recipe};
 use burst::ConditionedBurst;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::regular_file::read_limited;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Frame, Result, Size};
@@ -20,7 +22,7 @@ use qudi_model::regression::{BurstAligner, PreDenoiser};
 use rand::{Rng, RngExt};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
+use sha2::{Digest as _, Sha256};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -175,14 +177,21 @@ fn sha256(predenoiser: &PreDenoiser) -> Result<String> {
 }
 
 /// The metadata of a file, as TOML.
-#[derive(Serialize, Deserialize)]
+#[derive(Clone, Serialize, Deserialize)]
 struct Label {
     drawn: String,
+    /// Number of the burst.
+    number: u64,
+    /// Digest of everything else and of all tensors; empty while it is computed.
+    sha256: String,
     ppp: f64,
     mean_level: f64,
     gain: f64,
     sensor: Sensor,
 }
+
+/// Light and gain beyond which no burst is drawn, and tables would not fit into memory.
+const MAX_LIGHT: f64 = 1e9;
 
 /// The key of the only entry of a file's metadata.
 const KEY: &str = "burst";
@@ -244,9 +253,6 @@ impl BurstCache {
         let report =
             |e: &dyn std::fmt::Display| Error::data(format!("no burst: {e}"), &path, "report this");
         let Acquisition { ppp, mean_level, gain, ref sensor, .. } = burst.sample.acquisition;
-        let label = Label { drawn: self.key.text(), ppp, mean_level, gain, sensor: sensor.clone() };
-        // TOML: its numbers come back bit for bit.
-        let label = toml::to_string(&label).map_err(|e| report(&e))?;
         let words =
             |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>();
         let truth = burst.sample.truth.iter().flat_map(|frame| words(&frame.data)).collect();
@@ -257,6 +263,19 @@ impl BurstCache {
             let signed = |plane: &Vec<i8>| plane.iter().flat_map(|v| v.to_le_bytes()).collect();
             bytes.extend(aligned.standardized().map(signed));
         }
+        let contents = bytes.iter().map(Vec::as_slice);
+        let mut label = Label {
+            drawn: self.key.text(),
+            number,
+            sha256: String::new(),
+            ppp,
+            mean_level,
+            gain,
+            sensor: sensor.clone(),
+        };
+        label.sha256 = self.digest(&label, contents).map_err(|e| report(&e))?;
+        // TOML: its numbers come back bit for bit.
+        let label = toml::to_string(&label).map_err(|e| report(&e))?;
         let views = self.tensors().into_iter().zip(&bytes).map(|((name, kind), bytes)| {
             Ok((name, TensorView::new(kind, self.shape.to_vec(), bytes).map_err(|e| report(&e))?))
         });
@@ -266,27 +285,36 @@ impl BurstCache {
         PendingFile::write_whole(&path, &file, Overwrite::Yes)
     }
 
+    /// Computes the digest of a burst with this label and these tensors.
+    fn digest<'a>(
+        &self,
+        label: &Label,
+        contents: impl Iterator<Item = &'a [u8]>,
+    ) -> std::result::Result<String, toml::ser::Error> {
+        let label = Label { sha256: String::new(), ..label.clone() };
+        let mut digest = Digest::default();
+        digest.add("label", toml::to_string(&label)?.as_bytes());
+        for ((name, _), bytes) in self.tensors().iter().zip(contents) {
+            digest.add(name, bytes);
+        }
+        Ok(digest.text())
+    }
+
     /// Burst `number`, if it is there.
     ///
     /// # Errors
     /// [`Error`] if it cannot be read, is damaged, or was drawn for something else.
     pub(super) fn read(&self, number: u64) -> Result<Option<CachedBurst>> {
         let path = self.path(number);
-        let io = |e| Error::io("read the burst", &path, e);
-        let length = match std::fs::metadata(&path) {
-            Ok(about) => about.len(),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(io(e)),
-        };
+        if path.symlink_metadata().is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound) {
+            return Ok(None);
+        }
         let damaged =
             |what: String| Error::data(what, &path, "remove the file: it will be drawn again");
         let pixels: usize = self.shape.iter().product();
         let bytes = |kind: Dtype| pixels * kind.bitsize() / 8;
         let whole = self.tensors().iter().map(|(_, kind)| bytes(*kind)).sum::<usize>();
-        if length > (whole + HEADER) as u64 {
-            return Err(damaged(format!("{length} bytes are more than a burst of the recipe has")));
-        }
-        let file = std::fs::read(&path).map_err(io)?;
+        let file = read_limited(&path, (whole + HEADER) as u64, "read the burst")?;
         let (_, header) = SafeTensors::read_metadata(&file).map_err(|e| damaged(e.to_string()))?;
         let label = header.metadata().as_ref().and_then(|entries| entries.get(KEY));
         let label: Label = label
@@ -303,8 +331,13 @@ impl BurstCache {
             ));
         }
         label.sensor.validate()?;
-        if ![label.ppp, label.mean_level, label.gain].iter().all(|v| v.is_finite() && *v > 0.0) {
-            return Err(damaged("light and gain are no numbers above 0".to_owned()));
+        if label.number != number {
+            return Err(damaged(format!("it holds burst {}, and not {number}", label.number)));
+        }
+        let light = [label.ppp, label.mean_level, label.gain];
+        if !light.iter().all(|v| *v > 0.0 && *v <= MAX_LIGHT) {
+            let what = format!("light and gain are no numbers above 0, up to {MAX_LIGHT:e}");
+            return Err(damaged(what));
         }
         let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(e.to_string()))?;
         for (name, kind) in self.tensors() {
@@ -314,6 +347,11 @@ impl BurstCache {
             }
         }
         let data = |name: &str| tensors.tensor(name).map_or(&[][..], |tensor| tensor.data());
+        let names = self.tensors();
+        let digest = self.digest(&label, names.iter().map(|(name, _)| data(name)));
+        if digest.ok().as_ref() != Some(&label.sha256) {
+            return Err(damaged("its digest does not fit its content".to_owned()));
+        }
         let [_, height, width] = self.shape;
         let size = Size { height, width };
         let words = |bytes: &[u8]| {
@@ -333,6 +371,7 @@ impl BurstCache {
             gain: label.gain,
             sensor: label.sensor,
             dark: None,
+            pedestal: 0.0,
         };
         let sample = Sample { truth, counts: counts.collect(), acquisition };
         let signed = |name: &String| data(name).iter().map(|&b| b.cast_signed()).collect();

@@ -1,7 +1,7 @@
 //! Training data: clips, stills and procedural scenes, drawn sample by sample.
 //!
-//! Files are decoded once, into a [`Pack`], which threads share; a [`Dataset`] draws from it. Sample `k` of seed `s` is the same
-//! on any machine and for any number of threads.
+//! Files are decoded once, into a [`Pack`], which threads share; a [`Dataset`] draws from it. Sample `k` of
+//! seed `s` is the same on any machine and for any number of threads.
 
 mod config;
 mod content;

@@ -12,6 +12,7 @@ mod cases;
 
 mod burst_cache;
 pub mod dataset;
+mod digest;
 mod ema;
 mod learner;
 pub mod loss;
@@ -30,12 +31,13 @@ pub use burst_cache::{BurstSampler, Files, draw_bursts};
 pub use learner::{AlignedBatch, Context, CountBatch, Learner, Loss, Origin, diffusion};
 pub use optimizer::{Optimizer, OptimizerKind, learning_rate};
 pub use parameters::{gradients, parameters, with_parameters};
-pub use prefetch::Prefetcher;
+pub use prefetch::{Prefetcher, default_workers};
 pub use recipe::{
     CropsConfig, LearningPart, LossConfig, NetworkRecipe, Recipe, StageConfig, TrainConfig,
     ValidationConfig, recipe_names, recipe_table,
 };
-pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS, run_exists, steps_taken};
+pub use run::{Event, From, METRICS, RECIPE, Run, WEIGHTS};
 pub use speed::TrainingSpeed;
+pub use state::{remove_state, run_exists, steps_taken};
 pub use trainer::{LossValues, StepReport, Trainer};
 pub use validate::{Validation, ValidationClip, Validator};

@@ -5,10 +5,19 @@ use super::learner::Learner;
 use super::recipe::Recipe;
 use burn::tensor::Device;
 use qudi_core::{Error, Result};
+use rayon::ThreadPoolBuilder;
 use std::sync::mpsc::{Receiver, sync_channel};
 
 /// The number of batches that a thread keeps ready.
 const READY_BATCHES: usize = 2;
+
+/// The largest number of threads that draw by default, with the thread that learns.
+const DEFAULT_THREADS: usize = 16;
+
+/// Returns the default number of threads that draw: one less than there are cores, at most 15.
+pub fn default_workers() -> usize {
+    std::thread::available_parallelism().map_or(2, usize::from).clamp(2, DEFAULT_THREADS) - 1
+}
 
 /// Gives the batches of a network in order; they do not depend on the number of threads.
 #[derive(Debug)]
@@ -27,12 +36,18 @@ impl<L: Learner> Prefetcher<L> {
         let start = |worker: u64| {
             let (sender, receiver) = sync_channel(READY_BATCHES);
             let (recipe, mut bursts) = (recipe.clone(), bursts.clone());
-            let work = move || {
+            let mut draw = move || {
                 // Every thread draws each `count`-th batch, until nobody listens.
                 let mut number = first + worker;
                 while sender.send(L::draw(&recipe, &mut bursts, number)).is_ok() {
                     number += count;
                 }
+            };
+            // Shares no work with the threads that learn, which are busy: frames are small.
+            let pool = || ThreadPoolBuilder::new().num_threads(1).use_current_thread().build();
+            let work = move || match pool() {
+                Ok(pool) => pool.install(draw),
+                Err(_) => draw(),
             };
             std::thread::Builder::new().name(format!("prefetch-{worker}")).spawn(work).map_err(
                 |e| Error::request(format!("no thread for the data: {e}"), "workers", "use fewer"),

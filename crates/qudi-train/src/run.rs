@@ -4,7 +4,6 @@ use super::burst_cache::{BurstSampler, Files};
 use super::learner::{Learner, Origin};
 use super::prefetch::Prefetcher;
 use super::recipe::Recipe;
-use super::state;
 use super::trainer::{StepReport, Trainer};
 use super::validate::{Validation, Validator};
 use crate::dataset::Dataset;
@@ -56,19 +55,6 @@ pub enum From<L> {
     State,
 }
 
-/// Returns true if a folder holds a state to resume from.
-pub fn run_exists(folder: &Path) -> bool {
-    state::exists(folder)
-}
-
-/// Returns the steps taken by the state in a folder.
-///
-/// # Errors
-/// [`Error`] if there is none, or it is damaged.
-pub fn steps_taken(folder: &Path) -> Result<u64> {
-    state::steps_taken(folder)
-}
-
 /// One line of the metrics.
 #[derive(Serialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
@@ -78,7 +64,7 @@ enum Line<'a> {
 }
 
 impl<L: Learner> Run<L> {
-    /// Opens a run in `folder`, which exists.
+    /// Opens a run in `folder`, which exists. Nothing is written before [`Self::learn`].
     ///
     /// # Errors
     /// [`Error`] if the data, the state or the folder cannot be used.
@@ -104,7 +90,7 @@ impl<L: Learner> Run<L> {
         if let Some(folder) = &files.bursts {
             bursts = bursts.with_cache(folder, recipe)?;
         }
-        let run = Self {
+        Ok(Self {
             folder: folder.to_owned(),
             recipe: recipe.clone(),
             device: devices[0].clone(),
@@ -112,10 +98,7 @@ impl<L: Learner> Run<L> {
             bursts,
             validator,
             commit,
-        };
-        run.write(RECIPE, run.recipe.text().as_bytes())?;
-        run.trim_metrics()?;
-        Ok(run)
+        })
     }
 
     /// Returns the steps taken, and all steps.
@@ -135,10 +118,13 @@ impl<L: Learner> Run<L> {
         on: &mut dyn FnMut(Event<'_>) -> ControlFlow<()>,
     ) -> Result<()> {
         let train = self.recipe.train.clone();
+        self.write(RECIPE, self.recipe.text().as_bytes())?;
+        self.trim_metrics()?;
         let mut prefetcher =
             Prefetcher::<L>::new(&self.recipe, &self.bursts, self.trainer.batches(), workers)?;
-        if let Some(card) = self.trainer.card() {
-            prefetcher = prefetcher.uploading(card)?;
+        let card = self.trainer.card();
+        if let Some(card) = &card {
+            prefetcher = prefetcher.uploading(card.clone())?;
         }
         let mut metrics = self.metrics()?;
         if self.trainer.step_number() == 0
@@ -151,7 +137,11 @@ impl<L: Learner> Run<L> {
         }
         while self.trainer.step_number() < train.steps {
             let mut go_on = ControlFlow::Continue(());
-            if let Some(report) = self.trainer.begin_step(&mut prefetcher)? {
+            let report = match &card {
+                Some(_) => self.trainer.begin_step(&mut prefetcher)?,
+                None => Some(self.trainer.step(&mut prefetcher)?),
+            };
+            if let Some(report) = report {
                 self.log(&mut metrics, &Line::Step(&report))?;
                 go_on = on(Event::Step(&report));
             }

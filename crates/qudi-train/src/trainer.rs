@@ -53,6 +53,8 @@ pub struct Trainer<L> {
     pub(super) network: L,
     pub(super) ema: Ema,
     pub(super) optimizer: Optimizer,
+    /// Steps of the last state that was written or read.
+    pub(super) saved: Option<u64>,
     perceptual: Vec<Lpips>,
     /// Whether each parameter learns.
     learns: Vec<bool>,
@@ -121,6 +123,7 @@ impl<L: Learner> Trainer<L> {
             recipe: recipe.clone(),
             optimizer: Optimizer::new(recipe.train.optimizer, &start, shapes, L::prefers_adam),
             ema: Ema::new(start, recipe.train.ema),
+            saved: None,
             network: learner,
             devices,
             perceptual,
@@ -237,12 +240,12 @@ impl<L: Learner> Trainer<L> {
         for loss in &losses {
             let values = loss.values(&mut numbers);
             for (name, value) in &values.terms {
-                check(&format!("{name} loss"), *value, report.step)?;
+                check(&format!("{name} loss"), *value, report.step, self.saved)?;
             }
             report.loss.add(&values, 1.0 / losses.len() as f64);
         }
         report.norm = f64::from(*norm);
-        check("gradient norm", report.norm, report.step)?;
+        check("gradient norm", report.norm, report.step, self.saved)?;
         Ok(Some(report))
     }
 
@@ -318,15 +321,25 @@ impl<L: Learner> Trainer<L> {
     }
 }
 
-/// Checks a number of step `step`.
-fn check(what: &str, value: f64, step: u64) -> Result<()> {
+/// Checks a number of step `step`; `saved` is the step of the last checkpoint.
+fn check(what: &str, value: f64, step: u64, saved: Option<u64>) -> Result<()> {
     if value.is_finite() {
         return Ok(());
     }
+    let (found, help) = match saved {
+        Some(saved) => (
+            format!("the checkpoint of step {saved} is good"),
+            "lower train.lr or train.clip, and resume from the checkpoint",
+        ),
+        None => (
+            "there is no checkpoint yet".to_owned(),
+            "lower train.lr or train.clip, and start again",
+        ),
+    };
     Err(Error::request(
-        format!("{what} is {value} at step {step}: training stopped, the last checkpoint is good"),
+        format!("{what} is {value} at step {step}: training stopped, {found}"),
         what,
-        "lower train.lr or train.clip, and resume from the checkpoint",
+        help,
     ))
 }
 

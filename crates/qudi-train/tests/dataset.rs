@@ -166,6 +166,9 @@ fn packs_are_smaller_by_shrink() {
     assert!(error < 3.0, "{error} levels");
 }
 
+/// Changes a recipe's sources.
+type Change<'a> = &'a dyn Fn(&mut Vec<PackedSource>);
+
 /// A pack says what it was made from: another recipe is refused, part of it is not.
 #[test]
 fn rejects_packs_of_other_recipes() {
@@ -186,7 +189,7 @@ fn rejects_packs_of_other_recipes() {
     open(&|_| ()).unwrap();
     open(&|sources| drop(sources.remove(0))).unwrap();
     open(&|sources| sources[2].lossless = Some(ClipWindow { frames: 5, crop: 16 })).unwrap();
-    let changes: [(&str, &dyn Fn(&mut Vec<PackedSource>)); 6] = [
+    let changes: [(&str, Change); 6] = [
         ("shrink\":1.5", &|sources| sources[0].shrink = 1.5),
         ("clips/c0", &|sources| sources[0].from = vec!["clips/c0".into()]),
         ("stills", &|sources| sources[0].kind = SourceKind::Stills),
@@ -430,6 +433,7 @@ fn rejects_forged_packs() {
     let mut encoder = image::codecs::jpeg::JpegEncoder::new(&mut image);
     encoder.encode(&[50; 256], 16, 16, image::ExtendedColorType::L8).unwrap();
     let name = "clips/a/000000.jpg";
+    let zeros = vec![0; 100_000];
     for (text, index, images) in [
         ("layout is 1", "{\"version\": 1, \"clips\": []}".to_owned(), &[][..]),
         ("index.json", String::new(), &[]),
@@ -442,7 +446,7 @@ fn rejects_forged_packs() {
         ("exceeds", index("1", "15"), &[(name, &image)]),
         ("another size", index("1", "17"), &[(name, &image)]),
         ("clips/a/000000.jpg", index("1", "16"), &[("clips/b/000000.jpg", &image)]),
-        ("more than", index("1", "16"), &[(name, &[0; 100_000])]),
+        ("more than", index("1", "16"), &[(name, &zeros)]),
         ("digest", index("1", "16"), &[(name, &image)]),
     ] {
         forged(&path, &index, images);

@@ -153,27 +153,6 @@ fn resumed_run_equals_undisturbed_run() {
     assert_eq!(lines(&folders[0]).len(), 9); // six steps, three validations
 }
 
-/// Killed between the renames of a new state, a run has the old one; half a new one is ignored.
-#[test]
-fn interrupted_state_write_leaves_a_whole_state() {
-    let recipe = recipe(&[]);
-    let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    let mut run = open::<Diffusion>(folder.path(), &recipe, From::Start(None)).unwrap();
-    let _ = learn(&mut run, 2);
-    let steps =
-        || open::<Diffusion>(folder.path(), &recipe, From::State).map(|run| run.progress()[0]);
-    std::fs::create_dir(at("state.new")).unwrap();
-    std::fs::write(at("state.new/tensors.safetensors"), b"half").unwrap();
-    assert_eq!(steps().unwrap(), 2);
-    std::fs::rename(at("state"), at("state.old")).unwrap();
-    assert_eq!(steps().unwrap(), 2);
-    let mut run = open::<Diffusion>(folder.path(), &recipe, From::State).unwrap();
-    let _ = learn(&mut run, 4);
-    assert_eq!(steps().unwrap(), 4);
-    assert!(!at("state.new").exists() && !at("state.old").exists());
-}
-
 #[test]
 fn rejects_damaged_states() {
     let recipe = recipe(&[]);
@@ -186,6 +165,13 @@ fn rejects_damaged_states() {
         std::fs::write(&path, &whole[..length]).unwrap();
         let error = open::<Diffusion>(folder.path(), &recipe, From::State).unwrap_err();
         assert!(error.to_string().contains("state"), "{error}");
+    }
+    for at in [whole.len() - 1, whole.len() / 2] {
+        let mut flipped = whole.clone();
+        flipped[at] ^= 1;
+        std::fs::write(&path, &flipped).unwrap();
+        let error = open::<Diffusion>(folder.path(), &recipe, From::State).unwrap_err();
+        assert!(error.to_string().contains("digest"), "{error}");
     }
     std::fs::write(&path, &whole).unwrap();
     let wider = crate::recipe(&[("network.unet.width", "16")]);
@@ -299,7 +285,17 @@ fn nan_loss_stops_the_step_and_names_the_term() {
         error.contains("first estimate") || error.contains("prediction loss is NaN at step 1"),
         "{error}"
     );
+    assert!(error.contains("first estimate") || error.contains("no checkpoint"), "{error}");
     assert_eq!(trainer.step_number(), 0);
+    // Neither state nor weights with NaN are written.
+    let folder = tempfile::tempdir().unwrap();
+    let error = trainer.save_state(folder.path()).unwrap_err().to_string();
+    assert!(error.contains("not finite"), "{error}");
+    assert!(std::fs::read_dir(folder.path()).unwrap().next().is_none());
+    let origin = Origin { steps: 1, commit: None };
+    let path = folder.path().join(WEIGHTS);
+    let error = trainer.averaged().save(&recipe, &origin, &path).unwrap_err().to_string();
+    assert!(error.contains("not finite") && !path.exists(), "{error}");
 }
 
 #[test]

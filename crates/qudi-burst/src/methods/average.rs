@@ -33,11 +33,13 @@ impl Restorer for Average {
         let detections = acquisition.sensor.quantum_efficiency * acquisition.ppp
             + acquisition.sensor.dark_per_frame()?;
         // Mean count per unit of image value.
-        let per_unit = law.mean(detections) / acquisition.mean_level;
+        let per_unit = (law.mean(detections) - acquisition.pedestal) / acquisition.mean_level;
         let mut frames = Vec::with_capacity(burst.frames.len());
         moving_sums(burst, WINDOW / 2, |sums, n| {
             let scale = 1.0 / (per_unit * f64::from(n));
-            let data = sums.iter().map(|&sum| (f64::from(sum) * scale) as f32).collect();
+            let pedestal = acquisition.pedestal * f64::from(n);
+            let data = sums.iter().map(|&sum| ((f64::from(sum) - pedestal) * scale) as f32);
+            let data = data.collect();
             frames.push(Frame { size: burst.size, data });
         });
         Ok(Restored { frames, std: None }.only(numbers))

@@ -51,8 +51,10 @@ impl Restorer for Mle {
         moving_sums(burst, self.radius, |sums, n| {
             let pixel = |(i, &sum): (usize, &u32)| {
                 let dark = acquisition.dark_of(i, ordinary);
-                let flux =
-                    acquisition.sensor.estimate_flux(f64::from(sum), n, acquisition.gain, dark);
+                let (sum, gain) = (f64::from(sum), acquisition.gain);
+                let flux = acquisition.sensor.estimate_signed_flux(sum, n, gain, dark);
+                // Signed counts give signed values.
+                let flux = if acquisition.pedestal > 0.0 { flux } else { flux.max(0.0) };
                 (flux * units) as f32
             };
             let data = sums.iter().enumerate().map(pixel).collect();

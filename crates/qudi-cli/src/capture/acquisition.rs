@@ -4,7 +4,7 @@ use crate::error::{CliError, Result};
 use qudi_core::USUAL_MEAN_LEVEL;
 use qudi_core::fitting_mean_level;
 use qudi_core::restorer::Acquisition;
-use qudi_core::sensor::Sensor;
+use qudi_core::sensor::{Response, Sensor};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_io::capture::{Capture, Summary};
 
@@ -54,6 +54,13 @@ impl CaptureAcquisition {
         summary: &Summary,
     ) -> Result<Self> {
         checked_mean_level(overrides.mean_level)?;
+        if overrides.gain.is_some() && sensor.response == Response::Binary {
+            return Err(CliError::new(
+                format!("`{}` is binary: its pixels fire or not, and have no gain", sensor.name),
+                "--gain",
+                "leave it out",
+            ));
+        }
         let output_sensor = capture.output_sensor(sensor)?;
         let (ppp, light_source) = light(overrides, capture, sensor, summary)?;
         let gain = match overrides.known_gain(capture) {
@@ -70,7 +77,10 @@ impl CaptureAcquisition {
             sensor: output_sensor,
             gain,
             dark,
-        };
+            pedestal: 0.0,
+        }
+        .without_echoes()?
+        .with_pedestal(capture.info().pedestal)?;
         // The recorded level gives what is restored the brightness of the clip.
         let recorded = capture.info().mean_level.filter(|_| overrides.ppp.is_none());
         acquisition.mean_level = match overrides.mean_level.or(recorded) {

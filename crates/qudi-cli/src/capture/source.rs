@@ -21,6 +21,8 @@ pub(crate) struct Source<'a> {
     pub(crate) sum: Option<Sum>,
     /// The sensor by name, if given.
     pub(crate) sensor: Option<&'a str>,
+    /// Frames that are judged at most, before any is used.
+    pub(crate) judged: u64,
 }
 
 /// A capture with its sensor, if that is known.
@@ -40,8 +42,16 @@ impl Source<'_> {
         }
     }
 
+    /// Opens the capture, and judges its frames.
+    fn open_judged(&self, sensor: Option<&Sensor>) -> Result<Capture> {
+        let mut capture = self.input.open(self.options, sensor)?;
+        let known = sensor.or(capture.info().sensor.as_ref()).cloned();
+        capture.judge_frames(self.judged, self.options, known.as_ref())?;
+        Ok(capture)
+    }
+
     fn open_file(&self, named: Option<Sensor>, settings: &Settings) -> Result<OpenedCapture> {
-        let capture = self.input.open(self.options, named.as_ref())?;
+        let capture = self.open_judged(named.as_ref())?;
         if named.is_some() {
             return Ok(OpenedCapture { capture, sensor: named });
         }
@@ -49,7 +59,7 @@ impl Source<'_> {
             Some(sensor) if settings.overrides_sensor() => {
                 let sensor = settings.adjusted(sensor)?;
                 // Opened again: a dark map that is set decides which pixels are repaired.
-                let capture = self.input.open(self.options, Some(&sensor))?;
+                let capture = self.open_judged(Some(&sensor))?;
                 Ok(OpenedCapture { capture, sensor: Some(sensor) })
             }
             sensor => Ok(OpenedCapture { capture, sensor }),

@@ -1,10 +1,13 @@
-//! Files and folders that appear only when finished; dropped before `finish`, they leave nothing behind.
+//! Files that appear only when finished; dropped before `finish`, they leave nothing behind.
 
+use super::unnamed_file;
 use crate::error::{Error, Result};
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-use tempfile::{NamedTempFile, TempDir};
+use tempfile::NamedTempFile;
+
+pub use super::atomic_folder::{OwnFolder, PendingFolder};
 
 /// What to do if the name is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -18,13 +21,84 @@ pub enum Overwrite {
 /// A file that appears under its name only when finished.
 #[derive(Debug)]
 pub struct PendingFile {
-    writer: BufWriter<NamedTempFile>,
+    writer: BufWriter<Temporary>,
     path: PathBuf,
     overwrite: Overwrite,
 }
 
+/// A file that is gone if its name does not become the result's.
+#[derive(Debug)]
+enum Temporary {
+    /// Gone with the process, however it ends.
+    Unnamed(File),
+    /// Gone when dropped.
+    Named(NamedTempFile),
+}
+
+impl Temporary {
+    fn create(folder: &Path) -> std::io::Result<Self> {
+        match unnamed_file::create(folder) {
+            Some(file) => Ok(Self::Unnamed(file)),
+            None => names().tempfile_in(folder).map(Self::Named),
+        }
+    }
+
+    fn file(&mut self) -> &mut File {
+        match self {
+            Self::Unnamed(file) => file,
+            Self::Named(file) => file.as_file_mut(),
+        }
+    }
+
+    /// Gives the file its name; a file that took the name in the meantime is kept unless it is overwritten.
+    fn persist(self, path: &Path, overwrite: Overwrite) -> std::io::Result<()> {
+        let named = match self {
+            Self::Unnamed(file) if overwrite == Overwrite::No => {
+                return unnamed_file::link(&file, path);
+            }
+            Self::Unnamed(file) => {
+                let link = |path: &Path| unnamed_file::link(&file, path);
+                let ((), name) = names().make_in(parent(path), link)?.into_parts();
+                return Ok(name.persist(path)?);
+            }
+            Self::Named(file) => file,
+        };
+        let kept = match overwrite {
+            Overwrite::Yes => named.persist(path),
+            Overwrite::No => named.persist_noclobber(path),
+        };
+        Ok(kept.map(drop)?)
+    }
+}
+
+impl Write for Temporary {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.file().write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.file().flush()
+    }
+}
+
+impl Seek for Temporary {
+    fn seek(&mut self, position: SeekFrom) -> std::io::Result<u64> {
+        self.file().seek(position)
+    }
+}
+
+/// Returns names for temporary files that nobody can foretell.
+fn names() -> tempfile::Builder<'static, 'static> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".qudi-").suffix(".tmp");
+    // Temporary files are private by default; results get the permissions of any new file.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder
+}
+
 /// Returns the folder of `path`, `.` for a bare name.
-fn parent(path: &Path) -> &Path {
+pub(super) fn parent(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
@@ -49,14 +123,8 @@ impl PendingFile {
         if path.is_dir() {
             return Err(Error::data("the output is a folder", path, "name a file"));
         }
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".qudi-").suffix(".tmp");
-        // Temporary files are private by default; results get the permissions of any new file.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let file = builder
-            .tempfile_in(parent(path))
-            .map_err(|e| Error::io("create the output", path, e))?;
+        let file =
+            Temporary::create(parent(path)).map_err(|e| Error::io("create the output", path, e))?;
         Ok(Self {
             writer: BufWriter::with_capacity(1 << 18, file),
             path: path.to_owned(),
@@ -90,24 +158,28 @@ impl PendingFile {
     /// If it cannot be written.
     pub fn flushed(&mut self) -> std::io::Result<&mut File> {
         self.writer.flush()?;
-        Ok(self.writer.get_mut().as_file_mut())
+        Ok(self.writer.get_mut().file())
     }
 
     /// Flushes to disk and gives the file its name.
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full or the folder is gone.
-    pub fn finish(self) -> Result<()> {
+    pub fn finish(mut self) -> Result<()> {
+        let synced = self.flushed().and_then(|file| file.sync_all());
+        synced.map_err(|e| self.fault(e))?;
+        self.finish_unsynced()
+    }
+
+    /// Gives the file its name, without waiting for the disk: for one of many files that can be made again.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the disk is full or the folder is gone.
+    pub fn finish_unsynced(self) -> Result<()> {
         let path = self.path;
         let fault = |e: std::io::Error| Error::io("write", &path, e);
         let file = self.writer.into_inner().map_err(|e| fault(e.into_error()))?;
-        file.as_file().sync_all().map_err(fault)?;
-        // A file that took the name in the meantime is kept.
-        let named = match self.overwrite {
-            Overwrite::Yes => file.persist(&path),
-            Overwrite::No => file.persist_noclobber(&path),
-        };
-        named.map(drop).map_err(|e| fault(e.error))
+        file.persist(&path, self.overwrite).map_err(fault)
     }
 }
 
@@ -121,122 +193,46 @@ impl Write for PendingFile {
     }
 }
 
-impl std::io::Seek for PendingFile {
-    fn seek(&mut self, position: std::io::SeekFrom) -> std::io::Result<u64> {
+impl Seek for PendingFile {
+    fn seek(&mut self, position: SeekFrom) -> std::io::Result<u64> {
         self.writer.seek(position)
     }
 }
 
-/// Describes the folders that a writer makes, so that no other is replaced.
-#[derive(Clone, Copy, Debug)]
-pub struct OwnFolder {
-    /// A file that every such folder holds.
-    pub marker: &'static str,
-    /// Returns true for names of files that are written into such folders.
-    pub is_own_file: fn(&str) -> bool,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-impl OwnFolder {
-    /// Refuses a folder at `path` that holds anything else. An empty one is fine.
-    ///
-    /// # Errors
-    /// [`Error`] that names a foreign file.
-    fn check(&self, path: &Path) -> Result<()> {
-        let list = |e| Error::io("list the output", path, e);
-        let help = "choose another name, or remove it yourself";
-        if !path.is_dir() {
-            return Err(Error::data("the output exists and is not a folder", path, help));
-        }
-        let mut marked = false;
-        let mut entries = 0;
-        for entry in std::fs::read_dir(path).map_err(list)? {
-            let entry = entry.map_err(list)?;
-            let name = entry.file_name().to_string_lossy().into_owned();
-            let is_file = entry.file_type().map_err(list)?.is_file();
-            if !is_file || !(name == self.marker || (self.is_own_file)(&name)) {
-                return Err(Error::data(
-                    format!("the output holds `{name}`, which this program did not write"),
-                    path,
-                    "choose another name, or move that file away",
-                ));
-            }
-            marked |= name == self.marker;
-            entries += 1;
-        }
-        if marked || entries == 0 {
-            return Ok(());
-        }
-        let marker = self.marker;
-        Err(Error::data(
-            format!("the output exists and was not made by this program (no {marker} in it)"),
-            path,
-            help,
-        ))
-    }
-}
-
-/// A folder that appears under its name only when finished.
-#[derive(Debug)]
-pub struct PendingFolder {
-    folder: TempDir,
-    path: PathBuf,
-    overwrite: Overwrite,
-    own: OwnFolder,
-}
-
-impl PendingFolder {
-    /// Creates a temporary folder in the parent of `path`. An existing folder is overwritten only if it is
-    /// empty or all its files are of `own`.
-    ///
-    /// # Errors
-    /// [`Error`] if the name is taken or the parent folder cannot be written.
-    pub fn create(path: &Path, overwrite: Overwrite, own: OwnFolder) -> Result<Self> {
-        refuse_taken(path, overwrite)?;
-        if path.symlink_metadata().is_ok() {
-            own.check(path)?;
-        }
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".qudi-").suffix(".tmp");
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
-        let folder = builder
-            .tempdir_in(parent(path))
-            .map_err(|e| Error::io("create the output", path, e))?;
-        Ok(Self { folder, path: path.to_owned(), overwrite, own })
+    fn names_in(folder: &Path) -> Vec<String> {
+        let entries = std::fs::read_dir(folder).unwrap();
+        entries.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned()).collect()
     }
 
-    /// Returns the path of a file inside, for writing.
-    pub fn file(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn unfinished_files_have_no_name_that_a_killed_process_could_leave() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.npy");
+        let mut file = PendingFile::create(&path, Overwrite::No).unwrap();
+        file.write_all(b"half").unwrap();
+        file.flushed().unwrap();
+        assert!(names_in(folder.path()).is_empty());
+        file.finish().unwrap();
+        assert_eq!(names_in(folder.path()), ["a.npy"]);
+        PendingFile::write_whole(&path, b"other", Overwrite::Yes).unwrap();
+        assert_eq!(
+            (names_in(folder.path()).len(), std::fs::read(&path).unwrap()),
+            (1, b"other".into())
+        );
     }
 
-    /// Returns the name after [`Self::finish`].
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Gives the folder its name.
-    ///
-    /// # Errors
-    /// [`Error::Io`] if that fails.
-    pub fn finish(self) -> Result<()> {
-        let fault = |e| Error::io("rename the finished folder to", &self.path, e);
-        if self.overwrite == Overwrite::Yes && self.path.is_dir() {
-            // Another program may have written to it in the meantime.
-            self.own.check(&self.path)?;
-            // The old folder is renamed first, and renamed back if the new one cannot replace it.
-            let aside = self.folder.path().with_extension("old");
-            std::fs::rename(&self.path, &aside).map_err(fault)?;
-            if let Err(e) = std::fs::rename(self.folder.path(), &self.path) {
-                let _ = std::fs::rename(&aside, &self.path);
-                return Err(fault(e));
-            }
-            std::fs::remove_dir_all(&aside).map_err(fault)?;
-        } else {
-            std::fs::rename(self.folder.path(), &self.path).map_err(fault)?;
-        }
-        // The temporary name is gone; there is nothing left to clean up.
-        let _ = self.folder.keep();
-        Ok(())
+    #[test]
+    fn a_file_that_took_the_name_meanwhile_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.npy");
+        let file = PendingFile::create(&path, Overwrite::No).unwrap();
+        std::fs::write(&path, "theirs").unwrap();
+        assert!(file.finish().is_err());
+        assert_eq!(std::fs::read(&path).unwrap(), b"theirs");
     }
 }

@@ -2,10 +2,13 @@
 //!
 //! Nothing is allocated from a header before the sizes it claims are checked against the file.
 
+mod half;
+
 use crate::error::{Error, Result};
 use crate::frame::{Frame, Size};
 use crate::limits::{ARRAY_HEADER_BYTES, HELD_ARRAY_BYTES};
 use crate::regular_file::open_regular;
+use half::half;
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Write};
 use std::path::Path;
@@ -31,6 +34,11 @@ pub enum Sample {
         /// Most significant byte first.
         big_endian: bool,
     },
+    /// `<f2` or `>f2`
+    F16 {
+        /// Most significant byte first.
+        big_endian: bool,
+    },
     /// `<f4` or `>f4`
     F32 {
         /// Most significant byte first.
@@ -48,7 +56,7 @@ impl Sample {
     pub fn bytes(self) -> usize {
         match self {
             Self::Bool | Self::U8 => 1,
-            Self::U16 { .. } => 2,
+            Self::U16 { .. } | Self::F16 { .. } => 2,
             Self::Integer { bytes, .. } => usize::from(bytes),
             Self::F32 { .. } => 4,
             Self::F64 { .. } => 8,
@@ -61,6 +69,7 @@ impl Sample {
             "b1" => Self::Bool,
             "u1" => Self::U8,
             "u2" => Self::U16 { big_endian },
+            "f2" => Self::F16 { big_endian },
             "f4" => Self::F32 { big_endian },
             "f8" => Self::F64 { big_endian },
             "i1" => Self::Integer { bytes: 1, signed: true, big_endian },
@@ -87,6 +96,7 @@ impl Sample {
         match self {
             Self::Bool | Self::U8 => false,
             Self::U16 { big_endian }
+            | Self::F16 { big_endian }
             | Self::F32 { big_endian }
             | Self::F64 { big_endian }
             | Self::Integer { big_endian, .. } => big_endian,
@@ -110,6 +120,7 @@ impl Sample {
                 let unused = 64 - 8 * u32::from(bytes);
                 if signed { (((word << unused) as i64) >> unused) as f32 } else { word as f32 }
             }
+            Self::F16 { .. } => half(u16::from_le_bytes([word[0], word[1]])),
             Self::F32 { .. } => f32::from_le_bytes(four),
             Self::F64 { .. } => f64::from_le_bytes(word) as f32,
         }
@@ -166,8 +177,12 @@ impl Header {
         let mut text = vec![0u8; length];
         reader.read_exact(&mut text).map_err(ended)?;
         let text = String::from_utf8(text).map_err(|_| fault("the .npy header is not text"))?;
-        let (descr, fortran, shape) =
-            parse_dictionary(&text).ok_or_else(|| fault("the .npy header is malformed"))?;
+        let (descr, fortran, shape) = parse_dictionary(&text).ok_or_else(|| {
+            if text.contains("[(") {
+                return fault("records of several fields, as of events (x, y, t), and no frames");
+            }
+            fault("the .npy header is malformed")
+        })?;
         let sample = Sample::from_descr(&descr)
             .ok_or_else(|| fault(&format!("samples of type `{descr}` are not images or counts")))?;
         let fortran = fortran && shape.len() > 1;
@@ -334,9 +349,15 @@ pub fn read_image(path: &Path) -> Result<Frame> {
 /// [`Error`] if it cannot be read, has other axes, or holds values that are not finite.
 pub fn read_clip(path: &Path, max_frames: usize) -> Result<Vec<Frame>> {
     let (header, reader) = Header::open(path)?;
-    let (&[frames, height, width], Some(full)) =
-        (header.shape.as_slice(), header.sample.full_scale())
-    else {
+    // An axis of one channel, before or after the picture, holds nothing.
+    let shape = match *header.shape.as_slice() {
+        [frames, 1, height, width] | [frames, height, width, 1] | [frames, height, width] => {
+            Some([frames, height, width])
+        }
+        [height, width] => Some([1, height, width]),
+        _ => None,
+    };
+    let (Some([frames, height, width]), Some(full)) = (shape, header.sample.full_scale()) else {
         return Err(Error::data(
             format!(
                 "an array of shape {:?}, or of wide integers, where a clip is expected",

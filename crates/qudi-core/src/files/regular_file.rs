@@ -65,9 +65,11 @@ pub fn read_limited(path: &Path, limit: u64, action: &str) -> Result<Vec<u8>> {
 /// # Errors
 /// [`Error`] as [`read_limited`], or if it is not UTF-8.
 pub fn read_text(path: &Path, limit: u64, action: &str) -> Result<String> {
-    String::from_utf8(read_limited(path, limit, action)?).map_err(|_| {
+    let text = String::from_utf8(read_limited(path, limit, action)?).map_err(|_| {
         Error::data(format!("cannot {action}: not a text file"), path, "save it as text in UTF-8")
-    })
+    })?;
+    // Editors may begin a file with a byte order mark.
+    Ok(text.strip_prefix('\u{feff}').map_or(text.clone(), str::to_owned))
 }
 
 #[cfg(test)]

@@ -2,7 +2,10 @@
 
 use crate::frame::Frame;
 
-/// Returns the PSNR of `estimate` against `truth`, both clipped to [0, 1]; infinite if they are equal.
+/// Largest PSNR in dB: of equal frames, and of frames that differ by less than a step of 16 bits.
+pub const MAX_PSNR: f64 = 100.0;
+
+/// Returns the PSNR of `estimate` against `truth`, both clipped to [0, 1], at most [`MAX_PSNR`].
 pub fn psnr(estimate: &Frame, truth: &Frame) -> f64 {
     scaled_psnr(estimate, truth, 1.0)
 }
@@ -12,14 +15,16 @@ pub fn gain_aligned_psnr(estimate: &Frame, truth: &Frame) -> f64 {
     scaled_psnr(estimate, truth, best_gain(estimate, truth))
 }
 
-/// Returns the factor on `estimate` with the least squared error; 1 for a black estimate.
+/// Returns the factor on `estimate` with the least squared error; 0 for a negative of the truth, which no
+/// exposure makes, and 1 where one of them is black.
 pub fn best_gain(estimate: &Frame, truth: &Frame) -> f64 {
-    let (mut cross, mut square) = (0.0, 0.0);
+    let (mut cross, mut square, mut light) = (0.0, 0.0, 0.0);
     for (&e, &t) in estimate.data.iter().zip(&truth.data) {
         cross += f64::from(e) * f64::from(t);
         square += f64::from(e) * f64::from(e);
+        light += f64::from(t.abs());
     }
-    if square > 0.0 { cross / square } else { 1.0 }
+    if square > 0.0 && light > 0.0 { (cross / square).max(0.0) } else { 1.0 }
 }
 
 fn scaled_psnr(estimate: &Frame, truth: &Frame, gain: f64) -> f64 {
@@ -28,7 +33,7 @@ fn scaled_psnr(estimate: &Frame, truth: &Frame, gain: f64) -> f64 {
         difference * difference
     });
     let mean = error.sum::<f64>() / estimate.data.len() as f64;
-    -10.0 * mean.log10()
+    (-10.0 * mean.log10()).min(MAX_PSNR)
 }
 
 #[cfg(test)]
@@ -41,7 +46,7 @@ mod tests {
         let size = Size { height: 4, width: 5 };
         let truth = Frame::filled(size, 0.5);
         assert!((psnr(&Frame::filled(size, 0.6), &truth) - 20.0).abs() < 1e-5);
-        assert!(psnr(&truth, &truth).is_infinite());
+        assert_eq!(psnr(&truth, &truth), MAX_PSNR);
     }
 
     #[test]
@@ -51,7 +56,14 @@ mod tests {
         let mut darker = truth.clone();
         darker.data.iter_mut().for_each(|v| *v *= 0.4);
         assert!((best_gain(&darker, &truth) - 2.5).abs() < 1e-6);
-        assert!(gain_aligned_psnr(&darker, &truth) > 100.0);
+        assert_eq!(gain_aligned_psnr(&darker, &truth), MAX_PSNR);
         assert!(psnr(&darker, &truth) < 20.0);
+        // A negative is no exposure of the truth, and a black truth fixes none.
+        let mut negative = truth.clone();
+        negative.data.iter_mut().for_each(|v| *v = -*v);
+        assert_eq!(best_gain(&negative, &truth), 0.0);
+        let black = Frame::filled(size, 0.0);
+        assert_eq!(best_gain(&truth, &black), 1.0);
+        assert_eq!(gain_aligned_psnr(&truth, &black), psnr(&truth, &black));
     }
 }

@@ -1,6 +1,9 @@
 //! Hot and dead pixels: found in a capture, and repaired before anything else looks at it.
 
+mod dead_lines;
+
 use crate::frame::Size;
+use dead_lines::dead_lines_and_clumps;
 use std::fmt::Write as _;
 
 /// Least ratio of a hot pixel to its brightest good neighbours.
@@ -66,6 +69,11 @@ impl BadPixels {
             } else if empty && around.dark < 3 {
                 bad.dead.push(i);
             }
+        }
+        if is_lit {
+            bad.dead.extend(dead_lines_and_clumps(&detections, size));
+            bad.dead.sort_unstable();
+            bad.dead.dedup();
         }
         bad.doubtful = doubtful(&detections, size, &bad);
         bad

@@ -26,7 +26,7 @@ impl CountLaw {
             gain,
             read_noise: sensor.read_noise,
             full_well: sensor.full_well.electrons(),
-            dead_time: sensor.defects.dead_time_ns * 1e-9 * sensor.fps.unwrap_or(0.0),
+            dead_time: sensor.dead_time(),
         }
     }
 

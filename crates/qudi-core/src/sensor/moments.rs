@@ -1,5 +1,6 @@
 //! Mean and variance of a count as functions of the detections expected, from a table.
 
+use super::echoes::counted;
 use super::{CountLaw, Response};
 
 /// Nodes of the table; between them both moments are nearly straight.
@@ -25,6 +26,8 @@ impl CountMoments {
             law.detections_for_mean(0.98 * full)
         } else if law.response == Response::Binary {
             full * 5.0
+        } else if law.dead_time() > 0.0 {
+            law.detections_for_mean(0.98 * full).min(100.0 / law.dead_time())
         } else {
             full / law.gain
         };
@@ -42,8 +45,11 @@ impl CountMoments {
                 let p = -(-detections / full).exp_m1();
                 return (full * p, full * p * (1.0 - p));
             }
-            let variance = detections + law.read_noise * law.read_noise;
-            (law.gain * detections, law.gain * law.gain * variance + 1.0 / 12.0)
+            let counted = counted(detections, law.dead_time());
+            // Dead time spaces counts more evenly (Cox 1962).
+            let variance = detections / (1.0 + detections * law.dead_time()).powi(3);
+            let variance = variance + law.read_noise * law.read_noise;
+            (law.gain * counted, law.gain * law.gain * variance + 1.0 / 12.0)
         };
         Self { max_detections, nodes: (0..=NODES).map(node).collect() }
     }

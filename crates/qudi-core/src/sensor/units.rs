@@ -23,6 +23,15 @@ pub enum DarkRate {
 }
 
 impl DarkRate {
+    /// Multiplies the rate by a factor.
+    #[must_use]
+    pub fn times(self, factor: f64) -> Self {
+        match self {
+            Self::PerFrame(v) => Self::PerFrame(v * factor),
+            Self::PerSecond(v) => Self::PerSecond(v * factor),
+        }
+    }
+
     /// Returns the number without its unit.
     pub fn value(self) -> f64 {
         let (Self::PerFrame(v) | Self::PerSecond(v)) = self;

@@ -21,7 +21,7 @@ const READ_NOISE_RANGE: (f64, f64) = (0.01, 30.0);
 /// Dark rates, hot pixels and read noise of a camera.
 #[derive(Clone, Debug)]
 pub struct Calibration {
-    /// Size of the maps.
+    /// Size of the maps: of the stored frames, not turned and not cropped.
     pub size: Size,
     /// Frames used.
     pub frames: u64,
@@ -35,6 +35,8 @@ pub struct Calibration {
     pub threshold: f64,
     /// Read noise in e- of the ordinary pixels, for linear sensors.
     pub read_noise: Option<f64>,
+    /// Correlation of the rates of neighbouring pixels, where it shows a picture.
+    pub picture: Option<f64>,
 }
 
 /// Measures `capture`, taken with the shutter closed. `gain` is in DN/e- and needed for linear
@@ -140,15 +142,41 @@ fn finish(
             rates[i] > threshold && significant
         })
         .collect();
+    // Maps are of the stored frames, so that whoever turns and crops these turns and crops the maps.
+    let stored = capture.native.size();
+    let dark: Vec<f32> = rates.iter().map(|&rate| rate as f32).collect();
+    let hot = BadPixels { hot, ..BadPixels::default() }.mask(size);
+    let hot = capture.view.stored(&hot, stored, false);
+    let hot = (0..hot.len()).filter(|&i| hot[i]).collect();
     Ok(Calibration {
-        size,
+        size: stored,
         frames,
-        dark: rates.iter().map(|&rate| rate as f32).collect(),
+        dark: capture.view.stored(&dark, stored, bulk as f32),
         bulk,
         bad: BadPixels { hot, ..BadPixels::default() },
         threshold,
         read_noise,
+        picture: picture(rates, size, 3.0 * bulk),
     })
+}
+
+/// Least correlation of neighbours in a picture; dark rates of pixels have nothing to do with each other.
+const PICTURE_CORRELATION: f64 = 0.3;
+
+/// Returns the correlation of the rates of neighbouring pixels if they show a picture. Pixels with rates
+/// beyond `most` are hot.
+fn picture(rates: &[f64], size: Size, most: f64) -> Option<f64> {
+    let clipped: Vec<f64> = rates.iter().map(|rate| rate.min(most)).collect();
+    let mean = clipped.iter().sum::<f64>() / clipped.len() as f64;
+    let (mut product, mut square) = (0.0, 0.0);
+    for row in clipped.chunks_exact(size.width) {
+        for pair in row.windows(2) {
+            product += (pair[0] - mean) * (pair[1] - mean);
+            square += (pair[0] - mean).powi(2);
+        }
+    }
+    let correlation = if square > 0.0 { product / square } else { 0.0 };
+    (correlation > PICTURE_CORRELATION).then_some(correlation)
 }
 
 /// Fits the read noise of the ordinary pixels by maximum likelihood. Their means lie in the middle, so that

@@ -97,17 +97,17 @@ fn nonzero(map: &Frame) -> BadPixels {
     BadPixels { hot, ..BadPixels::default() }
 }
 
-/// Loads a map of the frames in use; a map of the stored frames is turned and cropped as they are.
+/// Loads a map of the stored frames, turned and cropped as they are, or one of the frames in use.
 fn load(capture: &Capture, path: &Path) -> Result<Frame> {
     let map = read(path)?;
     let (size, stored) = (capture.size(), capture.native.size());
-    if map.size == size {
-        return Ok(map);
-    }
     if map.size == stored {
         let mut turned = Frame::filled(size, 0.0);
         capture.view.apply(&map.data, &mut turned.data);
         return Ok(turned);
+    }
+    if map.size == size {
+        return Ok(map);
     }
     Err(Error::data(
         format!("a map of {} for frames of {size}, stored as {stored}", map.size),

@@ -121,6 +121,7 @@ impl Summary {
                 let summed = f64::from(sensor.frames_summed);
                 let light = |(i, &sum): (usize, &u32)| {
                     let dark = capture.dark.as_ref().map_or(dark, |map| f64::from(map[i]) * summed);
+                    let dark = dark + capture.info.pedestal / gain;
                     sensor.estimate_flux(f64::from(sum), frames, gain, dark) as f32
                 };
                 self.sums.iter().enumerate().map(light).collect()
@@ -203,7 +204,8 @@ fn ppp(
         let largest = sums.iter().copied().max().unwrap_or(0);
         let fits = f64::from(largest) <= f64::from(native.max_count()) * per_frame * sampled;
         gain.or(native.fixed_gain()).filter(|_| fits).map(|gain| {
-            CountLaw::new(&native, gain).detections_for_mean(dn / per_frame) * per_frame
+            let seen = CountLaw::new(&native, gain).detections_for_mean(dn / per_frame);
+            (seen - capture.info.pedestal / gain).max(0.0) * per_frame
         })
     };
     let dark = match &capture.dark {
@@ -213,10 +215,13 @@ fn ppp(
         }
         None => native.dark_per_frame()?,
     };
-    let incident = detected
-        .filter(|_| sensor.is_some())
-        .map(|detected| ((detected - dark * per_frame) / native.quantum_efficiency).max(0.0));
-    Ok(Ppp { incident, detected, dn })
+    let of_light = |detected: f64| {
+        let frames = per_frame * f64::from(native.frames_summed);
+        let seen = detected / native.echo_factor_of_seen(detected / frames);
+        ((seen - dark * per_frame) / native.quantum_efficiency).max(0.0)
+    };
+    let incident = detected.filter(|_| sensor.is_some()).map(of_light);
+    Ok(Ppp { incident, detected, dn: dn - capture.info.pedestal * per_frame })
 }
 
 /// Computes the mean light over the picture, block by block: the response of binary pixels is not linear, so

@@ -84,6 +84,18 @@ impl View {
     }
 }
 
+impl View {
+    /// Puts an image in use back to where its pixels are stored; all other pixels are `outside`.
+    pub(crate) fn stored<T: Copy>(&self, image: &[T], stored: Size, outside: T) -> Vec<T> {
+        let mut out = vec![outside; stored.pixels()];
+        match &self.from {
+            None => out.copy_from_slice(image),
+            Some(from) => from.iter().zip(image).for_each(|(&i, &pixel)| out[i as usize] = pixel),
+        }
+        out
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,13 +1,14 @@
 //! A folder of gray images, one per frame, or a single one.
 
 use super::npy::described;
+use super::parts::holds_stacks;
 use super::{Format, Recognition};
 use crate::description::{CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::levels::infer_levels;
 use crate::frames::reordered::reordered;
 use crate::frames::samples::{Scale, no_count};
-use crate::recognition::Probe;
+use crate::recognition::{Probe, numbered};
 use image::DynamicImage;
 use qudi_core::Size;
 use qudi_core::regular_file::require_regular;
@@ -26,6 +27,7 @@ pub(crate) const FORMAT: Format = Format {
             return Ok(Some(Recognition::new(Certainty::Certain, &["burst.json in the folder"])));
         }
         let found = !files(probe)?.is_empty()
+            && !holds_stacks(probe)?
             && (probe.is_folder || probe.has_extension(SINGLE_EXTENSIONS));
         Ok(found.then(|| Recognition::new(Certainty::Likely, &["image files"])))
     },
@@ -57,7 +59,8 @@ fn open(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
-    let files = files(probe)?;
+    let (files, notes) = numbered(files(probe)?);
+    info.notes.extend(notes);
     let recorded = described(&probe.path.join("burst.json"), info);
     let frames = open_files(files, &probe.path, recorded.is_some(), options, info)?;
     match recorded {

@@ -35,6 +35,13 @@ pub(crate) const FORMAT: Format = Format {
     open,
 };
 
+/// Returns true if a TIFF holds several frames. One that cannot be read is none.
+pub(super) fn is_stack(path: &Path) -> bool {
+    let Ok(decoder) = decoder(path) else { return false };
+    let images = || describe(path).ok().flatten().and_then(|description| description.images);
+    decoder.more_images() || images().is_some_and(|images| images > 1)
+}
+
 /// A stack in one block, as ImageJ writes it.
 struct Block {
     start: u64,

@@ -22,7 +22,7 @@ pub(crate) const FORMAT: Format = Format {
     title: "visionsim dataset",
     options: super::ARRAY_OPTIONS,
     probe: |probe| {
-        let found = document(probe).is_file();
+        let found = document(&probe.path).is_file();
         Ok(found.then(|| Recognition::new(Certainty::Certain, &["transforms.json"])))
     },
     open,
@@ -47,9 +47,20 @@ struct Pose {
     file_path: Option<String>,
 }
 
-fn document(probe: &Probe) -> PathBuf {
-    let itself = probe.path.file_name().is_some_and(|name| name == "transforms.json");
-    if itself { probe.path.clone() } else { probe.path.join("transforms.json") }
+fn document(path: &Path) -> PathBuf {
+    let itself = path.file_name().is_some_and(|name| name == "transforms.json");
+    if itself { path.to_owned() } else { path.join("transforms.json") }
+}
+
+/// Returns the files that the data set at `path` lists; none if it is no data set.
+pub(super) fn files_of(path: &Path) -> Vec<PathBuf> {
+    let path = document(path);
+    let bytes = read_limited(&path, INDEX_BYTES, "read the list of frames").unwrap_or_default();
+    let Ok(transforms) = serde_json::from_slice::<Transforms>(&bytes) else { return Vec::new() };
+    let folder = path.parent().unwrap_or(Path::new("."));
+    let frames = transforms.frames.iter().filter_map(|pose| pose.file_path.as_deref());
+    let names = transforms.file_path.as_deref().into_iter().chain(frames);
+    names.filter_map(|name| inside(folder, name)).collect()
 }
 
 fn open(
@@ -57,7 +68,7 @@ fn open(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
-    let path = document(probe);
+    let path = document(&probe.path);
     let fault = |what: String| {
         Error::data(what, &path, "write the data set again with visionsim, or name the .npy itself")
     };

@@ -58,6 +58,8 @@ pub struct CaptureInfo {
     /// Sensor, if a record next to the file names it.
     #[serde(skip)]
     pub sensor: Option<Sensor>,
+    /// DN of every count that are pedestal: kept, so that noise below zero is not cut off.
+    pub pedestal: f64,
     /// Gain of the sensor in DN/e-, if a record says.
     pub gain: Option<f64>,
     /// Incident photons per pixel and native frame, if a record says.
@@ -102,6 +104,7 @@ impl CaptureInfo {
             vendor: Orientation::Raw,
             orient: Orientation::Raw,
             sensor: None,
+            pedestal: 0.0,
             gain: None,
             ppp: None,
             mean_level: None,

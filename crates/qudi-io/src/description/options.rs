@@ -2,7 +2,6 @@
 
 use super::mosaic::Mosaic;
 use qudi_core::Size;
-use qudi_core::sensor::Sensor;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -271,17 +270,4 @@ impl FromStr for MaskChoice {
             file => Self::File(file.into()),
         })
     }
-}
-
-/// Returns `options` with the sensor's pedestal and threshold, if they set neither.
-pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
-    let mut options = options.clone();
-    if options.offset.is_none()
-        && options.threshold.is_none()
-        && let Some(sensor) = sensor
-    {
-        options.offset = (sensor.offset > 0.0).then_some(sensor.offset);
-        options.threshold = sensor.threshold;
-    }
-    options
 }

@@ -137,6 +137,13 @@ impl CountFrames for SampleFrames {
             }
             return Ok(());
         }
+        if let (Scale::Counts, Sample::U16 { big_endian }) = (self.scale, self.sample) {
+            let read = if big_endian { u16::from_be_bytes } else { u16::from_le_bytes };
+            for (i, value) in stored.enumerate() {
+                counts[place(i)] = read([value[0], value[1]]);
+            }
+            return Ok(());
+        }
         for (i, value) in stored.enumerate() {
             let value = self.sample.decode(value);
             counts[place(i)] =

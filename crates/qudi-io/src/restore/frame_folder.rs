@@ -3,7 +3,7 @@
 
 use super::inputs::Inputs;
 use super::lock::{FolderLock, Share};
-use crate::writer::{frame_name, is_frame_name, save_png16};
+use crate::writer::{encode_png16, frame_name, is_frame_below, is_frame_name};
 use qudi_core::Transfer;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::limits::RECORD_BYTES;
@@ -28,7 +28,12 @@ pub struct FolderRun {
     pub inputs: Inputs,
     /// Share of the work.
     pub share: Share,
+    /// Number of all frames; none while the length of a pipe is unknown.
+    pub frames: Option<u64>,
 }
+
+/// Frames that the manifest of a pipe names at first; it is written again when there are more.
+const MIN_NAMED: u64 = 256;
 
 /// Restored frames as 16-bit PNG: `frame_000000.png`, ..., 65535 for 1.
 #[derive(Debug)]
@@ -36,6 +41,8 @@ pub struct FrameFolder {
     path: PathBuf,
     size: Size,
     run: FolderRun,
+    /// Number of frames that the manifest names.
+    named: u64,
     _lock: FolderLock,
 }
 
@@ -67,7 +74,8 @@ impl FrameFolder {
             }
         }
         let lock = FolderLock::take(path, run.share)?;
-        let folder = Self { path: path.to_owned(), size, run, _lock: lock };
+        let named = run.frames.unwrap_or(MIN_NAMED);
+        let folder = Self { path: path.to_owned(), size, run, named, _lock: lock };
         if !manifest.is_file() {
             folder.write_manifest(false, &Value::Null)?;
             return Ok(folder);
@@ -81,7 +89,7 @@ impl FrameFolder {
                     "start over without parts, or remove the folder yourself",
                 ));
             }
-            folder.clear()?;
+            folder.clear(&found)?;
             folder.write_manifest(false, &Value::Null)?;
             return Ok(folder);
         }
@@ -136,13 +144,16 @@ impl FrameFolder {
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full.
-    pub fn push(&self, frame: u64, image: &Frame) -> Result<Frame> {
+    pub fn push(&mut self, frame: u64, image: &Frame) -> Result<Frame> {
+        if frame >= self.named {
+            self.named = 2 * (frame + 1);
+            self.write_manifest(false, &Value::Null)?;
+        }
         let path = self.file(frame);
-        // The last run may have been killed between writing and renaming.
-        let unfinished = self.path.join(format!(".frame_{frame:06}.png"));
-        save_png16(image, &unfinished)
-            .and_then(|()| std::fs::rename(&unfinished, &path))
-            .map_err(|e| Error::io("write", &path, e))?;
+        let png = encode_png16(image).map_err(|e| Error::io("write", &path, e))?;
+        let mut file = PendingFile::create(&path, Overwrite::Yes)?;
+        file.write_all(&png).map_err(|e| file.fault(e))?;
+        file.finish_unsynced()?;
         let seen = |v: &f32| (v.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
         Ok(Frame { size: self.size, data: image.data.iter().map(seen).collect() })
     }
@@ -168,7 +179,10 @@ impl FrameFolder {
     ///
     /// # Errors
     /// [`Error::Io`] if the disk is full.
-    pub fn finish(&self, results: &Value) -> Result<()> {
+    pub fn finish(&mut self, results: &Value) -> Result<()> {
+        if self.run.frames.is_none() {
+            self.named = self.finished(0..u64::MAX);
+        }
         self.write_manifest(true, results)
     }
 
@@ -177,29 +191,58 @@ impl FrameFolder {
             "version": 1,
             "program": program(),
             "complete": complete,
+            "frames": self.named,
             "settings": self.run.settings,
             "inputs": self.run.inputs,
             "results": results,
+            "crc32": BLANK,
         });
-        let mut file = PendingFile::create(&self.path.join(MANIFEST), Overwrite::Yes)?;
-        serde_json::to_writer_pretty(&mut file, &manifest).map_err(|e| file.fault(e.into()))?;
-        writeln!(file).map_err(|e| file.fault(e))?;
-        file.finish()
+        let text = format!("{manifest:#}\n");
+        let text = text.replacen(&checksum_entry(BLANK), &checksum_entry(&checksum(&text)), 1);
+        PendingFile::write_whole(&self.path.join(MANIFEST), text.as_bytes(), Overwrite::Yes)
     }
 
-    /// Removes our own files only.
-    fn clear(&self) -> Result<()> {
+    /// Removes the frames that the manifest `found` names, and nothing else.
+    fn clear(&self, found: &Value) -> Result<()> {
         let io = |e| Error::io("clear the output", &self.path, e);
+        let named = found["frames"].as_u64().unwrap_or(0);
+        let mut own = Vec::new();
         for entry in std::fs::read_dir(&self.path).map_err(io)? {
             let path = entry.map_err(io)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let ours = is_frame_name(name.trim_start_matches('.'));
-            if ours {
-                std::fs::remove_file(&path).map_err(io)?;
+            if is_frame_below(&name, named) {
+                own.push(path);
+            } else if is_frame_name(&name) {
+                return Err(Error::data(
+                    format!("the output holds `{name}`, which its {MANIFEST} does not name"),
+                    &self.path,
+                    "choose another name, or move that file away",
+                ));
             }
         }
-        Ok(())
+        own.iter().try_for_each(std::fs::remove_file).map_err(io)
     }
+}
+
+/// Stands for the checksum while it is computed.
+const BLANK: &str = "--------";
+
+/// Computes the CRC-32 of a manifest whose own checksum is blank.
+fn checksum(text: &str) -> String {
+    format!("{:08x}", crc32fast::hash(text.as_bytes()))
+}
+
+/// Returns false if the checksum in a manifest is not its content's. Where there is none, nothing is checked.
+fn is_whole(text: &[u8], manifest: &Value) -> bool {
+    let (Some(own), Ok(text)) = (manifest["crc32"].as_str(), std::str::from_utf8(text)) else {
+        return true;
+    };
+    checksum(&text.replacen(&checksum_entry(own), &checksum_entry(BLANK), 1)) == own
+}
+
+/// Returns the entry of a checksum in a manifest.
+fn checksum_entry(checksum: &str) -> String {
+    format!("\"crc32\": \"{checksum}\"")
 }
 
 fn read_manifest(path: &Path) -> Result<Value> {
@@ -210,11 +253,14 @@ fn read_manifest(path: &Path) -> Result<Value> {
         serde_json::from_slice(&text).map_err(|e| fault(format!("not a manifest: {e}")))?;
     let ours = manifest["program"].as_str().is_some_and(|program| program.starts_with("qudi "))
         && manifest["settings"].is_object();
+    if ours && manifest["program"] == program().as_str() && !is_whole(&text, &manifest) {
+        return Err(fault("its checksum does not fit its content: it is damaged".to_owned()));
+    }
     if ours {
         return Ok(manifest);
     }
     Err(Error::data(
-        format!("the output exists, and its {MANIFEST} was not written by this program"),
+        format!("the output exists, and its {MANIFEST} is of no restoration by this program"),
         path,
         "choose another name, or remove it yourself",
     ))
@@ -262,7 +308,7 @@ mod tests {
     const SIZE: Size = Size { height: 3, width: 4 };
 
     fn run(settings: Value) -> FolderRun {
-        FolderRun { settings, inputs: Inputs::default(), share: Share::Whole }
+        FolderRun { settings, inputs: Inputs::default(), share: Share::Whole, frames: Some(5) }
     }
 
     fn image() -> Frame {
@@ -277,7 +323,7 @@ mod tests {
         let open = |settings: &Value, overwrite| {
             FrameFolder::open(&path, SIZE, run(settings.clone()), overwrite)
         };
-        let folder = open(&settings, Overwrite::No).unwrap();
+        let mut folder = open(&settings, Overwrite::No).unwrap();
         let seen = folder.push(0, &image()).unwrap();
         folder.push(2, &image()).unwrap();
         drop(folder);
@@ -292,6 +338,38 @@ mod tests {
         let fresh = open(&other, Overwrite::Yes).unwrap();
         assert_eq!(fresh.finished(0..5), 0);
         assert!(path.join("notes.txt").is_file(), "only our own files are removed");
+    }
+
+    #[test]
+    fn removes_only_frames_that_the_manifest_names() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("out");
+        let open = |frames| {
+            let run = FolderRun { frames, ..run(json!({})) };
+            FrameFolder::open(&path, SIZE, run, Overwrite::Yes)
+        };
+        open(None).unwrap().push(MIN_NAMED + 1, &image()).unwrap();
+        assert_eq!(open(Some(2)).unwrap().finished(MIN_NAMED + 1..MIN_NAMED + 2), 0);
+        std::fs::write(path.join("frame_000002.png"), "mine").unwrap();
+        let words = open(Some(2)).unwrap_err().to_string();
+        assert!(words.contains("frame_000002.png"), "{words}");
+        assert!(path.join("frame_000002.png").is_file());
+    }
+
+    /// A link that lies where a frame is written is replaced, not followed.
+    #[cfg(unix)]
+    #[test]
+    fn follows_no_link_that_lies_in_the_folder() {
+        let scratch = tempfile::tempdir().unwrap();
+        let (path, victim) = (scratch.path().join("out"), scratch.path().join("victim"));
+        std::fs::write(&victim, "theirs").unwrap();
+        let mut folder = FrameFolder::open(&path, SIZE, run(json!({})), Overwrite::No).unwrap();
+        for name in [".frame_000000.png", "frame_000000.png"] {
+            std::os::unix::fs::symlink(&victim, path.join(name)).unwrap();
+        }
+        folder.push(0, &image()).unwrap();
+        assert_eq!(std::fs::read(&victim).unwrap(), b"theirs");
+        assert!(!path.join("frame_000000.png").is_symlink());
     }
 
     #[test]
@@ -318,7 +396,7 @@ mod tests {
         assert!(words.contains("frame_000000.png"), "{words}");
         std::fs::write(foreign.join(MANIFEST), r#"{"name": "a web page"}"#).unwrap();
         let words = open().unwrap_err().to_string();
-        assert!(words.contains("not written by this program"), "{words}");
+        assert!(words.contains("of no restoration"), "{words}");
         assert!(foreign.join("frame_000000.png").is_file());
     }
 
@@ -336,6 +414,22 @@ mod tests {
         drop(open(b"one").unwrap());
         let words = open(b"two").unwrap_err().to_string();
         assert!(words.contains("`capture` was 3 bytes with CRC-32"), "{words}");
+    }
+
+    #[test]
+    fn refuses_damaged_manifests() {
+        let scratch = tempfile::tempdir().unwrap();
+        let path = scratch.path().join("out");
+        let open = || FrameFolder::open(&path, SIZE, run(json!({"ppp": 3.25})), Overwrite::No);
+        drop(open().unwrap());
+        let manifest = std::fs::read_to_string(path.join(MANIFEST)).unwrap();
+        let other = manifest.replace("\"frames\": 5", "\"frames\": 4");
+        assert_ne!(manifest, other);
+        std::fs::write(path.join(MANIFEST), other).unwrap();
+        let words = open().unwrap_err().to_string();
+        assert!(words.contains("checksum"), "{words}");
+        std::fs::write(path.join(MANIFEST), manifest).unwrap();
+        assert!(open().is_ok());
     }
 
     #[test]

@@ -21,7 +21,7 @@ pub enum Share {
 
 /// The lock of a folder, held until it is dropped.
 #[derive(Debug)]
-pub(super) struct FolderLock {
+pub struct FolderLock {
     _folder: Option<File>,
     /// Lock of a part, and its file, which is removed afterwards.
     part: Option<(File, PathBuf)>,
@@ -32,7 +32,7 @@ impl FolderLock {
     ///
     /// # Errors
     /// [`Error::Data`] if another run holds it.
-    pub(super) fn take(path: &Path, share: Share) -> Result<Self> {
+    pub fn take(path: &Path, share: Share) -> Result<Self> {
         let folder = handle(path);
         let held = match share {
             Share::Whole => folder.as_ref().map(File::try_lock),
@@ -43,6 +43,10 @@ impl FolderLock {
             return Ok(Self { _folder: folder, part: None });
         };
         let file = path.join(format!(".part-{number}-of-{of}.lock"));
+        if file.is_symlink() {
+            let help = "remove the link, or choose another folder";
+            return Err(Error::data("a link lies where the lock of a part belongs", &file, help));
+        }
         let part = OpenOptions::new().create(true).append(true).open(&file);
         let part = part.map_err(|e| Error::io("create the lock", &file, e))?;
         let what = format!("another run is at work on part {number} of {of} of this folder");

@@ -4,15 +4,21 @@ use super::array::ArrayWriter;
 use super::gif::GifWriter;
 use super::mp4::Mp4Writer;
 use super::tiff_stack::{TiffSamples, TiffStack};
-use super::{frame_name, is_frame_name};
+use super::{frame_name, is_frame_below};
+use crate::restore::MANIFEST;
 use image::{ImageBuffer, Luma};
 use qudi_core::atomic_file::{Overwrite, OwnFolder, PendingFolder};
 use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
 use std::path::Path;
 
-/// A folder of frames only, recognised by the first.
-const FRAMES: OwnFolder = OwnFolder { marker: "frame_000000.png", is_own_file: is_frame_name };
+/// A folder of frames, with a manifest that says how many.
+const FRAMES: OwnFolder = OwnFolder {
+    manifest: MANIFEST,
+    is_named: |manifest, name| {
+        manifest["frames"].as_u64().is_some_and(|frames| is_frame_below(name, frames))
+    },
+};
 
 /// A clip of images as a TIFF stack.
 pub struct TiffWriter {
@@ -114,13 +120,22 @@ impl ClipWriter {
             Self::Tiff(writer) => writer.stack.finish(),
             Self::Gif(gif) => gif.finish(),
             Self::Mp4Writer(film) => film.finish(),
-            Self::Folder { folder, .. } => folder.finish(),
+            Self::Folder { folder, frames } => {
+                let program = concat!("qudi ", env!("CARGO_PKG_VERSION"));
+                let manifest = serde_json::json!({ "program": program, "frames": frames });
+                folder.finish(format!("{manifest:#}\n").as_bytes())
+            }
         }
     }
 }
 
-/// Writes a frame as 16-bit gray PNG; 65535 is 1.
-pub(crate) fn save_png16(frame: &Frame, path: &Path) -> std::io::Result<()> {
+/// Writes a frame as 16-bit gray PNG into a file; 65535 is 1.
+fn save_png16(frame: &Frame, path: &Path) -> std::io::Result<()> {
+    std::fs::write(path, encode_png16(frame)?)
+}
+
+/// Encodes a frame as 16-bit gray PNG; 65535 is 1.
+pub(crate) fn encode_png16(frame: &Frame) -> std::io::Result<Vec<u8>> {
     let samples = sixteen_bits(frame);
     let image = ImageBuffer::<Luma<u16>, _>::from_raw(
         frame.size.width as u32,
@@ -128,7 +143,9 @@ pub(crate) fn save_png16(frame: &Frame, path: &Path) -> std::io::Result<()> {
         samples,
     );
     let image = image.expect("a frame holds all its pixels");
-    image.save_with_format(path, image::ImageFormat::Png).map_err(std::io::Error::other)
+    let mut png = std::io::Cursor::new(Vec::new());
+    image.write_to(&mut png, image::ImageFormat::Png).map_err(std::io::Error::other)?;
+    Ok(png.into_inner())
 }
 
 fn sixteen_bits(frame: &Frame) -> Vec<u16> {

@@ -4,11 +4,12 @@ use super::config::WindowConfig;
 use super::flow::WindowFlow;
 use super::hourglass::normalized;
 use super::input::MIDDLE;
+use super::merging::{Gate, MERGED, Merged};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
 use qudi_layers::ResidualStack;
-use qudi_layers::resample::by_burst;
+use qudi_layers::resample::{by_burst, upsample2};
 
 /// Planes of the pre-denoised frames and of the linear estimate at half the resolution.
 const IMAGES: usize = 4;
@@ -24,10 +25,14 @@ const DIFFERENCE: f32 = 8.0;
 pub(super) struct Fusion {
     backward: ResidualStack,
     forward: ResidualStack,
+    gate: Gate,
 }
 
 /// The frames of all bursts as the cells see them.
 pub(super) struct Frames<'a> {
+    /// Pre-denoised frames and linear estimate in image units at full resolution, `[bursts * frames, 1, H, W]`
+    /// each.
+    pub(super) whole: [&'a Tensor<4>; 2],
     /// Pre-denoised frames in image units, `[bursts * frames, 4, h, w]`.
     pub(super) restored: &'a Tensor<4>,
     /// Linear estimate in image units, likewise.
@@ -40,75 +45,115 @@ pub(super) struct Frames<'a> {
 
 impl WindowConfig {
     pub(super) fn init_fusion(&self, device: &Device) -> Fusion {
-        let inputs = self.widths[0] + self.state + 4 * IMAGES;
+        let inputs = self.widths[0] + self.state + 4 * IMAGES + MERGED;
         let cell = |inputs| ResidualStack::zeros([inputs, self.state], self.cell_blocks, device);
-        Fusion { backward: cell(inputs), forward: cell(inputs + self.state) }
+        Fusion {
+            backward: cell(inputs),
+            forward: cell(inputs + self.state),
+            gate: Gate::zeros(self.widths[0], device),
+        }
     }
 }
 
+/// What the cells pass on from frame to frame.
+#[derive(Clone, Debug)]
+struct Passed {
+    hidden: Tensor<4>,
+    merged: Merged,
+}
+
+/// What a window is fused to, for every frame.
+#[derive(Debug)]
+pub(super) struct Fused {
+    /// States from the frames before, and from those after: `[bursts * frames, state, h, w]` each.
+    pub(super) states: [Tensor<4>; 2],
+    /// Linear estimates merged along the flow.
+    pub(super) merged: Merged,
+}
+
 impl Fusion {
-    /// Computes the states of every frame, from the frames before and from those after it:
-    /// `[bursts * frames, state, h, w]` each.
-    pub(super) fn forward(
-        &self,
-        window: &Frames<'_>,
-        flow: &WindowFlow,
-        state: usize,
-    ) -> [Tensor<4>; 2] {
+    /// Fuses the frames of every burst.
+    pub(super) fn forward(&self, window: &Frames<'_>, flow: &WindowFlow, state: usize) -> Fused {
         let count = window.count;
         let [images, _, h, w] = window.features.dims();
         let bursts = images / count;
-        let of_frame = |x: &Tensor<4>, frame: usize| {
-            let channels = x.dims()[1];
-            by_burst(x.clone(), count).narrow(1, frame, 1).reshape([bursts, channels, h, w])
+        // The flow learns from true frames: the gradient of what is warped here is mostly noise, and a
+        // hundred times as large.
+        let flow = WindowFlow { pairs: flow.pairs.clone().detach(), ..*flow };
+        let whole_flow = WindowFlow { pairs: upsample2(flow.pairs.clone()) * 2.0, scale: 1 };
+        let of_frames = |x: &Tensor<4>| -> Vec<Tensor<4>> {
+            let [_, channels, height, width] = x.dims();
+            let bursts_of = by_burst(x.clone(), count);
+            let one = |frame| bursts_of.clone().narrow(1, frame, 1);
+            (0..count).map(|k| one(k).reshape([bursts, channels, height, width])).collect()
         };
         let images_of_frames = Tensor::cat(vec![window.restored.clone(), window.linear.clone()], 1);
-        let frames: Vec<Tensor<4>> =
-            (0..count).map(|frame| of_frame(&images_of_frames, frame)).collect();
-        let features: Vec<Tensor<4>> =
-            (0..count).map(|frame| of_frame(window.features, frame)).collect();
+        let (frames, features) = (of_frames(&images_of_frames), of_frames(window.features));
+        let [restored, linear] = window.whole.map(of_frames);
         let step = |cell: &ResidualStack,
                     frame: usize,
-                    last: Option<(usize, &Tensor<4>)>,
+                    last: Option<(usize, &Passed)>,
                     more: Option<&Tensor<4>>| {
             let own = frames[frame].clone();
-            let (hidden, difference) = match last {
-                Some((neighbour, hidden)) => {
-                    // The flow learns from true frames: the gradient of what is warped here is mostly
-                    // noise, and a hundred times as large.
-                    let along = flow.of_frame(frame, neighbour > frame, count).detach();
-                    let both = Tensor::cat(vec![hidden.clone(), frames[neighbour].clone()], 1);
-                    let both = warp(both, along);
+            let (hidden, difference, merged) = match last {
+                Some((neighbour, passed)) => {
+                    let next = neighbour > frame;
+                    let along = flow.of_frame(frame, next, count);
+                    let both = vec![passed.hidden.clone(), frames[neighbour].clone()];
+                    let both = warp(Tensor::cat(both, 1), along);
                     let aligned = both.clone().narrow(1, state, 2 * IMAGES);
-                    (both.narrow(1, 0, state), (aligned - own.clone()) * DIFFERENCE)
+                    let merged = self.gate.merge(
+                        &passed.merged,
+                        linear[frame].clone(),
+                        restored[frame].clone(),
+                        features[frame].clone(),
+                        whole_flow.of_frame(frame, next, count),
+                    );
+                    (both.narrow(1, 0, state), (aligned - own.clone()) * DIFFERENCE, merged)
                 }
-                None => (Tensor::zeros([bursts, state, h, w], &own.device()), own.zeros_like()),
+                None => (
+                    Tensor::zeros([bursts, state, h, w], &own.device()),
+                    own.zeros_like(),
+                    Merged::single(linear[frame].clone()),
+                ),
             };
             let restored = own.clone().narrow(1, 0, IMAGES);
             let noise = (own.narrow(1, IMAGES, IMAGES) - restored.clone()) * SCALE;
-            let mut inputs = vec![
-                features[frame].clone(),
-                hidden,
-                (restored - MIDDLE) * SCALE,
-                noise,
-                difference,
-            ];
+            let images = vec![(restored - MIDDLE) * SCALE, noise, difference];
+            let mut inputs = vec![features[frame].clone(), hidden, Tensor::cat(images, 1)];
             inputs.extend(more.cloned());
-            normalized(cell.forward(&inputs))
+            inputs.push(merged.planes());
+            Passed { hidden: normalized(cell.forward(&inputs)), merged }
         };
-        let mut later: Vec<Tensor<4>> = Vec::with_capacity(count);
+        let mut later: Vec<Passed> = Vec::with_capacity(count);
         for frame in (0..count).rev() {
-            let last = later.last().map(|hidden| (frame + 1, hidden));
-            let hidden = step(&self.backward, frame, last, None);
-            later.push(hidden);
+            let last = later.last().map(|passed| (frame + 1, passed));
+            let passed = step(&self.backward, frame, last, None);
+            later.push(passed);
         }
         later.reverse();
-        let mut earlier: Vec<Tensor<4>> = Vec::with_capacity(count);
+        let mut earlier: Vec<Passed> = Vec::with_capacity(count);
         for (frame, later) in later.iter().enumerate() {
-            let last = earlier.last().map(|hidden| (frame - 1, hidden));
-            let hidden = step(&self.forward, frame, last, Some(later));
-            earlier.push(hidden);
+            let last = earlier.last().map(|passed| (frame - 1, passed));
+            let passed = step(&self.forward, frame, last, Some(&later.hidden));
+            earlier.push(passed);
         }
-        [earlier, later].map(|list| Tensor::stack::<5>(list, 1).reshape([images, state, h, w]))
+        let sides = [&earlier, &later];
+        let [before, after] = sides.map(|list| Merged {
+            mean: of_all(list.iter().map(|passed| &passed.merged.mean)),
+            frames: of_all(list.iter().map(|passed| &passed.merged.frames)),
+        });
+        Fused {
+            states: sides.map(|list| of_all(list.iter().map(|passed| &passed.hidden))),
+            merged: Merged::joined(&before, &after, window.whole[1].clone()),
+        }
     }
+}
+
+/// Joins the images of every frame, `[bursts, c, h, w]` each, to those of all: `[bursts * frames, c, h, w]`.
+fn of_all<'a>(frames: impl Iterator<Item = &'a Tensor<4>>) -> Tensor<4> {
+    let frames: Vec<Tensor<4>> = frames.cloned().collect();
+    let [bursts, channels, h, w] = frames[0].dims();
+    let images = bursts * frames.len();
+    Tensor::stack::<5>(frames, 1).reshape([images, channels, h, w])
 }

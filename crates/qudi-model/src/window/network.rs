@@ -2,7 +2,7 @@
 
 use super::config::{FOLD, WindowConfig};
 use super::flow::{Flow, WindowFlow};
-use super::fusion::{Frames, Fusion};
+use super::fusion::{Frames, Fused, Fusion};
 use super::hourglass::normalized;
 use super::initial::initial_values;
 use super::input::{MIDDLE, Measurement};
@@ -41,7 +41,10 @@ pub struct EncodedWindow {
     pub restored: Tensor<4>,
     /// Flow on all levels, finest first.
     pub flow: Vec<WindowFlow>,
+    /// Linear estimates merged along the flow, in image units, `[bursts * frames, 1, H, W]`.
+    pub merged: Tensor<4>,
     features: Vec<Tensor<4>>,
+    merged_planes: Tensor<4>,
     sensor: Tensor<4>,
     error_sigma: Tensor<4>,
 }
@@ -76,6 +79,16 @@ impl WindowConfig {
 }
 
 impl EncodedWindow {
+    /// Returns features, states and pre-denoised frames, `[bursts * frames, channels, h, w]` each.
+    pub(super) fn features(&self) -> &[Tensor<4>] {
+        &self.features
+    }
+
+    /// Returns the planes of merged frames, `[bursts * frames, 8, h, w]`.
+    pub(super) fn merged_planes(&self) -> &Tensor<4> {
+        &self.merged_planes
+    }
+
     /// Returns sigma of usual errors in [-1, 1], `[bursts * frames, 1, 1, 1]`.
     pub fn error_sigma(&self) -> &Tensor<4> {
         &self.error_sigma
@@ -88,6 +101,8 @@ impl EncodedWindow {
         let flow = |flow: &WindowFlow| WindowFlow { pairs: inner(&flow.pairs), ..*flow };
         Self {
             restored: inner(&self.restored),
+            merged: inner(&self.merged),
+            merged_planes: inner(&self.merged_planes),
             flow: self.flow.iter().map(flow).collect(),
             features: self.features.iter().map(inner).collect(),
             sensor: inner(&self.sensor),
@@ -106,14 +121,18 @@ impl Window {
         let features = normalized(pyramid[0].clone());
         let folded = pixel_unshuffle(restored.clone(), FOLD);
         let window = Frames {
+            whole: [&restored, &conditioning.linear_estimate],
             restored: &folded,
             linear: &measurement.linear,
             features: &features,
             count: frames,
         };
-        let [earlier, later] = self.fusion.forward(&window, &flow[0], self.state);
+        let Fused { states: [earlier, later], merged } =
+            self.fusion.forward(&window, &flow[0], self.state);
         let image = (folded - MIDDLE) * SCALE;
         EncodedWindow {
+            merged_planes: merged.planes(),
+            merged: merged.mean,
             restored,
             flow,
             features: vec![features, earlier, later, image],
@@ -132,7 +151,7 @@ impl Window {
         state: &DiffusionState,
         schedule: &NoiseSchedule,
     ) -> WindowPrediction {
-        let EncodedWindow { restored, features, sensor, error_sigma, .. } = encoded;
+        let EncodedWindow { restored, sensor, error_sigma, .. } = encoded;
         let images = restored.dims()[0];
         let device = restored.device();
         let of_steps = |f: &dyn Fn(f64) -> f64| {
@@ -171,7 +190,7 @@ impl Window {
             })
             .collect();
         let correction =
-            self.unet.forward(features, step, sensor.clone(), &log_snr, &state.has_previous);
+            self.unet.forward(encoded, step, sensor.clone(), &log_snr, &state.has_previous);
         WindowPrediction { x0: base + difference + correction * c_out.clone(), c_out }
     }
 }

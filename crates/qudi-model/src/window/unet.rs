@@ -3,6 +3,8 @@
 
 use super::config::{FOLD, WindowConfig};
 use super::hourglass::{Hourglass, ImageHead};
+use super::merging::MERGED;
+use super::network::EncodedWindow;
 use crate::diffusion::state::per_image;
 use crate::sensor::SENSOR_NUMBERS;
 use burn::module::Module;
@@ -41,7 +43,7 @@ pub(super) struct StepImages {
 impl WindowConfig {
     pub(super) fn init_unet(&self, device: &Device) -> UNet {
         let [between, planes] = EMBEDDING;
-        let inputs = self.widths[0] + 2 * self.state + 3 * IMAGE + planes;
+        let inputs = self.widths[0] + 2 * self.state + 3 * IMAGE + planes + MERGED;
         UNet {
             enter: Linear::zeros([SENSOR_NUMBERS + STEP_NUMBERS, between], device),
             leave: Linear::zeros([between, planes], device),
@@ -55,12 +57,11 @@ impl UNet {
     /// Computes a correction of unit size, `[images, 1, H, W]`.
     ///
     /// # Shapes
-    /// - encoded: features and states of the window, `[images, channels, h, w]` each
     /// - sensor: `[images, 11, 1, 1]`
     /// - log_snr: the logarithm of signal over noise of every burst
     pub(super) fn forward(
         &self,
-        encoded: &[Tensor<4>],
+        encoded: &EncodedWindow,
         images: StepImages,
         sensor: Tensor<4>,
         log_snr: &[f32],
@@ -89,8 +90,8 @@ impl UNet {
         let embedding = self.leave.forward(silu(self.enter.forward(described)));
         let [_, planes] = EMBEDDING;
         let embedding = embedding.reshape([count, planes, 1, 1]);
-        let [_, _, h, w] = encoded[0].dims();
-        let mut inputs = encoded.to_vec();
+        let mut inputs = encoded.features().to_vec();
+        let [_, _, h, w] = inputs[0].dims();
         inputs.push(Tensor::cat(
             vec![
                 pixel_unshuffle(images.noisy, FOLD),
@@ -99,6 +100,7 @@ impl UNet {
             ],
             1,
         ));
+        inputs.push(encoded.merged_planes().clone());
         let features = self.hourglass.forward(&inputs, Some(&embedding));
         self.head.forward(features[0].clone())
     }

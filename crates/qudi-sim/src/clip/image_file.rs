@@ -23,10 +23,26 @@ pub fn is_image(path: &Path) -> bool {
 /// # Errors
 /// [`Error`] if it cannot be read, is damaged, or is too large.
 pub fn read_still(path: &Path, transfer: Transfer) -> Result<Frame> {
-    to_gray(decode_image(path)?, path, transfer)
+    Ok(read_scaled(path, transfer, None)?.0)
 }
 
-/// Decodes one image as it is stored.
+/// Reads one image as gray values, of which `white` becomes 1, with the white that was assumed.
+///
+/// # Errors
+/// As [`read_still`].
+pub(super) fn read_scaled(
+    path: &Path,
+    transfer: Transfer,
+    white: Option<f32>,
+) -> Result<(Frame, AssumedWhite)> {
+    to_gray(decode_image(path)?, path, transfer, white)
+}
+
+/// White of samples of more than 8 bits where nobody says it: the full scale of their type, which 10, 12 or
+/// 14 bits stored in 16 do not reach.
+pub type AssumedWhite = Option<f32>;
+
+/// Decodes one image, turned as its metadata say.
 ///
 /// # Errors
 /// [`Error`] if it cannot be read, is damaged, or is too large.
@@ -35,7 +51,7 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
     let guessed = ImageReader::new(file).with_guessed_format();
     let reader = guessed.map_err(|e| Error::io("open the image", path, e))?;
     // A few kilobytes can decode to gigabytes of pixels: the size in the header is checked first.
-    let decoder = reader.into_decoder().map_err(|e| unreadable(e, path))?;
+    let mut decoder = reader.into_decoder().map_err(|e| unreadable(e, path))?;
     let (width, height) = decoder.dimensions();
     if u64::from(width) * u64::from(height) > IMAGE_PIXELS {
         return Err(Error::data(
@@ -54,7 +70,10 @@ pub fn decode_image(path: &Path) -> Result<DynamicImage> {
             "cut it into smaller images, or save it with fewer channels",
         ));
     }
-    DynamicImage::from_decoder(decoder).map_err(|e| unreadable(e, path))
+    let orientation = decoder.orientation().map_err(|e| unreadable(e, path))?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(|e| unreadable(e, path))?;
+    image.apply_orientation(orientation);
+    Ok(image)
 }
 
 /// Creates the error for an image that cannot be decoded.
@@ -71,7 +90,12 @@ fn unreadable(e: ImageError, path: &Path) -> Error {
     }
 }
 
-fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame> {
+fn to_gray(
+    image: DynamicImage,
+    path: &Path,
+    transfer: Transfer,
+    white: Option<f32>,
+) -> Result<(Frame, AssumedWhite)> {
     let size =
         Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
     let gray = |samples: Vec<f32>, channels: usize, alpha: bool| -> Vec<f32> {
@@ -83,8 +107,20 @@ fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame
             })
             .collect()
     };
-    let from_u8 = |raw: Vec<u8>| raw.into_iter().map(|v| f32::from(v) / 255.0).collect();
-    let from_u16 = |raw: Vec<u16>| raw.into_iter().map(|v| f32::from(v) / 65535.0).collect();
+    let of_u8 = white.unwrap_or(255.0);
+    let of_u16 = white.unwrap_or(65535.0);
+    let of_f32 = white.unwrap_or(1.0);
+    let from_u8 = |raw: Vec<u8>| raw.into_iter().map(|v| f32::from(v) / of_u8).collect();
+    let from_u16 = |raw: Vec<u16>| raw.into_iter().map(|v| f32::from(v) / of_u16).collect();
+    let from_f32 = |raw: Vec<f32>| raw.into_iter().map(|v| v / of_f32).collect();
+    let deep = matches!(
+        image,
+        DynamicImage::ImageLuma16(_)
+            | DynamicImage::ImageLumaA16(_)
+            | DynamicImage::ImageRgb16(_)
+            | DynamicImage::ImageRgba16(_)
+    );
+    let assumed = (deep && white.is_none()).then_some(65535.0);
     let channels = usize::from(image.color().channel_count());
     let alpha = image.color().has_alpha();
     let samples: Vec<f32> = match image {
@@ -96,8 +132,8 @@ fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame
         DynamicImage::ImageLumaA16(i) => from_u16(i.into_raw()),
         DynamicImage::ImageRgb16(i) => from_u16(i.into_raw()),
         DynamicImage::ImageRgba16(i) => from_u16(i.into_raw()),
-        DynamicImage::ImageRgb32F(i) => i.into_raw(),
-        DynamicImage::ImageRgba32F(i) => i.into_raw(),
+        DynamicImage::ImageRgb32F(i) => from_f32(i.into_raw()),
+        DynamicImage::ImageRgba32F(i) => from_f32(i.into_raw()),
         other => {
             return Err(Error::data(
                 format!("an image of unsupported type {:?}", other.color()),
@@ -108,7 +144,7 @@ fn to_gray(image: DynamicImage, path: &Path, transfer: Transfer) -> Result<Frame
     };
     let data = gray(samples, channels, alpha);
     check_values(&data, path)?;
-    Ok(Frame { size, data })
+    Ok((Frame { size, data }, assumed))
 }
 
 /// Checks that floating-point values are in [0, 1], as in all scenes.
@@ -149,6 +185,24 @@ mod tests {
         assert!(error.contains("over the limit of 134217728 pixels"), "{error}");
         std::fs::write(&path, empty_png(20)).unwrap();
         assert!(decode_image(&path).unwrap_err().to_string().contains("not a readable image"));
+    }
+
+    /// EXIF orientation 6: the first row of the picture is the right column of what is stored.
+    #[test]
+    fn turns_images_as_their_metadata_say() {
+        let stored = image::RgbImage::from_fn(16, 8, |x, _| image::Rgb([16 * x as u8; 3]));
+        let mut jpeg = Vec::new();
+        let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100);
+        stored.write_with_encoder(encoder).unwrap();
+        let mut exif = b"\xff\xe1\x00\x22Exif\0\0MM\0\x2a\0\0\0\x08\0\x01".to_vec();
+        exif.extend(b"\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0");
+        jpeg.splice(2..2, exif);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.jpg");
+        std::fs::write(&path, jpeg).unwrap();
+        let frame = read_still(&path, Transfer::AsIs).unwrap();
+        assert_eq!(frame.size, Size { height: 16, width: 8 });
+        assert!(frame.data[0] < 0.05 && frame.data[15 * 8] > 0.9, "dark above, bright below");
     }
 
     #[cfg(unix)]

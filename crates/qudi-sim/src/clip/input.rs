@@ -1,11 +1,12 @@
 //! Inputs in a form that can be recorded and opened again.
 
 use super::gif::Gif;
-use super::image_file::{EXTENSIONS, read_still};
+use super::image_file::{EXTENSIONS, read_scaled};
 use super::images::ImageFolder;
 use super::npy::NpyFrames;
 use super::recorded::{Recorded, Repeated};
 use super::synthetic::Synthetic;
+use super::tiff_pages::TiffPages;
 use super::video::Video;
 use super::y4m::Y4m;
 use super::{ExposureSource, FrameReader};
@@ -42,6 +43,11 @@ pub enum Input {
     },
     /// A `.npy` array of frames.
     Npy {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A TIFF of several pages.
+    Tiff {
         /// The file.
         path: PathBuf,
     },
@@ -84,7 +90,7 @@ pub struct Sampling {
     pub frames_per_image: u64,
     /// Meaning of file values.
     pub transfer: Transfer,
-    /// File value of white in `.npy` arrays, if not the type's full scale.
+    /// File value of white in arrays and images, if not the type's full scale.
     pub white: Option<f32>,
 }
 
@@ -102,6 +108,11 @@ impl Default for Sampling {
 
 fn one() -> u64 {
     1
+}
+
+/// Returns true for a TIFF of several pages. One that cannot be read is a still, whose reader says why.
+fn has_pages(path: &Path) -> bool {
+    TiffPages::open(path, Transfer::AsIs, None).is_ok_and(|tiff| tiff.pages() > 1)
 }
 
 /// Length of synthetic clips unless said otherwise: one window of the paper's network.
@@ -145,6 +156,7 @@ impl Input {
             "gif" => Self::Gif { path },
             "y4m" => Self::Y4m { path },
             "npy" => Self::Npy { path },
+            "tif" | "tiff" if motion.is_none() && has_pages(&path) => Self::Tiff { path },
             e if EXTENSIONS.contains(&e) => {
                 let motion = motion.unwrap_or_default();
                 return Ok(Self::Still { path, motion, size, seed });
@@ -233,10 +245,19 @@ impl Input {
                 "give a number above 0",
             ));
         }
+        let has_white = matches!(
+            self,
+            Self::Images { .. } | Self::Npy { .. } | Self::Tiff { .. } | Self::Still { .. }
+        );
+        if sampling.white.is_some() && !has_white {
+            let help = "leave it out: videos, GIF and scenes know their white";
+            return Err(Error::request("white of a clip that has its own", "white", help));
+        }
         let transfer = sampling.transfer;
         let synthetic_frames = sampling.frames.unwrap_or(SYNTHETIC_FRAMES);
         let reader: Box<dyn FrameReader> = match self {
-            Self::Images { path } => Box::new(ImageFolder::open(path, transfer)?),
+            Self::Images { path } => Box::new(ImageFolder::open(path, transfer, sampling.white)?),
+            Self::Tiff { path } => Box::new(TiffPages::open(path, transfer, sampling.white)?),
             Self::Gif { path } => Box::new(Gif::open(path, transfer)?),
             Self::Npy { path } => Box::new(NpyFrames::open(path, transfer, sampling.white)?),
             Self::Video { path } => Box::new(Video::open(path, transfer)?),
@@ -259,10 +280,11 @@ impl Input {
                 Box::new(Y4m::open(BufReader::with_capacity(1 << 18, file), stdin, transfer)?)
             }
             Self::Still { path, motion, size, seed } => {
-                let image = read_still(path, transfer)?;
+                let (image, assumed) = read_scaled(path, transfer, sampling.white)?;
                 let size = size.unwrap_or(image.size);
                 let scene = still_scene(image, *motion, size, *seed);
-                return Ok(Box::new(Synthetic::new(scene, synthetic_frames, sampling.instants)));
+                let instants = sampling.instants;
+                return Ok(Box::new(Synthetic::new(scene, synthetic_frames, instants, assumed)));
             }
             Self::Procedural(procedural) => {
                 let size = procedural.size;
@@ -278,11 +300,12 @@ impl Input {
                     procedural.scene(),
                     synthetic_frames,
                     sampling.instants,
+                    None,
                 )));
             }
         };
         let reader = Box::new(Repeated::new(reader, sampling.frames_per_image));
-        Ok(Box::new(Recorded::new(reader, sampling.instants, sampling.frames)))
+        Ok(Box::new(Recorded::new(reader, sampling.instants, sampling.frames)?))
     }
 
     /// Returns true for synthetic scenes, whose flow is known.
@@ -297,6 +320,7 @@ impl Input {
             | Self::Gif { path }
             | Self::Y4m { path }
             | Self::Npy { path }
+            | Self::Tiff { path }
             | Self::Video { path }
             | Self::Still { path, .. } => path.display().to_string(),
             Self::Procedural(p) => format!("scene:{}", p.kind.name()),

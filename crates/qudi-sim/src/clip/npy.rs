@@ -1,7 +1,7 @@
 //! Frames in a `.npy` array: `[frames][height][width]`, with 1 or 3 channels last if any.
 
 use super::FrameReader;
-use super::image_file::check_values;
+use super::image_file::{AssumedWhite, check_values};
 use qudi_core::Transfer;
 use qudi_core::npy::{Header, Sample};
 use qudi_core::{Error, Result};
@@ -19,11 +19,14 @@ pub(super) struct NpyFrames {
     path: PathBuf,
     transfer: Transfer,
     white: f32,
+    assumed_white: AssumedWhite,
 }
 
 impl NpyFrames {
     pub(super) fn open(path: &Path, transfer: Transfer, white: Option<f32>) -> Result<Self> {
         let (header, reader) = Header::open(path)?;
+        let deep = header.sample.bytes() > 1 && header.sample.full_scale() != Some(1.0);
+        let assumed_white = header.sample.full_scale().filter(|_| deep && white.is_none());
         let Some(white) = white.or(header.sample.full_scale()) else {
             return Err(Error::data(
                 "an array of wide integers, whose value of white is unknown",
@@ -56,6 +59,7 @@ impl NpyFrames {
             path: path.to_owned(),
             transfer,
             white,
+            assumed_white,
         })
     }
 }
@@ -67,6 +71,10 @@ impl FrameReader for NpyFrames {
 
     fn frames(&self) -> Option<u64> {
         Some(self.total)
+    }
+
+    fn assumed_white(&mut self) -> Result<AssumedWhite> {
+        Ok(self.assumed_white)
     }
 
     fn next(&mut self) -> Result<Option<Frame>> {

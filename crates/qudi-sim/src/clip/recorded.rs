@@ -1,6 +1,6 @@
 //! Recorded clips as exposures: each output frame sees `instants` recorded frames in turn.
 
-use super::{ClipInfo, Exposure, ExposureSource, FrameReader};
+use super::{AssumedWhite, ClipInfo, Exposure, ExposureSource, FrameReader};
 use qudi_core::flow::Flow;
 use qudi_core::{Frame, Result, Size};
 
@@ -28,6 +28,10 @@ impl FrameReader for Repeated {
         self.reader.frames().map(|frames| frames.saturating_mul(self.times))
     }
 
+    fn assumed_white(&mut self) -> Result<AssumedWhite> {
+        self.reader.assumed_white()
+    }
+
     fn next(&mut self) -> Result<Option<Frame>> {
         if let Some((frame, left)) = &mut self.current
             && *left > 0
@@ -47,13 +51,19 @@ pub(super) struct Recorded {
     reader: Box<dyn FrameReader>,
     instants: usize,
     left: Option<u64>,
+    assumed_white: AssumedWhite,
 }
 
 impl Recorded {
     /// Creates a source of at most `limit` exposures of `instants` recorded frames each, without an
     /// incomplete last one.
-    pub(super) fn new(reader: Box<dyn FrameReader>, instants: usize, limit: Option<u64>) -> Self {
-        Self { reader, instants, left: limit }
+    pub(super) fn new(
+        mut reader: Box<dyn FrameReader>,
+        instants: usize,
+        limit: Option<u64>,
+    ) -> Result<Self> {
+        let assumed_white = reader.assumed_white()?;
+        Ok(Self { reader, instants, left: limit, assumed_white })
     }
 }
 
@@ -64,7 +74,7 @@ impl ExposureSource for Recorded {
             (Some(there), Some(limit)) => Some(there.min(limit)),
             (there, _) => there,
         };
-        ClipInfo { size: self.reader.size(), frames }
+        ClipInfo { size: self.reader.size(), frames, assumed_white: self.assumed_white }
     }
 
     fn next(&mut self) -> Result<Option<Exposure>> {

@@ -1,6 +1,6 @@
 //! Synthetic scenes as exposures, rendered at the instants that each exposure needs.
 
-use super::{ClipInfo, Exposure, ExposureSource};
+use super::{AssumedWhite, ClipInfo, Exposure, ExposureSource};
 use crate::scene::Scene;
 use qudi_core::Result;
 use qudi_core::flow::Flow;
@@ -10,17 +10,24 @@ pub(super) struct Synthetic {
     frames: u64,
     instants: usize,
     next: u64,
+    assumed_white: AssumedWhite,
 }
 
 impl Synthetic {
-    pub(super) fn new(scene: Scene, frames: u64, instants: usize) -> Self {
-        Self { scene, frames, instants, next: 0 }
+    pub(super) fn new(
+        scene: Scene,
+        frames: u64,
+        instants: usize,
+        assumed_white: AssumedWhite,
+    ) -> Self {
+        Self { scene, frames, instants, next: 0, assumed_white }
     }
 }
 
 impl ExposureSource for Synthetic {
     fn info(&self) -> ClipInfo {
-        ClipInfo { size: self.scene.size, frames: Some(self.frames) }
+        let Self { frames, assumed_white, .. } = *self;
+        ClipInfo { size: self.scene.size, frames: Some(frames), assumed_white }
     }
 
     fn next(&mut self) -> Result<Option<Exposure>> {

@@ -283,8 +283,19 @@ mod tests {
             std::fs::write(file.path(), dark).unwrap_or_else(|e| panic!("{e}"));
             let error = (0..6).find_map(|number| cached(&recipe).sample(number).err());
             assert!(error.is_some_and(|e| e.to_string().contains("above 0")));
+            let mut flipped = bytes.clone();
+            flipped[bytes.len() - 1] ^= 4;
+            std::fs::write(file.path(), flipped).unwrap_or_else(|e| panic!("{e}"));
+            let error = (0..6).find_map(|number| cached(&recipe).sample(number).err());
+            assert!(error.is_some_and(|e| e.to_string().contains("digest")));
             std::fs::write(file.path(), bytes).unwrap_or_else(|e| panic!("{e}"));
         }
+        let path = |number: u64| folder.path().join(format!("1-{number:06}.safetensors"));
+        let kept = std::fs::read(path(1)).unwrap_or_else(|e| panic!("{e}"));
+        std::fs::copy(path(0), path(1)).unwrap_or_else(|e| panic!("{e}"));
+        let error = (0..6).find_map(|number| cached(&recipe).sample(number).err());
+        assert!(error.is_some_and(|e| e.to_string().contains("it holds burst 0, and not 1")));
+        std::fs::write(path(1), kept).unwrap_or_else(|e| panic!("{e}"));
         // What other weights restored is something else, too.
         let device = burn::tensor::Device::flex();
         let config = recipe.network.regression().unwrap_or_else(|e| panic!("{e}"));

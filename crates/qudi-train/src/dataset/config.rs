@@ -74,8 +74,8 @@ pub struct SourceConfig {
     /// Largest step through a clip, in its frames: with 2, motion is also twice as fast.
     #[serde(default = "one_frame")]
     pub stride: usize,
-    /// Largest factor by which packed clips and stills are downscaled; each sample draws one log-uniformly from 1 to
-    /// it.
+    /// Largest factor by which packed clips and stills are downscaled; each sample draws one log-uniformly
+    /// from 1 to it.
     #[serde(default = "one")]
     pub max_downscale: f64,
     /// Fastest motion given to stills and procedural scenes, in pixels per frame.
@@ -111,6 +111,11 @@ fn usual_speed() -> f64 {
 }
 
 impl SourceConfig {
+    /// Returns true if its scenes come from files.
+    pub fn reads_files(&self) -> bool {
+        self.kind != SourceKind::Scenes
+    }
+
     /// Draws the factor by which a sample is downscaled.
     pub(super) fn factor(&self, random: &mut impl Rng) -> f64 {
         if self.max_downscale > 1.0 { self.max_downscale.powf(uniform(random)) } else { 1.0 }
@@ -259,7 +264,7 @@ impl DataConfig {
 
     /// Returns the sources that read files, as a pack holds them.
     pub fn packed_sources(&self) -> Vec<PackedSource> {
-        let files = self.source.iter().filter(|source| source.kind != SourceKind::Scenes);
+        let files = self.source.iter().filter(|source| source.reads_files());
         files
             .map(|source| PackedSource {
                 name: source.name.clone(),

@@ -1,9 +1,9 @@
 //! Coding of a pack's frames: gray JPEG for training, gray PNG for validation.
 //!
 //! JPEG has one quantization step for all frequencies instead of the usual tables, which remove fine texture:
-//! texture is what a network has to learn. The error is then about the same everywhere, at most
-//! [`STEP`] / sqrt(12) = 3.8 of 255 (root mean square over a block, rounding included); where coefficients are
-//! small it is less. Photon noise at 30 photons per pixel has ten times as much at mid-gray.
+//! texture is what a network has to learn. The root-mean-square error is about [`STEP`] / sqrt(12) = 3.8 of
+//! 255 in the finest texture, and less where coefficients are small; photon noise at 30 photons per pixel is
+//! six times as much at mid-gray.
 
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
@@ -124,6 +124,6 @@ mod tests {
             }
         }
         let wide = Size { height: 1, width: 70_000 };
-        assert!(FrameCodec::Jpeg.encode(&[0; 70_000], wide).is_err());
+        assert!(FrameCodec::Jpeg.encode(&vec![0; 70_000], wide).is_err());
     }
 }

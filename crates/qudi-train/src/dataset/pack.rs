@@ -1,8 +1,8 @@
 //! Decoded training data in one file: a ZIP archive of gray images with an index, which any tool opens.
 //!
-//! Frames for training are JPEG (quantized, see `frame_codec`), downscaled by `data.source.shrink`; validation
-//! clips are PNG, exact, and only the middle that a recipe measures. A pack is decoded once, when it is
-//! opened, and stays in memory with one byte per pixel: 0.3 GB for the sources of `data/open-scenes.toml`.
+//! Frames for training are JPEG (quantized, see `frame_codec`), downscaled by `data.source.shrink`;
+//! validation clips are PNG, exact, and only the middle that a recipe measures. A pack is decoded once, when
+//! it is opened, and stays in memory with one byte per pixel: 0.3 GB for `data/open-scenes.toml`.
 
 use super::pack_index::{Clip, INDEX, Index, PackedSource, damaged};
 use qudi_core::limits::PACK_INDEX_BYTES;
@@ -74,7 +74,9 @@ impl Pack {
         while frames.len() < images.len() {
             let rest = &images[frames.len()..];
             let batch = read_batch(&mut archive, &index, rest, path)?;
-            batch.iter().for_each(|image| digest.update(image));
+            for image in &batch {
+                digest.update(image);
+            }
             let decode = |(&(clip, frame), image): (&(&Clip, usize), &Vec<u8>)| {
                 let codec = index.source(clip).expect("checked in the index").codec();
                 let fault = |e| damaged(path, format!("{}: {e}", index.entry(clip, frame)));

@@ -36,9 +36,9 @@ struct Image {
     psnr: f64,
 }
 
-/// Decodes every clip and still of `sources`, below the folder `data`, into one pack. Returns the mean PSNR of
-/// training frames, as decoded from the pack, against their downscaled sources. `on` receives every clip, and
-/// returns `Break` to stop.
+/// Decodes every clip and still of `sources`, below the folder `data`, into one pack. Returns the mean PSNR
+/// of training frames, as decoded from the pack, against their downscaled sources. `on` receives every clip,
+/// and returns `Break` to stop.
 ///
 /// # Errors
 /// [`Error`] if something cannot be read or written; [`Error::Interrupted`] if asked to stop.

@@ -72,8 +72,12 @@ impl Learner for Window {
         // Errors in units of what they usually are: no light level drowns another.
         let error = (prediction.x0 - truth.clone()) / prediction.c_out;
         sum.add("prediction", weights.prediction, log_mean_square(error));
-        let error = (encoded.restored.clone() * 2.0 - 1.0 - truth) / encoded.error_sigma().clone();
-        sum.add("pre", weights.pre, log_mean_square(error));
+        let before = |frames: &Tensor<4>| {
+            let error = frames.clone() * 2.0 - 1.0 - truth.clone();
+            log_mean_square(error / encoded.error_sigma().clone())
+        };
+        sum.add("pre", weights.pre, before(&encoded.restored));
+        sum.add("merged", weights.pre, before(&encoded.merged));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
         let flow = flows.reduce(Tensor::add).expect("a level");

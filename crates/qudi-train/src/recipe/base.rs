@@ -1,9 +1,10 @@
 //! `base = "data/open-clips.toml"` in a recipe: a file of tables that several recipes share.
 
+use super::Recipe;
 use qudi_core::limits::TEXT_BYTES;
 use qudi_core::regular_file::read_text;
 use qudi_core::{Error, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 /// Bases inside the program by name.
@@ -24,7 +25,7 @@ pub(super) fn over_base(mut recipe: Table, folder: Option<&Path>) -> Result<Tabl
     let Some(name) = name.as_str() else {
         return Err(Error::request("`base` is not a string", "base", help));
     };
-    let file = folder.map(|folder| folder.join(name)).filter(|path| path.exists());
+    let file = beside(folder, name);
     let built_in = BASES.iter().find(|(base, _)| *base == name).map(|(_, text)| (*text).to_owned());
     let text = match (file, built_in) {
         (Some(path), _) => read_text(&path, TEXT_BYTES, "read the base of the recipe")?,
@@ -37,6 +38,20 @@ pub(super) fn over_base(mut recipe: Table, folder: Option<&Path>) -> Result<Tabl
     let mut base = parsed.map_err(fault)?;
     merge(&mut base, recipe);
     Ok(base)
+}
+
+/// Returns the base of this name in the recipe's folder, if it is there.
+fn beside(folder: Option<&Path>, name: &str) -> Option<PathBuf> {
+    folder.map(|folder| folder.join(name)).filter(|path| path.exists())
+}
+
+impl Recipe {
+    /// Returns the file of the base that the recipe in a file names; none if the base is built in.
+    pub fn base_file(path: &Path) -> Option<PathBuf> {
+        let text = read_text(path, TEXT_BYTES, "read the recipe").ok()?;
+        let recipe: Table = text.parse().ok()?;
+        beside(path.parent(), recipe.get("base")?.as_str()?)
+    }
 }
 
 /// Returns the tables of a built-in recipe, laid over its base.

@@ -40,9 +40,9 @@ pub(crate) struct Bench {
     /// --train: how long
     #[arg(long, value_name = "S", default_value = "60", requires = "train", allow_negative_numbers = true, value_parser = number::real(number::SECONDS))]
     pub(crate) seconds: f64,
-    /// --train: threads that draw samples
-    #[arg(long, value_name = "N", default_value = "1", requires = "train", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
-    pub(crate) workers: usize,
+    /// --train: threads that draw samples [default: as for `qudi train`]
+    #[arg(long, value_name = "N", requires = "train", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
+    pub(crate) workers: Option<usize>,
     /// --train: folder with the weights of LPIPS, as for `qudi train`
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, requires = "train")]
     pub(crate) backbones: Option<PathBuf>,

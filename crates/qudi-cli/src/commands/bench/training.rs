@@ -12,7 +12,7 @@ use qudi_model::diffusion::Diffusion;
 use qudi_model::regression::Regression;
 use qudi_model::window::Window;
 use qudi_train::dataset::Pack;
-use qudi_train::{Files, Learner, NetworkRecipe, Recipe, TrainingSpeed};
+use qudi_train::{Files, Learner, NetworkRecipe, Recipe, TrainingSpeed, default_workers};
 use serde_json::json;
 
 /// Trains the recipe for a while and reports its speed.
@@ -41,7 +41,7 @@ fn measure<L: Learner>(recipe: &Recipe, args: &Bench, report: &Report) -> Result
             files,
             &opened.device,
             args.backbones.as_deref(),
-            args.workers,
+            args.workers.unwrap_or_else(default_workers),
             args.seconds,
             &mut |seconds| {
                 bar.update("training", seconds as u64, Some(args.seconds as u64));

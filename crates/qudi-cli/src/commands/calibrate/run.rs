@@ -5,7 +5,7 @@ use crate::args::{Global, Sum};
 use crate::capture::{remarks, required_sensor};
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::places::Places;
+use crate::places::calibration_maps;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
@@ -32,14 +32,7 @@ pub(crate) fn run(
             "name it, for example, camera.toml",
         ));
     }
-    let maps = ["dark", "bad"].map(|map| args.output.with_extension(format!("{map}.npy")));
-    Places::default()
-        .reads_burst(&args.capture)
-        .reads(args.reading.files())
-        .reads(args.sensor.as_deref())
-        .writes(&maps)
-        .writes([&args.output])
-        .check()?;
+    let maps = calibration_maps(&args.output);
     for path in maps.iter().chain([&args.output]) {
         refuse_taken(path, overwrite)?;
     }
@@ -71,6 +64,11 @@ pub(crate) fn run(
     // What was written must be readable.
     Sensor::load(&args.output.to_string_lossy())?;
     remarks(&capture, report);
+    if let Some(correlation) = calibration.picture {
+        report.warning(&format!(
+            "neighbouring pixels have like rates (correlation {correlation:.2}): the capture shows a picture, or the sensor glows; close the shutter and cover it"
+        ));
+    }
     let per_second = |rate: f64| fps.map_or(String::new(), |fps| format!(" ({:.1}/s)", rate * fps));
     let mut text = String::new();
     let _ = writeln!(

@@ -5,7 +5,6 @@ use crate::args::{Global, Sum};
 use crate::capture::{is_pipe, refuse_terminal, remarks, sum_by_itself};
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::places::Places;
 use crate::report::{Bar, Report};
 use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
@@ -19,18 +18,17 @@ use std::path::Path;
 pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()> {
     let overwrite = global.overwrite();
     let options = args.reading.options(MaskChoice::None);
-    let format = BurstFormat::for_path(&args.output, 1, true);
-    let record = format.ok().map(|format| format.record_path(&args.output));
-    Places::default()
-        .reads_burst(&args.capture)
-        .reads(args.reading.files())
-        .writes([&args.output])
-        .writes(record.filter(|record| !record.starts_with(&args.output)))
-        .check()?;
     refuse_taken(&args.output, overwrite)?;
     let mut capture = open(args, &options)?;
     let max_count = largest_count(&mut capture, args)?;
     let format = BurstFormat::for_path(&args.output, max_count, !args.unpacked)?;
+    if args.unpacked && !(format == BurstFormat::NpyU8 && max_count == 1) {
+        return Err(CliError::new(
+            format!("counts up to {max_count} in {} are not packed", args.output.display()),
+            "--unpacked",
+            "leave it out: only binary .npy bursts are packed",
+        ));
+    }
     refuse_taken(&format.record_path(&args.output), overwrite)?;
     let size = capture.size();
     let mut writer = BurstWriter::create(&args.output, format, size, max_count, overwrite)?;

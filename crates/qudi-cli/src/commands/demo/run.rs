@@ -9,7 +9,6 @@ use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::network::{self, NetworkChoice};
 use crate::methods::trained::built_in_knows;
-use crate::places::Places;
 use crate::report::{Bar, Cell, Column, Output, Report, Table, json};
 use crate::settings::Settings;
 use qudi_burst::Average;
@@ -59,11 +58,6 @@ pub(crate) fn run(
         let help = "name a .png; the page lies next to it";
         return Err(CliError::new("the picture and the page are one file", path.display(), help));
     }
-    Places::default()
-        .reads([&demo.sensor])
-        .reads(demo.network.weight_files())
-        .writes([&path, &page])
-        .check()?;
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
     let page_file = Output::open(Some(&page), overwrite)?;

@@ -77,6 +77,9 @@ pub(crate) struct Eval {
     /// join
     #[arg(long, value_name = "I/N", conflicts_with = "capture")]
     pub(crate) shard: Option<Shard>,
+    /// Join the parts of --shard, which were printed with --json: the same figures as of one run
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["capture", "shard", "external", "export_photons", "html"], value_hint = ValueHint::FilePath)]
+    pub(crate) join: Vec<PathBuf>,
     /// Write every figure of every frame
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) csv: Option<PathBuf>,
@@ -115,16 +118,6 @@ pub(crate) enum Protocol {
     Strict,
     /// The public code of QUIVER, seeded: overlapping windows share no photon
     Quiver,
-}
-
-impl Protocol {
-    /// Returns the name on the command line.
-    pub(crate) fn name(self) -> &'static str {
-        match self {
-            Self::Strict => "strict",
-            Self::Quiver => "quiver",
-        }
-    }
 }
 
 /// Frames of another program.

@@ -45,6 +45,7 @@ pub(crate) fn evaluate_capture(
         options: &plan.read,
         sum: plan.sum,
         sensor: plan.sensor.as_deref(),
+        judged: u64::MAX,
     };
     let summed = SummedCapture::new(source.open(overrides)?, &source)?;
     let sensor = summed.required_sensor()?;
@@ -137,6 +138,7 @@ fn score(
         flicker: None,
         flow: None,
         added: None,
+        range: None,
         seconds_per_frame: Some(seconds / frames as f64),
         peak_mib: peak.grown_mib(),
         frames: sink.frames,

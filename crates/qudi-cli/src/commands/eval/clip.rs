@@ -78,12 +78,6 @@ impl Clip {
         Ok(clips.into_iter().filter(|clip| names.contains(&clip.name)).collect())
     }
 
-    /// Returns the clips' files and folders; none for a scene.
-    pub(crate) fn places(data: &str) -> Result<Vec<PathBuf>> {
-        let clips = if data.starts_with("scene:") { Vec::new() } else { Self::find(data)? };
-        Ok(clips.into_iter().map(|clip| PathBuf::from(clip.place)).collect())
-    }
-
     /// Returns its name.
     pub(crate) fn name(&self) -> &str {
         &self.name
@@ -123,6 +117,7 @@ impl Clip {
         let acquisition = Acquisition::new(sensor.clone(), summary.light.ppp, USUAL_MEAN_LEVEL)?;
         let mut acquisition = acquisition.with_seed(exposing.seed);
         acquisition.gain = summary.gain;
+        acquisition = acquisition.without_echoes()?;
         acquisition.mean_level = if let Some(mean_level) = plan.mean_level {
             mean_level
         } else {
@@ -148,8 +143,16 @@ impl Clip {
             acquisition,
             perceptual: plan.perceptual.clone(),
             appearance: plan.appearance,
+            notes: summary.notes,
         })
     }
+}
+
+/// Returns the files and folders of the clips in `data`; none for a scene, or where there are none.
+pub(crate) fn clip_places(data: &str) -> Vec<PathBuf> {
+    let clips =
+        if data.starts_with("scene:") { Vec::new() } else { Clip::find(data).unwrap_or_default() };
+    clips.into_iter().map(|clip| PathBuf::from(clip.place)).collect()
 }
 
 /// Returns the name of a clip: of a file without its extension, of a folder as it is, dots and all.
@@ -163,12 +166,19 @@ pub(crate) fn stem(path: &Path) -> String {
 /// Returns the names of clips: of files without the extension, of folders in full, since `run.1` and `run.2`
 /// are two clips. Files that differ in the extension alone keep it.
 fn clip_names(clips: &[PathBuf]) -> Vec<String> {
-    let names: Vec<String> = clips.iter().map(|path| stem(path)).collect();
-    let is_unique = |name: &String| names.iter().filter(|other| *other == name).count() == 1;
-    let name = |(path, name): (&PathBuf, &String)| {
-        if is_unique(name) { name.clone() } else { full_name(path) }
-    };
-    clips.iter().zip(&names).map(name).collect()
+    let mut names: Vec<String> = clips.iter().map(|path| stem(path)).collect();
+    // A name in full may be another clip's short one.
+    loop {
+        let is_unique = |name: &String| names.iter().filter(|other| *other == name).count() == 1;
+        let name = |(path, name): (&PathBuf, &String)| {
+            if is_unique(name) { name.clone() } else { full_name(path) }
+        };
+        let unique: Vec<String> = clips.iter().zip(&names).map(name).collect();
+        if unique == names {
+            return names;
+        }
+        names = unique;
+    }
 }
 
 fn full_name(path: &Path) -> String {

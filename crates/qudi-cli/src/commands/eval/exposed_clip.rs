@@ -1,6 +1,7 @@
 //! One clip, exposed at one light level, scored for every method.
 
 use super::args::External;
+use super::external::ExternalFrames;
 use super::html::Pictures;
 use super::metrics::{Compared, aligned, scaled};
 use super::perceptual::Perceptual;
@@ -12,13 +13,11 @@ use crate::memory::PeakMemory;
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;
 use qudi_core::metrics::{Consistency, OCTAVES, best_gain, octave_energies};
-use qudi_core::npy::read_clip;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::windows::Windows;
 use qudi_core::{Camera, Frame, Light, Size};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
-use qudi_sim::clip::{Input, Sampling};
 use qudi_sim::{Exposed, Sink, Start};
 use std::rc::Rc;
 use std::time::Instant;
@@ -74,6 +73,8 @@ pub(super) struct ExposedClip {
     pub(super) perceptual: Option<Rc<Perceptual>>,
     /// True if appearance is measured.
     pub(super) appearance: bool,
+    /// What makes the clip doubtful.
+    pub(super) notes: Vec<String>,
 }
 
 impl ExposedClip {
@@ -173,6 +174,7 @@ impl ExposedClip {
             flicker: None,
             flow: None,
             added: None,
+            range: None,
             seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
             peak_mib: highest,
             picture,
@@ -191,21 +193,8 @@ impl ExposedClip {
 
     /// Scores frames that another program made of the exported photons.
     pub(super) fn score_external(&self, external: &External) -> Result<Score> {
-        let name = burst_name(&self.name, self.ppp);
-        let array = external.folder.join(format!("{name}.npy"));
-        let (place, frames) = if array.is_file() {
-            let frames = read_clip(&array, usize::MAX)?;
-            (array, frames)
-        } else {
-            let place = external.folder.join(name);
-            let input = Input::parse(&place.display().to_string(), None, None, 1, 0.0)?;
-            let mut source = input.open(&Sampling::default())?;
-            let mut frames = Vec::new();
-            while let Some(exposure) = source.next()? {
-                frames.push(exposure.truth().clone());
-            }
-            (place, frames)
-        };
+        let ExternalFrames { frames, place, range: [low, high] } =
+            ExternalFrames::read(external, &self.name, self.ppp)?;
         let expected = self.photons.truth.len();
         if frames.len() != expected || frames.iter().any(|frame| frame.size != self.size) {
             return Err(CliError::new(
@@ -218,7 +207,8 @@ impl ExposedClip {
                 "restore every frame of the burst that --export-photons wrote",
             ));
         }
-        self.score(&frames, &[], None, " (another program)".to_owned())
+        let how = format!(" (another program, values from {low:.3} to {high:.3})");
+        Ok(Score { range: Some([low, high]), ..self.score(&frames, &[], None, how)? })
     }
 
     /// Scores all frames; `sigmas` are their predicted standard deviations, if there are any.
@@ -249,6 +239,7 @@ impl ExposedClip {
                 Motion::Estimated(_) => Some(FlowKind::Estimated),
             },
             added: None,
+            range: None,
             seconds_per_frame: cost.map(|cost| cost.seconds_per_frame),
             peak_mib: cost.and_then(|cost| cost.peak_mib),
             picture: aligned(

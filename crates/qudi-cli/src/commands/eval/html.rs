@@ -239,6 +239,7 @@ mod tests {
             flicker: None,
             flow: None,
             added: None,
+            range: None,
             seconds_per_frame: None,
             peak_mib: None,
             picture: Frame::filled(size, 0.5),

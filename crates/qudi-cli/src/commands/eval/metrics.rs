@@ -156,7 +156,7 @@ impl Metric {
             Better::Lower => value > bar,
             Better::One => (value - 1.0).abs() > (bar - 1.0).abs(),
         };
-        value.is_nan() || is_worse
+        !value.is_finite() || is_worse
     }
 }
 
@@ -226,6 +226,8 @@ mod tests {
         }
         assert!(PSNR_A.misses(9.9, 10.0) && !PSNR_A.misses(10.0, 10.0));
         assert!(GMSD.misses(0.2, 0.1) && CHI_SQUARE.misses(0.5, 1.2));
-        assert!(METRICS.iter().all(|metric| metric.misses(f64::NAN, 0.0)));
+        for value in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            assert!(METRICS.iter().all(|metric| metric.misses(value, 0.0)));
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! The plan of an evaluation: its arguments, checked once.
 
 use super::args::{Eval, External, Protocol};
+use super::external::check_names;
 use super::perceptual::Perceptual;
 use super::score::Row;
 use super::table1;
@@ -86,6 +87,7 @@ impl Plan {
     /// [`CliError`] for unknown methods and arguments that do not go together.
     pub(super) fn new(args: &Eval, overwrite: Overwrite) -> Result<Self> {
         checked_mean_level(args.mean_level)?;
+        check_names(&args.external)?;
         let mut steps = args.steps.clone();
         steps.sort_unstable();
         steps.dedup();

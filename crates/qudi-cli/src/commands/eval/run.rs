@@ -1,21 +1,23 @@
 //! `qudi eval`: methods against known truth on the same photons, or on a real capture without one.
 
+use super::about::about;
 use super::args::{Eval, External, Protocol};
 use super::capture::{Evaluation, evaluate_capture};
 use super::clip::Clip;
 use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
 use super::html::{Pictures, html};
+use super::join::join;
+use super::mark::remarks;
 use super::metrics::{METRICS, Metric, PSNR_A, Part};
 use super::plan::Plan;
-use super::score::{FlowKind, Row, Score};
+use super::score::{Row, Score};
 use super::table::{frames, looks, summary};
 use super::table1;
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::trained::refusal;
-use crate::places::Places;
 use crate::report::{Output, Report, csv, markdown};
 use crate::settings::Settings;
 use qudi_core::Frame;
@@ -30,18 +32,6 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let overwrite = global.overwrite();
-    let clips = if args.capture { Vec::new() } else { Clip::places(&args.data)? };
-    let outputs = [&args.csv, &args.markdown, &args.html, &args.export_photons];
-    let external = args.external.iter().map(|external| &external.folder);
-    Places::default()
-        .reads(args.capture.then_some(&args.data))
-        .reads(clips)
-        .reads(external)
-        .reads(args.sensor.as_deref())
-        .reads(args.network.weight_files())
-        .reads(&args.backbones)
-        .writes(outputs.into_iter().flatten())
-        .check()?;
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
     let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
     let html_file = output(&args.html)?;
@@ -49,11 +39,22 @@ pub(crate) fn run(
         refuse_taken(folder, overwrite)?;
     }
     let plan = Plan::new(args, overwrite)?;
-    let Evaluation { rows, pictures, about, settings } = if args.capture {
+    let Evaluation { rows, pictures, about, settings } = if !args.join.is_empty() {
+        join(&args.join)?
+    } else if args.capture {
         evaluate_capture(&plan, settings, report)?
     } else {
         evaluate_clips(&plan, settings, report)?
     };
+    for remark in remarks(&rows) {
+        report.warning(&remark);
+    }
+    for (row, score) in rows.iter().flat_map(|row| row.scores.iter().map(move |s| (row, s))) {
+        if let Some([low, high]) = score.range {
+            let frames = format!("{} of {} at {} PPP", row.method, score.clip, row.ppp);
+            report.remark(&format!("note: values of {frames} run from {low:.4} to {high:.4}"));
+        }
+    }
     csv_file.write(|| Ok(csv::table(&frames(&rows))))?;
     let mut further = looks(&rows);
     let mut about = about;
@@ -78,20 +79,23 @@ pub(crate) fn run(
     let shown = further.iter().map(|(title, table)| format!("{title}\n{}\n", table.to_text()));
     let text = format!("{}\n{}{about}\n", table.to_text(), shown.collect::<String>());
     report.result(&text, || document(settings, &rows))?;
-    let psnr_a = |row: &Row| row.over_clips(&PSNR_A).map_or(f64::NAN, |s| s.mean);
-    let misses = |row: &Row, bar: f64| row.refused.is_none() && PSNR_A.misses(psnr_a(row), bar);
-    match args.min_psnr {
-        Some(bar) => match rows.iter().find(|row| misses(row, bar)) {
-            Some(row) => Err(CliError::Missed(format!(
-                "missed: {} reaches {:.2} dB at {} PPP, below {bar}",
-                row.label(),
-                psnr_a(row),
-                row.ppp
-            ))),
-            None => Ok(()),
-        },
+    match args.min_psnr.and_then(|bar| missed(&rows, bar)) {
+        Some(missed) => Err(CliError::Missed(missed)),
         None => Ok(()),
     }
+}
+
+/// Returns what misses a least psnr-a: the first method that is worse, or was not measured.
+fn missed(rows: &[Row], bar: f64) -> Option<String> {
+    let psnr_a = |row: &Row| row.over_clips(&PSNR_A).map_or(f64::NAN, |s| s.mean);
+    let row = rows.iter().find(|row| row.refused.is_some() || PSNR_A.misses(psnr_a(row), bar))?;
+    let (method, ppp) = (row.label(), row.ppp);
+    Some(match &row.refused {
+        Some(reason) => format!("missed: {method} was not measured at {ppp} PPP: {reason}"),
+        None => {
+            format!("missed: {method} reaches {:.2} dB at {ppp} PPP, below {bar}", psnr_a(row))
+        }
+    })
 }
 
 /// Evaluates every method on every clip at every light level.
@@ -125,8 +129,7 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     let each = rows.len() / levels.len();
     let mut pictures = Vec::new();
     let mut bar = report.bar();
-    let number = clips.len();
-    let total = (number * levels.len()) as u64;
+    let total = (clips.len() * levels.len()) as u64;
     // By value: what was found out about a clip goes with it.
     for (i, clip) in clips.into_iter().enumerate() {
         for (j, &ppp) in levels.iter().enumerate() {
@@ -135,6 +138,9 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
                 return Err(CliError::Interrupted);
             }
             let exposed = clip.expose(plan, &exposing, ppp)?;
+            for note in exposed.notes.iter().filter(|_| j == 0) {
+                report.warning(note);
+            }
             if plan.pictures {
                 pictures.push(exposed.pictures());
             }
@@ -142,26 +148,6 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         }
     }
     drop(bar);
-    let flow = match rows.first().and_then(Row::flow) {
-        Some(FlowKind::True) => "; flicker: rms change along the true flow beyond the truth's",
-        Some(FlowKind::Estimated) => {
-            "; flicker: rms change along the estimated flow (on the truth, checked both ways) beyond the truth's"
-        }
-        None => "",
-    };
-    let protocol = plan.protocol.name();
-    let about = format!(
-        "{number} {} ({}), {}, protocol {protocol}, seed {}; mean over clips ± 95 % confidence; PSNR in dB, -a after the best gain; worst 5 % of frames{flow}; peak MiB above what was held before{}",
-        if number == 1 { "clip" } else { "clips" },
-        names.join(", "),
-        exposing.sensor.name,
-        exposing.seed,
-        if plan.appearance && plan.perceptual.is_none() {
-            "; LPIPS was not measured: --backbones names no weights"
-        } else {
-            ""
-        }
-    );
     let settings = json!({
         "protocol": plan.protocol,
         "data": plan.data,
@@ -170,7 +156,9 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
         "seed": exposing.seed,
         "exposure": plan.mean_level,
         "overlap": plan.overlap,
+        "lpips_missing": plan.appearance && plan.perceptual.is_none(),
     });
+    let about = about(&settings, &rows);
     Ok(Evaluation { rows, pictures, about, settings })
 }
 

@@ -1,39 +1,62 @@
 //! Scores of methods: of a frame, of a clip, of all clips. Values that need a truth are absent without one.
 
+use super::mark::Mark;
 use super::metrics::{Compared, METRICS, Metric};
 use crate::error::Result;
-use qudi_core::Frame;
 use qudi_core::metrics::{OCTAVES, Statistics};
-use serde::{Serialize, Serializer};
+use qudi_core::{Frame, Size};
+use serde::ser::SerializeMap;
+use serde::{Deserialize, Serialize, Serializer};
+use serde_json::Value;
 
-/// The values of one frame, in the order of [`METRICS`].
+/// The values of one frame.
 #[derive(Clone, Debug)]
-pub(crate) struct FrameScore(Vec<Option<f64>>);
+pub(crate) struct FrameScore {
+    /// In the order of [`METRICS`].
+    values: Vec<Option<f64>>,
+    pub(crate) mark: Option<Mark>,
+}
 
 impl FrameScore {
     /// Computes all metrics of a restored frame.
     pub(crate) fn of(compared: &Compared<'_>) -> Result<Self> {
         let values = METRICS.iter().map(|metric| (metric.value)(compared));
-        Ok(Self(values.collect::<Result<_>>()?))
+        Ok(Self { values: values.collect::<Result<_>>()?, mark: Mark::of(compared) })
+    }
+
+    /// Reads the values of a frame; none if they are no numbers.
+    fn from_json(value: &Value) -> Option<Self> {
+        let values = value.as_object()?;
+        let mark = values.get("mark").and_then(Value::as_str);
+        let values = METRICS.iter().map(|metric| values.get(metric.key).and_then(Value::as_f64));
+        Some(Self { values: values.collect(), mark: mark.and_then(Mark::by_name) })
     }
 
     /// Takes some values; all others are unknown.
     pub(crate) fn of_values(values: &[(&Metric, f64)]) -> Self {
         let value = |metric: &Metric| values.iter().find(|(m, _)| m.key == metric.key);
-        Self(METRICS.iter().map(|metric| value(metric).map(|(_, value)| *value)).collect())
+        let values = METRICS.iter().map(|metric| value(metric).map(|(_, value)| *value));
+        Self { values: values.collect(), mark: None }
     }
 
     /// Returns the value of a metric.
     pub(crate) fn get(&self, metric: &Metric) -> Option<f64> {
-        let values = METRICS.iter().zip(&self.0);
+        let values = METRICS.iter().zip(&self.values);
         values.into_iter().find(|(m, _)| m.key == metric.key).and_then(|(_, value)| *value)
     }
 }
 
 impl Serialize for FrameScore {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let known = METRICS.iter().zip(&self.0).filter(|(_, value)| value.is_some());
-        serializer.collect_map(known.map(|(metric, value)| (metric.key, value)))
+        let known = METRICS.iter().zip(&self.values).filter(|(_, value)| value.is_some());
+        let mut map = serializer.serialize_map(None)?;
+        for (metric, value) in known {
+            map.serialize_entry(metric.key, value)?;
+        }
+        if let Some(mark) = self.mark {
+            map.serialize_entry("mark", mark.name())?;
+        }
+        map.end()
     }
 }
 
@@ -54,7 +77,7 @@ pub(crate) struct Cost {
 }
 
 /// Origin of the flow that flicker is measured along.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum FlowKind {
     /// The scene is synthetic.
@@ -82,12 +105,42 @@ pub(crate) struct Score {
     pub(crate) seconds_per_frame: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) peak_mib: Option<f64>,
+    /// Range of the values of frames that another program made.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) range: Option<[f32; 2]>,
     /// The middle frame; after the best gain where there is a truth.
     #[serde(skip)]
     pub(crate) picture: Frame,
     /// Text after the method's name: ` over 5 frames`, ` (regression) on cpu`.
     #[serde(skip)]
     pub(crate) how: String,
+}
+
+impl Score {
+    /// Reads the figures of a clip as [`Serialize`] writes them; none if they are no such figures.
+    pub(crate) fn from_json(value: &Value) -> Option<Self> {
+        let frames = value["frames"].as_array()?.iter().map(FrameScore::from_json);
+        let octaves = |key: &str| serde_json::from_value::<[f64; OCTAVES]>(value[key].clone()).ok();
+        let added = octaves("added").zip(octaves("missed"));
+        Some(Self {
+            clip: value["clip"].as_str()?.to_owned(),
+            frames: frames.collect::<Option<_>>()?,
+            chi_square: value["chi_square"].as_f64(),
+            flicker: value["flicker"].as_f64(),
+            flow: serde_json::from_value(value["flow"].clone()).ok(),
+            added: added.map(|(added, missed)| Added { added, missed }),
+            seconds_per_frame: value["seconds_per_frame"].as_f64(),
+            peak_mib: value["peak_mib"].as_f64(),
+            range: serde_json::from_value(value["range"].clone()).ok(),
+            picture: Frame::filled(Size { height: 1, width: 1 }, 0.0),
+            how: String::new(),
+        })
+    }
+
+    /// Returns the frames whose truth is not black: a black one says nothing of a method.
+    pub(crate) fn lit(&self) -> impl Iterator<Item = &FrameScore> {
+        self.frames.iter().filter(|frame| frame.mark != Some(Mark::Black))
+    }
 }
 
 /// All scores of one method at one light level.
@@ -128,11 +181,10 @@ impl Row {
         }
     }
 
-    /// Returns statistics over clips of the mean over each clip's frames.
+    /// Returns statistics over clips of the mean over each clip's frames, black ones of the truth aside.
     pub(crate) fn over_clips(&self, metric: &Metric) -> Option<Statistics> {
         let mean = |score: &Score| {
-            let values: Option<Vec<f64>> =
-                score.frames.iter().map(|frame| frame.get(metric)).collect();
+            let values: Option<Vec<f64>> = score.lit().map(|frame| frame.get(metric)).collect();
             Statistics::of(&values?).map(|statistics| statistics.mean)
         };
         self.statistics(mean)
@@ -140,12 +192,12 @@ impl Row {
 
     /// Returns statistics over clips of the frame in the middle.
     pub(crate) fn centre(&self, metric: &Metric) -> Option<Statistics> {
-        self.statistics(|score| score.frames.get(score.frames.len() / 2)?.get(metric))
+        self.statistics(|score| score.lit().nth(score.lit().count() / 2)?.get(metric))
     }
 
     /// Returns statistics over all frames of all clips.
     pub(crate) fn over_frames(&self, metric: &Metric) -> Option<Statistics> {
-        let all = self.scores.iter().flat_map(|score| &score.frames);
+        let all = self.scores.iter().flat_map(Score::lit);
         let all: Option<Vec<f64>> = all.map(|frame| frame.get(metric)).collect();
         Statistics::of(&all?)
     }

@@ -128,7 +128,9 @@ pub(crate) fn frames(rows: &[Row]) -> Table {
     let compares = rows.iter().any(|row| row.steps.is_some());
     let first = ["method", "steps", "ppp", "clip", "frame"];
     let first = first.into_iter().filter(|key| compares || *key != "steps");
+    let marks = all().any(|frame| frame.mark.is_some());
     let keys = first.chain(metrics.iter().map(|metric| metric.key));
+    let keys = keys.chain(marks.then_some("mark"));
     let mut table = Table::new(keys.map(|key| Column::new(key, key)).collect());
     for row in rows {
         for score in &row.scores {
@@ -139,6 +141,9 @@ pub(crate) fn frames(rows: &[Row]) -> Table {
                 cells.extend(place);
                 let values = metrics.iter();
                 cells.extend(values.map(|metric| Cell::number(frame.get(metric), metric.digits)));
+                cells.extend(
+                    marks.then(|| frame.mark.map_or(Cell::Unknown, |m| Cell::text(m.name()))),
+                );
                 table.rows.push(cells);
             }
         }

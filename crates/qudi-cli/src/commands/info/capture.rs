@@ -6,10 +6,10 @@ use crate::args::Global;
 use crate::capture::{Input, Source, SummedCapture, describe_sum, warnings};
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
-use crate::places::Places;
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::{BitOrderCheck, Capture, SumChoice, Summary};
@@ -36,12 +36,6 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     let overwrite = global.overwrite();
-    Places::default()
-        .reads_burst(path)
-        .reads(info.reading.files())
-        .reads(info.sensor.as_deref())
-        .writes(&info.preview)
-        .check()?;
     if let Some(preview) = &info.preview {
         refuse_taken(preview, overwrite)?;
     }
@@ -51,6 +45,7 @@ pub(crate) fn run(
         options: &options,
         sum: info.reading.sum(),
         sensor: info.sensor.as_deref(),
+        judged: SAMPLE_FRAMES,
     };
     let summed = SummedCapture::new(source.open(settings)?, &source)?;
     let sum = summed.sum().cloned();
@@ -219,6 +214,7 @@ fn document(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> Va
         "summed": capture.summed(),
         "fps": capture.fps(),
         "looked_at": summary.sampled,
+        "findings": capture.findings(),
         "ppp": summary.ppp,
         "sensor": sensor.map(|sensor| &sensor.name),
         "mean": summary.mean,

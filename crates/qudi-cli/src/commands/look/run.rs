@@ -9,11 +9,12 @@ use crate::capture::{
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
 use crate::methods::default::default_method;
-use crate::places::Places;
+use crate::places::default_look;
 use crate::report::html::{data_url, render};
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::{PostFilter, Qbp};
+use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Frame, linear_to_srgb};
@@ -22,7 +23,6 @@ use qudi_io::description::MaskChoice;
 use qudi_io::writer::Picture;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Sums of the window that one instant is restored from.
@@ -41,7 +41,7 @@ pub(crate) fn run(
 ) -> Result<()> {
     let output = match &args.output {
         Some(output) => output.clone(),
-        None => default_output(&args.capture),
+        None => default_look(&args.capture),
     };
     let picture_only = match output.extension().map(|e| e.to_string_lossy().to_lowercase()) {
         Some(extension) if extension == "html" => false,
@@ -51,12 +51,6 @@ pub(crate) fn run(
             return Err(CliError::new("a look is .html or .png", output.display(), help));
         }
     };
-    Places::default()
-        .reads_burst(&args.capture)
-        .reads(args.reading.files())
-        .reads(args.sensor.as_deref())
-        .writes([&output])
-        .check()?;
     let file = Output::open(Some(&output), global.overwrite())?;
     let options = args.reading.options(MaskChoice::Auto);
     let source = Source {
@@ -64,6 +58,7 @@ pub(crate) fn run(
         options: &options,
         sum: args.reading.sum(),
         sensor: args.sensor.as_deref(),
+        judged: SAMPLE_FRAMES,
     };
     let summed = SummedCapture::new(source.open(settings)?, &source)?;
     let sum = summed.sum().cloned();
@@ -128,12 +123,6 @@ pub(crate) fn run(
             "restore": forecast,
         })
     })
-}
-
-/// Returns `NAME-look.html`, in the current folder.
-fn default_output(capture: &Path) -> PathBuf {
-    let stem = capture.file_stem().unwrap_or(capture.as_os_str()).to_string_lossy().into_owned();
-    PathBuf::from(format!("{stem}-look.html"))
 }
 
 /// Returns a sensor that detects every photon, for binary frames of an unknown camera.

@@ -3,7 +3,6 @@
 use super::args::Publish;
 use crate::args::Global;
 use crate::error::{CliError, Result};
-use crate::places::Places;
 use crate::report::Report;
 use crate::weights::{Weights, sha256};
 use burn::tensor::Device;
@@ -27,10 +26,6 @@ pub(crate) fn run(args: &Publish, global: &Global, report: &Report) -> Result<()
             "name a .safetensors file",
         ));
     }
-    Places::default()
-        .reads([&args.weights])
-        .writes([path, &path.with_extension("sha256")])
-        .check()?;
     let device = Device::flex();
     if let Ok(Some(contents)) = describe(&args.weights, &device) {
         return Err(CliError::new(

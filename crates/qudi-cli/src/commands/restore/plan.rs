@@ -7,7 +7,6 @@ use crate::capture::{Input, LightOverrides, Source, is_pipe, refuse_terminal};
 use crate::error::{CliError, Result};
 use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
-use crate::places::Places;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::writer::TiffSamples;
@@ -63,15 +62,6 @@ impl Plan {
         }
         let overwrite = global.overwrite();
         let beside = [&args.chi_map, &args.side_by_side, &args.uncertainty];
-        Places::default()
-            .reads_burst(&args.capture)
-            .reads(args.reading.files())
-            .reads(args.sensor.as_deref())
-            .reads(args.network.weight_files())
-            .reads(&global.config)
-            .writes([&args.output])
-            .writes(beside.into_iter().flatten())
-            .check()?;
         for path in beside.into_iter().flatten() {
             refuse_taken(path, overwrite)?;
         }
@@ -139,6 +129,7 @@ impl Plan {
             options: &self.read,
             sum: self.sum,
             sensor: self.sensor.as_deref(),
+            judged: u64::MAX,
         }
     }
 

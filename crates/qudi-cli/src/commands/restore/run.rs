@@ -206,7 +206,13 @@ impl Job {
             .transpose()?;
         let mode = own.map(|own| own.mode(&plan.network));
         self.warnings.extend(warnings::of_chi_square(chi_square, &self.acquisition.sensor));
-        Ok(json!({"chi_square": chi_square, "mode": mode, "warnings": self.warnings}))
+        Ok(json!({
+            "chi_square": chi_square,
+            "mode": mode,
+            "warnings": self.warnings,
+            "notes": self.capture().info().notes,
+            "findings": self.capture().findings(),
+        }))
     }
 
     /// Returns the entries of the manifest of an output folder. Weights are among the settings by their
@@ -232,7 +238,8 @@ impl Job {
             }
         }
         let share = plan.shard.map_or(Share::Whole, Shard::share);
-        Ok(FolderRun { settings: settings.clone(), inputs, share })
+        let frames = self.schedule.instants.pictures(self.capture());
+        Ok(FolderRun { settings: settings.clone(), inputs, share, frames })
     }
 
     pub(super) fn run(

@@ -5,7 +5,6 @@ use crate::args::Global;
 use crate::args::number::COUNT;
 use crate::args::tiff_samples::tiff_samples;
 use crate::error::{CliError, Result};
-use crate::places::Places;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_io::sidecar::Record;
@@ -86,7 +85,6 @@ impl Plan {
         }
         let transforms = Path::new(&args.output).with_file_name("transforms.json");
         let transforms = args.visionsim.then_some(transforms);
-        check_places(args, &simulation, global, transforms.as_deref())?;
         let max_count = simulation.sensor.max_count();
         let outputs = OutputPlan {
             output: args.output.clone(),
@@ -133,6 +131,13 @@ fn format(args: &Simulate, max_count: u16) -> Result<BurstFormat> {
     } else {
         BurstFormat::for_path(Path::new(&args.output), max_count, packed)?
     };
+    if args.unpacked && !(format == BurstFormat::NpyU8 && max_count == 1) {
+        return Err(CliError::new(
+            format!("this burst is not packed: counts up to {max_count}, in {}", args.output),
+            "--unpacked",
+            "leave it out: only binary .npy bursts are packed",
+        ));
+    }
     if args.visionsim && (format != BurstFormat::NpyPacked || args.output == "-") {
         return Err(CliError::new(
             "visionsim opens packed binary .npy files only",
@@ -141,31 +146,6 @@ fn format(args: &Simulate, max_count: u16) -> Result<BurstFormat> {
         ));
     }
     Ok(format)
-}
-
-/// Refuses outputs that are inputs.
-fn check_places(
-    args: &Simulate,
-    simulation: &Simulation,
-    global: &Global,
-    transforms: Option<&Path>,
-) -> Result<()> {
-    let input = args.input.as_deref().filter(|input| !input.starts_with("scene:"));
-    let format = BurstFormat::for_path(Path::new(&args.output), 1, true);
-    let record = format.ok().map(|format| format.record_path(Path::new(&args.output)));
-    // The record of a folder lies in the folder.
-    let record = record.filter(|record| !record.starts_with(&args.output));
-    let beside = [&args.truth, &args.flow, &args.preview];
-    Places::default()
-        .reads(input)
-        .reads(&args.from)
-        .reads([simulation.input.place()])
-        .reads(&global.config)
-        .writes([&args.output])
-        .writes(record.filter(|_| args.output != "-"))
-        .writes(beside.into_iter().flatten())
-        .writes(transforms)
-        .check()
 }
 
 fn reject_settings_beside_record(args: &Simulate, global: &Global) -> Result<()> {
@@ -180,6 +160,20 @@ fn reject_settings_beside_record(args: &Simulate, global: &Global) -> Result<()>
     ))
 }
 
+/// Refuses settings that this input has no use for.
+fn refuse_unused(input: &Input, settings: &Settings) -> Result<()> {
+    match input {
+        Input::Procedural(_) => {
+            settings.refuse(&["simulate.motion"], "by procedural scenes, which move by themselves")
+        }
+        Input::Still { .. } => settings.refuse(&["simulate.speed"], "by stills: motion moves them"),
+        _ => settings.refuse(
+            &["simulate.speed", "simulate.scene_seed"],
+            "by recorded clips, which are as they are",
+        ),
+    }
+}
+
 fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
     let input = Input::parse(
         args.input.as_deref().unwrap_or_default(),
@@ -188,6 +182,7 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
         settings.get("simulate.scene_seed")?,
         settings.get("simulate.speed")?,
     )?;
+    refuse_unused(&input, settings)?;
     let frames: Option<u64> = settings.get("simulate.frames")?;
     if let Some(frames) = frames.filter(|frames| frames > COUNT.end()) {
         let help = format!("give a number up to {}", COUNT.end());

@@ -50,6 +50,9 @@ pub(crate) fn run(
         report
             .remark(&format!("the clip gives {} frames of the {asked} asked for", summary.frames));
     }
+    for note in &summary.notes {
+        report.warning(note);
+    }
     let record = record_of(simulation, &summary, plan.format);
     let written = outputs.finish(&record)?;
     let text = describe(&record, &summary, &written, &plan.output);

@@ -42,9 +42,9 @@ pub(crate) struct Train {
     /// Stop after this time, with the state written, as Ctrl-C does: --resume goes on
     #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number::real(number::SECONDS), conflicts_with = "prepare")]
     pub(crate) seconds: Option<f64>,
-    /// Threads that draw samples
-    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
-    pub(crate) workers: usize,
+    /// Threads that draw samples; results do not depend on it [default: one less than the cores, at most 15]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=number::MAX_THREADS))]
+    pub(crate) workers: Option<usize>,
     /// Folder with the weights of LPIPS, made by scripts/convert/lpips.py [default: where Burn keeps them]
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]
     pub(crate) backbones: Option<PathBuf>,

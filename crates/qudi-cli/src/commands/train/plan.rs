@@ -5,7 +5,7 @@ use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::settings::{Settings, toml_text};
 use qudi_core::atomic_file::Overwrite;
-use qudi_train::{RECIPE, Recipe, recipe_names};
+use qudi_train::{RECIPE, Recipe, default_workers, recipe_names};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -72,7 +72,7 @@ impl Plan {
             init: args.init.clone(),
             devices: args.device.clone(),
             end: args.seconds.map(|seconds| Instant::now() + Duration::from_secs_f64(seconds)),
-            workers: args.workers,
+            workers: args.workers.unwrap_or_else(default_workers),
             backbones: args.backbones.clone(),
             overwrite: global.overwrite(),
         })

@@ -11,10 +11,11 @@ use serde_json::Value;
 const MAX_POINTS: usize = 120;
 
 /// Parts of the loss, by their keys in the metrics.
-const LOSSES: [(&str, &str); 14] = [
+const LOSSES: [(&str, &str); 15] = [
     ("total", "total"),
     ("prediction", "prediction"),
     ("pre", "pre-denoiser"),
+    ("merged", "merged frames"),
     ("perceptual", "perceptual"),
     ("flow", "flow"),
     // Of learned baselines.

@@ -1,10 +1,11 @@
 //! `qudi train`: a recipe and data in, weights out.
 
 use super::args::Train;
-use super::data::{files, make_folder, make_pack};
+use super::data::{files, make_pack};
 use super::environment::{ENVIRONMENT, environment};
 use super::plan::{Action, Plan};
 use super::resume::{check_pack, check_recipe};
+use super::run_folder::{RunFolder, check_folder, clear};
 use super::stages::train_stages;
 use super::watch::{Watch, quality_text, write, write_report};
 use crate::args::Global;
@@ -14,19 +15,17 @@ use crate::interrupt;
 use crate::report::Report;
 use crate::settings::Settings;
 use crate::version::COMMIT;
+use burn::tensor::Device;
 use qudi_baselines::learning::Baseline;
-use qudi_core::atomic_file::Overwrite;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Diffusion;
 use qudi_model::regression::Regression;
 use qudi_model::window::Window;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::Lpips;
-use qudi_train::{
-    From, Learner, METRICS, NetworkRecipe, RECIPE, Run, Validation, WEIGHTS, draw_bursts,
-    run_exists,
-};
+use qudi_train::{From, Learner, NetworkRecipe, Run, Validation, WEIGHTS, draw_bursts};
 use serde_json::json;
+use std::path::Path;
 
 pub(crate) fn run(
     args: &Train,
@@ -83,6 +82,25 @@ pub(super) fn train(plan: &Plan, report: &Report) -> Result<()> {
     }
 }
 
+/// Refuses weights that the network of a recipe cannot start from.
+pub(super) fn check_init(plan: &Plan, init: Option<&Path>, device: &Device) -> Result<()> {
+    let Some(path) = init else { return Ok(()) };
+    let recipe = &plan.recipe;
+    match recipe.network {
+        NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => {
+            Regression::load(path, recipe, device).map(drop)
+        }
+        NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => {
+            <Diffusion as Learner>::load(path, recipe, device).map(drop)
+        }
+        NetworkRecipe::Qudi(NetworkConfig::Window(_)) => {
+            Window::load(path, recipe, device).map(drop)
+        }
+        NetworkRecipe::Baseline(_) => Baseline::load(path, recipe, device).map(drop),
+    }?;
+    Ok(())
+}
+
 fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let (folder, recipe) = (&plan.folder, &plan.recipe);
     check_folder(plan)?;
@@ -91,7 +109,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
         check_pack(folder, &plan.pack)?;
     }
     let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
-    make_folder(folder, "the run's folder", "choose another with -o")?;
+    let _folder = RunFolder::open(folder)?;
     find_backbones(plan)?;
     let files = files(plan, report)?;
     let from = if plan.action == Action::Resume {
@@ -104,6 +122,9 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
     let commit = COMMIT.map(str::to_owned);
     let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
+    if plan.action == Action::Start {
+        clear(folder)?;
+    }
     write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
     let mut watch = Watch::new(recipe, folder, plan.end, report);
     let learnt =
@@ -179,35 +200,4 @@ fn draw<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     }
     let text = format!("{}: {bursts} bursts", folder.display());
     report.result(&text, || json!({"folder": folder, "bursts": bursts}))
-}
-
-/// Refuses a folder without a state to resume from, or with a run that would be lost.
-pub(super) fn check_folder(plan: &Plan) -> Result<()> {
-    let folder = &plan.folder;
-    let exists = run_exists(folder);
-    let resume = plan.action == Action::Resume;
-    if resume && !exists {
-        return Err(CliError::new(
-            "there is no state to go on from",
-            folder.display(),
-            "start without --resume, or name the run's folder with -o",
-        ));
-    }
-    let own = [WEIGHTS, RECIPE, METRICS, ENVIRONMENT, "report.html"];
-    let taken = exists || own.iter().any(|name| folder.join(name).exists());
-    if !resume && taken && plan.overwrite == Overwrite::No {
-        return Err(CliError::new(
-            "the folder holds a run already",
-            folder.display(),
-            "go on with --resume, choose another folder, or start anew with --force",
-        ));
-    }
-    if !resume && taken {
-        // A new run must not be taken for the old one's continuation.
-        for name in ["state", "state.old", "state.new"] {
-            let _ = std::fs::remove_dir_all(folder.join(name));
-        }
-        let _ = std::fs::remove_file(folder.join(METRICS));
-    }
-    Ok(())
 }

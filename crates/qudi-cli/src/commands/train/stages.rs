@@ -1,14 +1,18 @@
 //! Recipes of several stages: one run after the other, each in a folder of its own.
 
-use super::data::{files, make_folder};
+use super::data::files;
+use super::environment::{ENVIRONMENT, environment};
 use super::plan::{Action, Plan};
 use super::resume::check_recipe;
-use super::run::{check_folder, find_backbones, train};
+use super::run::{check_init, find_backbones, train};
+use super::run_folder::{RunFolder, check_folder, clear};
 use super::watch::write;
+use crate::device;
 use crate::error::{CliError, Result};
 use crate::report::Report;
 use qudi_core::atomic_file::Overwrite;
-use qudi_train::{RECIPE, Recipe, WEIGHTS, run_exists, steps_taken};
+use qudi_train::dataset::{Dataset, Pack};
+use qudi_train::{RECIPE, Recipe, Validator, WEIGHTS, run_exists, steps_taken};
 use serde_json::json;
 
 /// Trains all stages, or those that are left, and puts the last one's weights into the run's folder.
@@ -35,9 +39,23 @@ pub(super) fn train_stages(
         check_recipe(&stage.folder, &stage.recipe)?;
     }
     stages.iter().try_for_each(find_backbones)?;
-    make_folder(folder, "the run's folder", "choose another with -o")?;
-    // A run whose files are not there leaves nothing behind.
+    let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
+    let _folder = RunFolder::open(folder)?;
+    // A run whose files are not there leaves nothing behind, and no stage is trained for one that cannot be.
     files(plan, report)?;
+    for stage in &stages {
+        let sources = stage.recipe.packed_sources();
+        let pack = (!sources.is_empty()).then(|| Pack::open(&plan.pack, &sources)).transpose()?;
+        Validator::new(&stage.recipe, pack.as_ref())?;
+        Dataset::new(&stage.recipe.data, pack)?;
+    }
+    if plan.action == Action::Start {
+        if let Some(first) = stages.first() {
+            check_init(first, plan.init.as_deref(), &devices[0].device)?;
+        }
+        std::iter::once(plan).chain(&stages).try_for_each(|plan| clear(&plan.folder))?;
+    }
+    write(folder, ENVIRONMENT, environment(&devices, &plan.pack)?.as_bytes())?;
     write(folder, RECIPE, plan.recipe.text().as_bytes())?;
     let count = stages.len();
     let mut init = plan.init.clone();

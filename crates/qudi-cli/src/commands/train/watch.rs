@@ -14,7 +14,10 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Folder of pictures in a run's folder.
-const SAMPLES: &str = "samples";
+pub(super) const SAMPLES: &str = "samples";
+
+/// Name of the report.
+pub(super) const REPORT: &str = "report.html";
 
 /// Formats quality at every light level.
 pub(crate) fn quality_text(means: &[(f64, [f64; 3])]) -> String {
@@ -144,5 +147,5 @@ pub(crate) fn write_report(folder: &Path) -> Result<()> {
         environment: &read(ENVIRONMENT)?,
         picture: picture.as_deref(),
     })?;
-    write(folder, "report.html", text.as_bytes())
+    write(folder, REPORT, text.as_bytes())
 }

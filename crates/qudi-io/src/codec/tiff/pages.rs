@@ -24,6 +24,8 @@ pub(crate) struct TiffPages {
     samples: (usize, usize),
     /// True for rows of single bits, padded to bytes.
     bits: bool,
+    /// True if single bits are stored as they are, whatever the decoder makes of them.
+    inverted: bool,
     /// True if the first pixel of a byte is its lowest bit.
     reversed: bool,
 }
@@ -145,10 +147,15 @@ impl TiffPages {
                 "save the stack with interleaved channels, or one channel as gray",
             ));
         }
-        if photometric(&mut decoder, path)? == 0 && bits > 1 {
-            let text =
-                "white is zero in it (photometric interpretation 0): values are turned round";
-            info.notes.push(text.to_owned());
+        let white_is_zero = photometric(&mut decoder, path)? == 0;
+        if white_is_zero {
+            let effect = if bits > 1 {
+                "values are turned round"
+            } else {
+                "single bits are counts all the same, and taken as they are stored"
+            };
+            let text = format!("white is zero in it (photometric interpretation 0): {effect}");
+            info.notes.push(text);
         }
         let (width, height) = decoder.dimensions().map_err(|e| fault(path, e))?;
         let size = Size::new(height as usize, width as usize, &path.display().to_string())?;
@@ -167,8 +174,17 @@ impl TiffPages {
         let path = path.to_owned();
         let scale = Scale::Counts;
         let bits_only = bits == 1 && samples.0 == 1;
-        let mut pages =
-            Self { decoder, path, size, frames, scale, samples, bits: bits_only, reversed };
+        let mut pages = Self {
+            decoder,
+            path,
+            size,
+            frames,
+            scale,
+            samples,
+            bits: bits_only,
+            inverted: white_is_zero && bits_only,
+            reversed,
+        };
         pages.drop_unreadable(options, info)?;
         pages.scale = pages.find_scale(bits, options, recorded, info)?;
         Ok(pages)
@@ -285,6 +301,11 @@ impl CountFrames for TiffPages {
             }
             for (counts, bytes) in counts.chunks_mut(width).zip(bytes.chunks(row)) {
                 crate::writer::unpack_row(bytes, counts);
+                if self.inverted {
+                    for count in counts.iter_mut() {
+                        *count = 1 - *count;
+                    }
+                }
             }
             return Ok(());
         }

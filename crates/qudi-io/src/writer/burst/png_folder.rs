@@ -1,6 +1,6 @@
 //! Counts as a folder of gray PNG files: `frame_000000.png`, ...
 
-use crate::writer::{frame_name, is_frame_name};
+use crate::writer::{frame_name, is_frame_below};
 use image::{ImageBuffer, Luma};
 use qudi_core::Size;
 use qudi_core::atomic_file::{Overwrite, OwnFolder, PendingFolder};
@@ -24,7 +24,13 @@ impl PngFolder {
         max_count: u16,
         overwrite: Overwrite,
     ) -> Result<Self> {
-        let own = OwnFolder { marker: Self::RECORD, is_own_file: is_frame_name };
+        let own = OwnFolder {
+            manifest: Self::RECORD,
+            is_named: |record, name| {
+                let frames = record["burst"]["frames"].as_u64();
+                frames.is_some_and(|frames| is_frame_below(name, frames))
+            },
+        };
         let folder = PendingFolder::create(path, overwrite, own)?;
         Ok(Self { folder, size, deep: max_count > 255, frames: 0 })
     }
@@ -48,8 +54,6 @@ impl PngFolder {
     }
 
     pub(crate) fn finish(self, record: &[u8]) -> Result<()> {
-        std::fs::write(self.folder.file(Self::RECORD), record)
-            .map_err(|e| Error::io("write the record of", self.folder.path(), e))?;
-        self.folder.finish()
+        self.folder.finish(record)
     }
 }

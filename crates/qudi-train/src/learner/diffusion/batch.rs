@@ -119,12 +119,11 @@ impl Batch {
     /// Returns the batch as an example for the loss, on the device of `conditioning`.
     pub(in crate::learner) fn example<'a>(&'a self, conditioning: &'a Conditioning) -> Example<'a> {
         let device = conditioning.linear_estimate.device();
-        let (truth, noise) = match self.uploaded_to(&device) {
-            Some(uploaded) => (uploaded.truth.clone(), uploaded.noise.clone()),
-            None => {
-                let tensor = |values: &Vec<f32>| to_tensor(values.clone(), self.size, &device);
-                (tensor(&self.truth), tensor(&self.noise))
-            }
+        let (truth, noise) = if let Some(uploaded) = self.uploaded_to(&device) {
+            (uploaded.truth.clone(), uploaded.noise.clone())
+        } else {
+            let tensor = |values: &Vec<f32>| to_tensor(values.clone(), self.size, &device);
+            (tensor(&self.truth), tensor(&self.noise))
         };
         Example {
             conditioning,

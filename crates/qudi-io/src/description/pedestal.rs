@@ -1,0 +1,36 @@
+//! The pedestal of counts: what is subtracted of it, and what is kept so that noise below zero is not cut off.
+
+use super::options::ReadOptions;
+use qudi_core::sensor::{Response, Sensor};
+
+/// Standard deviations of the read noise that are kept below zero.
+const KEPT_SIGMAS: f64 = 3.0;
+
+/// Returns `options` with the sensor's pedestal and threshold, if they set neither.
+pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
+    let mut options = options.clone();
+    if options.offset.is_none()
+        && options.threshold.is_none()
+        && let Some(sensor) = sensor
+    {
+        options.offset = (sensor.offset > 0.0).then_some(sensor.offset);
+        options.threshold = sensor.threshold;
+    }
+    options
+}
+
+/// Keeps a part of the pedestal in the counts of a sensor with read noise, and returns it in DN: signed values
+/// without a sign.
+pub(crate) fn keep_pedestal(options: &mut ReadOptions, sensor: Option<&Sensor>) -> f64 {
+    let (Some(offset), None, Some(sensor)) = (options.offset, options.threshold, sensor) else {
+        return 0.0;
+    };
+    let Some(gain) = sensor.fixed_gain().filter(|_| sensor.response == Response::Linear) else {
+        return 0.0;
+    };
+    let noise = sensor.read_noise;
+    let electrons = if noise > 0.0 { (KEPT_SIGMAS * noise).max(noise * noise) } else { 0.0 };
+    let kept = (electrons * gain).ceil().min(offset.floor());
+    options.offset = Some(offset - kept);
+    kept
+}

@@ -1,0 +1,90 @@
+//! Folders: stacks in parts, missing numbers, strangers, and maps that turn with the frames.
+
+use crate::{counts, npy, open, plain, scratch, write};
+use qudi_io::description::{MaskChoice, Orientation, ReadOptions};
+use std::path::Path;
+
+const SIDE: usize = 16;
+
+/// Counts of frame `t`, all different.
+fn frame(t: usize) -> Vec<u8> {
+    (0..SIDE * SIDE).map(|i| ((i * 7 + t * 13) % 23) as u8).collect()
+}
+
+fn tiff(path: &Path, frames: std::ops::Range<usize>) {
+    let file = std::fs::File::create(path).unwrap();
+    let mut encoder = tiff::encoder::TiffEncoder::new(file).unwrap();
+    for t in frames {
+        let side = SIDE as u32;
+        encoder.write_image::<tiff::encoder::colortype::Gray8>(side, side, &frame(t)).unwrap();
+    }
+}
+
+fn expected(frames: usize) -> Vec<Vec<u16>> {
+    (0..frames).map(|t| frame(t).into_iter().map(u16::from).collect()).collect()
+}
+
+#[test]
+fn stacks_in_parts_are_read_one_after_the_other() {
+    let folder = scratch();
+    // In natural order, the last one shorter.
+    for (number, frames) in [(2, 0..10), (9, 10..20), (10, 20..27)] {
+        tiff(&folder.path().join(format!("rec_{number}.tif")), frames);
+    }
+    let mut capture = open(folder.path(), &plain()).unwrap();
+    assert_eq!(capture.frames(), 27);
+    assert!(counts(&mut capture) == expected(27));
+    let arrays = scratch();
+    for (number, frames) in [(0, 0..4), (1, 4..9)] {
+        let bytes: Vec<u8> = frames.clone().flat_map(frame).collect();
+        let shape = format!("({}, {SIDE}, {SIDE})", frames.len());
+        write(arrays.path(), &format!("a{number}.npy"), &npy("|u1", "False", &shape, &bytes));
+    }
+    let mut capture = open(arrays.path(), &plain()).unwrap();
+    assert!(counts(&mut capture) == expected(9));
+    assert!(capture.info().notes.iter().any(|note| note.contains("2 parts")));
+}
+
+#[test]
+fn holes_and_strangers_are_named() {
+    let folder = scratch();
+    let save = |name: &str, t: usize| {
+        let side = SIDE as u32;
+        image::GrayImage::from_raw(side, side, frame(t))
+            .unwrap()
+            .save(folder.path().join(name))
+            .unwrap();
+    };
+    for t in (0..9).chain(14..30) {
+        save(&format!("f_{t:04}.png"), t);
+    }
+    save("mean.png", 3);
+    let capture = open(folder.path(), &plain()).unwrap();
+    assert_eq!(capture.frames(), 25);
+    let notes = capture.info().notes.join("; ");
+    assert!(
+        notes.contains("numbers 9 to 13 are missing") && notes.contains("`mean.png`"),
+        "{notes}"
+    );
+}
+
+#[test]
+fn maps_turn_with_the_frames() {
+    let folder = scratch();
+    let bytes: Vec<u8> = (0..6).flat_map(frame).collect();
+    let path = write(folder.path(), "a.npy", &npy("|u1", "False", "(6, 16, 16)", &bytes));
+    let mut map = [0; SIDE * SIDE];
+    map[3] = 1;
+    let mask = write(folder.path(), "mask.npy", &npy("|u1", "False", "(16, 16)", &map));
+    let bad = |orient| {
+        let options = ReadOptions {
+            mask: MaskChoice::File(mask.clone()),
+            orient: Some(orient),
+            ..ReadOptions::default()
+        };
+        open(&path, &options).unwrap().bad_pixels().hot.clone()
+    };
+    assert_eq!(bad(Orientation::Raw), [3]);
+    assert_eq!(bad(Orientation::Rot180), [SIDE * SIDE - 1 - 3]);
+    assert_eq!(bad(Orientation::Transpose), [3 * SIDE]);
+}
