@@ -1,13 +1,14 @@
 #!/bin/sh
-# Trains on a machine with a graphics card that is had for a quarter of an hour. Nothing is installed or fetched
-# there: it needs an NVIDIA driver and a Python with the PyTorch that the program was built with.
+# Trains on a machine with a graphics card that is had for a quarter of an hour. Nothing is installed or
+# fetched there: it needs an NVIDIA driver and a Python with the PyTorch that the program was built with.
 #
-#     scripts/card.sh train QUDI PACK WEIGHTS OUT SECONDS [RECIPE [SET...]]
+#     scripts/card.sh train QUDI PACK WEIGHTS OUT SECONDS [RECIPE [--set KEY=VALUE...]]
 #
-# QUDI is the program, built with `--features qudi-cli/libtorch` (docs/network.md). It tests the card, measures
-# the speed of training on every backend that the program has, trains from WEIGHTS on the fastest for what is
-# left of SECONDS, and leaves the weights in OUT every minute, in half precision, with metrics and a report.
-# DEVICES=libtorch-cpu rehearses it on the processor.
+# QUDI is the program, built with `--features qudi-cli/libtorch` (docs/notes/training/graphics-cards.md). It
+# tests the card, measures the speed of training on every backend that the program has, trains from WEIGHTS on
+# the fastest for what is left of SECONDS, and leaves the weights in OUT every twenty seconds, in half
+# precision, with metrics and a report. DEVICES=libtorch-cpu rehearses it on the processor; BATCH is the
+# number of samples of a step, 64 by default.
 #
 #     scripts/card.sh parts FILE FOLDER
 #
@@ -107,5 +108,5 @@ print(len(steps) * $batch)" "$out/metrics.jsonl")
 case "${1:-}" in
 parts) shift && parts "$@" ;;
 train) shift && train "$@" ;;
-*) sed -n '2,17p' "$0" && exit 2 ;;
+*) sed -n '2,16p' "$0" && exit 2 ;;
 esac

@@ -1,7 +1,7 @@
 //! Operations that Burn's flex backend lacks or computes slowly, with their gradients.
 //!
-//! Every operation takes tensors of any device. On flex it is computed here, on LibTorch it is LibTorch's own;
-//! elsewhere it is composed of Burn's own operations with the same result.
+//! Every operation takes tensors of any device. On flex it is computed here, on LibTorch it is LibTorch's
+//! own; elsewhere it is composed of Burn's own operations with the same result.
 #![warn(missing_docs)]
 // Vector code must be inlined into the functions that are compiled for the machine's vector unit.
 #![allow(clippy::inline_always)]

@@ -30,8 +30,8 @@ pub(super) struct Fusion {
 
 /// The frames of all bursts as the cells see them.
 pub(super) struct Frames<'a> {
-    /// Pre-denoised frames and linear estimate in image units at full resolution, `[bursts * frames, 1, H, W]`
-    /// each.
+    /// Pre-denoised frames and linear estimate in image units at full resolution,
+    /// `[bursts * frames, 1, H, W]` each.
     pub(super) whole: [&'a Tensor<4>; 2],
     /// Pre-denoised frames in image units, `[bursts * frames, 4, h, w]`.
     pub(super) restored: &'a Tensor<4>,
@@ -150,7 +150,7 @@ impl Fusion {
     }
 }
 
-/// Joins the images of every frame, `[bursts, c, h, w]` each, to those of all: `[bursts * frames, c, h, w]`.
+/// Joins the images of every frame, `[bursts, c, h, w]` each, in the order `[bursts * frames, c, h, w]`.
 fn of_all<'a>(frames: impl Iterator<Item = &'a Tensor<4>>) -> Tensor<4> {
     let frames: Vec<Tensor<4>> = frames.cloned().collect();
     let [bursts, channels, h, w] = frames[0].dims();
