@@ -78,7 +78,7 @@ pub fn open(
     let sum = args.reading.sum();
     let input = input.unwrap_or_else(|| Input::at(Some(&args.capture)));
     let sensor = args.sensor.as_deref();
-    let source = Source { input, options: &options, sum, sensor, judged: u64::MAX };
+    let source = Source { input, options: &options, sum, sensor, judged: 0 };
     let opened = source.open(&settings)?;
     if sum != Some(Sum::Auto) {
         return Ok((opened.capture, opened.sensor));

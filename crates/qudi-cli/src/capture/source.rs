@@ -45,6 +45,9 @@ impl Source<'_> {
     /// Opens the capture, and judges its frames.
     fn open_judged(&self, sensor: Option<&Sensor>) -> Result<Capture> {
         let mut capture = self.input.open(self.options, sensor)?;
+        if self.judged == 0 {
+            return Ok(capture);
+        }
         let known = sensor.or(capture.info().sensor.as_ref()).cloned();
         capture.judge_frames(self.judged, self.options, known.as_ref())?;
         Ok(capture)

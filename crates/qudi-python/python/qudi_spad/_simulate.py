@@ -61,8 +61,11 @@ def simulate(
             np.save(clip, _clip(frames))
         burst = os.path.join(folder, "burst.npy")
         named = {"sensor": str(sensor), "ppp": ppp, "seed": seed, **options}
-        record = result(["simulate", *flags(named), "--unpacked", f"--output={burst}", "--", clip])
-        return np.load(burst), record
+        record = result(["simulate", *flags(named), f"--output={burst}", "--", clip])
+        counts = np.load(burst)
+    if record["burst"]["bitpack"]:
+        counts = np.unpackbits(counts, axis=-1, count=record["burst"]["width"])
+    return counts, record
 
 
 def _clip(frames: npt.ArrayLike) -> npt.NDArray[Any]:

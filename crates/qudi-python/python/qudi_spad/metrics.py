@@ -24,7 +24,7 @@ def psnr(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> float | npt.NDArray[n
     Returns
     -------
     float or ndarray
-        One value, or one a frame; infinite for equal images.
+        One value, or one a frame; 100 for equal images.
 
     Raises
     ------
