@@ -47,6 +47,7 @@ impl Recipe {
                         "must be \"none\" for this network",
                     ),
                     ("train.ablate", is_default(&self.train.ablate), "is for the other diffusion"),
+                    ("train.learns", self.train.learns.is_empty(), "is for the regression"),
                     (
                         "train.gradient_checkpointing",
                         !self.train.gradient_checkpointing,
