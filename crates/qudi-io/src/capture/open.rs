@@ -13,7 +13,7 @@ impl Capture {
     /// Opens the capture at `path`. Its dark map and bad pixels come from `sensor`, if `options` name none.
     ///
     /// # Errors
-    /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
+    /// [`Error`](qudi_core::Error) if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
         let mut options = with_pedestal(options, sensor);
         let named = options.offset.is_some() || options.threshold.is_some();
