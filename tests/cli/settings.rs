@@ -14,6 +14,7 @@ const COMMANDS: &[(&str, &[&str])] = &[
     ("demo --device none", &["sensor"]),
     ("train tiny -o t --device none", &["network", "data", "train", "validation"]),
     ("bench --size 16x16 --frames 3 --rounds 1 --method average", &[]),
+    ("bench --train tiny --device none", &["network", "data", "train", "validation"]),
     ("convert b.npy -o copy.npy -f", &[]),
     ("publish none.safetensors -o w.safetensors", &[]),
     ("selftest --only none", &[]),

@@ -135,6 +135,7 @@ impl Command {
             Self::Train(_) => "train",
             Self::Publish(_) => "publish",
             Self::Eval(_) => "eval",
+            Self::Bench(bench) if bench.train.is_some() => "bench --train",
             Self::Bench(_) => "bench",
             Self::Selftest(_) => "selftest",
             Self::Convert(_) => "convert",

@@ -17,7 +17,7 @@ const COMMANDS: &[(&str, &[&[&str]])] = &[
     ("light", &[&["sensor"]]),
     ("demo", &[&["sensor"]]),
     ("train", &[RECIPE]),
-    ("bench", &[RECIPE]),
+    ("bench --train", &[RECIPE]),
     ("config", &[SETTINGS, RECIPE]),
 ];
 

@@ -45,10 +45,6 @@ pub(crate) fn run(args: &Bench, settings: &Settings, report: &Report) -> Result<
     if let Some(recipe) = &args.train {
         return super::training::run(recipe, args, settings, report);
     }
-    if let Some((key, _, origin)) = settings.recipe_changes().first() {
-        let help = "name a recipe with --train, or leave it out";
-        return Err(CliError::new(format!("`{key}` is for --train"), origin, help));
-    }
     let options = args.network.options(args.steps.steps, &args.given);
     options.check_methods(&args.method)?;
     let old = args.compare.as_deref().map(load).transpose()?;
