@@ -13,6 +13,7 @@ mod judge;
 mod mosaic;
 mod open;
 mod pixel_map;
+mod scene_changes;
 mod summary;
 mod view;
 

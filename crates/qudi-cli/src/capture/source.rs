@@ -42,9 +42,10 @@ impl Source<'_> {
         }
     }
 
-    /// Opens the capture, and judges its frames.
+    /// Opens the capture with signed counts, and judges its frames.
     fn open_judged(&self, sensor: Option<&Sensor>) -> Result<Capture> {
-        let mut capture = self.input.open(self.options, sensor)?;
+        let options = ReadOptions { signed: true, ..self.options.clone() };
+        let mut capture = self.input.open(&options, sensor)?;
         let known = sensor.or(capture.info().sensor.as_ref()).cloned();
         capture.judge_frames(self.judged, self.options, known.as_ref())?;
         Ok(capture)
