@@ -285,7 +285,7 @@ fn pipes_are_converted() {
 /// Noise below the pedestal is not cut off: dark parts keep their mean.
 #[test]
 fn counts_below_the_pedestal_are_signed() {
-    let folder = scratch("field-pedestal");
+    let folder = scratch("field-signed");
     let sensor = "base = \"ideal\"\noffset = 100\ngain = 2\nread_noise = 1.5\n";
     std::fs::write(folder.join("s.toml"), sensor).unwrap();
     let (height, width, frames) = (32, 48, 44);

@@ -40,6 +40,7 @@ fn weights(path: &Path, value: f32) {
             steps: 0,
             commit: None,
             licence: "MIT OR Apache-2.0".into(),
+            recipes: Vec::new(),
         },
         sampling: Some(Sampling::default()),
     };

@@ -288,6 +288,11 @@ changes = { \"train.learns\" = [\"uncertainty\"], \"train.seed\" = 7 }
     assert_eq!(names, [&stages[..], &files].concat());
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
     let whole = read("run/weights.safetensors");
+    // The weights hold the recipes of all stages, with every switch.
+    let said = run(&folder, "info run/weights.safetensors");
+    for words in ["recipe of stage 3", "\"refinement\"", "\"uncertainty\"", "train.timesteps = "] {
+        assert!(said.contains(words), "no {words} in\n{said}");
+    }
     assert!(whole == read("run/3-rest/weights.safetensors"));
     // Only the uncertainty has learnt in the last stage.
     let tensors = |name: &str| {

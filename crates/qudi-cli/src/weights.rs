@@ -79,6 +79,16 @@ impl fmt::Display for Weights {
     }
 }
 
+/// Returns the recipes in a file of weights; none if it has none, or cannot be read.
+pub(crate) fn recipes_of(path: &Path) -> Vec<String> {
+    if let Ok(description) = describe(path) {
+        return description.provenance.recipes;
+    }
+    let contents = qudi_baselines::import::describe(path, &Device::flex()).ok().flatten();
+    let description = contents.and_then(|contents| contents.description);
+    description.map(|description| description.provenance.recipes).unwrap_or_default()
+}
+
 fn built_in(kind: NetworkKind) -> &'static BuiltIn {
     match kind {
         NetworkKind::Regression => &REGRESSION,

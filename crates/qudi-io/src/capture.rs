@@ -13,6 +13,7 @@ mod judge;
 mod mosaic;
 mod open;
 mod pixel_map;
+mod scene_changes;
 mod summary;
 mod view;
 
@@ -43,6 +44,8 @@ pub struct Capture {
     info: CaptureInfo,
     native: Box<dyn CountFrames>,
     view: View,
+    /// The view without turn and crop by the user, which maps are of.
+    usual: View,
     /// Native frames in use; for a pipe, those that have arrived.
     range: Range<u64>,
     /// One past the last requested native frame.
@@ -86,11 +89,12 @@ impl Capture {
         if let Some(max) = info.max_count.filter(|_| info.packing.is_none()) {
             native = Box::new(DepthChecked::new(native, max, depth_source(options, &info), path));
         }
+        let stored = native.size();
+        let plane = mosaic_plane(&mut info, options, path)?;
+        let usual = View::new(stored, plane, info.orient, info.vendor, None)?;
         if let Some(orient) = options.orient {
             info.orient = orient;
         }
-        let stored = native.size();
-        let plane = mosaic_plane(&mut info, options, path)?;
         let view = View::new(stored, plane, info.orient, info.vendor, options.crop)?;
         let sum = options.sum.unwrap_or(1);
         let start = options.start.unwrap_or(0);
@@ -112,6 +116,7 @@ impl Capture {
             path: path.to_owned(),
             info,
             view,
+            usual,
             range,
             end: options.end,
             complete: false,
@@ -175,6 +180,7 @@ impl Capture {
             path: place.to_owned(),
             info,
             view: View { size, from: None },
+            usual: View { size, from: None },
             range: 0..frames.len() as u64,
             end: None,
             complete: true,

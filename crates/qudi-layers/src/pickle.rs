@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::Path;
+use std::rc::Rc;
 use zip::ZipArchive;
 
 /// Pickles before the values of a file from before PyTorch 1.6: magic number, version, system, weights, keys.
@@ -90,19 +91,28 @@ fn check_former(bytes: &[u8]) -> std::result::Result<(), String> {
 
 /// Checks one pickle, and returns its length.
 fn check_pickle(bytes: &[u8]) -> std::result::Result<usize, String> {
-    let mut pickle = Pickle { bytes, at: 0, strings: Vec::new(), memo: BTreeMap::new() };
+    let last = [None, None];
+    let mut pickle = Pickle { bytes, at: 0, last, memo: BTreeMap::new(), numbered: None };
     while pickle.step()? {}
     Ok(pickle.at)
 }
+
+/// Longest name that may be called for.
+const NAME_BYTES: usize = 100;
+
+/// Most strings that a pickle keeps for later.
+const MAX_KEPT: usize = 1 << 20;
 
 /// A walk over the operations of a pickle.
 struct Pickle<'a> {
     bytes: &'a [u8],
     at: usize,
-    /// What was pushed, where it is a string: names of what is called for are made of the last two.
-    strings: Vec<Option<String>>,
-    /// What is kept for later, where it is a string.
-    memo: BTreeMap<usize, Option<String>>,
+    /// The last two things pushed, where they are short strings: names of what is called for.
+    last: [Option<Rc<str>>; 2],
+    /// Short strings that are kept for later.
+    memo: BTreeMap<usize, Rc<str>>,
+    /// Things kept without a number, or none if numbers are given: no program writes both.
+    numbered: Option<usize>,
 }
 
 impl<'a> Pickle<'a> {
@@ -135,19 +145,42 @@ impl<'a> Pickle<'a> {
     }
 
     fn text(&mut self, count: usize) -> std::result::Result<(), String> {
-        let text = String::from_utf8_lossy(self.counted(count)?).into_owned();
-        self.strings.push(Some(text));
+        let text = String::from_utf8_lossy(self.counted(count)?);
+        self.push(Some(&text));
         Ok(())
     }
 
-    /// Keeps what was pushed last under a number.
-    fn keep(&mut self, number: usize) {
-        self.memo.insert(number, self.strings.last().cloned().flatten());
+    /// Pushes a string, or something else.
+    fn push(&mut self, text: Option<&str>) {
+        self.last.swap(0, 1);
+        self.last[1] = text.filter(|text| text.len() <= NAME_BYTES).map(Rc::from);
+    }
+
+    /// Keeps what was pushed last under a number, or under the next one.
+    fn keep(&mut self, number: Option<usize>) -> std::result::Result<(), String> {
+        let number = match (number, self.numbered) {
+            (Some(number), None) => number,
+            (None, count) if count.is_some() || self.memo.is_empty() => {
+                let next = count.unwrap_or(0);
+                self.numbered = Some(next + 1);
+                next
+            }
+            _ => return Err("a pickle keeps things in two ways".to_owned()),
+        };
+        match &self.last[1] {
+            Some(text) => self.memo.insert(number, Rc::clone(text)),
+            None => self.memo.remove(&number),
+        };
+        if self.memo.len() > MAX_KEPT {
+            return Err(format!("a pickle keeps more than {MAX_KEPT} strings"));
+        }
+        Ok(())
     }
 
     /// Pushes what is kept under a number.
     fn recall(&mut self, number: usize) {
-        self.strings.push(self.memo.get(&number).cloned().flatten());
+        self.last.swap(0, 1);
+        self.last[1] = self.memo.get(&number).cloned();
     }
 
     /// Takes one operation; returns false at the end. Python's `pickletools` lists the operations.
@@ -162,24 +195,24 @@ impl<'a> Pickle<'a> {
             }
             // Module and name were pushed before.
             0x93 => {
-                let mut string = || self.strings.pop().flatten().unwrap_or_default();
-                let (name, module) = (string(), string());
-                admit(&module, &name)?;
-                self.strings.push(None);
+                let [module, name] = &self.last;
+                let text = |text: &Option<Rc<str>>| text.as_deref().unwrap_or_default().to_owned();
+                admit(&text(module), &text(name))?;
+                self.push(None);
             }
             // Names of a registry of extensions.
             0x82..=0x84 => return Err("an extension is called for".to_owned()),
             b'F' | b'I' | b'L' | b'P' => {
                 self.line()?;
-                self.strings.push(None);
+                self.push(None);
             }
             b'S' | b'V' => {
                 let line = self.line()?;
-                self.strings.push(Some(line.trim_matches(['\'', '"']).to_owned()));
+                self.push(Some(line.trim_matches(['\'', '"'])));
             }
             b'p' => {
                 let number = self.line()?.trim().parse().unwrap_or(usize::MAX);
-                self.keep(number);
+                self.keep(Some(number))?;
             }
             b'g' => {
                 let number = self.line()?.trim().parse().unwrap_or(usize::MAX);
@@ -187,13 +220,13 @@ impl<'a> Pickle<'a> {
             }
             b'q' | b'r' => {
                 let number = self.number(if operation == b'q' { 1 } else { 4 })?;
-                self.keep(number);
+                self.keep(Some(number))?;
             }
             b'h' | b'j' => {
                 let number = self.number(if operation == b'h' { 1 } else { 4 })?;
                 self.recall(number);
             }
-            0x94 => self.keep(self.memo.len()),
+            0x94 => self.keep(None)?,
             b'X' | b'T' => self.text(4)?,
             b'U' | 0x8c => self.text(1)?,
             0x8d => self.text(8)?,
@@ -227,7 +260,7 @@ impl<'a> Pickle<'a> {
             | 0x85..=0x89
             | 0x8f..=0x92
             | 0x97
-            | 0x98 => self.strings.push(None),
+            | 0x98 => self.push(None),
             other => return Err(format!("an operation {other:#04x} that no pickle has")),
         }
         Ok(true)

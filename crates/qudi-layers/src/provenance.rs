@@ -19,4 +19,7 @@ pub struct Provenance {
     pub commit: Option<String>,
     /// Licence of the weights.
     pub licence: String,
+    /// Recipes of all stages in their order, as TOML; none in files from before they were kept.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub recipes: Vec<String>,
 }

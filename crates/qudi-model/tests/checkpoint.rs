@@ -34,6 +34,7 @@ fn description() -> Description {
             steps: 0,
             commit: None,
             licence: "MIT OR Apache-2.0".into(),
+            recipes: Vec::new(),
         },
         sampling: Some(Sampling::default()),
     }

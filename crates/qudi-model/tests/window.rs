@@ -131,6 +131,7 @@ fn weights_of_another_kind_are_refused_with_the_method_that_takes_them() {
             steps: 1,
             commit: None,
             licence: "MIT".into(),
+            recipes: Vec::new(),
         },
         sampling: None,
     };

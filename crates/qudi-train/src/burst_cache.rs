@@ -132,6 +132,8 @@ pub(super) struct BurstCache {
 struct CacheKey {
     program: String,
     data: DataConfig,
+    /// Digest of the decoded files.
+    pack: Option<String>,
     seed: u64,
     cached_frames: usize,
     mean_level: bool,
@@ -203,6 +205,7 @@ impl BurstCache {
     pub(super) fn new(
         folder: &Path,
         recipe: &Recipe,
+        pack: Option<String>,
         aligner: Option<&BurstAligner>,
     ) -> Result<Self> {
         let Some(crops) = recipe.train.crops else {
@@ -216,6 +219,7 @@ impl BurstCache {
         let key = CacheKey {
             program: env!("CARGO_PKG_VERSION").to_owned(),
             data: recipe.data.clone(),
+            pack,
             seed: recipe.train.seed,
             cached_frames: crops.cached_frames,
             mean_level: !recipe.train.ablate.removes(Part::MeanLevel),

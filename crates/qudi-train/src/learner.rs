@@ -203,12 +203,14 @@ fn save_described<N: Network>(
 }
 
 /// Where weights come from, besides the recipe.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Origin {
     /// Steps taken.
     pub steps: u64,
     /// The commit of the program.
     pub commit: Option<String>,
+    /// Recipes of the stages before, as TOML.
+    pub earlier: Vec<String>,
 }
 
 /// Returns the description that weights of a recipe hold of their training.
@@ -221,5 +223,6 @@ fn provenance(recipe: &Recipe, origin: &Origin) -> Provenance {
         steps: origin.steps,
         commit: origin.commit.clone(),
         licence: recipe.train.licence.clone(),
+        recipes: origin.earlier.iter().cloned().chain([recipe.text()]).collect(),
     }
 }

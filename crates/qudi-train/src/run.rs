@@ -43,7 +43,8 @@ pub struct Run<L> {
     bursts: BurstSampler,
     validator: Option<Validator>,
     device: Device,
-    commit: Option<String>,
+    /// Where the weights come from; its steps are not the run's.
+    origin: Origin,
 }
 
 /// Start of a run.
@@ -75,7 +76,7 @@ impl<L: Learner> Run<L> {
         files: Files,
         devices: &[Device],
         backbones: Option<&Path>,
-        commit: Option<String>,
+        origin: Origin,
     ) -> Result<Self> {
         let validator = Validator::new(recipe, files.pack.as_ref())?;
         let trainer = match from {
@@ -97,7 +98,7 @@ impl<L: Learner> Run<L> {
             trainer,
             bursts,
             validator,
-            commit,
+            origin,
         })
     }
 
@@ -187,7 +188,7 @@ impl<L: Learner> Run<L> {
     }
 
     fn save_weights(&self) -> Result<()> {
-        let origin = Origin { steps: self.trainer.step_number(), commit: self.commit.clone() };
+        let origin = Origin { steps: self.trainer.step_number(), ..self.origin.clone() };
         self.trainer.averaged().save(&self.recipe, &origin, &self.folder.join(WEIGHTS))
     }
 

@@ -82,7 +82,15 @@ fn weights(network: &Baseline) -> Vec<f32> {
 }
 
 fn open(folder: &Path, recipe: &Recipe, from: From<Baseline>) -> Result<Run<Baseline>, Error> {
-    Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
+    Run::open(
+        folder,
+        recipe,
+        from,
+        Files::default(),
+        &[Device::flex()],
+        None,
+        qudi_train::Origin::default(),
+    )
 }
 
 fn learn(run: &mut Run<Baseline>, stop_after: u64) -> Result<(), Error> {
@@ -117,7 +125,8 @@ fn every_method_learns_and_restores() {
         assert!(moved > after.len() / 3, "{name}: {moved} of {} weights moved", after.len());
 
         let path = folder.path().join(format!("{name}.safetensors"));
-        let origin = qudi_train::Origin { steps: 2, commit: Some("abc".to_owned()) };
+        let origin =
+            qudi_train::Origin { steps: 2, commit: Some("abc".to_owned()), ..Default::default() };
         trainer.averaged().save(&recipe, &origin, &path).unwrap();
         let description = describe(&path, &Device::flex()).unwrap().unwrap().description.unwrap();
         assert_eq!((description.method.as_str(), description.provenance.steps), (name, 2));

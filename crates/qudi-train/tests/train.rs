@@ -70,7 +70,7 @@ fn trained_as<L: Learner>(
 }
 
 fn open<L: Learner>(folder: &Path, recipe: &Recipe, from: From<L>) -> Result<Run<L>, Error> {
-    Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, None)
+    Run::open(folder, recipe, from, Files::default(), &[Device::flex()], None, Origin::default())
 }
 
 fn learn<L: Learner>(run: &mut Run<L>, stop_after: u64) -> Result<(), Error> {
@@ -292,7 +292,7 @@ fn nan_loss_stops_the_step_and_names_the_term() {
     let error = trainer.save_state(folder.path()).unwrap_err().to_string();
     assert!(error.contains("not finite"), "{error}");
     assert!(std::fs::read_dir(folder.path()).unwrap().next().is_none());
-    let origin = Origin { steps: 1, commit: None };
+    let origin = Origin { steps: 1, ..Origin::default() };
     let path = folder.path().join(WEIGHTS);
     let error = trainer.averaged().save(&recipe, &origin, &path).unwrap_err().to_string();
     assert!(error.contains("not finite") && !path.exists(), "{error}");
@@ -386,7 +386,7 @@ fn whole_weights_start_a_network_without_a_part() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("whole.safetensors");
     let whole = recipe(&[]);
-    init(&whole).save(&whole, &Origin { steps: 1, commit: None }, &path).unwrap();
+    init(&whole).save(&whole, &Origin { steps: 1, ..Origin::default() }, &path).unwrap();
     let without = recipe(&[("train.ablate", "[\"flow\", \"fusion\"]")]);
     let loaded = Diffusion::load(&path, &without, &Device::flex()).unwrap();
     let third_loss = |recipe: &Recipe, start: Option<Diffusion>| {

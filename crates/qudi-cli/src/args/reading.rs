@@ -134,6 +134,7 @@ impl Reading {
             mask: given.mask.unwrap_or(mask),
             dcr: given.dcr,
             lenient: given.lenient,
+            signed: false,
         }
     }
 }

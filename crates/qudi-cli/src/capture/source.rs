@@ -42,9 +42,10 @@ impl Source<'_> {
         }
     }
 
-    /// Opens the capture, and judges its frames.
+    /// Opens the capture with signed counts, and judges its frames.
     fn open_judged(&self, sensor: Option<&Sensor>) -> Result<Capture> {
-        let mut capture = self.input.open(self.options, sensor)?;
+        let options = ReadOptions { signed: true, ..self.options.clone() };
+        let mut capture = self.input.open(&options, sensor)?;
         if self.judged == 0 {
             return Ok(capture);
         }

@@ -123,6 +123,7 @@ mod tests {
             steps: 0,
             commit: None,
             licence: String::new(),
+            recipes: Vec::new(),
         }
     }
 

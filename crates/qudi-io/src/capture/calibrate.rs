@@ -21,7 +21,7 @@ const READ_NOISE_RANGE: (f64, f64) = (0.01, 30.0);
 /// Dark rates, hot pixels and read noise of a camera.
 #[derive(Clone, Debug)]
 pub struct Calibration {
-    /// Size of the maps: of the stored frames, not turned and not cropped.
+    /// Size of the maps: of frames without turn and crop.
     pub size: Size,
     /// Frames used.
     pub frames: u64,
@@ -142,22 +142,32 @@ fn finish(
             rates[i] > threshold && significant
         })
         .collect();
-    // Maps are of the stored frames, so that whoever turns and crops these turns and crops the maps.
-    let stored = capture.native.size();
+    // Maps are of the frames without turn and crop, so that whoever turns and crops these turns and crops maps.
     let dark: Vec<f32> = rates.iter().map(|&rate| rate as f32).collect();
     let hot = BadPixels { hot, ..BadPixels::default() }.mask(size);
-    let hot = capture.view.stored(&hot, stored, false);
+    let hot = usual(capture, &hot, false);
     let hot = (0..hot.len()).filter(|&i| hot[i]).collect();
     Ok(Calibration {
-        size: stored,
+        size: capture.usual.size,
         frames,
-        dark: capture.view.stored(&dark, stored, bulk as f32),
+        dark: usual(capture, &dark, bulk as f32),
         bulk,
         bad: BadPixels { hot, ..BadPixels::default() },
         threshold,
         read_noise,
         picture: picture(rates, size, 3.0 * bulk),
     })
+}
+
+/// Returns a map of the frames in use as one of the frames without turn and crop, `outside` where these end.
+fn usual<T: Copy>(capture: &Capture, map: &[T], outside: T) -> Vec<T> {
+    if capture.view == capture.usual {
+        return map.to_vec();
+    }
+    let stored = capture.view.stored(map, capture.native.size(), outside);
+    let mut usual = vec![outside; capture.usual.size.pixels()];
+    capture.usual.apply(&stored, &mut usual);
+    usual
 }
 
 /// Least correlation of neighbours in a picture; dark rates of pixels have nothing to do with each other.

@@ -24,8 +24,6 @@ pub struct FrameFindings {
     pub cuts: Vec<u64>,
     /// First frames of another light.
     pub light_steps: Vec<u64>,
-    /// Numbers that a frame counter skips, before these frames.
-    pub lost_before: Vec<u64>,
 }
 
 impl FrameFindings {
@@ -43,13 +41,13 @@ impl FrameFindings {
         let mut notes = Vec::new();
         let mut note = |frames: &[u64], what: &str, effect: &str| {
             if !frames.is_empty() {
-                notes.push(format!("{} {what} ({}){effect}", frames.len(), list(frames)));
+                notes.push(format!("{what}: {}{effect}", list(frames)));
             }
         };
         let effect = if replaced {
-            ": a good neighbour stands in for each"
+            "; a good neighbour stands in for each"
         } else {
-            ": too many to be exceptions, so that they are read as they are"
+            "; too many to be exceptions, so that they are read as they are"
         };
         note(&self.empty, "empty frames", effect);
         note(&self.saturated, "frames at one value", effect);
@@ -57,11 +55,10 @@ impl FrameFindings {
         note(&self.repeated, "frames that repeat the one before", "");
         note(
             &self.cuts,
-            "cuts to another scene",
-            ": restore the parts apart, with `start` and `end`",
+            "cuts to another scene at frames",
+            "; restore the parts apart, with `start` and `end`",
         );
-        note(&self.light_steps, "steps of the light", "");
-        note(&self.lost_before, "gaps in the frame counter, before frames", "");
+        note(&self.light_steps, "steps of the light at frames", "");
         if let Some(times) = self.stored_times {
             notes.push(format!("every frame is stored {times} times: each is read once"));
         }
@@ -71,5 +68,9 @@ impl FrameFindings {
 
 fn list(frames: &[u64]) -> String {
     let shown = frames.iter().take(MAX_LISTED).map(u64::to_string).collect::<Vec<_>>().join(", ");
-    if frames.len() > MAX_LISTED { format!("{shown}, ...") } else { shown }
+    if frames.len() > MAX_LISTED {
+        format!("{shown}, ... ({} in all)", frames.len())
+    } else {
+        shown
+    }
 }

@@ -3,7 +3,8 @@
 
 use super::Capture;
 use super::findings::FrameFindings;
-use super::frame_statistics::{BLOCKS, FrameStatistics};
+use super::frame_statistics::FrameStatistics;
+use super::scene_changes::changes;
 use crate::description::ReadOptions;
 use crate::frames::every_nth::EveryNth;
 use crate::frames::shifted::Shifted;
@@ -37,21 +38,6 @@ const MAX_TIMES: u64 = 32;
 /// Share of runs that have the same length, if every frame is stored as often.
 const REGULAR_SHARE: f64 = 0.9;
 
-/// Groups of frames in which the scene is followed.
-const MAX_GROUPS: usize = 8192;
-
-/// Counts of a block and group that tell one scene from another.
-const BLOCK_COUNTS: f64 = 50.0;
-
-/// Factor by which a change exceeds those before and after it, at a cut.
-const CUT_FACTOR: f64 = 5.0;
-
-/// Least change of a cut, over what chance explains.
-const MIN_CUT: f64 = 8.0;
-
-/// Least relative change of a step of the light.
-const MIN_STEP: f64 = 0.25;
-
 /// Lowest bits that are empty in all values, if these are shifted.
 const SHIFTED_BITS: std::ops::RangeInclusive<u32> = 3..=12;
 
@@ -82,9 +68,8 @@ impl Capture {
         let mut findings = FrameFindings::default();
         let mut seen: Vec<FrameStatistics> = Vec::new();
         let mut largest = 0;
-        let stretches = stretches(self.native_frames(), limit);
-        let whole = stretches.len() == 1;
-        for stretch in stretches {
+        let mut times = Vec::new();
+        for stretch in stretches(self.native_frames(), limit) {
             let first = self.range.start + stretch.start;
             let mut frames = Vec::new();
             for frame in first..self.range.start + stretch.end {
@@ -94,6 +79,7 @@ impl Capture {
             findings.looked_at += frames.len() as u64;
             largest = frames.iter().map(|frame| frame.largest.0).fold(largest, u16::max);
             judge(&frames, first, size.pixels(), &mut findings);
+            times.push(findings.stored_times.take());
             seen.append(&mut frames);
         }
         let bits = seen.iter().fold(0, |bits, frame| bits | frame.bits);
@@ -102,8 +88,8 @@ impl Capture {
         let samples = (seen.len() * size.pixels()) as f64;
         let mut replan = self.shift(bits, largest, sensor);
         replan |= self.take_for_binary(largest, mean, samples, sensor);
-        let runs = findings.stored_times.filter(|_| whole);
-        if let Some(times) = runs {
+        let same = times.iter().all(|other| *other == times[0]);
+        if let Some(times) = times[0].filter(|_| same) {
             self.read_once(times, first_run(&seen, times));
             // Numbers of frames are now others.
             findings = FrameFindings { stored_times: Some(times), ..FrameFindings::default() };
@@ -309,71 +295,6 @@ fn first_run(frames: &[FrameStatistics], times: u64) -> u64 {
     runs(frames).first().copied().unwrap_or(times).min(times)
 }
 
-/// Finds cuts and steps of the light: changes from one group of frames to the next that are far larger than
-/// those before and after.
-fn changes(frames: &[FrameStatistics], first: u64, findings: &mut FrameFindings) {
-    let group = frames.len().div_ceil(MAX_GROUPS);
-    let groups: Vec<[f64; BLOCKS]> = frames.chunks(group).map(total).collect();
-    let mean = groups.iter().flatten().sum::<f64>() / (groups.len() * BLOCKS) as f64;
-    let length = ((BLOCK_COUNTS / mean.max(1e-9)).ceil() as usize).max(2);
-    if groups.len() < 4 * length {
-        return;
-    }
-    let window = |from: usize| {
-        let mut sum = [0.0; BLOCKS];
-        for blocks in &groups[from..from + length] {
-            sum.iter_mut().zip(blocks).for_each(|(sum, block)| *sum += block);
-        }
-        sum
-    };
-    let windows: Vec<[f64; BLOCKS]> = (0..=groups.len() - length).map(window).collect();
-    let change = |at: usize| difference(&windows[at - length], &windows[at]);
-    let places = length..=groups.len() - length;
-    let all: Vec<[f64; 2]> = places.clone().map(change).collect();
-    let value = |kind: usize, at: usize| all[at - length][kind];
-    for at in places.clone() {
-        for (kind, least) in [(0, MIN_CUT), (1, MIN_STEP)] {
-            let own = value(kind, at);
-            let sides = [at.checked_sub(length), Some(at + length)];
-            let sides = sides.into_iter().flatten().filter(|side| places.contains(side));
-            let usual = sides.map(|side| value(kind, side)).fold(0.0, f64::max);
-            let floor = if kind == 0 { 1.0 } else { 0.02 };
-            let near =
-                at.saturating_sub(length).max(length)..=(at + length).min(groups.len() - length);
-            let is_peak = near.clone().all(|other| value(kind, other) < own || other >= at);
-            let is_peak = is_peak && near.clone().all(|other| value(kind, other) <= own);
-            if own > least && own > CUT_FACTOR * usual.max(floor) && is_peak {
-                let frame = first + (at * group) as u64;
-                let list = if kind == 0 { &mut findings.cuts } else { &mut findings.light_steps };
-                list.push(frame);
-            }
-        }
-    }
-    // Another scene has another light, too.
-    let cuts = findings.cuts.clone();
-    findings.light_steps.retain(|step| !cuts.contains(step));
-}
-
-fn total(frames: &[FrameStatistics]) -> [f64; BLOCKS] {
-    let mut sum = [0.0; BLOCKS];
-    for frame in frames {
-        sum.iter_mut().zip(frame.blocks).for_each(|(sum, block)| *sum += f64::from(block));
-    }
-    sum
-}
-
-/// Compares two windows: the change of the picture over chance, whatever its light, and of the light.
-fn difference(before: &[f64; BLOCKS], after: &[f64; BLOCKS]) -> [f64; 2] {
-    let [one, other] = [before, after].map(|blocks| blocks.iter().sum::<f64>());
-    if one <= 0.0 || other <= 0.0 {
-        return [0.0, 2.0 * f64::from(u8::from(one != other))];
-    }
-    let scale = one / other;
-    let square = |(a, b): (&f64, &f64)| (a - b * scale).powi(2) / (a + b * scale * scale).max(1.0);
-    let picture = before.iter().zip(after).map(square).sum::<f64>() / BLOCKS as f64;
-    [picture, 2.0 * (one - other).abs() / (one + other)]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -445,7 +366,7 @@ mod tests {
         let mut sums = vec![0; SIZE.pixels()];
         capture.total(11..13, &mut sums).unwrap();
         assert!(sums.iter().zip(&good[11]).all(|(&sum, &count)| sum == 2 * u32::from(count)));
-        assert!(capture.info().notes.iter().any(|note| note.contains("1 empty frames (12)")));
+        assert!(capture.info().notes.iter().any(|note| note.contains("empty frames: 12;")));
     }
 
     #[test]

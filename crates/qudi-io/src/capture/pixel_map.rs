@@ -97,13 +97,22 @@ fn nonzero(map: &Frame) -> BadPixels {
     BadPixels { hot, ..BadPixels::default() }
 }
 
-/// Loads a map of the stored frames, turned and cropped as they are, or one of the frames in use.
+/// Loads a map of the frames as they are read without turn and crop, turned and cropped like them; or one of
+/// the stored frames, or of the frames in use.
 fn load(capture: &Capture, path: &Path) -> Result<Frame> {
     let map = read(path)?;
     let (size, stored) = (capture.size(), capture.native.size());
-    if map.size == stored {
+    if map.size == size && capture.view == capture.usual {
+        return Ok(map);
+    }
+    let stored_map = if map.size == capture.usual.size {
+        Some(capture.usual.stored(&map.data, stored, 0.0))
+    } else {
+        (map.size == stored).then(|| map.data.clone())
+    };
+    if let Some(stored_map) = stored_map {
         let mut turned = Frame::filled(size, 0.0);
-        capture.view.apply(&map.data, &mut turned.data);
+        capture.view.apply(&stored_map, &mut turned.data);
         return Ok(turned);
     }
     if map.size == size {

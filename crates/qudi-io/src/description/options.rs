@@ -59,6 +59,9 @@ pub struct ReadOptions {
     pub dcr: Option<PathBuf>,
     /// True to drop an incomplete last frame instead of refusing the file.
     pub lenient: bool,
+    /// Keep a part of the pedestal of a sensor with read noise, so that noise below zero is not cut off.
+    #[serde(skip)]
+    pub signed: bool,
 }
 
 impl ReadOptions {

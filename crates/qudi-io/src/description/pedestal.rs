@@ -20,12 +20,15 @@ pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> R
     options
 }
 
-/// Keeps a part of the pedestal in the counts of a sensor with read noise, and returns it in DN: signed
-/// values without a sign.
+/// Keeps a part of the pedestal in the counts of a sensor with read noise, if `options` ask for it, and
+/// returns it in DN: signed values without a sign.
 pub(crate) fn keep_pedestal(options: &mut ReadOptions, sensor: Option<&Sensor>) -> f64 {
     let (Some(offset), None, Some(sensor)) = (options.offset, options.threshold, sensor) else {
         return 0.0;
     };
+    if !options.signed {
+        return 0.0;
+    }
     let Some(gain) = sensor.fixed_gain().filter(|_| sensor.response == Response::Linear) else {
         return 0.0;
     };

@@ -12,10 +12,15 @@ use std::path::Path;
 /// Extensions of image files.
 pub(super) const EXTENSIONS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
 
-/// Returns true if the name ends like an image file's.
+/// Returns true for a file whose name ends like an image's.
 pub fn is_image(path: &Path) -> bool {
+    has_image_name(path) && path.is_file()
+}
+
+/// Returns true if the name ends like an image file's, whatever it is.
+pub(super) fn has_image_name(path: &Path) -> bool {
     let known = |e: &std::ffi::OsStr| EXTENSIONS.iter().any(|known| e.eq_ignore_ascii_case(known));
-    path.extension().is_some_and(known) && path.is_file()
+    path.extension().is_some_and(known)
 }
 
 /// Reads one image as gray values in [0, 1]; an alpha channel is ignored.

@@ -1,7 +1,7 @@
 //! A folder of image files, in the order of the numbers in their names; a TIFF may hold several frames.
 
 use super::FrameReader;
-use super::image_file::{AssumedWhite, EXTENSIONS, is_image, read_scaled};
+use super::image_file::{AssumedWhite, EXTENSIONS, has_image_name, is_image, read_scaled};
 use super::tiff_pages::{TiffPages, is_tiff};
 use qudi_core::Transfer;
 use qudi_core::natural_order::natural_order;
@@ -28,8 +28,14 @@ impl ImageFolder {
         for entry in std::fs::read_dir(folder).map_err(read)? {
             let path = entry.map_err(read)?.path();
             // macOS adds `._a.png` for every `a.png` on other file systems: attributes, no image.
-            if is_image(&path) && !file_name(&path).starts_with("._") {
+            if file_name(&path).starts_with("._") {
+                continue;
+            }
+            if is_image(&path) {
                 files.push(path);
+            } else if has_image_name(&path) && !path.is_dir() {
+                let help = "remove it, or put the frame in its place";
+                return Err(Error::data("a broken link, a pipe or a device", &path, help));
             }
         }
         files.sort_by(|a, b| natural_order(&file_name(a), &file_name(b)));
@@ -111,6 +117,17 @@ fn file_name(path: &Path) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn names_broken_links() {
+        let folder = tempfile::tempdir().unwrap();
+        let image = image::GrayImage::from_pixel(3, 2, image::Luma([51]));
+        image.save(folder.path().join("a.png")).unwrap();
+        std::os::unix::fs::symlink("nowhere", folder.path().join("b.png")).unwrap();
+        let error = ImageFolder::open(folder.path(), Transfer::AsIs, None).err().unwrap();
+        assert!(error.to_string().contains("broken link"), "{error}");
+    }
 
     #[test]
     fn skips_attribute_files_of_macos() {

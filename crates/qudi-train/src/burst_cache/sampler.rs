@@ -56,8 +56,9 @@ impl BurstSampler {
     /// # Errors
     /// [`Error`](qudi_core::Error) if the recipe has no `train.crops`.
     pub fn with_cache(self, folder: &Path, recipe: &Recipe) -> Result<Self> {
-        let cache = Some(Arc::new(BurstCache::new(folder, recipe, self.aligner.as_ref())?));
-        Ok(Self { cache, ..self })
+        let pack = self.dataset.pack_sha256();
+        let cache = BurstCache::new(folder, recipe, pack, self.aligner.as_ref())?;
+        Ok(Self { cache: Some(Arc::new(cache)), ..self })
     }
 
     /// Sample `number`.

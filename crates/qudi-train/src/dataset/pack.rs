@@ -37,6 +37,8 @@ struct Contents {
     first: Vec<usize>,
     means: Vec<f64>,
     frames: Vec<Vec<u8>>,
+    /// Digest of everything in it.
+    sha256: String,
 }
 
 /// A frame of a pack, with 8 bits per pixel.
@@ -88,6 +90,7 @@ impl Pack {
         }
         index.check_digest(digest, path)?;
 
+        let sha256 = index.sha256().to_owned();
         let clips = index.clips;
         let mean = |(clip, &first): (&Clip, &usize)| {
             let values = frames[first..first + clip.frames].iter().flatten();
@@ -95,7 +98,13 @@ impl Pack {
             sum as f64 / 255.0 / (clip.frames * clip.size.pixels()) as f64
         };
         let means = clips.par_iter().zip(&first).map(mean).collect();
-        Ok(Self(Arc::new(Contents { path: path.to_owned(), clips, first, means, frames })))
+        let path = path.to_owned();
+        Ok(Self(Arc::new(Contents { path, clips, first, means, frames, sha256 })))
+    }
+
+    /// Returns the digest of everything in it.
+    pub fn sha256(&self) -> &str {
+        &self.0.sha256
     }
 
     /// Returns the clips and stills in it.

@@ -186,6 +186,11 @@ impl Index {
         format!("{:x}", images.chain_update(text).finalize())
     }
 
+    /// Returns the digest that is written down.
+    pub(super) fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
     /// Checks the digest.
     pub(super) fn check_digest(&self, images: Sha256, path: &Path) -> Result<()> {
         if self.digest(images) == self.sha256 {

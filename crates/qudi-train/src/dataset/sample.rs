@@ -52,6 +52,11 @@ impl Dataset {
         Ok(Self { config: config.clone(), pack, sensors, clips })
     }
 
+    /// Returns the digest of the pack that samples are drawn from, if there is one.
+    pub(crate) fn pack_sha256(&self) -> Option<String> {
+        self.pack.as_ref().map(|pack| pack.sha256().to_owned())
+    }
+
     /// Draws sample `number` of `seed`.
     ///
     /// # Errors

@@ -47,14 +47,14 @@ pub(super) fn remarks(rows: &[Row]) -> Vec<String> {
     if let Some(row) = rows.iter().find(|row| !row.scores.is_empty()) {
         for (count, list) in row.scores.iter().filter_map(|score| marked(score, Mark::Black)) {
             remarks.push(format!(
-                "{count} black frames of the truth of {list} are left out of all means"
+                "black frames of the truth of {list}, {count} in all, are left out of all means"
             ));
         }
     }
     for row in rows {
         for (count, list) in row.scores.iter().filter_map(|score| marked(score, Mark::Equal)) {
             remarks.push(format!(
-                "{count} frames of {} at {} PPP equal the truth and count {MAX_PSNR} dB: {list}",
+                "frames of {} at {} PPP that equal the truth, {count} in all, count {MAX_PSNR} dB: {list}",
                 row.label(),
                 row.ppp
             ));

@@ -7,7 +7,7 @@ use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::methods::learned_names;
 use crate::report::Report;
-use crate::settings::Settings;
+use crate::settings::{Settings, recipe_keys, toml_text};
 use crate::weights::Weights;
 use burn::tensor::Device;
 use qudi_baselines::import::{Contents, describe};
@@ -124,7 +124,8 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
     ];
     lines.extend(provenance(&d.provenance));
     lines.push(("sha-256", weights.sha256()?));
-    report.result(&to_text(&lines), || json!(weights.describe().ok()))
+    let text = to_text(&lines) + &recipes(&d.provenance);
+    report.result(&text, || json!(weights.describe().ok()))
 }
 
 /// Returns lines about the training of weights.
@@ -138,6 +139,38 @@ fn provenance(p: &Provenance) -> [(&'static str, String); 5] {
         ("made by", p.program.clone() + &commit),
         ("licence", p.licence.clone()),
     ]
+}
+
+/// Formats the recipes of all stages: every key that is set, and the defaults of other keys of `train`.
+fn recipes(p: &Provenance) -> String {
+    let mut text = String::new();
+    for (number, recipe) in p.recipes.iter().enumerate() {
+        let table: toml::Table = recipe.parse().unwrap_or_default();
+        let _ = write!(text, "\nrecipe of stage {}\n\n{recipe}", number + 1);
+        let unset = recipe_defaults(&table);
+        if !unset.is_empty() {
+            let _ = writeln!(text, "\ndefaults    {}", unset.join(", "));
+        }
+    }
+    text
+}
+
+/// Returns the keys of `train` that a recipe leaves at their defaults, as they would be set.
+fn recipe_defaults(recipe: &toml::Table) -> Vec<String> {
+    let is_set = |name: &str| {
+        let (part, keys) = name.split_once('.')?;
+        let mut value = recipe.get(part)?;
+        for key in keys.split('.') {
+            value = value.get(key)?;
+        }
+        Some(())
+    };
+    let keys = recipe_keys().into_iter().map(|(key, _)| key);
+    let unset = keys.filter(|key| {
+        let of_training = key.name.starts_with("train.") && !key.name.contains(".0");
+        of_training && !key.default.is_null() && is_set(&key.name).is_none()
+    });
+    unset.map(|key| format!("{} = {}", key.name, toml_text(&key.default))).collect()
 }
 
 /// Formats lines of keys and values.
@@ -164,7 +197,8 @@ fn learned(contents: &Contents, path: &Path, report: &Report) -> Result<()> {
         ("use", format!("--method {name} --weights {name}={}", path.display())),
         ("sha-256", sha256.clone()),
     ]);
-    report.result(&to_text(&lines), || {
+    let trained = description.as_ref().map(|description| recipes(&description.provenance));
+    report.result(&(to_text(&lines) + &trained.unwrap_or_default()), || {
         let mut document =
             json!({"method": name, "parameters": parameters, "sizes": sizes, "sha256": sha256});
         if let Some(description) = description {

@@ -15,6 +15,7 @@ use crate::interrupt;
 use crate::report::Report;
 use crate::settings::Settings;
 use crate::version::COMMIT;
+use crate::weights::recipes_of;
 use burn::tensor::Device;
 use qudi_baselines::learning::Baseline;
 use qudi_model::config::NetworkConfig;
@@ -23,7 +24,7 @@ use qudi_model::regression::Regression;
 use qudi_model::window::Window;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::Lpips;
-use qudi_train::{From, Learner, NetworkRecipe, Run, Validation, WEIGHTS, draw_bursts};
+use qudi_train::{From, Learner, NetworkRecipe, Origin, Run, Validation, WEIGHTS, draw_bursts};
 use serde_json::json;
 use std::path::Path;
 
@@ -101,6 +102,16 @@ pub(super) fn check_init(plan: &Plan, init: Option<&Path>, device: &Device) -> R
     Ok(())
 }
 
+/// Returns the recipes of the stages before: of the weights to start from, or of the run's own but the last.
+fn earlier_recipes(plan: &Plan) -> Vec<String> {
+    if plan.action != Action::Resume {
+        return plan.init.as_deref().map(recipes_of).unwrap_or_default();
+    }
+    let mut recipes = recipes_of(&plan.folder.join(WEIGHTS));
+    recipes.pop();
+    recipes
+}
+
 fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let (folder, recipe) = (&plan.folder, &plan.recipe);
     check_folder(plan)?;
@@ -121,7 +132,9 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     };
     let list: Vec<_> = devices.iter().map(|device| device.device.clone()).collect();
     let commit = COMMIT.map(str::to_owned);
-    let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), commit)?;
+    let earlier = earlier_recipes(plan);
+    let origin = Origin { steps: 0, commit, earlier };
+    let mut run = Run::open(folder, recipe, from, files, &list, plan.backbones.as_deref(), origin)?;
     if plan.action == Action::Start {
         clear(folder)?;
     }
