@@ -190,8 +190,8 @@ impl Sensor {
         self.estimate_signed_flux(sum, frames, gain, dark_per_frame).max(0.0)
     }
 
-    /// Estimates as [`Self::estimate_flux`], negative where noise leaves less than the dark counts: means over
-    /// pixels have no bias.
+    /// Estimates as [`Self::estimate_flux`], negative where noise leaves less than the dark counts: means
+    /// over pixels have no bias.
     pub fn estimate_signed_flux(
         &self,
         sum: f64,

@@ -1,4 +1,5 @@
-//! The pedestal of counts: what is subtracted of it, and what is kept so that noise below zero is not cut off.
+//! The pedestal of counts: what is subtracted of it, and what is kept so that noise below zero is not cut
+//! off.
 
 use super::options::ReadOptions;
 use qudi_core::sensor::{Response, Sensor};
@@ -19,8 +20,8 @@ pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> R
     options
 }
 
-/// Keeps a part of the pedestal in the counts of a sensor with read noise, if `options` ask for it, and returns
-/// it in DN: signed values without a sign.
+/// Keeps a part of the pedestal in the counts of a sensor with read noise, if `options` ask for it, and
+/// returns it in DN: signed values without a sign.
 pub(crate) fn keep_pedestal(options: &mut ReadOptions, sensor: Option<&Sensor>) -> f64 {
     let (Some(offset), None, Some(sensor)) = (options.offset, options.threshold, sensor) else {
         return 0.0;
