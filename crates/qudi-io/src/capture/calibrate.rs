@@ -142,7 +142,7 @@ fn finish(
             rates[i] > threshold && significant
         })
         .collect();
-    // Maps are of the frames without turn and crop, so that whoever turns and crops these turns and crops maps.
+    // Maps are of the frames without turn and crop, and are turned and cropped with these.
     let dark: Vec<f32> = rates.iter().map(|&rate| rate as f32).collect();
     let hot = BadPixels { hot, ..BadPixels::default() }.mask(size);
     let hot = usual(capture, &hot, false);
