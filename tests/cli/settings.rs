@@ -63,7 +63,7 @@ fn every_command_applies_or_rejects_set_keys_by_name() {
             }
             let text = said(&folder, command, &["--set", known]);
             let key = known.split('=').next().unwrap();
-            let refusal = format!("`{key}` is not a setting of `qudi {verb}`");
+            let refusal = format!("`{key}` is not a setting of `qudi {verb}");
             assert_eq!(text.contains(&refusal), !takes.contains(part), "{command} {known}: {text}");
         }
     }
