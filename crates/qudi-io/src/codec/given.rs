@@ -112,12 +112,12 @@ mod tests {
     #[test]
     fn two_axes_are_one_frame() {
         let fetch = |first: u64, rows: u64| {
-            assert_eq!((first, rows), (0, 16));
-            Ok((0..16 * 8).map(|place| place % 5).collect())
+            assert_eq!((first, rows), (0, 64));
+            Ok((0..64 * 64u64).map(|place| (place % 5) as u8).collect())
         };
-        let array = array(&[16, 8], Box::new(fetch));
+        let array = array(&[64, 64], Box::new(fetch));
         let mut capture = Capture::from_array(array, &ReadOptions::default(), None).unwrap();
-        let mut counts = vec![0; 16 * 8];
+        let mut counts = vec![0; 64 * 64];
         capture.read(0, &mut counts).unwrap();
         assert_eq!((capture.frames(), counts[127]), (1, 2));
     }
