@@ -1,6 +1,6 @@
 //! `qudi train` from recipe to restored frames, and its errors.
 
-use crate::support::{listing, refused, run, scratch};
+use crate::support::{listing, qudi, refused, run, scratch};
 use image::{GrayImage, Luma};
 use safetensors::SafeTensors;
 use std::collections::BTreeMap;
@@ -18,6 +18,28 @@ fn with_recipes(name: &str) -> PathBuf {
         std::fs::copy(recipe, folder.join(format!("{to}.toml"))).unwrap();
     }
     folder
+}
+
+/// A run that stops in time ends well, with a state to go on from; the speed of training is measured without
+/// a file, and options of methods are refused there.
+#[test]
+fn training_stops_in_time_and_its_speed_is_measured() {
+    let folder = scratch("train-seconds");
+    let quick = "--device cpu --set data.crop=32 --set data.frames=3";
+    let validation = "--set validation.crop=32 --set validation.frames=3";
+    run(&folder, &format!("train tiny -o run --seconds 1 -q {quick} {validation}"));
+    assert!(folder.join("run/state").is_dir() && folder.join("run/weights.safetensors").is_file());
+    let output = run(&folder, &format!("bench --train tiny --seconds 1 --json {quick}"));
+    let found: serde_json::Value = serde_json::from_str(&output).unwrap();
+    assert!(found["speed"]["samples_per_second"].as_f64().unwrap() > 0.0);
+    assert!(found["speed"]["tflops"].as_f64().unwrap() > 0.0);
+    for option in ["--steps 2", "--precision f32", "--weights w.safetensors", "--tile 64"] {
+        let words = format!("bench --train tiny {option}");
+        let output = qudi(&folder).args(words.split(' ')).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{text}");
+        assert!(text.contains("cannot be used with"), "{option}: {text}");
+    }
 }
 
 /// The shipped recipe learns, in less than two minutes on two cores.

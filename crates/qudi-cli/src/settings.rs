@@ -21,6 +21,7 @@ use qudi_core::limits::TEXT_BYTES;
 use qudi_core::nearest::nearest;
 use qudi_core::regular_file::read_text;
 use qudi_core::sensor::{Sensor, load_document, merge_documents};
+use qudi_train::Recipe;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 use std::path::Path;
@@ -193,6 +194,12 @@ impl Settings {
     /// Returns the keys of a recipe that were set, with value and origin.
     pub(crate) fn recipe_changes(&self) -> &[(String, Value, String)] {
         &self.recipe
+    }
+
+    /// Loads a recipe with the keys that were set.
+    pub(crate) fn recipe(&self, name: &str) -> Result<Recipe> {
+        let changes = self.recipe.iter().map(|(key, value, _)| (key.clone(), toml_text(value)));
+        Ok(Recipe::load(name, &changes.collect::<Vec<_>>())?)
     }
 
     /// Returns the value of a key; ask for an `Option` where it may be unset.

@@ -40,7 +40,7 @@ pub(crate) fn is_cube<const D: usize>(tensor: &Tensor<D>) -> bool {
 }
 
 /// Returns true if LibTorch computes tensors of this device, on a processor or on a card.
-pub fn is_libtorch(device: &Device) -> bool {
+fn is_libtorch(device: &Device) -> bool {
     #[cfg(feature = "libtorch")]
     {
         use burn::backend::DispatchDevice;

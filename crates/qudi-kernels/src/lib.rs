@@ -27,7 +27,7 @@ mod uninitialised;
 mod warp;
 
 pub use attention::attention;
-pub use backend::{is_flex, is_libtorch, with_stock_operations};
+pub use backend::{is_flex, with_stock_operations};
 #[cfg(feature = "libtorch")]
 pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};

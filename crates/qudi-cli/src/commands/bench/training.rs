@@ -5,7 +5,7 @@ use crate::device;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::Report;
-use crate::settings::{Settings, toml_text};
+use crate::settings::Settings;
 use qudi_baselines::learning::Baseline;
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Diffusion;
@@ -17,9 +17,7 @@ use serde_json::json;
 
 /// Trains the recipe for a while and reports its speed.
 pub(super) fn run(recipe: &str, args: &Bench, settings: &Settings, report: &Report) -> Result<()> {
-    let changes = settings.recipe_changes().iter();
-    let changes: Vec<_> = changes.map(|(key, value, _)| (key.clone(), toml_text(value))).collect();
-    let recipe = Recipe::load(recipe, &changes)?;
+    let recipe = settings.recipe(recipe)?;
     let measure = match recipe.network {
         NetworkRecipe::Qudi(NetworkConfig::Regression(_)) => measure::<Regression>,
         NetworkRecipe::Qudi(NetworkConfig::Diffusion(_)) => measure::<Diffusion>,

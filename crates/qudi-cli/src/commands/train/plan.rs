@@ -3,7 +3,7 @@
 use super::args::Train;
 use crate::args::Global;
 use crate::error::{CliError, Result};
-use crate::settings::{Settings, toml_text};
+use crate::settings::Settings;
 use qudi_core::atomic_file::Overwrite;
 use qudi_train::{RECIPE, Recipe, default_workers, recipe_names};
 use std::path::PathBuf;
@@ -80,8 +80,6 @@ impl Plan {
 }
 
 fn recipe(args: &Train, settings: &Settings) -> Result<Recipe> {
-    let changes = settings.recipe_changes().iter();
-    let changes: Vec<_> = changes.map(|(key, value, _)| (key.clone(), toml_text(value))).collect();
     let own = args.output.as_ref().map(|folder| folder.join(RECIPE));
     let name = match (&args.recipe, own) {
         (Some(name), _) => name.clone(),
@@ -95,5 +93,5 @@ fn recipe(args: &Train, settings: &Settings) -> Result<Recipe> {
             ));
         }
     };
-    Ok(Recipe::load(&name, &changes)?)
+    settings.recipe(&name)
 }
