@@ -9,6 +9,7 @@ use crate::error::{CliError, Result};
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::colour::Colour;
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
@@ -151,6 +152,14 @@ pub(crate) fn describe(
             let bits = usize::BITS - largest.leading_zeros();
             line("largest", format!("{largest}; if counts have {bits} bits, say --bits {bits}"));
         }
+    }
+    if let (Some(colours), Some(cfa)) = (summary.colours, &about.cfa) {
+        let rates = Colour::ALL
+            .into_iter()
+            .zip(colours)
+            .filter_map(|(colour, mean)| mean.map(|mean| format!("{} {mean:.4}", colour.name())));
+        let rates: Vec<_> = rates.collect();
+        line("colours", format!("{cfa}: mean counts {}", rates.join(", ")));
     }
     line("pixels", capture.bad_pixels().describe(capture.size()));
     histogram(&mut text, &summary.histogram);
