@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compares restored colours of photographs in motion behind a colour filter: QuDi, what is known, and bounds.
 
-    python3 scripts/colour.py QUDI PICTURES_FOLDER [--ppp 3.25,9.75] [--pictures 1,5] [--cfa rggb] [--size HxW]
+    python3 scripts/colour.py QUDI FOLDER [--ppp 3.25,9.75] [--pictures 1,5] [--cfa rggb] [--size HxW]
 
 Needs NumPy. Every picture moves by 0.7 and -0.45 pixels a frame for 11 frames, in linear light, and is exposed
 behind the filter with the sensor of `qudi simulate`. The middle frame is scored after one common gain.
@@ -16,9 +16,11 @@ behind the filter with the sensor of `qudi simulate`. The middle frame is scored
 import argparse
 import json
 import pathlib
+import struct
 import subprocess
 import tempfile
 import time
+import zlib
 
 import numpy as np
 
@@ -54,6 +56,27 @@ def demosaiced(planes, letters, size):
     for k, letter in enumerate(letters):
         of[letter].append(interpolated(planes[k], k // 2, k % 2, size))
     return np.stack([np.mean(of[c], 0) for c in "rgb"], -1)
+
+
+def shown(planes, truth):
+    """8-bit sRGB of linear light, at the brightness of the truth."""
+    gain = (planes * truth).sum() / max((planes * planes).sum(), 1e-12)
+    light = np.clip(gain * planes, 0, 1)
+    curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return (255 * curve + 0.5).astype(np.uint8)
+
+
+def write_png(path, pixels):
+    """Writes an 8-bit RGB PNG."""
+    height, width, _ = pixels.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(rows, 9)), (b"IEND", b"")]
+    with open(path, "wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for name, data in chunks:
+            file.write(struct.pack(">I", len(data)) + name + data)
+            file.write(struct.pack(">I", zlib.crc32(name + data)))
 
 
 class Runner:
@@ -92,6 +115,7 @@ class Runner:
         out["ciede"], out["zipper"] = document["ciede2000_median"], document["zipper"]
         if arguments.quick:
             return out
+        pictures = {"truth": middle, "qudi": colour[MIDDLE]}
         tile = arguments.cfa.split("@")[0]
         if len(tile) == 4 and set(tile) <= set("rgb"):
             planes = []
@@ -103,8 +127,20 @@ class Runner:
                 planes.append(self.restored("p.npy", "po.npy", *gray)[0][MIDDLE])
                 average = self.restored("p.npy", "pa.npy", *gray, "--method", "average")[0][MIDDLE]
                 planes[-1] = (planes[-1], average)
-            out["apart"] = psnr(demosaiced([p for p, _ in planes], tile, frame_size), middle)
-            out["average"] = psnr(demosaiced([a for _, a in planes], tile, frame_size), middle)
+            pictures["apart"] = demosaiced([p for p, _ in planes], tile, frame_size)
+            pictures["average"] = demosaiced([a for _, a in planes], tile, frame_size)
+            out["apart"] = psnr(pictures["apart"], middle)
+            out["average"] = psnr(pictures["average"], middle)
+            counts = np.load(self.folder / "g.npy")[MIDDLE].astype(float)
+            mosaic = np.zeros((*frame_size, 3))
+            for k, letter in enumerate(tile):
+                mosaic[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)] = counts[k // 2 :: 2, k % 2 :: 2]
+            if arguments.picture:
+                dimmed = [shown(mosaic, middle)]
+                rest = [shown(pictures[name], middle) for name in ("average", "qudi", "truth")]
+                gap = np.full((frame_size[0], 6, 3), 255, np.uint8)
+                parts = [part for panel in dimmed + rest for part in (panel, gap)][:-1]
+                write_png(arguments.picture, np.concatenate(parts, 1))
         full = []
         for name, clip in [("gray", truth @ LUMA), *[(k, truth[..., k]) for k in range(3)]]:
             np.save(self.folder / "k.npy", clip.astype(np.float32))
@@ -121,14 +157,15 @@ class Runner:
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("qudi")
-    parser.add_argument("pictures_folder", type=pathlib.Path)
+    parser.add_argument("folder", type=pathlib.Path)
     parser.add_argument("--ppp", default="3.25,9.75")
     parser.add_argument("--pictures", help="names without extension")
     parser.add_argument("--cfa", default="rggb")
     parser.add_argument("--size")
+    parser.add_argument("--picture", help="write mosaic, average, QuDi and truth of the last picture, .png")
     parser.add_argument("--quick", action="store_true", help="restore with QuDi alone")
     arguments = parser.parse_args()
-    pictures = sorted(arguments.pictures_folder.resolve().glob("*.png"))
+    pictures = sorted(arguments.folder.resolve().glob("*.png"))
     if arguments.pictures:
         pictures = [p for p in pictures if p.stem in arguments.pictures.split(",")]
     with tempfile.TemporaryDirectory() as scratch:

@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 mod bad_input;
 #[path = "cli/baselines.rs"]
 mod baselines;
+#[path = "cli/colour.rs"]
+mod colour;
 #[path = "cli/eval.rs"]
 mod eval;
 #[path = "cli/field.rs"]

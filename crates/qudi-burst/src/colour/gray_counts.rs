@@ -22,9 +22,9 @@ pub(super) struct GrayCounts<'a> {
 }
 
 impl GrayCounts<'_> {
-    /// Turns the counts of frame `frame` into gray ones. What a count tells beyond luma and chroma, which it
-    /// is expected to have, is scaled to what luma would tell. Where that has more noise than a gray count, it
-    /// is scaled down to as much noise: the law of the result is the gray pixel's.
+    /// Turns the counts of frame `frame` into gray ones. The difference of a count from the one that luma and
+    /// chroma let expect is scaled to the difference that a gray count would have. Where that has more noise
+    /// than a gray count, it is scaled down to as much noise: the law of the result is the gray pixel's.
     pub(super) fn of(&self, counts: &[u16], frame: usize, acquisition: &Acquisition) -> Vec<u16> {
         let Self { filter, response, luma, chroma } = self;
         let seen = responses(filter);

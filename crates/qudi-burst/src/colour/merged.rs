@@ -45,7 +45,7 @@ impl MergedColours {
                 let (place, [here, there]) = displaced.place(i % size.width, i / size.width);
                 let misfit =
                     ((here.max(0.0) + floor) / (there.max(0.0) + floor)).ln() * (1.0 / MISFIT);
-                // Dark counts of this pixel beyond those of an ordinary one.
+                // Dark counts of this pixel that an ordinary one has not.
                 let excess = (acquisition.dark_of(i, typical) - typical) as f32;
                 let count = f32::from(count) - slope * excess;
                 merged.add(filter.colours()[i], place, count, (-0.5 * misfit * misfit).exp());

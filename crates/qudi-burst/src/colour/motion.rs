@@ -6,12 +6,14 @@ use crate::motion::constant_velocity::ConstantVelocity;
 use crate::motion::flow::spread;
 use crate::motion::hypotheses::select_on_estimates;
 use crate::motion::reference_frames::ReferenceFrames;
+use crate::patch::PatchMotion;
 use crate::prepared_burst::PreparedBurst;
 use crate::reference::ReferenceEstimate;
 use qudi_core::colour::{Colour, ColourFilter};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{Gain, Response, Sensor};
 use qudi_core::{Frame, Result, Size};
+use std::sync::OnceLock;
 
 /// Counts that are added: 2 x 2.
 const ADDED: u32 = 4;
@@ -28,6 +30,8 @@ pub(super) struct QuadMotion {
     burst: PreparedBurst,
     velocity: Option<ConstantVelocity>,
     references: ReferenceFrames,
+    /// Motion of the patches of each frame to all frames, found on first use.
+    motions: Vec<OnceLock<PatchMotion>>,
     /// Restored luma of each frame, in image units.
     luma: Vec<Frame>,
 }
@@ -72,15 +76,17 @@ impl QuadMotion {
         let estimate = ReferenceEstimate::compute(view, &of_quads)?;
         let ReferenceEstimate { frames: luma, mean_counts, burst, velocity, .. } = estimate;
         let references = ReferenceFrames::new(&burst, mean_counts, REFERENCE_ERROR);
-        Ok(Self { size, burst, velocity, references, luma })
+        let motions = luma.iter().map(|_| OnceLock::new()).collect();
+        Ok(Self { size, burst, velocity, references, motions, luma })
     }
 
     /// Returns the displacement of each frame's pixels to frame `reference`.
     pub(super) fn to(&self, reference: usize) -> Vec<Displaced<'_>> {
-        let matched = self.references.align(&self.burst, reference);
-        let velocity = self.velocity.as_ref();
-        let motion =
-            select_on_estimates(&self.burst, velocity, &self.references, reference, matched);
+        let motion = self.motions[reference].get_or_init(|| {
+            let matched = self.references.align(&self.burst, reference);
+            let velocity = self.velocity.as_ref();
+            select_on_estimates(&self.burst, velocity, &self.references, reference, matched)
+        });
         let displaced = |(k, motion): (usize, &Vec<[f32; 2]>)| Displaced {
             size: self.size,
             displacement: spread(&self.burst.grid, motion, self.size),

@@ -8,13 +8,13 @@ use qudi_core::sensor::{CountLaw, CountMoments};
 const NODES: usize = 2048;
 
 /// Share of full scale at which counts tell no more light.
-const SATURATED: f64 = 0.98;
+const SATURATION: f64 = 0.98;
 
 /// Largest count of which the mean response is inverted exactly; deeper samples are nearly linear.
 const MAX_EXACT_COUNT: u16 = 1023;
 
 /// Lower bound of variances, and of the response's slope.
-const LEAST: f32 = 1e-3;
+const MIN_VARIANCE: f32 = 1e-3;
 
 /// Response of the pixels of an acquisition to light.
 #[derive(Debug)]
@@ -35,9 +35,9 @@ impl CountResponse {
         let law = CountLaw::new(sensor, acquisition.gain);
         let full = f64::from(sensor.max_count());
         let last = if sensor.max_count() <= MAX_EXACT_COUNT {
-            law.detections_for_mean(SATURATED * full)
+            law.detections_for_mean(SATURATION * full)
         } else {
-            SATURATED * full / acquisition.gain
+            SATURATION * full / acquisition.gain
         };
         let moments = CountMoments::new(&law);
         let node = |i: usize| moments.at(last * (i as f64 / NODES as f64).powi(2));
@@ -62,8 +62,8 @@ impl CountResponse {
         let between = |table: &[f32]| table[i] + part * (table[i + 1] - table[i]);
         CountAt {
             mean: between(&self.means),
-            variance: between(&self.variances).max(LEAST),
-            slope: ((self.means[i + 1] - self.means[i]) / width).max(LEAST) * self.per_unit,
+            variance: between(&self.variances).max(MIN_VARIANCE),
+            slope: ((self.means[i + 1] - self.means[i]) / width).max(MIN_VARIANCE) * self.per_unit,
         }
     }
 

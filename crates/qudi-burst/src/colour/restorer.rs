@@ -6,6 +6,7 @@ use qudi_core::colour::ColourFilter;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
 use qudi_core::{Error, Frame, Result};
+use rayon::prelude::*;
 use std::fmt;
 
 /// Counts of the rarest colour over which chroma is averaged, in a Gaussian's effective area.
@@ -74,6 +75,13 @@ impl Restorer for ColourRestorer {
                 "use the filter of this camera, of its frames' size",
             ));
         }
+        if burst.size.height < 2 || burst.size.width < 2 {
+            return Err(Error::request(
+                format!("colours in frames of {}", burst.size),
+                "crop",
+                "read a larger part of the frames, or one colour as gray with `channel`",
+            ));
+        }
         let response = CountResponse::new(acquisition)?;
         let means = MergedColours::means(burst.frames, &self.filter);
         let light = means.map(|mean| response.image(mean));
@@ -100,7 +108,7 @@ impl Restorer for ColourRestorer {
             };
             gray.of(&burst.frames[frame], frame, acquisition)
         };
-        let counts: Vec<Vec<u16>> = (0..burst.frames.len()).map(gray).collect();
+        let counts: Vec<Vec<u16>> = (0..burst.frames.len()).into_par_iter().map(gray).collect();
         let view = BurstView { size: burst.size, frames: &counts };
         let restored = self.method.restore_frames(view, acquisition, numbers)?;
         if !self.with_chroma {
@@ -110,7 +118,7 @@ impl Restorer for ColourRestorer {
             let chroma: Chroma = colours.refined(&merged(frame), luma);
             chroma.coloured(luma)
         };
-        let colour = numbers.iter().zip(&restored.frames).map(coloured).collect();
+        let colour = numbers.par_iter().zip(&restored.frames).map(coloured).collect();
         Ok(Restored { colour: Some(colour), ..restored })
     }
 }

@@ -14,7 +14,7 @@ const GRAY_SHARE: f64 = 0.01;
 const MIN_BLOCKS: usize = 8;
 
 /// Share of full scale beyond which a block counts as saturated.
-const SATURATED: f64 = 0.8;
+const SATURATION: f64 = 0.8;
 
 /// Range of guessed gains.
 const GAIN_RANGE: [f64; 2] = [0.1, 10.0];
@@ -56,7 +56,7 @@ pub(super) fn guessed_gains(
     let sensor = &acquisition.sensor;
     let dark = sensor.dark_per_frame().unwrap_or(0.0);
     let frames = summary.sampled as f64;
-    let most = SATURATED * f64::from(sensor.max_count());
+    let most = SATURATION * f64::from(sensor.max_count());
     let light = |block: &[(u64, u64); 3]| -> Option<[f64; 3]> {
         let mut light = [0.0; 3];
         for (k, &(sum, pixels)) in block.iter().enumerate() {

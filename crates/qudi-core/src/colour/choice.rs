@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// A colour filter array as users name it: `rggb@0,0`, or a picture with a pixel of its colour for each pixel.
+/// A colour filter array as users name it: `rggb@0,0`, or a picture of it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum FilterChoice {

@@ -28,6 +28,11 @@ impl Colour {
         ["red", "green", "blue", "white"][self as usize]
     }
 
+    /// Returns its letter in patterns.
+    pub fn letter(self) -> char {
+        ['r', 'g', 'b', 'w'][self as usize]
+    }
+
     /// Returns the colour of a letter of a pattern; `None` for cyan, magenta and yellow.
     fn of_letter(letter: char) -> Option<Self> {
         Some(match letter {
@@ -127,6 +132,15 @@ impl ColourFilter {
         Self { size, colours, efficiency: self.efficiency }.complete("crop")
     }
 
+    /// Returns the letters of the first `side` x `side` pixels, if the frames are that large.
+    pub fn first_tile(&self, side: usize) -> Option<String> {
+        if self.size.height < side || self.size.width < side {
+            return None;
+        }
+        let colour = |i: usize| self.colours[i / side * self.size.width + i % side];
+        Some((0..side * side).map(|i| colour(i).letter()).collect())
+    }
+
     /// Returns the size of the frames.
     pub fn size(&self) -> Size {
         self.size
@@ -212,6 +226,8 @@ mod tests {
         let filter = tiled("rggb").unwrap();
         let flipped = filter.seen(SIZE, Some(&[3, 2, 1, 0, 7, 6, 5, 4])).unwrap();
         assert_eq!(flipped, tiled("grbg").unwrap());
+        assert_eq!(flipped.first_tile(2).as_deref(), Some("grbg"));
+        assert_eq!(flipped.first_tile(4), None);
         let size = Size { height: 1, width: 2 };
         assert!(filter.seen(size, Some(&[0, 1])).is_err(), "no blue is left");
     }

@@ -13,8 +13,8 @@ pub(super) enum MosaicPart {
     Plane(MosaicPlane),
 }
 
-/// Returns what of a mosaic is read; `None` for captures without one. The filter is the user's, the file's, or
-/// the sensor's.
+/// Returns the part of a mosaic that is read; `None` for captures without one. The filter is the user's, the
+/// file's, or the sensor's.
 pub(super) fn mosaic_part(
     info: &mut CaptureInfo,
     options: &ReadOptions,
@@ -90,7 +90,7 @@ pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<f64> {
 const MAX_OTHERS: f64 = 0.5;
 
 /// Refuses a Bayer pattern whose two pixels of one colour differ all over the picture, while the other two do
-/// not: the tile begins one pixel beside.
+/// not: the tile begins a pixel further.
 pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
     let size = filter.size();
     let bayer = cfa.tile().is_some_and(|mosaic| mosaic.side() == 2);
@@ -115,7 +115,7 @@ pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoic
             100.0 * same
         ),
         "cfa",
-        "the tile begins one pixel beside, as in rggb@0,1 instead of rggb@0,0",
+        "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0",
     ))
 }
 

@@ -63,8 +63,8 @@ pub enum ClipWriter {
 
 impl ClipWriter {
     /// Starts a clip of frames of `size`: a `.npy`, `.tif`, `.gif`, `.mp4`, or a folder if the name has no
-    /// extension. Frames are gray or of three `planes`. `tiff` gives the samples of a `.tif`, `fps` the rate at
-    /// which `.gif` and `.mp4` play.
+    /// extension. Frames are gray or of three `planes`. `tiff` gives the samples of a `.tif`, `fps` the rate
+    /// at which `.gif` and `.mp4` play.
     ///
     /// # Errors
     /// [`Error`] for other extensions, or if the name is taken or the folder cannot be written.

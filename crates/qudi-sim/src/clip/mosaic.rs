@@ -13,8 +13,8 @@ pub(crate) struct MosaicClip {
     filter: ColourFilter,
 }
 
-/// Returns true if a clip of `input` is decoded from sRGB: images and videos are, arrays are as they are unless
-/// `transfer` says otherwise.
+/// Returns true if a clip of `input` is decoded from sRGB: images and videos are, arrays are as they are
+/// unless `transfer` says otherwise.
 pub(crate) fn decodes(input: &Input, transfer: Transfer) -> bool {
     transfer.decodes() || !matches!(input, Input::Npy { .. } | Input::Procedural(_))
 }

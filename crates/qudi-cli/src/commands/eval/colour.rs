@@ -29,7 +29,7 @@ struct ColourScore {
     luma: f64,
 }
 
-/// Scores the frames of `restored` against those of `truth`.
+/// Scores the frames of `restored` against the same frames of `truth`.
 pub(super) fn score_files(truth: &Path, restored: &Path, report: &Report) -> Result<()> {
     let [mut truths, mut others] = [truth, restored].map(ColourClip::open);
     let (truths, others) = match (&mut truths, &mut others) {

@@ -230,6 +230,7 @@ fn document(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> Va
         "saturated": summary.saturated,
         "histogram": summary.histogram,
         "bit_order": summary.bit_order,
+        "colours": summary.colours,
         "hot": bad.hot.len(),
         "dead": bad.dead.len(),
     })

@@ -62,8 +62,8 @@ pub(crate) struct Restore {
     /// Restore luma alone of a capture behind a colour filter
     #[arg(long)]
     pub(crate) gray: bool,
-    /// White balance of a capture behind a colour filter: gains of red, green and blue, for what is shown; .npy
-    /// and float .tif hold the sensor's own colours [default: the sensor file's, or guessed]
+    /// White balance of a capture behind a colour filter: gains of red, green and blue, for what is shown;
+    /// .npy and float .tif hold the sensor's own colours [default: the sensor file's, or guessed]
     #[arg(long, value_name = "R,G,B", conflicts_with = "gray")]
     pub(crate) wb: Option<Gains>,
     /// Tone curve of what is written: none (values follow the light, as in the clip), or srgb, which
