@@ -38,4 +38,4 @@ picture:
 
 # The settings reference, from the program itself
 config-docs:
-    cargo run -- config docs > configs/README.md
+    cargo run -- config docs > docs/settings.md
