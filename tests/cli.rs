@@ -7,6 +7,10 @@ use std::path::{Path, PathBuf};
 mod bad_input;
 #[path = "cli/baselines.rs"]
 mod baselines;
+#[path = "cli/challenge.rs"]
+mod challenge;
+#[path = "cli/documentation.rs"]
+mod documentation;
 #[path = "cli/eval.rs"]
 mod eval;
 #[path = "cli/field.rs"]

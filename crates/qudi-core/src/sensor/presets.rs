@@ -22,6 +22,7 @@ macro_rules! presets {
 presets!(
     "qudi-paper",
     "ideal",
+    "ideal-binary",
     "swissspad2",
     "swissspad3",
     "spad512s",
