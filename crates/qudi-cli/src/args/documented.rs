@@ -15,6 +15,10 @@ fn pages() -> Vec<PathBuf> {
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
+            if path.ends_with("docs/notes") {
+                // Notes have commands of the commits that they name.
+                continue;
+            }
             if path.is_dir() {
                 folders.push(path);
             } else if path.extension().is_some_and(|extension| extension == "md") {
@@ -96,18 +100,19 @@ fn calls(text: &str) -> Vec<Vec<String>> {
 
 #[test]
 fn every_documented_command_is_taken() {
-    let mut count = 0;
+    let (mut count, mut faults) = (0, String::new());
     for page in pages() {
         let text = std::fs::read_to_string(&page).unwrap();
         let text = shell(&page, &text).replace("$SLURM_ARRAY_TASK_ID", "1").replace("{}", "1");
         for words in calls(&text) {
             count += 1;
             if let Err(error) = Args::try_parse_from(&words) {
-                panic!("{}: {}\n{error}", page.display(), words.join(" "));
+                faults += &format!("{}: {}\n{error}\n", page.display(), words.join(" "));
             }
         }
     }
-    assert!(count > 100, "{count} commands: the pages lie elsewhere");
+    assert!(faults.is_empty(), "{faults}");
+    assert!(count > 80, "{count} commands: the pages lie elsewhere");
 }
 
 #[test]
