@@ -83,6 +83,7 @@ pub(crate) mod publish {
 pub(crate) mod restore {
     pub(crate) mod args;
     pub(crate) mod caller;
+    mod challenge;
     mod chi_square_map;
     mod output;
     mod plan;

@@ -56,6 +56,7 @@ pub(crate) fn evaluate_capture(
         gain: plan.gain,
         mean_level: plan.mean_level,
         seed,
+        white: None,
     };
     let summary = light.measure(&mut capture, Some(&sensor))?;
     let CaptureAcquisition { acquisition, light_source } =

@@ -72,6 +72,15 @@ pub(crate) struct Restore {
     /// Write .tif with 32-bit float samples, nothing clipped, instead of 16-bit ones
     #[arg(long)]
     pub(crate) float: bool,
+    /// CAPTURE is a set of the Single Photon Challenge (SCENE/FRAME.npy), OUT the .zip that its site takes:
+    /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there
+    #[arg(long, conflicts_with_all = [
+        "sensor", "ppp", "gain", "mean_level", "overlap", "every", "tonemap", "fps", "shard", "float", "chi_map",
+        "side_by_side", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient", "axes", "channel", "cfa",
+        "array", "levels", "bits", "offset", "threshold", "header", "trailer", "frames_per_file", "start", "end",
+        "crop", "mask", "dcr", "lenient",
+    ])]
+    pub(crate) challenge: bool,
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) chi_map: Option<PathBuf>,

@@ -90,6 +90,7 @@ impl Plan {
                 gain: args.gain,
                 mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
+                white: None,
             },
             method: args.method,
             network,

@@ -1,6 +1,7 @@
 //! `qudi restore`: a capture through a method into frames.
 
 use super::args::{Restore, Tonemap};
+use super::challenge;
 use super::chi_square_map::ChiSquareMap;
 use super::output::{Output, Sink};
 use super::plan::Plan;
@@ -40,6 +41,9 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
+    if args.challenge {
+        return challenge::run(args, settings, global, report);
+    }
     let plan = Plan::new(args, global, report.json())?;
     let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
     let settings = job.settings(&plan)?;
@@ -104,7 +108,7 @@ pub(super) struct Job {
     aligned: AlignedCapture,
     pub(super) acquisition: Acquisition,
     light_source: &'static str,
-    method: &'static Method,
+    pub(super) method: &'static Method,
     restorer: Box<dyn Restorer>,
     /// What the method chose for this capture.
     choice: String,
@@ -145,6 +149,16 @@ impl Job {
             schedule,
             warnings,
         })
+    }
+
+    /// Returns the method in words, as in `qudi (regression) on cpu`.
+    pub(super) fn method_text(&self) -> String {
+        format!("{}{}", self.method.name, self.choice)
+    }
+
+    /// Returns the number of native frames in a frame; none if sums are aligned.
+    pub(super) fn plain_sum(&self) -> Option<u32> {
+        self.aligned.alignment.is_none().then(|| self.capture().summed())
     }
 
     pub(super) fn capture(&self) -> &Capture {
@@ -360,8 +374,7 @@ fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture().size());
-    let (name, choice) = (job.method.name, &job.choice);
-    let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
+    let mut text = format!("{output}   {frames} frames of {size} by {}\n", job.method_text());
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
