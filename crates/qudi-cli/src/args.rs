@@ -1,5 +1,7 @@
 //! The command line: options of every command, and groups of options that several commands share.
 
+#[cfg(test)]
+mod documented;
 pub(crate) mod given;
 mod methods;
 mod network;
@@ -122,7 +124,6 @@ pub(crate) enum Command {
     Look(Box<Look>),
     Config(Config),
     Completions(Completions),
-    #[command(hide = true)]
     Man(Man),
 }
 

@@ -40,6 +40,7 @@ pub(crate) mod eval {
     pub(crate) mod args;
     mod capture;
     mod clip;
+    mod colour;
     mod exact_json;
     mod exposed_clip;
     mod exposing;
@@ -83,6 +84,7 @@ pub(crate) mod publish {
 pub(crate) mod restore {
     pub(crate) mod args;
     pub(crate) mod caller;
+    mod challenge;
     mod chi_square_map;
     mod output;
     mod plan;
