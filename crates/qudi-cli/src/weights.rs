@@ -118,7 +118,7 @@ pub(crate) fn sha256(bytes: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-        use qudi_model::regression::Regression;
+    use qudi_model::regression::Regression;
     use qudi_model::window::Window;
 
     #[test]
