@@ -9,6 +9,8 @@ mod bad_input;
 mod baselines;
 #[path = "cli/challenge.rs"]
 mod challenge;
+#[path = "cli/colour.rs"]
+mod colour;
 #[path = "cli/documentation.rs"]
 mod documentation;
 #[path = "cli/eval.rs"]

@@ -40,6 +40,7 @@ pub(crate) mod eval {
     pub(crate) mod args;
     mod capture;
     mod clip;
+    mod colour;
     mod exact_json;
     mod exposed_clip;
     mod exposing;

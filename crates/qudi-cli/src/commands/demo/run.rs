@@ -98,7 +98,7 @@ pub(crate) fn run(
         );
     }
     let mut shown = Vec::new();
-    let mut last = Restored { frames: Vec::new(), std: None };
+    let mut last = Restored::gray(Vec::new(), None);
     let count = methods.len() as u64;
     for (done, (label, method, how)) in (1..).zip(&mut methods) {
         let start = Instant::now();

@@ -13,7 +13,7 @@ use crate::places::default_look;
 use crate::report::html::{data_url, render};
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
-use qudi_burst::{PostFilter, Qbp};
+use qudi_burst::{ColourRestorer, PostFilter, Qbp};
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
@@ -145,8 +145,11 @@ fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<F
         capture.read(frame, counts)?;
     }
     let view = BurstView { size, frames: &frames };
-    let mut qbp = Qbp::new(PostFilter::Bm3d);
-    Ok(qbp.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
+    let mut method: Box<dyn Restorer> = Box::new(Qbp::new(PostFilter::Bm3d));
+    if let Some(filter) = capture.filter() {
+        method = Box::new(ColourRestorer::new(method, filter.clone(), false));
+    }
+    Ok(method.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
 }
 
 /// Describes what `qudi restore` would do, and about how long that takes.

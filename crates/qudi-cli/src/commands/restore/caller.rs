@@ -65,6 +65,8 @@ pub(crate) fn run(
 ) -> Result<Value> {
     refuse_files(&args)?;
     let shard = args.shard.take();
+    // Callers receive one plane.
+    args.gray |= args.wb.is_none();
     let plan = Plan::new(&args, global, false)?;
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
@@ -102,6 +104,7 @@ fn refuse_files(args: &Restore) -> Result<()> {
         (args.uncertainty.is_some(), "--uncertainty"),
         (args.float, "--float"),
         (args.fps.is_some(), "--fps"),
+        (args.wb.is_some(), "--wb"),
     ];
     let Some((_, flag)) = given.into_iter().find(|(given, _)| *given) else { return Ok(()) };
     Err(CliError::new("no file is written", flag, "leave it out: frames and sigma are returned"))

@@ -10,8 +10,9 @@ use crate::args::{Global, Shard};
 use crate::capture::{
     AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
 };
+use crate::colour::{Rendering, dng_tags};
 use crate::device;
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::default::default_method;
 use crate::methods::network::{OwnNetwork, device_failed};
@@ -19,9 +20,11 @@ use crate::methods::options::NetworkOptions;
 use crate::methods::{Built, Kind, Method};
 use crate::report::{Report, duration};
 use crate::settings::Settings;
+use qudi_burst::ColourRestorer;
+use qudi_core::colour::FilterChoice;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_io::capture::Capture;
+use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::MaskChoice;
 use qudi_io::restore::{FolderRun, Inputs, RestoreSink, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
@@ -48,7 +51,7 @@ pub(crate) fn run(
     let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
-    let mut output = Output::open(&plan, job.capture(), run)?;
+    let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
     let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(u64::MAX);
@@ -115,6 +118,8 @@ pub(super) struct Job {
     pub(super) schedule: Schedule,
     /// What makes the result doubtful.
     pub(super) warnings: Vec<String>,
+    /// Rendering of the colours, where colours are restored.
+    pub(super) rendering: Option<Rendering>,
 }
 
 impl Job {
@@ -136,6 +141,7 @@ impl Job {
         let CaptureAcquisition { acquisition, light_source } =
             CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
         let warnings = warnings::of_capture(capture, &summary);
+        let rendering = rendering(plan, capture, &summary, &acquisition)?;
         let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
         let overlap = plan.overlap * aligned.frames_per_sum();
         let schedule = aligned.schedule(restorer.as_ref(), overlap, plan.every)?;
@@ -148,6 +154,7 @@ impl Job {
             choice,
             schedule,
             warnings,
+            rendering,
         })
     }
 
@@ -201,6 +208,12 @@ impl Job {
         if let Some(every) = plan.every {
             settings["every"] = json!(every);
         }
+        if let Some(filter) = capture.filter() {
+            settings["gray"] = json!(plan.gray);
+            if let (Some(rendering), Some(choice)) = (&self.rendering, &capture.info().cfa) {
+                settings["dng"] = dng_tags(choice, filter, acquisition, rendering);
+            }
+        }
         if plan.tonemap != Tonemap::None {
             settings["tonemap"] = json!("srgb");
         }
@@ -241,6 +254,9 @@ impl Job {
             }
             if let Some(map) = &plan.read.dcr {
                 inputs.add("dcr", map)?;
+            }
+            if let Some(FilterChoice::Picture(path)) = &self.capture().info().cfa {
+                inputs.add("cfa", path)?;
             }
             let defects = &self.acquisition.sensor.defects;
             for (name, file) in
@@ -300,6 +316,35 @@ impl Job {
     }
 }
 
+/// Returns the rendering of the colours of a capture behind a colour filter, unless luma alone is restored.
+fn rendering(
+    plan: &Plan,
+    capture: &Capture,
+    summary: &Summary,
+    acquisition: &Acquisition,
+) -> Result<Option<Rendering>> {
+    if capture.filter().is_none() {
+        let given = plan.gray.then_some("--gray").or(plan.white_balance.map(|_| "--wb"));
+        let Some(flag) = given else { return Ok(None) };
+        return Err(CliError::new(
+            "the capture is gray",
+            flag,
+            "leave it out, or name the colour filter with --cfa",
+        ));
+    }
+    if plan.gray {
+        return Ok(None);
+    }
+    if plan.output == "-" {
+        return Err(CliError::new(
+            "colours are not written as Y4M",
+            "-o -",
+            "name a file or a folder, or restore luma alone with --gray",
+        ));
+    }
+    Ok(Some(Rendering::new(plan.white_balance, capture, summary, acquisition)))
+}
+
 /// Makes the restorer of the named method, or of the default one, for this capture.
 fn restorer(
     plan: &Plan,
@@ -314,7 +359,10 @@ fn restorer(
     };
     plan.network.check_diffusion(&[method])?;
     let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
-    Ok((method, (aligned.around(restorer), choice)))
+    let restorer = aligned.around(restorer);
+    let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
+    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.gray);
+    Ok((method, (Box::new(coloured), choice)))
 }
 
 /// Returns the default method; prints the reason if it is not the network.
@@ -385,6 +433,9 @@ fn describe(
         format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {mean_level:.4}"),
     );
     line("sensor", format!("{}, gain {:.4} DN/e-", acquisition.sensor.name, acquisition.gain));
+    if let Some(rendering) = &job.rendering {
+        line("colours", rendering.describe());
+    }
     if resumed > 0 {
         line("resumed", format!("{resumed} frames were there already"));
     }
