@@ -13,8 +13,14 @@ use std::path::Path;
 const BLOCKS_NOT_RUN: usize = 28;
 
 /// Pages with shell blocks that run.
-const SHELL_PAGES: [&str; 5] =
-    ["README.md", "docs/quickstart.md", "docs/methods.md", "docs/sensors.md", "docs/challenge.md"];
+const SHELL_PAGES: [&str; 6] = [
+    "README.md",
+    "docs/quickstart.md",
+    "docs/methods.md",
+    "docs/sensors.md",
+    "docs/colour.md",
+    "docs/challenge.md",
+];
 
 /// Pages whose blocks of Python the package's tests run (crates/qudi-python/tests/test_documentation.py).
 const PYTHON_PAGES: [&str; 4] =
@@ -22,7 +28,8 @@ const PYTHON_PAGES: [&str; 4] =
 
 /// Pages whose tables a test reads: below, of recipes (crates/qudi-train/src/recipe/stage.rs), and of
 /// settings, which are the program's own example.
-const TABLE_PAGES: [&str; 3] = ["docs/sensors.md", "docs/training.md", "docs/settings.md"];
+const TABLE_PAGES: [&str; 4] =
+    ["docs/sensors.md", "docs/colour.md", "docs/training.md", "docs/settings.md"];
 
 /// What every block begins with. Scenes are small, and outputs of the block before are overwritten.
 const PROLOGUE: &str = r#"
@@ -135,12 +142,19 @@ fn shell_blocks_run_as_documented() {
 #[test]
 fn sensor_files_are_read_as_documented() {
     let folder = scratch("documented-sensor");
-    let text = std::fs::read_to_string(root().join("docs/sensors.md")).unwrap();
-    let tables: Vec<_> = blocks(&text).into_iter().filter(|(info, _)| info == "toml").collect();
-    let [(_, lab)] = &tables[..] else { panic!("{tables:?}") };
-    std::fs::write(folder.join("lab.toml"), lab).unwrap();
+    let table = |page: &str| {
+        let text = std::fs::read_to_string(root().join(page)).unwrap();
+        let mut tables = blocks(&text).into_iter().filter(|(info, _)| info == "toml");
+        let (table, more) = (tables.next(), tables.next());
+        assert!(more.is_none(), "{more:?}");
+        table.unwrap().1
+    };
+    std::fs::write(folder.join("lab.toml"), table("docs/sensors.md")).unwrap();
     let printed = run(&folder, "info lab.toml");
     assert!(printed.contains("lab-a") && printed.contains("16600"), "{printed}");
+    let colour = format!("base = \"spad512s\"\n{}", table("docs/colour.md"));
+    std::fs::write(folder.join("colour.toml"), colour).unwrap();
+    assert!(run(&folder, "info colour.toml").contains("rggb@0,0"));
 }
 
 #[test]
