@@ -24,7 +24,7 @@ SUMMARY = Path("docs/SUMMARY.md")
 NOTES = Path("docs/notes/README.md")
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 # Pages without a place in the book: cases of tests, and pages of folders that only developers open.
-OUTSIDE = ("tests/", "fuzz/", "crates/", ".github/")
+OUTSIDE = ("tests/", "fuzz/", "crates/", "configs/", ".github/")
 
 
 def tracked(*patterns):

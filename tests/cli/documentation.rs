@@ -3,7 +3,7 @@
 //! the library checks the options of their commands, too.
 
 use super::challenge::{still, write_cube};
-use super::support::scratch;
+use super::support::{run, scratch};
 use crate::root;
 use assert_cmd::Command;
 use std::fmt::Write;
@@ -12,9 +12,24 @@ use std::path::Path;
 /// Number of blocks in all pages that are marked `sh no-run`.
 const BLOCKS_NOT_RUN: usize = 28;
 
-/// Pages with blocks that run.
-const PAGES: [&str; 5] =
-    ["README.md", "docs/quickstart.md", "docs/methods.md", "docs/sensors.md", "docs/challenge.md"];
+/// Pages with shell blocks that run.
+const SHELL_PAGES: [&str; 6] = [
+    "README.md",
+    "docs/quickstart.md",
+    "docs/methods.md",
+    "docs/sensors.md",
+    "docs/colour.md",
+    "docs/challenge.md",
+];
+
+/// Pages whose blocks of Python the package's tests run (crates/qudi-python/tests/test_documentation.py).
+const PYTHON_PAGES: [&str; 4] =
+    ["README.md", "docs/quickstart.md", "docs/formats.md", "docs/python.md"];
+
+/// Pages whose tables a test reads: below, of recipes (crates/qudi-train/src/recipe/stage.rs), and of
+/// settings, which are the program's own example.
+const TABLE_PAGES: [&str; 4] =
+    ["docs/sensors.md", "docs/colour.md", "docs/training.md", "docs/settings.md"];
 
 /// What every block begins with. Scenes are small, and outputs of the block before are overwritten.
 const PROLOGUE: &str = r#"
@@ -73,21 +88,18 @@ fn write_pictures(folder: &Path) {
     std::fs::write(folder.join("clip.mp4"), "stands for a video").unwrap();
 }
 
-/// Returns the shell blocks of a page that run, and the number of blocks that do not.
-fn blocks(text: &str) -> (Vec<String>, usize) {
-    let (mut run, mut not_run, mut open) = (Vec::new(), 0, None);
+/// Returns the blocks of code of a page, each with its language and marks.
+fn blocks(text: &str) -> Vec<(String, String)> {
+    let (mut blocks, mut open) = (Vec::new(), None);
     for line in text.lines() {
         match (line.trim_start().strip_prefix("```"), &mut open) {
-            (Some(info), None) => {
-                not_run += usize::from(info == "sh no-run");
-                open = Some((info == "sh").then(String::new));
-            }
-            (Some(_), _) => run.extend(open.take().flatten()),
-            (None, Some(Some(block))) => writeln!(block, "{line}").unwrap(),
-            (None, _) => {}
+            (Some(info), None) => open = Some((info.to_owned(), String::new())),
+            (Some(_), _) => blocks.extend(open.take()),
+            (None, Some((_, block))) => writeln!(block, "{line}").unwrap(),
+            (None, None) => {}
         }
     }
-    (run, not_run)
+    blocks
 }
 
 /// Runs shell text in a folder, and panics with its errors if a command fails.
@@ -117,18 +129,36 @@ fn shell_blocks_run_as_documented() {
         write_cube(&inputs.join(set), "attic/000000", 64, set == "train", still);
     }
     shell(&inputs, &inputs, INPUTS, "the inputs");
-    for name in PAGES {
+    for name in SHELL_PAGES {
         let page = folder.join(name.replace('/', "-"));
         shell(&folder, &inputs, &format!("cp -R inputs '{}'", page.display()), name);
         let text = std::fs::read_to_string(root().join(name)).unwrap();
-        for block in blocks(&text).0 {
-            shell(&page, &inputs, &block, name);
+        for (_, block) in blocks(&text).iter().filter(|(info, _)| info == "sh") {
+            shell(&page, &inputs, block, name);
         }
     }
 }
 
 #[test]
-fn blocks_that_do_not_run_are_counted() {
+fn sensor_files_are_read_as_documented() {
+    let folder = scratch("documented-sensor");
+    let table = |page: &str| {
+        let text = std::fs::read_to_string(root().join(page)).unwrap();
+        let mut tables = blocks(&text).into_iter().filter(|(info, _)| info == "toml");
+        let (table, more) = (tables.next(), tables.next());
+        assert!(more.is_none(), "{more:?}");
+        table.unwrap().1
+    };
+    std::fs::write(folder.join("lab.toml"), table("docs/sensors.md")).unwrap();
+    let printed = run(&folder, "info lab.toml");
+    assert!(printed.contains("lab-a") && printed.contains("16600"), "{printed}");
+    let colour = format!("base = \"spad512s\"\n{}", table("docs/colour.md"));
+    std::fs::write(folder.join("colour.toml"), colour).unwrap();
+    assert!(run(&folder, "info colour.toml").contains("rggb@0,0"));
+}
+
+#[test]
+fn every_block_is_tested_or_counted() {
     let mut pages = vec![root().join("README.md"), root().join("CONTRIBUTING.md")];
     let mut folders = vec![root().join("docs")];
     while let Some(folder) = folders.pop() {
@@ -144,14 +174,21 @@ fn blocks_that_do_not_run_are_counted() {
     }
     let mut total = 0;
     for page in pages {
-        let (run, not_run) = blocks(&std::fs::read_to_string(&page).unwrap());
-        total += not_run;
-        let is_listed = PAGES.iter().any(|name| page.ends_with(name));
-        assert!(
-            run.is_empty() || is_listed,
-            "list {} in PAGES, or mark its blocks",
-            page.display()
-        );
+        for (info, _) in blocks(&std::fs::read_to_string(&page).unwrap()) {
+            let tested: &[&str] = match info.as_str() {
+                "sh" => &SHELL_PAGES,
+                "python" => &PYTHON_PAGES,
+                "toml" => &TABLE_PAGES,
+                "sh no-run" => {
+                    total += 1;
+                    continue;
+                }
+                "text" => continue, // Output and diagrams.
+                _ => &[],
+            };
+            let is_tested = tested.iter().any(|name| page.ends_with(name));
+            assert!(is_tested, "{}: no test reads its blocks of `{info}`", page.display());
+        }
     }
     assert_eq!(total, BLOCKS_NOT_RUN, "let a new block run, or count it");
 }

@@ -32,7 +32,7 @@ def test_python_page(tmp_path, monkeypatch):
     assert np.load("restored-2.npy").shape == (1, 64, 64)
 
 
-@pytest.mark.filterwarnings("ignore::qudi_spad.CaptureWarning")
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/formats.md"])
 def test_other_pages(tmp_path, monkeypatch, page):
     """Blocks about the package, and about reading our files with NumPy alone."""

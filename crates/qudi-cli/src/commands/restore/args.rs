@@ -83,7 +83,7 @@ pub(crate) struct Restore {
     /// CAPTURE is a set of the Single Photon Challenge (SCENE/FRAME.npy), OUT the .zip that its site takes:
     /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there
     #[arg(long, conflicts_with_all = [
-        "sensor", "ppp", "gain", "mean_level", "overlap", "every", "tonemap", "fps", "shard", "float", "chi_map",
+        "sensor", "ppp", "gain", "gray", "wb", "mean_level", "overlap", "every", "tonemap", "fps", "shard", "float", "chi_map",
         "side_by_side", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient", "axes", "channel", "cfa",
         "array", "levels", "bits", "offset", "threshold", "header", "trailer", "frames_per_file", "start", "end",
         "crop", "mask", "dcr", "lenient",
