@@ -78,6 +78,9 @@ pub(crate) struct Restore {
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
+    /// Write a page that plays: counts, restored frames, uncertainty and misfit under a slider, the settings
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) html: Option<PathBuf>,
     /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over
     /// --samples K
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]

@@ -135,6 +135,9 @@ impl<'a> Sink<'a> {
 
 impl RestoreSink for Sink<'_> {
     fn uncertainty(&mut self, _: u64, sigma: &Frame) -> qudi_core::Result<()> {
+        if let Some(map) = &mut self.map {
+            map.add_uncertainty(sigma);
+        }
         self.uncertainty.push(sigma)
     }
 
