@@ -27,6 +27,15 @@ lint:
 doc:
     cargo doc --workspace --no-deps --open
 
+# The documentation as a site in target/site; `pip install -r scripts/site-requirements.txt` has mdBook
+site:
+    cargo doc --workspace --no-deps
+    python3 scripts/site.py --build target/site
+
+# Packages of all crates in target/package
+package:
+    scripts/package.sh
+
 # Nanoseconds per pixel of the camera, seconds per window of the classical methods
 bench:
     cargo bench -p qudi-core
@@ -39,4 +48,4 @@ picture:
 
 # The settings reference, from the program itself
 config-docs:
-    cargo run -- config docs > configs/README.md
+    cargo run -- config docs > docs/settings.md

@@ -1,5 +1,5 @@
-//! A headless browser for tests of pages: Chromium where it is installed, driven through a pipe by its DevTools
-//! protocol.
+//! A headless browser for tests of pages: Chromium where it is installed, driven through a pipe by the
+//! protocol of its developer tools.
 
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};

@@ -1,5 +1,7 @@
 //! The command line: options of every command, and groups of options that several commands share.
 
+#[cfg(test)]
+mod documented;
 pub(crate) mod given;
 mod methods;
 mod network;
@@ -124,7 +126,6 @@ pub(crate) enum Command {
     View(Box<View>),
     Config(Config),
     Completions(Completions),
-    #[command(hide = true)]
     Man(Man),
 }
 

@@ -30,6 +30,7 @@ pub(crate) mod convert {
 pub(crate) mod demo {
     mod animation;
     pub(crate) mod args;
+    mod grid;
     mod html;
     mod picture;
     mod restored;
@@ -44,6 +45,7 @@ pub(crate) mod eval {
     pub(crate) mod args;
     mod capture;
     mod clip;
+    mod colour;
     mod exact_json;
     mod exposed_clip;
     mod exposing;
@@ -87,6 +89,7 @@ pub(crate) mod publish {
 pub(crate) mod restore {
     pub(crate) mod args;
     pub(crate) mod caller;
+    mod challenge;
     mod chi_square_map;
     pub(crate) mod on_demand;
     mod output;

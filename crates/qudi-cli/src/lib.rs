@@ -7,6 +7,7 @@
 mod args;
 mod calls;
 mod capture;
+mod colour;
 mod commands;
 mod device;
 mod error;

@@ -187,6 +187,11 @@ pub(crate) fn picture_url(frame: &Frame, quality: u8) -> String {
     jpeg_url(&jpeg(frame, quality))
 }
 
+/// Encodes red, green and blue of a picture as a JPEG data URL.
+pub(crate) fn colour_url(planes: &[Frame; 3], quality: u8) -> String {
+    jpeg_url(&colour_jpeg(planes, quality))
+}
+
 /// Encodes a map as a JPEG data URL, whose white is `max`.
 pub(crate) fn map_url(map: &Frame, max: f32) -> String {
     let data = map.data.iter().map(|value| value / max).collect();
@@ -201,13 +206,24 @@ pub(crate) fn counts_url(frame: &Frame, quality: u8) -> String {
 
 /// Encodes a frame as a gray JPEG.
 pub(crate) fn jpeg(frame: &Frame, quality: u8) -> Vec<u8> {
-    let Size { height, width } = frame.size;
+    encoded(&samples(frame), frame.size, ColorType::Luma, quality)
+}
+
+/// Encodes red, green and blue as a JPEG.
+pub(crate) fn colour_jpeg(planes: &[Frame; 3], quality: u8) -> Vec<u8> {
+    let [red, green, blue] = planes.each_ref().map(samples);
+    let pixels = red.into_iter().zip(green).zip(blue);
+    let pixels: Vec<u8> = pixels.flat_map(|((red, green), blue)| [red, green, blue]).collect();
+    encoded(&pixels, planes[0].size, ColorType::Rgb, quality)
+}
+
+fn encoded(samples: &[u8], size: Size, colour: ColorType, quality: u8) -> Vec<u8> {
     let mut jpeg = Vec::new();
     let mut encoder = Encoder::new(&mut jpeg, quality);
     encoder.set_optimized_huffman_tables(true);
     // Sides that no JPEG has leave the picture out; a missing one is seen on the page.
-    if let (Ok(height), Ok(width)) = (u16::try_from(height), u16::try_from(width)) {
-        let _ = encoder.encode(&samples(frame), width, height, ColorType::Luma);
+    if let (Ok(height), Ok(width)) = (u16::try_from(size.height), u16::try_from(size.width)) {
+        let _ = encoder.encode(samples, width, height, colour);
     }
     jpeg
 }

@@ -6,7 +6,8 @@ use crate::error::Result;
 use crate::report::Column;
 use crate::report::html::{TableView, render};
 use crate::report::player::{
-    Kind, Layer, MAX_UNCERTAINTY, Player, Scene, counts_frame, counts_url, map_url, picture_url,
+    Kind, Layer, MAX_UNCERTAINTY, Player, Scene, colour_url, counts_frame, counts_url, map_url,
+    picture_url,
 };
 use qudi_core::Frame;
 use serde::Serialize;
@@ -75,26 +76,32 @@ fn page(
 fn player(restored: &RestoredScene, quality: u8) -> Player {
     let exposed = &restored.exposed;
     let sensor = &exposed.acquisition.sensor;
-    let urls = |frames: &[Frame]| -> Vec<String> {
-        frames.iter().map(|frame| picture_url(frame, quality)).collect()
+    let url = |planes: [&Frame; 3]| {
+        if exposed.is_coloured() {
+            colour_url(&planes.map(Frame::clone), quality)
+        } else {
+            picture_url(planes[0], quality)
+        }
     };
     let counts = exposed
         .counts
         .iter()
         .map(|counts| counts_url(&counts_frame(SIZE, counts, sensor.max_count()), quality));
-    let mut scene = Scene::new(capitalized(exposed.scene.name), SIZE, FRAMES as u64);
-    scene.caption = vec![exposed.scene.about.to_owned()];
+    let mut scene = Scene::new(capitalized(exposed.name), SIZE, FRAMES as u64);
+    scene.caption = vec![exposed.about.to_owned()];
     let bits = format!("{} bit", sensor.output_bits());
     scene.layers.push(Layer::new("counts", Kind::Counts, counts.collect()).with_note(bits));
     for method in &restored.methods {
         let note = format!("{:.2} dB", method.psnr_a[CENTRE]);
         // The mean is the same for all frames.
         let shown = if method.name == AVERAGE { CENTRE..CENTRE + 1 } else { 0..FRAMES };
-        let layer = Layer::new(method.name, Kind::Restored, urls(&method.frames[shown]));
+        let layer =
+            Layer::new(method.name, Kind::Restored, shown.map(|t| url(method.planes(t))).collect());
         scene.layers.push(layer.with_note(note));
     }
     scene.right = scene.layers.len() - 1;
-    let truth = Layer::new("truth", Kind::Truth, urls(&exposed.truths));
+    let truth =
+        Layer::new("truth", Kind::Truth, (0..FRAMES).map(|t| url(exposed.truth(t))).collect());
     scene.layers.push(truth.with_note("without noise"));
     let sigmas = restored.uncertainty.frames.iter();
     let sigmas = sigmas.map(|sigma| map_url(sigma, MAX_UNCERTAINTY)).collect();

@@ -15,7 +15,6 @@ use crate::report::{Output, Report, json};
 use crate::settings::Settings;
 use qudi_burst::{Average, PostFilter, Qbp, QbpRefined};
 use qudi_core::atomic_file::Overwrite;
-use qudi_core::restorer::Acquisition;
 use serde_json::json;
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -34,6 +33,7 @@ pub(crate) fn run(
     }
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
+    let picture_file = Output::open(Some(&path), overwrite)?;
     let page_file = Output::open(Some(&page), overwrite)?;
     let animation = demo.animate.then(|| path.with_extension("gif"));
     let animation_file = Output::open(animation.as_deref(), overwrite)?;
@@ -42,7 +42,7 @@ pub(crate) fn run(
     let mut restored = Vec::new();
     for scene in scenes()? {
         let exposed = ExposedScene::new(scene, &sensor, demo.ppp, demo.seed, &mut bar)?;
-        let contenders = contenders(demo, &exposed.acquisition)?;
+        let contenders = contenders(demo, &exposed)?;
         restored.push(exposed.restore(contenders, &mut bar)?);
     }
     drop(bar);
@@ -52,7 +52,7 @@ pub(crate) fn run(
         );
     }
 
-    picture(&restored, demo.ppp).save(&path, overwrite)?;
+    picture_file.write(|| picture(&restored, demo.ppp).png())?;
     let foot = format!(
         "{} at {} photons/pixel/frame, seed {}; psnr in dB, -a after the best gain",
         sensor.name, demo.ppp, demo.seed
@@ -69,7 +69,7 @@ pub(crate) fn run(
     }
     report.result(&text, || {
         let scenes = restored.iter().map(|scene| {
-            let name = scene.exposed.scene.name.to_owned();
+            let name = scene.exposed.name.to_owned();
             (name, json!(json::rows(&scene.table())))
         });
         json!({
@@ -83,7 +83,8 @@ pub(crate) fn run(
 }
 
 /// Returns the methods that are shown, the best one last.
-fn contenders(demo: &Demo, acquisition: &Acquisition) -> Result<Vec<Contender>> {
+fn contenders(demo: &Demo, exposed: &ExposedScene) -> Result<Vec<Contender>> {
+    let acquisition = &exposed.acquisition;
     let mut contenders = vec![
         Contender {
             label: "AVERAGE OF 11",
@@ -107,7 +108,11 @@ fn contenders(demo: &Demo, acquisition: &Acquisition) -> Result<Vec<Contender>> 
         let (restorer, how) = network::restorer(NetworkChoice::Best, &options, acquisition, SIZE)?;
         contenders.push(Contender { label: "QUDI", restorer, how: format!("the network{how}") });
     }
-    Ok(contenders)
+    let seeing = |contender: Contender| Contender {
+        restorer: exposed.behind_filter(contender.restorer),
+        ..contender
+    };
+    Ok(contenders.into_iter().map(seeing).collect())
 }
 
 /// Returns the command that makes the same pictures.

@@ -1,7 +1,7 @@
-//! The built-in scenes: a photograph in motion behind a price tag, and a chart.
+//! The built-in scenes: a colour photograph in motion behind a price tag, and a chart.
 
 use crate::error::{CliError, Result};
-use qudi_core::{Frame, Size, Transfer};
+use qudi_core::{Frame, Size};
 use qudi_sim::scene::{
     Layer, Line, Motion, Paint, Procedural, ProceduralScene, Scene, Shape, StillMotion, still_scene,
 };
@@ -19,7 +19,13 @@ pub(super) struct DemoScene {
     pub(super) name: &'static str,
     /// Description in a sentence.
     pub(super) about: &'static str,
-    pub(super) scene: Scene,
+    pub(super) planes: Planes,
+}
+
+/// A scene in gray, or in red, green and blue.
+pub(super) enum Planes {
+    Gray(Scene),
+    Colour(Box<[Scene; 3]>),
 }
 
 /// Returns the scenes, the one that is shown first before the others.
@@ -28,22 +34,36 @@ pub(super) fn scenes() -> Result<[DemoScene; 2]> {
         DemoScene {
             name: "photograph",
             about: "A photograph that turns, pans and comes nearer, behind a price tag that passes in the opposite \
-                    direction (Grocery Store Dataset, Marcus Klasson, MIT licence). The built-in networks were not \
-                    trained on photographs of this collection.",
-            scene: photograph()?,
+                    direction, seen through a Bayer filter (Grocery Store Dataset, Marcus Klasson, MIT licence). \
+                    The built-in networks were not trained on photographs of this collection. Numbers are of its \
+                    luma.",
+            planes: Planes::Colour(Box::new(photograph()?)),
         },
         DemoScene {
             name: "chart",
             about: "A turning and panning test chart behind two lines of text: hard edges, fine bars, strong contrast.",
-            scene: chart(),
+            planes: Planes::Gray(chart()),
         },
     ])
 }
 
-/// Sets the photograph in motion, and a tag before it.
-fn photograph() -> Result<Scene> {
+/// Sets red, green and blue of the photograph in motion, and a tag before them.
+fn photograph() -> Result<[Scene; 3]> {
+    let image = image::load_from_memory(PHOTOGRAPH)
+        .map_err(|e| CliError::new(e, "the built-in photograph", "report this as a bug"))?
+        .into_rgb8();
+    let size = Size { height: image.height() as usize, width: image.width() as usize };
+    let plane = |k: usize| {
+        let data = image.pixels().map(|pixel| f32::from(pixel.0[k]) / 255.0).collect();
+        behind_tag(Frame { size, data })
+    };
+    Ok([plane(0), plane(1), plane(2)])
+}
+
+/// Sets an image in motion, and a tag before it.
+fn behind_tag(image: Frame) -> Scene {
     let motion = StillMotion { pan: [2.4, -0.9], rotate: 0.4, zoom: 1.004, layers: 0 };
-    let mut scene = still_scene(gray(PHOTOGRAPH)?, motion, SIZE, 0);
+    let mut scene = still_scene(image, motion, SIZE, 0);
     let motion = Motion::pan([-6.0, 1.2]);
     let (centre, half) = ([196.0, 122.0], [47.0, 17.0]);
     scene.layers.push(Layer {
@@ -57,7 +77,7 @@ fn photograph() -> Result<Scene> {
         dot: 1.75,
     };
     scene.layers.push(Layer { motion, shape: Shape::Text(text), paint: Paint::Flat(0.05) });
-    Ok(scene)
+    scene
 }
 
 /// Makes a turning and panning chart behind two lines of text that pass it in opposite directions.
@@ -68,23 +88,13 @@ fn chart() -> Scene {
     chart
 }
 
-/// Decodes a photograph as gray values.
-fn gray(jpeg: &[u8]) -> Result<Frame> {
-    let image = image::load_from_memory(jpeg)
-        .map_err(|e| CliError::new(e, "the built-in photograph", "report this as a bug"))?
-        .into_rgb8();
-    let size = Size { height: image.height() as usize, width: image.width() as usize };
-    let value = |pixel: &image::Rgb<u8>| Transfer::AsIs.gray(pixel.0.map(|v| f32::from(v) / 255.0));
-    Ok(Frame { size, data: image.pixels().map(value).collect() })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn tag_hides_and_uncovers_the_photograph_within_the_frame() {
-        let scene = photograph().unwrap_or_else(|e| panic!("{e:?}"));
+        let [_, scene, _] = photograph().unwrap_or_else(|e| panic!("{e:?}"));
         let (first, last) = (scene.render(0.0), scene.render(10.0));
         let bright = |frame: &Frame, x: usize| frame.row(112)[x] > 0.9;
         assert!(bright(&first, 160) && bright(&last, 96) && !bright(&last, 232));

@@ -7,7 +7,7 @@ use super::metrics::CHI_SQUARE;
 use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
 use crate::capture::{CaptureAcquisition, Input, LightOverrides, Source, SummedCapture, remarks};
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
 use crate::report::Report;
@@ -53,11 +53,19 @@ pub(crate) fn evaluate_capture(
     let sensor = summed.required_sensor()?;
     summed.remark_sum(report);
     let mut capture = summed.capture;
+    if let (Some(_), Some(cfa)) = (capture.filter(), &capture.info().cfa) {
+        return Err(CliError::new(
+            format!("a capture behind the colour filter {cfa}"),
+            path.display(),
+            "methods are compared on gray: read one plane with --channel, or restore it with `qudi restore`",
+        ));
+    }
     let light = LightOverrides {
         ppp: plan.ppp.first().copied(),
         gain: plan.gain,
         mean_level: plan.mean_level,
         seed,
+        white: None,
     };
     let summary = light.measure(&mut capture, Some(&sensor))?;
     let CaptureAcquisition { acquisition, light_source } =

@@ -4,6 +4,7 @@ use super::about::about;
 use super::args::{Eval, External, Protocol};
 use super::capture::{Evaluation, evaluate_capture};
 use super::clip::Clip;
+use super::colour::score_files;
 use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
 use super::html::{Pictures, html, loop_frames};
@@ -23,7 +24,7 @@ use crate::settings::Settings;
 use qudi_core::Frame;
 use qudi_core::atomic_file::refuse_taken;
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 pub(crate) fn run(
     args: &Eval,
@@ -31,6 +32,9 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
+    if let Some(restored) = &args.restored {
+        return score_files(Path::new(&args.data), restored, report);
+    }
     let overwrite = global.overwrite();
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
     let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);

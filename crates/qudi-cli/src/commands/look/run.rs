@@ -14,11 +14,11 @@ use crate::report::html::render;
 use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, picture_url};
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
-use qudi_burst::{PostFilter, Qbp};
+use qudi_burst::{ColourRestorer, PostFilter, Qbp};
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
-use qudi_core::{Frame, Size, linear_to_srgb};
+use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::Capture;
 use qudi_io::description::MaskChoice;
 use qudi_io::writer::Picture;
@@ -65,7 +65,7 @@ pub(crate) fn run(
     let sum = summed.sum().cloned();
     let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
-    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0 };
+    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0, white: None };
     let summary = light.measure(&mut capture, sensor.as_ref())?;
     let warnings = warnings::of_capture(&capture, &summary);
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
@@ -88,7 +88,7 @@ pub(crate) fn run(
     match acquired {
         Ok(CaptureAcquisition { acquisition, .. }) => {
             let start = Instant::now();
-            let instant = restore_instant(&counts, mean.size, &acquisition)?;
+            let instant = restore_instant(&counts, &capture, &acquisition)?;
             let seconds = start.elapsed().as_secs_f64();
             let instant = for_the_eye(instant.with_white_at_highlights());
             picture.place(0, 1, &["ONE INSTANT"], &instant);
@@ -150,10 +150,17 @@ fn read_window(capture: &mut Capture) -> Result<(u64, Vec<Vec<u16>>)> {
 }
 
 /// Aligns and merges sums, and returns the one in the middle.
-fn restore_instant(frames: &[Vec<u16>], size: Size, acquisition: &Acquisition) -> Result<Frame> {
-    let view = BurstView { size, frames };
-    let mut qbp = Qbp::new(PostFilter::Bm3d);
-    Ok(qbp.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
+fn restore_instant(
+    frames: &[Vec<u16>],
+    capture: &Capture,
+    acquisition: &Acquisition,
+) -> Result<Frame> {
+    let view = BurstView { size: capture.size(), frames };
+    let mut method: Box<dyn Restorer> = Box::new(Qbp::new(PostFilter::Bm3d));
+    if let Some(filter) = capture.filter() {
+        method = Box::new(ColourRestorer::new(method, filter.clone(), false));
+    }
+    Ok(method.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
 }
 
 /// The pictures of the page.

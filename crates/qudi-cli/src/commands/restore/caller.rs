@@ -65,6 +65,8 @@ pub(crate) fn run(
 ) -> Result<Value> {
     refuse_files(&args)?;
     let shard = args.shard.take();
+    // Callers receive one plane.
+    args.gray |= args.wb.is_none();
     let plan = Plan::new(&args, global, false)?;
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
@@ -99,9 +101,11 @@ fn refuse_files(args: &Restore) -> Result<()> {
         (args.chi_map.is_some(), "--chi-map"),
         (args.side_by_side.is_some(), "--side-by-side"),
         (args.html.is_some(), "--html"),
+        (args.challenge, "--challenge"),
         (args.uncertainty.is_some(), "--uncertainty"),
         (args.float, "--float"),
         (args.fps.is_some(), "--fps"),
+        (args.wb.is_some(), "--wb"),
     ];
     let Some((_, flag)) = given.into_iter().find(|(given, _)| *given) else { return Ok(()) };
     Err(CliError::new("no file is written", flag, "leave it out: frames and sigma are returned"))

@@ -54,7 +54,28 @@ impl ChiSquareMap {
         self.page.take()
     }
 
+    /// Adds the next frame.
     pub(super) fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
+        if let Some(page) = &mut self.page {
+            page.add(restored, counts);
+        }
+        self.measure(restored, counts)
+    }
+
+    /// Adds the colours of the next frame, of which every pixel sees `seen`.
+    pub(super) fn add_colour(
+        &mut self,
+        restored: &[Frame; 3],
+        seen: &Frame,
+        counts: &[u16],
+    ) -> qudi_core::Result<()> {
+        if let Some(page) = &mut self.page {
+            page.add_colour(restored, counts);
+        }
+        self.measure(seen, counts)
+    }
+
+    fn measure(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         if self.keep_latest || self.shown.contains(&self.measured) {
             if self.keep_latest {
                 self.pictures.truncate(self.shown.len());
@@ -65,9 +86,6 @@ impl ChiSquareMap {
             self.pictures.push((self.measured, [counts, restored.clone()]));
         }
         self.measured += 1;
-        if let Some(page) = &mut self.page {
-            page.add(restored, counts);
-        }
         self.consistency.add(restored, counts, &self.acquisition).map(drop)
     }
 

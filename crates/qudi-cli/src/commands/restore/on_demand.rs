@@ -5,6 +5,7 @@ use super::plan::Plan;
 use super::run::{Job, describe};
 use crate::args::Global;
 use crate::capture::Source;
+use crate::colour::Rendering;
 use crate::error::Result;
 use crate::report::Report;
 use crate::report::player::counts_frame;
@@ -52,6 +53,11 @@ impl OnDemand {
     /// Returns true if the capture was simulated, from images as screens show them.
     pub(crate) fn is_simulated(&self) -> bool {
         self.job.capture().info().mean_level.is_some()
+    }
+
+    /// Returns how colours are rendered, if there are any.
+    pub(crate) fn rendering(&self) -> Option<Rendering> {
+        self.job.rendering.clone()
     }
 
     /// Returns what makes the pictures doubtful.

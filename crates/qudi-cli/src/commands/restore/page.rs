@@ -2,10 +2,11 @@
 
 use super::args::Tonemap;
 use super::output::toned;
+use crate::colour::{Rendering, encoded};
 use crate::error::Result;
 use crate::report::html::render;
 use crate::report::player::{
-    Kind, Layer, MAX_FRAMES, MAX_UNCERTAINTY, QUALITY, Scene, counts_frame, counts_url,
+    Kind, Layer, MAX_FRAMES, MAX_UNCERTAINTY, QUALITY, Scene, colour_url, counts_frame, counts_url,
     frame_distance, map_url, picture_url,
 };
 use qudi_core::{Frame, Size};
@@ -19,6 +20,8 @@ pub(super) struct RestoredPage {
     size: Size,
     max_count: u16,
     tonemap: Tonemap,
+    /// Rendering of colours, if there are any.
+    rendering: Option<Rendering>,
     /// Distance between shown frames.
     distance: u64,
     /// Frames that came so far.
@@ -42,20 +45,53 @@ pub(super) struct About<'a> {
 
 impl RestoredPage {
     /// Creates the page of `pictures` frames, or of the first ones of a pipe.
-    pub(super) fn new(size: Size, max_count: u16, tonemap: Tonemap, pictures: Option<u64>) -> Self {
+    pub(super) fn new(
+        size: Size,
+        max_count: u16,
+        tonemap: Tonemap,
+        rendering: Option<Rendering>,
+        pictures: Option<u64>,
+    ) -> Self {
         let distance = pictures.map_or(1, |pictures| frame_distance(size, pictures));
         let [counts, restored, sigmas] = [const { Vec::new() }; 3];
         let (frames, numbers) = (0, Vec::new());
-        Self { size, max_count, tonemap, distance, frames, numbers, counts, restored, sigmas }
+        Self {
+            size,
+            max_count,
+            tonemap,
+            rendering,
+            distance,
+            frames,
+            numbers,
+            counts,
+            restored,
+            sigmas,
+        }
     }
 
     /// Takes the next frame with its counts.
     pub(super) fn add(&mut self, restored: &Frame, counts: &[u16]) {
         if self.shows(self.frames) {
+            self.restored.push(picture_url(&toned(self.tonemap, restored), QUALITY));
+        }
+        self.add_counts(counts);
+    }
+
+    /// Takes the colours of the next frame with its counts.
+    pub(super) fn add_colour(&mut self, restored: &[Frame; 3], counts: &[u16]) {
+        if self.shows(self.frames) {
+            let rendered = self.rendering.as_ref().map(|rendering| rendering.rendered(restored));
+            let shown = encoded(rendered.as_ref().unwrap_or(restored));
+            self.restored.push(colour_url(&shown, QUALITY));
+        }
+        self.add_counts(counts);
+    }
+
+    fn add_counts(&mut self, counts: &[u16]) {
+        if self.shows(self.frames) {
             self.numbers.push(self.frames);
             let counts = counts_frame(self.size, counts, self.max_count);
             self.counts.push(counts_url(&counts, QUALITY));
-            self.restored.push(picture_url(&toned(self.tonemap, restored), QUALITY));
         }
         self.frames += 1;
     }
@@ -117,7 +153,7 @@ mod tests {
     const SIZE: Size = Size { height: 8, width: 10 };
 
     fn page(pictures: Option<u64>, added: u64) -> RestoredPage {
-        let mut page = RestoredPage::new(SIZE, 7, Tonemap::None, pictures);
+        let mut page = RestoredPage::new(SIZE, 7, Tonemap::None, None, pictures);
         for _ in 0..added {
             page.add(&Frame::filled(SIZE, 0.5), &vec![3; SIZE.pixels()]);
             page.add_uncertainty(&Frame::filled(SIZE, 0.1));

@@ -4,6 +4,7 @@ use super::args::{Restore, Tonemap};
 use crate::args::tiff_samples::tiff_samples;
 use crate::args::{Global, Shard, Sum};
 use crate::capture::{Input, LightOverrides, Source, is_pipe, refuse_terminal};
+use crate::colour::Gains;
 use crate::error::{CliError, Result};
 use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
@@ -31,6 +32,9 @@ pub(super) struct Plan {
     /// Native frames from one picture to the next, if not every frame becomes one.
     pub(super) every: Option<u64>,
     pub(super) tonemap: Tonemap,
+    /// True if luma alone is restored of a capture behind a colour filter.
+    pub(super) gray: bool,
+    pub(super) white_balance: Option<Gains>,
     /// Frames per second of played outputs.
     pub(super) played_fps: f64,
     pub(super) light: LightOverrides,
@@ -87,12 +91,15 @@ impl Plan {
             sum: args.reading.sum(),
             every: args.every,
             tonemap: args.tonemap,
+            gray: args.gray,
+            white_balance: args.wb,
             played_fps: args.fps.unwrap_or(PLAYED_FPS),
             light: LightOverrides {
                 ppp: args.ppp,
                 gain: args.gain,
                 mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
+                white: None,
             },
             method: args.method,
             network,

@@ -1,6 +1,7 @@
 //! `qudi restore`: a capture through a method into frames.
 
 use super::args::{Restore, Tonemap};
+use super::challenge;
 use super::chi_square_map::ChiSquareMap;
 use super::output::{Output, Sink};
 use super::page::{About, RestoredPage};
@@ -10,8 +11,9 @@ use crate::args::{Global, Shard};
 use crate::capture::{
     AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
 };
+use crate::colour::{Rendering, dng_tags};
 use crate::device;
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::default::default_method;
 use crate::methods::network::{OwnNetwork, device_failed};
@@ -19,9 +21,11 @@ use crate::methods::options::NetworkOptions;
 use crate::methods::{Built, Kind, Method};
 use crate::report::{Output as PageFile, Report, duration};
 use crate::settings::Settings;
+use qudi_burst::ColourRestorer;
+use qudi_core::colour::FilterChoice;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_io::capture::Capture;
+use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::MaskChoice;
 use qudi_io::restore::{FolderRun, Inputs, RestoreSink, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
@@ -41,11 +45,14 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
+    if args.challenge {
+        return challenge::run(args, settings, global, report);
+    }
     let plan = Plan::new(args, global, report.json())?;
     let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
-    let mut output = Output::open(&plan, job.capture(), run)?;
+    let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
     let page_file = PageFile::open(plan.html.as_deref(), plan.overwrite)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
@@ -54,6 +61,12 @@ pub(crate) fn run(
     let page = plan.html.is_some().then(|| job.page(&plan));
     let mut map = ChiSquareMap::new(job.capture(), &job.acquisition).with_page(page);
     let done = output.finished(part.clone());
+    if done > 0 && plan.html.is_some() && job.rendering.is_some() {
+        let help = "leave it out, or write into another folder";
+        let what =
+            format!("{done} frames were restored by an earlier run, whose colours are balanced");
+        return Err(CliError::new(what, "--html", help));
+    }
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
@@ -125,6 +138,8 @@ pub(super) struct Job {
     pub(super) schedule: Schedule,
     /// What makes the result doubtful.
     pub(super) warnings: Vec<String>,
+    /// Rendering of the colours, where colours are restored.
+    pub(super) rendering: Option<Rendering>,
 }
 
 impl Job {
@@ -146,6 +161,7 @@ impl Job {
         let CaptureAcquisition { acquisition, light_source } =
             CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
         let warnings = warnings::of_capture(capture, &summary);
+        let rendering = rendering(plan, capture, &summary, &acquisition)?;
         let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
         let overlap = plan.overlap * aligned.frames_per_sum();
         let schedule = aligned.schedule(restorer.as_ref(), overlap, plan.every)?;
@@ -158,7 +174,18 @@ impl Job {
             choice,
             schedule,
             warnings,
+            rendering,
         })
+    }
+
+    /// Returns the method in words, as in `qudi (regression) on cpu`.
+    pub(super) fn method_text(&self) -> String {
+        format!("{}{}", self.method.name, self.choice)
+    }
+
+    /// Returns the number of native frames in a frame; none if sums are aligned.
+    pub(super) fn plain_sum(&self) -> Option<u32> {
+        self.aligned.alignment.is_none().then(|| self.capture().summed())
     }
 
     pub(super) fn capture(&self) -> &Capture {
@@ -169,7 +196,7 @@ impl Job {
     fn page(&self, plan: &Plan) -> RestoredPage {
         let (size, max_count) = (self.capture().size(), self.acquisition.sensor.max_count());
         let pictures = self.schedule.instants.pictures(self.capture());
-        RestoredPage::new(size, max_count, plan.tonemap, pictures)
+        RestoredPage::new(size, max_count, plan.tonemap, self.rendering.clone(), pictures)
     }
 
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
@@ -207,6 +234,12 @@ impl Job {
         }
         if let Some(every) = plan.every {
             settings["every"] = json!(every);
+        }
+        if let Some(filter) = capture.filter() {
+            settings["gray"] = json!(plan.gray);
+            if let (Some(rendering), Some(choice)) = (&self.rendering, &capture.info().cfa) {
+                settings["dng"] = dng_tags(choice, filter, acquisition, rendering);
+            }
         }
         if plan.tonemap != Tonemap::None {
             settings["tonemap"] = json!("srgb");
@@ -248,6 +281,9 @@ impl Job {
             }
             if let Some(map) = &plan.read.dcr {
                 inputs.add("dcr", map)?;
+            }
+            if let Some(FilterChoice::Picture(path)) = &self.capture().info().cfa {
+                inputs.add("cfa", path)?;
             }
             let defects = &self.acquisition.sensor.defects;
             for (name, file) in
@@ -307,6 +343,35 @@ impl Job {
     }
 }
 
+/// Returns the rendering of the colours of a capture behind a colour filter, unless luma alone is restored.
+fn rendering(
+    plan: &Plan,
+    capture: &Capture,
+    summary: &Summary,
+    acquisition: &Acquisition,
+) -> Result<Option<Rendering>> {
+    if capture.filter().is_none() {
+        let given = plan.gray.then_some("--gray").or(plan.white_balance.map(|_| "--wb"));
+        let Some(flag) = given else { return Ok(None) };
+        return Err(CliError::new(
+            "the capture is gray",
+            flag,
+            "leave it out, or name the colour filter with --cfa",
+        ));
+    }
+    if plan.gray {
+        return Ok(None);
+    }
+    if plan.output == "-" {
+        return Err(CliError::new(
+            "colours are not written as Y4M",
+            "-o -",
+            "name a file or a folder, or restore luma alone with --gray",
+        ));
+    }
+    Ok(Some(Rendering::new(plan.white_balance, capture, summary, acquisition)))
+}
+
 /// Makes the restorer of the named method, or of the default one, for this capture.
 fn restorer(
     plan: &Plan,
@@ -321,7 +386,10 @@ fn restorer(
     };
     plan.network.check_diffusion(&[method])?;
     let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
-    Ok((method, (aligned.around(restorer), choice)))
+    let restorer = aligned.around(restorer);
+    let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
+    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.gray);
+    Ok((method, (Box::new(coloured), choice)))
 }
 
 /// Returns the default method; prints the reason if it is not the network.
@@ -382,8 +450,7 @@ pub(super) fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture().size());
-    let (name, choice) = (job.method.name, &job.choice);
-    let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
+    let mut text = format!("{output}   {frames} frames of {size} by {}\n", job.method_text());
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
@@ -394,6 +461,9 @@ pub(super) fn describe(
         format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {mean_level:.4}"),
     );
     line("sensor", format!("{}, gain {:.4} DN/e-", acquisition.sensor.name, acquisition.gain));
+    if let Some(rendering) = &job.rendering {
+        line("colours", rendering.describe());
+    }
     if resumed > 0 {
         line("resumed", format!("{resumed} frames were there already"));
     }

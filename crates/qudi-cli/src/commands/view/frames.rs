@@ -3,11 +3,12 @@
 use super::args::View;
 use super::server::Answer;
 use crate::args::Global;
+use crate::colour::{Rendering, encoded};
 use crate::commands::restore::on_demand::OnDemand;
 use crate::error::{CliError, Result};
 use crate::methods::{METHODS, Method};
 use crate::report::Report;
-use crate::report::player::{Kind, Layer, QUALITY, jpeg};
+use crate::report::player::{Kind, Layer, QUALITY, colour_jpeg, jpeg};
 use crate::settings::Settings;
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::restore::RestoreSink;
@@ -98,6 +99,7 @@ impl<'a> Frames<'a> {
         let previous = frame.checked_sub(1).is_some_and(|n| self.kept.get(layer, n).is_some());
         let report = self.report;
         let restorer = self.opened(method)?;
+        let rendering = restorer.rendering();
         // Methods that align sums may make one picture less than others.
         let picture = frame.min(restorer.pictures().saturating_sub(1));
         if layer == COUNTS {
@@ -106,7 +108,7 @@ impl<'a> Frames<'a> {
         } else {
             let length = if previous { RUN_LENGTH } else { 1 };
             let end = (picture + length).min(restorer.pictures());
-            let mut encoded = Encoded { tone, frames: Vec::new() };
+            let mut encoded = Encoded { tone, rendering, frames: Vec::new() };
             restorer.restore(picture..end, &mut encoded, report)?;
             for (n, jpeg) in (frame..).zip(encoded.frames) {
                 self.kept.insert(layer, n, jpeg);
@@ -148,12 +150,20 @@ impl Tone {
 /// Restored frames, encoded as they come.
 struct Encoded {
     tone: Tone,
+    rendering: Option<Rendering>,
     frames: Vec<Vec<u8>>,
 }
 
 impl RestoreSink for Encoded {
     fn frame(&mut self, _: u64, restored: &Frame, _: &[u16]) -> qudi_core::Result<()> {
         self.frames.push(self.tone.encode(restored));
+        Ok(())
+    }
+
+    fn colour(&mut self, _: u64, restored: &[Frame; 3], _: &[u16]) -> qudi_core::Result<()> {
+        let rendered = self.rendering.as_ref().map(|rendering| rendering.rendered(restored));
+        let shown = encoded(rendered.as_ref().unwrap_or(restored));
+        self.frames.push(colour_jpeg(&shown, QUALITY));
         Ok(())
     }
 }
