@@ -92,7 +92,7 @@ fn parse(text: &str, place: &str) -> Result<Value> {
     let fault = |what: String, place: String| Error::Sensor {
         what,
         place,
-        help: "see configs/sensors for examples".to_owned(),
+        help: "see `qudi info swissspad2` for an example".to_owned(),
     };
     let document: toml::Value = toml::from_str(text).map_err(|e: toml::de::Error| {
         let line = e.span().map(|span| text[..span.start].lines().count().max(1));

@@ -143,8 +143,8 @@ fn conversion(
     })
 }
 
-/// Returns the colour filter of the frames as they are read: tiles are turned and cropped with them, a picture
-/// is of the stored frames.
+/// Returns the colour filter of the frames as they are read: tiles are turned and cropped with them, a
+/// picture is of the stored frames.
 fn converted_filter(capture: &Capture) -> Option<FilterChoice> {
     let (filter, choice) = (capture.filter()?, capture.info().cfa.as_ref()?);
     let tile = filter.first_tile(choice.tile()?.side())?;

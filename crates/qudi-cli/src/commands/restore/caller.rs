@@ -100,6 +100,8 @@ fn refuse_files(args: &Restore) -> Result<()> {
     let given = [
         (args.chi_map.is_some(), "--chi-map"),
         (args.side_by_side.is_some(), "--side-by-side"),
+        (args.html.is_some(), "--html"),
+        (args.challenge, "--challenge"),
         (args.uncertainty.is_some(), "--uncertainty"),
         (args.float, "--float"),
         (args.fps.is_some(), "--fps"),

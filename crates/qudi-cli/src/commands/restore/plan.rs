@@ -47,6 +47,7 @@ pub(super) struct Plan {
     pub(super) tiff: TiffSamples,
     pub(super) chi_square_map: Option<PathBuf>,
     pub(super) side_by_side: Option<PathBuf>,
+    pub(super) html: Option<PathBuf>,
     pub(super) uncertainty: Option<PathBuf>,
     pub(super) overwrite: Overwrite,
 }
@@ -65,14 +66,16 @@ impl Plan {
             ));
         }
         let overwrite = global.overwrite();
-        let beside = [&args.chi_map, &args.side_by_side, &args.uncertainty];
+        let beside = [&args.chi_map, &args.side_by_side, &args.html, &args.uncertainty];
         for path in beside.into_iter().flatten() {
             refuse_taken(path, overwrite)?;
         }
-        if args.shard.is_some() && args.side_by_side.is_some() {
+        let shows = [(&args.side_by_side, "--side-by-side"), (&args.html, "--html")];
+        let shows = shows.into_iter().find(|(path, _)| path.is_some());
+        if let (Some(_), Some((_, flag))) = (args.shard, shows) {
             return Err(CliError::new(
                 "a part of the work has not all the frames to show",
-                "--side-by-side",
+                flag,
                 "ask for it when all parts are done: the same command without --shard",
             ));
         }
@@ -96,6 +99,7 @@ impl Plan {
                 gain: args.gain,
                 mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
+                white: None,
             },
             method: args.method,
             network,
@@ -104,6 +108,7 @@ impl Plan {
             tiff: tiff_samples(args.float, Path::new(&args.output))?,
             chi_square_map: args.chi_map.clone(),
             side_by_side: args.side_by_side.clone(),
+            html: args.html.clone(),
             uncertainty: args.uncertainty.clone(),
             overwrite,
         };

@@ -1,8 +1,10 @@
 //! `qudi restore`: a capture through a method into frames.
 
 use super::args::{Restore, Tonemap};
+use super::challenge;
 use super::chi_square_map::ChiSquareMap;
 use super::output::{Output, Sink};
+use super::page::{About, RestoredPage};
 use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
@@ -17,7 +19,7 @@ use crate::methods::default::default_method;
 use crate::methods::network::{OwnNetwork, device_failed};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{Built, Kind, Method};
-use crate::report::{Report, duration};
+use crate::report::{Output as PageFile, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::ColourRestorer;
 use qudi_core::colour::FilterChoice;
@@ -43,17 +45,28 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
+    if args.challenge {
+        return challenge::run(args, settings, global, report);
+    }
     let plan = Plan::new(args, global, report.json())?;
     let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
     let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
+    let page_file = PageFile::open(plan.html.as_deref(), plan.overwrite)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
     let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
-    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition);
+    let page = plan.html.is_some().then(|| job.page(&plan));
+    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition).with_page(page);
     let done = output.finished(part.clone());
+    if done > 0 && plan.html.is_some() && job.rendering.is_some() {
+        let help = "leave it out, or write into another folder";
+        let what =
+            format!("{done} frames were restored by an earlier run, whose colours are balanced");
+        return Err(CliError::new(what, "--html", help));
+    }
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
@@ -86,6 +99,17 @@ pub(crate) fn run(
     let seconds = (made > 0).then(|| start.elapsed().as_secs_f64() / made as f64);
     let frames = part.end - part.start;
     let text = describe(&plan.output, &job, frames, done, map.chi_square(), seconds);
+    if let Some(page) = map.take_page() {
+        let about = About {
+            capture: plan.capture.display().to_string(),
+            method: job.method.name,
+            text: &text,
+            warnings: &job.warnings,
+            settings: &settings,
+            misfit: map.map(),
+        };
+        page_file.write(|| page.html(about))?;
+    }
     if plan.output == "-" {
         report.remark(text.trim_end());
         return Ok(());
@@ -104,10 +128,10 @@ pub(crate) fn run(
 
 /// What a run needs: a capture and its acquisition, the method, and the pictures that it makes.
 pub(super) struct Job {
-    aligned: AlignedCapture,
+    pub(super) aligned: AlignedCapture,
     pub(super) acquisition: Acquisition,
     light_source: &'static str,
-    method: &'static Method,
+    pub(super) method: &'static Method,
     restorer: Box<dyn Restorer>,
     /// What the method chose for this capture.
     choice: String,
@@ -154,8 +178,25 @@ impl Job {
         })
     }
 
+    /// Returns the method in words, as in `qudi (regression) on cpu`.
+    pub(super) fn method_text(&self) -> String {
+        format!("{}{}", self.method.name, self.choice)
+    }
+
+    /// Returns the number of native frames in a frame; none if sums are aligned.
+    pub(super) fn plain_sum(&self) -> Option<u32> {
+        self.aligned.alignment.is_none().then(|| self.capture().summed())
+    }
+
     pub(super) fn capture(&self) -> &Capture {
         &self.aligned.capture
+    }
+
+    /// Returns the page of the pictures, which are yet to come.
+    fn page(&self, plan: &Plan) -> RestoredPage {
+        let (size, max_count) = (self.capture().size(), self.acquisition.sensor.max_count());
+        let pictures = self.schedule.instants.pictures(self.capture());
+        RestoredPage::new(size, max_count, plan.tonemap, self.rendering.clone(), pictures)
     }
 
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
@@ -399,7 +440,8 @@ fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<
     })
 }
 
-fn describe(
+/// Describes a run in lines.
+pub(super) fn describe(
     output: &str,
     job: &Job,
     frames: u64,
@@ -408,8 +450,7 @@ fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture().size());
-    let (name, choice) = (job.method.name, &job.choice);
-    let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
+    let mut text = format!("{output}   {frames} frames of {size} by {}\n", job.method_text());
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
