@@ -65,9 +65,7 @@ pub(crate) fn run(
 ) -> Result<Value> {
     refuse_files(&args)?;
     let shard = args.shard.take();
-    // Callers receive one plane.
-    args.gray |= args.wb.is_none();
-    let plan = Plan::new(&args, global, false)?;
+    let plan = Plan { luma_alone: true, ..Plan::new(&args, global, false)? };
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
         None => plan.source(),

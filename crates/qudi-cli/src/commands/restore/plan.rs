@@ -32,8 +32,10 @@ pub(super) struct Plan {
     /// Native frames from one picture to the next, if not every frame becomes one.
     pub(super) every: Option<u64>,
     pub(super) tonemap: Tonemap,
-    /// True if luma alone is restored of a capture behind a colour filter.
+    /// True if luma alone is asked for.
     pub(super) gray: bool,
+    /// True if luma alone is restored of a capture behind a colour filter.
+    pub(super) luma_alone: bool,
     pub(super) white_balance: Option<Gains>,
     /// Frames per second of played outputs.
     pub(super) played_fps: f64,
@@ -92,6 +94,7 @@ impl Plan {
             every: args.every,
             tonemap: args.tonemap,
             gray: args.gray,
+            luma_alone: args.gray,
             white_balance: args.wb,
             played_fps: args.fps.unwrap_or(PLAYED_FPS),
             light: LightOverrides {

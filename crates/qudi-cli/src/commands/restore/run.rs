@@ -236,7 +236,7 @@ impl Job {
             settings["every"] = json!(every);
         }
         if let Some(filter) = capture.filter() {
-            settings["gray"] = json!(plan.gray);
+            settings["gray"] = json!(plan.luma_alone);
             if let (Some(rendering), Some(choice)) = (&self.rendering, &capture.info().cfa) {
                 settings["dng"] = dng_tags(choice, filter, acquisition, rendering);
             }
@@ -359,7 +359,7 @@ fn rendering(
             "leave it out, or name the colour filter with --cfa",
         ));
     }
-    if plan.gray {
+    if plan.luma_alone {
         return Ok(None);
     }
     if plan.output == "-" {
@@ -388,7 +388,7 @@ fn restorer(
     let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
     let restorer = aligned.around(restorer);
     let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
-    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.gray);
+    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.luma_alone);
     Ok((method, (Box::new(coloured), choice)))
 }
 
