@@ -41,10 +41,10 @@ bench:
     cargo bench -p qudi-core
     cargo bench -p qudi-burst
 
-# The pictures of README and quick start
+# The picture of the README
 picture:
     cargo run --release -- demo --animate -o target/demo.png --force
-    cp target/demo.png target/demo.gif docs/images/
+    cp target/demo.gif docs/images/
 
 # The settings reference, from the program itself
 config-docs:

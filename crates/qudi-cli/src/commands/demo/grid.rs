@@ -1,6 +1,7 @@
 //! Colour frames side by side under labels: a grid for each of red, green and blue.
 
 use crate::error::{CliError, Result};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use qudi_core::{Frame, Size};
 use qudi_io::writer::Picture;
@@ -47,7 +48,7 @@ impl Grid {
         let Pixels { size, rgb } = self.pixels();
         let mut png = Vec::new();
         let (width, height) = (size.width as u32, size.height as u32);
-        image::codecs::png::PngEncoder::new(&mut png)
+        PngEncoder::new_with_quality(&mut png, CompressionType::Best, FilterType::Adaptive)
             .write_image(&rgb, width, height, ExtendedColorType::Rgb8)
             .map_err(|e| CliError::new(e, "the picture", "report this as a bug"))?;
         Ok(png)

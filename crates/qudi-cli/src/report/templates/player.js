@@ -89,6 +89,7 @@ class Player {
     this.views = views(this.scene);
     this.sides = { left: this.scene.left, right: this.scene.right };
     this.pictures = new Pictures(this.scene, () => this.draw(), text => { part('.state').textContent = text; });
+    element.classList.toggle('served', Boolean(this.scene.layers[0].path));
     this.build();
     this.listen();
     new ResizeObserver(() => this.draw()).observe(part('.stage'));
