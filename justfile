@@ -41,9 +41,10 @@ bench:
     cargo bench -p qudi-core
     cargo bench -p qudi-burst
 
-# The picture of the README
+# The pictures of README and quick start
 picture:
-    cargo run --release -- demo -o docs/images/demo.png --force
+    cargo run --release -- demo --animate -o target/demo.png --force
+    cp target/demo.png target/demo.gif docs/images/
 
 # The settings reference, from the program itself
 config-docs:

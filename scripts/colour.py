@@ -104,7 +104,7 @@ class Runner:
         )
         truth = np.load(self.folder / "t.npy")
         record = json.loads((self.folder / "m.npy.json").read_text())
-        level = record["light"]["mean_level"]
+        level = record["light"]["exposure"]
         light = ["--exposure", level, "--ppp", ppp, "--seed", 2, "--force", "--transfer", "as-is"]
         middle, frame_size = truth[MIDDLE], truth.shape[1:3]
         out = {}

@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 mod bad_input;
 #[path = "cli/baselines.rs"]
 mod baselines;
+#[path = "cli/browser.rs"]
+mod browser;
 #[path = "cli/challenge.rs"]
 mod challenge;
 #[path = "cli/colour.rs"]
@@ -21,6 +23,8 @@ mod field;
 mod network;
 #[path = "cli/outputs.rs"]
 mod outputs;
+#[path = "cli/pages.rs"]
+mod pages;
 #[path = "cli/places.rs"]
 mod places;
 #[path = "cli/report.rs"]
@@ -37,6 +41,8 @@ mod settings;
 mod support;
 #[path = "cli/train.rs"]
 mod train;
+#[path = "cli/view.rs"]
+mod view;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")

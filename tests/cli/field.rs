@@ -241,7 +241,7 @@ fn looks_at_a_capture_on_one_page() {
     let text = run(&folder, "look c.npy --sensor swissspad2");
     assert!(text.contains("restore    `qudi restore` makes") && text.contains("sum  "), "{text}");
     let page = std::fs::read_to_string(folder.join("c-look.html")).unwrap();
-    assert!(page.contains("base64,iVBOR") && page.contains("c.npy"));
+    assert!(page.contains("base64,/9j/") && page.contains("c.npy") && page.contains("one instant"));
     // Binary frames are shown without a sensor, too.
     run(&folder, "look c.npy -o look.png");
     let size = image::image_dimensions(folder.join("look.png")).unwrap();

@@ -32,6 +32,7 @@ use crate::commands::restore::args::Restore;
 use crate::commands::selftest::args::Selftest;
 use crate::commands::simulate::args::Simulate;
 use crate::commands::train::args::Train;
+use crate::commands::view::args::View;
 use crate::version;
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
 use qudi_core::atomic_file::Overwrite;
@@ -122,6 +123,7 @@ pub(crate) enum Command {
     Light(Light),
     Info(Box<Info>),
     Look(Box<Look>),
+    View(Box<View>),
     Config(Config),
     Completions(Completions),
     Man(Man),
@@ -145,6 +147,7 @@ impl Command {
             Self::Light(_) => "light",
             Self::Info(_) => "info",
             Self::Look(_) => "look",
+            Self::View(_) => "view",
             Self::Config(_) => "config",
             Self::Completions(_) => "completions",
             Self::Man(_) => "man",

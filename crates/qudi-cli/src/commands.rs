@@ -28,10 +28,15 @@ pub(crate) mod convert {
 }
 
 pub(crate) mod demo {
+    mod animation;
     pub(crate) mod args;
+    mod grid;
     mod html;
+    mod picture;
+    mod restored;
     pub(crate) mod run;
-    mod shown;
+    mod scenes;
+    mod uncertainty;
 }
 
 pub(crate) mod eval {
@@ -86,7 +91,9 @@ pub(crate) mod restore {
     pub(crate) mod caller;
     mod challenge;
     mod chi_square_map;
+    pub(crate) mod on_demand;
     mod output;
+    mod page;
     mod plan;
     pub(crate) mod run;
     mod uncertainty;
@@ -119,4 +126,14 @@ pub(crate) mod train {
     mod watch;
 
     pub(crate) use run_folder::run_files;
+}
+
+pub(crate) mod view {
+    mod address;
+    pub(crate) mod args;
+    mod frames;
+    mod page;
+    mod request;
+    pub(crate) mod run;
+    mod server;
 }

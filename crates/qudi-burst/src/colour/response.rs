@@ -2,16 +2,20 @@
 
 use qudi_core::Result;
 use qudi_core::restorer::Acquisition;
-use qudi_core::sensor::{CountLaw, CountMoments};
+use qudi_core::sensor::{CountLaw, CountMoments, Response};
+use rayon::prelude::*;
 
 /// Nodes of the tables.
-const NODES: usize = 2048;
+const NODES: usize = 1024;
 
-/// Share of full scale at which counts tell no more light.
-const SATURATION: f64 = 0.98;
+/// Share of full scale at which counts tell no more light: bright colours saturate long before luma does.
+const SATURATION: f64 = 0.998;
 
-/// Largest count of which the mean response is inverted exactly; deeper samples are nearly linear.
-const MAX_EXACT_COUNT: u16 = 1023;
+/// Detections of a binary sensor that saturate it, in units of the frames it sums.
+const BINARY_SATURATION: f64 = 5.0;
+
+/// Largest count of which the moments are summed exactly; deeper samples are nearly linear.
+const MAX_EXACT_COUNT: u16 = 63;
 
 /// Lower bound of variances, and of the response's slope.
 const MIN_VARIANCE: f32 = 1e-3;
@@ -34,14 +38,20 @@ impl CountResponse {
         let sensor = &acquisition.sensor;
         let law = CountLaw::new(sensor, acquisition.gain);
         let full = f64::from(sensor.max_count());
-        let last = if sensor.max_count() <= MAX_EXACT_COUNT {
-            law.detections_for_mean(SATURATION * full)
-        } else {
-            SATURATION * full / acquisition.gain
+        let exact = sensor.response == Response::Linear && sensor.max_count() <= MAX_EXACT_COUNT;
+        let last = match sensor.response {
+            Response::Binary => BINARY_SATURATION * full,
+            Response::Linear if exact => saturating_detections(&law, SATURATION * full),
+            Response::Linear => SATURATION * full / acquisition.gain,
         };
         let moments = CountMoments::new(&law);
-        let node = |i: usize| moments.at(last * (i as f64 / NODES as f64).powi(2));
-        let (means, variances) = (0..=NODES).map(node).map(|(m, v)| (m as f32, v as f32)).unzip();
+        let node = |i: usize| {
+            let detections = last * (i as f64 / NODES as f64).powi(2);
+            let (mean, variance) =
+                if exact { exact_moments(&law, detections) } else { moments.at(detections) };
+            (mean as f32, variance as f32)
+        };
+        let (means, variances) = (0..=NODES).into_par_iter().map(node).unzip();
         Ok(Self {
             last: last as f32,
             means,
@@ -77,6 +87,29 @@ impl CountResponse {
         let detections = node(above - 1) + part * (node(above) - node(above - 1));
         (detections - self.dark) / self.per_unit
     }
+}
+
+/// Returns the detections whose mean count is `mean`, or the most that the full well lets count.
+fn saturating_detections(law: &CountLaw, mean: f64) -> f64 {
+    let (mut low, mut high) = (0.0, 1.0);
+    while law.mean(high) < mean && high < 1e4 {
+        (low, high) = (high, 2.0 * high);
+    }
+    for _ in 0..40 {
+        let middle = 0.5 * (low + high);
+        if law.mean(middle) < mean { low = middle } else { high = middle }
+    }
+    high
+}
+
+/// Returns mean and variance of a count.
+fn exact_moments(law: &CountLaw, detections: f64) -> (f64, f64) {
+    let (mut mean, mut square) = (0.0, 0.0);
+    for (count, probability) in law.probabilities(detections).iter().enumerate() {
+        mean += count as f64 * probability;
+        square += (count * count) as f64 * probability;
+    }
+    (mean, square - mean * mean)
 }
 
 /// Law of a count at some light.

@@ -177,11 +177,14 @@ mod tests {
     }
 
     #[test]
-    fn gray_scenes_have_no_colour() {
+    fn static_gray_scenes_have_no_colour() {
         let filter = filter("rggb");
-        let (frames, acquisition) = counts(&filter, 0.0);
+        let (_, acquisition) = counts(&filter, 0.0);
+        let gray = filter.mosaic(&scene(0, 0.0));
+        let mut camera = Camera::new(&acquisition.sensor, SIZE, LIGHT, 6).unwrap();
+        let frames: Vec<_> = (0..11).map(|t| camera.expose(t, &[&gray]).unwrap()).collect();
         let view = BurstView { size: SIZE, frames: &frames };
-        let mut restorer = ColourRestorer::new(Box::new(Average), filter, true);
+        let mut restorer = ColourRestorer::new(Box::new(QbpRefined), filter, true);
         let restored = restorer.restore_frames(view, &acquisition, &[5]).unwrap();
         let colour = &restored.colour.unwrap()[0];
         let luma = restored.frames[0].mean();

@@ -21,7 +21,7 @@ const DIFFERENCE: f32 = 8.0;
 /// Scale of displacements among the inputs.
 const DISPLACEMENT: f32 = 0.25;
 
-/// Planes among the inputs next to the compared features: difference, its size, frame, flow, and the flow of
+/// Planes among the inputs, without the compared features: difference, its size, frame, flow, and the flow of
 /// related pairs.
 const PLANES: usize = 3 + 2 + 6;
 

@@ -58,8 +58,8 @@ pub(super) fn soft_match(
     Tensor::cat(vec![expected(0), expected(1)], 1)
 }
 
-/// Averages the differences of every pair of frames with the differences before and after: motion is about
-/// the same there, and noise is not.
+/// Averages the differences of every pair of frames with the differences of the pairs before and after, whose
+/// motion is about the same and whose noise is not.
 fn mean_of_pairs_around(difference: Tensor<4>, pairs_of_burst: usize) -> Tensor<4> {
     let [pairs, candidates, h, w] = difference.dims();
     let whole = difference.reshape([pairs / pairs_of_burst, pairs_of_burst, candidates * h * w]);

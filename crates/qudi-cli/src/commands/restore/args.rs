@@ -84,7 +84,7 @@ pub(crate) struct Restore {
     /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there
     #[arg(long, conflicts_with_all = [
         "sensor", "ppp", "gain", "gray", "wb", "mean_level", "overlap", "every", "tonemap", "fps", "shard", "float", "chi_map",
-        "side_by_side", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient", "axes", "channel", "cfa",
+        "side_by_side", "html", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient", "axes", "channel", "cfa",
         "array", "levels", "bits", "offset", "threshold", "header", "trailer", "frames_per_file", "start", "end",
         "crop", "mask", "dcr", "lenient",
     ])]
@@ -95,6 +95,9 @@ pub(crate) struct Restore {
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
+    /// Write a page that plays: counts, restored frames, uncertainty and misfit under a slider, the settings
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) html: Option<PathBuf>,
     /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over
     /// --samples K
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]

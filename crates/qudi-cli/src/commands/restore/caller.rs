@@ -65,9 +65,7 @@ pub(crate) fn run(
 ) -> Result<Value> {
     refuse_files(&args)?;
     let shard = args.shard.take();
-    // Callers receive one plane.
-    args.gray |= args.wb.is_none();
-    let plan = Plan::new(&args, global, false)?;
+    let plan = Plan { luma_alone: true, ..Plan::new(&args, global, false)? };
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
         None => plan.source(),
@@ -100,6 +98,7 @@ fn refuse_files(args: &Restore) -> Result<()> {
     let given = [
         (args.chi_map.is_some(), "--chi-map"),
         (args.side_by_side.is_some(), "--side-by-side"),
+        (args.html.is_some(), "--html"),
         (args.challenge, "--challenge"),
         (args.uncertainty.is_some(), "--uncertainty"),
         (args.float, "--float"),

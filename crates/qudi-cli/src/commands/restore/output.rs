@@ -185,6 +185,9 @@ impl<'a> Sink<'a> {
 
 impl RestoreSink for Sink<'_> {
     fn uncertainty(&mut self, _: u64, sigma: &Frame) -> qudi_core::Result<()> {
+        if let Some(map) = &mut self.map {
+            map.add_uncertainty(sigma);
+        }
         self.uncertainty.push(sigma)
     }
 
@@ -195,7 +198,7 @@ impl RestoreSink for Sink<'_> {
         counts: &[u16],
     ) -> qudi_core::Result<()> {
         let seen = self.output.push_colour(number, restored)?;
-        self.map.as_mut().map_or(Ok(()), |map| map.add(&seen, counts))
+        self.map.as_mut().map_or(Ok(()), |map| map.add_colour(restored, &seen, counts))
     }
 
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {

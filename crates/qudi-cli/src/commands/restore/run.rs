@@ -4,6 +4,7 @@ use super::args::{Restore, Tonemap};
 use super::challenge;
 use super::chi_square_map::ChiSquareMap;
 use super::output::{Output, Sink};
+use super::page::{About, RestoredPage};
 use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
@@ -18,7 +19,7 @@ use crate::methods::default::default_method;
 use crate::methods::network::{OwnNetwork, device_failed};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{Built, Kind, Method};
-use crate::report::{Report, duration};
+use crate::report::{Output as PageFile, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::ColourRestorer;
 use qudi_core::colour::FilterChoice;
@@ -52,12 +53,20 @@ pub(crate) fn run(
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
     let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
+    let page_file = PageFile::open(plan.html.as_deref(), plan.overwrite)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
     let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
-    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition);
+    let page = plan.html.is_some().then(|| job.page(&plan));
+    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition).with_page(page);
     let done = output.finished(part.clone());
+    if done > 0 && plan.html.is_some() && job.rendering.is_some() {
+        let help = "leave it out, or write into another folder";
+        let what =
+            format!("{done} frames were restored by an earlier run, whose colours are balanced");
+        return Err(CliError::new(what, "--html", help));
+    }
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
@@ -90,6 +99,17 @@ pub(crate) fn run(
     let seconds = (made > 0).then(|| start.elapsed().as_secs_f64() / made as f64);
     let frames = part.end - part.start;
     let text = describe(&plan.output, &job, frames, done, map.chi_square(), seconds);
+    if let Some(page) = map.take_page() {
+        let about = About {
+            capture: plan.capture.display().to_string(),
+            method: job.method.name,
+            text: &text,
+            warnings: &job.warnings,
+            settings: &settings,
+            misfit: map.map(),
+        };
+        page_file.write(|| page.html(about))?;
+    }
     if plan.output == "-" {
         report.remark(text.trim_end());
         return Ok(());
@@ -108,7 +128,7 @@ pub(crate) fn run(
 
 /// What a run needs: a capture and its acquisition, the method, and the pictures that it makes.
 pub(super) struct Job {
-    aligned: AlignedCapture,
+    pub(super) aligned: AlignedCapture,
     pub(super) acquisition: Acquisition,
     light_source: &'static str,
     pub(super) method: &'static Method,
@@ -172,6 +192,13 @@ impl Job {
         &self.aligned.capture
     }
 
+    /// Returns the page of the pictures, which are yet to come.
+    fn page(&self, plan: &Plan) -> RestoredPage {
+        let (size, max_count) = (self.capture().size(), self.acquisition.sensor.max_count());
+        let pictures = self.schedule.instants.pictures(self.capture());
+        RestoredPage::new(size, max_count, plan.tonemap, self.rendering.clone(), pictures)
+    }
+
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
     pub(super) fn settings(&self, plan: &Plan) -> Result<Value> {
         let (capture, acquisition) = (self.capture(), &self.acquisition);
@@ -209,7 +236,7 @@ impl Job {
             settings["every"] = json!(every);
         }
         if let Some(filter) = capture.filter() {
-            settings["gray"] = json!(plan.gray);
+            settings["gray"] = json!(plan.luma_alone);
             if let (Some(rendering), Some(choice)) = (&self.rendering, &capture.info().cfa) {
                 settings["dng"] = dng_tags(choice, filter, acquisition, rendering);
             }
@@ -332,7 +359,7 @@ fn rendering(
             "leave it out, or name the colour filter with --cfa",
         ));
     }
-    if plan.gray {
+    if plan.luma_alone {
         return Ok(None);
     }
     if plan.output == "-" {
@@ -361,7 +388,7 @@ fn restorer(
     let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
     let restorer = aligned.around(restorer);
     let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
-    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.gray);
+    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.luma_alone);
     Ok((method, (Box::new(coloured), choice)))
 }
 
@@ -413,7 +440,8 @@ fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<
     })
 }
 
-fn describe(
+/// Describes a run in lines.
+pub(super) fn describe(
     output: &str,
     job: &Job,
     frames: u64,
