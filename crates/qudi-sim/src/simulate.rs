@@ -2,7 +2,7 @@
 //!
 //! Memory holds one exposure at a time, however long the clip.
 
-use crate::clip::{AssumedWhite, Input, Sampling};
+use crate::clip::{AssumedWhite, Combs, Input, Sampling};
 use qudi_core::Checksum;
 use qudi_core::flow::Flow;
 use qudi_core::sensor::{PixelMaps, Sensor};
@@ -127,10 +127,11 @@ pub fn simulate(
 
     let mut source = input.open(sampling)?;
     let info = source.info();
-    let mut clip = ClipStatistics::default();
+    let (mut clip, mut combs) = (ClipStatistics::default(), Combs::default());
     let mut frames = 0;
     while let Some(exposure) = source.next()? {
         exposure.instants.iter().for_each(|frame| clip.add(&frame.data));
+        combs.add(exposure.truth());
         frames += 1;
         progress(Stage::Measuring, frames, info.frames)?;
     }
@@ -142,7 +143,10 @@ pub fn simulate(
         ));
     }
 
-    let notes = check_white(input, sampling.transfer, clip.largest(), info.assumed_white)?;
+    let mut notes = check_white(input, sampling.transfer, clip.largest(), info.assumed_white)?;
+    if !matches!(input, Input::Procedural(_) | Input::Still { .. }) {
+        notes.extend(combs.note(&input.place()));
+    }
     if clip.largest() <= 0.0 && simulation.mean_level.is_none() {
         return Err(Error::request(
             "the clip is black: there is no light to distribute photons over",
