@@ -1,6 +1,7 @@
 //! `qudi look`: an overview of a capture.
 
 use super::args::Look;
+use super::strip::strip;
 use crate::args::given::Given;
 use crate::args::{Global, Network};
 use crate::capture::{
@@ -14,7 +15,6 @@ use crate::report::html::{data_url, render};
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::{PostFilter, Qbp};
-use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Frame, linear_to_srgb};
@@ -27,6 +27,9 @@ use std::time::Instant;
 
 /// Sums of the window that one instant is restored from.
 const WINDOW: u64 = 11;
+
+/// Bytes of frames that are judged, which takes less than a second.
+const JUDGED_BYTES: u64 = 1 << 30;
 
 /// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
 ///
@@ -58,7 +61,7 @@ pub(crate) fn run(
         options: &options,
         sum: args.reading.sum(),
         sensor: args.sensor.as_deref(),
-        judged: SAMPLE_FRAMES,
+        judged: JUDGED_BYTES,
     };
     let summed = SummedCapture::new(source.open(settings)?, &source)?;
     let sum = summed.sum().cloned();
@@ -85,7 +88,9 @@ pub(crate) fn run(
     match acquired {
         Ok(CaptureAcquisition { acquisition, .. }) => {
             let start = Instant::now();
-            let instant = restore_instant(&mut capture, &acquisition)?;
+            let part = capture.longest_part();
+            let instant =
+                capture.in_part(&part, |capture| restore_instant(capture, &acquisition))?;
             let seconds = start.elapsed().as_secs_f64();
             picture.place(0, 1, &["ONE INSTANT"], &for_the_eye(instant.with_white_at_highlights()));
             let (words, document) = plan(&capture, &acquisition, seconds)?;
@@ -105,6 +110,7 @@ pub(crate) fn run(
                 "picture": data_url(&png),
                 "averaged": summary.sampled,
                 "aligned": WINDOW.min(capture.frames()),
+                "strip": strip(capture.timeline(), capture.findings()),
                 "text": text,
             });
             render("look.html", context)
@@ -120,6 +126,7 @@ pub(crate) fn run(
             "sum": sum,
             "ppp": summary.ppp,
             "warnings": warnings,
+            "findings": capture.findings(),
             "restore": forecast,
         })
     })

@@ -47,9 +47,10 @@ pub(crate) fn run(
     let mut output = Output::open(&plan, job.capture(), run)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
-    let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(u64::MAX);
+    let known = job.schedule.instants.pictures(job.capture());
+    let frames = known.unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
-    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition);
+    let mut map = ChiSquareMap::new(job.capture().size(), known, &job.acquisition);
     let done = output.finished(part.clone());
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
@@ -181,6 +182,11 @@ impl Job {
         if capture.summed() > 1 && plan.read.sum.is_none() {
             settings["sum"] = json!(capture.summed());
         }
+        let parts = capture.parts();
+        if parts.len() > 1 {
+            let parts: Vec<_> = parts.iter().map(|part| [part.start, part.end]).collect();
+            settings["parts"] = json!(parts);
+        }
         if let Some(alignment) = self.aligned.alignment {
             settings["aligned_sums"] = json!(alignment.native_frames());
         }
@@ -299,7 +305,9 @@ fn restorer(
         None => announced_method(plan, &aligned.capture, &seen, report)?,
     };
     plan.network.check_diffusion(&[method])?;
-    let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
+    let part = aligned.capture.longest_part();
+    let (restorer, choice) =
+        aligned.capture.in_part(&part, |capture| method.restorer(capture, &seen, &plan.network))?;
     Ok((method, (aligned.around(restorer), choice)))
 }
 
