@@ -27,15 +27,25 @@ lint:
 doc:
     cargo doc --workspace --no-deps --open
 
+# The documentation as a site in target/site; `pip install -r scripts/site-requirements.txt` has mdBook
+site:
+    cargo doc --workspace --no-deps
+    python3 scripts/site.py --build target/site
+
+# Packages of all crates in target/package
+package:
+    scripts/package.sh
+
 # Nanoseconds per pixel of the camera, seconds per window of the classical methods
 bench:
     cargo bench -p qudi-core
     cargo bench -p qudi-burst
 
-# The picture of the README
+# The pictures of README and quick start
 picture:
-    cargo run --release -- demo -o docs/images/demo.png --force
+    cargo run --release -- demo --animate -o target/demo.png --force
+    cp target/demo.png target/demo.gif docs/images/
 
 # The settings reference, from the program itself
 config-docs:
-    cargo run -- config docs > configs/README.md
+    cargo run -- config docs > docs/settings.md

@@ -10,7 +10,7 @@ set -eu
 qudi=$1 data=$2 weights=$3 out=$4 steps=$5
 shift 5
 [ $# -gt 0 ] || set -- whole forward-model flow fusion self-conditioning
-recipe=$(dirname "$0")/../configs/paper-mini.toml
+recipe=$(dirname "$0")/../crates/qudi-model/recipes/paper-mini.toml
 mkdir -p "$out"
 # The common part of the recipe, and its third stage, "mean".
 awk "/^\\[\\[stage\\]\\]/ { n++ } n == 0 || n == 3" "$recipe" >"$out/recipe.toml"

@@ -7,6 +7,14 @@ use std::path::{Path, PathBuf};
 mod bad_input;
 #[path = "cli/baselines.rs"]
 mod baselines;
+#[path = "cli/browser.rs"]
+mod browser;
+#[path = "cli/challenge.rs"]
+mod challenge;
+#[path = "cli/colour.rs"]
+mod colour;
+#[path = "cli/documentation.rs"]
+mod documentation;
 #[path = "cli/eval.rs"]
 mod eval;
 #[path = "cli/field.rs"]
@@ -15,6 +23,8 @@ mod field;
 mod network;
 #[path = "cli/outputs.rs"]
 mod outputs;
+#[path = "cli/pages.rs"]
+mod pages;
 #[path = "cli/places.rs"]
 mod places;
 #[path = "cli/report.rs"]
@@ -31,6 +41,8 @@ mod settings;
 mod support;
 #[path = "cli/train.rs"]
 mod train;
+#[path = "cli/view.rs"]
+mod view;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
@@ -61,14 +73,14 @@ fn settings_reference_is_up_to_date() {
         .args(["config", "docs"])
         .output()
         .unwrap();
-    let committed = std::fs::read_to_string(root().join("configs/README.md")).unwrap();
+    let committed = std::fs::read_to_string(root().join("docs/settings.md")).unwrap();
     assert_eq!(String::from_utf8(output.stdout).unwrap(), committed, "run `just config-docs`");
 }
 
 #[test]
 fn accepts_the_example_settings() {
     let folder = support::scratch("example-settings");
-    let settings = root().join("configs/simulate.toml");
+    let settings = root().join("crates/qudi-cli/src/settings/example.toml");
     support::qudi(&folder)
         .args("simulate scene:text --size 32x32 --frames 3 -o out.npy --config".split(' '))
         .arg(settings)

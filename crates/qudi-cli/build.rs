@@ -17,10 +17,19 @@ fn main() {
     // Debug builds would be compiled anew after every commit.
     let is_release = env::var("PROFILE").is_ok_and(|profile| profile == "release");
     let is_given = env::var("QUDI_COMMIT").is_ok();
-    let commit = if is_release && !is_given { commit() } else { None };
+    let commit = if is_release && !is_given { packaged_commit().or_else(commit) } else { None };
     if let Some(commit) = commit {
         println!("cargo:rustc-env=QUDI_COMMIT={commit}");
     }
+}
+
+/// Returns the commit that cargo noted when it packaged the sources, which then lie in no repository.
+fn packaged_commit() -> Option<String> {
+    let path = Path::new(&env::var_os("CARGO_MANIFEST_DIR")?).join(".cargo_vcs_info.json");
+    let text = std::fs::read_to_string(path).ok()?;
+    let (_, commit) = text.split_once("\"sha1\": \"")?;
+    let (commit, _) = commit.split_once('"')?;
+    Some(commit.to_owned())
 }
 
 /// Returns the commit of the repository; none without git, and where the sources lie in another repository.

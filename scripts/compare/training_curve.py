@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="bursts to use [default: as in the recipe]")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    recipe = tomllib.loads((ROOT / "configs/small.toml").read_text())
+    recipe = tomllib.loads((ROOT / "crates/qudi-model/recipes/small.toml").read_text())
     train, pre, fold = recipe["train"], recipe["network"], recipe["network"]["fold"]
     count = args.count or train["crops"]["bursts"]
     bursts = [Burst(path) for path in sorted(args.bursts.glob("*.safetensors"))[:count]]

@@ -11,7 +11,9 @@ const QUICK_SETTINGS: &str = "--device cpu -q --set network.width=4 --set train.
 /// Creates a folder with the recipe of EMVD on procedural scenes alone.
 fn with_recipe(name: &str) -> PathBuf {
     let folder = scratch(name);
-    let text = std::fs::read_to_string(crate::root().join("configs/baselines/emvd.toml")).unwrap();
+    let text =
+        std::fs::read_to_string(crate::root().join("crates/qudi-baselines/recipes/emvd.toml"))
+            .unwrap();
     let scenes = "[[data.source]]\nname = \"scenes\"\nkind = \"scenes\"\nfrom = [\"dead-leaves\", \"text\"]\n";
     let text = text.replace("[train]", &format!("{scenes}speed = 5.0\n\n[train]"));
     let text = text.replace("[validation]", "[validation]\nfrom = [\"scene:text\"]");

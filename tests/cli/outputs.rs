@@ -359,4 +359,6 @@ fn writes_completions_and_manual() {
     }
     qudi(&folder).args(["man", "pages"]).assert().success();
     assert!(listing(&folder.join("pages")).contains(&"qudi-simulate.1".to_owned()));
+    let scripts = listing(&folder.join("pages/completions"));
+    assert_eq!(scripts, ["_qudi", "_qudi.ps1", "qudi.bash", "qudi.elv", "qudi.fish"]);
 }

@@ -125,7 +125,8 @@ fn prepared(name: &str) -> PathBuf {
     std::fs::create_dir(folder.join("ext")).unwrap();
     std::fs::create_dir_all(folder.join("data/a")).unwrap();
     std::fs::copy(folder.join("fr/frame_000000.png"), folder.join("data/a/0.png")).unwrap();
-    let recipe = std::fs::read_to_string(crate::root().join("configs/tiny.toml")).unwrap();
+    let recipe =
+        std::fs::read_to_string(crate::root().join("crates/qudi-model/recipes/tiny.toml")).unwrap();
     let source = "[[data.source]]\nname = \"films\"\nkind = \"clips\"\nfrom = [\"a\"]\n\n[train]";
     let recipe = recipe.replacen("[train]", source, 1);
     let recipe = recipe.replacen("name = \"qudi-paper\"", "name = \"cal.toml\"", 1);
@@ -169,7 +170,7 @@ fn training_keeps_its_recipe_its_start_and_files_of_others() {
     let folder = prepared("places-train");
     let quick = "--device cpu -q --set train.steps=1 --set data.crop=32 --set data.frames=3 \
         --set validation.crop=32 --set validation.frames=3";
-    let tiny = crate::root().join("configs/tiny.toml");
+    let tiny = crate::root().join("crates/qudi-model/recipes/tiny.toml");
     std::fs::create_dir(folder.join("m")).unwrap();
     std::fs::copy(tiny, folder.join("m/recipe.toml")).unwrap();
     std::fs::create_dir_all(folder.join("m/state/mine")).unwrap();

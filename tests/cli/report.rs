@@ -32,7 +32,7 @@ fn page_shows_clips_of_two_sizes_under_their_full_names() {
         .assert()
         .success();
     let page = std::fs::read_to_string(folder.join("report.html")).unwrap();
-    for part in ["<b>run.1</b>", "<b>run.2</b>", "aspect-ratio:48/32", "aspect-ratio:24/40"] {
+    for part in ["<h2>run.1, ", "<h2>run.2, ", "aspect-ratio:48/32", "aspect-ratio:24/40"] {
         assert!(page.contains(part), "{part}");
     }
     let csv = std::fs::read_to_string(folder.join("frames.csv")).unwrap();

@@ -136,7 +136,8 @@ fn packs_train_without_the_files() {
         let image = GrayImage::from_fn(48, 40, |x, y| Luma([(4 * (x + t) + 2 * y) as u8]));
         image.save(clip.join(format!("{t}.png"))).unwrap();
     }
-    let recipe = std::fs::read_to_string(crate::root().join("configs/tiny.toml")).unwrap();
+    let recipe =
+        std::fs::read_to_string(crate::root().join("crates/qudi-model/recipes/tiny.toml")).unwrap();
     let films =
         "[[data.source]]\nname = \"films\"\nkind = \"clips\"\nfrom = [\"films\"]\n\n[train]";
     let recipe = recipe.replacen("[train]", films, 1);

@@ -106,7 +106,7 @@ impl Restorer for LearnedRestorer {
         requested: &[usize],
     ) -> Result<Restored> {
         let (Some(&first), Some(&last)) = (requested.iter().min(), requested.iter().max()) else {
-            return Ok(Restored { frames: Vec::new(), std: None });
+            return Ok(Restored::gray(Vec::new(), None));
         };
         progress(self.method().name(), 0, burst.frames.len())?;
         let tiling = Tiling::new(burst.size, self.sizes.multiple(), self.tile);
@@ -134,6 +134,6 @@ impl Restorer for LearnedRestorer {
             let image = expected.map_or(*value, |expected| expected.image(*value));
             *value = image.clamp(0.0, 1.0);
         }
-        Ok(Restored { frames, std: None })
+        Ok(Restored::gray(frames, None))
     }
 }

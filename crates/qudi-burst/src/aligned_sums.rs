@@ -96,7 +96,7 @@ impl Restorer for AlignedSums {
             }
         }
         let frames = frames.into_iter().flatten().collect();
-        Ok(Restored { frames, std: std.into_iter().collect() })
+        Ok(Restored::gray(frames, std.into_iter().collect()))
     }
 }
 

@@ -11,6 +11,7 @@
 
 mod aligned_burst;
 mod aligned_sums;
+mod colour;
 mod denoise;
 mod merge;
 pub mod methods;
@@ -23,6 +24,7 @@ mod temporal_filter;
 
 pub use aligned_burst::{AlignedBurst, AlignedFrame, Alignments};
 pub use aligned_sums::{AlignedSums, choose_count};
+pub use colour::ColourRestorer;
 pub use denoise::bm3d::bm3d;
 pub use denoise::vst::{Transform, VarianceStabilizer};
 pub use methods::{Average, Mle, PatchFlow, PostFilter, Qbp, QbpSettings, TransformDenoise};

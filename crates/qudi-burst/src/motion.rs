@@ -3,7 +3,7 @@
 mod affine;
 pub(crate) mod block_alignment;
 pub(crate) mod constant_velocity;
-mod flow;
+pub(crate) mod flow;
 pub(crate) mod global_motion;
 pub(crate) mod grid;
 pub(crate) mod hypotheses;

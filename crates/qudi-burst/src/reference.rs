@@ -139,7 +139,7 @@ impl Restorer for QbpRefined {
         numbers: &[usize],
     ) -> Result<Restored> {
         let frames = ReferenceEstimate::of_frames(burst, acquisition, numbers)?.frames;
-        Ok(Restored { frames, std: None })
+        Ok(Restored::gray(frames, None))
     }
 }
 

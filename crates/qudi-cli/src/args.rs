@@ -1,5 +1,7 @@
 //! The command line: options of every command, and groups of options that several commands share.
 
+#[cfg(test)]
+mod documented;
 pub(crate) mod given;
 mod methods;
 mod network;
@@ -30,6 +32,7 @@ use crate::commands::restore::args::Restore;
 use crate::commands::selftest::args::Selftest;
 use crate::commands::simulate::args::Simulate;
 use crate::commands::train::args::Train;
+use crate::commands::view::args::View;
 use crate::version;
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum, ValueHint};
 use qudi_core::atomic_file::Overwrite;
@@ -120,9 +123,9 @@ pub(crate) enum Command {
     Light(Light),
     Info(Box<Info>),
     Look(Box<Look>),
+    View(Box<View>),
     Config(Config),
     Completions(Completions),
-    #[command(hide = true)]
     Man(Man),
 }
 
@@ -144,6 +147,7 @@ impl Command {
             Self::Light(_) => "light",
             Self::Info(_) => "info",
             Self::Look(_) => "look",
+            Self::View(_) => "view",
             Self::Config(_) => "config",
             Self::Completions(_) => "completions",
             Self::Man(_) => "man",

@@ -16,7 +16,7 @@ use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, Size};
 use qudi_io::capture::Capture;
 use qudi_io::description::MaskChoice;
-use qudi_io::writer::{ClipWriter, TiffSamples};
+use qudi_io::writer::{ClipWriter, Planes, TiffSamples};
 use qudi_model::MatrixUnits;
 use serde_json::Value;
 use std::path::Path;
@@ -115,7 +115,7 @@ pub fn write_frames(
 ) -> Result<(), CliError> {
     let overwrite = if force { Overwrite::Yes } else { Overwrite::No };
     let samples = if float { TiffSamples::F32 } else { TiffSamples::U16 };
-    let mut writer = ClipWriter::create(path, size, samples, fps, overwrite)?;
+    let mut writer = ClipWriter::create(path, size, Planes::Gray, samples, fps, overwrite)?;
     for frame in frames {
         writer.push(&frame?)?;
     }

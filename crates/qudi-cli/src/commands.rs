@@ -28,10 +28,15 @@ pub(crate) mod convert {
 }
 
 pub(crate) mod demo {
+    mod animation;
     pub(crate) mod args;
+    mod grid;
     mod html;
+    mod picture;
+    mod restored;
     pub(crate) mod run;
-    mod shown;
+    mod scenes;
+    mod uncertainty;
 }
 
 pub(crate) mod eval {
@@ -40,6 +45,7 @@ pub(crate) mod eval {
     pub(crate) mod args;
     mod capture;
     mod clip;
+    mod colour;
     mod exact_json;
     mod exposed_clip;
     mod exposing;
@@ -84,8 +90,11 @@ pub(crate) mod publish {
 pub(crate) mod restore {
     pub(crate) mod args;
     pub(crate) mod caller;
+    mod challenge;
     mod chi_square_map;
+    pub(crate) mod on_demand;
     mod output;
+    mod page;
     mod plan;
     pub(crate) mod run;
     mod uncertainty;
@@ -118,4 +127,14 @@ pub(crate) mod train {
     mod watch;
 
     pub(crate) use run_folder::run_files;
+}
+
+pub(crate) mod view {
+    mod address;
+    pub(crate) mod args;
+    mod frames;
+    mod page;
+    mod request;
+    pub(crate) mod run;
+    mod server;
 }

@@ -7,6 +7,7 @@
 mod args;
 mod calls;
 mod capture;
+mod colour;
 mod commands;
 mod device;
 mod error;
@@ -107,6 +108,7 @@ fn run_command(args: &Args, report: &report::Report) -> error::Result<()> {
         Command::Light(light) => commands::light::run::run(light, &settings, report),
         Command::Info(info) => commands::info::run::run(info, &settings, &args.global, report),
         Command::Look(look) => commands::look::run::run(look, &settings, &args.global, report),
+        Command::View(view) => commands::view::run::run(view, &settings, &args.global, report),
         Command::Config(config) => commands::config::run::run(config, &settings, report),
         Command::Completions(completions) => commands::completions::run::run(completions),
         Command::Man(man) => commands::completions::run::man(man),

@@ -11,6 +11,7 @@ pub(crate) mod json;
 pub(crate) mod markdown;
 mod message;
 mod output;
+pub(crate) mod player;
 mod printable;
 pub(crate) mod svg;
 mod table;

@@ -89,7 +89,7 @@ impl Settings {
 
     fn add_file(&mut self, path: &Path) -> Result<()> {
         let place = path.display().to_string();
-        let help = "see `qudi config docs` for the keys and configs/ for examples";
+        let help = "see `qudi config docs` for the keys and an example";
         let text = read_text(path, TEXT_BYTES, "read the settings")?;
         let document: Value = toml::from_str(&text).map_err(|e| {
             CliError::new(format!("not a TOML document: {}", e.message()), &place, help)

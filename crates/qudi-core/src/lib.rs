@@ -19,6 +19,7 @@
 #![warn(missing_docs)]
 
 mod camera;
+pub mod colour;
 pub mod error;
 mod files;
 pub mod flow;

@@ -2,6 +2,7 @@
 
 mod calibration;
 mod chi_square;
+mod colour;
 mod detail;
 mod gmsd;
 mod octaves;
@@ -11,6 +12,7 @@ mod statistics;
 
 pub use calibration::{Calibration, calibration};
 pub use chi_square::Consistency;
+pub use colour::{colour_psnr, common_gain, zipper_error};
 pub use detail::{Detail, detail};
 pub use gmsd::gmsd;
 pub use octaves::{OCTAVES, octave_energies};

@@ -41,6 +41,8 @@ pub struct Restored {
     pub frames: Vec<Frame>,
     /// The standard deviation (sigma) of each pixel's error, where the method predicts it.
     pub std: Option<Vec<Frame>>,
+    /// Red, green and blue of each frame, of captures behind a colour filter; `frames` are their luma.
+    pub colour: Option<Vec<[Frame; 3]>>,
 }
 
 /// A method: turns all frames of a window into images at once.
@@ -80,6 +82,11 @@ pub trait Restorer {
 }
 
 impl Restored {
+    /// Creates gray frames, with the standard deviations that the method predicts.
+    pub fn gray(frames: Vec<Frame>, std: Option<Vec<Frame>>) -> Self {
+        Self { frames, std, colour: None }
+    }
+
     /// Selects the frames `numbers` of a window that was restored whole, in that order.
     ///
     /// # Panics
@@ -90,7 +97,8 @@ impl Restored {
             return self;
         }
         let select = |frames: Vec<Frame>| numbers.iter().map(|&n| frames[n].clone()).collect();
-        Self { frames: select(self.frames), std: self.std.map(select) }
+        let colour = self.colour.map(|colour| numbers.iter().map(|&n| colour[n].clone()).collect());
+        Self { frames: select(self.frames), std: self.std.map(select), colour }
     }
 }
 

@@ -27,6 +27,7 @@ pub use moments::CountMoments;
 pub use presets::{PRESETS, Preset, preset};
 pub use units::{DarkRate, FullWell, Gain};
 
+use crate::colour::SensorColour;
 use crate::error::{Error, Result};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -97,6 +98,9 @@ pub struct Sensor {
     /// Imperfect pixels; all off by default.
     #[serde(default)]
     pub defects: Defects,
+    /// Colour filter array; none of a monochrome sensor.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub colour: Option<SensorColour>,
     /// Sources of the numbers.
     #[serde(default)]
     pub sources: Vec<String>,
@@ -263,6 +267,9 @@ impl Sensor {
         }
         self.validate_depth()?;
         self.defects.validate(self)?;
+        if let Some(colour) = &self.colour {
+            colour.validate(self)?;
+        }
         self.dark_per_frame().map(drop)
     }
 

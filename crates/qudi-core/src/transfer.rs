@@ -11,21 +11,36 @@ pub enum Transfer {
     AsIs,
     /// Decode sRGB to linear light first, as a camera in front of the scene would see it.
     Srgb,
+    /// Take one plane, red, green or blue, in place of gray: as it is, or decoded to linear light.
+    #[serde(skip)]
+    Plane {
+        /// Index of the plane.
+        index: usize,
+        /// True to decode sRGB.
+        decodes: bool,
+    },
 }
 
 impl Transfer {
     /// Converts a file value into radiance in [0, 1].
     pub fn decode(self, value: f32) -> f32 {
         match self {
-            Self::AsIs => value,
-            Self::Srgb => srgb_to_linear(value),
+            Self::AsIs | Self::Plane { decodes: false, .. } => value,
+            Self::Srgb | Self::Plane { decodes: true, .. } => srgb_to_linear(value),
         }
     }
 
-    /// Computes gray from R, G, B in [0, 1]: BT.601 luma of the values as they are, or the luminance of
-    /// BT.709 primaries in linear light.
-    pub fn gray(self, [r, g, b]: [f32; 3]) -> f32 {
+    /// Returns true if values are decoded from sRGB.
+    pub fn decodes(self) -> bool {
+        matches!(self, Self::Srgb | Self::Plane { decodes: true, .. })
+    }
+
+    /// Computes gray from R, G, B in [0, 1]: BT.601 luma of the values as they are, the luminance of BT.709
+    /// primaries in linear light, or one plane.
+    pub fn gray(self, rgb: [f32; 3]) -> f32 {
+        let [r, g, b] = rgb;
         match self {
+            Self::Plane { index, .. } => self.decode(rgb[index]),
             Self::AsIs => 0.299 * r + 0.587 * g + 0.114 * b,
             Self::Srgb => {
                 0.2126 * srgb_to_linear(r) + 0.7152 * srgb_to_linear(g) + 0.0722 * srgb_to_linear(b)

@@ -189,7 +189,7 @@ mod tests {
             numbers: &[usize],
         ) -> Result<Restored> {
             let frames = vec![Frame::filled(burst.size, 0.0); numbers.len()];
-            Ok(Restored { frames, std: None })
+            Ok(Restored::gray(frames, None))
         }
     }
 

@@ -8,6 +8,7 @@ mod auto_sum;
 mod calibrate;
 mod counter;
 mod depth;
+mod filter;
 mod findings;
 mod frame_statistics;
 mod judge;
@@ -33,9 +34,11 @@ use crate::frames::depth::DepthChecked;
 use crate::frames::pipe::FIRST_WINDOW;
 use crate::frames::{CountFrames, memory};
 use depth::{check_sum, depth_source, state_depth};
-use mosaic::mosaic_plane;
+use filter::filter_of;
+use mosaic::{MosaicPart, mosaic_part};
 use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
+use qudi_core::colour::ColourFilter;
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Error, Result};
@@ -71,6 +74,8 @@ pub struct Capture {
     counter: Vec<usize>,
     /// Dark electrons per native frame and pixel of the view, if known.
     dark: Option<Vec<f32>>,
+    /// The colour filter, of captures whose colours are read.
+    filter: Option<ColourFilter>,
     stored: Vec<u16>,
     stored_sums: Vec<u32>,
 }
@@ -101,12 +106,23 @@ impl Capture {
             native = Box::new(DepthChecked::new(native, max, depth_source(options, &info), path));
         }
         let stored = native.size();
-        let plane = mosaic_plane(&mut info, options, path)?;
+        let part = mosaic_part(&mut info, options, sensor)?;
+        let plane = match &part {
+            Some(MosaicPart::Plane(plane)) => Some(*plane),
+            _ => None,
+        };
         let usual = View::new(stored, plane, info.orient, info.vendor, None)?;
         if let Some(orient) = options.orient {
             info.orient = orient;
         }
         let view = View::new(stored, plane, info.orient, info.vendor, options.crop)?;
+        let filter = match &part {
+            Some(MosaicPart::Whole(choice)) => {
+                let sensor = sensor.or(info.sensor.as_ref());
+                Some(filter_of(choice, sensor, stored, &usual, &view)?)
+            }
+            _ => None,
+        };
         let sum = options.sum.unwrap_or(1);
         let start = options.start.unwrap_or(0);
         native.discard_before(start);
@@ -140,6 +156,7 @@ impl Capture {
             timeline: Vec::new(),
             counter: Vec::new(),
             dark: None,
+            filter,
             stored: vec![0; stored.pixels()],
             stored_sums: Vec::new(),
             native,
@@ -208,6 +225,7 @@ impl Capture {
             timeline: Vec::new(),
             counter: Vec::new(),
             dark: None,
+            filter: None,
             stored: vec![0; size.pixels()],
             stored_sums: Vec::new(),
             native: Box::new(memory::MemoryFrames { size, frames }),
@@ -351,6 +369,11 @@ impl Capture {
     /// Returns the dark electrons per native frame of every pixel, if a map is known.
     pub fn dark(&self) -> Option<&[f32]> {
         self.dark.as_deref()
+    }
+
+    /// Returns the colour filter in front of the pixels, unless they are read as gray.
+    pub fn filter(&self) -> Option<&ColourFilter> {
+        self.filter.as_ref()
     }
 
     /// Returns the pixels that are repaired: named ones, or found ones.

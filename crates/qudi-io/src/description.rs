@@ -2,7 +2,6 @@
 
 mod format_options;
 mod info;
-mod mosaic;
 mod options;
 mod pedestal;
 
@@ -10,7 +9,5 @@ pub use format_options::FormatOption;
 pub(crate) use format_options::{refuse_others, refuse_packing};
 pub(crate) use info::RECORD;
 pub use info::{CaptureInfo, Certainty, Packing};
-pub use mosaic::Mosaic;
-pub(crate) use mosaic::MosaicPlane;
 pub use options::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 pub(crate) use pedestal::{keep_pedestal, with_pedestal};

@@ -4,6 +4,7 @@ use crate::description::ReadOptions;
 use crate::writer::BurstFormat;
 use qudi_core::Light;
 use qudi_core::Size;
+use qudi_core::colour::FilterChoice;
 use qudi_core::limits::RECORD_BYTES;
 use qudi_core::regular_file::read_limited;
 use qudi_core::sensor::Sensor;
@@ -118,6 +119,9 @@ pub struct Conversion {
     pub format: String,
     /// Options with which it was read.
     pub read: ReadOptions,
+    /// Colour filter of the converted frames.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cfa: Option<FilterChoice>,
 }
 
 /// A record of either kind.

@@ -11,8 +11,8 @@ mod tiff_stack;
 
 pub use array::ArrayWriter;
 pub use burst::{BurstFormat, BurstWriter, beside, pack_row, unpack_row, write_npy_stream};
-pub use clip::ClipWriter;
-pub(crate) use clip::encode_png16;
+pub use clip::{ClipWriter, Planes};
+pub(crate) use clip::{encode_colour_png16, encode_png16};
 pub(crate) use frame_name::{frame_name, is_frame_below, is_frame_name};
 pub use gif::GifWriter;
 pub use mp4::Mp4Writer;

@@ -60,11 +60,11 @@ struct Document {
 
 /// Names and texts of the presets, smallest first.
 pub const PRESETS: &[(&str, &str)] = &[
-    ("tiny", include_str!("../../../configs/tiny.toml")),
-    ("small", include_str!("../../../configs/small.toml")),
-    ("window", include_str!("../../../configs/window.toml")),
-    ("paper-mini", include_str!("../../../configs/paper-mini.toml")),
-    ("paper", include_str!("../../../configs/paper.toml")),
+    ("tiny", include_str!("../recipes/tiny.toml")),
+    ("small", include_str!("../recipes/small.toml")),
+    ("window", include_str!("../recipes/window.toml")),
+    ("paper-mini", include_str!("../recipes/paper-mini.toml")),
+    ("paper", include_str!("../recipes/paper.toml")),
 ];
 
 impl NetworkConfig {

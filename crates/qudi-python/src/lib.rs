@@ -10,7 +10,9 @@ mod run;
 mod source;
 mod write;
 
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use qudi_core::sensor::Sensor;
 use std::ffi::OsString;
 
 /// See [`qudi_cli::keep_freed_pages`].
@@ -32,7 +34,7 @@ mod _native {
     #[pymodule_export]
     use super::write::write_frames;
     #[pymodule_export]
-    use super::{main, methods, sensor, version};
+    use super::{main, methods, sensor, sensor_toml, version};
     use pyo3::prelude::*;
 
     #[pymodule_init]
@@ -66,4 +68,12 @@ fn methods() -> Vec<(&'static str, &'static str)> {
 fn sensor(name: &str) -> PyResult<String> {
     let sensor = qudi_cli::sensor(name).map_err(errors::exception)?;
     Ok(serde_json::to_string(&sensor).unwrap_or_default())
+}
+
+/// Returns a sensor given as JSON as the text of a TOML file.
+#[pyfunction]
+fn sensor_toml(json: &str) -> PyResult<String> {
+    let report = |error: &dyn std::fmt::Display| PyValueError::new_err(error.to_string());
+    let sensor: Sensor = serde_json::from_str(json).map_err(|error| report(&error))?;
+    toml::to_string(&sensor).map_err(|error| report(&error))
 }

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import qudi_spad as qs
+from test_command_line import qudi
 
 ROOT = Path(__file__).parents[3]
 
@@ -29,6 +30,23 @@ def test_python_page(tmp_path, monkeypatch):
             monkeypatch.setattr("sys.argv", ["restore.py", "2"])
         exec(compile(block, "docs/python.md", "exec"), names)
     assert np.load("restored-2.npy").shape == (1, 64, 64)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/formats.md"])
+def test_other_pages(tmp_path, monkeypatch, page):
+    """Blocks about the package, and about reading our files with NumPy alone."""
+    monkeypatch.chdir(tmp_path)
+    for name, sensor in [("burst.npy", "qudi-paper"), ("binary.npy", "swissspad2")]:
+        options = ["--sensor", sensor, "--frames=11", "--size=64x64", "-o", name]
+        assert qudi("simulate", "scene:dead-leaves", *options).returncode == 0
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
+    assert blocks
+    for block in blocks:
+        names = {}
+        exec(compile(block, page, "exec"), names)
+        for counts in (names.get("counts"), names.get("frames")):
+            assert counts is None or counts.shape == (11, 64, 64)
 
 
 @pytest.mark.filterwarnings("ignore::qudi_spad.CaptureWarning")

@@ -137,6 +137,24 @@ def test_sensors(tmp_path):
     assert qs.Sensor.from_toml(tmp_path / "own.toml").name == "own"
 
 
+def test_the_sensor_of_a_capture_is_an_argument(tmp_path):
+    """A camera that only a record describes, given on to an array of the same counts."""
+    (tmp_path / "own.toml").write_text('base = "swissspad2"\nname = "own"\nquantum_efficiency = 0.31\n')
+    own = qs.Sensor.from_toml(tmp_path / "own.toml")
+    counts, record = qs.simulate("scene:dead-leaves", sensor=own, ppp=0.4, frames=12, size=(32, 32))
+    np.save(tmp_path / "burst.npy", np.packbits(counts, axis=-1))
+    (tmp_path / "burst.npy.json").write_text(json.dumps(record))
+    (tmp_path / "own.toml").unlink()
+    capture = qs.open(tmp_path / "burst.npy")
+    assert capture.sensor.name == "own" and "quantum_efficiency = 0.31" in capture.sensor.to_toml()
+    given = {"ppp": 0.4, "sum": 1, "method": "mle"}
+    expected = qs.restore(capture, **given)
+    result = qs.restore(counts, sensor=capture.sensor, bits=1, **given)
+    np.testing.assert_array_equal(result.frames, expected.frames)
+    other = qs.restore(counts, sensor="swissspad2", bits=1, **given)
+    assert not np.array_equal(other.frames, expected.frames)
+
+
 def test_calibrating(tmp_path):
     rng = np.random.default_rng(2)
     dark = rng.random((2000, 32, 32)) < 0.002

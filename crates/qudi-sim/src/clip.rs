@@ -8,6 +8,7 @@ mod gif;
 mod image_file;
 mod images;
 mod input;
+mod mosaic;
 mod npy;
 mod ppm;
 mod recorded;
@@ -19,6 +20,8 @@ mod y4m;
 pub(crate) use combs::Combs;
 pub use image_file::{AssumedWhite, decode_image, is_image, read_still};
 pub use input::{Input, Sampling};
+pub use mosaic::filter_picture;
+pub(crate) use mosaic::{MosaicClip, decodes};
 pub use video::{Video, VideoStream, video_stream};
 
 use qudi_core::Result;
@@ -43,6 +46,8 @@ pub struct Exposure {
     pub instants: Vec<Frame>,
     /// The scene in the middle of the exposure, where it is none of the instants.
     middle: Option<Frame>,
+    /// Red, green and blue of the scene in the middle of the exposure, behind a colour filter.
+    colour: Option<Box<[Frame; 3]>>,
 }
 
 impl Exposure {

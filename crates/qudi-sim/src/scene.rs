@@ -11,7 +11,7 @@ mod procedural;
 mod shape;
 mod still;
 
-pub use font::{GLYPH_HEIGHT, GLYPH_WIDTH, draw_text};
+pub use font::{GLYPH_HEIGHT, GLYPH_WIDTH, Line, draw_text};
 pub use layers::{Layer, Scene};
 pub use motion::{Motion, Placement};
 pub use paint::Paint;

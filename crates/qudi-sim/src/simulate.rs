@@ -2,7 +2,7 @@
 //!
 //! Memory holds one exposure at a time, however long the clip.
 
-use crate::clip::{AssumedWhite, Combs, Input, Sampling};
+use crate::clip::{AssumedWhite, Combs, ExposureSource, Input, MosaicClip, Sampling, decodes};
 use qudi_core::Checksum;
 use qudi_core::flow::Flow;
 use qudi_core::sensor::{PixelMaps, Sensor};
@@ -31,6 +31,24 @@ pub struct Simulation {
     pub mean_level: Option<f64>,
     /// Seed of photons and noise.
     pub seed: u64,
+}
+
+impl Simulation {
+    /// Opens the clip at its beginning: behind the sensor's colour filter, if it has one.
+    fn open(&self) -> Result<Box<dyn ExposureSource>> {
+        let colour = self.sensor.colour.as_ref();
+        let Some((colour, cfa)) = colour.and_then(|c| Some((c, c.cfa.as_ref()?))) else {
+            return self.input.open(&self.sampling);
+        };
+        if self.sensor.rolling_shutter > 0.0 {
+            return Err(Error::request(
+                "a rolling shutter behind a colour filter",
+                "rolling_shutter",
+                "leave one of the two out: the true colours of single rows are not known",
+            ));
+        }
+        Ok(Box::new(MosaicClip::open(&self.input, &self.sampling, cfa, colour)?))
+    }
 }
 
 /// Progress of a simulation.
@@ -69,8 +87,11 @@ pub struct Exposed<'a> {
     pub index: u64,
     /// The counts, `[height * width]`.
     pub counts: &'a [u16],
-    /// The scene in the middle of the exposure; of each row's exposure for a rolling shutter.
+    /// The scene in the middle of the exposure; of each row's exposure for a rolling shutter. Behind a colour
+    /// filter, what every pixel sees of it.
     pub truth: &'a Frame,
+    /// Red, green and blue of the scene in the middle of the exposure, behind a colour filter.
+    pub colour: Option<&'a [Frame; 3]>,
 }
 
 /// Receiver of exposed frames.
@@ -125,7 +146,7 @@ pub fn simulate(
     let Simulation { input, sampling, sensor, .. } = simulation;
     sensor.validate()?;
 
-    let mut source = input.open(sampling)?;
+    let mut source = simulation.open()?;
     let info = source.info();
     let (mut clip, mut combs) = (ClipStatistics::default(), Combs::default());
     let mut frames = 0;
@@ -143,8 +164,11 @@ pub fn simulate(
         ));
     }
 
-    let mut notes = check_white(input, sampling.transfer, clip.largest(), info.assumed_white)?;
-    if !matches!(input, Input::Procedural(_) | Input::Still { .. }) {
+    let coloured = simulation.sensor.colour.as_ref().is_some_and(|colour| colour.cfa.is_some());
+    let decoded = coloured && decodes(input, sampling.transfer);
+    let transfer = if decoded { Transfer::Srgb } else { sampling.transfer };
+    let mut notes = check_white(input, transfer, clip.largest(), info.assumed_white)?;
+    if !coloured && !matches!(input, Input::Procedural(_) | Input::Still { .. }) {
         notes.extend(combs.note(&input.place()));
     }
     if clip.largest() <= 0.0 && simulation.mean_level.is_none() {
@@ -167,7 +191,7 @@ pub fn simulate(
     let mut camera = Camera::with_maps(sensor, maps, info.size, light, simulation.seed)?;
     sink.start(Start { size: info.size, frames })?;
 
-    let mut source = input.open(sampling)?;
+    let mut source = simulation.open()?;
     let (mut sum, mut saturated) = (0u64, 0u64);
     let mut again = Checksum::default();
     let mut shutter = RollingShutter::new(sensor);
@@ -186,7 +210,8 @@ pub fn simulate(
         sum += counts.iter().map(|&c| u64::from(c)).sum::<u64>();
         saturated += counts.iter().filter(|&&c| c == sensor.max_count()).count() as u64;
         let flow = || if index + 1 < frames { source.flow(index) } else { None };
-        sink.frame(Exposed { index, counts: &counts, truth }, &flow)?;
+        let colour = exposure.colour_truth();
+        sink.frame(Exposed { index, counts: &counts, truth, colour }, &flow)?;
         progress(Stage::Exposing, index + 1, Some(frames))?;
     }
     if again.crc32() != clip.crc32() {
@@ -221,7 +246,7 @@ fn check_white(
     assumed: AssumedWhite,
 ) -> Result<Vec<String>> {
     // As it is stored.
-    let largest = if transfer == Transfer::Srgb { linear_to_srgb(largest) } else { largest };
+    let largest = if transfer.decodes() { linear_to_srgb(largest) } else { largest };
     let Some(full) = assumed.filter(|_| largest > 0.0 && largest <= FOURTEEN_BITS) else {
         let dark = largest > 0.0 && largest < MIN_BRIGHTEST;
         let note = || format!("the clip never exceeds {largest:.3} of white: {}", input.place());

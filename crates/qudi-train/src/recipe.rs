@@ -229,7 +229,7 @@ impl Recipe {
         place: &str,
         changes: &[(String, String)],
     ) -> Result<Self> {
-        let help = "compare with configs/small.toml and docs/training.md";
+        let help = "see `qudi config docs` for the keys and docs/training.md for examples";
         let fault = |what: String| Error::request(what, place, help);
         let document: toml::Table =
             text.parse().map_err(|e: toml::de::Error| fault(e.message().to_owned()))?;

@@ -20,7 +20,7 @@ use std::path::Path;
 /// small samples.
 fn recipe(method: Method, changes: &[(&str, &str)]) -> Recipe {
     let text = std::fs::read_to_string(format!(
-        "{}/../../configs/baselines/{}.toml",
+        "{}/../qudi-baselines/recipes/{}.toml",
         env!("CARGO_MANIFEST_DIR"),
         method.name()
     ));
@@ -274,8 +274,8 @@ fn wrong_recipes_are_refused_by_key() {
         let error = load(name, key, value);
         assert!(error.contains(word), "{name} {key}={value}: {error}");
     }
-    let text =
-        include_str!("../../../configs/tiny.toml").replace("noise_start_fraction = 0.7\n", "");
+    let text = include_str!("../../qudi-model/recipes/tiny.toml")
+        .replace("noise_start_fraction = 0.7\n", "");
     let error = Recipe::parse(&text, "tiny", &[]).unwrap_err().to_string();
     assert!(error.contains("train.noise_start_fraction is missing"), "{error}");
     for method in METHODS {

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 def load(preset: str) -> dict:
     """The [network] table of a diffusion preset, with the switches of this reference, which is also a regression."""
-    config = tomllib.loads((ROOT / "configs" / f"{preset}.toml").read_text())["network"]
+    config = tomllib.loads((ROOT / "crates/qudi-model/recipes" / f"{preset}.toml").read_text())["network"]
     config["pre"]["neighbours"], config["flow"]["registration"], config["unet"]["temporal"] = 0, False, False
     return config | {"reference": "none"}
 
@@ -699,7 +699,7 @@ def coefficients(t: int, after: int, ancestral: bool) -> tuple[float, float, flo
     return math.sqrt(b) * (1 - alpha) / (1 - a), math.sqrt(alpha) * (1 - b) / (1 - a), sigma
 
 
-# configs/sensors/qudi-paper.toml: 3-bit counts.
+# crates/qudi-core/sensors/qudi-paper.toml: 3-bit counts.
 QE, DARK, READ, FULL_WELL, FULL_SCALE = 0.8, 1.6, 0.2, 200, 7
 
 

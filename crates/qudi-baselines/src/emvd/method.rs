@@ -24,7 +24,7 @@ const COLOURS: [[f32; 4]; 4] = [
 impl LearnedMethod for Emvd {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/emvd.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/emvd.toml");
     const MARK: &'static str = "vd.fusion.net1.weight";
     const MULTIPLE: usize = MULTIPLE;
     const BYTES: usize = 72;

@@ -15,7 +15,7 @@ const INITIAL_SCALE: f32 = 0.2;
 impl LearnedMethod for FloRnn {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/flornn.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/flornn.toml");
     const MARK: &'static str = "forward_rnn.first_conv.weight";
     const MULTIPLE: usize = 1;
     const BYTES: usize = 176;

@@ -16,7 +16,7 @@ const INITIAL_SCALE: f32 = 0.1;
 impl LearnedMethod for MemDeblur {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/memdeblur.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/memdeblur.toml");
     const MARK: &'static str = "memory.key_proj.key_proj.weight";
     const MULTIPLE: usize = MULTIPLE;
     const BYTES: usize = 205;

@@ -15,7 +15,7 @@ const COPIES: std::ops::Range<usize> = 1..5;
 impl LearnedMethod for Quiver {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/quiver.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/quiver.toml");
     const MARK: &'static str = "predenoise.sfe1.weight";
     const MULTIPLE: usize = MULTIPLE;
     const BYTES: usize = 1150;

@@ -16,7 +16,7 @@ const ATTENTION_DEVIATION: f32 = 0.02;
 impl LearnedMethod for Rvrt {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/rvrt.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/rvrt.toml");
     const MARK: &'static str = "reconstruction.main.1.weight";
     const MULTIPLE: usize = MULTIPLE;
     const BYTES: usize = 170;

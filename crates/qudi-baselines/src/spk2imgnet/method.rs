@@ -14,7 +14,7 @@ use std::collections::VecDeque;
 impl LearnedMethod for Spk2ImgNet {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/spk2imgnet.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/spk2imgnet.toml");
     const MARK: &'static str = "extractor.conv0_0.weight";
     const MULTIPLE: usize = MULTIPLE;
     const BYTES: usize = 650;

@@ -14,7 +14,7 @@ use qudi_core::Result;
 impl LearnedMethod for KernelPrediction {
     type Sizes = Sizes;
 
-    const RECIPE: &'static str = include_str!("../../../../configs/baselines/student-teacher.toml");
+    const RECIPE: &'static str = include_str!("../../recipes/student-teacher.toml");
     const MARK: &'static str = "kernels.weight";
     const MULTIPLE: usize = MULTIPLE;
     const BYTES: usize = 195;

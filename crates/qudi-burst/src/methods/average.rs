@@ -42,6 +42,6 @@ impl Restorer for Average {
             let data = data.collect();
             frames.push(Frame { size: burst.size, data });
         });
-        Ok(Restored { frames, std: None }.only(numbers))
+        Ok(Restored::gray(frames, None).only(numbers))
     }
 }

@@ -60,6 +60,6 @@ impl Restorer for Mle {
             let data = sums.iter().enumerate().map(pixel).collect();
             frames.push(Frame { size: burst.size, data });
         });
-        Ok(Restored { frames, std: None }.only(numbers))
+        Ok(Restored::gray(frames, None).only(numbers))
     }
 }

@@ -127,7 +127,7 @@ impl Restorer for Qbp {
         acquisition: &Acquisition,
         numbers: &[usize],
     ) -> Result<Restored> {
-        Ok(Restored { frames: self.merge_frames(burst, acquisition, numbers)?, std: None })
+        Ok(Restored::gray(self.merge_frames(burst, acquisition, numbers)?, None))
     }
 }
 

@@ -70,6 +70,6 @@ impl Restorer for TransformDenoise {
             let z = denoise(SearchSettings::NORMAL, z, vst, 1.0);
             frames.push(image(&z, vst, acquisition, ordinary));
         });
-        Ok(Restored { frames, std: None }.only(numbers))
+        Ok(Restored::gray(frames, None).only(numbers))
     }
 }

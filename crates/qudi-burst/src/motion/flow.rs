@@ -53,7 +53,7 @@ pub fn estimate_flow(now: &Frame, next: &Frame) -> Flow {
 }
 
 /// Interpolates the displacements of patches linearly between their centres.
-fn spread(grid: &Grid, flow: &[[f32; 2]], size: Size) -> Vec<[f32; 2]> {
+pub(crate) fn spread(grid: &Grid, flow: &[[f32; 2]], size: Size) -> Vec<[f32; 2]> {
     // For every pixel of a row or column, the patch before it and the share of the next one.
     let places = |corners: &[usize], length: usize| -> Vec<(usize, usize, f32)> {
         let place = |at: usize| {

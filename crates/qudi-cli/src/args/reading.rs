@@ -4,9 +4,8 @@ use super::{Sum, number};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args as ClapArgs, ValueHint};
 use qudi_core::Size;
-use qudi_io::description::{
-    Axes, BitOrder, Crop, MaskChoice, Mosaic, Orientation, PackAxis, ReadOptions,
-};
+use qudi_core::colour::FilterChoice;
+use qudi_io::description::{Axes, BitOrder, Crop, MaskChoice, Orientation, PackAxis, ReadOptions};
 use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 
@@ -33,12 +32,13 @@ pub(crate) struct Reading {
     /// Order of an array's axes (time, height, width), slowest first
     #[arg(long, value_name = "AXES", value_parser = words::<Axes>(&["thw", "twh", "hwt", "wht", "htw", "wth"]))]
     axes: Option<Axes>,
-    /// Colour channel to read as gray, from 0; of a mosaic (--cfa), the letter of its pattern
+    /// Colour channel to read as gray, from 0; of a mosaic (--cfa), the pixels of a letter of its pattern
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<usize>(0..=4095))]
     channel: Option<usize>,
     /// Colour filter array: the colours of a tile row by row, and where the first tile begins, as in rggb@0,0
-    #[arg(long, value_name = "PATTERN[@Y,X]")]
-    cfa: Option<Mosaic>,
+    /// or quad-rggb; or a picture of it in pure red, green, blue and white (.png)
+    #[arg(long, value_name = "PATTERN[@Y,X]|FILE")]
+    cfa: Option<FilterChoice>,
     /// Array (variable, data set) in a file that holds several
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
@@ -99,7 +99,11 @@ impl Reading {
             Some(MaskChoice::File(path)) => Some(path),
             _ => None,
         };
-        mask.into_iter().chain(&self.dcr).map(PathBuf::as_path).collect()
+        let filter = match &self.cfa {
+            Some(FilterChoice::Picture(path)) => Some(path),
+            _ => None,
+        };
+        mask.into_iter().chain(&self.dcr).chain(filter).map(PathBuf::as_path).collect()
     }
 
     /// Returns the options; without --mask, pixels are treated as `mask` says.

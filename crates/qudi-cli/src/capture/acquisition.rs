@@ -18,6 +18,8 @@ pub(crate) struct LightOverrides {
     /// Image value that receives `ppp` photons, unless the capture decides.
     pub(crate) mean_level: Option<f64>,
     pub(crate) seed: u64,
+    /// Incident photons of white per native frame, where the brightness is known.
+    pub(crate) white: Option<f64>,
 }
 
 impl LightOverrides {
@@ -83,7 +85,8 @@ impl CaptureAcquisition {
         .with_pedestal(capture.info().pedestal)?;
         // The recorded level gives what is restored the brightness of the clip.
         let recorded = capture.info().mean_level.filter(|_| overrides.ppp.is_none());
-        acquisition.mean_level = match overrides.mean_level.or(recorded) {
+        let white = overrides.white.map(|white| ppp / (white * f64::from(capture.summed())));
+        acquisition.mean_level = match overrides.mean_level.or(recorded).or(white) {
             Some(mean_level) => mean_level,
             None => measured_mean_level(capture, &acquisition)?,
         };

@@ -131,6 +131,8 @@ impl AlignedCapture {
         let readable = capture.length().is_some() && !capture.forward_only();
         let aligns = method.is_none_or(|method| method.aligns);
         let known = sensor.dark_per_frame().is_ok();
+        // Sums that are aligned by whole pixels would mix the colours of a filter.
+        let aligns = aligns && capture.filter().is_none();
         let short = |choice: &SumChoice| choice.limit == SumLimit::Motion && !choice.still;
         match choice.filter(short) {
             Some(choice) if readable && aligns && known => {

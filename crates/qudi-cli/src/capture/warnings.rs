@@ -34,7 +34,7 @@ pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
     }
     if let Some(contrast) = summary.mosaic {
         warnings.push(format!(
-            "pixels of a tile of 2 x 2 differ by {:.0} % all over the picture, as behind a colour filter array: name it and a plane (--cfa rggb@0,0 --channel 0), or colours are restored as texture",
+            "pixels of a tile of 2 x 2 differ by {:.0} % all over the picture, as behind a colour filter array: name it (--cfa rggb@0,0, or the phase that your camera has), or colours are restored as texture",
             100.0 * contrast
         ));
     }

@@ -16,7 +16,10 @@ pub(super) fn check(command: &Command) -> Result<()> {
             ("--html", args.html.as_ref(), &["html", "htm"]),
         ],
         Command::Demo(args) => vec![("--output", args.output.as_ref(), &["png"])],
-        Command::Restore(args) => vec![("--side-by-side", args.side_by_side.as_ref(), &["png"])],
+        Command::Restore(args) => vec![
+            ("--side-by-side", args.side_by_side.as_ref(), &["png"]),
+            ("--html", args.html.as_ref(), &["html", "htm"]),
+        ],
         Command::Simulate(args) => vec![
             ("--flow", args.flow.as_ref(), &["npy"]),
             ("--preview", args.preview.as_ref(), &["gif"]),

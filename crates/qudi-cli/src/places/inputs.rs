@@ -62,7 +62,11 @@ pub(super) fn inputs_of(command: &Command, settings: &Settings, global: &Global)
             inputs.capture(&args.capture, &args.reading, args.sensor.as_deref());
         }
         Command::Train(args) => inputs.training(args, global),
-        Command::Selftest(_) | Command::Config(_) | Command::Completions(_) | Command::Man(_) => {}
+        Command::Selftest(_)
+        | Command::Config(_)
+        | Command::Completions(_)
+        | Command::Man(_)
+        | Command::View(_) => {}
     }
     inputs.list
 }

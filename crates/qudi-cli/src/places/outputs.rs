@@ -14,7 +14,7 @@ pub(super) fn outputs_of(command: &Command, global: &Global) -> Vec<PathBuf> {
         Command::Simulate(args) => simulated(args, &mut list),
         Command::Restore(args) => {
             list.push(PathBuf::from(&args.output));
-            let beside = [&args.chi_map, &args.side_by_side, &args.uncertainty];
+            let beside = [&args.chi_map, &args.side_by_side, &args.html, &args.uncertainty];
             list.extend(beside.into_iter().flatten().cloned());
         }
         Command::Convert(args) => {
@@ -34,8 +34,9 @@ pub(super) fn outputs_of(command: &Command, global: &Global) -> Vec<PathBuf> {
         }
         Command::Demo(args) => {
             let picture = args.output.clone().unwrap_or_else(|| PathBuf::from("qudi-demo.png"));
-            let page = picture.with_extension("html");
-            list.extend([picture, page]);
+            list.push(picture.with_extension("html"));
+            list.extend(args.animate.then(|| picture.with_extension("gif")));
+            list.push(picture);
         }
         Command::Info(args) => list.extend(args.preview.clone()),
         Command::Look(args) => {
@@ -47,7 +48,8 @@ pub(super) fn outputs_of(command: &Command, global: &Global) -> Vec<PathBuf> {
         | Command::Light(_)
         | Command::Config(_)
         | Command::Completions(_)
-        | Command::Man(_) => {}
+        | Command::Man(_)
+        | Command::View(_) => {}
     }
     list
 }

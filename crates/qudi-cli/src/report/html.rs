@@ -1,24 +1,34 @@
-//! Pages: single files that fetch nothing, made of the templates in `templates/`.
+//! Pages: single files that fetch nothing, made of the templates in `templates/`. Their policy forbids every
+//! script except ours, whose checksum it names.
 
 use super::{Table, printable};
 use crate::error::{CliError, Result};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use image::{ExtendedColorType, ImageEncoder};
-use minijinja::value::Serde;
+use minijinja::value::{Serde, Value};
 use minijinja::{AutoEscape, Environment};
-use qudi_core::{Frame, Size};
 use serde::Serialize;
+use sha2::{Digest, Sha256};
+
+/// Style of all pages.
+const STYLE: &str = include_str!("templates/page.css");
+
+/// Script of pages with pictures that play.
+const SCRIPT: &str = include_str!("templates/player.js");
 
 /// The templates, by the names that they include each other under.
-const TEMPLATES: [(&str, &str); 7] = [
+const TEMPLATES: [(&str, &str); 11] = [
     ("base.html", include_str!("templates/base.html")),
     ("demo.html", include_str!("templates/demo.html")),
     ("eval.html", include_str!("templates/eval.html")),
+    ("keys.html", include_str!("templates/keys.html")),
     ("look.html", include_str!("templates/look.html")),
+    ("player.html", include_str!("templates/player.html")),
     ("plot.html", include_str!("templates/plot.html")),
+    ("restore.html", include_str!("templates/restore.html")),
     ("table.html", include_str!("templates/table.html")),
     ("train.html", include_str!("templates/train.html")),
+    ("view.html", include_str!("templates/view.html")),
 ];
 
 /// Fills in a template. All text of the context is escaped: none of it becomes markup.
@@ -29,11 +39,23 @@ pub(crate) fn render(template: &str, context: impl Serialize) -> Result<String> 
         for (name, source) in TEMPLATES {
             environment.add_template(name, source)?;
         }
+        environment.add_global("style", Value::from_safe_string(STYLE.to_owned()));
+        environment.add_global("script", Value::from_safe_string(SCRIPT.to_owned()));
+        environment.add_global("policy", policy());
         environment.get_template(template)?.render(Serde(context))
     };
     fill().map_err(|e: minijinja::Error| {
         CliError::new(format!("cannot make the page: {e}"), template, "report this as a bug")
     })
+}
+
+/// Returns the content security policy of pages: pictures are in the page, or come from the program that
+/// serves it; no other script runs, and nothing else is fetched.
+pub(crate) fn policy() -> String {
+    let script = STANDARD.encode(Sha256::digest(SCRIPT));
+    format!(
+        "default-src 'none'; img-src data: blob:; connect-src 'self'; style-src 'unsafe-inline'; script-src 'sha256-{script}'; base-uri 'none'; form-action 'none'"
+    )
 }
 
 /// A table as templates read it.
@@ -57,32 +79,6 @@ pub(crate) fn data_url(png: &[u8]) -> String {
     format!("data:image/png;base64,{}", STANDARD.encode(png))
 }
 
-/// Returns the size of the crop that [`crop`] takes.
-pub(crate) fn crop_size(size: Size, largest: usize) -> Size {
-    Size { height: size.height.min(largest), width: size.width.min(largest) }
-}
-
-/// Crops the middle of a frame, at most `largest` pixels to a side, and encodes it as a data URL; 0 is black
-/// and 1 is white.
-pub(crate) fn crop(frame: &Frame, largest: usize) -> String {
-    let Size { height, width } = crop_size(frame.size, largest);
-    let (top, left) = ((frame.size.height - height) / 2, (frame.size.width - width) / 2);
-    let mut bytes = Vec::with_capacity(height * width);
-    for y in top..top + height {
-        let row = &frame.row(y)[left..left + width];
-        bytes.extend(row.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8));
-    }
-    let mut png = Vec::new();
-    // Writing to memory does not fail; a missing picture would be seen on the page.
-    let _ = image::codecs::png::PngEncoder::new(&mut png).write_image(
-        &bytes,
-        width as u32,
-        height as u32,
-        ExtendedColorType::L8,
-    );
-    data_url(&png)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -100,7 +96,7 @@ mod tests {
 
     #[test]
     fn all_templates_are_self_contained() {
-        for (name, source) in TEMPLATES {
+        for (name, source) in TEMPLATES.into_iter().chain([("style", STYLE), ("script", SCRIPT)]) {
             for fetched in ["http:", "https:", "url(", "@import", "<link", "src=\"/"] {
                 assert!(!source.contains(fetched), "{name} fetches {fetched}");
             }
@@ -108,9 +104,15 @@ mod tests {
     }
 
     #[test]
-    fn crops_the_middle_and_keeps_small_frames_whole() {
-        let size = Size { height: 40, width: 300 };
-        assert_eq!(crop_size(size, 224), Size { height: 40, width: 224 });
-        assert!(crop(&Frame::filled(size, 0.5), 224).starts_with("data:image/png;base64,iVBOR"));
+    fn policy_allows_the_script_of_the_page_alone() {
+        let context = json!({"title": "t", "players": [{"data": "{}"}]});
+        let page = render("look.html", context).unwrap_or_else(|e| panic!("{e:?}"));
+        let parts: Vec<&str> = page.split("<script>").collect();
+        assert_eq!(parts.len(), 2, "one script");
+        let script = parts[1].split("</script>").next().unwrap_or_default();
+        let sum = STANDARD.encode(Sha256::digest(script));
+        assert!(policy().contains(&format!("'sha256-{sum}'")));
+        let written = policy().replace('\'', "&#x27;").replace('/', "&#x2f;");
+        assert!(page.contains(&written), "{written}");
     }
 }

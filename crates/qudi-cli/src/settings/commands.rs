@@ -13,6 +13,7 @@ const COMMANDS: &[(&str, &[&[&str]])] = &[
     ("restore", &[&["sensor"]]),
     ("info", &[&["sensor"]]),
     ("look", &[&["sensor"]]),
+    ("view", &[&["sensor"]]),
     ("calibrate", &[&["sensor"]]),
     ("light", &[&["sensor"]]),
     ("demo", &[&["sensor"]]),

@@ -61,6 +61,7 @@ const FLAGS: &[(&str, [&str; 3])] = &[
     ("sensor.gain", ["gain", "GAIN", "Sensor"]),
     ("sensor.frames_summed", ["sum", "N", "Sensor"]),
     ("sensor.rolling_shutter", ["rolling-shutter", "0..1", "Sensor"]),
+    ("sensor.colour.cfa", ["cfa", "PATTERN|FILE", "Sensor"]),
 ];
 
 /// Keys of sensor files that describe the sensor, and are no settings.

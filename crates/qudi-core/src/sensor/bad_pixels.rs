@@ -203,13 +203,18 @@ pub struct Repair {
 impl Repair {
     /// Plans the repair of the pixels set in `mask`; in clusters the search widens.
     pub fn new(mask: &[bool], size: Size) -> Self {
+        Self::among(mask, size, |_, _| true)
+    }
+
+    /// Plans the repair of the pixels set in `mask` from those that are `alike`.
+    pub fn among(mask: &[bool], size: Size, alike: impl Fn(usize, usize) -> bool) -> Self {
         let widest = size.height.max(size.width) as isize;
         let good = |i: usize| -> Vec<usize> {
             let mut found = Vec::new();
             let mut radius = 1;
             while found.is_empty() && radius <= widest {
                 neighbours(i, size, radius, |j| {
-                    if !mask[j] {
+                    if !mask[j] && alike(i, j) {
                         found.push(j);
                     }
                 });

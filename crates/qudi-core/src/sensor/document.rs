@@ -1,6 +1,7 @@
 //! Sensor files: TOML, alone or on top of a preset (`base = "swissspad2"`).
 
 use super::{PRESETS, Sensor, preset};
+use crate::colour::FilterChoice;
 use crate::error::{Error, Result};
 use crate::limits::TEXT_BYTES;
 use crate::regular_file::read_text;
@@ -68,9 +69,10 @@ pub fn load_document(name_or_path: &str) -> Result<Value> {
         document = merged;
     }
     // Paths of maps are relative to the sensor file.
-    for key in ["/defects/dark_map", "/defects/bad_pixels"] {
+    for key in ["/defects/dark_map", "/defects/bad_pixels", "/colour/cfa"] {
         if let Some(map) = document.pointer_mut(key)
             && let Some(name) = map.as_str()
+            && (key != "/colour/cfa" || FilterChoice::is_picture(name))
             && let Some(folder) = path.parent()
         {
             let map_path = std::path::absolute(folder.join(name))
@@ -90,7 +92,7 @@ fn parse(text: &str, place: &str) -> Result<Value> {
     let fault = |what: String, place: String| Error::Sensor {
         what,
         place,
-        help: "see configs/sensors for examples".to_owned(),
+        help: "see `qudi info swissspad2` for an example".to_owned(),
     };
     let document: toml::Value = toml::from_str(text).map_err(|e: toml::de::Error| {
         let line = e.span().map(|span| text[..span.start].lines().count().max(1));

@@ -1,4 +1,4 @@
-//! The built-in sensors: `configs/sensors/*.toml`.
+//! The built-in sensors: `sensors/*.toml` of this crate.
 
 /// A built-in sensor.
 #[derive(Clone, Copy, Debug)]
@@ -14,7 +14,7 @@ macro_rules! presets {
         /// All built-in sensors, the default first.
         pub const PRESETS: &[Preset] = &[$(Preset {
             name: $name,
-            toml: include_str!(concat!("../../../../configs/sensors/", $name, ".toml")),
+            toml: include_str!(concat!("../../sensors/", $name, ".toml")),
         }),*];
     };
 }
@@ -22,6 +22,7 @@ macro_rules! presets {
 presets!(
     "qudi-paper",
     "ideal",
+    "ideal-binary",
     "swissspad2",
     "swissspad3",
     "spad512s",

@@ -1,37 +1,42 @@
-//! Captures behind a colour filter array: the plane that is read, and the detection of a mosaic.
+//! Captures behind a colour filter array: what of it is read, and the detection of a mosaic.
 
-use crate::description::{CaptureInfo, MosaicPlane, ReadOptions};
+use crate::description::{CaptureInfo, ReadOptions};
+use qudi_core::colour::{ColourFilter, FilterChoice, MosaicPlane};
+use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Result, Size};
-use std::path::Path;
 
-/// Returns the pixels of the mosaic that are read; `None` for captures without one.
-pub(super) fn mosaic_plane(
+/// The part of a mosaic that is read.
+pub(super) enum MosaicPart {
+    /// Every pixel, each with its colour.
+    Whole(FilterChoice),
+    /// The pixels of one letter.
+    Plane(MosaicPlane),
+}
+
+/// Returns the part of a mosaic that is read; `None` for captures without one. The filter is the user's, the
+/// file's, or the sensor's.
+pub(super) fn mosaic_part(
     info: &mut CaptureInfo,
     options: &ReadOptions,
-    path: &Path,
-) -> Result<Option<MosaicPlane>> {
-    let Some(mosaic) = options.cfa.clone().or(info.cfa.take()) else { return Ok(None) };
-    info.cfa = Some(mosaic.clone());
-    let letters = mosaic.pattern();
-    let index = match options.channel {
-        Some(index) => index,
-        None if options.cfa.is_some() => {
-            let first = letters.chars().next().unwrap_or_default();
-            info.notes.push(format!(
-                "one colour of the mosaic {mosaic} is read, the first ({first}); all are {}",
-                mosaic.choices()
-            ));
-            0
-        }
-        None => {
-            return Err(Error::data(
-                format!("a capture behind a colour filter array ({})", letters.to_uppercase()),
-                path,
-                format!("read one of its colours as gray: {}", mosaic.choices()),
-            ));
-        }
+    sensor: Option<&Sensor>,
+) -> Result<Option<MosaicPart>> {
+    let of_sensor = || {
+        let sensor = sensor.or(info.sensor.as_ref())?;
+        sensor.colour.as_ref()?.cfa.clone()
     };
-    let plane = mosaic.plane(index);
+    let Some(choice) = options.cfa.clone().or(info.cfa.clone()).or_else(of_sensor) else {
+        return Ok(None);
+    };
+    info.cfa = Some(choice.clone());
+    let Some(index) = options.channel else { return Ok(Some(MosaicPart::Whole(choice))) };
+    let FilterChoice::Tile(mosaic) = choice else {
+        return Err(Error::request(
+            format!("channel {index} of the filter {choice}, which is a picture"),
+            "channel",
+            "leave it out: all pixels are read with their colours",
+        ));
+    };
+    let plane = mosaic.plane(index).map(MosaicPart::Plane);
     if plane.is_none() {
         return Err(Error::request(
             format!("channel {index} of the mosaic {mosaic}"),
@@ -81,6 +86,62 @@ pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<f64> {
     diagonal.or(rows.and(columns))
 }
 
+/// Contrast of the other two pixels, as a share of the greens', below which the greens are not green.
+const MAX_OTHERS: f64 = 0.5;
+
+/// Refuses a Bayer pattern whose two pixels of one colour differ all over the picture, while the other two do
+/// not: the tile begins a pixel further.
+pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
+    let size = filter.size();
+    let bayer = cfa.tile().is_some_and(|mosaic| mosaic.side() == 2);
+    if !bayer || size.height < 2 || size.width < 2 {
+        return Ok(());
+    }
+    let colour = |y: usize, x: usize| filter.colours()[y * size.width + x];
+    let diagonals = [[(0, 0), (1, 1)], [(0, 1), (1, 0)]];
+    let twins = diagonals.iter().position(|&[a, b]| colour(a.0, a.1) == colour(b.0, b.1));
+    let Some(twins) = twins else { return Ok(()) };
+    let contrast = |pair: [(usize, usize); 2]| pair_contrast(sums, size, pair);
+    let (same, others) = (contrast(diagonals[twins]), contrast(diagonals[1 - twins]));
+    let Some(same) = same else { return Ok(()) };
+    if others.unwrap_or(0.0) > MAX_OTHERS * same {
+        return Ok(());
+    }
+    let [(y, x), _] = diagonals[twins];
+    Err(Error::mismatch(
+        format!(
+            "the two {} pixels of a tile of {cfa} differ by {:.0} % all over the picture, and the other two do not",
+            colour(y, x).name(),
+            100.0 * same
+        ),
+        "cfa",
+        "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0",
+    ))
+}
+
+/// Returns by how much two pixels of tiles of 2 x 2 differ, as a share of their mean, if they do nearly
+/// everywhere.
+fn pair_contrast(sums: &[u32], size: Size, pair: [(usize, usize); 2]) -> Option<f64> {
+    let mut contrasts = Vec::new();
+    for top in (0..size.height.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
+        for left in (0..size.width.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
+            let mut totals = [0.0; 2];
+            for (total, (down, across)) in totals.iter_mut().zip(pair) {
+                for y in (top + down..top + BLOCK_SIDE).step_by(2) {
+                    for x in (left + across..left + BLOCK_SIDE).step_by(2) {
+                        *total += f64::from(sums[y * size.width + x]);
+                    }
+                }
+            }
+            let [a, b] = totals;
+            if a + b > 0.0 {
+                contrasts.push(2.0 * (a - b) / (a + b));
+            }
+        }
+    }
+    agreed_contrast(contrasts)
+}
+
 /// Returns the median of the contrasts, if nearly all have the same sign and it is large enough.
 fn agreed_contrast(mut contrasts: Vec<f64>) -> Option<f64> {
     let positive = contrasts.iter().filter(|&&contrast| contrast > 0.0).count();
@@ -110,6 +171,31 @@ mod tests {
             (light * noise * filters[y % 2][x % 2]) as u32
         };
         mosaic_contrast(&(0..size.pixels()).map(value).collect::<Vec<_>>(), size)
+    }
+
+    #[test]
+    fn a_phase_that_the_picture_contradicts_is_refused() {
+        let size = Size { height: 128, width: 160 };
+        let mut rng = Streams::new(6).row(Domain::Photons, 0, 0);
+        let rates = [[60.0, 100.0], [100.0, 40.0]];
+        let sums: Vec<u32> = (0..size.pixels())
+            .map(|i| {
+                let noise = 1.0 + 0.4 * (uniform(&mut rng) - 0.5);
+                (rates[i / size.width % 2][i % size.width % 2] * noise) as u32
+            })
+            .collect();
+        let check = |text: &str| {
+            let cfa: FilterChoice = text.parse().unwrap();
+            let filter = ColourFilter::tiled(cfa.tile().unwrap(), size).unwrap();
+            check_phase(&sums, &filter, &cfa)
+        };
+        for right in ["rggb", "bggr", "grbg@0,1", "rgbw"] {
+            assert!(check(right).is_ok(), "{right}");
+        }
+        for wrong in ["grbg", "gbrg", "rggb@0,1"] {
+            let error = check(wrong).unwrap_err().to_string();
+            assert!(error.contains("two green pixels"), "{error}");
+        }
     }
 
     #[test]

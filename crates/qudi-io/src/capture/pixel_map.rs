@@ -6,6 +6,7 @@ use crate::description::{CaptureInfo, MaskChoice, ReadOptions};
 use qudi_core::Frame;
 use qudi_core::Transfer;
 use qudi_core::bad_pixels::{BadPixels, Repair};
+use qudi_core::colour::ColourFilter;
 use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::npy::read_image;
 use qudi_core::regular_file::require_regular;
@@ -65,7 +66,10 @@ pub(crate) fn plan(
     };
     let size = capture.size();
     add_counter(capture);
-    capture.repair = Repair::new(&capture.bad.mask(size), size);
+    let colours = capture.filter.as_ref().map(ColourFilter::colours);
+    capture.repair = Repair::among(&capture.bad.mask(size), size, |i, j| {
+        colours.is_none_or(|colours| colours[i] == colours[j])
+    });
     if capture.repair.count() < capture.bad.len() {
         return Err(Error::request(
             "every pixel is bad",

@@ -1,11 +1,12 @@
 //! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
 
 use super::Capture;
-use super::mosaic::mosaic_contrast;
+use super::mosaic::{check_phase, mosaic_contrast};
 use crate::description::{BitOrder, PackAxis};
 use crate::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_core::PppDefinition;
 use qudi_core::Result;
+use qudi_core::colour::ColourFilter;
 use qudi_core::sensor::{CountLaw, DarkRate, Response, Sensor};
 use qudi_core::{Frame, Size};
 use serde::Serialize;
@@ -28,6 +29,9 @@ pub struct Summary {
     /// Difference between the pixels of tiles of 2 x 2, where the picture looks like an unnamed colour filter
     /// array.
     pub mosaic: Option<f64>,
+    /// Mean count of a pixel behind red, green, blue and white, of captures whose colours are read; none of
+    /// colours that the filter lacks.
+    pub colours: Option<[Option<f64>; 4]>,
     /// Sum of the measured frames, repaired.
     pub sums: Vec<u32>,
 }
@@ -69,7 +73,7 @@ impl Summary {
     /// own rule follows the light.
     ///
     /// # Errors
-    /// [`Error`](qudi_core::Error) if the file cannot be read.
+    /// [`Error`](qudi_core::Error) if the file cannot be read, or the picture contradicts its colour filter.
     pub fn measure(
         capture: &mut Capture,
         sensor: Option<&Sensor>,
@@ -86,6 +90,9 @@ impl Summary {
                 *sum += u32::from(count);
                 histogram[usize::from(count)] += 1;
             }
+        }
+        if let (Some(filter), Some(cfa)) = (&capture.filter, &capture.info.cfa) {
+            check_phase(&sums, filter, cfa)?;
         }
         let largest = histogram.iter().rposition(|&n| n > 0).unwrap_or(0);
         histogram.truncate(largest + 1);
@@ -105,6 +112,7 @@ impl Summary {
             ppp,
             bit_order,
             mosaic: if capture.info.cfa.is_none() { mosaic_contrast(&sums, size) } else { None },
+            colours: capture.filter.as_ref().map(|filter| colour_means(&sums, looked, filter)),
             sums,
         })
     }
@@ -130,6 +138,17 @@ impl Summary {
         };
         Frame { size, data }.with_white_at_highlights()
     }
+}
+
+/// Returns the mean count of an output frame behind each colour.
+fn colour_means(sums: &[u32], frames: u64, filter: &ColourFilter) -> [Option<f64>; 4] {
+    let (mut totals, mut pixels) = ([0.0; 4], [0u64; 4]);
+    for (&sum, &colour) in sums.iter().zip(filter.colours()) {
+        totals[colour as usize] += f64::from(sum);
+        pixels[colour as usize] += 1;
+    }
+    let mean = |k: usize| totals[k] / (pixels[k] * frames) as f64;
+    std::array::from_fn(|k| (pixels[k] > 0).then(|| mean(k)))
 }
 
 /// Returns the sensor of native frames: `sensor`, or an ideal binary one if it is unknown, summing as many

@@ -1,7 +1,8 @@
 //! Turned and cropped frames: the stored pixel of each pixel of the result.
 
-use crate::description::{Crop, MosaicPlane, Orientation};
+use crate::description::{Crop, Orientation};
 use qudi_core::Size;
+use qudi_core::colour::MosaicPlane;
 use qudi_core::{Error, Result};
 
 /// A turned and cropped frame.

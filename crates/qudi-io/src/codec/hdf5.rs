@@ -181,7 +181,7 @@ fn metadata(
                 return Err(Error::data(
                     format!("a capture behind a colour filter array ({pattern})"),
                     path,
-                    "say how its tiles lie and which colour to read, as in `cfa rggb@0,0` and `channel 0`",
+                    "say how its tiles lie, as in `cfa rggb@0,0`",
                 ));
             }
         }

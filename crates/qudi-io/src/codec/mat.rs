@@ -124,7 +124,7 @@ fn choose(path: &Path, options: &ReadOptions) -> Result<MatArray> {
         return Err(Error::data(
             "a simulated colour-filter capture (`imbs`)",
             path,
-            "read it with `array imbs`, and one of its colours with its pattern beside it, as in `cfa rggb@0,0` `channel 0`",
+            "read it with `array imbs`, and its pattern beside it, as in `cfa rggb@0,0`",
         ));
     }
     let captures: Vec<_> = found.iter().filter(|a| a.dims.len() >= 3).collect();

@@ -145,6 +145,7 @@ pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayo
             info.binary = conversion.binary;
             let known = conversion.preset.as_deref().and_then(preset);
             info.preset = known.map(|preset| preset.name);
+            info.cfa = conversion.cfa;
             conversion.burst
         }
     };

@@ -1,7 +1,7 @@
 //! Descriptions of opened captures: what is known, and from where.
 
-use super::mosaic::Mosaic;
 use super::options::{BitOrder, Orientation, PackAxis};
+use qudi_core::colour::FilterChoice;
 use qudi_core::sensor::Sensor;
 use serde::Serialize;
 
@@ -66,8 +66,8 @@ pub struct CaptureInfo {
     pub ppp: Option<f64>,
     /// Image value that receives `ppp` photons, if a record says.
     pub mean_level: Option<f64>,
-    /// Colour filter array, if the file or the user names it.
-    pub cfa: Option<Mosaic>,
+    /// Colour filter array, if the file, the user or the sensor names it.
+    pub cfa: Option<FilterChoice>,
     /// Camera preset that this format belongs to.
     pub preset: Option<&'static str>,
     /// Frames before which numbers are missing.

@@ -1,7 +1,7 @@
 //! Options for reading a capture, where its file does not say.
 
-use super::mosaic::Mosaic;
 use qudi_core::Size;
+use qudi_core::colour::FilterChoice;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -26,7 +26,7 @@ pub struct ReadOptions {
     pub channel: Option<usize>,
     /// Colour filter array in front of the pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub cfa: Option<Mosaic>,
+    pub cfa: Option<FilterChoice>,
     /// Name of the array, in a file that holds several.
     pub array: Option<String>,
     /// Binary frames averaged into a pixel value: `count = round(value * levels / full scale)`.

@@ -3,7 +3,7 @@
 
 use super::inputs::Inputs;
 use super::lock::{FolderLock, Share};
-use crate::writer::{encode_png16, frame_name, is_frame_below, is_frame_name};
+use crate::writer::{encode_colour_png16, encode_png16, frame_name, is_frame_below, is_frame_name};
 use qudi_core::Transfer;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
 use qudi_core::limits::RECORD_BYTES;
@@ -145,17 +145,29 @@ impl FrameFolder {
     /// # Errors
     /// [`Error::Io`] if the disk is full.
     pub fn push(&mut self, frame: u64, image: &Frame) -> Result<Frame> {
+        self.write(frame, encode_png16(image))?;
+        let seen = |v: &f32| (v.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
+        Ok(Frame { size: self.size, data: image.data.iter().map(seen).collect() })
+    }
+
+    /// Writes a frame of red, green and blue.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the disk is full.
+    pub fn push_colour(&mut self, frame: u64, planes: &[Frame; 3]) -> Result<()> {
+        self.write(frame, encode_colour_png16(planes))
+    }
+
+    fn write(&mut self, frame: u64, png: std::io::Result<Vec<u8>>) -> Result<()> {
         if frame >= self.named {
             self.named = 2 * (frame + 1);
             self.write_manifest(false, &Value::Null)?;
         }
         let path = self.file(frame);
-        let png = encode_png16(image).map_err(|e| Error::io("write", &path, e))?;
+        let png = png.map_err(|e| Error::io("write", &path, e))?;
         let mut file = PendingFile::create(&path, Overwrite::Yes)?;
         file.write_all(&png).map_err(|e| file.fault(e))?;
-        file.finish_unsynced()?;
-        let seen = |v: &f32| (v.clamp(0.0, 1.0) * 65535.0).round() / 65535.0;
-        Ok(Frame { size: self.size, data: image.data.iter().map(seen).collect() })
+        file.finish_unsynced()
     }
 
     /// Reads a finished frame.

@@ -18,6 +18,14 @@ pub trait RestoreSink {
     /// The sink's own; the run ends with it.
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()>;
 
+    /// Takes red, green and blue of frame `number`, in place of a gray frame.
+    ///
+    /// # Errors
+    /// The sink's own; the run ends with it.
+    fn colour(&mut self, number: u64, restored: &[Frame; 3], counts: &[u16]) -> Result<()> {
+        self.frame(number, &restored[1], counts)
+    }
+
     /// Takes the uncertainty of frame `number`, right after the frame: the standard deviation over the
     /// samples of a method that draws several. Other methods have none.
     ///
@@ -100,6 +108,10 @@ impl RestoreSink for Renumbered<'_> {
         self.sink.frame(self.first + number, restored, counts)
     }
 
+    fn colour(&mut self, number: u64, restored: &[Frame; 3], counts: &[u16]) -> Result<()> {
+        self.sink.colour(self.first + number, restored, counts)
+    }
+
     fn uncertainty(&mut self, number: u64, uncertainty: &Frame) -> Result<()> {
         self.sink.uncertainty(self.first + number, uncertainty)
     }
@@ -159,7 +171,10 @@ fn run_centred(
         let (view, at) = (BurstView { size, frames: &counts }, before as usize);
         let restored = restorer.restore_frames(view, &acquisition, &[at])?;
         refuse_not_finite(picture, &restored.frames, capture.path())?;
-        sink.frame(picture, &restored.frames[0], &counts[at])?;
+        match &restored.colour {
+            Some(colour) => sink.colour(picture, &colour[0], &counts[at])?,
+            None => sink.frame(picture, &restored.frames[0], &counts[at])?,
+        }
         if let Some(uncertainty) = restored.std {
             sink.uncertainty(picture, &uncertainty[0])?;
         }
@@ -183,6 +198,7 @@ fn run_windows(
     let mut first_held = 0;
     let mut restored_until = 0;
     let mut fade = CrossFade::default();
+    let mut planes: [CrossFade; 3] = Default::default();
     let mut uncertainties = CrossFade::default();
     for number in windows.first_with(first).. {
         // A pipe tells its length at its end. The place of this window and the next one is certain once the
@@ -223,6 +239,12 @@ fn run_windows(
             refuse_not_finite(before, &restored.frames, capture.path())?;
             let weight = |picture| windows.weight(number, instants.frame_of(picture));
             fade.push(before, restored.frames, weight);
+            if let Some(colours) = restored.colour {
+                for (k, plane) in planes.iter_mut().enumerate() {
+                    let frames = colours.iter().map(|colours| colours[k].clone()).collect();
+                    plane.push(before, frames, weight);
+                }
+            }
             if let Some(uncertainty) = restored.std {
                 uncertainties.push(before, uncertainty, weight);
             }
@@ -234,8 +256,14 @@ fn run_windows(
         while let Some((picture, image)) = fade.pop(until) {
             let requested = pictures.contains(&picture);
             let frame = instants.frame_of(picture);
-            if requested {
-                sink.frame(picture, &image, &counts[(frame - first_held) as usize])?;
+            let colour = planes.each_mut().map(|plane| plane.pop(until).map(|(_, frame)| frame));
+            let counts = &counts[(frame - first_held) as usize];
+            match colour {
+                _ if !requested => {}
+                [Some(red), Some(green), Some(blue)] => {
+                    sink.colour(picture, &[red, green, blue], counts)?;
+                }
+                _ => sink.frame(picture, &image, counts)?,
             }
             if let Some((_, uncertainty)) = uncertainties.pop(until).filter(|_| requested) {
                 sink.uncertainty(picture, &uncertainty)?;

@@ -1,4 +1,4 @@
-//! A gray animated GIF of what was recorded, for a quick look.
+//! An animated GIF of what was recorded or restored, for a quick look.
 
 use qudi_core::Size;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
@@ -23,6 +23,9 @@ impl std::fmt::Debug for GifWriter {
 
 /// Least time of a frame in hundredths of a second: browsers slow down faster ones.
 const MIN_DELAY: f64 = 2.0;
+
+/// Speed of the choice of 256 colours, from 1 (best) to 30.
+const PALETTE_SPEED: i32 = 10;
 
 /// Largest number of frames: longer previews would be larger than the data.
 const MAX_FRAMES: usize = 200;
@@ -75,6 +78,23 @@ impl GifWriter {
             buffer: counts.iter().map(gray).collect(),
             ..gif::Frame::default()
         };
+        frame.make_lzw_pre_encoded();
+        let path = self.encoder.get_ref().path().to_owned();
+        self.encoder.write_lzw_pre_encoded_frame(&frame).map_err(|e| fault(&path, e))
+    }
+
+    /// Adds a frame of red, green and blue samples, in the 256 colours that suit it best.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the disk is full.
+    pub(super) fn push_colour(&mut self, samples: Vec<u8>) -> Result<()> {
+        if self.frames == MAX_FRAMES {
+            return Ok(());
+        }
+        self.frames += 1;
+        let (width, height) = self.size;
+        let mut frame = gif::Frame::from_rgb_speed(width, height, &samples, PALETTE_SPEED);
+        frame.delay = self.delay;
         frame.make_lzw_pre_encoded();
         let path = self.encoder.get_ref().path().to_owned();
         self.encoder.write_lzw_pre_encoded_frame(&frame).map_err(|e| fault(&path, e))

@@ -1,5 +1,6 @@
 //! MP4 through the `ffmpeg` program on PATH, for looking at: 8 bits, compressed.
 
+use super::clip::Planes;
 use qudi_core::atomic_file::{Overwrite, UnfinishedFolder, refuse_taken};
 use qudi_core::ffmpeg;
 use qudi_core::{Error, Result};
@@ -28,7 +29,13 @@ impl Mp4Writer {
     ///
     /// # Errors
     /// [`Error`] if the name is taken or there is no ffmpeg.
-    pub fn create(path: &Path, size: Size, fps: f64, overwrite: Overwrite) -> Result<Self> {
+    pub fn create(
+        path: &Path,
+        size: Size,
+        planes: Planes,
+        fps: f64,
+        overwrite: Overwrite,
+    ) -> Result<Self> {
         refuse_taken(path, overwrite)?;
         let io = |e| Error::io("create the output", path, e);
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -38,9 +45,10 @@ impl Mp4Writer {
         let mut url = std::ffi::OsString::from("file:");
         url.push(unfinished.path().join(FILM));
         let rate = fps.to_string();
+        let pixels = if planes == Planes::Gray { "gray" } else { "rgb24" };
         let shape = format!("{}x{}", size.width, size.height);
         let spawned = ffmpeg()
-            .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "gray"])
+            .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", pixels])
             .args(["-s", shape.as_str(), "-r", rate.as_str(), "-i", "-"])
             // Players want even sides and half-resolution colour.
             .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16"])
@@ -66,8 +74,13 @@ impl Mp4Writer {
     /// # Errors
     /// [`Error`] with ffmpeg's words if it has given up.
     pub fn push(&mut self, frame: &Frame) -> Result<()> {
+        self.push_values(&frame.data)
+    }
+
+    /// Adds a frame of all its samples, pixel by pixel.
+    pub(super) fn push_values(&mut self, values: &[f32]) -> Result<()> {
         let bytes: Vec<u8> =
-            frame.data.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+            values.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
         let Some(stdin) = &mut self.child.stdin else { return Err(self.failed()) };
         match stdin.write_all(&bytes) {
             Ok(()) => Ok(()),

@@ -49,6 +49,11 @@ impl Picture {
         }
     }
 
+    /// Returns the picture as one frame.
+    pub fn into_frame(self) -> Frame {
+        self.canvas
+    }
+
     /// Encodes the picture as an 8-bit gray PNG.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! A multi-page gray TIFF, as ImageJ opens it: counts of 8 or 16 bits, or images of 16 bits or
+//! A multi-page TIFF, as ImageJ opens it: gray counts of 8 or 16 bits, or gray or colour images of 16 bits or
 //! float.
 
 use qudi_core::Size;
@@ -71,6 +71,14 @@ impl TiffStack {
 
     pub(crate) fn push_f32(&mut self, samples: &[f32]) -> Result<()> {
         self.push::<colortype::Gray32Float>(samples)
+    }
+
+    pub(crate) fn push_rgb16(&mut self, samples: &[u16]) -> Result<()> {
+        self.push::<colortype::RGB16>(samples)
+    }
+
+    pub(crate) fn push_rgb_f32(&mut self, samples: &[f32]) -> Result<()> {
+        self.push::<colortype::RGB32Float>(samples)
     }
 
     fn push<C: ColorType>(&mut self, samples: &[C::Inner]) -> Result<()>

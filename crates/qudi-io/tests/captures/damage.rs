@@ -331,12 +331,13 @@ fn masks_in_fortran_order_are_read() {
 #[test]
 fn overwrites_folders_of_own_files_only() {
     use qudi_core::atomic_file::Overwrite;
-    use qudi_io::writer::{ClipWriter, TiffSamples};
+    use qudi_io::writer::{ClipWriter, Planes, TiffSamples};
     let scratch = scratch();
     let path = scratch.path().join("m");
     let size = Size { height: 2, width: 2 };
     let save = || {
-        let mut writer = ClipWriter::create(&path, size, TiffSamples::U16, 25.0, Overwrite::Yes)?;
+        let mut writer =
+            ClipWriter::create(&path, size, Planes::Gray, TiffSamples::U16, 25.0, Overwrite::Yes)?;
         writer.push(&Frame::filled(size, 0.5))?;
         writer.finish()
     };

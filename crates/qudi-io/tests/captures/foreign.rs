@@ -74,7 +74,10 @@ fn reads_hdf5_captures() {
     }
     let mono = open(&golden("mono.ubi.h5"), &plain()).unwrap();
     assert_eq!((mono.max_count(), mono.fps()), (Some(7), Some(10_000.0)));
-    assert!(refusal(open(&golden("cfa.ubi.h5"), &plain())).contains("colour filter array (RGGB)"));
+    let mosaic = open(&golden("cfa.ubi.h5"), &plain()).unwrap();
+    let colours = mosaic.filter().unwrap().shares();
+    assert_eq!(mosaic.info().cfa.as_ref().map(ToString::to_string), Some("rggb@0,0".into()));
+    assert!((colours[1] - 0.5).abs() < 0.03, "{colours:?}");
     let trimmed = ReadOptions { size: Some("12x20".parse().unwrap()), ..plain() };
     assert_eq!(frames("packed.h5", &trimmed)[6 * 39..], expected("bits.npy"));
 }

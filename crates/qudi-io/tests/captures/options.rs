@@ -169,7 +169,14 @@ fn applies_options_of_all_captures_to_every_format() {
         let all = [
             ("orient", ReadOptions { orient: Some(Orientation::Rot180), ..base.clone() }),
             ("crop", ReadOptions { crop: Some("0:8,8:16".parse().unwrap()), ..base.clone() }),
-            ("cfa", ReadOptions { cfa: Some("rggb".parse().unwrap()), ..base.clone() }),
+            (
+                "cfa",
+                ReadOptions {
+                    cfa: Some("rggb".parse().unwrap()),
+                    channel: Some(0),
+                    ..base.clone()
+                },
+            ),
             ("sum", ReadOptions { sum: Some(2), ..base.clone() }),
             ("start", ReadOptions { start: Some(1), ..base.clone() }),
             ("bits", ReadOptions { bits: Some(5), ..base.clone() }),

@@ -102,10 +102,9 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             moments.add(&self.sample(&window, number)?);
         }
         let tiling = &window.tiling;
-        Ok(Restored {
-            frames: tiling.frames(&moments.mean()),
-            std: (self.options.samples > 1).then(|| tiling.frames(&moments.standard_deviation())),
-        })
+        let drawn = self.options.samples > 1;
+        let std = drawn.then(|| tiling.frames(&moments.standard_deviation()));
+        Ok(Restored::gray(tiling.frames(&moments.mean()), std))
     }
 
     /// Pads a window to the size that the network needs.

@@ -224,8 +224,9 @@ mod tests {
 
     /// Returns a small network whose parameters are not zero.
     fn network() -> (RegressionConfig, Regression) {
-        let text = include_str!("../../../../tests/golden/regression.toml");
-        let config = NetworkConfig::parse(text, "regression").unwrap_or_else(|e| panic!("{e}"));
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/regression.toml");
+        let text = std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{e}"));
+        let config = NetworkConfig::parse(&text, "regression").unwrap_or_else(|e| panic!("{e}"));
         let NetworkConfig::Regression(config) = config else { panic!("{config:?}") };
         let network = init_parameters(config.init(1, &Device::flex()), |_, shape| {
             let count: usize = shape.iter().product();

@@ -67,7 +67,7 @@ impl RegressionRestorer {
             *sigma = sigma.min(MAX_UNCERTAINTY);
         }
         let frames = filter_over_time(&aligned, frames, noise_sigmas, 1.0);
-        Ok(Restored { frames, std: Some(uncertainty) })
+        Ok(Restored::gray(frames, Some(uncertainty)))
     }
 }
 

@@ -18,6 +18,13 @@ const RADIUS: [usize; LEVELS] = [0, 3, 4];
 /// Scale of the differences of frames among the inputs.
 const DIFFERENCE: f32 = 8.0;
 
+/// Scale of displacements among the inputs.
+const DISPLACEMENT: f32 = 0.25;
+
+/// Planes among the inputs, without the compared features: difference, its size, frame, flow, and the flow of
+/// related pairs.
+const PLANES: usize = 3 + 2 + 6;
+
 /// The network of one level.
 #[derive(Module, Debug)]
 pub(super) struct FlowLevel {
@@ -48,7 +55,7 @@ impl WindowConfig {
             let width = self.flow[level];
             FlowLevel {
                 compared: Conv2d::zeros([self.widths[level], COMPARED], 1, Bias::Yes, device),
-                stack: ResidualStack::zeros([2 * COMPARED + 5, width], 1, device),
+                stack: ResidualStack::zeros([2 * COMPARED + PLANES, width], 1, device),
                 out: Conv2d::zeros([width, 2], 3, Bias::Yes, device),
             }
         };
@@ -65,6 +72,23 @@ pub(super) fn pairs(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
     let (early, late) = (part(0), part(1));
     let references = Tensor::cat(vec![early.clone(), late.clone()], 0);
     (references, Tensor::cat(vec![late, early], 0))
+}
+
+/// Returns how the flow of the pairs before and after, and the opposite of the flow back, differ from every
+/// pair's own, `[pairs, 6, h, w]`: noise makes them differ where motion does not.
+fn related(flow: &Tensor<4>, pairs_of_burst: usize) -> Tensor<4> {
+    let [pairs, _, h, w] = flow.dims();
+    let last = pairs_of_burst - 1;
+    let whole = by_burst(flow.clone(), pairs_of_burst);
+    let shifted = |parts: [(usize, usize); 2]| {
+        let parts = parts.map(|(first, count)| whole.clone().narrow(1, first, count));
+        Tensor::cat(parts.to_vec(), 1).reshape([pairs, 2, h, w]) - flow.clone()
+    };
+    let (before, after) = (shifted([(0, 1), (0, last)]), shifted([(1, last), (last, 1)]));
+    let half = pairs / 2;
+    let parts = [half, 0].map(|first| flow.clone().narrow(0, first, half));
+    let back = (Tensor::cat(parts.to_vec(), 0) + flow.clone()) * -1.0;
+    Tensor::cat(vec![before, after, back], 1)
 }
 
 impl Flow {
@@ -112,16 +136,17 @@ impl FlowLevel {
         if RADIUS[level] > 0 {
             let near = warp(neighbour.clone(), start.detach());
             // Values of no gradient: outside autodiff, then constants of it.
-            let found = soft_match(reference.clone(), near, RADIUS[level]).detach();
+            let found = soft_match(reference.clone(), near, RADIUS[level], frames - 1).detach();
             flow = flow + found;
         }
         let warped = warp(Tensor::cat(vec![other, neighbour], 1), flow.clone());
         let other = warped.clone().narrow(1, 0, COMPARED);
         let difference = (warped.narrow(1, COMPARED, 1) - reference.clone()) * DIFFERENCE;
-        let motion = flow.clone().detach() * 0.25;
+        let motion = flow.clone().detach() * DISPLACEMENT;
+        let related = related(&motion, frames - 1);
         let signed = reference * 2.0 - 1.0;
         let size = difference.clone().abs();
-        let inputs = [compared, other, difference, size, signed, motion];
+        let inputs = [compared, other, difference, size, signed, motion, related];
         flow + self.out.linear(&[self.stack.forward(&inputs)])
     }
 }
@@ -138,16 +163,20 @@ impl WindowFlow {
         part.narrow(1, place, 1).reshape([bursts, 2, h, w])
     }
 
-    /// Computes the mean difference between true frames and their neighbours along the flow, `[1]`: the
-    /// square root of squares, smooth at zero.
+    /// Computes how well true frames agree with their neighbours along the flow, `[1]`: the mean over pairs
+    /// of the logarithm of the mean difference, so that pairs that move little count as much as others.
     ///
     /// # Shapes
     /// - truth: `[bursts * frames, 1, H, W]` in image units
     pub fn warping_error(&self, truth: &Tensor<4>, frames: usize) -> Tensor<1> {
-        /// Smooths the root.
+        /// Smooths the root of squares.
         const SMOOTH: f32 = 1e-5;
+        /// Difference below which nothing more is won.
+        const FLOOR: f32 = 5e-3;
         let (reference, neighbour) = pairs(shrink(truth.clone(), self.scale), frames);
         let difference = warp(neighbour, self.pairs.clone()) - reference;
-        (difference.powi_scalar(2) + SMOOTH).sqrt().mean()
+        let [count, _, h, w] = difference.dims();
+        let size = (difference.powi_scalar(2) + SMOOTH).sqrt().reshape([count, h * w]);
+        (size.mean_dim(1) + FLOOR).log().mean()
     }
 }

@@ -23,15 +23,22 @@ const BLOCK_RADIUS: usize = 4;
 /// under a softmax of block differences and a prior towards none. No gradient flows through it.
 ///
 /// # Shapes
-/// - reference, neighbour: `[pairs, 1, h, w]` in image units
+/// - reference, neighbour: `[pairs, 1, h, w]` in image units; `pairs_of_burst` in a row are of one burst and
+///   direction
 /// - output: `[pairs, 2, h, w]`, x before y, in cells
-pub(super) fn soft_match(reference: Tensor<4>, neighbour: Tensor<4>, radius: usize) -> Tensor<4> {
+pub(super) fn soft_match(
+    reference: Tensor<4>,
+    neighbour: Tensor<4>,
+    radius: usize,
+    pairs_of_burst: usize,
+) -> Tensor<4> {
     let [pairs, _, h, w] = reference.dims();
     let side = 2 * radius + 1;
     let padded = neighbour.pad((radius, radius, radius, radius), PadMode::Edge);
     let options = UnfoldOptions::new([1, 1], [0, 0], [1, 1]);
     let candidates = unfold4d(padded, [side, side], options).reshape([pairs, side * side, h, w]);
     let difference = mean_around((candidates - reference).powi_scalar(2), BLOCK_RADIUS);
+    let difference = mean_of_pairs_around(difference, pairs_of_burst);
     let floor = difference.clone().mean_dim(1) * MEAN_SHARE + NOISE_FLOOR;
     let offset = |at: usize| at as f32 - radius as f32;
     let displacements = (0..side * side).map(|k| [offset(k % side), offset(k / side)]);
@@ -49,6 +56,19 @@ pub(super) fn soft_match(reference: Tensor<4>, neighbour: Tensor<4>, radius: usi
     let weights = softmax(difference.clone() * -SHARPNESS / floor - prior, 1);
     let expected = |axis: usize| (weights.clone() * plane(&move |v| v[axis])).sum_dim(1);
     Tensor::cat(vec![expected(0), expected(1)], 1)
+}
+
+/// Averages the differences of every pair of frames with the differences of the pairs before and after, whose
+/// motion is about the same and whose noise is not.
+fn mean_of_pairs_around(difference: Tensor<4>, pairs_of_burst: usize) -> Tensor<4> {
+    let [pairs, candidates, h, w] = difference.dims();
+    let whole = difference.reshape([pairs / pairs_of_burst, pairs_of_burst, candidates * h * w]);
+    let mean = |pair: usize| {
+        let first = pair.saturating_sub(1);
+        let last = (pair + 1).min(pairs_of_burst - 1);
+        whole.clone().narrow(1, first, last + 1 - first).mean_dim(1)
+    };
+    Tensor::cat((0..pairs_of_burst).map(mean).collect(), 1).reshape([pairs, candidates, h, w])
 }
 
 #[cfg(test)]
@@ -70,11 +90,21 @@ mod tests {
         };
         let at = |flow: &[f32], axis: usize| flow[axis * 32 * 32 + 16 * 32 + 16];
         let (reference, moved) = (image(&texture), image(&|x, y| texture(x - 2.0, y + 1.0)));
-        let flow = read(soft_match(reference, moved, 3)).unwrap_or_else(|e| panic!("{e}"));
+        let flow = read(soft_match(reference, moved, 3, 1)).unwrap_or_else(|e| panic!("{e}"));
         assert!((at(&flow, 0) - 2.0).abs() < 0.3, "{}", at(&flow, 0));
         assert!((at(&flow, 1) + 1.0).abs() < 0.3, "{}", at(&flow, 1));
         let flat = image(&|_, _| 0.5);
-        let flow = read(soft_match(flat.clone(), flat, 3)).unwrap_or_else(|e| panic!("{e}"));
+        let flow = read(soft_match(flat.clone(), flat, 3, 1)).unwrap_or_else(|e| panic!("{e}"));
         assert!(at(&flow, 0).abs() < 1e-4 && at(&flow, 1).abs() < 1e-4);
+    }
+
+    /// Pairs are averaged with their neighbours of the same burst only.
+    #[test]
+    fn pairs_of_other_bursts_are_left_alone() {
+        let values: Vec<f32> = vec![1.0, 2.0, 6.0, 30.0, 60.0, 30.0];
+        let differences = Tensor::<1>::from_floats(values.as_slice(), &Device::flex());
+        let mean = mean_of_pairs_around(differences.reshape([6, 1, 1, 1]), 3);
+        let mean = read(mean).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(mean, [1.5, 3.0, 4.0, 45.0, 40.0, 45.0]);
     }
 }

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ._sensor import Sensor, argument
+
 Options = Mapping[str, object]
 
 
@@ -31,6 +33,8 @@ def _text(name: str, value: object) -> str:
         value = value.item()
     if isinstance(value, (str, int, float)):
         return str(value)
+    if isinstance(value, Sensor):
+        return argument(value)
     if isinstance(value, os.PathLike):
         return str(os.fspath(value))
     if isinstance(value, (tuple, list)):

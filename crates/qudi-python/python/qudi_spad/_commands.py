@@ -115,7 +115,7 @@ def calibrate(
     with tempfile.TemporaryDirectory(prefix="qudi-spad-") as folder:
         path, given = _file(capture, options, folder)
         if sensor is not None:
-            given["sensor"] = str(sensor)
+            given["sensor"] = sensor
         given["force"] = overwrite
         result(["calibrate", *flags(given), f"--output={os.fspath(output)}", "--", path])
     return Sensor.from_toml(output)
@@ -206,8 +206,6 @@ _settings = settings
 def _file(capture: Input, options: dict[str, object], folder: str) -> tuple[str, dict[str, object]]:
     """Returns the path of a capture, which is written if it is in memory only, and its options."""
     given = dict(options)
-    if isinstance(given.get("sensor"), Sensor):
-        given["sensor"] = str(given["sensor"])
     path, source = source_of(capture, given)
     if source is None:
         return path, given

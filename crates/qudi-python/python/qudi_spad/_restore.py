@@ -188,8 +188,6 @@ def _start(capture: Input, names: dict[str, object], others: dict[str, object]) 
     path, source = source_of(capture, options)
     if options.get("sum") == "auto":
         del options["sum"]
-    if isinstance(options.get("sensor"), Sensor):
-        options["sensor"] = str(options["sensor"])
     arguments = ["restore", *flags(options), "--output=-", "--", path]
     return start(arguments, frames=True, source=source)
 

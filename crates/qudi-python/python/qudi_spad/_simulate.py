@@ -60,7 +60,7 @@ def simulate(
             clip = os.path.join(folder, "clip.npy")
             np.save(clip, _clip(frames))
         burst = os.path.join(folder, "burst.npy")
-        named = {"sensor": str(sensor), "ppp": ppp, "seed": seed, **options}
+        named = {"sensor": sensor, "ppp": ppp, "seed": seed, **options}
         record = result(["simulate", *flags(named), f"--output={burst}", "--", clip])
         counts = np.load(burst)
     if record["burst"]["bitpack"]:

@@ -88,7 +88,7 @@ impl ExposureSource for Recorded {
             let Some(frame) = self.reader.next()? else { return Ok(None) };
             instants.push(frame);
         }
-        Ok(Some(Exposure { instants, middle: None }))
+        Ok(Some(Exposure { instants, middle: None, colour: None }))
     }
 
     fn flow(&self, _: u64) -> Option<Flow> {

@@ -41,7 +41,7 @@ impl ExposureSource for Synthetic {
         let time = |i: usize| middle + (i as f64 + 0.5) / n as f64 - 0.5;
         let instants = (0..n).map(|i| self.scene.render(time(i))).collect();
         let middle = n.is_multiple_of(2).then(|| self.scene.render(middle));
-        Ok(Some(Exposure { instants, middle }))
+        Ok(Some(Exposure { instants, middle, colour: None }))
     }
 
     fn flow(&self, index: u64) -> Option<Flow> {

@@ -157,8 +157,9 @@ mod tests {
     fn recipe(crops: &str) -> Recipe {
         let changes = [("data.crop", "32"), ("data.frames", "3"), ("train.crops", crops)];
         let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
-        let text = include_str!("../../../../tests/golden/regression.toml");
-        Recipe::parse(text, "regression", &changes).unwrap_or_else(|e| panic!("{e}"))
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/regression.toml");
+        let text = std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{e}"));
+        Recipe::parse(&text, "regression", &changes).unwrap_or_else(|e| panic!("{e}"))
     }
 
     fn of(recipe: &Recipe) -> BurstSampler {

@@ -9,8 +9,8 @@ use toml::{Table, Value};
 
 /// Bases inside the program by name.
 const BASES: &[(&str, &str)] = &[
-    ("data/open-clips.toml", include_str!("../../../../configs/data/open-clips.toml")),
-    ("data/open-scenes.toml", include_str!("../../../../configs/data/open-scenes.toml")),
+    ("data/open-clips.toml", include_str!("../../recipes/data/open-clips.toml")),
+    ("data/open-scenes.toml", include_str!("../../recipes/data/open-scenes.toml")),
 ];
 
 /// Lays a recipe over the base that it names, if it names one: a file, relative to the recipe's folder, or
@@ -114,7 +114,7 @@ mod tests {
     fn recipes_win_over_files_beside_them_and_these_over_the_program() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mine.toml");
-        let text = include_str!("../../../../configs/baselines/emvd.toml");
+        let text = super::super::network::preset("emvd").unwrap();
         std::fs::write(&path, text).unwrap();
         let load = || Recipe::load(&path.display().to_string(), &[]);
         assert_eq!(load().unwrap(), Recipe::load("emvd", &[]).unwrap());

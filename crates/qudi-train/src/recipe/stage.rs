@@ -91,3 +91,25 @@ pub(super) fn have_good_names(stages: &[StageConfig]) -> bool {
     };
     stages.iter().enumerate().all(is_first)
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    #[test]
+    fn stages_of_the_documentation_are_a_recipes() {
+        let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/training.md");
+        let page = std::fs::read_to_string(page).unwrap();
+        let (_, block) = page.split_once("```toml\n").unwrap();
+        let (block, _) = block.split_once("```").unwrap();
+        let small = super::super::network::preset("small").unwrap();
+        let (small, _) = small.split_once("[[stage]]").unwrap();
+        let recipe = Recipe::parse(&format!("{small}{block}"), "docs/training.md", &[]).unwrap();
+        let stages = recipe.stages().unwrap();
+        let names: Vec<_> = stages.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["refinement", "pre-denoiser"]);
+        assert_eq!(stages[1].1.train.steps, 14000);
+    }
+}

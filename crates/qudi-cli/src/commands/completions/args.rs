@@ -1,6 +1,6 @@
 //! Options of `qudi completions` and `qudi man`.
 
-use clap::Args as ClapArgs;
+use clap::{Args as ClapArgs, ValueHint};
 use clap_complete::Shell;
 use std::path::PathBuf;
 
@@ -11,9 +11,10 @@ pub(crate) struct Completions {
     pub(crate) shell: Shell,
 }
 
-/// Write the manual pages
+/// Write the manual pages, and the completion scripts of all shells next to them
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Man {
-    /// Folder for the pages [default: the main page on standard output]
+    /// Folder for qudi.1, qudi-restore.1, ... and completions/ [default: the main page on standard output]
+    #[arg(value_hint = ValueHint::DirPath)]
     pub(crate) folder: Option<PathBuf>,
 }

@@ -1,10 +1,11 @@
-//! `qudi completions` and the hidden `qudi man`, both made from the command line's definition.
+//! `qudi completions` and `qudi man`, both made from the command line's definition.
 
 use super::args::{Completions, Man};
 use crate::args::Args;
 use crate::error::{CliError, Result};
 use crate::report::print;
-use clap::CommandFactory;
+use clap::{CommandFactory, ValueEnum};
+use clap_complete::Shell;
 
 pub(crate) fn run(completions: &Completions) -> Result<()> {
     let mut script = Vec::new();
@@ -17,7 +18,12 @@ pub(crate) fn man(man: &Man) -> Result<()> {
         CliError::new(format!("cannot write the manual: {e}"), "man", "check the folder")
     };
     if let Some(folder) = &man.folder {
-        std::fs::create_dir_all(folder).map_err(write)?;
+        let scripts = folder.join("completions");
+        std::fs::create_dir_all(&scripts).map_err(write)?;
+        for shell in Shell::value_variants() {
+            clap_complete::generate_to(*shell, &mut Args::command(), "qudi", &scripts)
+                .map_err(write)?;
+        }
         return clap_mangen::generate_to(Args::command(), folder).map_err(write);
     }
     let mut page = Vec::new();

@@ -39,7 +39,10 @@ fn show(settings: &Settings, report: &Report) -> Result<()> {
     })
 }
 
-/// Returns the reference of all keys; `configs/README.md` is this text.
+/// An example of a file for `--config`.
+const EXAMPLE: &str = include_str!("../../settings/example.toml");
+
+/// Returns the reference of all keys; `docs/settings.md` is this text.
 fn docs() -> String {
     let mut text = String::from(
         "# Settings
@@ -61,8 +64,16 @@ Every command reads settings in layers; the later one wins:
 Unknown keys are errors everywhere. `--set` with a key that the command does not take is an error. A file and
 the environment are shared between commands: there, known keys of other commands are ignored.
 
-Sensor files in `sensors/` hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one
+[Sensor files](sensors.md) hold the keys of `[sensor]` without the prefix, and `base = \"PRESET\"` starts one
 from a preset. This page is the output of `qudi config docs`.
+
+The settings of one experiment, for example:
+
+```toml
+",
+    );
+    text += EXAMPLE;
+    text += "```
 
 ## Keys of the simulation and the sensor
 
@@ -70,17 +81,16 @@ Keys without a default have none, or the value of the chosen sensor.
 
 | key | values | default | meaning |
 |---|---|---|---|
-",
-    );
+";
     for Documented { name, values, default, doc, .. } in keys().iter().map(|key| &key.documented) {
         let _ = writeln!(text, "| `{name}` | {values} | {} | {doc} |", code(default));
     }
     text += "
 ## Keys of recipes
 
-A recipe is a TOML file of these keys; [training](../docs/training.md) explains how they work together. `0`
-stands for the number of an entry in a list. `base = \"data/open-clips.toml\"` starts a recipe from another file.
-The last column names the recipes in this folder that set the key; the learned methods are in `baselines/`.
+A recipe is a TOML file of these keys; [training](training.md) explains how they work together. `0`
+stands for the number of an entry in a list. `base = \"data/open-clips.toml\"` starts a recipe from another
+file. The last column names the recipes of the program that set the key.
 
 | key | values | default | meaning | set by |
 |---|---|---|---|---|
@@ -92,7 +102,7 @@ The last column names the recipes in this folder that set the key; the learned m
             writeln!(text, "| `{name}` | {values} | {default} | {doc} | {} |", setters(&recipes));
     }
     text += "
-Recipes with `network.method` are for [learned methods of others](../docs/training.md#learned-methods-of-others),
+Recipes with `network.method` are for [learned methods of others](training.md#learned-methods-of-others),
 with other keys in `[network]`:
 
 | method | key | values | meaning |

@@ -8,6 +8,7 @@ use crate::interrupt;
 use crate::report::{Bar, Report};
 use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
+use qudi_core::colour::FilterChoice;
 use qudi_io::capture::Capture;
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
@@ -139,7 +140,16 @@ fn conversion(
         capture: absolute(&args.capture)?,
         format: about.format.to_owned(),
         read: options.clone(),
+        cfa: converted_filter(capture),
     })
+}
+
+/// Returns the colour filter of the frames as they are read: tiles are turned and cropped with them, a
+/// picture is of the stored frames.
+fn converted_filter(capture: &Capture) -> Option<FilterChoice> {
+    let (filter, choice) = (capture.filter()?, capture.info().cfa.as_ref()?);
+    let tile = filter.first_tile(choice.tile()?.side())?;
+    tile.parse().ok()
 }
 
 /// Returns the largest count that can appear: known, or the limit of the sample type that the counts need.

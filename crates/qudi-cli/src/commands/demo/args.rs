@@ -5,7 +5,7 @@ use crate::args::{Network, Steps, number};
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
 
-/// See what the camera sees, and what every method makes of it: a built-in scene in one picture and one page
+/// See what the camera sees, and what every method makes of it: built-in scenes in one picture and one page
 #[derive(Debug, ClapArgs)]
 pub(crate) struct Demo {
     #[command(flatten)]
@@ -13,6 +13,10 @@ pub(crate) struct Demo {
     /// Picture to write [default: qudi-demo.png, overwritten]
     #[arg(short, long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) output: Option<PathBuf>,
+    /// Write an animated picture as well, next to the other: counts, the best classical method, QuDi, truth
+    /// (GIF, at most 2 MB)
+    #[arg(long)]
+    pub(crate) animate: bool,
     /// Sensor: a name or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
     pub(crate) sensor: String,

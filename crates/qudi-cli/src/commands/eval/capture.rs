@@ -2,15 +2,16 @@
 
 use super::clip::stem;
 use super::exposing::{FRAMES, SEED};
-use super::html::Pictures;
+use super::html::{Pictures, cut, loop_frames};
 use super::metrics::CHI_SQUARE;
 use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
 use crate::capture::{CaptureAcquisition, Input, LightOverrides, Source, SummedCapture, remarks};
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
 use crate::report::Report;
+use crate::report::player::counts_frame;
 use crate::settings::Settings;
 use qudi_core::Frame;
 use qudi_core::metrics::Consistency;
@@ -19,6 +20,7 @@ use qudi_core::windows::Windows;
 use qudi_io::capture::Capture;
 use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
 use serde_json::{Value, json};
+use std::ops::Range;
 use std::path::Path;
 use std::time::Instant;
 
@@ -51,30 +53,45 @@ pub(crate) fn evaluate_capture(
     let sensor = summed.required_sensor()?;
     summed.remark_sum(report);
     let mut capture = summed.capture;
+    if let (Some(_), Some(cfa)) = (capture.filter(), &capture.info().cfa) {
+        return Err(CliError::new(
+            format!("a capture behind the colour filter {cfa}"),
+            path.display(),
+            "methods are compared on gray: read one plane with --channel, or restore it with `qudi restore`",
+        ));
+    }
     let light = LightOverrides {
         ppp: plan.ppp.first().copied(),
         gain: plan.gain,
         mean_level: plan.mean_level,
         seed,
+        white: None,
     };
     let summary = light.measure(&mut capture, Some(&sensor))?;
     let CaptureAcquisition { acquisition, light_source } =
         CaptureAcquisition::new(&light, &mut capture, &sensor, &summary)?;
     let frames = capture.frames().min(plan.frames.unwrap_or(FRAMES));
-    let mut counts = vec![0; capture.size().pixels()];
-    capture.read(frames / 2, &mut counts)?;
-    let full = f32::from(acquisition.sensor.max_count());
-    let data = counts.iter().map(|&count| f32::from(count) / full).collect();
     let clip = stem(path);
-    let counts = Frame { size: capture.size(), data };
-    let mut pictures = Pictures::new(clip.clone(), acquisition.ppp, counts, None);
+    let shown = if plan.pictures { loop_frames(plan.contenders.len() + 1) as u64 } else { 0 };
+    let shown = shown.min(frames);
+    let first = (frames / 2).saturating_sub(shown / 2).min(frames - shown);
+    let shown = first..first + shown;
+    let mut counts = Vec::new();
+    for frame in shown.clone() {
+        let mut read = vec![0; capture.size().pixels()];
+        capture.read(frame, &mut read)?;
+        counts.push(counts_frame(capture.size(), &read, acquisition.sensor.max_count()));
+    }
+    let mut pictures =
+        Pictures::new(clip.clone(), acquisition.ppp, shown.clone().collect(), &counts);
     let mut rows = Vec::new();
     let mut bar = report.bar();
     for (n, contender) in plan.contenders.iter().enumerate() {
         bar.update("evaluating", n as u64, Some(plan.contenders.len() as u64));
-        let score = score(contender, &clip, &mut capture, frames, &acquisition, plan)?;
+        let mut score =
+            score(contender, &clip, &mut capture, (frames, &shown), &acquisition, plan)?;
         let row = contender.row(acquisition.ppp);
-        pictures.add(&row.label(), &score);
+        pictures.add(&row.label(), &mut score);
         rows.push(Row { scores: vec![score], ..row });
     }
     drop(bar);
@@ -101,20 +118,21 @@ pub(crate) fn evaluate_capture(
     Ok(Evaluation { rows, pictures: vec![pictures], about, settings })
 }
 
+/// Scores a method on the first frames, of which some are shown.
 fn score(
     contender: &Contender,
     clip: &str,
     capture: &mut Capture,
-    frames: u64,
+    (frames, shown): (u64, &Range<u64>),
     acquisition: &Acquisition,
     plan: &Plan,
 ) -> Result<Score> {
     let mut sink = Watch {
         consistency: Consistency::new(capture.size(), acquisition),
         acquisition,
-        shown: frames / 2,
+        shown: shown.clone(),
         frames: Vec::new(),
-        picture: None,
+        pictures: Vec::new(),
     };
     let peak = PeakMemory::start();
     let start = Instant::now();
@@ -144,26 +162,26 @@ fn score(
         seconds_per_frame: Some(seconds / frames as f64),
         peak_mib: peak.grown_mib(),
         frames: sink.frames,
-        picture: sink.picture.unwrap_or(Frame::filled(capture.size(), 0.0)),
+        pictures: sink.pictures,
         how,
     })
 }
 
-/// Measures frames as they come, and keeps the one that is shown.
+/// Measures frames as they come, and keeps the shown part of some.
 struct Watch<'a> {
     consistency: Consistency,
     acquisition: &'a Acquisition,
-    shown: u64,
+    shown: Range<u64>,
     frames: Vec<FrameScore>,
-    picture: Option<Frame>,
+    pictures: Vec<Frame>,
 }
 
 impl RestoreSink for Watch<'_> {
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         let chi_square = self.consistency.add(restored, counts, self.acquisition)?;
         self.frames.push(FrameScore::of_values(&[(&CHI_SQUARE, chi_square)]));
-        if number == self.shown {
-            self.picture = Some(restored.clone());
+        if self.shown.contains(&number) {
+            self.pictures.push(cut(restored));
         }
         Ok(())
     }

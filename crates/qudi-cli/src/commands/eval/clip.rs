@@ -144,6 +144,7 @@ impl Clip {
             perceptual: plan.perceptual.clone(),
             appearance: plan.appearance,
             notes: summary.notes,
+            shown: 0..0,
         })
     }
 }

@@ -2,7 +2,7 @@
 
 use super::args::External;
 use super::external::ExternalFrames;
-use super::html::Pictures;
+use super::html::{Pictures, cut};
 use super::metrics::{Compared, aligned, scaled};
 use super::perceptual::Perceptual;
 use super::plan::{Contender, Plan};
@@ -10,6 +10,7 @@ use super::score::{Added, Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
+use crate::report::player::counts_frame;
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;
 use qudi_core::metrics::{Consistency, OCTAVES, best_gain, octave_energies};
@@ -19,6 +20,7 @@ use qudi_core::{Camera, Frame, Light, Size};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{RestoreSink, Schedule, run as run_method};
 use qudi_sim::{Exposed, Sink, Start};
+use std::ops::Range;
 use std::rc::Rc;
 use std::time::Instant;
 
@@ -75,6 +77,8 @@ pub(super) struct ExposedClip {
     pub(super) appearance: bool,
     /// What makes the clip doubtful.
     pub(super) notes: Vec<String>,
+    /// Frames that the page shows.
+    pub(super) shown: Range<usize>,
 }
 
 impl ExposedClip {
@@ -165,8 +169,12 @@ impl ExposedClip {
             frames.push(FrameScore::of(&self.compared(&restored, &scene[WINDOW / 2]))?);
             middles.push(restored);
         }
-        let middle = windows / 2;
-        let picture = aligned(&middles[middle], &truth[middle + WINDOW / 2]);
+        // The first window's middle frame is the sixth.
+        let shown = self
+            .shown
+            .clone()
+            .filter_map(|t| Some((middles.get(t.checked_sub(WINDOW / 2)?)?, &truth[t])));
+        let pictures = shown.map(|(image, truth)| cut(&aligned(image, truth))).collect();
         Ok(Score {
             clip: self.name.clone(),
             frames,
@@ -177,7 +185,7 @@ impl ExposedClip {
             range: None,
             seconds_per_frame: Some(seconds / (windows * WINDOW) as f64),
             peak_mib: highest,
-            picture,
+            pictures,
             how,
         })
     }
@@ -242,24 +250,32 @@ impl ExposedClip {
             range: None,
             seconds_per_frame: cost.map(|cost| cost.seconds_per_frame),
             peak_mib: cost.and_then(|cost| cost.peak_mib),
-            picture: aligned(
-                &restored[restored.len() / 2],
-                &self.photons.truth[restored.len() / 2],
-            ),
+            pictures: self
+                .shown
+                .clone()
+                .map(|t| cut(&aligned(&restored[t], &self.photons.truth[t])))
+                .collect(),
             how,
         })
     }
 }
 
 impl ExposedClip {
-    /// Returns pictures of the middle frame: truth and counts.
-    pub(super) fn pictures(&self) -> Pictures {
-        let middle = self.photons.truth.len() / 2;
-        let full = f32::from(self.acquisition.sensor.max_count());
-        let counts = self.photons.counts[middle].iter().map(|&count| f32::from(count) / full);
-        let counts = Frame { size: self.size, data: counts.collect() };
-        let truth = self.photons.truth[middle].clone();
-        Pictures::new(self.name.clone(), self.ppp, counts, Some(truth))
+    /// Selects at most `frames` frames around the middle for the page, and returns their truth and counts as
+    /// its pictures.
+    pub(super) fn show(&mut self, frames: usize) -> Pictures {
+        let all = self.photons.truth.len();
+        let frames = frames.min(all);
+        let first = (all / 2).saturating_sub(frames / 2).min(all - frames);
+        self.shown = first..first + frames;
+        let full = self.acquisition.sensor.max_count();
+        let counts = self.photons.counts[self.shown.clone()].iter();
+        let counts: Vec<Frame> =
+            counts.map(|counts| counts_frame(self.size, counts, full)).collect();
+        let truth = self.photons.truth[self.shown.clone()].iter();
+        let numbers = (first as u64..).take(frames).collect();
+        Pictures::new(self.name.clone(), self.ppp, numbers, &counts)
+            .with_truth(&truth.cloned().collect::<Vec<_>>())
     }
 
     /// Measures what was added to the frames of the fewest steps, and what the latter missed.

@@ -2,7 +2,7 @@
 
 use super::args::Protocol;
 use super::plan::Plan;
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::settings::Settings;
 use qudi_core::sensor::Sensor;
 use qudi_core::{PppDefinition, Size};
@@ -49,6 +49,13 @@ impl Exposing {
             None => settings.given("simulate.seed")?.unwrap_or(SEED),
         };
         let mut sensor = settings.sensor(&name)?;
+        if let Some(cfa) = sensor.colour.as_ref().and_then(|colour| colour.cfa.as_ref()) {
+            return Err(CliError::new(
+                format!("clips behind the colour filter {cfa}"),
+                "sensor.colour.cfa",
+                "methods are compared on gray: expose with `qudi simulate --cfa`, and score colours with `qudi eval TRUTH --restored FILE`",
+            ));
+        }
         if let Some(sum) = plan.read.sum {
             sensor.frames_summed = sum;
             sensor.validate()?;

@@ -1,31 +1,43 @@
-//! The page of `qudi eval`: table, plot, and pictures side by side.
+//! The page of `qudi eval`: table, plots, and pictures that play.
 
 use super::metrics::{CHI_SQUARE, GMSD, LPIPS_ALEX, LPIPS_VGG, Metric, PSNR_A, SSIM};
 use super::score::{Row, Score};
 use super::table::summary;
 use crate::error::Result;
 use crate::report::Table;
-use crate::report::html::{TableView, crop, crop_size, render};
+use crate::report::html::{TableView, render};
+use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, picture_url};
 use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
-use qudi_core::Frame;
+use qudi_core::{Frame, Size};
 use serde::Serialize;
 use std::fmt::Write;
 
-/// Largest side of the pictures: a crop from the middle.
+/// Largest side of the pictures: they are cut to the middle.
 const CROP: usize = 224;
 
-/// Errors are shown this many times larger, zero at middle gray.
-const ERROR_GAIN: f32 = 2.0;
+/// Bytes of all pictures of a page, about.
+const PICTURES_BYTES: usize = 12_000_000;
 
-/// The pictures of a clip at one light level.
+/// Bytes of a picture, about.
+const PICTURE_BYTES: usize = 14_000;
+
+/// Frames of a loop at most.
+const MAX_LOOP_FRAMES: usize = 33;
+
+/// Frames of a loop at least: fewer do not show motion.
+const MIN_LOOP_FRAMES: usize = 3;
+
+/// The pictures of a clip at one light level, encoded.
 pub(crate) struct Pictures {
-    pub(crate) clip: String,
-    pub(crate) ppp: f64,
-    /// Counts of the middle frame, full scale for 1.
-    pub(crate) counts: Frame,
-    pub(crate) truth: Option<Frame>,
+    clip: String,
+    ppp: f64,
+    size: Size,
+    /// Numbers of the frames that are shown.
+    numbers: Vec<u64>,
+    counts: Vec<String>,
+    truth: Option<Vec<String>>,
     /// Restored frames by method.
-    restored: Vec<(String, Frame)>,
+    restored: Vec<(String, Vec<String>)>,
     captions: Vec<String>,
 }
 
@@ -39,7 +51,7 @@ struct Page<'a> {
     looks: Vec<Looks>,
     plots: Vec<Drawing>,
     has_truth: bool,
-    clips: Vec<Clip>,
+    players: Vec<Player>,
 }
 
 /// A further table.
@@ -49,37 +61,23 @@ struct Looks {
     table: TableView,
 }
 
-/// Pictures of a clip, two of them under a slider.
-#[derive(Serialize)]
-struct Clip {
-    name: String,
-    ppp: f64,
-    /// Size of the pictures.
-    width: usize,
-    height: usize,
-    /// Size of the frames.
-    size: String,
-    cropped: bool,
-    captions: Vec<String>,
-    pictures: Vec<Picture>,
-    /// Numbers of the pictures that are shown first.
-    left: usize,
-    right: usize,
-}
-
-#[derive(Serialize)]
-struct Picture {
-    name: String,
-    url: String,
-}
-
 impl Pictures {
-    pub(crate) fn new(clip: String, ppp: f64, counts: Frame, truth: Option<Frame>) -> Self {
-        Self { clip, ppp, counts, truth, restored: Vec::new(), captions: Vec::new() }
+    /// Creates the pictures of a clip from its counts, full scale for 1.
+    pub(crate) fn new(clip: String, ppp: f64, numbers: Vec<u64>, counts: &[Frame]) -> Self {
+        let size = counts.first().map_or(Size { height: 1, width: 1 }, |counts| counts.size);
+        let counts = counts.iter().map(|counts| counts_url(&cut(counts), QUALITY)).collect();
+        let (truth, restored, captions) = (None, Vec::new(), Vec::new());
+        Self { clip, ppp, size, numbers, counts, truth, restored, captions }
     }
 
-    /// Adds the restored frame of a method.
-    pub(crate) fn add(&mut self, method: &str, score: &Score) {
+    /// Adds the truth of the shown frames.
+    pub(crate) fn with_truth(self, truth: &[Frame]) -> Self {
+        let truth = truth.iter().map(|truth| picture_url(&cut(truth), QUALITY)).collect();
+        Self { truth: Some(truth), ..self }
+    }
+
+    /// Adds the restored frames of a method, and takes them out of its score.
+    pub(crate) fn add(&mut self, method: &str, score: &mut Score) {
         let middle = score.frames.get(score.frames.len() / 2);
         let value = |metric| middle.and_then(|frame| frame.get(metric));
         let mut caption = format!("{method}{}", score.how);
@@ -89,8 +87,54 @@ impl Pictures {
             let _ = write!(caption, ": chi-square {chi_square:.3}");
         }
         self.captions.push(caption);
-        self.restored.push((method.to_owned(), score.picture.clone()));
+        let frames = std::mem::take(&mut score.pictures);
+        let urls = frames.iter().map(|frame| picture_url(frame, QUALITY)).collect();
+        self.restored.push((method.to_owned(), urls));
     }
+
+    /// Returns the pictures as the template plays them.
+    fn player(&self) -> Player {
+        // Four digits of an estimated level are plenty.
+        let ppp = (self.ppp * 1e4).round() / 1e4;
+        let (shown, frames) = (cut_size(self.size), self.numbers.len() as u64);
+        let title = format!("{}, {ppp} photons per pixel and frame", self.clip);
+        let mut scene = Scene::new(title, shown, frames);
+        if shown != self.size {
+            scene.caption = vec![format!("The middle {shown} pixels of {}.", self.size)];
+        }
+        scene.numbers = Some(self.numbers.clone());
+        scene.layers = vec![Layer::new("counts", Kind::Counts, self.counts.clone())];
+        for (method, frames) in &self.restored {
+            scene.layers.push(Layer::new(method, Kind::Restored, frames.clone()));
+        }
+        // The last method against the truth; without one, the counts against it.
+        scene.right = scene.layers.len() - 1;
+        if let Some(truth) = &self.truth {
+            scene.layers.push(Layer::new("truth", Kind::Truth, truth.clone()));
+            (scene.left, scene.right) = (scene.right, scene.right + 1);
+        }
+        scene.notes.clone_from(&self.captions);
+        scene.player()
+    }
+}
+
+/// Returns how many frames a loop of each of `pictures` pictures has, so that the page stays small.
+pub(crate) fn loop_frames(pictures: usize) -> usize {
+    let fitting = PICTURES_BYTES / (PICTURE_BYTES * pictures.max(1));
+    if fitting < MIN_LOOP_FRAMES { 1 } else { fitting.min(MAX_LOOP_FRAMES) }
+}
+
+/// Returns the size that [`cut`] cuts to.
+fn cut_size(size: Size) -> Size {
+    Size { height: size.height.min(CROP), width: size.width.min(CROP) }
+}
+
+/// Cuts a frame to its middle, which the page shows.
+pub(crate) fn cut(frame: &Frame) -> Frame {
+    let size = cut_size(frame.size);
+    let (top, left) = ((frame.size.height - size.height) / 2, (frame.size.width - size.width) / 2);
+    let rows = (top..top + size.height).flat_map(|y| &frame.row(y)[left..left + size.width]);
+    Frame { size, data: rows.copied().collect() }
 }
 
 /// Renders the page.
@@ -116,7 +160,7 @@ pub(crate) fn html(
                 .filter_map(|plot| plot.draw())
                 .collect(),
             has_truth: pictures.iter().any(|clip| clip.truth.is_some()),
-            clips: pictures.iter().map(clip).collect(),
+            players: pictures.iter().map(Pictures::player).collect(),
         },
     )
 }
@@ -183,47 +227,6 @@ fn perception(rows: &[Row]) -> Option<Plot> {
     })
 }
 
-fn clip(clip: &Pictures) -> Clip {
-    let mut pictures = Vec::new();
-    let mut add =
-        |name: String, frame: &Frame| pictures.push(Picture { name, url: crop(frame, CROP) });
-    add("counts".to_owned(), &clip.counts);
-    for (method, frame) in &clip.restored {
-        add(method.clone(), frame);
-        if let Some(truth) = &clip.truth {
-            add(format!("{method}: error"), &error(frame, truth));
-        }
-    }
-    if let Some(truth) = &clip.truth {
-        add("truth".to_owned(), truth);
-    }
-    // The last method against the truth; without one, the counts against it.
-    let right = pictures.len() - 1;
-    let left = if clip.truth.is_some() { right.saturating_sub(2) } else { 0 };
-    let size = clip.counts.size;
-    let shown = crop_size(size, CROP);
-    Clip {
-        name: clip.clip.clone(),
-        // Four digits of an estimated level are plenty.
-        ppp: (clip.ppp * 1e4).round() / 1e4,
-        width: shown.width,
-        height: shown.height,
-        size: size.to_string(),
-        cropped: shown != size,
-        captions: clip.captions.clone(),
-        pictures,
-        left,
-        right,
-    }
-}
-
-/// Returns signed errors around middle gray.
-fn error(image: &Frame, truth: &Frame) -> Frame {
-    let pairs = image.data.iter().zip(&truth.data);
-    let data = pairs.map(|(image, truth)| 0.5 + ERROR_GAIN * 0.5 * (image - truth)).collect();
-    Frame { size: truth.size, data }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -242,37 +245,54 @@ mod tests {
             range: None,
             seconds_per_frame: None,
             peak_mib: None,
-            picture: Frame::filled(size, 0.5),
+            pictures: vec![cut(&Frame::filled(size, 0.5))],
             how: how.to_owned(),
         }
     }
 
     fn pictures(clip: &str, size: Size) -> Pictures {
-        let frame = Frame::filled(size, 0.4);
-        Pictures::new(clip.to_owned(), 3.25, frame.clone(), Some(frame))
+        let frames = [Frame::filled(size, 0.4)];
+        Pictures::new(clip.to_owned(), 3.25, vec![0], &frames).with_truth(&frames)
     }
 
     #[test]
     fn draws_clips_of_two_sizes_under_one_name() {
         let sizes = [Size { height: 24, width: 32 }, Size { height: 300, width: 40 }];
         let mut clips = sizes.map(|size| pictures("run", size));
-        let scores = sizes.map(|size| score("run", size, ""));
-        for (clip, score) in clips.iter_mut().zip(&scores) {
+        let mut scores = sizes.map(|size| score("run", size, ""));
+        for (clip, score) in clips.iter_mut().zip(&mut scores) {
             clip.add("mle", score);
         }
         let rows = [Row { scores: scores.to_vec(), ..Row::new("mle".to_owned(), 3.25) }];
         let page = html(&rows, &[], &clips, "about").unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("aspect-ratio:32/24") && page.contains("aspect-ratio:40/224"));
-        assert!(page.contains("the middle 40 x 224 pixels"));
+        assert!(page.contains("The middle 224 x 40 pixels of 300 x 40"));
     }
 
     #[test]
     fn captions_say_how_pictures_were_made() {
         let size = Size { height: 24, width: 32 };
         let mut clip = pictures("<dog>", size);
-        clip.add("qudi", &score("<dog>", size, " (diffusion in 4 steps) on cpu"));
+        clip.add("qudi", &mut score("<dog>", size, " (diffusion in 4 steps) on cpu"));
         let page = html(&[], &[], &[clip], "about").unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("qudi (diffusion in 4 steps) on cpu: PSNR 25.00 dB"), "{page}");
-        assert!(page.contains("<b>&lt;dog&gt;</b>"), "names are no markup");
+        assert!(page.contains("&lt;dog&gt;, 3.25") && !page.contains("<dog>"), "no markup");
+    }
+
+    #[test]
+    fn loops_are_short_where_there_are_many_pictures() {
+        assert_eq!(loop_frames(4), MAX_LOOP_FRAMES);
+        assert_eq!(loop_frames(231), 3);
+        assert_eq!(loop_frames(1000), 1);
+    }
+
+    #[test]
+    fn cuts_the_middle_and_keeps_small_frames_whole() {
+        let size = Size { height: 40, width: 300 };
+        let frame = Frame::from_fn(size, |x, _| x as f32 / 300.0);
+        let middle = cut(&frame);
+        assert_eq!(middle.size, Size { height: 40, width: 224 });
+        assert_eq!(middle.row(3)[0], frame.row(3)[38]);
+        assert_eq!(cut(&middle), middle);
     }
 }

@@ -4,9 +4,10 @@ use super::about::about;
 use super::args::{Eval, External, Protocol};
 use super::capture::{Evaluation, evaluate_capture};
 use super::clip::Clip;
+use super::colour::score_files;
 use super::exposed_clip::ExposedClip;
 use super::exposing::Exposing;
-use super::html::{Pictures, html};
+use super::html::{Pictures, html, loop_frames};
 use super::join::join;
 use super::mark::remarks;
 use super::metrics::{METRICS, Metric, PSNR_A, Part};
@@ -23,7 +24,7 @@ use crate::settings::Settings;
 use qudi_core::Frame;
 use qudi_core::atomic_file::refuse_taken;
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 pub(crate) fn run(
     args: &Eval,
@@ -31,6 +32,9 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
+    if let Some(restored) = &args.restored {
+        return score_files(Path::new(&args.data), restored, report);
+    }
     let overwrite = global.overwrite();
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);
     let (csv_file, markdown_file) = (output(&args.csv)?, output(&args.markdown)?);
@@ -130,6 +134,11 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
     let mut pictures = Vec::new();
     let mut bar = report.bar();
     let total = (clips.len() * levels.len()) as u64;
+    let shown = match plan.protocol {
+        Protocol::Strict => loop_frames(total as usize * (each + 2)),
+        // Windows whose middle frames are scored have none at the ends.
+        Protocol::Quiver => 1,
+    };
     // By value: what was found out about a clip goes with it.
     for (i, clip) in clips.into_iter().enumerate() {
         for (j, &ppp) in levels.iter().enumerate() {
@@ -137,12 +146,12 @@ fn evaluate_clips(plan: &Plan, settings: &Settings, report: &Report) -> Result<E
             if interrupt::check().is_break() {
                 return Err(CliError::Interrupted);
             }
-            let exposed = clip.expose(plan, &exposing, ppp)?;
+            let mut exposed = clip.expose(plan, &exposing, ppp)?;
             for note in exposed.notes.iter().filter(|_| j == 0) {
                 report.warning(note);
             }
             if plan.pictures {
-                pictures.push(exposed.pictures());
+                pictures.push(exposed.show(shown));
             }
             score_all(plan, &exposed, &mut rows[j * each..][..each], pictures.last_mut())?;
         }
@@ -170,9 +179,9 @@ fn score_all(
     rows: &mut [Row],
     mut pictures: Option<&mut Pictures>,
 ) -> Result<()> {
-    let mut add = |row: &mut Row, score: Score| {
+    let mut add = |row: &mut Row, mut score: Score| {
         if let Some(pictures) = &mut pictures {
-            pictures.add(&row.label(), &score);
+            pictures.add(&row.label(), &mut score);
         }
         row.scores.push(score);
     };

@@ -3,8 +3,8 @@
 use super::mark::Mark;
 use super::metrics::{Compared, METRICS, Metric};
 use crate::error::Result;
+use qudi_core::Frame;
 use qudi_core::metrics::{OCTAVES, Statistics};
-use qudi_core::{Frame, Size};
 use serde::ser::SerializeMap;
 use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value;
@@ -108,9 +108,9 @@ pub(crate) struct Score {
     /// Range of the values of frames that another program made.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) range: Option<[f32; 2]>,
-    /// The middle frame; after the best gain where there is a truth.
+    /// Frames for the page, cut to what it shows; after the best gain where there is a truth.
     #[serde(skip)]
-    pub(crate) picture: Frame,
+    pub(crate) pictures: Vec<Frame>,
     /// Text after the method's name: ` over 5 frames`, ` (regression) on cpu`.
     #[serde(skip)]
     pub(crate) how: String,
@@ -132,7 +132,7 @@ impl Score {
             seconds_per_frame: value["seconds_per_frame"].as_f64(),
             peak_mib: value["peak_mib"].as_f64(),
             range: serde_json::from_value(value["range"].clone()).ok(),
-            picture: Frame::filled(Size { height: 1, width: 1 }, 0.0),
+            pictures: Vec::new(),
             how: String::new(),
         })
     }

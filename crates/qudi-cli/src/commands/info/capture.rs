@@ -9,6 +9,7 @@ use crate::error::{CliError, Result};
 use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::colour::Colour;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::{BitOrderCheck, Capture, SumChoice, Summary};
@@ -154,6 +155,14 @@ pub(crate) fn describe(
             line("largest", format!("{largest}; if counts have {bits} bits, say --bits {bits}"));
         }
     }
+    if let (Some(colours), Some(cfa)) = (summary.colours, &about.cfa) {
+        let rates = Colour::ALL
+            .into_iter()
+            .zip(colours)
+            .filter_map(|(colour, mean)| mean.map(|mean| format!("{} {mean:.4}", colour.name())));
+        let rates: Vec<_> = rates.collect();
+        line("colours", format!("{cfa}: mean counts {}", rates.join(", ")));
+    }
     line("pixels", capture.bad_pixels().describe(capture.size()));
     histogram(&mut text, &summary.histogram);
     for remark in &about.notes {
@@ -223,6 +232,7 @@ fn document(capture: &Capture, summary: &Summary, sensor: Option<&Sensor>) -> Va
         "saturated": summary.saturated,
         "histogram": summary.histogram,
         "bit_order": summary.bit_order,
+        "colours": summary.colours,
         "hot": bad.hot.len(),
         "dead": bad.dead.len(),
     })

@@ -16,7 +16,7 @@ use qudi_io::codec::FORMATS;
 use qudi_io::sidecar::Sidecar;
 use qudi_layers::Provenance;
 use qudi_model::config::NetworkKind;
-use serde_json::json;
+use serde_json::{Map, Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -49,7 +49,8 @@ pub(crate) fn run(
             match describe(path, &Device::flex())? {
                 Some(contents) => learned(&contents, path, report),
                 None if extension.as_deref() == Some("safetensors") => {
-                    weights(&Weights::File(path.to_owned()), report)
+                    let (text, document) = weights(&Weights::File(path.to_owned()))?;
+                    report.result(&text, || document)
                 }
                 None => Err(CliError::new(
                     "weights of no network that is known here",
@@ -72,7 +73,7 @@ pub(crate) fn run(
         _ if preset(subject).is_some() => sensor(subject, settings, report),
         _ if subject == "weights" => {
             settings.refuse(&["sensor."], "for weights")?;
-            weights(&Weights::BuiltIn(NetworkKind::Regression), report)
+            built_in_weights(report)
         }
         _ => Err(CliError::new(
             format!("there is no file and no sensor named `{subject}`"),
@@ -110,8 +111,21 @@ fn sensors(report: &Report) -> Result<()> {
     report.result(&text, || json!(sensors))
 }
 
-/// Describes weights.
-fn weights(weights: &Weights, report: &Report) -> Result<()> {
+/// Describes the networks in the program.
+fn built_in_weights(report: &Report) -> Result<()> {
+    let methods =
+        [("qudi-regression", NetworkKind::Regression), ("qudi-diffusion", NetworkKind::Window)];
+    let (mut texts, mut documents) = (Vec::new(), Map::new());
+    for (method, kind) in methods {
+        let (text, document) = weights(&Weights::BuiltIn(kind))?;
+        texts.push(format!("method      {method}\n{text}"));
+        documents.insert(method.to_owned(), document);
+    }
+    report.result(&texts.join("\n\n"), || Value::Object(documents))
+}
+
+/// Returns a description of weights, in words and as a document.
+fn weights(weights: &Weights) -> Result<(String, Value)> {
     let d = weights.describe()?;
     let sizes = d.network.parameters(&Device::flex());
     let kind = d.network.kind();
@@ -125,7 +139,7 @@ fn weights(weights: &Weights, report: &Report) -> Result<()> {
     lines.extend(provenance(&d.provenance));
     lines.push(("sha-256", weights.sha256()?));
     let text = to_text(&lines) + &recipes(&d.provenance);
-    report.result(&text, || json!(weights.describe().ok()))
+    Ok((text, json!(d)))
 }
 
 /// Returns lines about the training of weights.

@@ -11,10 +11,11 @@ use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
 use crate::methods::default::default_method;
 use crate::places::default_look;
-use crate::report::html::{data_url, render};
+use crate::report::html::render;
+use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, picture_url};
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
-use qudi_burst::{PostFilter, Qbp};
+use qudi_burst::{ColourRestorer, PostFilter, Qbp};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Frame, linear_to_srgb};
@@ -67,7 +68,7 @@ pub(crate) fn run(
     let sum = summed.sum().cloned();
     let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
-    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0 };
+    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0, white: None };
     let summary = light.measure(&mut capture, sensor.as_ref())?;
     let warnings = warnings::of_capture(&capture, &summary);
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
@@ -84,15 +85,19 @@ pub(crate) fn run(
     };
     let mut picture = Picture::new(mean.size, 1, 2, 1);
     picture.place(0, 0, &["MEAN"], &mean);
+    let part = capture.longest_part();
+    let (first, counts) = capture.in_part(&part, read_window)?;
+    let first = first + part.start / u64::from(capture.summed());
+    let mut restored = None;
     let mut forecast = Value::Null;
     match acquired {
         Ok(CaptureAcquisition { acquisition, .. }) => {
             let start = Instant::now();
-            let part = capture.longest_part();
-            let instant =
-                capture.in_part(&part, |capture| restore_instant(capture, &acquisition))?;
+            let instant = restore_instant(&counts, &capture, &acquisition)?;
             let seconds = start.elapsed().as_secs_f64();
-            picture.place(0, 1, &["ONE INSTANT"], &for_the_eye(instant.with_white_at_highlights()));
+            let instant = for_the_eye(instant.with_white_at_highlights());
+            picture.place(0, 1, &["ONE INSTANT"], &instant);
+            restored = Some(instant);
             let (words, document) = plan(&capture, &acquisition, seconds)?;
             line(&words);
             forecast = document;
@@ -100,17 +105,15 @@ pub(crate) fn run(
         Err(CliError::Error { what, .. }) => line(&format!("not yet: {what}")),
         Err(other) => return Err(other),
     }
-    let png = picture.to_png()?;
     if picture_only {
-        file.write(|| Ok(png))?;
+        file.write(|| Ok(picture.to_png()?))?;
     } else {
         file.write(|| {
+            let pictures = Pictures { mean: &mean, instant: restored.as_ref(), counts: &counts };
             let context = json!({
                 "title": args.capture.display().to_string(),
-                "picture": data_url(&png),
-                "averaged": summary.sampled,
-                "aligned": WINDOW.min(capture.frames()),
                 "strip": strip(capture.timeline(), capture.findings()),
+                "players": [pictures.player(first, summary.sampled)],
                 "text": text,
             });
             render("look.html", context)
@@ -142,18 +145,71 @@ fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     Ok(ideal)
 }
 
-/// Aligns and merges sums around the middle of the capture.
-fn restore_instant(capture: &mut Capture, acquisition: &Acquisition) -> Result<Frame> {
+/// Reads sums around the middle of a part, and returns the number of the first one.
+fn read_window(capture: &mut Capture) -> Result<(u64, Vec<Vec<u16>>)> {
     let length = capture.frames().min(WINDOW);
     let first = if capture.forward_only() { 0 } else { (capture.frames() - length) / 2 };
-    let size = capture.size();
-    let mut frames = vec![vec![0; size.pixels()]; length as usize];
+    let mut frames = vec![vec![0; capture.size().pixels()]; length as usize];
     for (frame, counts) in (first..).zip(&mut frames) {
         capture.read(frame, counts)?;
     }
-    let view = BurstView { size, frames: &frames };
-    let mut qbp = Qbp::new(PostFilter::Bm3d);
-    Ok(qbp.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
+    Ok((first, frames))
+}
+
+/// Aligns and merges sums, and returns the one in the middle.
+fn restore_instant(
+    frames: &[Vec<u16>],
+    capture: &Capture,
+    acquisition: &Acquisition,
+) -> Result<Frame> {
+    let view = BurstView { size: capture.size(), frames };
+    let mut method: Box<dyn Restorer> = Box::new(Qbp::new(PostFilter::Bm3d));
+    if let Some(filter) = capture.filter() {
+        method = Box::new(ColourRestorer::new(method, filter.clone(), false));
+    }
+    Ok(method.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
+}
+
+/// The pictures of the page.
+struct Pictures<'a> {
+    mean: &'a Frame,
+    /// One instant, where the light is known.
+    instant: Option<&'a Frame>,
+    /// The sums that the instant is made of.
+    counts: &'a [Vec<u16>],
+}
+
+impl Pictures<'_> {
+    /// Returns the pictures as the template plays them; `first` is the number of the first sum, and
+    /// `averaged` the number of frames in the mean.
+    fn player(&self, first: u64, averaged: u64) -> Player {
+        let (size, frames) = (self.mean.size, self.counts.len());
+        let brightest = self.counts.iter().flatten().copied().max().unwrap_or(0);
+        let full = f32::from(brightest.max(1));
+        let gray = |counts: &Vec<u16>| Frame {
+            size,
+            data: counts.iter().map(|&count| f32::from(count) / full).collect(),
+        };
+        let counts = self.counts.iter().map(|counts| counts_url(&gray(counts), QUALITY));
+        let mut scene = Scene::new("Mean, counts, one instant", size, frames as u64);
+        scene.caption = vec![format!(
+            "The mean of {averaged} frames, response inverted, bad pixels repaired; {frames} sums around the middle \
+             of the capture; and one instant, for which these are aligned and merged. Mean and instant are brightened \
+             for the eye (sRGB), white at the 99.5th percentile."
+        )];
+        let numbers = first..first + frames as u64;
+        scene.numbers = Some(numbers.collect());
+        scene.layers = vec![
+            Layer::new("mean", Kind::Restored, vec![picture_url(self.mean, QUALITY)]),
+            Layer::new("counts", Kind::Counts, counts.collect()),
+        ];
+        if let Some(instant) = self.instant {
+            let frames = vec![picture_url(instant, QUALITY)];
+            scene.layers.push(Layer::new("one instant", Kind::Restored, frames));
+        }
+        scene.right = scene.layers.len() - 1;
+        scene.player()
+    }
 }
 
 /// Describes what `qudi restore` would do, and about how long that takes.

@@ -2,6 +2,7 @@
 
 use crate::args::given::{DIFFUSION, Given};
 use crate::args::{Network, Reading, Shard, Steps, methods, number};
+use crate::colour::Gains;
 use crate::methods::Method;
 use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use std::path::PathBuf;
@@ -58,6 +59,13 @@ pub(crate) struct Restore {
     /// number of frames summed (--sum), sums slide
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = number::whole::<u64>(number::COUNT))]
     pub(crate) every: Option<u64>,
+    /// Restore luma alone of a capture behind a colour filter
+    #[arg(long)]
+    pub(crate) gray: bool,
+    /// White balance of a capture behind a colour filter: gains of red, green and blue, for what is shown;
+    /// .npy and float .tif hold the sensor's own colours [default: the sensor file's, or guessed]
+    #[arg(long, value_name = "R,G,B", conflicts_with = "gray")]
+    pub(crate) wb: Option<Gains>,
     /// Tone curve of what is written: none (values follow the light, as in the clip), or srgb, which
     /// brightens shadows for the eye
     #[arg(long, value_name = "CURVE", default_value = "none")]
@@ -72,12 +80,24 @@ pub(crate) struct Restore {
     /// Write .tif with 32-bit float samples, nothing clipped, instead of 16-bit ones
     #[arg(long)]
     pub(crate) float: bool,
+    /// CAPTURE is a set of the Single Photon Challenge (SCENE/FRAME.npy), OUT the .zip that its site takes:
+    /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there
+    #[arg(long, conflicts_with_all = [
+        "sensor", "ppp", "gain", "gray", "wb", "mean_level", "overlap", "every", "tonemap", "fps", "shard", "float", "chi_map",
+        "side_by_side", "html", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient", "axes", "channel", "cfa",
+        "array", "levels", "bits", "offset", "threshold", "header", "trailer", "frames_per_file", "start", "end",
+        "crop", "mask", "dcr", "lenient",
+    ])]
+    pub(crate) challenge: bool,
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) chi_map: Option<PathBuf>,
     /// Write a picture of the first, middle and last frame: counts above, restored below
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
+    /// Write a page that plays: counts, restored frames, uncertainty and misfit under a slider, the settings
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub(crate) html: Option<PathBuf>,
     /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over
     /// --samples K
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]

@@ -65,7 +65,7 @@ pub(crate) fn run(
 ) -> Result<Value> {
     refuse_files(&args)?;
     let shard = args.shard.take();
-    let plan = Plan::new(&args, global, false)?;
+    let plan = Plan { luma_alone: true, ..Plan::new(&args, global, false)? };
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
         None => plan.source(),
@@ -98,9 +98,12 @@ fn refuse_files(args: &Restore) -> Result<()> {
     let given = [
         (args.chi_map.is_some(), "--chi-map"),
         (args.side_by_side.is_some(), "--side-by-side"),
+        (args.html.is_some(), "--html"),
+        (args.challenge, "--challenge"),
         (args.uncertainty.is_some(), "--uncertainty"),
         (args.float, "--float"),
         (args.fps.is_some(), "--fps"),
+        (args.wb.is_some(), "--wb"),
     ];
     let Some((_, flag)) = given.into_iter().find(|(given, _)| *given) else { return Ok(()) };
     Err(CliError::new("no file is written", flag, "leave it out: frames and sigma are returned"))

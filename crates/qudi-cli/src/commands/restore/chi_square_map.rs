@@ -1,5 +1,6 @@
 //! Chi-square of the counts given the restored frames, and frames next to their counts.
 
+use super::page::RestoredPage;
 use crate::error::Result;
 use qudi_core::atomic_file::Overwrite;
 use qudi_core::metrics::Consistency;
@@ -8,7 +9,8 @@ use qudi_core::{Error, Frame, Size};
 use qudi_io::writer::{ArrayWriter, Picture};
 use std::path::Path;
 
-/// The misfit of restored frames: chi-square of all frames, and three of them next to their counts.
+/// The misfit of restored frames: chi-square of all frames, three of them next to their counts, and the page
+/// that shows many.
 pub(super) struct ChiSquareMap {
     consistency: Consistency,
     acquisition: Acquisition,
@@ -20,6 +22,8 @@ pub(super) struct ChiSquareMap {
     keep_latest: bool,
     /// Frames measured so far.
     measured: u64,
+    /// The page, if one is written.
+    page: Option<RestoredPage>,
 }
 
 impl ChiSquareMap {
@@ -37,10 +41,42 @@ impl ChiSquareMap {
             pictures: Vec::new(),
             keep_latest: pictures.is_none(),
             measured: 0,
+            page: None,
         }
     }
 
+    /// Adds the page that shows the frames.
+    pub(super) fn with_page(self, page: Option<RestoredPage>) -> Self {
+        Self { page, ..self }
+    }
+
+    /// Takes the page, with all frames that were added.
+    pub(super) fn take_page(&mut self) -> Option<RestoredPage> {
+        self.page.take()
+    }
+
+    /// Adds the next frame.
     pub(super) fn add(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
+        if let Some(page) = &mut self.page {
+            page.add(restored, counts);
+        }
+        self.measure(restored, counts)
+    }
+
+    /// Adds the colours of the next frame, of which every pixel sees `seen`.
+    pub(super) fn add_colour(
+        &mut self,
+        restored: &[Frame; 3],
+        seen: &Frame,
+        counts: &[u16],
+    ) -> qudi_core::Result<()> {
+        if let Some(page) = &mut self.page {
+            page.add_colour(restored, counts);
+        }
+        self.measure(seen, counts)
+    }
+
+    fn measure(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
         if self.keep_latest || self.shown.contains(&self.measured) {
             if self.keep_latest {
                 self.pictures.truncate(self.shown.len());
@@ -54,8 +90,20 @@ impl ChiSquareMap {
         self.consistency.add(restored, counts, &self.acquisition).map(drop)
     }
 
+    /// Adds the uncertainty of the frame that was added last to the page.
+    pub(super) fn add_uncertainty(&mut self, sigma: &Frame) {
+        if let Some(page) = &mut self.page {
+            page.add_uncertainty(sigma);
+        }
+    }
+
     pub(super) fn chi_square(&self) -> Option<f64> {
         self.consistency.chi_square()
+    }
+
+    /// Returns the chi-square of every pixel.
+    pub(super) fn map(&self) -> Frame {
+        self.consistency.map()
     }
 
     /// Composes counts above and restored frames below: the first, the middle (not for a pipe without length)

@@ -5,20 +5,33 @@ use super::chi_square_map::ChiSquareMap;
 use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use super::y4m;
+use crate::colour::{Rendering, encoded, is_linear};
 use crate::error::Result;
+use qudi_core::colour::ColourFilter;
 use qudi_core::{Error, Frame, linear_to_srgb, srgb_to_linear};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink, Schedule};
-use qudi_io::writer::ClipWriter;
+use qudi_io::writer::{ClipWriter, Planes};
 use serde_json::Value;
 use std::borrow::Cow;
 use std::ops::Range;
 use std::path::Path;
 
-/// An output of frames, and the tone curve with which they are written.
+/// An output of frames, and how they are written.
 pub(super) struct Output {
     place: Place,
     tonemap: Tonemap,
+    /// How colours are written, if there are any.
+    colour: Option<ColourOutput>,
+}
+
+/// How colours are written.
+struct ColourOutput {
+    rendering: Rendering,
+    /// True if the file holds the sensor's own colours in linear light.
+    is_linear: bool,
+    /// What every pixel sees of the colours.
+    filter: ColourFilter,
 }
 
 /// A place for frames.
@@ -32,18 +45,31 @@ enum Place {
 }
 
 impl Output {
-    pub(super) fn open(plan: &Plan, capture: &Capture, run: FolderRun) -> Result<Self> {
+    pub(super) fn open(
+        plan: &Plan,
+        capture: &Capture,
+        rendering: Option<Rendering>,
+        run: FolderRun,
+    ) -> Result<Self> {
         let (path, size) = (Path::new(&plan.output), capture.size());
         let (fps, overwrite) = (plan.played_fps, plan.overwrite);
+        let planes = if rendering.is_some() { Planes::Rgb } else { Planes::Gray };
+        let is_linear = is_linear(path, plan.tiff) && plan.tonemap == Tonemap::None;
+        let filter = capture.filter().cloned();
+        let colour = rendering.zip(filter).map(|(rendering, filter)| ColourOutput {
+            rendering,
+            is_linear,
+            filter,
+        });
         let place = if plan.output == "-" {
             y4m::write_header(size, fps)?;
             Place::Pipe
         } else if path.extension().is_none() {
             Place::Folder(FrameFolder::open(path, size, run, overwrite)?)
         } else {
-            Place::File(Some(ClipWriter::create(path, size, plan.tiff, fps, overwrite)?))
+            Place::File(Some(ClipWriter::create(path, size, planes, plan.tiff, fps, overwrite)?))
         };
-        Ok(Self { place, tonemap: plan.tonemap })
+        Ok(Self { place, tonemap: plan.tonemap, colour })
     }
 
     /// Returns how many frames from the start of `range` on an earlier run finished.
@@ -63,6 +89,10 @@ impl Output {
         pictures: Range<u64>,
     ) -> Result<()> {
         let Place::Folder(folder) = &self.place else { return Ok(()) };
+        if self.colour.is_some() {
+            // Colours were balanced and cut to what screens show: their counts are not known from them.
+            return Ok(());
+        }
         let mut counts = vec![0; capture.size().pixels()];
         for picture in pictures {
             schedule.instants.read(capture, picture, &mut counts)?;
@@ -88,6 +118,26 @@ impl Output {
             }
         }
         frame
+    }
+
+    /// Writes the colours of picture `number`, and returns what every pixel sees of them.
+    fn push_colour(&mut self, number: u64, restored: &[Frame; 3]) -> qudi_core::Result<Frame> {
+        let Some(ColourOutput { rendering, is_linear, filter }) = &self.colour else {
+            return Err(Error::request("colours of a gray capture", "cfa", "report this as a bug"));
+        };
+        let shown;
+        let planes = if *is_linear {
+            restored
+        } else {
+            shown = encoded(&rendering.rendered(restored));
+            &shown
+        };
+        match &mut self.place {
+            Place::Folder(folder) => folder.push_colour(number, planes)?,
+            Place::File(Some(writer)) => writer.push_colour(planes)?,
+            Place::File(None) | Place::Pipe => {}
+        }
+        Ok(filter.mosaic(restored))
     }
 
     /// Writes picture `number`, and returns it as a reader of the file sees it, where that differs.
@@ -134,7 +184,20 @@ impl<'a> Sink<'a> {
 
 impl RestoreSink for Sink<'_> {
     fn uncertainty(&mut self, _: u64, sigma: &Frame) -> qudi_core::Result<()> {
+        if let Some(map) = &mut self.map {
+            map.add_uncertainty(sigma);
+        }
         self.uncertainty.push(sigma)
+    }
+
+    fn colour(
+        &mut self,
+        number: u64,
+        restored: &[Frame; 3],
+        counts: &[u16],
+    ) -> qudi_core::Result<()> {
+        let seen = self.output.push_colour(number, restored)?;
+        self.map.as_mut().map_or(Ok(()), |map| map.add_colour(restored, &seen, counts))
     }
 
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {

@@ -4,6 +4,7 @@ use super::args::{Restore, Tonemap};
 use crate::args::tiff_samples::tiff_samples;
 use crate::args::{Global, Shard, Sum};
 use crate::capture::{Input, LightOverrides, Source, is_pipe, refuse_terminal};
+use crate::colour::Gains;
 use crate::error::{CliError, Result};
 use crate::methods::Method;
 use crate::methods::options::NetworkOptions;
@@ -31,6 +32,11 @@ pub(super) struct Plan {
     /// Native frames from one picture to the next, if not every frame becomes one.
     pub(super) every: Option<u64>,
     pub(super) tonemap: Tonemap,
+    /// True if luma alone is asked for.
+    pub(super) gray: bool,
+    /// True if luma alone is restored of a capture behind a colour filter.
+    pub(super) luma_alone: bool,
+    pub(super) white_balance: Option<Gains>,
     /// Frames per second of played outputs.
     pub(super) played_fps: f64,
     pub(super) light: LightOverrides,
@@ -43,6 +49,7 @@ pub(super) struct Plan {
     pub(super) tiff: TiffSamples,
     pub(super) chi_square_map: Option<PathBuf>,
     pub(super) side_by_side: Option<PathBuf>,
+    pub(super) html: Option<PathBuf>,
     pub(super) uncertainty: Option<PathBuf>,
     pub(super) overwrite: Overwrite,
 }
@@ -61,14 +68,16 @@ impl Plan {
             ));
         }
         let overwrite = global.overwrite();
-        let beside = [&args.chi_map, &args.side_by_side, &args.uncertainty];
+        let beside = [&args.chi_map, &args.side_by_side, &args.html, &args.uncertainty];
         for path in beside.into_iter().flatten() {
             refuse_taken(path, overwrite)?;
         }
-        if args.shard.is_some() && args.side_by_side.is_some() {
+        let shows = [(&args.side_by_side, "--side-by-side"), (&args.html, "--html")];
+        let shows = shows.into_iter().find(|(path, _)| path.is_some());
+        if let (Some(_), Some((_, flag))) = (args.shard, shows) {
             return Err(CliError::new(
                 "a part of the work has not all the frames to show",
-                "--side-by-side",
+                flag,
                 "ask for it when all parts are done: the same command without --shard",
             ));
         }
@@ -84,12 +93,16 @@ impl Plan {
             sum: args.reading.sum(),
             every: args.every,
             tonemap: args.tonemap,
+            gray: args.gray,
+            luma_alone: args.gray,
+            white_balance: args.wb,
             played_fps: args.fps.unwrap_or(PLAYED_FPS),
             light: LightOverrides {
                 ppp: args.ppp,
                 gain: args.gain,
                 mean_level: args.mean_level,
                 seed: args.seed.unwrap_or(0),
+                white: None,
             },
             method: args.method,
             network,
@@ -98,6 +111,7 @@ impl Plan {
             tiff: tiff_samples(args.float, Path::new(&args.output))?,
             chi_square_map: args.chi_map.clone(),
             side_by_side: args.side_by_side.clone(),
+            html: args.html.clone(),
             uncertainty: args.uncertainty.clone(),
             overwrite,
         };

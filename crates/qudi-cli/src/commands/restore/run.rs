@@ -1,26 +1,31 @@
 //! `qudi restore`: a capture through a method into frames.
 
 use super::args::{Restore, Tonemap};
+use super::challenge;
 use super::chi_square_map::ChiSquareMap;
 use super::output::{Output, Sink};
+use super::page::{About, RestoredPage};
 use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
 use crate::capture::{
     AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
 };
+use crate::colour::{Rendering, dng_tags};
 use crate::device;
-use crate::error::Result;
+use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::methods::default::default_method;
 use crate::methods::network::{OwnNetwork, device_failed};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{Built, Kind, Method};
-use crate::report::{Report, duration};
+use crate::report::{Output as PageFile, Report, duration};
 use crate::settings::Settings;
+use qudi_burst::ColourRestorer;
+use qudi_core::colour::FilterChoice;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
-use qudi_io::capture::Capture;
+use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::MaskChoice;
 use qudi_io::restore::{FolderRun, Inputs, RestoreSink, Schedule, Share, run as run_method};
 use serde_json::{Value, json};
@@ -40,18 +45,30 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
+    if args.challenge {
+        return challenge::run(args, settings, global, report);
+    }
     let plan = Plan::new(args, global, report.json())?;
     let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
-    let mut output = Output::open(&plan, job.capture(), run)?;
+    let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
+    let page_file = PageFile::open(plan.html.as_deref(), plan.overwrite)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
     let known = job.schedule.instants.pictures(job.capture());
     let frames = known.unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
-    let mut map = ChiSquareMap::new(job.capture().size(), known, &job.acquisition);
+    let page = plan.html.is_some().then(|| job.page(&plan));
+    let map = ChiSquareMap::new(job.capture().size(), known, &job.acquisition);
+    let mut map = map.with_page(page);
     let done = output.finished(part.clone());
+    if done > 0 && plan.html.is_some() && job.rendering.is_some() {
+        let help = "leave it out, or write into another folder";
+        let what =
+            format!("{done} frames were restored by an earlier run, whose colours are balanced");
+        return Err(CliError::new(what, "--html", help));
+    }
     let mut uncertainty = UncertaintyFile::create(&plan, job.method, job.capture(), done)?;
     let rest = part.start + done..part.end;
     if done == 0 {
@@ -84,6 +101,17 @@ pub(crate) fn run(
     let seconds = (made > 0).then(|| start.elapsed().as_secs_f64() / made as f64);
     let frames = part.end - part.start;
     let text = describe(&plan.output, &job, frames, done, map.chi_square(), seconds);
+    if let Some(page) = map.take_page() {
+        let about = About {
+            capture: plan.capture.display().to_string(),
+            method: job.method.name,
+            text: &text,
+            warnings: &job.warnings,
+            settings: &settings,
+            misfit: map.map(),
+        };
+        page_file.write(|| page.html(about))?;
+    }
     if plan.output == "-" {
         report.remark(text.trim_end());
         return Ok(());
@@ -102,16 +130,18 @@ pub(crate) fn run(
 
 /// What a run needs: a capture and its acquisition, the method, and the pictures that it makes.
 pub(super) struct Job {
-    aligned: AlignedCapture,
+    pub(super) aligned: AlignedCapture,
     pub(super) acquisition: Acquisition,
     light_source: &'static str,
-    method: &'static Method,
+    pub(super) method: &'static Method,
     restorer: Box<dyn Restorer>,
     /// What the method chose for this capture.
     choice: String,
     pub(super) schedule: Schedule,
     /// What makes the result doubtful.
     pub(super) warnings: Vec<String>,
+    /// Rendering of the colours, where colours are restored.
+    pub(super) rendering: Option<Rendering>,
 }
 
 impl Job {
@@ -133,6 +163,7 @@ impl Job {
         let CaptureAcquisition { acquisition, light_source } =
             CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
         let warnings = warnings::of_capture(capture, &summary);
+        let rendering = rendering(plan, capture, &summary, &acquisition)?;
         let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
         let overlap = plan.overlap * aligned.frames_per_sum();
         let schedule = aligned.schedule(restorer.as_ref(), overlap, plan.every)?;
@@ -145,11 +176,29 @@ impl Job {
             choice,
             schedule,
             warnings,
+            rendering,
         })
+    }
+
+    /// Returns the method in words, as in `qudi (regression) on cpu`.
+    pub(super) fn method_text(&self) -> String {
+        format!("{}{}", self.method.name, self.choice)
+    }
+
+    /// Returns the number of native frames in a frame; none if sums are aligned.
+    pub(super) fn plain_sum(&self) -> Option<u32> {
+        self.aligned.alignment.is_none().then(|| self.capture().summed())
     }
 
     pub(super) fn capture(&self) -> &Capture {
         &self.aligned.capture
+    }
+
+    /// Returns the page of the pictures, which are yet to come.
+    fn page(&self, plan: &Plan) -> RestoredPage {
+        let (size, max_count) = (self.capture().size(), self.acquisition.sensor.max_count());
+        let pictures = self.schedule.instants.pictures(self.capture());
+        RestoredPage::new(size, max_count, plan.tonemap, self.rendering.clone(), pictures)
     }
 
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
@@ -193,6 +242,12 @@ impl Job {
         if let Some(every) = plan.every {
             settings["every"] = json!(every);
         }
+        if let Some(filter) = capture.filter() {
+            settings["gray"] = json!(plan.luma_alone);
+            if let (Some(rendering), Some(choice)) = (&self.rendering, &capture.info().cfa) {
+                settings["dng"] = dng_tags(choice, filter, acquisition, rendering);
+            }
+        }
         if plan.tonemap != Tonemap::None {
             settings["tonemap"] = json!("srgb");
         }
@@ -233,6 +288,9 @@ impl Job {
             }
             if let Some(map) = &plan.read.dcr {
                 inputs.add("dcr", map)?;
+            }
+            if let Some(FilterChoice::Picture(path)) = &self.capture().info().cfa {
+                inputs.add("cfa", path)?;
             }
             let defects = &self.acquisition.sensor.defects;
             for (name, file) in
@@ -292,6 +350,35 @@ impl Job {
     }
 }
 
+/// Returns the rendering of the colours of a capture behind a colour filter, unless luma alone is restored.
+fn rendering(
+    plan: &Plan,
+    capture: &Capture,
+    summary: &Summary,
+    acquisition: &Acquisition,
+) -> Result<Option<Rendering>> {
+    if capture.filter().is_none() {
+        let given = plan.gray.then_some("--gray").or(plan.white_balance.map(|_| "--wb"));
+        let Some(flag) = given else { return Ok(None) };
+        return Err(CliError::new(
+            "the capture is gray",
+            flag,
+            "leave it out, or name the colour filter with --cfa",
+        ));
+    }
+    if plan.luma_alone {
+        return Ok(None);
+    }
+    if plan.output == "-" {
+        return Err(CliError::new(
+            "colours are not written as Y4M",
+            "-o -",
+            "name a file or a folder, or restore luma alone with --gray",
+        ));
+    }
+    Ok(Some(Rendering::new(plan.white_balance, capture, summary, acquisition)))
+}
+
 /// Makes the restorer of the named method, or of the default one, for this capture.
 fn restorer(
     plan: &Plan,
@@ -308,7 +395,10 @@ fn restorer(
     let part = aligned.capture.longest_part();
     let (restorer, choice) =
         aligned.capture.in_part(&part, |capture| method.restorer(capture, &seen, &plan.network))?;
-    Ok((method, (aligned.around(restorer), choice)))
+    let restorer = aligned.around(restorer);
+    let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
+    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.luma_alone);
+    Ok((method, (Box::new(coloured), choice)))
 }
 
 /// Returns the default method; prints the reason if it is not the network.
@@ -359,7 +449,8 @@ fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<
     })
 }
 
-fn describe(
+/// Describes a run in lines.
+pub(super) fn describe(
     output: &str,
     job: &Job,
     frames: u64,
@@ -368,8 +459,7 @@ fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture().size());
-    let (name, choice) = (job.method.name, &job.choice);
-    let mut text = format!("{output}   {frames} frames of {size} by {name}{choice}\n");
+    let mut text = format!("{output}   {frames} frames of {size} by {}\n", job.method_text());
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };
@@ -380,6 +470,9 @@ fn describe(
         format!("{ppp:.4} incident photons/pixel/frame ({source}), exposure {mean_level:.4}"),
     );
     line("sensor", format!("{}, gain {:.4} DN/e-", acquisition.sensor.name, acquisition.gain));
+    if let Some(rendering) = &job.rendering {
+        line("colours", rendering.describe());
+    }
     if resumed > 0 {
         line("resumed", format!("{resumed} frames were there already"));
     }

@@ -1,6 +1,7 @@
 //! Where the frames of a simulation go.
 
 use super::plan::OutputPlan;
+use crate::colour::{encoded, is_linear};
 use crate::error::{CliError, Result};
 use qudi_core::Error;
 use qudi_core::atomic_file::PendingFile;
@@ -92,7 +93,7 @@ impl Sink for Outputs<'_> {
             )?);
         }
         let create = |path: &PathBuf| {
-            ClipWriter::create(path, start.size, plan.tiff, PREVIEW_FPS, overwrite)
+            ClipWriter::create(path, start.size, plan.planes, plan.tiff, PREVIEW_FPS, overwrite)
         };
         self.truth = plan.truth.as_ref().map(create).transpose()?;
         let create = |path: &PathBuf| {
@@ -117,8 +118,12 @@ impl Sink for Outputs<'_> {
             let written = stdout().lock().write_all(&encode(exposed.counts));
             written.map_err(|e| Error::io("write", Path::new("standard output"), e))?;
         }
-        if let Some(truth) = &mut self.truth {
-            truth.push(exposed.truth)?;
+        if let (Some(truth), Some(path)) = (&mut self.truth, &self.plan.truth) {
+            match exposed.colour {
+                Some(colour) if is_linear(path, self.plan.tiff) => truth.push_colour(colour)?,
+                Some(colour) => truth.push_colour(&encoded(colour))?,
+                None => truth.push(exposed.truth)?,
+            }
         }
         if let Some(preview) = &mut self.preview {
             preview.push(exposed.counts)?;

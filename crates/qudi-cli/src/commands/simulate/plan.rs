@@ -6,9 +6,11 @@ use crate::args::number::COUNT;
 use crate::args::tiff_samples::tiff_samples;
 use crate::error::{CliError, Result};
 use crate::settings::Settings;
+use qudi_core::Error;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::colour::FilterChoice;
 use qudi_io::sidecar::Record;
-use qudi_io::writer::{BurstFormat, TiffSamples};
+use qudi_io::writer::{BurstFormat, Planes, TiffSamples};
 use qudi_sim::Simulation;
 use qudi_sim::clip::{Input, Sampling};
 use std::hash::{BuildHasher, RandomState};
@@ -33,6 +35,8 @@ pub(super) struct OutputPlan {
     /// Full scale of the counts.
     pub(super) max_count: u16,
     pub(super) truth: Option<PathBuf>,
+    /// Planes of the truth.
+    pub(super) planes: Planes,
     /// Samples of the truth's `.tif`.
     pub(super) tiff: TiffSamples,
     pub(super) flow: Option<PathBuf>,
@@ -91,6 +95,10 @@ impl Plan {
             format: format(args, max_count)?,
             max_count,
             truth: args.truth.clone(),
+            planes: match &simulation.sensor.colour {
+                Some(colour) if colour.cfa.is_some() => Planes::Rgb,
+                _ => Planes::Gray,
+            },
             tiff: match &args.truth {
                 Some(path) => tiff_samples(args.float, path)?,
                 None => TiffSamples::U16,
@@ -188,6 +196,14 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
         let help = format!("give a number up to {}", COUNT.end());
         return Err(CliError::new(format!("{frames} frames"), "--frames", help));
     }
+    let mut sensor = settings.sensor(&settings.get::<String>("simulate.sensor")?)?;
+    if let Some(FilterChoice::Picture(path)) =
+        sensor.colour.as_mut().and_then(|colour| colour.cfa.as_mut())
+    {
+        // Absolute, so that a record works from any folder.
+        *path = std::path::absolute(&*path)
+            .map_err(|e| Error::io("find the filter", Path::new(path), e))?;
+    }
     // Drawn seeds stay short enough to be read out and typed.
     let drawn = || RandomState::new().hash_one(0) % 1_000_000;
     Ok(Simulation {
@@ -199,7 +215,7 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
             transfer: settings.get("simulate.transfer")?,
             white: settings.get("simulate.white")?,
         },
-        sensor: settings.sensor(&settings.get::<String>("simulate.sensor")?)?,
+        sensor,
         ppp: settings.get("simulate.ppp")?,
         ppp_def: settings.get("simulate.ppp_def")?,
         mean_level: settings.get("simulate.exposure")?,

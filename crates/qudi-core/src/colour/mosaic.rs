@@ -15,10 +15,13 @@ pub struct Mosaic {
 
 /// The pixels of one letter of the pattern: every `step`-th, from a row and a column on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct MosaicPlane {
-    pub(crate) step: usize,
-    pub(crate) row: usize,
-    pub(crate) column: usize,
+pub struct MosaicPlane {
+    /// Pixels from one to the next, along rows and columns.
+    pub step: usize,
+    /// The first row.
+    pub row: usize,
+    /// The first column.
+    pub column: usize,
 }
 
 /// Letters of colour filters: red, green, blue, white (or clear), cyan, magenta, yellow.
@@ -36,7 +39,7 @@ impl Mosaic {
     }
 
     /// Returns the pixels of letter `index` of the pattern, if it has that many.
-    pub(crate) fn plane(&self, index: usize) -> Option<MosaicPlane> {
+    pub fn plane(&self, index: usize) -> Option<MosaicPlane> {
         let step = self.side();
         let at = |corner: usize, within: usize| (corner + within) % step;
         (index < self.letters.len()).then(|| MosaicPlane {
@@ -46,8 +49,16 @@ impl Mosaic {
         })
     }
 
+    /// Returns the letter of the pixel in a row and a column.
+    pub fn letter(&self, row: usize, column: usize) -> char {
+        let side = self.side();
+        let within = |at: usize, corner: usize| (at + side - corner) % side;
+        let index = within(row, self.corner.0) * side + within(column, self.corner.1);
+        char::from(self.letters.as_bytes()[index])
+    }
+
     /// Lists the option for each plane, as in "`channel 0` (r), 1 (g)".
-    pub(crate) fn choices(&self) -> String {
+    pub fn choices(&self) -> String {
         let each = self.letters.chars().enumerate();
         let each: Vec<_> = each.map(|(i, letter)| format!("{i} ({letter})")).collect();
         format!("`channel {}`", each.join(", "))
@@ -60,11 +71,15 @@ impl FromStr for Mosaic {
     fn from_str(text: &str) -> Result<Self, String> {
         let wanted = || {
             format!(
-                "expected the colours of a tile of 2 x 2 or 4 x 4 pixels and the row and column where it begins, as in rggb@0,0 (letters {LETTERS}); not `{text}`"
+                "expected the colours of a tile of 2 x 2 or 4 x 4 pixels and the row and column where it begins, as in rggb@0,0 or quad-rggb (letters {LETTERS}), or a picture of the filter (.png, .tif); not `{text}`"
             )
         };
         let (letters, corner) = text.split_once('@').unwrap_or((text, "0,0"));
         let letters = letters.to_lowercase();
+        let letters = match letters.strip_prefix("quad-") {
+            Some(tile) if tile.len() == 4 => quad(tile),
+            _ => letters,
+        };
         let known = letters.chars().all(|letter| LETTERS.contains(letter));
         let corner = corner.split_once(',').and_then(|(row, column)| {
             Some((row.trim().parse().ok()?, column.trim().parse().ok()?))
@@ -76,6 +91,12 @@ impl FromStr for Mosaic {
         let side = mosaic.side();
         if corner.0 >= side || corner.1 >= side { Err(wanted()) } else { Ok(mosaic) }
     }
+}
+
+/// Returns the letters of a quad pattern, in which every letter of a tile covers 2 x 2 pixels.
+fn quad(tile: &str) -> String {
+    let letters: Vec<char> = tile.chars().collect();
+    (0..16).map(|i| letters[i / 8 * 2 + i % 4 / 2]).collect()
 }
 
 impl std::fmt::Display for Mosaic {
@@ -118,8 +139,20 @@ mod tests {
     }
 
     #[test]
+    fn letters_repeat_from_the_corner_on() {
+        let letters = |text: &str| -> String {
+            let mosaic: Mosaic = text.parse().unwrap();
+            (0..8).map(|i| mosaic.letter(i / 4, i % 4)).collect()
+        };
+        assert_eq!(letters("rggb"), "rgrggbgb");
+        assert_eq!(letters("rggb@1,0"), "gbgbrgrg");
+        assert_eq!(letters("quad-rggb"), "rrggrrgg");
+        assert_eq!("quad-rggb".parse::<Mosaic>().unwrap().pattern(), "rrggrrggggbbggbb");
+    }
+
+    #[test]
     fn rejects_what_is_no_pattern() {
-        for text in ["", "rgb", "rgxb", "rggb@2,0", "rggb@0", "rggb@a,b", "rggbrggb"] {
+        for text in ["", "rgb", "rgxb", "rggb@2,0", "rggb@0", "rggb@a,b", "rggbrggb", "quad-rgg"] {
             assert!(text.parse::<Mosaic>().is_err(), "{text}");
         }
     }

@@ -1,0 +1,149 @@
+//! Captures behind a colour filter array: simulated, described, restored, scored.
+
+use crate::support::{npy_bytes, refused, run, scratch};
+use std::path::{Path, PathBuf};
+
+const FRAMES: usize = 11;
+const HEIGHT: usize = 64;
+const WIDTH: usize = 96;
+
+/// Writes a colour clip: a texture of slowly changing hue that moves.
+fn clip(folder: &Path) {
+    let mut bytes = Vec::new();
+    for t in 0..FRAMES {
+        for i in 0..HEIGHT * WIDTH {
+            let x = (i % WIDTH) as f32 - 0.5 * t as f32;
+            let y = (i / WIDTH) as f32 + 0.3 * t as f32;
+            let luma = 0.35 + 0.1 * (0.4 * x + 0.15 * y).sin() + 0.1 * (0.3 * y - 0.35 * x).sin();
+            for k in 0..3 {
+                let hue = 0.07 * x - 0.05 * y + 2.1 * k as f32;
+                bytes.extend((luma * (1.0 + 0.5 * hue.sin())).to_le_bytes());
+            }
+        }
+    }
+    let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH}, 3)");
+    std::fs::write(folder.join("clip.npy"), npy_bytes("<f4", &shape, &bytes)).unwrap();
+}
+
+/// Exposes the clip behind a filter; the truth goes to `t.npy`.
+fn exposed(name: &str, cfa: &str) -> PathBuf {
+    let folder = scratch(name);
+    clip(&folder);
+    let simulate = "simulate clip.npy -o m.npy --truth t.npy --ppp 3.25 --seed 3 --cfa";
+    run(&folder, &format!("{simulate} {cfa}"));
+    folder
+}
+
+fn document(folder: &Path, args: &str) -> serde_json::Value {
+    serde_json::from_str(&run(folder, args)).unwrap()
+}
+
+#[test]
+fn colours_of_a_mosaic_are_restored() {
+    let folder = exposed("colour-restore", "rggb");
+    let text = run(&folder, "info m.npy");
+    assert!(text.contains("rggb@0,0: mean counts red") && text.contains("blue"), "{text}");
+    run(&folder, "restore m.npy -o c.npy --method qbp-refined");
+    let shape = npy_shape(&folder.join("c.npy"));
+    assert_eq!(shape, format!("({FRAMES}, {HEIGHT}, {WIDTH}, 3)"));
+    let scores = document(&folder, "eval t.npy --restored c.npy --json");
+    let linear = scores["cpsnr_linear"].as_f64().unwrap();
+    assert!(linear > 27.0, "{scores}");
+    assert!(scores["ciede2000_median"].as_f64().unwrap() < 6.0, "{scores}");
+    // Without its colours, the clip is far from itself.
+    run(&folder, "restore m.npy -o g.npy --method qbp-refined --gray");
+    assert_eq!(npy_shape(&folder.join("g.npy")), format!("({FRAMES}, {HEIGHT}, {WIDTH})"));
+}
+
+#[test]
+fn pictures_are_balanced_and_the_manifest_has_the_names_of_dng() {
+    let folder = exposed("colour-picture", "gbrg");
+    let restore = "restore m.npy --method average --wb 2,1,0.5 --end 3";
+    run(&folder, &format!("{restore} -o f"));
+    run(&folder, &format!("{restore} -o f.tif --float"));
+    let image = image::open(folder.join("f/frame_000000.png")).unwrap();
+    assert_eq!(image.color(), image::ColorType::Rgb16);
+    let manifest = std::fs::read_to_string(folder.join("f/manifest.json")).unwrap();
+    let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
+    let dng = &manifest["settings"]["dng"];
+    assert_eq!(dng["CFAPattern"], serde_json::json!([1, 2, 0, 1]));
+    assert_eq!(dng["AsShotNeutral"], serde_json::json!([0.5, 1.0, 2.0]));
+    assert_eq!(dng["WhiteLevel"], 7);
+    let mean = |k: usize| {
+        let samples = image.as_rgb16().unwrap().pixels().map(|pixel| f64::from(pixel.0[k]));
+        samples.sum::<f64>() / (65535 * HEIGHT * WIDTH) as f64
+    };
+    assert!(mean(0) > 1.2 * mean(1) && mean(1) > 1.2 * mean(2), "gains brighten red");
+    let text = run(&folder, "restore m.npy --method average -o g.gif --end 2");
+    assert!(text.contains("a guess"), "{text}");
+}
+
+#[test]
+fn a_picture_of_the_filter_is_turned_with_the_frames() {
+    let folder = scratch("colour-filter");
+    clip(&folder);
+    let colours = [[255, 0, 0], [0, 255, 0], [0, 255, 0], [0, 0, 255]];
+    let pixel = |x: u32, y: u32| image::Rgb(colours[(y % 2 * 2 + x % 2) as usize]);
+    let filter = image::RgbImage::from_fn(WIDTH as u32, HEIGHT as u32, pixel);
+    filter.save(folder.join("rggb.png")).unwrap();
+    let simulate = "simulate clip.npy --ppp 3.25 --seed 3";
+    run(&folder, &format!("{simulate} -o a.npy --cfa rggb"));
+    run(&folder, &format!("{simulate} -o b.npy --cfa rggb.png"));
+    let bytes = |name: &str| std::fs::read(folder.join(name)).unwrap();
+    assert_eq!(bytes("a.npy"), bytes("b.npy"));
+    let restore = "--method average --crop 1:41,3:63 --orient flip-h";
+    run(&folder, &format!("restore a.npy -o ca.npy {restore}"));
+    run(&folder, &format!("restore b.npy -o cb.npy {restore}"));
+    assert_eq!(bytes("ca.npy"), bytes("cb.npy"));
+    image::RgbImage::from_fn(8, 8, pixel).save(folder.join("small.png")).unwrap();
+    refused(&folder, "info a.npy --cfa small.png", &["a filter of 8 x 8", "64 x 96"]);
+    let mut other = filter;
+    other.put_pixel(5, 0, image::Rgb([250, 0, 0]));
+    other.save(folder.join("other.png")).unwrap();
+    refused(&folder, "info a.npy --cfa other.png", &["[250, 0, 0] at row 0, column 5"]);
+    refused(&folder, "info a.npy --cfa rggb.png --channel 1", &["which is a picture"]);
+}
+
+#[test]
+fn contradictions_are_refused() {
+    let folder = exposed("colour-refused", "rggb");
+    refused(&folder, "restore m.npy -o - --method average", &["not written as Y4M", "--gray"]);
+    refused(&folder, "restore m.npy -o a.npy --wb 1,2", &["gains of red, green and blue"]);
+    let full = "info clip8.npy --cfa rggb";
+    let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH}, 3)");
+    let counts = vec![1; FRAMES * HEIGHT * WIDTH * 3];
+    std::fs::write(folder.join("clip8.npy"), npy_bytes("|u1", &shape, &counts)).unwrap();
+    refused(&folder, full, &["a colour capture of 3 channels"]);
+    run(&folder, "simulate scene:text --size 64x96 --frames 3 -o gray.npy --seed 1");
+    refused(&folder, "restore gray.npy -o x.npy --gray", &["the capture is gray", "--gray"]);
+    refused(&folder, "restore gray.npy -o x.npy --wb 1,1,1", &["the capture is gray", "--wb"]);
+    refused(&folder, "simulate clip.npy -o x.npy --cfa cmyg", &["the colour `c`"]);
+    refused(&folder, "simulate clip.npy -o x.npy --cfa rgxb", &["rggb@0,0"]);
+    refused(&folder, "eval t.npy --restored gray.npy", &["holds no colour frames"]);
+    refused(&folder, "eval m.npy --capture", &["colour filter rggb@0,0", "--channel"]);
+}
+
+/// Returns the shape in the header of a `.npy` file.
+fn npy_shape(path: &Path) -> String {
+    let bytes = std::fs::read(path).unwrap();
+    let header = String::from_utf8_lossy(&bytes[..128]).into_owned();
+    let shape = header.split("'shape': ").nth(1).unwrap();
+    format!("{})", shape.split(')').next().unwrap())
+}
+
+#[test]
+fn phases_that_the_picture_contradicts_are_refused() {
+    let folder = exposed("colour-phase", "rggb");
+    // A flat orange scene: red, green and blue differ everywhere.
+    let mut bytes = Vec::new();
+    for _ in 0..3 * 160 * 160 {
+        [0.6f32, 0.35, 0.1].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+    }
+    std::fs::write(folder.join("flat.npy"), npy_bytes("<f4", "(3, 160, 160, 3)", &bytes)).unwrap();
+    run(&folder, "simulate flat.npy -o f.npy --cfa rggb --ppp 20 --seed 2");
+    std::fs::remove_file(folder.join("f.npy.json")).unwrap();
+    let info = "info f.npy --bits 3 --cfa";
+    run(&folder, &format!("{info} rggb"));
+    refused(&folder, &format!("{info} rggb@0,1"), &["two green pixels", "rggb@0,1"]);
+    run(&folder, &format!("{info} bggr"));
+}
