@@ -58,9 +58,12 @@ def demosaiced(planes, letters, size):
     return np.stack([np.mean(of[c], 0) for c in "rgb"], -1)
 
 
-def shown(planes, truth):
-    """8-bit sRGB of linear light, at the brightness of the truth."""
-    gain = (planes * truth).sum() / max((planes * planes).sum(), 1e-12)
+def best_gain(planes, truth):
+    return (planes * truth).sum() / max((planes * planes).sum(), 1e-12)
+
+
+def shown(planes, gain):
+    """8-bit sRGB of linear light."""
     light = np.clip(gain * planes, 0, 1)
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return (255 * curve + 0.5).astype(np.uint8)
@@ -136,10 +139,11 @@ class Runner:
             for k, letter in enumerate(tile):
                 mosaic[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)] = counts[k // 2 :: 2, k % 2 :: 2]
             if arguments.picture:
-                dimmed = [shown(mosaic, middle)]
-                rest = [shown(pictures[name], middle) for name in ("average", "qudi", "truth")]
+                panels = [shown(mosaic, 1 / counts.max())]
+                for name in ("average", "qudi", "truth"):
+                    panels.append(shown(pictures[name], best_gain(pictures[name], middle)))
                 gap = np.full((frame_size[0], 6, 3), 255, np.uint8)
-                parts = [part for panel in dimmed + rest for part in (panel, gap)][:-1]
+                parts = [part for panel in panels for part in (panel, gap)][:-1]
                 write_png(arguments.picture, np.concatenate(parts, 1))
         full = []
         for name, clip in [("gray", truth @ LUMA), *[(k, truth[..., k]) for k in range(3)]]:

@@ -137,7 +137,7 @@ fn phases_that_the_picture_contradicts_are_refused() {
     // A flat orange scene: red, green and blue differ everywhere.
     let mut bytes = Vec::new();
     for _ in 0..3 * 160 * 160 {
-        [0.6f32, 0.35, 0.1].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+        bytes.extend([0.6f32, 0.35, 0.1].iter().flat_map(|value| value.to_le_bytes()));
     }
     std::fs::write(folder.join("flat.npy"), npy_bytes("<f4", "(3, 160, 160, 3)", &bytes)).unwrap();
     run(&folder, "simulate flat.npy -o f.npy --cfa rggb --ppp 20 --seed 2");

@@ -56,7 +56,9 @@ impl Colours<'_> {
             }
         }
         let least = MIN_LUMA * self.mean_luma();
-        luma.iter_mut().for_each(|luma| *luma = luma.max(least));
+        for luma in &mut luma {
+            *luma = luma.max(least);
+        }
         let sigma = (FIRST_CHROMA_WIDTH * self.sigma).max(FIRST_LUMA_SIGMA);
         let ratios = std::array::from_fn(|k| {
             let light = merged.light(k, self.response, sigma, self.mean[k]);
