@@ -27,6 +27,7 @@ while :; do
     if wait "$run" 2>/dev/null; then break; fi
     killed=$((killed + 1))
     # A run killed before its first state starts anew; one killed later goes on.
+    resume=--force
     if [ -d "$folder/killed/state" ] || [ -d "$folder/killed/state.old" ]; then resume=--resume; fi
 done
 

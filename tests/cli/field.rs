@@ -241,6 +241,7 @@ fn looks_at_a_capture_on_one_page() {
     let text = run(&folder, "look c.npy --sensor swissspad2");
     assert!(text.contains("restore    `qudi restore` makes") && text.contains("sum  "), "{text}");
     let page = std::fs::read_to_string(folder.join("c-look.html")).unwrap();
+    assert!(page.contains("<svg class=\"timeline\"") && page.contains("counts per pixel"));
     assert!(page.contains("base64,/9j/") && page.contains("c.npy") && page.contains("one instant"));
     // Binary frames are shown without a sensor, too.
     run(&folder, "look c.npy -o look.png");
@@ -320,4 +321,97 @@ fn counts_below_the_pedestal_are_signed() {
         sums[i % width * 2 / width] += value / (frames * height * width / 2) as f64;
     }
     assert!((sums[0] - 0.05).abs() < 0.03 && (sums[1] - 0.55).abs() < 0.03, "{sums:?}");
+}
+
+/// Two scenes one after the other are restored as each of them alone.
+#[test]
+fn nothing_reaches_over_a_cut() {
+    let folder = capture("field-cut", 220, 0.2, 0.0);
+    let one = std::fs::read(folder.join("c.npy")).unwrap();
+    let frames = &one[one.len() - 220 * 32 * 6..];
+    // The other scene has half of the light on its right half.
+    let other = frames.iter().enumerate();
+    let other: Vec<u8> =
+        other.map(|(i, &byte)| if i % 6 < 3 { byte } else { byte & 0x55 }).collect();
+    let both = [frames, &other].concat();
+    std::fs::write(folder.join("both.npy"), npy_bytes("|u1", "(440, 32, 6)", &both)).unwrap();
+    let restore = "restore both.npy --sensor swissspad2 --ppp 1 --exposure 0.4 --mask none";
+    let values = |name: &str| {
+        let bytes = std::fs::read(folder.join(name)).unwrap();
+        bytes[bytes.iter().position(|&byte| byte == b'\n').unwrap() + 1..].to_vec()
+    };
+    for options in
+        ["--sum 7 --method average", "--sum 7 --method qbp --every 2", "--sum 3 --every 8"]
+    {
+        let run_part = |name: &str, part: &str| {
+            run(&folder, &format!("{restore} {options} {part} -o {name}.npy -f"));
+            values(&format!("{name}.npy"))
+        };
+        let parts = [run_part("before", "--end 220"), run_part("after", "--start 220")].concat();
+        assert!(run_part("whole", "") == parts, "{options}");
+    }
+    let text = said(&folder, &format!("{restore} --method average -o frames"));
+    assert!(text.contains("cuts to another scene at frames: 220"), "{text}");
+    let manifest = std::fs::read_to_string(folder.join("frames/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_str(&manifest).unwrap();
+    assert_eq!(manifest["settings"]["parts"], serde_json::json!([[0, 220], [220, 440]]));
+    assert_eq!(manifest["results"]["findings"]["cuts"], serde_json::json!([220]));
+    // A run that was interrupted goes on to the same pictures, and the same chi-square.
+    let chi_square = |manifest: &Value| manifest["results"]["chi_square"].as_f64().unwrap();
+    let pictures = listing(&folder.join("frames"));
+    let middle = format!("frame_{:06}.png", pictures.len() / 2);
+    std::fs::remove_file(folder.join("frames").join(middle)).unwrap();
+    run(&folder, &format!("{restore} --method average -o frames"));
+    let again = std::fs::read_to_string(folder.join("frames/manifest.json")).unwrap();
+    let again: Value = serde_json::from_str(&again).unwrap();
+    assert_eq!(chi_square(&again), chi_square(&manifest));
+    let page = run(&folder, "look both.npy --sensor swissspad2 --json");
+    let page: Value = serde_json::from_str(&page).unwrap();
+    assert_eq!(page["findings"]["cuts"], serde_json::json!([220]));
+    let page = std::fs::read_to_string(folder.join("both-look.html")).unwrap();
+    assert!(page.contains("<title>cut: frame 220</title>"));
+}
+
+#[test]
+fn calibration_warns_of_a_picture_in_a_dark_capture() {
+    let folder = capture("field-dark", 200, 0.2, 0.0);
+    let text = said(&folder, "calibrate c.npy --sensor swissspad2 -o lit.toml");
+    assert!(text.contains("the capture shows a picture"), "{text}");
+    let mut state = 3_u64;
+    let mut byte = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        (state >> 56) as u8
+    };
+    let dark: Vec<u8> = (0..200 * 32 * 6).map(|_| byte() & byte() & byte()).collect();
+    std::fs::write(folder.join("d.npy"), npy_bytes("|u1", "(200, 32, 6)", &dark)).unwrap();
+    let text = said(&folder, "calibrate d.npy --sensor swissspad2 -o dark.toml");
+    assert!(!text.contains("picture"), "{text}");
+}
+
+/// A pedestal that nobody names is told from dark counts, and from then on subtracted.
+#[test]
+fn calibration_finds_the_pedestal() {
+    let folder = scratch("field-pedestal-found");
+    let mut state = 5_u64;
+    let mut uniform = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        (state >> 40) as f64 / (1u64 << 24) as f64
+    };
+    // Sums of twelve uniform numbers are nearly normal.
+    let values = (0..30 * 32 * 48).map(|_| {
+        let normal: f64 = (0..12).map(|_| uniform()).sum::<f64>() - 6.0;
+        (100.0 + 2.0 * 1.5 * normal).round() as u16
+    });
+    let bytes: Vec<u8> = values.flat_map(u16::to_le_bytes).collect();
+    std::fs::write(folder.join("d.npy"), npy_bytes("<u2", "(30, 32, 48)", &bytes)).unwrap();
+    for (name, options) in [("found", ""), ("given", "--offset 100")] {
+        let calibrate = format!("calibrate d.npy --sensor ideal --gain 2 -o {name}.toml {options}");
+        let found: Value = serde_json::from_str(&run(&folder, &(calibrate + " --json"))).unwrap();
+        let number = |key: &str| found[key].as_f64().unwrap();
+        assert!((number("offset") - 100.0).abs() < 0.2, "{found}");
+        assert!(number("dark_per_frame") < 0.05 && number("hot_pixels") < 3.0, "{found}");
+        assert!((number("read_noise") - 1.5).abs() < 0.1, "{found}");
+        let sensor = std::fs::read_to_string(folder.join(format!("{name}.toml"))).unwrap();
+        assert!(sensor.contains("offset = "), "{sensor}");
+    }
 }

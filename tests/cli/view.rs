@@ -38,7 +38,7 @@ impl View {
     /// Sends bytes and returns the answer.
     fn ask(&self, request: &[u8]) -> String {
         let mut stream = TcpStream::connect(self.parts().0).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
         stream.write_all(request).unwrap();
         let mut answer = Vec::new();
         // A refused request may still be on its way when the server hangs up.

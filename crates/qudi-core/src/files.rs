@@ -7,6 +7,7 @@ mod ffmpeg;
 pub mod natural_order;
 pub mod npy;
 pub mod regular_file;
+mod unfinished_folder;
 mod unnamed_file;
 
 pub use ffmpeg::ffmpeg;

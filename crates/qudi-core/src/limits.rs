@@ -6,8 +6,11 @@
 /// Pixels of one frame: more than any sensor has, and indices fit into 32 bits.
 pub const FRAME_PIXELS: usize = 1 << 29;
 
-/// Pixels of an image that is decoded as a whole: 134 megapixels, or 512 MiB as 32-bit floats.
-pub const IMAGE_PIXELS: u64 = 1 << 27;
+/// Pixels of an image that is decoded as a whole: 67 megapixels, or 256 MiB as 32-bit floats.
+pub const IMAGE_PIXELS: u64 = 1 << 26;
+
+/// Pixels of a frame of a capture that is stored as images, whose sums take 1 GiB: more than any sensor has.
+pub const IMAGE_FRAME_PIXELS: u64 = 1 << 25;
 
 /// Bytes of one frame in a video stream: enough for 8-bit 4:4:4 frames of the largest images.
 pub const VIDEO_FRAME_BYTES: usize = 1 << 30;

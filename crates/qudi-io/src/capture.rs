@@ -6,6 +6,7 @@
 
 mod auto_sum;
 mod calibrate;
+mod counter;
 mod depth;
 mod filter;
 mod findings;
@@ -13,15 +14,20 @@ mod frame_statistics;
 mod judge;
 mod mosaic;
 mod open;
+mod parts;
+mod pedestal;
 mod pixel_map;
 mod scene_changes;
 mod summary;
+mod timeline;
 mod view;
 
 pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
 pub use findings::FrameFindings;
+pub use pedestal::Pedestal;
 pub use summary::{BitOrderCheck, Summary};
+pub use timeline::Stretch;
 
 use crate::description::{CaptureInfo, ReadOptions};
 use crate::frames::depth::DepthChecked;
@@ -61,6 +67,11 @@ pub struct Capture {
     findings: FrameFindings,
     /// Broken native frames, and the good ones that are read instead.
     stand_ins: BTreeMap<u64, u64>,
+    /// Native frames before which the scene or the light changes suddenly, in rising order.
+    boundaries: Vec<u64>,
+    timeline: Vec<Stretch>,
+    /// Stored pixels that hold a frame counter.
+    counter: Vec<usize>,
     /// Dark electrons per native frame and pixel of the view, if known.
     dark: Option<Vec<f32>>,
     /// The colour filter, of captures whose colours are read.
@@ -141,6 +152,9 @@ impl Capture {
             bad: BadPixels::default(),
             findings: FrameFindings::default(),
             stand_ins: BTreeMap::new(),
+            boundaries: Vec::new(),
+            timeline: Vec::new(),
+            counter: Vec::new(),
             dark: None,
             filter,
             stored: vec![0; stored.pixels()],
@@ -163,7 +177,8 @@ impl Capture {
         options: &ReadOptions,
         sensor: Option<&Sensor>,
     ) -> Result<Self> {
-        check_sum(sum, self.native_frames(), &self.info)?;
+        let longest = self.longest_part();
+        check_sum(sum, longest.end - longest.start, &self.info)?;
         self.sum = sum;
         self.complete = false;
         self.wait_for(FIRST_WINDOW)?;
@@ -206,6 +221,9 @@ impl Capture {
             bad: BadPixels::default(),
             findings: FrameFindings::default(),
             stand_ins: BTreeMap::new(),
+            boundaries: Vec::new(),
+            timeline: Vec::new(),
+            counter: Vec::new(),
             dark: None,
             filter: None,
             stored: vec![0; size.pixels()],
@@ -231,11 +249,14 @@ impl Capture {
 
     /// Returns the number of output frames; for a pipe, of those that have arrived.
     pub fn frames(&self) -> u64 {
-        self.native_frames() / u64::from(self.sum)
+        self.sums()
     }
 
     /// Returns the number of all output frames; `None` while the length of a pipe is unknown.
     pub fn length(&self) -> Option<u64> {
+        if self.complete {
+            return Some(self.sums());
+        }
         let end = match (self.native.length(), self.end) {
             (Some(length), Some(end)) => length.min(end),
             (length, _) => length?,
@@ -276,9 +297,10 @@ impl Capture {
                 format!("the pipe ended after {} frames, before `end {end}`", self.range.end);
             self.info.notes.push(text);
         }
-        let left_over = self.native_frames() % u64::from(self.sum);
+        let left_over = self.native_frames() - self.sums() * u64::from(self.sum);
         if left_over > 0 {
-            let text = format!("the last {left_over} frames fill no sum of {}", self.sum);
+            let place = if self.boundaries.is_empty() { "the last" } else { "at ends of parts," };
+            let text = format!("{place} {left_over} frames fill no sum of {}", self.sum);
             self.info.notes.push(text);
         }
     }
@@ -370,7 +392,7 @@ impl Capture {
     /// [`Error`] if the file cannot be read, or a sum does not fit into 16 bits.
     pub fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
         self.check(frame..frame + 1)?;
-        self.read_from(frame * u64::from(self.sum), counts)
+        self.read_from(self.begins(frame), counts)
     }
 
     /// Reads the output frame that begins with native frame `native`, counted from the first in use; sums may
@@ -429,6 +451,14 @@ impl Capture {
         self.native.copy_packed(self.range.start + first, bytes)
     }
 
+    /// Compares the stored data with their checksum, also where their frames were not read.
+    ///
+    /// # Errors
+    /// [`Error`] if they differ, or the file cannot be read.
+    pub fn verify(&mut self) -> Result<()> {
+        self.native.verify()
+    }
+
     /// Sums output frames, bad pixels repaired.
     ///
     /// # Errors
@@ -442,8 +472,19 @@ impl Capture {
     /// Sums output frames, turned and cropped only.
     fn stored_total(&mut self, frames: Range<u64>, sums: &mut [u32]) -> Result<()> {
         self.check(frames.clone())?;
-        let native = |frame: u64| self.range.start + frame * u64::from(self.sum);
-        self.stored_sum(native(frames.start)..native(frames.end), sums)
+        let native = |frame: u64| self.range.start + self.begins(frame);
+        if self.boundaries.is_empty() || frames.end - frames.start < 2 {
+            let first = native(frames.start);
+            let count = (frames.end - frames.start) * u64::from(self.sum);
+            return self.stored_sum(first..first + count, sums);
+        }
+        let mut one = vec![0; sums.len()];
+        sums.fill(0);
+        for frame in frames {
+            self.stored_total(frame..frame + 1, &mut one)?;
+            sums.iter_mut().zip(&one).for_each(|(sum, one)| *sum += one);
+        }
+        Ok(())
     }
 
     /// Sums stored frames `range`, turned and cropped only.

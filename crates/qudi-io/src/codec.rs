@@ -216,7 +216,7 @@ const FOREIGN_FORMATS: &[(&[u8], &[&str], &str, &str)] = &[
     ),
     (
         b"ZISRAWFILE",
-        &["czi", "nd2", "lif", "oib", "oif", "lsm", "ims"],
+        &["czi", "nd2", "lif", "oib", "oif", "lsm", "ims", "dv", "mrc"],
         "a microscope's own format",
         "export it from ImageJ (Bio-Formats) as a TIFF stack of 8 or 16 bits",
     ),
@@ -225,6 +225,12 @@ const FOREIGN_FORMATS: &[(&[u8], &[&str], &str, &str)] = &[
         &["ser"],
         "a SER video of an astronomer's camera",
         "export its frames as a multi-page TIFF or FITS, as PIPP, Siril or `serpy` do, and name that",
+    ),
+    (
+        b"Andor Technology",
+        &["sif", "dcimg", "cine", "mraw", "cih", "cihx", "b16", "seq", "spe", "xcap"],
+        "a camera's own format",
+        "export it from the camera's software as a TIFF stack of 16 bits, uncompressed and unscaled",
     ),
     (
         b"% evt",

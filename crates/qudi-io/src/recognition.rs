@@ -10,4 +10,4 @@ pub use bit_order::{Z_SCORE_THRESHOLD, bit_order_z_score};
 pub(crate) use byte_kind::ByteKind;
 pub(crate) use probe::Probe;
 pub(crate) use raw_sample::{Convention, SWISSSPAD_FILE_BYTES, stem};
-pub(crate) use sequence::numbered;
+pub(crate) use sequence::{Numbered, numbered};

@@ -3,6 +3,7 @@
 //! An [`Input`] says what to read and can be opened as often as needed; an [`ExposureSource`]
 //! yields, for each output frame, the instants that one exposure sees.
 
+mod combs;
 mod gif;
 mod image_file;
 mod images;
@@ -16,11 +17,12 @@ mod tiff_pages;
 mod video;
 mod y4m;
 
+pub(crate) use combs::Combs;
 pub use image_file::{AssumedWhite, decode_image, is_image, read_still};
 pub use input::{Input, Sampling};
 pub use mosaic::filter_picture;
 pub(crate) use mosaic::{MosaicClip, decodes};
-pub use video::Video;
+pub use video::{Video, VideoStream, video_stream};
 
 use qudi_core::Result;
 use qudi_core::flow::Flow;

@@ -2,7 +2,7 @@
 //!
 //! Memory holds one exposure at a time, however long the clip.
 
-use crate::clip::{AssumedWhite, ExposureSource, Input, MosaicClip, Sampling, decodes};
+use crate::clip::{AssumedWhite, Combs, ExposureSource, Input, MosaicClip, Sampling, decodes};
 use qudi_core::Checksum;
 use qudi_core::flow::Flow;
 use qudi_core::sensor::{PixelMaps, Sensor};
@@ -148,10 +148,11 @@ pub fn simulate(
 
     let mut source = simulation.open()?;
     let info = source.info();
-    let mut clip = ClipStatistics::default();
+    let (mut clip, mut combs) = (ClipStatistics::default(), Combs::default());
     let mut frames = 0;
     while let Some(exposure) = source.next()? {
         exposure.instants.iter().for_each(|frame| clip.add(&frame.data));
+        combs.add(exposure.truth());
         frames += 1;
         progress(Stage::Measuring, frames, info.frames)?;
     }
@@ -166,7 +167,10 @@ pub fn simulate(
     let coloured = simulation.sensor.colour.as_ref().is_some_and(|colour| colour.cfa.is_some());
     let decoded = coloured && decodes(input, sampling.transfer);
     let transfer = if decoded { Transfer::Srgb } else { sampling.transfer };
-    let notes = check_white(input, transfer, clip.largest(), info.assumed_white)?;
+    let mut notes = check_white(input, transfer, clip.largest(), info.assumed_white)?;
+    if !coloured && !matches!(input, Input::Procedural(_) | Input::Still { .. }) {
+        notes.extend(combs.note(&input.place()));
+    }
     if clip.largest() <= 0.0 && simulation.mean_level.is_none() {
         return Err(Error::request(
             "the clip is black: there is no light to distribute photons over",

@@ -355,6 +355,21 @@ fn rejects_data_that_cannot_be_sampled() {
     assert!(matches!(pack_in(&missing, folder.path()), Err(Error::Io { .. })));
 }
 
+/// One bad clip says what to do, and the next one is not found only after it was mended.
+#[test]
+fn names_all_unreadable_clips_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    files(folder.path());
+    for name in ["c0/3.png", "c1/0.png"] {
+        std::fs::write(folder.path().join("clips").join(name), b"no image").unwrap();
+    }
+    let error = pack_in(&super_config("clips"), folder.path()).unwrap_err();
+    let words = format!("{error}; {}", error.help().unwrap_or_default());
+    for part in ["2 of 2 clips", "clips/c0", "clips/c1", "not a readable image", "move them out"] {
+        assert!(words.contains(part), "{part}: {words}");
+    }
+}
+
 fn super_config(from: &str) -> DataConfig {
     config(vec![source("clips", SourceKind::Clips, &[from])])
 }

@@ -146,12 +146,23 @@ fn measured_mean_level(capture: &mut Capture, acquisition: &Acquisition) -> Resu
     let size = capture.size();
     // Only the first frames of a pipe have arrived.
     let first = 2 * LONGEST_HALF as u64 + 1;
-    let frames =
-        if capture.forward_only() { capture.frames().min(first) } else { capture.frames() };
-    let read = |frame| {
-        let mut counts = vec![0; size.pixels()];
-        capture.read(frame, &mut counts)?;
-        Ok(counts)
-    };
-    Ok(fitting_mean_level(size, frames, acquisition, read)?)
+    let mut mean_level = f64::INFINITY;
+    for part in capture.parts() {
+        let level = capture.in_part(&part, |capture| {
+            let forward = capture.forward_only();
+            let frames = if forward { capture.frames().min(first) } else { capture.frames() };
+            let read = |frame| {
+                let mut counts = vec![0; size.pixels()];
+                capture.read(frame, &mut counts)?;
+                Ok(counts)
+            };
+            if frames == 0 {
+                Ok(f64::INFINITY)
+            } else {
+                fitting_mean_level(size, frames, acquisition, read)
+            }
+        })?;
+        mean_level = mean_level.min(level);
+    }
+    Ok(mean_level)
 }

@@ -150,7 +150,9 @@ impl AlignedCapture {
         options: &ReadOptions,
         sensor: &Sensor,
     ) -> Result<Self> {
-        let (sum, frames) = (choice.frames, capture.native_frames());
+        // Lengths are chosen in the longest part between cuts.
+        let part = capture.longest_part();
+        let (sum, frames) = (choice.frames, part.end - part.start);
         let distance = every.map_or(u64::from(sum), |every| every.min(frames)) as u32;
         let bytes = capture.size().pixels() * size_of::<u16>();
         let steps = (f64::from(sum) * choice.motion / MAX_FINE_MOTION).ceil();
@@ -163,7 +165,8 @@ impl AlignedCapture {
             let held = (WINDOW * count) as u64;
             held * u64::from(fine) <= frames && held * bytes as u64 <= WINDOW_BYTES
         };
-        let lengths = choose(&mut capture, choice, steps as usize, sensor, &fits)?;
+        let lengths = capture
+            .in_part(&part, |capture| choose(capture, choice, steps as usize, sensor, &fits))?;
         let alignment = lengths.map(alignment);
         let sum = alignment.map_or(sum, |alignment| alignment.fine);
         Ok(Self { capture: capture.summed_by(sum, options, Some(sensor))?, alignment })

@@ -21,7 +21,7 @@ pub(crate) struct Source<'a> {
     pub(crate) sum: Option<Sum>,
     /// The sensor by name, if given.
     pub(crate) sensor: Option<&'a str>,
-    /// Frames that are judged at most, before any is used.
+    /// Bytes of frames that are judged at most, before any is used.
     pub(crate) judged: u64,
 }
 

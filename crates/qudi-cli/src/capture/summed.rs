@@ -65,7 +65,8 @@ pub(crate) fn sum_by_itself(
 ) -> Result<(Capture, Option<SumChoice>)> {
     // A pipe shows what has come through it.
     capture.wait_for(PIPED_FRAMES)?;
-    match choose_sum(&mut capture)? {
+    let part = capture.longest_part();
+    match capture.in_part(&part, choose_sum)? {
         Some(choice) if choice.frames > 1 => {
             Ok((capture.summed_by(choice.frames, options, sensor)?, Some(choice)))
         }

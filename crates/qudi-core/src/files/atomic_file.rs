@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use tempfile::NamedTempFile;
 
 pub use super::atomic_folder::{OwnFolder, PendingFolder};
+pub use super::unfinished_folder::UnfinishedFolder;
 
 /// What to do if the name is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,12 +1,12 @@
 //! Folders that appear only when finished, with a manifest of what this program wrote into them.
 
 use super::atomic_file::{Overwrite, parent, refuse_taken};
+use super::unfinished_folder::UnfinishedFolder;
 use crate::error::{Error, Result};
 use crate::limits::RECORD_BYTES;
 use crate::regular_file::read_limited;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use tempfile::TempDir;
 
 /// The folders that a writer makes, known by their manifest, so that no other is replaced.
 #[derive(Clone, Copy, Debug)]
@@ -63,7 +63,7 @@ impl OwnFolder {
 /// A folder that appears under its name only when finished.
 #[derive(Debug)]
 pub struct PendingFolder {
-    folder: TempDir,
+    folder: UnfinishedFolder,
     path: PathBuf,
     overwrite: Overwrite,
     own: OwnFolder,
@@ -80,12 +80,7 @@ impl PendingFolder {
         if path.symlink_metadata().is_ok() {
             own.files(path)?;
         }
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".qudi-").suffix(".tmp");
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777));
-        let folder = builder
-            .tempdir_in(parent(path))
+        let folder = UnfinishedFolder::create_in(parent(path))
             .map_err(|e| Error::io("create the output", path, e))?;
         Ok(Self { folder, path: path.to_owned(), overwrite, own })
     }
@@ -108,6 +103,7 @@ impl PendingFolder {
         std::fs::write(self.file(self.own.manifest), manifest)
             .map_err(|e| Error::io("write the manifest of", &self.path, e))?;
         let fault = |e| Error::io("rename the finished folder to", &self.path, e);
+        self.folder.unlocked().map_err(fault)?;
         if self.overwrite == Overwrite::Yes && self.path.is_dir() {
             // Another program may have written to it in the meantime.
             let files = self.own.files(&self.path)?;
@@ -127,7 +123,7 @@ impl PendingFolder {
             std::fs::rename(self.folder.path(), &self.path).map_err(fault)?;
         }
         // The temporary name is gone; there is nothing left to clean up.
-        let _ = self.folder.keep();
+        self.folder.keep();
         Ok(())
     }
 }

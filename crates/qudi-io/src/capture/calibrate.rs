@@ -1,6 +1,7 @@
 //! Calibration from a dark capture: dark rate of every pixel, hot pixels, read noise.
 
 use super::Capture;
+use super::pedestal::{Pedestal, ordinary};
 use qudi_core::Size;
 use qudi_core::bad_pixels::BadPixels;
 use qudi_core::sensor::{CountLaw, Response, Sensor};
@@ -35,12 +36,15 @@ pub struct Calibration {
     pub threshold: f64,
     /// Read noise in e- of the ordinary pixels, for linear sensors.
     pub read_noise: Option<f64>,
+    /// Pedestal in DN, if there is one: given, or found in the counts.
+    pub pedestal: Option<Pedestal>,
     /// Correlation of the rates of neighbouring pixels, where it shows a picture.
     pub picture: Option<f64>,
 }
 
 /// Measures `capture`, taken with the shutter closed. `gain` is in DN/e- and needed for linear
-/// sensors; `hot` is a threshold in dark electrons per native frame.
+/// sensors, which may count above a pedestal of `offset` DN; `hot` is a threshold in dark electrons per
+/// native frame.
 ///
 /// # Errors
 /// [`Error`] if the capture cannot be read, is no dark one, or the gain is unknown.
@@ -48,6 +52,7 @@ pub fn calibrate(
     capture: &mut Capture,
     sensor: &Sensor,
     gain: Option<f64>,
+    offset: Option<f64>,
     hot: Option<f64>,
     on: &mut dyn FnMut(u64, u64) -> std::ops::ControlFlow<()>,
 ) -> Result<Calibration> {
@@ -78,7 +83,7 @@ pub fn calibrate(
     if binary {
         let rate = |&sum: &u64| -(-(sum as f64).min(trials - 0.5) / trials).ln_1p();
         let rates: Vec<f64> = sums.iter().map(rate).collect();
-        return finish(capture, size, frames, &rates, trials, hot, None);
+        return finish(capture, frames, &rates, trials, hot, None, None);
     }
     let gain = gain.ok_or_else(|| {
         Error::request(
@@ -88,10 +93,14 @@ pub fn calibrate(
         )
     })?;
     let means: Vec<f64> = sums.iter().map(|&sum| sum as f64 / trials).collect();
+    if let Some(pedestal) = Pedestal::find(capture, gain, offset, &means)? {
+        let rates: Vec<f64> = means.iter().map(|mean| (mean - pedestal.offset) / gain).collect();
+        let noise = pedestal.read_noise;
+        return finish(capture, frames, &rates, trials, hot, Some(noise), Some(pedestal));
+    }
     let read_noise = fit_read_noise(capture, sensor, gain, &means)?;
     let law = CountLaw::new(&Sensor { read_noise, ..sensor.clone() }, gain);
-    let rates = invert(&law, &means);
-    finish(capture, size, frames, &rates, trials, hot, Some(read_noise))
+    finish(capture, frames, &invert(&law, &means), trials, hot, Some(read_noise), None)
 }
 
 /// Returns the detections for each mean count, by interpolation in a table.
@@ -113,19 +122,20 @@ fn invert(law: &CountLaw, means: &[f64]) -> Vec<f64> {
 
 fn finish(
     capture: &Capture,
-    size: Size,
     frames: u64,
     rates: &[f64],
     trials: f64,
     hot: Option<f64>,
     read_noise: Option<f64>,
+    pedestal: Option<Pedestal>,
 ) -> Result<Calibration> {
+    let size = capture.size();
     let mut sorted = rates.to_vec();
     sorted.sort_by(f64::total_cmp);
     let median = sorted[sorted.len() / 2];
     let darkest = &sorted[..(sorted.len() * 9).div_ceil(10)];
     let trimmed = darkest.iter().sum::<f64>() / darkest.len() as f64;
-    let bulk = if median > 0.0 { median } else { trimmed };
+    let bulk = if median > 0.0 { median } else { trimmed.max(0.0) };
     let ninth = sorted[(sorted.len() - 1) * 9 / 10];
     if ninth > 0.5 && read_noise.is_none() {
         return Err(Error::data(
@@ -138,12 +148,13 @@ fn finish(
     let hot = (0..rates.len())
         .filter(|&i| {
             let expected = bulk * trials;
-            let significant = rates[i] * trials > expected + HOT_SIGMAS * (expected + 1.0).sqrt();
+            let variance = expected + trials * read_noise.unwrap_or(0.0).powi(2) + 1.0;
+            let significant = rates[i] * trials > expected + HOT_SIGMAS * variance.sqrt();
             rates[i] > threshold && significant
         })
         .collect();
     // Maps are of the frames without turn and crop, and are turned and cropped with these.
-    let dark: Vec<f32> = rates.iter().map(|&rate| rate as f32).collect();
+    let dark: Vec<f32> = rates.iter().map(|&rate| rate.max(0.0) as f32).collect();
     let hot = BadPixels { hot, ..BadPixels::default() }.mask(size);
     let hot = usual(capture, &hot, false);
     let hot = (0..hot.len()).filter(|&i| hot[i]).collect();
@@ -155,6 +166,7 @@ fn finish(
         bad: BadPixels { hot, ..BadPixels::default() },
         threshold,
         read_noise,
+        pedestal,
         picture: picture(rates, size, 3.0 * bulk),
     })
 }
@@ -189,16 +201,11 @@ fn picture(rates: &[f64], size: Size, most: f64) -> Option<f64> {
     (correlation > PICTURE_CORRELATION).then_some(correlation)
 }
 
-/// Fits the read noise of the ordinary pixels by maximum likelihood. Their means lie in the middle, so that
-/// one dark rate describes them all.
+/// Fits the read noise of the ordinary pixels by maximum likelihood.
 fn fit_read_noise(capture: &mut Capture, sensor: &Sensor, gain: f64, means: &[f64]) -> Result<f64> {
-    let mut sorted = means.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let n = sorted.len();
-    let (low, high) = (sorted[n * 3 / 10], sorted[n * 7 / 10]);
-    let chosen: Vec<usize> = (0..n).filter(|&i| (low..=high).contains(&means[i])).collect();
+    let chosen = ordinary(means);
     let mut histogram = vec![0u64; usize::from(sensor.max_count()) + 1];
-    let mut counts = vec![0u16; n];
+    let mut counts = vec![0u16; means.len()];
     for frame in capture.sample_frames() {
         capture.read(frame, &mut counts)?;
         for &i in &chosen {

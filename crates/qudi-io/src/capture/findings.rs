@@ -18,8 +18,12 @@ pub struct FrameFindings {
     pub outlying: Vec<u64>,
     /// Frames that repeat the one before.
     pub repeated: Vec<u64>,
+    /// First frames after missing numbers.
+    pub missing: Vec<u64>,
     /// How often every frame is stored, if more than once.
     pub stored_times: Option<u64>,
+    /// Ratio of the light of every other frame to the light of the rest, if exposures take turns.
+    pub alternates: Option<f64>,
     /// First frames of another scene.
     pub cuts: Vec<u64>,
     /// First frames of another light.
@@ -34,6 +38,25 @@ impl FrameFindings {
         frames.sort_unstable();
         frames.dedup();
         frames
+    }
+
+    /// Returns the first frames of parts that have nothing to do with those before, in rising order.
+    pub(super) fn boundaries(&self) -> Vec<u64> {
+        let mut frames: Vec<u64> = self.cuts.iter().chain(&self.light_steps).copied().collect();
+        frames.sort_unstable();
+        frames
+    }
+
+    /// Gives the frames other numbers; several may get the same one.
+    pub(super) fn renumber(&mut self, number: impl Fn(u64) -> u64) {
+        let lists = [&mut self.empty, &mut self.saturated, &mut self.outlying, &mut self.repeated];
+        let others = [&mut self.cuts, &mut self.light_steps, &mut self.missing];
+        for frames in lists.into_iter().chain(others) {
+            for frame in frames.iter_mut() {
+                *frame = number(*frame);
+            }
+            frames.dedup();
+        }
     }
 
     /// Describes what was found, a sentence each; `replaced` is true if others stand in for broken frames.
@@ -53,12 +76,14 @@ impl FrameFindings {
         note(&self.saturated, "frames at one value", effect);
         note(&self.outlying, "frames far from the light of their neighbours", effect);
         note(&self.repeated, "frames that repeat the one before", "");
-        note(
-            &self.cuts,
-            "cuts to another scene at frames",
-            "; restore the parts apart, with `start` and `end`",
-        );
-        note(&self.light_steps, "steps of the light at frames", "");
+        let effect = "; nothing is summed, aligned or merged across them";
+        note(&self.cuts, "cuts to another scene at frames", effect);
+        note(&self.light_steps, "steps of the light at frames", effect);
+        if let Some(ratio) = self.alternates {
+            notes.push(format!(
+                "every other frame is {ratio:.1} times as light as the rest, as if exposures took turns: frames of one exposure belong together"
+            ));
+        }
         if let Some(times) = self.stored_times {
             notes.push(format!("every frame is stored {times} times: each is read once"));
         }

@@ -8,47 +8,179 @@ const SIDE: usize = 8;
 /// Blocks of a frame.
 pub(super) const BLOCKS: usize = SIDE * SIDE;
 
+/// Share of the pixels at one value from which on a frame is constant.
+pub(super) const CONSTANT_SHARE: f64 = 0.95;
+
+/// Rows of bits that are counted in bytes, eight to the pixel, before these overflow.
+const MAX_BYTE_ROWS: usize = 31;
+
 /// Numbers of one frame.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct FrameStatistics {
     /// Sum of all counts.
     pub(super) sum: u64,
     /// Pixels with counts.
     pub(super) lit: u32,
-    /// Largest count, and the pixels that have it.
-    pub(super) largest: (u16, u32),
+    /// Largest count.
+    pub(super) largest: u16,
+    /// True if nearly all pixels have the largest count.
+    pub(super) is_constant: bool,
     /// All counts, bit by bit.
     pub(super) bits: u16,
     /// Hash of all counts.
     pub(super) hash: u64,
-    /// Sum of the counts in each block.
-    pub(super) blocks: [u32; BLOCKS],
+}
+
+/// Sums of the counts in the blocks of frames.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Blocks(pub(super) [u32; BLOCKS]);
+
+/// A hash over words, in four lanes that do not wait for each other.
+struct Hash([u64; 4]);
+
+impl Hash {
+    fn new() -> Self {
+        Self([0xcbf2_9ce4_8422_2325, 0x9ae1_6a3b_2f90_404f, 0xc3a5_c85c_97cb_3127, 1])
+    }
+
+    fn add(&mut self, lane: usize, word: u64) {
+        let hash = &mut self.0[lane];
+        *hash = (*hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
+    }
+
+    fn value(mut self) -> u64 {
+        for lane in 1..4 {
+            let word = self.0[lane];
+            self.add(0, word);
+        }
+        self.0[0]
+    }
+}
+
+/// Returns the row of blocks that row `y` of a frame belongs to.
+fn band(y: usize, height: usize) -> usize {
+    y * SIDE / height
 }
 
 impl FrameStatistics {
     /// Looks at the counts of a frame.
-    pub(super) fn of(counts: &[u16], size: Size) -> Self {
+    pub(super) fn of(counts: &[u16], size: Size) -> (Self, Blocks) {
         let mut blocks = [0u32; BLOCKS];
-        let mut hash = 0xcbf2_9ce4_8422_2325u64;
-        let (mut lit, mut bits, mut most) = (0u32, 0u16, 0u16);
+        let mut own = Self::default();
         let width = size.width.div_ceil(SIDE);
         for (y, row) in counts.chunks_exact(size.width).enumerate() {
-            let down = y * SIDE / size.height;
-            for (across, part) in row.chunks(width).enumerate() {
-                let sum: u32 = part.iter().map(|&count| u32::from(count)).sum();
-                blocks[down * SIDE + across] += sum;
-                lit += part.iter().map(|&count| u32::from(count > 0)).sum::<u32>();
-                bits |= part.iter().fold(0, |bits, &count| bits | count);
-                most = part.iter().fold(most, |most, &count| most.max(count));
+            let blocks = &mut blocks[band(y, size.height) * SIDE..][..SIDE];
+            for (block, part) in blocks.iter_mut().zip(row.chunks(width)) {
+                *block += part.iter().map(|&count| u32::from(count)).sum::<u32>();
             }
-            // Four counts to the word.
-            for words in row.chunks(4) {
-                let word = words.iter().fold(0, |word, &count| word << 16 | u64::from(count));
-                hash = (hash ^ word).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
+            for part in row.chunks(1 << 12) {
+                own.lit += u32::from(part.iter().map(|&count| u16::from(count > 0)).sum::<u16>());
+            }
+            own.bits |= row.iter().fold(0, |bits, &count| bits | count);
+            own.largest = row.iter().fold(own.largest, |most, &count| most.max(count));
+        }
+        let mut hash = Hash::new();
+        let (sixteens, rest) = counts.as_chunks::<16>();
+        for words in sixteens {
+            for (lane, word) in words.as_chunks::<4>().0.iter().enumerate() {
+                hash.add(lane, word.iter().rev().fold(0, |all, &c| all << 16 | u64::from(c)));
             }
         }
-        let at_most = counts.iter().map(|&count| u32::from(count == most)).sum();
-        let sum = blocks.iter().map(|&sum| u64::from(sum)).sum();
-        Self { sum, lit, largest: (most, at_most), bits, hash, blocks }
+        for &count in rest {
+            hash.add(0, count.into());
+        }
+        own.hash = hash.value();
+        own.sum = blocks.iter().map(|&sum| u64::from(sum)).sum();
+        let (pixels, most) = (size.pixels() as f64, own.largest);
+        if most > 0 && own.sum as f64 > CONSTANT_SHARE * pixels * f64::from(most) {
+            let at_most: u32 = counts.iter().map(|&count| u32::from(count == most)).sum();
+            own.is_constant = f64::from(at_most) > CONSTANT_SHARE * pixels;
+        }
+        (own, Blocks(blocks))
+    }
+
+    /// Looks at a binary frame, 8 pixels to the byte along rows.
+    pub(super) fn of_packed(bytes: &[u8], size: Size) -> (Self, Blocks) {
+        let mut blocks = [0u32; BLOCKS];
+        let row_bytes = size.width.div_ceil(8);
+        let width = row_bytes.div_ceil(SIDE);
+        let mut ones = vec![0u8; row_bytes];
+        let mut rows = 0;
+        for (y, row) in bytes.chunks_exact(row_bytes).enumerate() {
+            for (ones, byte) in ones.iter_mut().zip(row) {
+                *ones += byte.count_ones() as u8;
+            }
+            rows += 1;
+            let next = band(y + 1, size.height);
+            let own = band(y, size.height);
+            if rows == MAX_BYTE_ROWS || next > own {
+                for (block, part) in blocks[own * SIDE..].iter_mut().zip(ones.chunks(width)) {
+                    *block += part.iter().map(|&ones| u32::from(ones)).sum::<u32>();
+                }
+                ones.fill(0);
+                rows = 0;
+            }
+        }
+        let mut hash = Hash::new();
+        let (words, rest) = bytes.as_chunks::<32>();
+        for words in words {
+            for (lane, word) in words.as_chunks().0.iter().enumerate() {
+                hash.add(lane, u64::from_le_bytes(*word));
+            }
+        }
+        for &byte in rest {
+            hash.add(0, byte.into());
+        }
+        let lit: u32 = blocks.iter().sum();
+        let largest = u16::from(lit > 0);
+        let is_constant = f64::from(lit) > CONSTANT_SHARE * size.pixels() as f64;
+        let (sum, hash) = (u64::from(lit), hash.value());
+        (Self { sum, lit, largest, is_constant, bits: largest, hash }, Blocks(blocks))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn packed_frames_have_the_numbers_of_their_counts() {
+        for (height, width) in [(300, 64), (5, 13), (70, 200), (8, 8), (1, 1)] {
+            let size = Size { height, width };
+            let row_bytes = width.div_ceil(8);
+            let mut bytes: Vec<u8> =
+                (0..height * row_bytes).map(|i| (i * i * 31 + 7 * i) as u8).collect();
+            for row in bytes.chunks_mut(row_bytes) {
+                row[row_bytes - 1] &= (0xff00 >> ((width - 1) % 8 + 1)) as u8;
+            }
+            let counts: Vec<u16> = (0..height * width)
+                .map(|i| {
+                    let (y, x) = (i / width, i % width);
+                    u16::from(bytes[y * row_bytes + x / 8] >> (7 - x % 8) & 1)
+                })
+                .collect();
+            let (packed, of_bits) = FrameStatistics::of_packed(&bytes, size);
+            let (plain, of_counts) = FrameStatistics::of(&counts, size);
+            let numbers = |s: &FrameStatistics| (s.sum, s.lit, s.largest, s.is_constant, s.bits);
+            assert_eq!(numbers(&packed), numbers(&plain), "{size}");
+            if width % 64 == 0 {
+                assert_eq!(of_bits.0, of_counts.0, "{size}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_count_changes_the_hash() {
+        let size = Size { height: 5, width: 13 };
+        let counts: Vec<u16> = (0..size.pixels() as u16).collect();
+        let (plain, _) = FrameStatistics::of(&counts, size);
+        for i in 0..counts.len() {
+            let mut other = counts.clone();
+            other[i] += 1;
+            assert_ne!(FrameStatistics::of(&other, size).0.hash, plain.hash, "{i}");
+        }
+        let mut turned = counts.clone();
+        turned.swap(3, 40);
+        assert_ne!(FrameStatistics::of(&turned, size).0.hash, plain.hash);
     }
 }

@@ -2,14 +2,18 @@
 //! the light.
 
 use super::Capture;
+use super::counter::{Counter, Edges};
 use super::findings::FrameFindings;
-use super::frame_statistics::FrameStatistics;
-use super::scene_changes::changes;
+use super::frame_statistics::{Blocks, FrameStatistics};
+use super::scene_changes::{Change, Groups, most_likely_place};
+use super::timeline::Stretch;
 use crate::description::ReadOptions;
 use crate::frames::every_nth::EveryNth;
 use crate::frames::shifted::Shifted;
 use qudi_core::Result;
 use qudi_core::sensor::{Response, Sensor};
+use rayon::prelude::*;
+use std::ops::Range;
 
 /// Neighbours on each side whose median a frame is compared with.
 const NEIGHBOURS: usize = 4;
@@ -28,6 +32,10 @@ const MIN_LIT: f64 = 0.7;
 
 /// Ratio of the light of the neighbours before and after within which they agree.
 const AGREEMENT: f64 = 1.3;
+
+/// Pairs of frames of which one is lighter, if exposures take turns, and the least ratio of their light.
+const MIN_TURNS: usize = 5;
+const MIN_ALTERNATION: f64 = 1.2;
 
 /// Share of the frames beyond which they are no exceptions.
 const MAX_SHARE: f64 = 0.2;
@@ -48,10 +56,10 @@ const MIN_VALUES: u16 = 12;
 const MIN_DOUBLES: f64 = 50.0;
 
 impl Capture {
-    /// Judges at most `limit` frames in one pass, in stretches spread over the capture, and applies what is
-    /// found: a good frame stands in for a broken one, a frame that is stored several times is read once, and
-    /// values at the upper end of their words are shifted. `options` and `sensor` are the ones it was opened
-    /// with. Captures that can be read once only are not judged.
+    /// Judges the frames in one pass over at most `limit` bytes, in stretches of a longer capture, and
+    /// applies what is found: a good frame stands in for a broken one, a frame that is stored several times
+    /// is read once, values at the upper end of their words are shifted, and parts end at cuts. `options` and
+    /// `sensor` are the ones it was opened with. Captures that can be read once only are not judged.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the capture cannot be read.
@@ -64,44 +72,52 @@ impl Capture {
         if self.forward_only() || self.length().is_none() || self.native_frames() < 2 {
             return Ok(());
         }
-        let size = self.native.size();
-        let mut findings = FrameFindings::default();
+        let pixels = self.native.size().pixels();
+        let bytes = if self.info.packing.is_some() { pixels.div_ceil(8) } else { 2 * pixels };
+        let gaps = self.info.gaps.iter().filter(|gap| self.range.contains(gap));
+        let missing = gaps.copied().collect();
+        let mut findings = FrameFindings { missing, ..FrameFindings::default() };
         let mut seen: Vec<FrameStatistics> = Vec::new();
-        let mut largest = 0;
         let mut times = Vec::new();
-        for stretch in stretches(self.native_frames(), limit) {
+        for stretch in stretches(self.native_frames(), limit / bytes as u64) {
             let first = self.range.start + stretch.start;
-            let mut frames = Vec::new();
-            for frame in first..self.range.start + stretch.end {
-                self.native.read(frame, &mut self.stored)?;
-                frames.push(FrameStatistics::of(&self.stored, size));
+            let (frames, groups, edges) = self.look_at(first..self.range.start + stretch.end)?;
+            let size = self.native.size();
+            self.timeline.push(Stretch::new(first, frames.len(), &groups, size));
+            judge(&frames, first, &mut findings);
+            for change in groups.changes() {
+                let at = first + self.place_of(change, first, frames.len())?;
+                if change.is_cut { &mut findings.cuts } else { &mut findings.light_steps }.push(at);
             }
-            findings.looked_at += frames.len() as u64;
-            largest = frames.iter().map(|frame| frame.largest.0).fold(largest, u16::max);
-            judge(&frames, first, size.pixels(), &mut findings);
+            if let Some(counter) = edges.counter() {
+                self.take_counter(counter, first, &mut findings);
+            }
             times.push(findings.stored_times.take());
-            seen.append(&mut frames);
+            seen.extend(frames);
         }
+        findings.looked_at = seen.len() as u64;
+        findings.alternates = alternation(&seen);
         let bits = seen.iter().fold(0, |bits, frame| bits | frame.bits);
-        let mean = seen.iter().map(|frame| frame.sum as f64).sum::<f64>()
-            / (seen.len() * size.pixels()) as f64;
-        let samples = (seen.len() * size.pixels()) as f64;
+        let largest = seen.iter().map(|frame| frame.largest).fold(0, u16::max);
+        let samples = (seen.len() * pixels) as f64;
+        let mean = seen.iter().map(|frame| frame.sum as f64).sum::<f64>() / samples;
         let mut replan = self.shift(bits, largest, sensor);
         replan |= self.take_for_binary(largest, mean, samples, sensor);
         let same = times.iter().all(|other| *other == times[0]);
         if let Some(times) = times[0].filter(|_| same) {
-            self.read_once(times, first_run(&seen, times));
-            // Numbers of frames are now others.
-            findings = FrameFindings { stored_times: Some(times), ..FrameFindings::default() };
-            findings.looked_at = seen.len() as u64;
+            self.read_once(times, first_run(&seen, times), &mut findings);
             replan = true;
         }
         let share = findings.replaced().len() as f64 / seen.len() as f64;
+        self.boundaries = findings.boundaries();
         let replaced = share <= MAX_SHARE;
         if replaced {
             self.replace(&findings.replaced());
             replan |= share > 0.0;
         }
+        let longest = self.longest_part();
+        super::depth::check_sum(self.sum, longest.end - longest.start, &self.info)?;
+        replan |= !self.boundaries.is_empty() && self.sum > 1 || !self.counter.is_empty();
         self.info.notes.extend(findings.notes(replaced));
         self.findings = findings;
         if replan {
@@ -110,9 +126,98 @@ impl Capture {
         Ok(())
     }
 
+    /// Looks at stored frames: numbers of each, their blocks in groups, and where counters are.
+    fn look_at(&mut self, frames: Range<u64>) -> Result<(Vec<FrameStatistics>, Groups, Edges)> {
+        let mut groups = Groups::new((frames.end - frames.start) as usize);
+        let (mut seen, mut edges) = (Vec::new(), Edges::default());
+        self.for_each(frames, |frame, blocks, counts| {
+            seen.push(frame);
+            groups.push(&blocks);
+            edges.push(counts);
+        })?;
+        Ok((seen, groups, edges))
+    }
+
+    /// Notes a frame counter, whose pixels are repaired, and the frames that it misses.
+    fn take_counter(&mut self, counter: Counter, first: u64, findings: &mut FrameFindings) {
+        let Counter { pixels, jumps } = counter;
+        if self.counter.is_empty() {
+            self.info.notes.push(format!(
+                "{} pixels from number {} on hold a frame counter: they are repaired",
+                pixels.len(),
+                pixels[0]
+            ));
+            self.counter = pixels;
+        }
+        if let Some((frame, count)) = jumps.first() {
+            self.info.notes.push(format!(
+                "the frame counter jumps before {} frames, first before frame {}: {count} are missing there",
+                jumps.len(),
+                first + frame
+            ));
+        }
+        findings.missing.extend(jumps.iter().map(|(frame, _)| first + frame));
+    }
+
+    /// Looks at each of the stored frames, without unpacking packed ones, which have no counts then.
+    fn for_each(
+        &mut self,
+        frames: Range<u64>,
+        mut take: impl FnMut(FrameStatistics, Blocks, &[u16]),
+    ) -> Result<()> {
+        let size = self.native.size();
+        let frame_bytes = size.height * size.width.div_ceil(8);
+        let mut is_packed = self.info.packing.is_some();
+        let (mut bytes, mut counts) = (Vec::new(), Vec::new());
+        let mut next = frames.start;
+        while next < frames.end {
+            let at_once = if is_packed { frame_bytes } else { 2 * size.pixels() };
+            let n = ((PIECE_BYTES / at_once).max(1) as u64).min(frames.end - next);
+            bytes.resize(if is_packed { n as usize * frame_bytes } else { 0 }, 0);
+            if is_packed && !self.native.copy_packed(next, &mut bytes)? {
+                is_packed = false;
+                continue;
+            }
+            if is_packed {
+                let looks = bytes.par_chunks_exact(frame_bytes);
+                let looks = looks.map(|frame| FrameStatistics::of_packed(frame, size));
+                for (frame, blocks) in looks.collect::<Vec<_>>() {
+                    take(frame, blocks, &[]);
+                }
+            } else {
+                counts.resize(n as usize * size.pixels(), 0);
+                for (number, counts) in (next..).zip(counts.chunks_exact_mut(size.pixels())) {
+                    self.native.read(number, counts)?;
+                }
+                let looks = counts.par_chunks_exact(size.pixels());
+                let looks: Vec<_> = looks.map(|frame| FrameStatistics::of(frame, size)).collect();
+                for ((frame, blocks), counts) in looks.into_iter().zip(counts.chunks(size.pixels()))
+                {
+                    take(frame, blocks, counts);
+                }
+            }
+            next += n;
+        }
+        Ok(())
+    }
+
+    /// Returns the number of frames between `first` and a change, among `frames` frames.
+    fn place_of(&mut self, change: Change, first: u64, frames: usize) -> Result<u64> {
+        let near = change.at.saturating_sub(change.reach)..(change.at + change.reach).min(frames);
+        let mut counts = Vec::with_capacity(near.len());
+        let stored = first + near.start as u64..first + near.end as u64;
+        self.for_each(stored, |_, Blocks(blocks), _| counts.push(blocks.map(f64::from)))?;
+        Ok((near.start + most_likely_place(&counts)) as u64)
+    }
+
     /// Returns what was found out about single frames.
     pub fn findings(&self) -> &FrameFindings {
         &self.findings
+    }
+
+    /// Returns the light and the changes of the stretches that were looked at.
+    pub fn timeline(&self) -> &[Stretch] {
+        &self.timeline
     }
 
     /// Shifts values whose lowest bits are all empty; returns true if they are.
@@ -155,20 +260,32 @@ impl Capture {
         true
     }
 
-    /// Reads every frame once that is stored `times` times, the first one `first` times.
-    fn read_once(&mut self, times: u64, first: u64) {
+    /// Reads every frame once that is stored `times` times, the first one `first` times, and counts what was
+    /// found by the frames that are left.
+    fn read_once(&mut self, times: u64, first: u64, findings: &mut FrameFindings) {
         let frames = std::mem::replace(&mut self.native, Box::new(NoFrames(self.view.size)));
         let once = EveryNth::new(frames, times, self.range.start + first);
+        findings.stored_times = Some(times);
+        findings.renumber(|frame| once.holding(frame));
+        for stretch in &mut self.timeline {
+            stretch.first = once.holding(stretch.first);
+            stretch.step = stretch.step.div_ceil(times);
+        }
         self.range = once.among(self.range.start)..once.among(self.range.end);
         self.end = self.end.map(|end| once.among(end));
         self.native = Box::new(once);
         self.info.fps = self.info.fps.map(|fps| fps / times as f64);
     }
 
-    /// Lets the nearest good frame stand in for each of `bad`.
+    /// Lets the nearest good frame of the same part stand in for each of `bad`.
     fn replace(&mut self, bad: &[u64]) {
         for &frame in bad {
-            let good = |frame: &u64| self.range.contains(frame) && !bad.contains(frame);
+            let part = |at: u64| self.boundaries.partition_point(|&boundary| boundary <= at);
+            let good = |other: &u64| {
+                self.range.contains(other)
+                    && part(*other) == part(frame)
+                    && bad.binary_search(other).is_err()
+            };
             let nearest = (1..self.native_frames())
                 .flat_map(|far| [frame.wrapping_sub(far), frame + far])
                 .find(good);
@@ -194,16 +311,23 @@ impl crate::frames::CountFrames for NoFrames {
     }
 }
 
-/// Returns stretches of `frames` frames with at most `limit` in all: the beginning, the middle, the end.
-fn stretches(frames: u64, limit: u64) -> Vec<std::ops::Range<u64>> {
-    let length = if frames <= limit { frames } else { (limit / 3).max(2) };
+/// Bytes that are read at once.
+const PIECE_BYTES: usize = 1 << 20;
+
+/// Fewest frames of a stretch.
+const MIN_STRETCH: u64 = 12;
+
+/// Returns stretches of `frames` frames: all, or the beginning, the middle and the end of more than `limit`.
+fn stretches(frames: u64, limit: u64) -> Vec<Range<u64>> {
+    let part = (limit / 3).max(MIN_STRETCH);
+    let length = if frames <= limit.max(3 * part) { frames } else { part };
     let firsts = [0, (frames - length) / 2, frames - length];
     let firsts = if length == frames { &firsts[..1] } else { &firsts[..] };
     firsts.iter().map(|&first| first..first + length).collect()
 }
 
 /// Judges consecutive frames from `first` on.
-fn judge(frames: &[FrameStatistics], first: u64, pixels: usize, findings: &mut FrameFindings) {
+fn judge(frames: &[FrameStatistics], first: u64, findings: &mut FrameFindings) {
     let sums: Vec<f64> = frames.iter().map(|frame| frame.sum as f64).collect();
     let lit: Vec<f64> = frames.iter().map(|frame| f64::from(frame.lit)).collect();
     let number = |n: usize| first + n as u64;
@@ -214,8 +338,6 @@ fn judge(frames: &[FrameStatistics], first: u64, pixels: usize, findings: &mut F
             continue;
         }
         let ratio = frame.sum as f64 / usual;
-        let (most, at_most) = frame.largest;
-        let is_constant = most > 0 && f64::from(at_most) > 0.95 * pixels as f64;
         let [one, other] = [median(before), median(after)];
         let agree = one.max(other) <= AGREEMENT * one.min(other).max(1.0);
         let (lit_before, lit_after) = around(&lit, n);
@@ -224,14 +346,28 @@ fn judge(frames: &[FrameStatistics], first: u64, pixels: usize, findings: &mut F
         let is_partial = lit < usual_lit && is_far(lit, usual_lit, MIN_LIT.recip());
         if frame.sum == 0 {
             findings.empty.push(number(n));
-        } else if is_constant && ratio > 1.1 {
+        } else if frame.is_constant && ratio > 1.1 {
             findings.saturated.push(number(n));
         } else if agree && (is_far(frame.sum as f64, usual, MIN_FACTOR) || is_partial) {
             findings.outlying.push(number(n));
         }
     }
     repeats(frames, first, findings);
-    changes(frames, first, findings);
+}
+
+/// Returns how much lighter every other frame is, as with exposures that take turns.
+fn alternation(frames: &[FrameStatistics]) -> Option<f64> {
+    let sums = frames.iter().map(|frame| frame.sum as f64);
+    let halves = [0, 1].map(|half| sums.clone().skip(half).step_by(2).collect::<Vec<f64>>());
+    if halves[1].len() < MIN_TURNS {
+        return None;
+    }
+    let [one, other] = &halves;
+    let [even, odd] = halves.each_ref().map(|half| median(half.clone()));
+    let apart = |a: f64, b: f64| a > MIN_ALTERNATION * b && a - b > SIGMAS * (a + b).sqrt();
+    let pairs = || one.iter().zip(other);
+    let takes_turns = pairs().all(|(&a, &b)| apart(a, b)) || pairs().all(|(&a, &b)| apart(b, a));
+    takes_turns.then(|| even.max(odd) / even.min(odd).max(1.0))
 }
 
 /// Returns true if a number of counts is off by a factor, and by far more than chance explains.
@@ -333,7 +469,7 @@ mod tests {
         let sensor = Sensor::load("ideal").unwrap();
         let mut capture = Capture::in_memory("scene", SIZE, frames, &sensor).unwrap();
         let options = crate::description::ReadOptions::default();
-        capture.judge_frames(1000, &options, Some(&sensor)).unwrap();
+        capture.judge_frames(1 << 30, &options, Some(&sensor)).unwrap();
         let findings = capture.findings().clone();
         (capture, findings)
     }
@@ -360,6 +496,7 @@ mod tests {
             (findings.empty, findings.saturated, findings.outlying),
             (vec![12], vec![20], vec![7, 25])
         );
+        assert_eq!((findings.cuts, findings.light_steps), (vec![], vec![]));
         let mut counts = vec![0; SIZE.pixels()];
         capture.read(12, &mut counts).unwrap();
         assert_eq!(counts, good[11]);
@@ -367,6 +504,30 @@ mod tests {
         capture.total(11..13, &mut sums).unwrap();
         assert!(sums.iter().zip(&good[11]).all(|(&sum, &count)| sum == 2 * u32::from(count)));
         assert!(capture.info().notes.iter().any(|note| note.contains("empty frames: 12;")));
+    }
+
+    #[test]
+    fn frame_counters_are_repaired_and_tell_missing_frames() {
+        let mut counted = frames(40, 1.0, 99);
+        counted.drain(20..23);
+        let numbers = (1000..1020).chain(1023..1040);
+        for (counts, number) in counted.iter_mut().zip(numbers) {
+            counts[..2].copy_from_slice(&[number >> 8, number & 255]);
+        }
+        let (capture, findings) = judged(counted);
+        assert_eq!(findings.missing, [20]);
+        assert_eq!(capture.bad_pixels().hot, [0, 1]);
+        let notes = capture.info().notes.join("; ");
+        assert!(notes.contains("frame counter") && notes.contains("3 are missing"), "{notes}");
+    }
+
+    #[test]
+    fn exposures_that_take_turns_are_named() {
+        let mut turns = frames(20, 1.0, 99);
+        turns.iter_mut().step_by(2).flatten().for_each(|count| *count *= 4);
+        let (capture, findings) = judged(turns);
+        assert!((findings.alternates.unwrap() - 4.0).abs() < 0.3, "{:?}", findings.alternates);
+        assert!(capture.info().notes.iter().any(|note| note.contains("every other frame")));
     }
 
     #[test]
@@ -387,12 +548,51 @@ mod tests {
 
     #[test]
     fn cuts_and_steps_of_the_light_are_named() {
-        let (_, findings) = judged(frames(60, 0.5, 33));
+        let (capture, findings) = judged(frames(60, 0.5, 33));
         assert_eq!((findings.cuts, findings.light_steps), (vec![33], vec![]));
+        assert_eq!(capture.parts(), [0..33, 33..60]);
         let mut step = frames(60, 0.5, 99);
         step[25..].iter_mut().flatten().for_each(|count| *count = *count * 3 / 2);
         let (_, findings) = judged(step);
         assert_eq!((findings.cuts, findings.light_steps), (vec![], vec![25]));
+        let mut twice: Vec<_> = frames(60, 0.5, 33);
+        twice = twice.into_iter().flat_map(|frame| [frame.clone(), frame]).collect();
+        assert_eq!(judged(twice).1.cuts, [33]);
+    }
+
+    /// Few photons show a cut in long windows only, and its place as exactly as they can.
+    #[test]
+    fn cuts_of_dim_scenes_are_found_near_their_place() {
+        let mut dim = frames(600, 0.0, 307);
+        dim.iter_mut().flatten().for_each(|count| *count = u16::from(*count > 6));
+        let (_, findings) = judged(dim);
+        assert_eq!(findings.cuts.len(), 1);
+        assert!(findings.cuts[0].abs_diff(307) <= 1, "{:?}", findings.cuts);
+    }
+
+    #[test]
+    fn no_sum_reaches_over_a_cut() {
+        let good = frames(60, 0.5, 33);
+        let (mut capture, _) = judged(good.clone());
+        capture.info.max_count = Some(99);
+        let sensor = Sensor::load("ideal").unwrap();
+        let options = crate::description::ReadOptions::default();
+        let mut capture = capture.summed_by(7, &options, Some(&sensor)).unwrap();
+        assert_eq!(capture.frames(), 33 / 7 + 27 / 7);
+        assert_eq!(capture.length(), Some(capture.frames()));
+        let total = |frames: &[Vec<u16>]| -> Vec<u16> {
+            (0..SIZE.pixels()).map(|i| frames.iter().map(|frame| frame[i]).sum()).collect()
+        };
+        let mut counts = vec![0; SIZE.pixels()];
+        capture.read(3, &mut counts).unwrap();
+        assert_eq!(counts, total(&good[21..28]));
+        capture.read(4, &mut counts).unwrap();
+        assert_eq!(counts, total(&good[33..40]));
+        let mut sums = vec![0; SIZE.pixels()];
+        capture.total(3..5, &mut sums).unwrap();
+        let both = [&good[21..28], &good[33..40]].concat();
+        assert!(sums.iter().zip(total(&both)).all(|(&sum, count)| sum == u32::from(count)));
+        assert!(capture.summed_by(34, &options, Some(&sensor)).is_err());
     }
 
     #[test]
@@ -403,14 +603,14 @@ mod tests {
         let mut capture = Capture::in_memory("scene", SIZE, bright.collect(), &sensor).unwrap();
         capture.info.max_count = None;
         let options = crate::description::ReadOptions::default();
-        capture.judge_frames(1000, &options, None).unwrap();
+        capture.judge_frames(1 << 30, &options, None).unwrap();
         let mut read = vec![0; SIZE.pixels()];
         capture.read(3, &mut read).unwrap();
         assert!(read.iter().zip(&counts[3]).all(|(&read, &count)| read == 5 * count));
         let bits = counts.iter().map(|frame| frame.iter().map(|&c| c.min(1)).collect());
         let mut capture = Capture::in_memory("scene", SIZE, bits.collect(), &sensor).unwrap();
         (capture.info.max_count, capture.info.binary) = (None, false);
-        capture.judge_frames(1000, &options, None).unwrap();
+        capture.judge_frames(1 << 30, &options, None).unwrap();
         assert!(capture.info().binary && capture.max_count() == Some(1));
     }
 }

@@ -50,13 +50,22 @@ pub(crate) fn plan(
             note_unknown_rate(&mut capture.info);
         }
     }
-    capture.bad = match (&options.mask, named) {
-        (MaskChoice::None, _) => BadPixels::default(),
-        (MaskChoice::File(path), _) => nonzero(&load(capture, path)?),
-        (MaskChoice::Auto, Some(named)) => named,
-        (MaskChoice::Auto, None) => find(capture)?,
+    let known = match &options.mask {
+        MaskChoice::File(path) => Some(nonzero(&load(capture, path)?)),
+        MaskChoice::Auto => named,
+        MaskChoice::None => Some(BadPixels::default()),
+    };
+    if let Some(known) = &known {
+        let mask = known.mask(capture.size());
+        let stored = capture.view.stored(&mask, capture.native.size(), false);
+        capture.native.ignore(&stored);
+    }
+    capture.bad = match known {
+        Some(known) => known,
+        None => find(capture)?,
     };
     let size = capture.size();
+    add_counter(capture);
     let colours = capture.filter.as_ref().map(ColourFilter::colours);
     capture.repair = Repair::among(&capture.bad.mask(size), size, |i, j| {
         colours.is_none_or(|colours| colours[i] == colours[j])
@@ -69,6 +78,23 @@ pub(crate) fn plan(
         ));
     }
     Ok(())
+}
+
+/// Adds the pixels of a frame counter to the bad ones.
+fn add_counter(capture: &mut Capture) {
+    if capture.counter.is_empty() {
+        return;
+    }
+    let mut stored = vec![false; capture.native.size().pixels()];
+    for &pixel in &capture.counter {
+        stored[pixel] = true;
+    }
+    let mut seen = capture.bad.mask(capture.size());
+    let known = seen.clone();
+    capture.view.apply(&stored, &mut seen);
+    let new = (0..seen.len()).filter(|&i| seen[i] && !known[i]);
+    capture.bad.hot.extend(new);
+    capture.bad.hot.sort_unstable();
 }
 
 /// Notes once that dark rates are not subtracted; the maps are determined again when frames are summed.

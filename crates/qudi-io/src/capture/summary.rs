@@ -178,7 +178,7 @@ fn check_bit_order(capture: &mut Capture, sampled: &[u64]) -> Result<Option<BitO
     let stored = capture.native.size();
     let mut sums = vec![0u32; stored.pixels()];
     for &look in sampled {
-        let first = capture.range.start + look * u64::from(capture.sum);
+        let first = capture.range.start + capture.begins(look);
         capture.native.add(first..first + u64::from(capture.sum), &mut sums)?;
     }
     let z_score = match packing.axis {

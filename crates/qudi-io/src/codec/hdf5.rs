@@ -2,6 +2,7 @@
 //! datasets named by numbers.
 
 mod guard;
+mod links;
 
 use super::array::{Array, Hints, Place};
 use super::{Format, Recognition};
@@ -10,6 +11,7 @@ use crate::description::{Axes, CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
 use crate::recognition::Probe;
 use hdf5_pure::{Datatype, DatatypeByteOrder};
+use links::linked_files;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
 use std::path::Path;
@@ -54,6 +56,16 @@ fn open(
         }
     })
     .map_err(damaged)?;
+    if found.is_empty() {
+        let links = linked_files(path);
+        if !links.is_empty() {
+            return Err(Error::data(
+                format!("it links to datasets in other files: {}", links.join(", ")),
+                path,
+                "give one of these files instead",
+            ));
+        }
+    }
     found.sort_by(|(a, _), (b, _)| qudi_core::natural_order::natural_order(&a.path, &b.path));
     if options.array.is_none() {
         photon_hdf5(&found, path)?;
@@ -236,7 +248,11 @@ fn choose(found: &[&Candidate], options: &ReadOptions, path: &Path) -> Result<us
     match (captures.next(), captures.next()) {
         (Some((at, _)), None) => Ok(at),
         (None, _) => Err(Error::data(
-            format!("no dataset of frames in it; there are {}", listed()),
+            if found.is_empty() {
+                "no dataset of numbers in it".to_owned()
+            } else {
+                format!("no dataset of frames in it; there are {}", listed())
+            },
             path,
             "a capture has the axes frames, height, width",
         )),

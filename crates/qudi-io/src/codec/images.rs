@@ -8,9 +8,10 @@ use crate::frames::CountFrames;
 use crate::frames::levels::infer_levels;
 use crate::frames::reordered::reordered;
 use crate::frames::samples::{Scale, no_count};
-use crate::recognition::{Probe, numbered};
+use crate::recognition::{Numbered, Probe, numbered};
 use image::DynamicImage;
 use qudi_core::Size;
+use qudi_core::limits::IMAGE_FRAME_PIXELS;
 use qudi_core::regular_file::require_regular;
 use qudi_core::{Error, Result};
 use qudi_sim::clip::decode_image;
@@ -59,8 +60,9 @@ fn open(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
-    let (files, notes) = numbered(files(probe)?);
+    let Numbered { files, notes, gaps } = numbered(files(probe)?);
     info.notes.extend(notes);
+    info.gaps = gaps.into_iter().map(|file| file as u64).collect();
     let recorded = described(&probe.path.join("burst.json"), info);
     let frames = open_files(files, &probe.path, recorded.is_some(), options, info)?;
     match recorded {
@@ -167,7 +169,7 @@ fn lossy(path: &Path) -> bool {
 
 /// Reads the gray samples of an image, or of one channel, with its size and full scale.
 fn gray(path: &Path, channel: Option<usize>) -> Result<(Size, Vec<u16>, u16)> {
-    let image = decode_image(path)?;
+    let image = decode_image(path, IMAGE_FRAME_PIXELS)?;
     let size =
         Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
     let channels = usize::from(image.color().channel_count());

@@ -1,11 +1,11 @@
 //! A folder of numbered parts, each a stack of frames: multi-page TIFF, or NumPy arrays.
 
-use super::tiff::is_stack;
+use super::tiff::{is_of_set, is_stack};
 use super::{Format, Recognition};
 use crate::description::{CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
 use crate::frames::chain::Chain;
-use crate::recognition::{Probe, numbered};
+use crate::recognition::{Numbered, Probe, numbered};
 use qudi_core::{Error, Result};
 use std::path::PathBuf;
 
@@ -60,11 +60,16 @@ fn open(
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
-    let (files, notes) = numbered(files(probe)?);
+    let Numbered { files, notes, gaps } = numbered(files(probe)?);
     let Some(first) = files.first() else {
         return Err(Error::data("the folder holds no stacks", &probe.path, "name one file"));
     };
     let (part, about) = super::open(first, options)?;
+    if is_of_set(first) {
+        // Its first file brings all the others.
+        *info = CaptureInfo { reasons: std::mem::take(&mut info.reasons), ..about };
+        return Ok(part);
+    }
     let size = part.size();
     let mut lengths = vec![part.frames()];
     for file in &files[1..] {
@@ -85,6 +90,7 @@ fn open(
         reasons: std::mem::take(&mut info.reasons),
         ..about
     };
+    info.gaps = gaps.into_iter().map(|part| lengths[..part].iter().sum()).collect();
     info.notes.extend(notes);
     info.notes.push(format!("{} parts are read one after the other", files.len()));
     let options = options.clone();

@@ -8,6 +8,7 @@ use super::npy::described;
 use super::{Format, Recognition};
 use crate::description::{CaptureInfo, Certainty, ReadOptions};
 use crate::frames::CountFrames;
+use crate::frames::chain::Chain;
 use crate::frames::channel_pages::ChannelPages;
 use crate::frames::frame_bytes::{FrameBytes, Segment};
 use crate::frames::reordered::reordered;
@@ -19,7 +20,7 @@ use pages::{TiffPages, bits_reversed, decoder, fault, photometric};
 use qudi_core::Size;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use tiff::ColorType;
 use tiff::tags::{ByteOrder, Tag};
 
@@ -61,12 +62,74 @@ fn open(
     }
     let recorded = described(&sidecar::beside(path), info);
     let description = describe(path)?;
-    let frames = stack(probe, description.as_ref(), recorded.as_ref(), options, info)?;
+    let files = set(path, description.as_ref());
+    let frames = match files.len() {
+        0 => stack(probe, description.as_ref(), recorded.as_ref(), options, info)?,
+        _ => stacks(files, options, info)?,
+    };
     if let Some(description) = &description {
         info.fps = info.fps.or(description.fps);
     }
     let frames = channel_of(frames, description, options, info, path)?;
     reordered(frames, options.axes, path)
+}
+
+/// Returns the files of the set that a TIFF belongs to, as OME describes it; none if it stands alone.
+fn set(path: &Path, description: Option<&Description>) -> Vec<PathBuf> {
+    let names = description.map_or(&[][..], |description| &description.files);
+    let own = path.file_name().unwrap_or_default().to_string_lossy();
+    if names.len() < 2 || !names.iter().any(|name| *name == own) {
+        return Vec::new();
+    }
+    names.iter().map(|name| path.with_file_name(name)).collect()
+}
+
+/// Returns true if a TIFF belongs to a set that is read with each of its files.
+pub(super) fn is_of_set(path: &Path) -> bool {
+    let description = describe(path).ok().flatten();
+    !set(path, description.as_ref()).is_empty()
+}
+
+/// Opens the stacks of a set, one after the other.
+fn stacks(
+    mut files: Vec<PathBuf>,
+    options: &ReadOptions,
+    info: &mut CaptureInfo,
+) -> Result<Box<dyn CountFrames>> {
+    if let Some(missing) = files.iter().find(|file| !file.is_file()).cloned() {
+        if !options.lenient {
+            return Err(Error::data(
+                format!("not there, though it is one of {} files of one stack (OME)", files.len()),
+                &missing,
+                "copy it next to the others, or read those that are there with `lenient`",
+            ));
+        }
+        info.notes.push(format!("{} of the set is missing", missing.display()));
+        files.retain(|file| file.is_file());
+    }
+    let open = |file: &PathBuf, options: &ReadOptions, info: &mut CaptureInfo| {
+        let probe = Probe::new(file, None)?;
+        stack(&probe, describe(file)?.as_ref(), None, options, info)
+    };
+    let mut lengths = Vec::new();
+    let mut size = None;
+    for file in &files {
+        let part = open(file, options, &mut info.clone())?;
+        if *size.get_or_insert(part.size()) != part.size() {
+            return Err(Error::data(
+                format!("frames of {} in a set with other ones", part.size()),
+                file,
+                "frames of one capture have one size",
+            ));
+        }
+        lengths.push(part.frames());
+    }
+    let first = open(&files[0], options, info)?;
+    info.notes
+        .push(format!("{} files of one stack (OME) are read one after the other", files.len()));
+    let (options, about) = (options.clone(), info.clone());
+    let opener = move |part: usize| open(&files[part], &options, &mut about.clone());
+    Ok(Box::new(Chain::new(first.size(), &lengths, Box::new(opener))))
 }
 
 /// Reads the description of the stack by ImageJ or OME.

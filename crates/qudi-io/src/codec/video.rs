@@ -10,7 +10,7 @@ use crate::recognition::Probe;
 use qudi_core::Transfer;
 use qudi_core::npy::Sample;
 use qudi_core::{Error, Result};
-use qudi_sim::clip::{FrameReader, Video};
+use qudi_sim::clip::{FrameReader, Video, VideoStream, video_stream};
 use std::io::{BufWriter, Write};
 
 pub(crate) const FORMAT: Format = Format {
@@ -29,13 +29,24 @@ pub(crate) const FORMAT: Format = Format {
     open,
 };
 
-/// Decodes the video once into an unnamed temporary file, 8 bits per pixel.
+/// Codecs that keep every value of 8-bit gray frames.
+const LOSSLESS: [&str; 6] = ["ffv1", "rawvideo", "huffyuv", "ffvhuff", "png", "utvideo"];
+
+/// Decodes the video once into an unnamed temporary file, 8 bits per pixel. Deeper videos are refused.
 fn open(
     probe: &Probe,
     options: &ReadOptions,
     info: &mut CaptureInfo,
 ) -> Result<Box<dyn CountFrames>> {
     let path = &probe.path;
+    let stream = video_stream(path)?;
+    if let Some(stream) = stream.as_ref().filter(|stream| stream.bits() > 8) {
+        return Err(Error::data(
+            format!("a video of {} bits per sample ({})", stream.bits(), stream.pixels),
+            path,
+            "videos are read with 8 bits; write its frames with `ffmpeg -i FILE frame_%06d.png` and read the folder",
+        ));
+    }
     let mut video = Video::open(path, Transfer::AsIs)?;
     let size = video.size();
     let spool = |e| Error::io("store the decoded frames of", path, e);
@@ -47,10 +58,15 @@ fn open(
         frames += 1;
     }
     let file = file.into_inner().map_err(|e| spool(e.into_error()))?;
-    info.notes.push(
-        "video is stored with loss: its values are not photon counts, and no figure made from them means much"
-            .to_owned(),
-    );
+    let keeps_all = |stream: &VideoStream| {
+        LOSSLESS.contains(&&*stream.codec) && stream.pixels.starts_with("gray")
+    };
+    if !stream.as_ref().is_some_and(keeps_all) {
+        info.notes.push(
+            "video is stored with loss: its values are not photon counts, and no figure made from them means much"
+                .to_owned(),
+        );
+    }
     let scale = Scale::asked(options, 255.0, info).unwrap_or(Scale::Counts);
     let segment = Segment { path: path.clone(), start: 0, frames };
     let bytes = FrameBytes::spool(segment, file, size.pixels());

@@ -70,6 +70,9 @@ pub struct CaptureInfo {
     pub cfa: Option<FilterChoice>,
     /// Camera preset that this format belongs to.
     pub preset: Option<&'static str>,
+    /// Frames before which numbers are missing.
+    #[serde(skip)]
+    pub gaps: Vec<u64>,
     /// Notes for the user.
     #[serde(rename = "remarks")]
     pub notes: Vec<String>,
@@ -110,6 +113,7 @@ impl CaptureInfo {
             mean_level: None,
             cfa: None,
             preset: None,
+            gaps: Vec::new(),
             notes: Vec::new(),
         }
     }

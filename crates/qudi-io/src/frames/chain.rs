@@ -14,6 +14,8 @@ pub(crate) struct Chain {
     firsts: Vec<u64>,
     opener: OpenPart,
     open: Option<(usize, Box<dyn CountFrames>)>,
+    /// Pixels that may hold anything; empty for none.
+    ignored: Vec<bool>,
 }
 
 impl Chain {
@@ -22,7 +24,7 @@ impl Chain {
         for length in lengths {
             firsts.push(firsts[firsts.len() - 1] + length);
         }
-        Self { size, firsts, opener, open: None }
+        Self { size, firsts, opener, open: None, ignored: Vec::new() }
     }
 
     /// Opens the part that holds `frame`, and returns it with the frame's number in it.
@@ -30,7 +32,9 @@ impl Chain {
         let at = self.firsts.partition_point(|&first| first <= frame) - 1;
         if self.open.as_ref().is_none_or(|(open, _)| *open != at) {
             self.open = None;
-            self.open = Some((at, (self.opener)(at)?));
+            let mut part = (self.opener)(at)?;
+            part.ignore(&self.ignored);
+            self.open = Some((at, part));
         }
         Ok((at, self.open.as_mut().expect("opened above").1.as_mut()))
     }
@@ -60,6 +64,11 @@ impl CountFrames for Chain {
             first = end;
         }
         Ok(())
+    }
+
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.ignored = pixels.to_vec();
+        self.open = None;
     }
 
     fn forward_only(&self) -> bool {

@@ -39,6 +39,10 @@ impl CountFrames for ChannelPages {
         self.inner.read((turn * self.channels + self.channel) * self.run + within, counts)
     }
 
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.inner.ignore(pixels);
+    }
+
     fn forward_only(&self) -> bool {
         self.inner.forward_only()
     }

@@ -59,6 +59,17 @@ pub trait CountFrames: Send {
         Ok(false)
     }
 
+    /// Reads values that are no counts as 0 where `pixels` is set: those pixels are repaired anyway.
+    fn ignore(&mut self, _pixels: &[bool]) {}
+
+    /// Compares all of the stored data with their checksum, if they have one that was not compared yet.
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if they differ, or the file cannot be read.
+    fn verify(&mut self) -> Result<()> {
+        Ok(())
+    }
+
     /// Returns true if frames cannot be read again, or only by starting over, as in a compressed file.
     fn forward_only(&self) -> bool {
         false

@@ -11,6 +11,8 @@ pub(crate) struct DepthChecked {
     /// Source of the depth, as in "`bits`" or "the file itself".
     source: &'static str,
     path: PathBuf,
+    /// Pixels that may hold anything; empty for none.
+    ignored: Vec<bool>,
 }
 
 impl DepthChecked {
@@ -20,7 +22,7 @@ impl DepthChecked {
         source: &'static str,
         path: &Path,
     ) -> Self {
-        Self { inner, max_count, source, path: path.to_owned() }
+        Self { inner, max_count, source, path: path.to_owned(), ignored: Vec::new() }
     }
 }
 
@@ -36,6 +38,9 @@ impl CountFrames for DepthChecked {
     // Sums are made of frames that are read one by one, so that each is checked.
     fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
         self.inner.read(frame, counts)?;
+        for (count, _) in counts.iter_mut().zip(&self.ignored).filter(|(_, ignored)| **ignored) {
+            *count = (*count).min(self.max_count);
+        }
         let Some(&largest) = counts.iter().max().filter(|&&largest| largest > self.max_count)
         else {
             return Ok(());
@@ -61,6 +66,15 @@ impl CountFrames for DepthChecked {
 
     fn discard_before(&mut self, frame: u64) {
         self.inner.discard_before(frame);
+    }
+
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.ignored = pixels.to_vec();
+        self.inner.ignore(pixels);
+    }
+
+    fn verify(&mut self) -> Result<()> {
+        self.inner.verify()
     }
 
     fn forward_only(&self) -> bool {

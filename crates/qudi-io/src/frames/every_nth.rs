@@ -21,6 +21,11 @@ impl EveryNth {
         if frame == 0 { 0 } else { self.first + (frame - 1) * self.times }
     }
 
+    /// Returns the frame that stored frame `stored` shows.
+    pub(crate) fn holding(&self, stored: u64) -> u64 {
+        if stored < self.first { 0 } else { 1 + (stored - self.first) / self.times }
+    }
+
     /// Returns the number of frames among the first `stored` ones.
     pub(crate) fn among(&self, stored: u64) -> u64 {
         if stored == 0 { 0 } else { 1 + stored.saturating_sub(self.first).div_ceil(self.times) }
@@ -47,6 +52,10 @@ impl CountFrames for EveryNth {
             self.frames.add(stored..stored + 1, sums)?;
         }
         Ok(())
+    }
+
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.frames.ignore(pixels);
     }
 
     fn forward_only(&self) -> bool {

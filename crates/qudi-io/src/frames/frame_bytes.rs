@@ -151,6 +151,16 @@ impl FrameBytes {
         }
     }
 
+    /// Compares what was not read yet with the checksum of the stored data, if they have one.
+    pub(crate) fn verify(&mut self) -> Result<()> {
+        match self {
+            Self::Files(files) => files.verify(),
+            Self::Stream(stream) => stream.verify(),
+            Self::Picked(picked) => picked.inner.verify(),
+            Self::Batched(_) | Self::Pipe(_) => Ok(()),
+        }
+    }
+
     /// Fills `bytes`, a whole number of frames, from frame `first` on.
     pub(crate) fn read(&mut self, first: u64, bytes: &mut [u8]) -> Result<()> {
         debug_assert_eq!(bytes.len() % self.frame_bytes(), 0);
@@ -243,6 +253,19 @@ impl RunningChecksum {
         let end = segment.start + segment.frames * frame_bytes as u64;
         file.seek(SeekFrom::Start(end))?;
         self.hash(file, self.checksum.range.end.saturating_sub(end))?;
+        self.compare()
+    }
+
+    /// Compares all of the file's part with the checksum.
+    fn whole(&mut self, file: &mut File) -> std::io::Result<()> {
+        let Range { start, end } = self.checksum.range;
+        self.hasher = crc32fast::Hasher::new();
+        file.seek(SeekFrom::Start(start))?;
+        self.hash(file, end - start)?;
+        self.compare()
+    }
+
+    fn compare(&self) -> std::io::Result<()> {
         let found = self.hasher.clone().finalize();
         let expected = self.checksum.expected;
         if found == expected { Ok(()) } else { Err(super::checksum::mismatch(found, expected)) }
@@ -292,19 +315,33 @@ impl Files {
                 .map_err(|e| Error::io(format!("read frame {first} of"), path, e))?;
             if let Some(checksum) = &mut self.checksum {
                 let segment = &self.segments[at];
-                checksum.add(first, piece, self.frame_bytes, segment, file).map_err(|e| {
-                    let ends = e.kind() == std::io::ErrorKind::UnexpectedEof;
-                    if ends || e.kind() == std::io::ErrorKind::InvalidData {
-                        return damaged(&e, path);
-                    }
-                    Error::io("check", path, e)
-                })?;
+                let added = checksum.add(first, piece, self.frame_bytes, segment, file);
+                added.map_err(|e| unverified(e, path))?;
             }
             bytes = rest;
             first += here;
         }
         Ok(())
     }
+
+    /// Reads what its checksum covers, unless all frames were read in order.
+    fn verify(&mut self) -> Result<()> {
+        let [Segment { path, frames, .. }] = &self.segments[..] else { return Ok(()) };
+        let Some(checksum) = self.checksum.as_mut().filter(|sum| sum.next < *frames) else {
+            return Ok(());
+        };
+        let compared = File::open(path).and_then(|mut file| checksum.whole(&mut file));
+        compared.map_err(|e| unverified(e, path))
+    }
+}
+
+/// Returns the error of data whose checksum was not compared, or differs.
+fn unverified(e: std::io::Error, path: &Path) -> Error {
+    let ends = e.kind() == std::io::ErrorKind::UnexpectedEof;
+    if ends || e.kind() == std::io::ErrorKind::InvalidData {
+        return damaged(&e, path);
+    }
+    Error::io("check", path, e)
 }
 
 /// The end of a stream after its last frame.
@@ -363,8 +400,17 @@ impl Stream {
         self.at = first;
         reader.read_exact(bytes).map_err(|e| fault(first, &self.path, e))?;
         self.at += (bytes.len() / self.frame_bytes) as u64;
-        if self.at == self.frames && self.after == StreamEnd::Verified {
+        if self.at == self.frames {
+            self.verify()?;
+        }
+        Ok(())
+    }
+
+    /// Reads to the end, where decoders compare checksums.
+    fn verify(&mut self) -> Result<()> {
+        if let (StreamEnd::Verified, Some(reader)) = (self.after, &mut self.reader) {
             std::io::copy(reader, &mut std::io::sink()).map_err(|e| damaged(&e, &self.path))?;
+            self.at = self.frames;
         }
         Ok(())
     }

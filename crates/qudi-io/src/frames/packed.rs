@@ -178,6 +178,10 @@ impl CountFrames for PackedFrames {
         Ok(true)
     }
 
+    fn verify(&mut self) -> Result<()> {
+        self.bytes.verify()
+    }
+
     fn forward_only(&self) -> bool {
         self.bytes.forward_only()
     }

@@ -92,6 +92,8 @@ pub(crate) struct SampleFrames {
     channel: Channel,
     scale: Scale,
     path: PathBuf,
+    /// Pixels that may hold anything; empty for none.
+    ignored: Vec<bool>,
     buffer: Vec<u8>,
 }
 
@@ -108,7 +110,8 @@ impl SampleFrames {
     ) -> Self {
         debug_assert_eq!(bytes.frame_bytes(), size.pixels() * channel.of * sample.bytes());
         let path = path.to_owned();
-        Self { bytes, sample, size, transposed, channel, scale, path, buffer: Vec::new() }
+        let (ignored, buffer) = (Vec::new(), Vec::new());
+        Self { bytes, sample, size, transposed, channel, scale, path, ignored, buffer }
     }
 }
 
@@ -146,10 +149,21 @@ impl CountFrames for SampleFrames {
         }
         for (i, value) in stored.enumerate() {
             let value = self.sample.decode(value);
-            counts[place(i)] =
-                self.scale.count(value).ok_or_else(|| no_count(value, frame, &self.path))?;
+            counts[place(i)] = match self.scale.count(value) {
+                Some(count) => count,
+                None if self.ignored.get(place(i)) == Some(&true) => 0,
+                None => return Err(no_count(value, frame, &self.path)),
+            };
         }
         Ok(())
+    }
+
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.ignored = pixels.to_vec();
+    }
+
+    fn verify(&mut self) -> Result<()> {
+        self.bytes.verify()
     }
 
     fn forward_only(&self) -> bool {

@@ -32,6 +32,10 @@ impl CountFrames for Shifted {
         Ok(())
     }
 
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.frames.ignore(pixels);
+    }
+
     fn forward_only(&self) -> bool {
         self.frames.forward_only()
     }

@@ -3,6 +3,7 @@
 use crate::capture::Capture;
 use qudi_core::windows::Windows;
 use qudi_core::{Error, Result};
+use std::ops::Range;
 
 /// Sums between pictures from which on separate windows cost no more than consecutive ones.
 const MIN_SEPARATE_SUMS: u64 = 8;
@@ -87,7 +88,7 @@ impl Instants {
     }
 
     /// Returns the native frame with which the sum of `sum` frames of a picture begins.
-    pub fn begins_at(self, picture: u64, sum: u64) -> u64 {
+    fn begins_at(self, picture: u64, sum: u64) -> u64 {
         match self {
             Self::Frames { .. } => self.frame_of(picture) * sum,
             Self::Centred { every } => picture * every,
@@ -96,13 +97,47 @@ impl Instants {
 
     /// Returns the number of pictures of `capture`; `None` while the length of a pipe is unknown.
     pub fn pictures(self, capture: &Capture) -> Option<u64> {
+        let parts = self.parts(capture);
         match self {
-            Self::Frames { .. } => capture.length().map(|frames| self.pictures_before(frames)),
-            Self::Centred { every } => {
-                let sum = u64::from(capture.summed());
-                Some((capture.native_frames() - sum) / every + 1)
+            Self::Frames { .. } if parts.len() == 1 => {
+                capture.length().map(|frames| self.pictures_before(frames))
             }
+            _ => parts.last().map(|(_, pictures)| pictures.end),
         }
+    }
+
+    /// Returns the parts of `capture`, and the pictures of each.
+    pub(super) fn parts(self, capture: &Capture) -> Vec<(Range<u64>, Range<u64>)> {
+        let sum = u64::from(capture.summed());
+        let mut end = 0;
+        let parts = capture.parts().into_iter().map(|part| {
+            let frames = part.end - part.start;
+            let pictures = match self {
+                Self::Frames { .. } => self.pictures_before(frames / sum),
+                Self::Centred { every } => (frames + every).saturating_sub(sum) / every,
+            };
+            end += pictures;
+            (part, end - pictures..end)
+        });
+        parts.collect()
+    }
+
+    /// Reads the counts of a picture, as the run that made it did.
+    ///
+    /// # Errors
+    /// [`Error`] if the capture cannot be read.
+    pub fn read(self, capture: &mut Capture, picture: u64, counts: &mut [u16]) -> Result<()> {
+        let sum = u64::from(capture.summed());
+        let parts = self.parts(capture);
+        let Some((part, pictures)) = parts.iter().find(|(_, all)| all.contains(&picture)) else {
+            return Err(Error::request(
+                format!("picture {picture}"),
+                capture.path().display(),
+                "ask for pictures of the capture",
+            ));
+        };
+        let first = self.begins_at(picture - pictures.start, sum);
+        capture.in_part(part, |capture| capture.read_from(first, counts))
     }
 }
 

@@ -56,13 +56,69 @@ fn refuse_not_finite(first: u64, frames: &[Frame], path: &Path) -> Result<()> {
 }
 
 /// Restores the pictures `numbers` of `capture`, scheduled by `schedule`, and hands them to `sink`. A picture
-/// does not depend on which others are restored, nor on whether it came from a file or a pipe. Memory holds
-/// two windows at most.
+/// does not depend on which others are restored, nor on whether it came from a file or a pipe. Every part
+/// between cuts is restored as if it were all of the capture. Memory holds two windows at most.
 ///
 /// # Errors
 /// [`Error`] if the capture cannot be read or the method or the sink fails; [`Error::Interrupted`] if `on`
 /// says so, which is called with the number of finished pictures and of all (if known).
 pub fn run(
+    restorer: &mut dyn Restorer,
+    capture: &mut Capture,
+    schedule: &Schedule,
+    numbers: Range<u64>,
+    acquisition: &Acquisition,
+    sink: &mut dyn RestoreSink,
+    on: &mut dyn FnMut(u64, Option<u64>) -> ControlFlow<()>,
+) -> Result<()> {
+    let parts = schedule.instants.parts(capture);
+    if parts.len() == 1 {
+        return run_part(restorer, capture, schedule, numbers, acquisition, sink, on);
+    }
+    let mut first_frame = 0;
+    for (part, pictures) in parts {
+        let wanted = numbers.start.max(pictures.start)..numbers.end.min(pictures.end);
+        let acquisition = Acquisition { first_frame, ..acquisition.clone() };
+        first_frame += (part.end - part.start) / u64::from(capture.summed());
+        if wanted.is_empty() {
+            continue;
+        }
+        let before = wanted.start - numbers.start;
+        let total = numbers.end.min(schedule.instants.pictures(capture).unwrap_or(numbers.end));
+        let mut on = |done, _| on(before + done, Some(total - numbers.start));
+        let mut sink = Renumbered { sink, first: pictures.start };
+        let wanted = wanted.start - pictures.start..wanted.end - pictures.start;
+        capture.in_part(&part, |capture| {
+            let windows = schedule.windows.over(capture.frames());
+            let schedule = Schedule { windows, ..*schedule };
+            run_part(restorer, capture, &schedule, wanted, &acquisition, &mut sink, &mut on)
+        })?;
+    }
+    Ok(())
+}
+
+/// A sink of pictures that are counted from one of them on.
+struct Renumbered<'a> {
+    sink: &'a mut dyn RestoreSink,
+    first: u64,
+}
+
+impl RestoreSink for Renumbered<'_> {
+    fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> Result<()> {
+        self.sink.frame(self.first + number, restored, counts)
+    }
+
+    fn colour(&mut self, number: u64, restored: &[Frame; 3], counts: &[u16]) -> Result<()> {
+        self.sink.colour(self.first + number, restored, counts)
+    }
+
+    fn uncertainty(&mut self, number: u64, uncertainty: &Frame) -> Result<()> {
+        self.sink.uncertainty(self.first + number, uncertainty)
+    }
+}
+
+/// Restores pictures of a capture without cuts.
+fn run_part(
     restorer: &mut dyn Restorer,
     capture: &mut Capture,
     schedule: &Schedule,
@@ -110,7 +166,8 @@ fn run_centred(
         for (number, counts) in (0..).zip(&mut counts) {
             capture.read_from(first + number * sum, counts)?;
         }
-        let acquisition = Acquisition { first_frame: first / sum, ..acquisition.clone() };
+        let first_frame = acquisition.first_frame + first / sum;
+        let acquisition = Acquisition { first_frame, ..acquisition.clone() };
         let (view, at) = (BurstView { size, frames: &counts }, before as usize);
         let restored = restorer.restore_frames(view, &acquisition, &[at])?;
         refuse_not_finite(picture, &restored.frames, capture.path())?;
@@ -169,7 +226,8 @@ fn run_windows(
             counts.push_back(frame);
         }
         capture.discard_before(range.end);
-        let acquisition = Acquisition { first_frame: range.start, ..acquisition.clone() };
+        let first_frame = acquisition.first_frame + range.start;
+        let acquisition = Acquisition { first_frame, ..acquisition.clone() };
         let restored_here = windows.restored(number);
         let before = instants.pictures_before(restored_here.start);
         let here = before..instants.pictures_before(restored_here.end);

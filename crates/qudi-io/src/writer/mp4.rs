@@ -1,7 +1,7 @@
 //! MP4 through the `ffmpeg` program on PATH, for looking at: 8 bits, compressed.
 
 use super::clip::Planes;
-use qudi_core::atomic_file::{Overwrite, refuse_taken};
+use qudi_core::atomic_file::{Overwrite, UnfinishedFolder, refuse_taken};
 use qudi_core::ffmpeg;
 use qudi_core::{Error, Result};
 use qudi_core::{Frame, Size};
@@ -9,7 +9,9 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
-use tempfile::NamedTempFile;
+
+/// Name of the unfinished film in its folder.
+const FILM: &str = "film.mp4";
 
 /// A film being written.
 #[derive(Debug)]
@@ -17,7 +19,7 @@ pub struct Mp4Writer {
     child: Child,
     /// Messages of ffmpeg; a file, since a full pipe would stop it.
     words: File,
-    unfinished: NamedTempFile,
+    unfinished: UnfinishedFolder,
     path: PathBuf,
     overwrite: Overwrite,
 }
@@ -37,15 +39,11 @@ impl Mp4Writer {
         refuse_taken(path, overwrite)?;
         let io = |e| Error::io("create the output", path, e);
         let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".qudi-").suffix(".mp4");
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        let unfinished = builder.tempfile_in(folder).map_err(io)?;
+        let unfinished = UnfinishedFolder::create_in(folder).map_err(io)?;
         let words = tempfile::tempfile().map_err(io)?;
         // `file:` keeps ffmpeg from taking the name for a URL or an option.
         let mut url = std::ffi::OsString::from("file:");
-        url.push(unfinished.path());
+        url.push(unfinished.path().join(FILM));
         let rate = fps.to_string();
         let pixels = if planes == Planes::Gray { "gray" } else { "rgb24" };
         let shape = format!("{}x{}", size.width, size.height);
@@ -103,7 +101,7 @@ impl Mp4Writer {
         }
         // A file that took the name since the start is kept.
         refuse_taken(&self.path, self.overwrite)?;
-        std::fs::rename(self.unfinished.path(), &self.path)
+        std::fs::rename(self.unfinished.path().join(FILM), &self.path)
             .map_err(|e| Error::io("write", &self.path, e))
     }
 

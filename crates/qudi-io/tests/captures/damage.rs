@@ -65,7 +65,29 @@ fn rejects_npz_entries_whose_checksum_does_not_match() {
         damage_crc(&path);
         let words = reading_fails(&path, &plain());
         assert!(words.contains("CRC-32"), "{method:?}: {words}");
+        // The checksum covers frames that are not asked for, too.
+        let first = ReadOptions { end: Some(5), ..plain() };
+        let mut capture = open(&path, &first).unwrap();
+        assert_eq!(counts(&mut capture).len(), 5);
+        assert!(capture.verify().unwrap_err().to_string().contains("CRC-32"), "{method:?}");
     }
+}
+
+#[test]
+fn refuses_images_that_would_fill_the_memory_before_decoding() {
+    let folder = scratch();
+    let mut header = b"IHDR".to_vec();
+    header.extend([8192u32, 8192].into_iter().flat_map(u32::to_be_bytes));
+    header.extend([8, 0, 0, 0, 0]);
+    let mut png = b"\x89PNG\r\n\x1a\n".to_vec();
+    for chunk in [header.as_slice(), b"IDAT"] {
+        png.extend((chunk.len() as u32 - 4).to_be_bytes());
+        png.extend(chunk);
+        png.extend(crc32fast::hash(chunk).to_be_bytes());
+    }
+    let path = write(folder.path(), "bomb.png", &png);
+    let words = refusal(open(&path, &plain()));
+    assert!(words.contains("8192 x 8192 pixels is over the limit of 33554432"), "{words}");
 }
 
 #[test]
@@ -80,15 +102,16 @@ fn rejects_encrypted_npz_entries() {
     assert!(refusal(open(&path, &plain())).contains("`a` is encrypted"));
 }
 
-/// Encodes a TIFF of one uncompressed page of single bits, 16 x 2, with FillOrder 2.
-fn lowest_bit_first() -> Vec<u8> {
+/// Encodes a TIFF of one uncompressed page of 4 bytes in two rows: samples of `bits` bits, 16 of one bit to
+/// the row. Black is zero if `photometric` is 1; bytes are filled from the lowest bit if `fill_order` is 2.
+fn small_tiff(bits: u32, photometric: u32, fill_order: u32, data: [u8; 4]) -> Vec<u8> {
     let entries: [(u16, u16, u32); 9] = [
-        (256, 3, 16),  // ImageWidth
-        (257, 3, 2),   // ImageLength
-        (258, 3, 1),   // BitsPerSample
-        (259, 3, 1),   // Compression: none
-        (262, 3, 1),   // PhotometricInterpretation: black is zero
-        (266, 3, 2),   // FillOrder: lowest bit first
+        (256, 3, 16 / bits), // ImageWidth
+        (257, 3, 2),         // ImageLength
+        (258, 3, bits),      // BitsPerSample
+        (259, 3, 1),         // Compression: none
+        (262, 3, photometric),
+        (266, 3, fill_order),
         (273, 4, 122), // StripOffsets
         (278, 3, 2),   // RowsPerStrip
         (279, 4, 4),   // StripByteCounts
@@ -103,19 +126,87 @@ fn lowest_bit_first() -> Vec<u8> {
     }
     bytes.extend([0; 4]);
     assert_eq!(bytes.len(), 122);
-    bytes.extend([0b0000_0001, 0b1000_0000, 0b0000_1100, 0]);
+    bytes.extend(data);
     bytes
 }
 
 #[test]
 fn tiff_bits_are_read_in_their_fill_order() {
     let folder = scratch();
-    let path = write(folder.path(), "a.tif", &lowest_bit_first());
+    let bits = [0b0000_0001, 0b1000_0000, 0b0000_1100, 0];
+    let path = write(folder.path(), "a.tif", &small_tiff(1, 1, 2, bits));
     let mut expected = vec![0; 32];
     for pixel in [0, 15, 18, 19] {
         expected[pixel] = 1;
     }
     assert_eq!(counts(&mut open(&path, &plain()).unwrap())[0], expected);
+}
+
+#[test]
+fn tiff_bits_are_counts_also_where_white_is_zero() {
+    let folder = scratch();
+    let bits = [0b1000_0000, 0b0000_0001, 0b0011_0000, 0];
+    let path = write(folder.path(), "a.tif", &small_tiff(1, 0, 1, bits));
+    let mut capture = open(&path, &plain()).unwrap();
+    let mut expected = vec![0; 32];
+    for pixel in [0, 15, 18, 19] {
+        expected[pixel] = 1;
+    }
+    assert_eq!(counts(&mut capture)[0], expected);
+    let notes = capture.info().notes.join("; ");
+    assert!(notes.contains("white is zero") && notes.contains("as they are stored"), "{notes}");
+}
+
+#[test]
+fn rejects_tiffs_of_twelve_bits_with_a_remedy() {
+    let folder = scratch();
+    let path = write(folder.path(), "a.tif", &small_tiff(12, 1, 1, [0; 4]));
+    let words = refusal(open(&path, &plain()));
+    assert!(words.contains("12") && words.contains("16-bit gray"), "{words}");
+}
+
+#[test]
+fn rejects_packed_pixels_and_headers_of_frames_with_a_remedy() {
+    let folder = scratch();
+    let size = Some(qudi_core::Size { height: 16, width: 32 });
+    let words = |name: &str, format: &str, bytes: usize| {
+        let path = write(folder.path(), name, &vec![1; bytes]);
+        let format = Some(format.to_owned());
+        refusal(open(&path, &ReadOptions { format, size, ..plain() }))
+    };
+    let text = words("mono12.raw", "raw-u16", 5 * 768);
+    assert!(text.contains("Mono12p") && text.contains("16 bits"), "{text}");
+    let text = words("headers.raw", "raw-u16", 10 * (1024 + 128));
+    assert!(text.contains("10 frames with headers of 128 bytes"), "{text}");
+    assert!(!text.contains("trailer"), "{text}");
+    let text = words("cut.raw", "raw-u16", 4 * 1024 + 37);
+    assert!(text.contains("trailer 37") && text.contains("lenient"), "{text}");
+}
+
+/// Values that are no counts are refused, unless a mask covers their pixels.
+#[test]
+fn masks_cover_values_that_are_no_counts() {
+    let folder = scratch();
+    let (bad, frames) = (37, 4);
+    let mut mask = vec![0; 64];
+    mask[bad] = 1;
+    let mask = write(folder.path(), "mask.npy", &npy("|u1", "False", "(8, 8)", &mask));
+    let masked = ReadOptions { mask: MaskChoice::File(mask), ..ReadOptions::default() };
+    let pixels = |fill: [u8; 4], count: [u8; 4]| -> Vec<u8> {
+        (0..64 * frames).flat_map(|i| if i % 64 == bad { fill } else { count }).collect()
+    };
+    let float = pixels(f32::NAN.to_le_bytes(), 3f32.to_le_bytes());
+    let word = pixels(u32::MAX.to_le_bytes(), 3u32.to_le_bytes());
+    for (descr, data) in [("<f4", float), ("<u4", word)] {
+        let path = write(folder.path(), "a.npy", &npy(descr, "False", "(4, 8, 8)", &data));
+        let plain = open(&path, &plain()).and_then(|mut capture| {
+            capture.read(0, &mut [0; 64])?;
+            Ok(capture)
+        });
+        assert!(refusal(plain).contains("whole numbers from 0 to 65535"), "{descr}");
+        let mut capture = open(&path, &masked).unwrap();
+        assert!(counts(&mut capture).iter().flatten().all(|&count| count == 3), "{descr}");
+    }
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Folders: stacks in parts, missing numbers, strangers, and maps that turn with the frames.
 
-use crate::{counts, npy, open, plain, scratch, write};
+use crate::{counts, npy, open, plain, refusal, scratch, write};
 use qudi_io::description::{MaskChoice, Orientation, ReadOptions};
 use std::path::Path;
 
@@ -43,6 +43,43 @@ fn stacks_in_parts_are_read_one_after_the_other() {
     let mut capture = open(arrays.path(), &plain()).unwrap();
     assert!(counts(&mut capture) == expected(9));
     assert!(capture.info().notes.iter().any(|note| note.contains("2 parts")));
+}
+
+#[test]
+fn sets_of_ome_are_read_from_any_of_their_files() {
+    let folder = scratch();
+    let names = ["a.ome.tif", "b.ome.tif", "c.ome.tif"];
+    let data = |(number, name): (usize, &&str)| {
+        format!(
+            "<TiffData FirstT=\"{}\" IFD=\"0\" PlaneCount=\"3\"><UUID FileName=\"{name}\">urn:uuid:{number}</UUID></TiffData>",
+            3 * number
+        )
+    };
+    let data: String = names.iter().enumerate().map(data).collect();
+    let text = format!("<OME><Image><Pixels SizeC=\"1\" SizeT=\"9\">{data}</Pixels></Image></OME>");
+    for (number, name) in names.iter().enumerate() {
+        let file = std::fs::File::create(folder.path().join(name)).unwrap();
+        let mut encoder = tiff::encoder::TiffEncoder::new(file).unwrap();
+        for t in 3 * number..3 * number + 3 {
+            let side = SIDE as u32;
+            let mut image =
+                encoder.new_image::<tiff::encoder::colortype::Gray8>(side, side).unwrap();
+            let tag = tiff::tags::Tag::ImageDescription;
+            image.encoder().write_tag(tag, text.as_str()).unwrap();
+            image.write_data(&frame(t)).unwrap();
+        }
+    }
+    for path in [folder.path().join("b.ome.tif"), folder.path().to_owned()] {
+        let mut capture = open(&path, &plain()).unwrap();
+        assert!(counts(&mut capture) == expected(9), "{}", path.display());
+        assert!(capture.info().notes.iter().any(|note| note.contains("3 files of one stack")));
+    }
+    std::fs::remove_file(folder.path().join("c.ome.tif")).unwrap();
+    let path = folder.path().join("a.ome.tif");
+    let words = refusal(open(&path, &plain()));
+    assert!(words.contains("one of 3 files") && words.contains("lenient"), "{words}");
+    let lenient = ReadOptions { lenient: true, ..plain() };
+    assert_eq!(open(&path, &lenient).unwrap().frames(), 6);
 }
 
 #[test]

@@ -153,7 +153,8 @@ fn calibration_of_a_binary_camera_recovers_its_map() {
     let options = ReadOptions { bits: Some(3), ..plain() };
     let mut capture = open(&path, &options).unwrap();
     let found =
-        calibrate(&mut capture, &truth, None, None, &mut |_, _| ControlFlow::Continue(())).unwrap();
+        calibrate(&mut capture, &truth, None, None, None, &mut |_, _| ControlFlow::Continue(()))
+            .unwrap();
     let maps = qudi_core::sensor::PixelMaps::draw(&truth, size).unwrap();
     assert_eq!(found.bad.hot, maps.hot);
     let dark = maps.dark.unwrap();
@@ -191,16 +192,58 @@ fn calibration_of_a_linear_camera_recovers_dark_and_read_noise() {
             read_noise: 0.0,
             ..truth.clone()
         };
-        let found =
-            calibrate(&mut capture, &base, Some(1.5), None, &mut |_, _| ControlFlow::Continue(()))
-                .unwrap();
+        let found = calibrate(&mut capture, &base, Some(1.5), None, None, &mut |_, _| {
+            ControlFlow::Continue(())
+        })
+        .unwrap();
         assert!((found.bulk / dark - 1.0).abs() < 0.03, "{} for {dark}", found.bulk);
         let noise = found.read_noise.unwrap();
         assert!((noise / read_noise - 1.0).abs() < 0.1, "{noise} for {read_noise}");
     }
     let mut capture = open(&folder.path().join("capture.npy"), &plain()).unwrap();
     let paper = Sensor::load("qudi-paper").unwrap();
-    let error = calibrate(&mut capture, &paper, None, None, &mut |_, _| ControlFlow::Continue(()))
-        .unwrap_err();
+    let error =
+        calibrate(&mut capture, &paper, None, None, None, &mut |_, _| ControlFlow::Continue(()))
+            .unwrap_err();
     assert!(error.to_string().contains("gain"), "{error}");
+}
+
+/// A pedestal is told from dark counts by their third moment, and from read noise by the mean.
+#[test]
+fn calibration_tells_pedestal_dark_and_read_noise_apart() {
+    let folder = scratch();
+    let camera = Sensor { bits: 12, gain: Gain::Fixed(2.0), ..Sensor::load("ideal").unwrap() };
+    let mut state = 1_u64;
+    let mut uniform = || {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        ((state >> 11) as f64 + 0.5) / (1u64 << 53) as f64
+    };
+    let mut draw = |dark: f64, read_noise: f64, offset: f64| {
+        let (mut electrons, mut product) = (-1.0, 1.0);
+        while product > (-dark).exp() {
+            product *= uniform();
+            electrons += 1.0;
+        }
+        let normal = (-2.0 * uniform().ln()).sqrt() * (std::f64::consts::TAU * uniform()).cos();
+        (offset + 2.0 * (f64::max(electrons, 0.0) + read_noise * normal)).round().max(0.0) as u16
+    };
+    for (dark, read_noise, offset) in [(0.0, 1.5, 100.0), (3.0, 1.0, 60.0), (30.0, 0.5, 0.0)] {
+        let counts = (0..40 * 64 * 96).map(|_| draw(dark, read_noise, offset));
+        let data: Vec<u8> = counts.flat_map(u16::to_le_bytes).collect();
+        let path = write(folder.path(), "dark.npy", &npy("<u2", "False", "(40, 64, 96)", &data));
+        for given in [None, Some(offset)] {
+            let mut capture = open(&path, &plain()).unwrap();
+            let mut go_on = |_, _| ControlFlow::Continue(());
+            let found =
+                calibrate(&mut capture, &camera, Some(2.0), given, None, &mut go_on).unwrap();
+            let pedestal = found.pedestal.map_or(0.0, |pedestal| pedestal.offset);
+            let case = format!("{dark} {read_noise} {offset} {given:?}: {pedestal} {}", found.bulk);
+            assert!((found.bulk - dark).abs() < 0.05 + 0.05 * dark, "{case}");
+            assert!((pedestal - offset).abs() < 0.3 + 0.1 * dark, "{case}");
+            let noise = found.read_noise.unwrap();
+            assert!((noise / read_noise - 1.0).abs() < 0.25 || dark > 9.0, "{case} {noise}");
+            assert!(found.bad.hot.len() < 5, "{case}: {} hot", found.bad.hot.len());
+        }
+    }
 }

@@ -40,29 +40,27 @@ pub(super) fn read_scaled(
     transfer: Transfer,
     white: Option<f32>,
 ) -> Result<(Frame, AssumedWhite)> {
-    to_gray(decode_image(path)?, path, transfer, white)
+    to_gray(decode_image(path, IMAGE_PIXELS)?, path, transfer, white)
 }
 
 /// White of samples of more than 8 bits where nobody says it: the full scale of their type, which 10, 12 or
 /// 14 bits stored in 16 do not reach.
 pub type AssumedWhite = Option<f32>;
 
-/// Decodes one image, turned as its metadata say.
+/// Decodes one image of at most `pixels` pixels, turned as its metadata say.
 ///
 /// # Errors
 /// [`Error`] if it cannot be read, is damaged, or is too large.
-pub fn decode_image(path: &Path) -> Result<DynamicImage> {
+pub fn decode_image(path: &Path, pixels: u64) -> Result<DynamicImage> {
     let file = BufReader::new(open_regular(path, "open the image")?);
     let guessed = ImageReader::new(file).with_guessed_format();
     let reader = guessed.map_err(|e| Error::io("open the image", path, e))?;
     // A few kilobytes can decode to gigabytes of pixels: the size in the header is checked first.
     let mut decoder = reader.into_decoder().map_err(|e| unreadable(e, path))?;
     let (width, height) = decoder.dimensions();
-    if u64::from(width) * u64::from(height) > IMAGE_PIXELS {
+    if u64::from(width) * u64::from(height) > pixels {
         return Err(Error::data(
-            format!(
-                "an image of {height} x {width} pixels is over the limit of {IMAGE_PIXELS} pixels"
-            ),
+            format!("an image of {height} x {width} pixels is over the limit of {pixels} pixels"),
             path,
             "cut it into smaller images",
         ));
@@ -95,6 +93,28 @@ fn unreadable(e: ImageError, path: &Path) -> Error {
     }
 }
 
+/// The way from the samples of pixels to gray values.
+struct Gray {
+    channels: usize,
+    /// Channels that are no opacity.
+    colours: usize,
+    white: f32,
+    transfer: Transfer,
+}
+
+impl Gray {
+    fn values<T: Copy + Into<f32>>(&self, samples: &[T]) -> Vec<f32> {
+        let value = |pixel: &[T]| {
+            let of = |channel: usize| pixel[channel].into() / self.white;
+            match self.colours {
+                1 => self.transfer.decode(of(0)),
+                _ => self.transfer.gray([of(0), of(1), of(2)]),
+            }
+        };
+        samples.chunks_exact(self.channels).map(value).collect()
+    }
+}
+
 fn to_gray(
     image: DynamicImage,
     path: &Path,
@@ -103,21 +123,6 @@ fn to_gray(
 ) -> Result<(Frame, AssumedWhite)> {
     let size =
         Size::new(image.height() as usize, image.width() as usize, &path.display().to_string())?;
-    let gray = |samples: Vec<f32>, channels: usize, alpha: bool| -> Vec<f32> {
-        let colours = channels - usize::from(alpha);
-        samples
-            .chunks_exact(channels)
-            .map(|p| {
-                if colours == 1 { transfer.decode(p[0]) } else { transfer.gray([p[0], p[1], p[2]]) }
-            })
-            .collect()
-    };
-    let of_u8 = white.unwrap_or(255.0);
-    let of_u16 = white.unwrap_or(65535.0);
-    let of_f32 = white.unwrap_or(1.0);
-    let from_u8 = |raw: Vec<u8>| raw.into_iter().map(|v| f32::from(v) / of_u8).collect();
-    let from_u16 = |raw: Vec<u16>| raw.into_iter().map(|v| f32::from(v) / of_u16).collect();
-    let from_f32 = |raw: Vec<f32>| raw.into_iter().map(|v| v / of_f32).collect();
     let deep = matches!(
         image,
         DynamicImage::ImageLuma16(_)
@@ -127,18 +132,19 @@ fn to_gray(
     );
     let assumed = (deep && white.is_none()).then_some(65535.0);
     let channels = usize::from(image.color().channel_count());
-    let alpha = image.color().has_alpha();
-    let samples: Vec<f32> = match image {
+    let colours = channels - usize::from(image.color().has_alpha());
+    let of = |full: f32| Gray { channels, colours, white: white.unwrap_or(full), transfer };
+    let data = match &image {
         DynamicImage::ImageLuma8(_)
         | DynamicImage::ImageLumaA8(_)
         | DynamicImage::ImageRgb8(_)
-        | DynamicImage::ImageRgba8(_) => from_u8(image.into_bytes()),
-        DynamicImage::ImageLuma16(i) => from_u16(i.into_raw()),
-        DynamicImage::ImageLumaA16(i) => from_u16(i.into_raw()),
-        DynamicImage::ImageRgb16(i) => from_u16(i.into_raw()),
-        DynamicImage::ImageRgba16(i) => from_u16(i.into_raw()),
-        DynamicImage::ImageRgb32F(i) => from_f32(i.into_raw()),
-        DynamicImage::ImageRgba32F(i) => from_f32(i.into_raw()),
+        | DynamicImage::ImageRgba8(_) => of(255.0).values(image.as_bytes()),
+        DynamicImage::ImageLuma16(i) => of(65535.0).values(i.as_raw()),
+        DynamicImage::ImageLumaA16(i) => of(65535.0).values(i.as_raw()),
+        DynamicImage::ImageRgb16(i) => of(65535.0).values(i.as_raw()),
+        DynamicImage::ImageRgba16(i) => of(65535.0).values(i.as_raw()),
+        DynamicImage::ImageRgb32F(i) => of(1.0).values(i.as_raw()),
+        DynamicImage::ImageRgba32F(i) => of(1.0).values(i.as_raw()),
         other => {
             return Err(Error::data(
                 format!("an image of unsupported type {:?}", other.color()),
@@ -147,7 +153,6 @@ fn to_gray(
             ));
         }
     };
-    let data = gray(samples, channels, alpha);
     check_values(&data, path)?;
     Ok((Frame { size, data }, assumed))
 }
@@ -186,10 +191,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("bomb.png");
         std::fs::write(&path, empty_png(20_000)).unwrap();
-        let error = decode_image(&path).unwrap_err().to_string();
-        assert!(error.contains("over the limit of 134217728 pixels"), "{error}");
+        let error = decode_image(&path, IMAGE_PIXELS).unwrap_err().to_string();
+        assert!(error.contains("over the limit of 67108864 pixels"), "{error}");
         std::fs::write(&path, empty_png(20)).unwrap();
-        assert!(decode_image(&path).unwrap_err().to_string().contains("not a readable image"));
+        assert!(
+            decode_image(&path, IMAGE_PIXELS)
+                .unwrap_err()
+                .to_string()
+                .contains("not a readable image")
+        );
     }
 
     /// EXIF orientation 6: the first row of the picture is the right column of what is stored.
@@ -213,7 +223,7 @@ mod tests {
     #[cfg(unix)]
     #[test]
     fn refuses_devices() {
-        let error = decode_image(Path::new("/dev/zero")).unwrap_err().to_string();
+        let error = decode_image(Path::new("/dev/zero"), 9).unwrap_err().to_string();
         assert_eq!(error, "cannot open the image: not a regular file");
     }
 }

@@ -3,6 +3,7 @@
 use super::{ClipInfo, Exposure, ExposureSource, Input, Sampling, decode_image};
 use qudi_core::colour::{ColourFilter, FilterChoice, SensorColour};
 use qudi_core::flow::Flow;
+use qudi_core::limits::IMAGE_PIXELS;
 use qudi_core::regular_file::require_regular;
 use qudi_core::{Error, Frame, Result, Size, Transfer};
 use std::path::Path;
@@ -90,7 +91,7 @@ impl ExposureSource for MosaicClip {
 /// [`Error`] if it cannot be read.
 pub fn filter_picture(path: &Path) -> Result<(Size, Vec<[u8; 3]>)> {
     require_regular(path, "read the filter")?;
-    let image = decode_image(path)?.to_rgb8();
+    let image = decode_image(path, IMAGE_PIXELS)?.to_rgb8();
     let size = Size { height: image.height() as usize, width: image.width() as usize };
     Ok((size, image.pixels().map(|pixel| pixel.0).collect()))
 }

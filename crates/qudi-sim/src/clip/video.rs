@@ -34,7 +34,13 @@ impl Video {
     /// [`Error`] if `ffmpeg` is missing or cannot decode it.
     pub fn open(path: &Path, transfer: Transfer) -> Result<Self> {
         // Opened here first, so that ffmpeg neither reports a missing file nor waits for a pipe.
-        open_regular(path, "open the video")?;
+        if video_stream(path)?.is_some_and(|stream| stream.is_interlaced) {
+            return Err(Error::data(
+                "an interlaced film: the lines of a frame belong to two instants",
+                path,
+                "deinterlace it first, as with `ffmpeg -i FILE -vf bwdif OUT.mkv`",
+            ));
+        }
         let scratch = |e| Error::io("make a temporary file for ffmpeg's messages", path, e);
         let mut words = tempfile::tempfile().map_err(scratch)?;
         // `file:` keeps ffmpeg from taking the name for a URL or an option.
@@ -74,6 +80,64 @@ impl Video {
             Ok(None) | Err(_) => Err(failed(&mut child, &mut words, path)),
         }
     }
+}
+
+/// A video stream as ffmpeg describes it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VideoStream {
+    /// Name of the codec, as `ffv1`.
+    pub codec: String,
+    /// Name of the pixel format, as `gray16le`.
+    pub pixels: String,
+    /// True if each frame has lines of two instants.
+    pub is_interlaced: bool,
+}
+
+impl VideoStream {
+    /// Finds the first video stream in what `ffmpeg -i` prints:
+    /// `Stream #0:0: Video: ffv1 (FFV1 / 0x31564646), gray16le(pc, top first), 96x64, ...`.
+    fn parse(text: &str) -> Option<Self> {
+        let line = text.lines().find_map(|line| line.split_once(": Video: "))?.1;
+        // Commas in parentheses divide nothing.
+        let mut depth = 0;
+        let mut fields = line.split(|c: char| {
+            depth += i32::from(c == '(') - i32::from(c == ')');
+            c == ',' && depth == 0
+        });
+        let codec = fields.next()?.split_whitespace().next()?.to_owned();
+        let format = fields.next()?.trim();
+        let pixels = format.split('(').next()?.trim().to_owned();
+        let is_interlaced = format.contains("top ") || format.contains("bottom ");
+        Some(Self { codec, pixels, is_interlaced })
+    }
+
+    /// Returns the bits of a sample: `gray16le` has 16, `yuv420p10le` has 10, `rgb24` has 8.
+    pub fn bits(&self) -> u32 {
+        let plain = self.pixels.trim_end_matches("le").trim_end_matches("be");
+        let digits = plain.rsplit(|c: char| !c.is_ascii_digit()).next().unwrap_or_default();
+        let bits: u32 = digits.parse().unwrap_or(8);
+        // Digits that are the bits of a pixel, or name a layout.
+        let bits = match plain.trim_end_matches(|c: char| c.is_ascii_digit()) {
+            "rgb" | "bgr" => bits / 3,
+            "rgba" | "bgra" | "argb" | "abgr" => bits / 4,
+            "nv" => 8,
+            _ => bits,
+        };
+        if (9..=32).contains(&bits) { bits } else { 8 }
+    }
+}
+
+/// Describes the video stream of the file at `path`; `None` if ffmpeg does not say.
+///
+/// # Errors
+/// [`Error`] if it is no regular file.
+pub fn video_stream(path: &Path) -> Result<Option<VideoStream>> {
+    open_regular(path, "open the video")?;
+    let mut url = std::ffi::OsString::from("file:");
+    url.push(path);
+    let output = ffmpeg().args(["-nostdin", "-hide_banner", "-i"]).arg(url).output();
+    let text = output.map(|output| String::from_utf8_lossy(&output.stderr).into_owned());
+    Ok(text.ok().as_deref().and_then(VideoStream::parse))
 }
 
 /// Creates the error from ffmpeg's own messages.
@@ -120,5 +184,30 @@ impl Drop for Video {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn streams_have_codec_depth_and_fields() {
+        let parse = |line: &str| {
+            let stream = VideoStream::parse(&format!("x\n  Stream #0:0: Video: {line}\n")).unwrap();
+            (stream.bits(), stream.codec, stream.is_interlaced)
+        };
+        let ffv1 = |bits| (bits, "ffv1".to_owned(), false);
+        let line = "ffv1 (FFV1 / 0x31564646), gray16le(pc, gbr/unknown/unknown), 96x64, 25 fps";
+        assert_eq!(parse(line), ffv1(16));
+        assert_eq!(parse("ffv1, gray(pc), 96x64"), ffv1(8));
+        assert_eq!(parse("ffv1, yuv420p10le, 96x64"), ffv1(10));
+        assert_eq!(parse("ffv1, bgr0, 96x64"), ffv1(8));
+        assert_eq!(parse("ffv1, rgb48le, 96x64"), ffv1(16));
+        assert_eq!(parse("ffv1, nv12, 96x64"), ffv1(8));
+        assert_eq!(parse("ffv1, uyvy422, 96x64"), ffv1(8));
+        let line = "mpeg2video (Main), yuv420p(tv, bt470bg, top first), 720x576, 25 fps";
+        assert_eq!(parse(line), (8, "mpeg2video".to_owned(), true));
+        assert_eq!(VideoStream::parse("Stream #0:1: Audio: aac"), None);
     }
 }

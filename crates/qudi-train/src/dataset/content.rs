@@ -75,6 +75,10 @@ fn gather(kind: SourceKind, folder: &Path, depth: usize, list: &mut Vec<PathBuf>
             paths.push(path);
         }
     }
+    if paths.is_empty() {
+        let help = "put frames or videos into it, or remove it";
+        return Err(Error::data("an empty folder among the sources", folder, help));
+    }
     paths.sort_by(|a, b| natural_order(&a.to_string_lossy(), &b.to_string_lossy()));
     if kind == SourceKind::Clips && paths.iter().any(|path| is_image(path)) {
         list.push(folder.to_owned());
@@ -86,7 +90,8 @@ fn gather(kind: SourceKind, folder: &Path, depth: usize, list: &mut Vec<PathBuf>
                 gather(kind, &path, depth - 1, list)?;
             }
         } else if kind == SourceKind::Stills {
-            if is_image(&path) {
+            // Pipes and broken links are refused by name when they are read.
+            if is_image(&path) || !path.is_file() {
                 list.push(path);
             }
         } else {

@@ -59,8 +59,16 @@ pub fn write_pack(
     let mut digest = Sha256::new();
     let (mut psnr, mut count) = (0.0, 0);
     let total = jobs.len();
+    let mut unreadable = Vec::new();
     for (source, content) in jobs {
-        let (clip, images) = packed(source, &content)?;
+        let (clip, images) = match packed(source, &content) {
+            Ok(packed) => packed,
+            // All of them are named at once.
+            Err(error) => {
+                unreadable.push(format!("{} ({error})", content.path.display()));
+                continue;
+            }
+        };
         if index.clips.iter().any(|other| other.source == clip.source && other.name == clip.name) {
             return Err(Error::data(
                 format!("source `{}` holds `{}` twice", clip.source, clip.name),
@@ -80,6 +88,17 @@ pub fn write_pack(
         if on(&PackProgress { clip, done: [index.clips.len(), total] }).is_break() {
             return Err(Error::Interrupted);
         }
+    }
+    if !unreadable.is_empty() {
+        return Err(Error::data(
+            format!(
+                "{} of {total} clips cannot be read: {}",
+                unreadable.len(),
+                unreadable.join("; ")
+            ),
+            data,
+            "repair these files or move them out of the sources; nothing was packed",
+        ));
     }
     store(&mut zip, INDEX, &index.signed(digest), path)?;
     zip.finish().map_err(|e| failed(path, e))?.into_inner().finish()?;

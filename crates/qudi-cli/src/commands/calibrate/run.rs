@@ -11,7 +11,7 @@ use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, PendingFile, refuse_taken};
 use qudi_core::npy::write_header;
 use qudi_core::sensor::{DarkRate, Gain, Response, Sensor, preset};
-use qudi_io::capture::{Calibration, Capture, calibrate};
+use qudi_io::capture::{Calibration, Capture, Pedestal, calibrate};
 use qudi_io::description::MaskChoice;
 use serde_json::json;
 use std::fmt::Write as _;
@@ -43,13 +43,14 @@ pub(crate) fn run(
             "leave it out, or give a number",
         ));
     }
-    let mut capture = Capture::open(&args.capture, &args.reading.options(MaskChoice::None), None)?;
+    let (mut capture, offset) = open(args)?;
     let (base, sensor) = base_sensor(args, settings, &capture)?;
+    let offset = offset.or((sensor.offset > 0.0).then_some(sensor.offset));
     let gain = args.gain.or(sensor.fixed_gain());
     let fps = capture.info().fps.or(sensor.fps);
     let hot = args.hot.as_deref().map(|text| threshold(text, fps)).transpose()?;
     let mut bar = report.bar();
-    let calibration = calibrate(&mut capture, &sensor, gain, hot, &mut |done, total| {
+    let calibration = calibrate(&mut capture, &sensor, gain, offset, hot, &mut |done, total| {
         bar.update("measuring", done, Some(total));
         interrupt::check()
     })?;
@@ -95,6 +96,9 @@ pub(crate) fn run(
     if let Some(noise) = calibration.read_noise {
         let _ = writeln!(text, "  read noise  {noise:.3} e-");
     }
+    if let Some(pedestal) = calibration.pedestal {
+        let _ = writeln!(text, "  pedestal    {:.2} DN{}", pedestal.offset, doubt(pedestal));
+    }
     for map in &maps {
         let _ = writeln!(text, "  wrote       {}", map.display());
     }
@@ -106,10 +110,35 @@ pub(crate) fn run(
             "hot_threshold_per_frame": calibration.threshold,
             "hot_pixels": calibration.bad.len(),
             "read_noise": calibration.read_noise,
+            "offset": calibration.pedestal.map(|pedestal| pedestal.offset),
             "fps": fps,
             "written": maps,
         })
     })
+}
+
+/// Opens the dark capture with its pedestal, and returns the one that is given.
+fn open(args: &Calibrate) -> Result<(Capture, Option<f64>)> {
+    let mut options = args.reading.options(MaskChoice::None);
+    let given = if options.threshold.is_none() { options.offset.take() } else { None };
+    let capture = Capture::open(&args.capture, &options, None)?;
+    let recorded = capture.info().sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
+    if recorded > 0.0 && options.threshold.is_none() {
+        options.offset = Some(0.0);
+        return Ok((Capture::open(&args.capture, &options, None)?, given.or(Some(recorded))));
+    }
+    Ok((capture, given))
+}
+
+/// Describes dark rates that cannot be told from a pedestal that was found.
+fn doubt(pedestal: Pedestal) -> String {
+    if pedestal.uncertain == 0.0 {
+        return String::new();
+    }
+    let rate = pedestal.uncertain;
+    format!(
+        ", from the counts: dark rates below {rate:.2e} e- per frame may lie in it; --offset gives it"
+    )
 }
 
 /// Returns the sensor to start from, and its name for `base` if it is a preset.
@@ -168,6 +197,9 @@ fn document(
         if let Some(noise) = calibration.read_noise {
             let _ = writeln!(text, "read_noise = {noise:.4}   # e- rms");
         }
+        if let Some(pedestal) = calibration.pedestal {
+            let _ = writeln!(text, "offset = {:.3}   # DN without light", pedestal.offset);
+        }
         if let Some(gain) = gain.filter(|_| sensor.response == Response::Linear) {
             let _ = writeln!(text, "gain = {gain:?}   # DN/e-, of the dark capture");
         }
@@ -185,6 +217,7 @@ fn document(
     own.name = stem.into_owned();
     own.dark = DarkRate::PerFrame(calibration.bulk);
     own.read_noise = calibration.read_noise.unwrap_or(own.read_noise);
+    own.offset = calibration.pedestal.map_or(own.offset, |pedestal| pedestal.offset);
     if let Some(gain) = gain.filter(|_| own.response == Response::Linear) {
         own.gain = Gain::Fixed(gain);
     }

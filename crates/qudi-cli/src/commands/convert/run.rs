@@ -59,6 +59,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
         frame += 1;
     }
     drop(bar);
+    capture.verify()?;
     let frames = frame;
     let layout = BurstLayout::of_counts(format, frames, size, max_count, capture.fps());
     let record = conversion(args, &options, &capture, layout)?;

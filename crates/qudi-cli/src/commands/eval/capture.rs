@@ -136,8 +136,10 @@ fn score(
     };
     let peak = PeakMemory::start();
     let start = Instant::now();
-    let (mut restorer, how) =
-        contender.method.restorer(capture, acquisition, &contender.network)?;
+    let part = capture.longest_part();
+    let (mut restorer, how) = capture.in_part(&part, |capture| {
+        contender.method.restorer(capture, acquisition, &contender.network)
+    })?;
     let windows = Windows::of(restorer.as_ref(), capture.frames(), plan.overlap)?;
     let mut go_on = |_: u64, _: Option<u64>| interrupt::check();
     run_method(

@@ -10,7 +10,6 @@ use crate::report::Report;
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::colour::Colour;
-use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::sensor::Sensor;
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::{BitOrderCheck, Capture, SumChoice, Summary};
@@ -20,6 +19,9 @@ use qudi_io::writer::Picture;
 use serde_json::{Value, json};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+
+/// Bytes of frames that are judged, which takes some hundredths of a second.
+const JUDGED_BYTES: u64 = 1 << 25;
 
 /// Columns of the histogram's bars.
 const BAR: usize = 40;
@@ -46,7 +48,7 @@ pub(crate) fn run(
         options: &options,
         sum: info.reading.sum(),
         sensor: info.sensor.as_deref(),
-        judged: SAMPLE_FRAMES,
+        judged: JUDGED_BYTES,
     };
     let summed = SummedCapture::new(source.open(settings)?, &source)?;
     let sum = summed.sum().cloned();

@@ -1,6 +1,7 @@
 //! `qudi look`: an overview of a capture.
 
 use super::args::Look;
+use super::strip::strip;
 use crate::args::given::Given;
 use crate::args::{Global, Network};
 use crate::capture::{
@@ -15,7 +16,6 @@ use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, pic
 use crate::report::{Output, Report, duration};
 use crate::settings::Settings;
 use qudi_burst::{ColourRestorer, PostFilter, Qbp};
-use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Frame, linear_to_srgb};
@@ -28,6 +28,9 @@ use std::time::Instant;
 
 /// Sums of the window that one instant is restored from.
 const WINDOW: u64 = 11;
+
+/// Bytes of frames that are judged, which takes less than a second.
+const JUDGED_BYTES: u64 = 1 << 30;
 
 /// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
 ///
@@ -59,7 +62,7 @@ pub(crate) fn run(
         options: &options,
         sum: args.reading.sum(),
         sensor: args.sensor.as_deref(),
-        judged: SAMPLE_FRAMES,
+        judged: JUDGED_BYTES,
     };
     let summed = SummedCapture::new(source.open(settings)?, &source)?;
     let sum = summed.sum().cloned();
@@ -82,7 +85,9 @@ pub(crate) fn run(
     };
     let mut picture = Picture::new(mean.size, 1, 2, 1);
     picture.place(0, 0, &["MEAN"], &mean);
-    let (first, counts) = read_window(&mut capture)?;
+    let part = capture.longest_part();
+    let (first, counts) = capture.in_part(&part, read_window)?;
+    let first = first + part.start / u64::from(capture.summed());
     let mut restored = None;
     let mut forecast = Value::Null;
     match acquired {
@@ -107,6 +112,7 @@ pub(crate) fn run(
             let pictures = Pictures { mean: &mean, instant: restored.as_ref(), counts: &counts };
             let context = json!({
                 "title": args.capture.display().to_string(),
+                "strip": strip(capture.timeline(), capture.findings()),
                 "players": [pictures.player(first, summary.sampled)],
                 "text": text,
             });
@@ -123,6 +129,7 @@ pub(crate) fn run(
             "sum": sum,
             "ppp": summary.ppp,
             "warnings": warnings,
+            "findings": capture.findings(),
             "restore": forecast,
         })
     })
@@ -138,7 +145,7 @@ fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     Ok(ideal)
 }
 
-/// Reads sums around the middle of the capture, and returns the number of the first one.
+/// Reads sums around the middle of a part, and returns the number of the first one.
 fn read_window(capture: &mut Capture) -> Result<(u64, Vec<Vec<u16>>)> {
     let length = capture.frames().min(WINDOW);
     let first = if capture.forward_only() { 0 } else { (capture.frames() - length) / 2 };

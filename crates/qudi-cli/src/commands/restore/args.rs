@@ -83,10 +83,10 @@ pub(crate) struct Restore {
     /// CAPTURE is a set of the Single Photon Challenge (SCENE/FRAME.npy), OUT the .zip that its site takes:
     /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there
     #[arg(long, conflicts_with_all = [
-        "sensor", "ppp", "gain", "gray", "wb", "mean_level", "overlap", "every", "tonemap", "fps", "shard", "float", "chi_map",
-        "side_by_side", "html", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient", "axes", "channel", "cfa",
-        "array", "levels", "bits", "offset", "threshold", "header", "trailer", "frames_per_file", "start", "end",
-        "crop", "mask", "dcr", "lenient",
+        "sensor", "ppp", "gain", "mean_level", "overlap", "every", "gray", "wb", "tonemap", "fps", "shard", "float",
+        "chi_map", "side_by_side", "html", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient",
+        "axes", "channel", "cfa", "array", "levels", "bits", "offset", "threshold", "header", "trailer",
+        "frames_per_file", "start", "end", "crop", "mask", "dcr", "lenient",
     ])]
     pub(crate) challenge: bool,
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png

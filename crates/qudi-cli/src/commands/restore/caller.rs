@@ -82,7 +82,7 @@ pub(crate) fn run(
         (None, frames) => 0..frames.unwrap_or(u64::MAX),
     };
     receiver.start(&settings, frames.map(|_| part.end - part.start))?;
-    let map = ChiSquareMap::new(job.capture(), &job.acquisition);
+    let map = ChiSquareMap::new(job.capture().size(), frames, &job.acquisition);
     let mut sink = Sink { receiver, map, tonemap: plan.tonemap };
     job.run(part, &mut sink, &plan.network, report)?;
     let results = job.results(&plan, sink.map.chi_square())?;

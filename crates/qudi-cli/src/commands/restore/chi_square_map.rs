@@ -5,8 +5,7 @@ use crate::error::Result;
 use qudi_core::atomic_file::Overwrite;
 use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
-use qudi_core::{Error, Frame};
-use qudi_io::capture::Capture;
+use qudi_core::{Error, Frame, Size};
 use qudi_io::writer::{ArrayWriter, Picture};
 use std::path::Path;
 
@@ -28,17 +27,19 @@ pub(super) struct ChiSquareMap {
 }
 
 impl ChiSquareMap {
-    pub(super) fn new(capture: &Capture, acquisition: &Acquisition) -> Self {
-        let length = capture.length();
+    /// Creates the map of `pictures` pictures, if their number is known.
+    pub(super) fn new(size: Size, pictures: Option<u64>, acquisition: &Acquisition) -> Self {
         let mut shown = vec![0];
-        shown.extend(length.into_iter().flat_map(|n| [(n - 1) / 2, n - 1]));
+        shown.extend(
+            pictures.into_iter().flat_map(|n| [n.saturating_sub(1) / 2, n.saturating_sub(1)]),
+        );
         shown.dedup();
         Self {
-            consistency: Consistency::new(capture.size(), acquisition),
+            consistency: Consistency::new(size, acquisition),
             acquisition: acquisition.clone(),
             shown,
             pictures: Vec::new(),
-            keep_latest: length.is_none(),
+            keep_latest: pictures.is_none(),
             measured: 0,
             page: None,
         }

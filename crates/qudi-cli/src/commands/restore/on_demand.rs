@@ -76,9 +76,9 @@ impl OnDemand {
         let max_count = self.job.acquisition.sensor.max_count();
         let instants = self.job.schedule.instants;
         let capture = &mut self.job.aligned.capture;
-        let (size, sum) = (capture.size(), u64::from(capture.summed()));
+        let size = capture.size();
         let mut counts = vec![0; size.pixels()];
-        capture.read_from(instants.begins_at(picture, sum), &mut counts)?;
+        instants.read(capture, picture, &mut counts)?;
         Ok(counts_frame(size, &counts, max_count))
     }
 

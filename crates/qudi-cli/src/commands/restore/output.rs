@@ -94,9 +94,8 @@ impl Output {
             return Ok(());
         }
         let mut counts = vec![0; capture.size().pixels()];
-        let sum = u64::from(capture.summed());
         for picture in pictures {
-            capture.read_from(schedule.instants.begins_at(picture, sum), &mut counts)?;
+            schedule.instants.read(capture, picture, &mut counts)?;
             map.add(&self.linear(folder.read(picture)?), &counts)?;
         }
         Ok(())

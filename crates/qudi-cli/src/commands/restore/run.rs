@@ -56,10 +56,12 @@ pub(crate) fn run(
     let page_file = PageFile::open(plan.html.as_deref(), plan.overwrite)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
-    let frames = job.schedule.instants.pictures(job.capture()).unwrap_or(u64::MAX);
+    let known = job.schedule.instants.pictures(job.capture());
+    let frames = known.unwrap_or(u64::MAX);
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
     let page = plan.html.is_some().then(|| job.page(&plan));
-    let mut map = ChiSquareMap::new(job.capture(), &job.acquisition).with_page(page);
+    let map = ChiSquareMap::new(job.capture().size(), known, &job.acquisition);
+    let mut map = map.with_page(page);
     let done = output.finished(part.clone());
     if done > 0 && plan.html.is_some() && job.rendering.is_some() {
         let help = "leave it out, or write into another folder";
@@ -229,6 +231,11 @@ impl Job {
         if capture.summed() > 1 && plan.read.sum.is_none() {
             settings["sum"] = json!(capture.summed());
         }
+        let parts = capture.parts();
+        if parts.len() > 1 {
+            let parts: Vec<_> = parts.iter().map(|part| [part.start, part.end]).collect();
+            settings["parts"] = json!(parts);
+        }
         if let Some(alignment) = self.aligned.alignment {
             settings["aligned_sums"] = json!(alignment.native_frames());
         }
@@ -385,7 +392,9 @@ fn restorer(
         None => announced_method(plan, &aligned.capture, &seen, report)?,
     };
     plan.network.check_diffusion(&[method])?;
-    let (restorer, choice) = method.restorer(&mut aligned.capture, &seen, &plan.network)?;
+    let part = aligned.capture.longest_part();
+    let (restorer, choice) =
+        aligned.capture.in_part(&part, |capture| method.restorer(capture, &seen, &plan.network))?;
     let restorer = aligned.around(restorer);
     let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
     let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.luma_alone);

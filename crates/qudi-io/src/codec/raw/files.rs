@@ -10,6 +10,9 @@ use std::path::{Path, PathBuf};
 /// Trailers that camera servers append to a stream of frames.
 pub(crate) const TRAILERS: [&[u8]; 2] = [b"DONE", b"ERROR"];
 
+/// Bytes before each frame that cameras write at most.
+const MAX_FRAME_HEADER: u64 = 4096;
+
 /// Opens the frames of `files`, `frame_bytes` each, after `header` bytes.
 pub(crate) fn frame_files(
     files: &[PathBuf],
@@ -89,15 +92,36 @@ fn segment(
                     body / frame_bytes
                 ),
                 path,
-                format!(
-                    "drop an incomplete last frame with `lenient`, or a trailer with `trailer {rest}`; or check `format` and `size`"
-                ),
+                advice(body, frame_bytes),
             ));
         }
         info.notes
             .push(format!("{}: incomplete last frame of {rest} bytes dropped", path.display()));
     }
     Ok(Segment { path: path.to_owned(), start: header, frames: body / frame_bytes })
+}
+
+/// Returns what to do with `body` bytes that are no whole frames.
+fn advice(body: u64, frame_bytes: u64) -> String {
+    let mut fits = Vec::new();
+    // Samples of 12 bits lie in words of 16, or closer.
+    if frame_bytes.is_multiple_of(4) && body.is_multiple_of(frame_bytes / 4 * 3) {
+        fits.push("12-bit packed pixels (Mono12p), to be unpacked to 16 bits first".to_owned());
+    }
+    let headers = (1..=(frame_bytes / 4).min(MAX_FRAME_HEADER) / 4).map(|words| 4 * words);
+    let whole = |header: &u64| body.is_multiple_of(frame_bytes + header);
+    if let Some(header) = { headers }.find(whole).filter(|header| body > frame_bytes + header) {
+        let frames = body / (frame_bytes + header);
+        fits.push(format!("{frames} frames with headers of {header} bytes, to be cut off first"));
+    }
+    let usual = "drop an incomplete last frame with `lenient`";
+    if fits.is_empty() {
+        let rest = body % frame_bytes;
+        return format!(
+            "{usual}, or a trailer with `trailer {rest}`; or check `format` and `size`"
+        );
+    }
+    format!("their length fits {}; {usual}; or check `format` and `size`", fits.join(", or "))
 }
 
 /// Returns the length of a known trailer, if the `rest` bytes beyond whole frames are one.

@@ -1,7 +1,7 @@
 //! Descriptions of TIFF stacks by ImageJ and OME: order of pages, channels, frame interval.
 
 /// The axes of a stack beyond rows and columns.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Description {
     /// Number of all images, if known.
     pub(super) images: Option<u64>,
@@ -11,6 +11,8 @@ pub(super) struct Description {
     pub(super) run: u64,
     /// Frames per second.
     pub(super) fps: Option<f64>,
+    /// Names of the files that hold the stack, in order, if it says.
+    pub(super) files: Vec<String>,
     /// Program that wrote it.
     pub(super) program: &'static str,
 }
@@ -36,6 +38,7 @@ fn imagej(text: &str) -> Description {
         channels: number("channels").unwrap_or(1),
         run: 1,
         fps: fps.filter(|fps| fps.is_finite() && *fps > 0.0),
+        files: Vec::new(),
         program: "ImageJ",
     }
 }
@@ -78,8 +81,27 @@ fn ome(text: &str) -> Option<Description> {
         channels: (extent("SizeC").unwrap_or(1) / samples.unwrap_or(1)).max(1),
         run,
         fps: fps.filter(|fps| fps.is_finite()),
+        files: files(text),
         program: "OME",
     })
+}
+
+/// Returns the files that `<TiffData FirstT="0" ...><UUID FileName="...">` name, in the order of their first
+/// instants. Only names in the same folder are taken.
+fn files(text: &str) -> Vec<String> {
+    let mut files: Vec<(u64, String)> = Vec::new();
+    for data in text.split("<TiffData").skip(1) {
+        let data = data.split("</TiffData>").next().unwrap_or_default();
+        let value = |name: &str| data.split(&format!("{name}=\"")).nth(1)?.split('"').next();
+        let first = value("FirstT").and_then(|text| text.parse().ok()).unwrap_or(0);
+        let Some(name) = value("FileName") else { continue };
+        let name = name.rsplit(['/', '\\']).next().unwrap_or_default();
+        if !name.is_empty() && !files.iter().any(|(_, other)| other == name) {
+            files.push((first, name.to_owned()));
+        }
+    }
+    files.sort_by_key(|&(first, _)| first);
+    files.into_iter().map(|(_, name)| name).collect()
 }
 
 #[cfg(test)]
@@ -95,6 +117,24 @@ mod tests {
         assert_eq!((d.images, d.channels, d.run, d.fps), (Some(12), 3, 1, Some(50.0)));
         let plain = Description::parse("ImageJ=1.53\nimages=7\n").unwrap();
         assert_eq!((plain.images, plain.channels, plain.fps), (Some(7), 1, None));
+    }
+
+    #[test]
+    fn reads_names_of_ome_sets() {
+        let data = |first: u64, name: &str| {
+            format!(
+                "<TiffData FirstT=\"{first}\" IFD=\"0\" PlaneCount=\"10\"><UUID FileName=\"{name}\">urn:uuid:1</UUID></TiffData>"
+            )
+        };
+        let text = format!(
+            "<OME><Image><Pixels SizeT=\"30\">{}{}{}{}</Pixels></Image></OME>",
+            data(20, "c.ome.tif"),
+            data(0, "/elsewhere/a.ome.tif"),
+            data(10, "b.ome.tif"),
+            data(11, "b.ome.tif"),
+        );
+        let files = Description::parse(&text).unwrap().files;
+        assert_eq!(files, ["a.ome.tif", "b.ome.tif", "c.ome.tif"]);
     }
 
     #[test]

@@ -28,6 +28,8 @@ pub(crate) struct TiffPages {
     inverted: bool,
     /// True if the first pixel of a byte is its lowest bit.
     reversed: bool,
+    /// Pixels that may hold anything; empty for none.
+    ignored: Vec<bool>,
 }
 
 pub(crate) fn fault(path: &Path, e: tiff::TiffError) -> Error {
@@ -184,6 +186,7 @@ impl TiffPages {
             bits: bits_only,
             inverted: white_is_zero && bits_only,
             reversed,
+            ignored: Vec::new(),
         };
         pages.drop_unreadable(options, info)?;
         pages.scale = pages.find_scale(bits, options, recorded, info)?;
@@ -330,9 +333,17 @@ impl CountFrames for TiffPages {
             return Err(self.wrong_length(frame, values.len()));
         }
         let chosen = values.into_iter().skip(index).step_by(of);
-        for (count, value) in counts.iter_mut().zip(chosen) {
-            *count = self.scale.count(value).ok_or_else(|| no_count(value, frame, &self.path))?;
+        for (pixel, (count, value)) in counts.iter_mut().zip(chosen).enumerate() {
+            *count = match self.scale.count(value) {
+                Some(count) => count,
+                None if self.ignored.get(pixel) == Some(&true) => 0,
+                None => return Err(no_count(value, frame, &self.path)),
+            };
         }
         Ok(())
+    }
+
+    fn ignore(&mut self, pixels: &[bool]) {
+        self.ignored = pixels.to_vec();
     }
 }
