@@ -244,7 +244,9 @@ fn looks_at_a_capture_on_one_page() {
     assert!(page.contains("<svg class=\"timeline\"") && page.contains("counts per pixel"));
     assert!(page.contains("base64,/9j/") && page.contains("c.npy") && page.contains("one instant"));
     // Binary frames are shown without a sensor, too.
-    run(&folder, "look c.npy -o look.png");
+    let text = run(&folder, "look c.npy -o look.png");
+    assert!(text.contains("restore    not yet: the file does not say which camera"), "{text}");
+    assert!(text.contains("name its sensor, as in --sensor"), "{text}");
     let size = image::image_dimensions(folder.join("look.png")).unwrap();
     assert!(size.0 > 2 * 48 && size.1 > 32, "{size:?}");
     refused(&folder, "look c.npy -o look.pdf", &["look.pdf", ".html"]);

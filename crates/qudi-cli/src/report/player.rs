@@ -36,6 +36,8 @@ pub(crate) struct Scene {
     pub(crate) frames: u64,
     /// Numbers of the frames in the capture, where they do not count from 0.
     pub(crate) numbers: Option<Vec<u64>>,
+    /// Number of frames of the capture, where more than `frames`.
+    pub(crate) total: Option<u64>,
     pub(crate) layers: Vec<Layer>,
     /// Layers that are shown first, by number.
     pub(crate) left: usize,
@@ -100,6 +102,8 @@ struct Data<'a> {
     height: usize,
     frames: u64,
     numbers: &'a Option<Vec<u64>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    total: Option<u64>,
     layers: &'a [Layer],
     left: usize,
     right: usize,
@@ -115,6 +119,7 @@ impl Scene {
             size,
             frames,
             numbers: None,
+            total: None,
             layers: Vec::new(),
             left: 0,
             right: 0,
@@ -132,6 +137,7 @@ impl Scene {
             height,
             frames: self.frames,
             numbers: &self.numbers,
+            total: self.total,
             layers: &self.layers,
             left: self.left,
             right: self.right,

@@ -68,7 +68,7 @@ pub(crate) fn run(
     let sum = summed.sum().cloned();
     let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
-    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0, white: None };
+    let light = LightOverrides { ppp: None, gain: None, mean_level: None, seed: 0, white: None };
     let summary = light.measure(&mut capture, sensor.as_ref())?;
     let warnings = warnings::of_capture(&capture, &summary);
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
@@ -76,6 +76,7 @@ pub(crate) fn run(
         let _ = writeln!(text, "restore    {value}");
     };
     let mean = for_the_eye(summary.picture(&capture, sensor.as_ref(), gain));
+    let unknown = sensor.is_none().then(|| unknown_sensor(&capture));
     let acquired = match sensor {
         Some(sensor) => CaptureAcquisition::new(&light, &mut capture, &sensor, &summary),
         None => ideal_sensor(&capture).and_then(|sensor| {
@@ -98,11 +99,15 @@ pub(crate) fn run(
             let instant = for_the_eye(instant.with_white_at_highlights());
             picture.place(0, 1, &["ONE INSTANT"], &instant);
             restored = Some(instant);
-            let (words, document) = plan(&capture, &acquisition, seconds)?;
-            line(&words);
-            forecast = document;
+            if let Some(CliError::Error { what, help, .. }) = unknown {
+                line(&not_yet(&what, help.as_deref()));
+            } else {
+                let (words, document) = plan(&capture, &acquisition, seconds)?;
+                line(&words);
+                forecast = document;
+            }
         }
-        Err(CliError::Error { what, .. }) => line(&format!("not yet: {what}")),
+        Err(CliError::Error { what, help, .. }) => line(&not_yet(&what, help.as_deref())),
         Err(other) => return Err(other),
     }
     if picture_only {
@@ -113,7 +118,7 @@ pub(crate) fn run(
             let context = json!({
                 "title": args.capture.display().to_string(),
                 "strip": strip(capture.timeline(), capture.findings()),
-                "players": [pictures.player(first, summary.sampled)],
+                "players": [pictures.player(first, capture.frames(), summary.sampled)],
                 "text": text,
             });
             render("look.html", context)
@@ -135,7 +140,13 @@ pub(crate) fn run(
     })
 }
 
-/// Returns a sensor that detects every photon, for binary frames of an unknown camera.
+/// Says why `qudi restore` refuses the capture as it is, and the remedy.
+fn not_yet(what: &str, help: Option<&str>) -> String {
+    let help = help.map_or(String::new(), |help| format!(": {help}"));
+    format!("not yet: {what}{help}")
+}
+
+/// Returns a sensor that detects every photon, for the one instant of binary frames of an unknown camera.
 fn ideal_sensor(capture: &Capture) -> Result<Sensor> {
     if !capture.info().binary {
         return Err(unknown_sensor(capture));
@@ -180,9 +191,9 @@ struct Pictures<'a> {
 }
 
 impl Pictures<'_> {
-    /// Returns the pictures as the template plays them; `first` is the number of the first sum, and
-    /// `averaged` the number of frames in the mean.
-    fn player(&self, first: u64, averaged: u64) -> Player {
+    /// Returns the pictures as the template plays them; `first` is the number of the first sum of the
+    /// capture's `total`, and `averaged` the number of frames in the mean.
+    fn player(&self, first: u64, total: u64, averaged: u64) -> Player {
         let (size, frames) = (self.mean.size, self.counts.len());
         let brightest = self.counts.iter().flatten().copied().max().unwrap_or(0);
         let full = f32::from(brightest.max(1));
@@ -199,6 +210,7 @@ impl Pictures<'_> {
         )];
         let numbers = first..first + frames as u64;
         scene.numbers = Some(numbers.collect());
+        scene.total = Some(total);
         scene.layers = vec![
             Layer::new("mean", Kind::Restored, vec![picture_url(self.mean, QUALITY)]),
             Layer::new("counts", Kind::Counts, counts.collect()),

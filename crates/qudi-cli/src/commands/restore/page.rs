@@ -121,6 +121,7 @@ impl RestoredPage {
             Layer::new(about.method, Kind::Restored, self.restored),
         ];
         scene.right = 1;
+        scene.total = Some(frames);
         // A run that went on has predicted uncertainty for the rest alone.
         if self.sigmas.len() == shown && shown > 0 {
             let layer = Layer::new("uncertainty", Kind::Map, self.sigmas);
