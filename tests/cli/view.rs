@@ -100,6 +100,21 @@ fn serves_its_page_and_frames() {
 }
 
 #[test]
+fn serves_the_colours_of_a_mosaic() {
+    let folder = scratch("view-mosaic");
+    run(
+        &folder,
+        "simulate scene:chart --cfa rggb --size 32x40 --frames 11 --ppp 9.75 --seed 1 -o m.npy -q",
+    );
+    let view = View::start(&folder, "m.npy --device cpu");
+    assert!(view.get("", "").contains("colours"));
+    for layer in ["counts", "mle", "qbp-refined"] {
+        let frame = view.get(&format!("frame/{layer}/5"), "Sec-Fetch-Site: same-origin\r\n");
+        assert!(frame.starts_with("HTTP/1.1 200 OK") && frame.contains("image/jpeg"), "{frame}");
+    }
+}
+
+#[test]
 fn refuses_foreign_requests() {
     let folder = capture("view-refuses");
     let view = View::start(&folder, "b.npy --device cpu");

@@ -50,6 +50,13 @@ pub(crate) fn run(
     }
     let plan = Plan::new(args, global, report.json())?;
     let mut job = Job::prepare(&plan, &plan.source(), settings, report)?;
+    if plan.output == "-" && job.rendering.is_some() {
+        return Err(CliError::new(
+            "colours are not written as Y4M",
+            "-o -",
+            "name a file or a folder, or restore luma alone with --gray",
+        ));
+    }
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
     let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
@@ -368,13 +375,6 @@ fn rendering(
     }
     if plan.luma_alone {
         return Ok(None);
-    }
-    if plan.output == "-" {
-        return Err(CliError::new(
-            "colours are not written as Y4M",
-            "-o -",
-            "name a file or a folder, or restore luma alone with --gray",
-        ));
     }
     Ok(Some(Rendering::new(plan.white_balance, capture, summary, acquisition)))
 }
