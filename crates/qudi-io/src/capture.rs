@@ -20,6 +20,7 @@ mod view;
 pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
 pub use judge::{FrameFindings, Stretch};
+pub use mosaic::MosaicContrast;
 pub use pedestal::Pedestal;
 pub use summary::{BitOrderCheck, Summary};
 

@@ -32,10 +32,11 @@ pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
             100.0 * share
         ));
     }
-    if let Some(contrast) = summary.mosaic {
+    if let Some(mosaic) = summary.mosaic {
+        let (side, percent) = (mosaic.side, 100.0 * mosaic.contrast);
+        let example = if side == 4 { "quad-rggb@0,0" } else { "rggb@0,0" };
         warnings.push(format!(
-            "pixels of a tile of 2 x 2 differ by {:.0} % all over the picture, as behind a colour filter array: name it (--cfa rggb@0,0, or the phase that your camera has), or colours are restored as texture",
-            100.0 * contrast
+            "pixels of a tile of {side} x {side} differ by {percent:.0} % all over the picture, as behind a colour filter array: name it (--cfa {example}, or the phase that your camera has), or colours are restored as texture"
         ));
     }
     if let (Some(recorded), Some(found)) = (capture.info().ppp, summary.ppp.incident) {

@@ -59,17 +59,45 @@ const MIN_AGREEMENT: f64 = 0.9;
 /// Least contrast between the pixels of a tile; uneven readout has less.
 const MIN_CONTRAST: f64 = 0.02;
 
-/// Returns by how much the pixels of tiles of 2 x 2 differ, as a share of their mean, if the picture `sums`
-/// looks like a mosaic: the two diagonals differ everywhere, or rows and columns both. Stripes along one axis
-/// come from readout.
-pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<f64> {
+/// A difference between the pixels of tiles all over the picture.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MosaicContrast {
+    /// Rows, and columns, of a tile: 2, or 4 where each colour covers 2 x 2 pixels.
+    pub side: usize,
+    /// Difference as a share of the mean.
+    pub contrast: f64,
+}
+
+/// Returns by how much the pixels of tiles differ if the picture `sums` looks like a mosaic, or like one
+/// whose colours cover 2 x 2 pixels each (quad Bayer).
+pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<MosaicContrast> {
+    if let Some(contrast) = tile_contrast(sums, size, |at| at % 2, |at| at % 2) {
+        return Some(MosaicContrast { side: 2, contrast });
+    }
+    let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].into_iter();
+    let contrasts = corners.filter_map(|(row, column)| {
+        tile_contrast(sums, size, |y| (y + row) / 2 % 2, |x| (x + column) / 2 % 2)
+    });
+    let contrast = contrasts.max_by(f64::total_cmp)?;
+    Some(MosaicContrast { side: 4, contrast })
+}
+
+/// Returns by how much the four colours of tiles differ, as a share of their mean, if the two diagonals
+/// differ everywhere, or rows and columns both. Stripes along one axis come from readout. `row` and `column`
+/// return the row and the column in a tile of 2 x 2 colours.
+fn tile_contrast(
+    sums: &[u32],
+    size: Size,
+    row: impl Fn(usize) -> usize,
+    column: impl Fn(usize) -> usize,
+) -> Option<f64> {
     let mut contrasts: [Vec<f64>; 3] = Default::default();
     for top in (0..size.height.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
         for left in (0..size.width.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
             let mut phases = [[0.0; 2]; 2];
             for y in top..top + BLOCK_SIDE {
                 for x in left..left + BLOCK_SIDE {
-                    phases[y % 2][x % 2] += f64::from(sums[y * size.width + x]);
+                    phases[row(y)][column(x)] += f64::from(sums[y * size.width + x]);
                 }
             }
             let [[a, b], [c, d]] = phases;
@@ -162,13 +190,20 @@ mod tests {
 
     /// Measures a picture with gradients and noise, seen through filters.
     fn seen(filters: [[f64; 2]; 2]) -> Option<f64> {
+        let seen = seen_at(|y, x| filters[y % 2][x % 2])?;
+        assert_eq!(seen.side, 2);
+        Some(seen.contrast)
+    }
+
+    /// Measures the picture through the filter that `filter` returns for a row and a column.
+    fn seen_at(filter: impl Fn(usize, usize) -> f64) -> Option<MosaicContrast> {
         let size = Size { height: 128, width: 160 };
         let mut rng = Streams::new(5).row(Domain::Photons, 0, 0);
         let value = |i: usize| {
             let (x, y) = (i % size.width, i / size.width);
             let light = 20.0 + 0.1 * x as f64 + 15.0 * (0.3 * y as f64).sin().powi(2);
             let noise = 1.0 + 0.4 * (uniform(&mut rng) - 0.5);
-            (light * noise * filters[y % 2][x % 2]) as u32
+            (light * noise * filter(y, x)) as u32
         };
         mosaic_contrast(&(0..size.pixels()).map(value).collect::<Vec<_>>(), size)
     }
@@ -196,6 +231,17 @@ mod tests {
             let error = check(wrong).unwrap_err().to_string();
             assert!(error.contains("two green pixels"), "{error}");
         }
+    }
+
+    #[test]
+    fn quad_mosaics_show_at_any_corner_and_stripes_do_not_count() {
+        let rggb = [[0.7, 1.0], [1.0, 0.5]];
+        for (row, column) in [(0, 0), (0, 1), (1, 0), (3, 3)] {
+            let seen = seen_at(|y, x| rggb[(y + row) / 2 % 2][(x + column) / 2 % 2]).unwrap();
+            assert_eq!(seen.side, 4, "{row}, {column}");
+            assert!((0.4..0.6).contains(&seen.contrast), "{seen:?}");
+        }
+        assert_eq!(seen_at(|_, x| [1.0, 0.8][x / 2 % 2]), None, "pairs of columns of a readout");
     }
 
     #[test]

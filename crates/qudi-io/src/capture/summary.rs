@@ -1,7 +1,7 @@
 //! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
 
 use super::Capture;
-use super::mosaic::{check_phase, mosaic_contrast};
+use super::mosaic::{MosaicContrast, check_phase, mosaic_contrast};
 use crate::description::{BitOrder, PackAxis};
 use crate::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_core::PppDefinition;
@@ -26,9 +26,8 @@ pub struct Summary {
     pub ppp: Ppp,
     /// Agreement of the picture with the bit order in use; packed captures only.
     pub bit_order: Option<BitOrderCheck>,
-    /// Difference between the pixels of tiles of 2 x 2, where the picture looks like an unnamed colour filter
-    /// array.
-    pub mosaic: Option<f64>,
+    /// Difference between the pixels of tiles, where the picture looks like an unnamed colour filter array.
+    pub mosaic: Option<MosaicContrast>,
     /// Mean count of a pixel behind red, green, blue and white, of captures whose colours are read; none of
     /// colours that the filter lacks.
     pub colours: Option<[Option<f64>; 4]>,
