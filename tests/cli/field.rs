@@ -254,6 +254,27 @@ fn looks_at_a_capture_on_one_page() {
 }
 
 #[test]
+fn looks_at_simulated_binary_frames_with_their_recorded_sensor() {
+    let folder = scratch("field-look-record");
+    let simulate = "simulate scene:text --sensor swissspad2 --size 64x64 --frames 21 --seed 1 -q";
+    run(&folder, &format!("{simulate} -o b.npy"));
+    let text = run(&folder, "look b.npy");
+    assert!(text.contains("`qudi restore` makes 21 pictures by"), "{text}");
+    let page = std::fs::read_to_string(folder.join("b-look.html")).unwrap();
+    assert!(page.contains("\"numbers\":[5,") && page.contains("\"total\":21"));
+}
+
+#[test]
+fn saturated_samples_are_warned_of_where_the_sensor_knows_full_scale() {
+    let folder = scratch("field-saturated");
+    let counts = npy_bytes("|u1", "(4, 64, 64)", &[7; 4 * 64 * 64]);
+    std::fs::write(folder.join("c.npy"), counts).unwrap();
+    let text = said(&folder, "restore c.npy --sensor qudi-paper --ppp 26 --method mle -o o.npy");
+    assert!(text.contains("100.0 % of the samples are saturated"), "{text}");
+    assert!(!text.contains("vary less"), "{text}");
+}
+
+#[test]
 fn clips_are_exposed_with_sums_and_detections_as_asked() {
     let folder = scratch("field-eval");
     let args = "eval scene:text --method mle --frames 11 --size 48x64 --ppp 4.9 --json";

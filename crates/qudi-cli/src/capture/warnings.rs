@@ -18,10 +18,14 @@ const MAX_BAD_SHARE: f64 = 0.01;
 /// Range of the ratio between the light of the counts and the recorded light.
 const LIGHT_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
-/// Returns the warnings on a capture itself.
-pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
+/// Returns the warnings on a capture itself; `sensor` knows the largest value where the file does not.
+pub(crate) fn of_capture(
+    capture: &Capture,
+    summary: &Summary,
+    sensor: Option<&Sensor>,
+) -> Vec<String> {
     let mut warnings = Vec::new();
-    warnings.extend(saturation(capture, summary));
+    warnings.extend(saturation(capture, summary, sensor));
     let bad = capture.bad_pixels();
     let share = (bad.len() + bad.doubtful) as f64 / capture.size().pixels() as f64;
     if share > MAX_BAD_SHARE {
@@ -51,11 +55,18 @@ pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
 }
 
 /// Warns if too many samples have their largest value. A single bit has it as often as it is set.
-fn saturation(capture: &Capture, summary: &Summary) -> Option<String> {
-    let max = capture.max_count()?;
+pub(crate) fn saturation(
+    capture: &Capture,
+    summary: &Summary,
+    sensor: Option<&Sensor>,
+) -> Option<String> {
+    let linear = sensor.filter(|sensor| sensor.response == Response::Linear);
+    let max = capture.max_count().or(linear.map(Sensor::max_count))?;
     let binary = capture.info().binary;
     let range = summary.mean / f64::from(max);
-    let saturated = summary.saturated.unwrap_or(0.0);
+    let samples: u64 = summary.histogram.iter().sum();
+    let largest = summary.histogram.get(usize::from(max)).copied().unwrap_or(0);
+    let saturated = largest as f64 / samples.max(1) as f64;
     let single_bits = binary && max == 1;
     let much = saturated > MAX_SATURATED_SHARE && !single_bits || range > MAX_ONES_SHARE && binary;
     much.then(|| {
@@ -67,9 +78,17 @@ fn saturation(capture: &Capture, summary: &Summary) -> Option<String> {
     })
 }
 
-/// Warns if the chi-square of the counts is outside its usual range.
-pub(crate) fn of_chi_square(chi_square: Option<f64>, sensor: &Sensor) -> Option<String> {
+/// Warns if the chi-square of the counts is outside its usual range. Saturated samples do not vary, so that
+/// a small one says nothing of a `saturated` capture.
+pub(crate) fn of_chi_square(
+    chi_square: Option<f64>,
+    sensor: &Sensor,
+    saturated: bool,
+) -> Option<String> {
     let chi_square = chi_square.filter(|chi_square| !CHI_SQUARE_RANGE.contains(chi_square))?;
+    if saturated && chi_square < 1.0 {
+        return None;
+    }
     let help = match (chi_square < 1.0, sensor.response) {
         (true, Response::Binary) => {
             "the counts vary less than their light allows: check --bits and --levels, and whether frames were averaged or filtered before"
@@ -82,4 +101,18 @@ pub(crate) fn of_chi_square(chi_square: Option<f64>, sensor: &Sensor) -> Option<
         }
     };
     Some(format!("chi-square is {chi_square:.3}, where 0.5 to 2 is usual: {help}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn saturation_explains_a_small_chi_square_alone() {
+        let sensor = Sensor::load("qudi-paper").unwrap();
+        let warns = |chi_square, saturated| of_chi_square(Some(chi_square), &sensor, saturated);
+        assert!(warns(0.1, false).unwrap().contains("vary less"));
+        assert_eq!(warns(0.1, true), None);
+        assert!(warns(9.0, true).is_some() && warns(1.0, false).is_none());
+    }
 }

@@ -62,7 +62,7 @@ pub(crate) fn run(
         }
         save(&picture, preview, overwrite)?;
     }
-    let warnings = warnings::of_capture(&capture, &summary);
+    let warnings = warnings::of_capture(&capture, &summary, sensor.as_ref());
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
     if let Some((record, path)) = record {
         text += &origin(record, path);

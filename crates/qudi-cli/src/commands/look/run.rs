@@ -70,7 +70,7 @@ pub(crate) fn run(
     let gain = capture.info().gain;
     let light = LightOverrides { ppp: None, gain: None, mean_level: None, seed: 0, white: None };
     let summary = light.measure(&mut capture, sensor.as_ref())?;
-    let warnings = warnings::of_capture(&capture, &summary);
+    let warnings = warnings::of_capture(&capture, &summary, sensor.as_ref());
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
     let mut line = |value: &str| {
         let _ = writeln!(text, "restore    {value}");

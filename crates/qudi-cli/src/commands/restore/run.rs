@@ -147,6 +147,8 @@ pub(super) struct Job {
     pub(super) schedule: Schedule,
     /// What makes the result doubtful.
     pub(super) warnings: Vec<String>,
+    /// True if so many samples are saturated that it is among the warnings.
+    saturated: bool,
     /// Rendering of the colours, where colours are restored.
     pub(super) rendering: Option<Rendering>,
 }
@@ -169,7 +171,8 @@ impl Job {
         let summary = plan.light.measure(capture, Some(&sensor))?;
         let CaptureAcquisition { acquisition, light_source } =
             CaptureAcquisition::new(&plan.light, capture, &sensor, &summary)?;
-        let warnings = warnings::of_capture(capture, &summary);
+        let warnings = warnings::of_capture(capture, &summary, Some(&sensor));
+        let saturated = warnings::saturation(capture, &summary, Some(&sensor)).is_some();
         let rendering = rendering(plan, capture, &summary, &acquisition)?;
         let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
         let overlap = plan.overlap * aligned.frames_per_sum();
@@ -183,6 +186,7 @@ impl Job {
             choice,
             schedule,
             warnings,
+            saturated,
             rendering,
         })
     }
@@ -273,7 +277,8 @@ impl Job {
             .map(|choice| OwnNetwork::new(&plan.network, choice))
             .transpose()?;
         let mode = own.map(|own| own.mode(&plan.network));
-        self.warnings.extend(warnings::of_chi_square(chi_square, &self.acquisition.sensor));
+        let sensor = &self.acquisition.sensor;
+        self.warnings.extend(warnings::of_chi_square(chi_square, sensor, self.saturated));
         Ok(json!({
             "chi_square": chi_square,
             "mode": mode,
