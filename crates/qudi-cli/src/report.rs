@@ -4,6 +4,7 @@
 //! one exporter.
 
 mod console;
+mod counted;
 pub(crate) mod csv;
 mod duration;
 pub(crate) mod html;
@@ -17,6 +18,7 @@ pub(crate) mod svg;
 mod table;
 
 pub(crate) use console::{Bar, Report, print};
+pub(crate) use counted::counted;
 pub(crate) use duration::duration;
 pub use message::{Listener, Message};
 pub(crate) use output::Output;

@@ -2,6 +2,7 @@
 
 use super::Built;
 use crate::error::Result;
+use crate::report::counted;
 use qudi_burst::{Mle, Transform, TransformDenoise};
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_io::capture::Capture;
@@ -12,7 +13,7 @@ const SAMPLES: u64 = 4;
 /// Makes the restorer of `mle`, with the number of frames chosen on the capture.
 pub(super) fn mle(capture: &mut Capture, acquisition: &Acquisition) -> Result<Built> {
     let mle = sampled(capture, |views| Mle::choose(views, acquisition))?;
-    Ok((Box::new(mle), over(mle.length())))
+    Ok((Box::new(mle), over(mle.length(), capture)))
 }
 
 /// Makes the restorer of `transform-denoise` and `bm3d`, with the number of frames chosen on the capture.
@@ -22,11 +23,12 @@ pub(super) fn transform_denoise(
     acquisition: &Acquisition,
 ) -> Result<Built> {
     let chosen = sampled(capture, |views| TransformDenoise::choose(transform, views, acquisition))?;
-    Ok((Box::new(chosen), over(chosen.length())))
+    Ok((Box::new(chosen), over(chosen.length(), capture)))
 }
 
-fn over(frames: usize) -> String {
-    format!(" over {frames} frames")
+/// Returns the number of frames in a sum, in words; a capture may have fewer.
+fn over(length: usize, capture: &Capture) -> String {
+    format!(" over {}", counted(capture.frames().min(length as u64), "frame"))
 }
 
 /// Applies `choose` to a few windows of the capture.

@@ -5,7 +5,7 @@ use crate::args::{Global, Sum};
 use crate::capture::{is_pipe, refuse_terminal, remarks, sum_by_itself};
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::report::{Bar, Report};
+use crate::report::{Bar, Report, counted};
 use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
 use qudi_core::colour::FilterChoice;
@@ -68,8 +68,9 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     writer.finish(&bytes, overwrite)?;
     remarks(&capture, report);
     let text = format!(
-        "{}   {frames} frames of {size}, {} bit, from {}",
+        "{}   {} of {size}, {} bit, from {}",
         args.output.display(),
+        counted(frames, "frame"),
         record.burst.bits,
         capture.info().title
     );

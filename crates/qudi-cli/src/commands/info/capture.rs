@@ -6,7 +6,7 @@ use crate::args::Global;
 use crate::capture::{Input, Source, SummedCapture, describe_sum, warnings};
 use crate::error::fields::flags_in_text;
 use crate::error::{CliError, Result};
-use crate::report::Report;
+use crate::report::{Report, counted};
 use crate::settings::Settings;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::colour::Colour;
@@ -130,7 +130,7 @@ pub(crate) fn describe(
             format!("not in the file; `{}` takes up to {fps} frames per second", sensor.name),
         );
     }
-    line("looked at", format!("{} frames", summary.sampled));
+    line("looked at", counted(summary.sampled, "frame"));
     let ppp = &summary.ppp;
     let photons = |value: Option<f64>| value.map_or("unknown".to_owned(), |v| format!("{v:.4}"));
     let by = sensor

@@ -13,7 +13,7 @@ use crate::methods::default::default_method;
 use crate::places::default_look;
 use crate::report::html::render;
 use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, picture_url};
-use crate::report::{Output, Report, duration};
+use crate::report::{Output, Report, counted, duration};
 use crate::settings::Settings;
 use qudi_burst::{ColourRestorer, PostFilter, Qbp};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
@@ -234,7 +234,8 @@ fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(S
     let reason = usual.reason.map_or(String::new(), |reason| format!(" ({reason})"));
     let sensor = &acquisition.sensor.name;
     let words = format!(
-        "`qudi restore` makes {pictures} pictures by {}{reason}, sensor {sensor}, in about {time}; --every N makes fewer",
+        "`qudi restore` makes {} by {}{reason}, sensor {sensor}, in about {time}; --every N makes fewer",
+        counted(pictures, "picture"),
         usual.method.name
     );
     let document = json!({"method": usual.method.name, "pictures": pictures, "seconds": total});

@@ -4,6 +4,7 @@ use super::args::Tonemap;
 use super::output::toned;
 use crate::colour::{Rendering, encoded};
 use crate::error::Result;
+use crate::report::counted;
 use crate::report::html::render;
 use crate::report::player::{
     Kind, Layer, MAX_FRAMES, MAX_UNCERTAINTY, QUALITY, Scene, colour_url, counts_frame, counts_url,
@@ -137,7 +138,7 @@ impl RestoredPage {
         let settings = serde_json::to_string_pretty(about.settings).unwrap_or_default();
         let context = json!({
             "title": about.capture,
-            "lead": format!("{frames} frames of {} restored by {}.", self.size, about.method),
+            "lead": format!("{} of {} restored by {}.", counted(frames, "frame"), self.size, about.method),
             "warnings": about.warnings,
             "players": [scene.player()],
             "text": about.text,

@@ -19,7 +19,7 @@ use crate::methods::default::default_method;
 use crate::methods::network::{OwnNetwork, device_failed};
 use crate::methods::options::NetworkOptions;
 use crate::methods::{Built, Kind, Method};
-use crate::report::{Output as PageFile, Report, duration};
+use crate::report::{Output as PageFile, Report, counted, duration};
 use crate::settings::Settings;
 use qudi_burst::ColourRestorer;
 use qudi_core::colour::FilterChoice;
@@ -464,7 +464,8 @@ pub(super) fn describe(
     seconds: Option<f64>,
 ) -> String {
     let (acquisition, size) = (&job.acquisition, job.capture().size());
-    let mut text = format!("{output}   {frames} frames of {size} by {}\n", job.method_text());
+    let made = counted(frames, "frame");
+    let mut text = format!("{output}   {made} of {size} by {}\n", job.method_text());
     let mut line = |key: &str, value: String| {
         let _ = writeln!(text, "  {key:<12}{value}");
     };

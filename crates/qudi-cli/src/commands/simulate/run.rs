@@ -6,7 +6,7 @@ use super::plan::Plan;
 use crate::args::Global;
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::report::Report;
+use crate::report::{Report, counted};
 use crate::settings::Settings;
 use qudi_io::sidecar::{BurstLayout, ClipDigest, Record, VERSION};
 use qudi_io::writer::BurstFormat;
@@ -47,8 +47,8 @@ pub(crate) fn run(
     if let Some(asked) = simulation.sampling.frames
         && summary.frames < asked
     {
-        report
-            .remark(&format!("the clip gives {} frames of the {asked} asked for", summary.frames));
+        let frames = counted(summary.frames, "frame");
+        report.remark(&format!("the clip gives {frames} of the {asked} asked for"));
     }
     for note in &summary.notes {
         report.warning(note);
@@ -87,8 +87,8 @@ fn describe(record: &Record, summary: &Summary, written: &[PathBuf], output: &st
     let meaning = meaning.as_ref().and_then(Value::as_str).unwrap_or_default().to_owned();
     let mut text = String::new();
     let name = if output == "-" { "standard output" } else { output };
-    let _ =
-        writeln!(text, "{name}   {} frames of {}, {} bit", burst.frames, burst.size, burst.bits);
+    let frames = counted(burst.frames, "frame");
+    let _ = writeln!(text, "{name}   {frames} of {}, {} bit", burst.size, burst.bits);
     let _ = writeln!(
         text,
         "  sensor  {} · gain {:.4} DN/e-",
