@@ -6,33 +6,27 @@
 
 mod auto_sum;
 mod calibrate;
-mod counter;
 mod depth;
 mod filter;
-mod findings;
-mod frame_statistics;
 mod judge;
 mod mosaic;
 mod open;
 mod parts;
 mod pedestal;
 mod pixel_map;
-mod scene_changes;
 mod summary;
-mod timeline;
 mod view;
 
 pub use auto_sum::{SUFFICIENT_DETECTIONS, SumChoice, SumLimit, choose_sum};
 pub use calibrate::{Calibration, calibrate};
-pub use findings::FrameFindings;
+pub use judge::{FrameFindings, Stretch};
 pub use pedestal::Pedestal;
 pub use summary::{BitOrderCheck, Summary};
-pub use timeline::Stretch;
 
 use crate::description::{CaptureInfo, ReadOptions};
+use crate::frames::CountFrames;
 use crate::frames::depth::DepthChecked;
 use crate::frames::pipe::FIRST_WINDOW;
-use crate::frames::{CountFrames, memory};
 use depth::{check_sum, depth_source, state_depth};
 use filter::filter_of;
 use mosaic::{MosaicPart, mosaic_part};
@@ -184,52 +178,6 @@ impl Capture {
         self.wait_for(FIRST_WINDOW)?;
         pixel_map::plan(&mut self, options, sensor)?;
         Ok(self)
-    }
-
-    /// Creates a capture from output frames of `sensor` in memory, `[frames][height * width]`.
-    ///
-    /// # Errors
-    /// [`Error::Request`] if there are none, or one has another size.
-    pub fn in_memory(
-        name: &str,
-        size: Size,
-        frames: Vec<Vec<u16>>,
-        sensor: &Sensor,
-    ) -> Result<Self> {
-        let place = Path::new(name);
-        if frames.is_empty() || frames.iter().any(|frame| frame.len() != size.pixels()) {
-            return Err(Error::request(
-                format!("{} frames, not all of {size}", frames.len()),
-                place.display(),
-                "give at least one frame, all of one size",
-            ));
-        }
-        let mut info = CaptureInfo::new("memory", "counts in memory");
-        info.max_count = Some(sensor.max_count());
-        info.binary = sensor.response == Response::Binary;
-        info.sensor = Some(sensor.clone());
-        Ok(Self {
-            path: place.to_owned(),
-            info,
-            view: View { size, from: None },
-            usual: View { size, from: None },
-            range: 0..frames.len() as u64,
-            end: None,
-            complete: true,
-            sum: 1,
-            repair: Repair::default(),
-            bad: BadPixels::default(),
-            findings: FrameFindings::default(),
-            stand_ins: BTreeMap::new(),
-            boundaries: Vec::new(),
-            timeline: Vec::new(),
-            counter: Vec::new(),
-            dark: None,
-            filter: None,
-            stored: vec![0; size.pixels()],
-            stored_sums: Vec::new(),
-            native: Box::new(memory::MemoryFrames { size, frames }),
-        })
     }
 
     /// Returns the description of the capture.

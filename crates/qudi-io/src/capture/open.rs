@@ -1,11 +1,15 @@
 //! Opening captures: from a path, a pipe, or an array that a caller holds.
 
-use super::Capture;
+use super::view::View;
+use super::{Capture, FrameFindings};
 use crate::codec::{self, GivenArray};
-use crate::description::{ReadOptions, keep_pedestal, with_pedestal};
+use crate::description::{CaptureInfo, ReadOptions, keep_pedestal, with_pedestal};
+use crate::frames::memory::MemoryFrames;
 use crate::frames::pipe::STDIN;
-use qudi_core::Result;
-use qudi_core::sensor::Sensor;
+use qudi_core::bad_pixels::{BadPixels, Repair};
+use qudi_core::sensor::{Response, Sensor};
+use qudi_core::{Error, Result, Size};
+use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +17,7 @@ impl Capture {
     /// Opens the capture at `path`. Its dark map and bad pixels come from `sensor`, if `options` name none.
     ///
     /// # Errors
-    /// [`Error`](qudi_core::Error) if it cannot be read, is of no known format, or an option does not fit.
+    /// [`Error`] if it cannot be read, is of no known format, or an option does not fit.
     pub fn open(path: &Path, options: &ReadOptions, sensor: Option<&Sensor>) -> Result<Self> {
         let mut options = with_pedestal(options, sensor);
         let named = options.offset.is_some() || options.threshold.is_some();
@@ -64,5 +68,51 @@ impl Capture {
         let (native, mut info) = array.open(&options)?;
         info.pedestal = kept;
         Self::assemble(&path, native, info, &options, sensor)
+    }
+
+    /// Creates a capture from output frames of `sensor` in memory, `[frames][height * width]`.
+    ///
+    /// # Errors
+    /// [`Error::Request`] if there are none, or one has another size.
+    pub fn in_memory(
+        name: &str,
+        size: Size,
+        frames: Vec<Vec<u16>>,
+        sensor: &Sensor,
+    ) -> Result<Self> {
+        let place = Path::new(name);
+        if frames.is_empty() || frames.iter().any(|frame| frame.len() != size.pixels()) {
+            return Err(Error::request(
+                format!("{} frames, not all of {size}", frames.len()),
+                place.display(),
+                "give at least one frame, all of one size",
+            ));
+        }
+        let mut info = CaptureInfo::new("memory", "counts in memory");
+        info.max_count = Some(sensor.max_count());
+        info.binary = sensor.response == Response::Binary;
+        info.sensor = Some(sensor.clone());
+        Ok(Self {
+            path: place.to_owned(),
+            info,
+            view: View { size, from: None },
+            usual: View { size, from: None },
+            range: 0..frames.len() as u64,
+            end: None,
+            complete: true,
+            sum: 1,
+            repair: Repair::default(),
+            bad: BadPixels::default(),
+            findings: FrameFindings::default(),
+            stand_ins: BTreeMap::new(),
+            boundaries: Vec::new(),
+            timeline: Vec::new(),
+            counter: Vec::new(),
+            dark: None,
+            filter: None,
+            stored: vec![0; size.pixels()],
+            stored_sums: Vec::new(),
+            native: Box::new(MemoryFrames { size, frames }),
+        })
     }
 }

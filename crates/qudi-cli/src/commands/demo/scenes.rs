@@ -96,8 +96,9 @@ mod tests {
     fn tag_hides_and_uncovers_the_photograph_within_the_frame() {
         let [_, scene, _] = photograph().unwrap_or_else(|e| panic!("{e:?}"));
         let (first, last) = (scene.render(0.0), scene.render(10.0));
-        let bright = |frame: &Frame, x: usize| frame.row(112)[x] > 0.9;
-        assert!(bright(&first, 160) && bright(&last, 96) && !bright(&last, 232));
+        // The tag falls by 12 pixels and moves to the left by 60.
+        let bright = |frame: &Frame, row: usize, x: usize| frame.row(row)[x] > 0.9;
+        assert!(bright(&first, 112, 160) && bright(&last, 124, 100) && !bright(&last, 124, 232));
         assert!(PHOTOGRAPH.len() <= 200_000);
     }
 }
