@@ -68,7 +68,7 @@ pub(crate) fn run(
     let sum = summed.sum().cloned();
     let SummedCapture { mut capture, sensor, .. } = summed;
     let gain = capture.info().gain;
-    let light = LightOverrides { ppp: None, gain, mean_level: None, seed: 0, white: None };
+    let light = LightOverrides { ppp: None, gain: None, mean_level: None, seed: 0, white: None };
     let summary = light.measure(&mut capture, sensor.as_ref())?;
     let warnings = warnings::of_capture(&capture, &summary);
     let mut text = describe(&capture, &summary, sensor.as_ref(), sum.as_ref(), &warnings);
