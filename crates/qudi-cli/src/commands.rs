@@ -79,7 +79,7 @@ pub(crate) mod light {
 pub(crate) mod look {
     pub(crate) mod args;
     pub(crate) mod run;
-    mod strip;
+    pub(crate) mod strip;
 }
 
 pub(crate) mod publish {

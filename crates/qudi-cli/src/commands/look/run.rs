@@ -30,7 +30,7 @@ use std::time::Instant;
 const WINDOW: u64 = 11;
 
 /// Bytes of frames that are judged, which takes less than a second.
-const JUDGED_BYTES: u64 = 1 << 30;
+pub(crate) const JUDGED_BYTES: u64 = 1 << 30;
 
 /// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
 ///
@@ -114,10 +114,14 @@ pub(crate) fn run(
         file.write(|| Ok(picture.to_png()?))?;
     } else {
         file.write(|| {
-            let pictures = Pictures { mean: &mean, instant: restored.as_ref(), counts: &counts };
+            let pictures = Pictures {
+                mean: &mean,
+                instant: restored.as_ref(),
+                counts: &counts,
+                strip: strip(capture.timeline(), capture.findings()),
+            };
             let context = json!({
                 "title": args.capture.display().to_string(),
-                "strip": strip(capture.timeline(), capture.findings()),
                 "players": [pictures.player(first, capture.frames(), summary.sampled)],
                 "text": text,
             });
@@ -188,6 +192,8 @@ struct Pictures<'a> {
     instant: Option<&'a Frame>,
     /// The sums that the instant is made of.
     counts: &'a [Vec<u16>],
+    /// Light and change over time.
+    strip: Option<String>,
 }
 
 impl Pictures<'_> {
@@ -220,6 +226,7 @@ impl Pictures<'_> {
             scene.layers.push(Layer::new("one instant", Kind::Restored, frames));
         }
         scene.right = scene.layers.len() - 1;
+        scene.strip.clone_from(&self.strip);
         scene.player()
     }
 }

@@ -14,7 +14,7 @@ const BASELINES: [f64; 2] = [62.0, 124.0];
 const MAX_MARKS: usize = 200;
 
 /// Draws the strip as SVG; `None` where nothing was looked at.
-pub(super) fn strip(timeline: &[Stretch], findings: &FrameFindings) -> Option<String> {
+pub(crate) fn strip(timeline: &[Stretch], findings: &FrameFindings) -> Option<String> {
     let (first, end) = (timeline.first()?.first, timeline.last()?.end());
     let x = |frame: u64| (frame - first) as f64 / (end - first).max(1) as f64 * SIZE[0];
     let lanes: [(&str, Values); 2] = [

@@ -6,11 +6,12 @@ use super::run::{Job, describe};
 use crate::args::Global;
 use crate::capture::Source;
 use crate::colour::Rendering;
+use crate::commands::look::run::JUDGED_BYTES;
+use crate::commands::look::strip::strip;
 use crate::error::Result;
 use crate::report::Report;
 use crate::report::player::counts_frame;
 use crate::settings::Settings;
-use qudi_core::limits::SAMPLE_FRAMES;
 use qudi_core::{Frame, Size};
 use qudi_io::restore::RestoreSink;
 use std::ops::Range;
@@ -22,7 +23,7 @@ pub(crate) struct OnDemand {
 }
 
 impl OnDemand {
-    /// Opens the capture that `args` name, and makes the restorer. Bad frames are found in a sample, since
+    /// Opens the capture that `args` name, and makes the restorer. Bad frames are looked for in a part, since
     /// nobody waits for a page until all of a long capture is read.
     pub(crate) fn new(
         args: &Restore,
@@ -31,7 +32,7 @@ impl OnDemand {
         report: &Report,
     ) -> Result<Self> {
         let plan = Plan::new(args, global, false)?;
-        let source = Source { judged: SAMPLE_FRAMES, ..plan.source() };
+        let source = Source { judged: JUDGED_BYTES, ..plan.source() };
         let job = Job::prepare(&plan, &source, settings, report)?;
         Ok(Self { plan, job })
     }
@@ -58,6 +59,11 @@ impl OnDemand {
     /// Returns how colours are rendered, if there are any.
     pub(crate) fn rendering(&self) -> Option<Rendering> {
         self.job.rendering.clone()
+    }
+
+    /// Draws light and change of the capture over time.
+    pub(crate) fn strip(&self) -> Option<String> {
+        strip(self.job.capture().timeline(), self.job.capture().findings())
     }
 
     /// Returns what makes the pictures doubtful.

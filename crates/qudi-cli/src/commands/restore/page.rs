@@ -42,6 +42,8 @@ pub(super) struct About<'a> {
     pub(super) settings: &'a Value,
     /// Chi-square of every pixel.
     pub(super) misfit: Frame,
+    /// Light and change of the capture over time.
+    pub(super) strip: Option<String>,
 }
 
 impl RestoredPage {
@@ -116,6 +118,7 @@ impl RestoredPage {
             let distance = self.distance;
             scene.caption = vec![format!("{shown} of {frames} frames, {distance} apart.")];
         }
+        scene.strip = about.strip;
         scene.numbers = Some(self.numbers);
         scene.layers = vec![
             Layer::new("counts", Kind::Counts, self.counts),
@@ -172,6 +175,7 @@ mod tests {
             warnings: &["<b>".to_owned()],
             settings: &json!({"capture": "</script><script>alert(3)</script>"}),
             misfit: Frame::filled(SIZE, 1.0),
+            strip: None,
         };
         let page = page(Some(3), 3).html(about).unwrap_or_else(|e| panic!("{e:?}"));
         assert_eq!(page.matches("<script").count(), 2, "ours: the data and the player");

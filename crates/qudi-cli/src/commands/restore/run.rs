@@ -12,6 +12,7 @@ use crate::capture::{
     AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
 };
 use crate::colour::{Rendering, dng_tags};
+use crate::commands::look::strip::strip;
 use crate::device;
 use crate::error::{CliError, Result};
 use crate::interrupt;
@@ -116,6 +117,7 @@ pub(crate) fn run(
             warnings: &job.warnings,
             settings: &settings,
             misfit: map.map(),
+            strip: strip(job.capture().timeline(), job.capture().findings()),
         };
         page_file.write(|| page.html(about))?;
     }

@@ -13,6 +13,7 @@ pub(super) fn page(frames: &Frames<'_>, title: &str) -> Result<String> {
     scene.layers = frames.layers();
     scene.right = scene.layers.len() - 1;
     scene.notes = first.warnings().iter().map(|warning| format!("Warning: {warning}")).collect();
+    scene.strip = first.strip();
     let context = json!({
         "title": title,
         "players": [scene.player()],

@@ -231,7 +231,7 @@ class Player {
     if (!this.incomplete) part('.state').textContent = '';
     else if (scene.layers[0].path && !part('.state').textContent) part('.state').textContent = 'restoring ...';
     part('.time').value = this.frame;
-    part('output').textContent = `${scene.numbers ? scene.numbers[this.frame] : this.frame} of ${scene.total ?? scene.frames}`;
+    part('output').textContent = scene.numbers ? `frame ${scene.numbers[this.frame]}` : `${this.frame} of ${scene.frames}`;
     part('.tag.left').textContent = this.views[left].name;
     part('.tag.right').textContent = this.views[right].name;
     this.showKey([left, right].map(n => this.views[n]).find(view => view.max));
