@@ -21,6 +21,7 @@ const LIGHT_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 /// Returns the warnings on a capture itself.
 pub(crate) fn of_capture(capture: &Capture, summary: &Summary) -> Vec<String> {
     let mut warnings = Vec::new();
+    warnings.extend(capture.filter_contradiction().map(str::to_owned));
     warnings.extend(saturation(capture, summary));
     let bad = capture.bad_pixels();
     let share = (bad.len() + bad.doubtful) as f64 / capture.size().pixels() as f64;

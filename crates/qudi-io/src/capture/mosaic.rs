@@ -93,8 +93,7 @@ const MAX_OTHERS: f64 = 0.5;
 /// not: the tile begins a pixel further.
 pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
     let size = filter.size();
-    let bayer = cfa.tile().is_some_and(|mosaic| mosaic.side() == 2);
-    if !bayer || size.height < 2 || size.width < 2 {
+    if filter.tile().is_none_or(|tile| tile.len() != 4) {
         return Ok(());
     }
     let colour = |y: usize, x: usize| filter.colours()[y * size.width + x];
@@ -108,6 +107,12 @@ pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoic
         return Ok(());
     }
     let [(y, x), _] = diagonals[twins];
+    let help = match cfa {
+        FilterChoice::Tile(_) => {
+            "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0"
+        }
+        FilterChoice::Picture(_) => "the picture of the filter is shifted by a pixel",
+    };
     Err(Error::mismatch(
         format!(
             "the two {} pixels of a tile of {cfa} differ by {:.0} % all over the picture, and the other two do not",
@@ -115,7 +120,7 @@ pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoic
             100.0 * same
         ),
         "cfa",
-        "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0",
+        help,
     ))
 }
 
