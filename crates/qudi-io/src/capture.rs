@@ -29,7 +29,7 @@ use crate::frames::CountFrames;
 use crate::frames::depth::DepthChecked;
 use crate::frames::pipe::FIRST_WINDOW;
 use depth::{check_sum, depth_source, state_depth};
-use filter::filter_of;
+use filter::{contradiction, filter_of, recorded_filter};
 use mosaic::{MosaicPart, mosaic_part};
 use qudi_core::Size;
 use qudi_core::bad_pixels::{self, BadPixels, Repair};
@@ -71,6 +71,8 @@ pub struct Capture {
     dark: Option<Vec<f32>>,
     /// The colour filter, of captures whose colours are read.
     filter: Option<ColourFilter>,
+    /// How the filter in use contradicts the one that the capture records.
+    filter_contradiction: Option<String>,
     stored: Vec<u16>,
     stored_sums: Vec<u32>,
 }
@@ -101,6 +103,7 @@ impl Capture {
             native = Box::new(DepthChecked::new(native, max, depth_source(options, &info), path));
         }
         let stored = native.size();
+        let recorded = recorded_filter(&info);
         let part = mosaic_part(&mut info, options, sensor)?;
         let plane = match &part {
             Some(MosaicPart::Plane(plane)) => Some(*plane),
@@ -118,6 +121,11 @@ impl Capture {
             }
             _ => None,
         };
+        let filter_contradiction = recorded.and_then(|recorded| {
+            let of_sensor = || sensor?.colour.as_ref()?.cfa.as_ref();
+            let given = options.cfa.as_ref().or_else(of_sensor);
+            contradiction(&recorded, given, info.cfa.as_ref(), stored, &usual)
+        });
         let sum = options.sum.unwrap_or(1);
         let start = options.start.unwrap_or(0);
         native.discard_before(start);
@@ -152,6 +160,7 @@ impl Capture {
             counter: Vec::new(),
             dark: None,
             filter,
+            filter_contradiction,
             stored: vec![0; stored.pixels()],
             stored_sums: Vec::new(),
             native,
@@ -323,6 +332,11 @@ impl Capture {
     /// Returns the colour filter in front of the pixels, unless they are read as gray.
     pub fn filter(&self) -> Option<&ColourFilter> {
         self.filter.as_ref()
+    }
+
+    /// Returns how the filter in use contradicts the one that the capture records, as a sentence.
+    pub fn filter_contradiction(&self) -> Option<&str> {
+        self.filter_contradiction.as_deref()
     }
 
     /// Returns the pixels that are repaired: named ones, or found ones.

@@ -1,5 +1,6 @@
 //! Warnings: what makes a result doubtful, and the remedy.
 
+use qudi_core::colour::Colour;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_io::capture::{Capture, Summary};
 
@@ -25,6 +26,7 @@ pub(crate) fn of_capture(
     sensor: Option<&Sensor>,
 ) -> Vec<String> {
     let mut warnings = Vec::new();
+    warnings.extend(capture.filter_contradiction().map(str::to_owned));
     warnings.extend(saturation(capture, summary, sensor));
     let bad = capture.bad_pixels();
     let share = (bad.len() + bad.doubtful) as f64 / capture.size().pixels() as f64;
@@ -69,6 +71,14 @@ pub(crate) fn saturation(
     let saturated = largest as f64 / samples.max(1) as f64;
     let single_bits = binary && max == 1;
     let much = saturated > MAX_SATURATED_SHARE && !single_bits || range > MAX_ONES_SHARE && binary;
+    let colour = if single_bits { None } else { saturated_colour(summary) };
+    if let (false, Some((colour, share))) = (much, colour) {
+        return Some(format!(
+            "{:.1} % of the samples behind {} are saturated: bright parts are lower bounds and lose their colour; expose shorter, or weaken the light",
+            100.0 * share,
+            colour.name()
+        ));
+    }
     much.then(|| {
         format!(
             "{:.1} % of the samples are saturated ({:.1} % of the range on average): bright parts are lower bounds; expose shorter, or weaken the light",
@@ -76,6 +86,12 @@ pub(crate) fn saturation(
             100.0 * range
         )
     })
+}
+
+/// Returns the colour that saturates most, with its share, if that is too much.
+fn saturated_colour(summary: &Summary) -> Option<(Colour, f64)> {
+    let shares = Colour::ALL.into_iter().zip(summary.saturated_colours?);
+    shares.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|&(_, share)| share > MAX_SATURATED_SHARE)
 }
 
 /// Warns if the chi-square of the counts is outside its usual range. Saturated samples do not vary, so that

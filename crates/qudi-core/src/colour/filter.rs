@@ -132,13 +132,18 @@ impl ColourFilter {
         Self { size, colours, efficiency: self.efficiency }.complete("crop")
     }
 
-    /// Returns the letters of the first `side` x `side` pixels, if the frames are that large.
-    pub fn first_tile(&self, side: usize) -> Option<String> {
-        if self.size.height < side || self.size.width < side {
-            return None;
-        }
-        let colour = |i: usize| self.colours[i / side * self.size.width + i % side];
-        Some((0..side * side).map(|i| colour(i).letter()).collect())
+    /// Returns the letters of the tile of 2 x 2 or 4 x 4 pixels that repeats over the frames from the first
+    /// pixel on, if one does.
+    pub fn tile(&self) -> Option<String> {
+        let Size { height, width } = self.size;
+        let repeats = |side: usize| {
+            let within = |i: usize| i / width % side * width + i % width % side;
+            side <= height.min(width)
+                && (0..self.colours.len()).all(|i| self.colours[i] == self.colours[within(i)])
+        };
+        let side = [2, 4].into_iter().find(|&side| repeats(side))?;
+        let letter = |i: usize| self.colours[i / side * width + i % side].letter();
+        Some((0..side * side).map(letter).collect())
     }
 
     /// Returns the size of the frames.
@@ -187,6 +192,13 @@ impl ColourFilter {
         weights
     }
 
+    /// Returns the luma of a scene of red, green and blue.
+    pub fn luma(&self, scene: &[Frame; 3]) -> Frame {
+        let weights = self.luma_weights().map(|weight| weight as f32);
+        let luma = |i: usize| (0..3).map(|k| weights[k] * scene[k].data[i]).sum();
+        Frame { size: self.size, data: (0..self.size.pixels()).map(luma).collect() }
+    }
+
     /// Returns the light that every pixel sees of a scene of red, green and blue.
     pub fn mosaic(&self, scene: &[Frame; 3]) -> Frame {
         let responses = Colour::ALL.map(|colour| self.response(colour).map(|v| v as f32));
@@ -219,6 +231,7 @@ mod tests {
         let luma: f64 =
             filter.luma_weights().iter().zip([0.2, 0.4, 0.6]).map(|(weight, v)| weight * v).sum();
         assert!((luma - mosaic.mean()).abs() < 1e-6);
+        assert!((luma - f64::from(filter.luma(&scene).data[5])).abs() < 1e-6);
     }
 
     #[test]
@@ -226,8 +239,9 @@ mod tests {
         let filter = tiled("rggb").unwrap();
         let flipped = filter.seen(SIZE, Some(&[3, 2, 1, 0, 7, 6, 5, 4])).unwrap();
         assert_eq!(flipped, tiled("grbg").unwrap());
-        assert_eq!(flipped.first_tile(2).as_deref(), Some("grbg"));
-        assert_eq!(flipped.first_tile(4), None);
+        assert_eq!(flipped.tile().as_deref(), Some("grbg"));
+        let irregular = filter.seen(SIZE, Some(&[0, 1, 2, 3, 4, 5, 5, 7])).unwrap();
+        assert_eq!(irregular.tile(), None);
         let size = Size { height: 1, width: 2 };
         assert!(filter.seen(size, Some(&[0, 1])).is_err(), "no blue is left");
     }

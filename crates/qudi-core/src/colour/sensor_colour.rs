@@ -8,6 +8,12 @@ use crate::sensor::Sensor;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+/// The least efficiency of a filter.
+const MIN_EFFICIENCY: f64 = 1e-6;
+
+/// The least volume that the rows of a matrix span, as a share of the product of their lengths.
+const MIN_VOLUME: f64 = 1e-6;
+
 /// The colour filter array of a sensor.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -47,13 +53,19 @@ impl SensorColour {
         let passed = self.efficiency.unwrap_or([1.0; 4]);
         for (colour, value) in Colour::ALL.into_iter().zip(passed) {
             let key = format!("colour.efficiency of {}", colour.name());
-            sensor.within(&key, value, f64::MIN_POSITIVE..=1.0)?;
+            sensor.within(&key, value, MIN_EFFICIENCY..=1.0)?;
         }
         for gain in self.white_balance.into_iter().flatten() {
             sensor.within("colour.white_balance", gain, 1e-3..=1e3)?;
         }
         for value in self.matrix.into_iter().flatten().flatten() {
             sensor.within("colour.matrix", value, -100.0..=100.0)?;
+        }
+        if self.matrix.is_some_and(is_singular) {
+            return Err(sensor.fault(
+                "colour.matrix is singular: it turns different colours into one".to_owned(),
+                "its rows are independent: sRGB red, green and blue of balanced sensor colours",
+            ));
         }
         Ok(())
     }
@@ -74,6 +86,17 @@ impl SensorColour {
             out
         })
     }
+}
+
+/// Returns true if the rows of `matrix` lie in a plane.
+fn is_singular(matrix: [[f64; 3]; 3]) -> bool {
+    let [a, b, c] = matrix;
+    let volume = a[0] * (b[1] * c[2] - b[2] * c[1])
+        + a[1] * (b[2] * c[0] - b[0] * c[2])
+        + a[2] * (b[0] * c[1] - b[1] * c[0]);
+    let lengths: f64 =
+        matrix.iter().map(|row| row.iter().map(|v| v * v).sum::<f64>().sqrt()).product();
+    volume.abs() <= MIN_VOLUME * lengths
 }
 
 #[cfg(test)]
@@ -97,6 +120,10 @@ mod tests {
         let mut sensor = Sensor::load("qudi-paper").unwrap();
         let efficiency = Some([0.0, 1.0, 1.0, 1.0]);
         sensor.colour = Some(SensorColour { efficiency, ..SensorColour::default() });
-        assert!(sensor.validate().unwrap_err().to_string().contains("efficiency of red"));
+        let error = sensor.validate().unwrap_err().to_string();
+        assert!(error.contains("efficiency of red` lies between 0.000001 and 1"), "{error}");
+        let matrix = Some([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 0.0, 1.0]]);
+        sensor.colour = Some(SensorColour { matrix, ..SensorColour::default() });
+        assert!(sensor.validate().unwrap_err().to_string().contains("singular"));
     }
 }

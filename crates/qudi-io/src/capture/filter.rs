@@ -1,6 +1,7 @@
 //! The colour filter of a capture, turned and cropped with its frames.
 
 use super::view::View;
+use crate::description::CaptureInfo;
 use qudi_core::colour::{ColourFilter, FilterChoice};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Result, Size};
@@ -26,6 +27,36 @@ pub(super) fn filter_of(
         Some(colour) => colour.applied_to(filter),
         None => filter,
     })
+}
+
+/// Returns the filter that the file or its record names.
+pub(super) fn recorded_filter(info: &CaptureInfo) -> Option<FilterChoice> {
+    let of_sensor = || info.sensor.as_ref()?.colour.as_ref()?.cfa.clone();
+    info.cfa.clone().or_else(of_sensor)
+}
+
+/// Returns a sentence on the filter in use, if the `given` one is not the `recorded` one, or none is in use.
+pub(super) fn contradiction(
+    recorded: &FilterChoice,
+    given: Option<&FilterChoice>,
+    used: Option<&FilterChoice>,
+    stored: Size,
+    usual: &View,
+) -> Option<String> {
+    let Some(used) = used else {
+        return Some(format!(
+            "the capture records the colour filter {recorded}, and the named sensor has none: frames are read as gray; name the filter with --cfa {recorded}"
+        ));
+    };
+    let given = given.filter(|&given| given != recorded)?;
+    let whole = View { size: stored, from: None };
+    let filter = |choice| filter_of(choice, None, stored, usual, &whole).ok();
+    if filter(given).is_some_and(|given| filter(recorded) == Some(given)) {
+        return None;
+    }
+    Some(format!(
+        "the capture records the colour filter {recorded}, and {given} is named: {used} is used; colours are wrong if that is not the camera's"
+    ))
 }
 
 /// Reads the picture of a filter.

@@ -76,7 +76,7 @@ pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<MosaicContrast
     }
     let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].into_iter();
     let contrasts = corners.filter_map(|(row, column)| {
-        tile_contrast(sums, size, |y| (y + row) / 2 % 2, |x| (x + column) / 2 % 2)
+        tile_contrast(sums, size, |y| ((y + row) >> 1) % 2, |x| ((x + column) >> 1) % 2)
     });
     let contrast = contrasts.max_by(f64::total_cmp)?;
     Some(MosaicContrast { side: 4, contrast })
@@ -121,8 +121,7 @@ const MAX_OTHERS: f64 = 0.5;
 /// not: the tile begins a pixel further.
 pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
     let size = filter.size();
-    let bayer = cfa.tile().is_some_and(|mosaic| mosaic.side() == 2);
-    if !bayer || size.height < 2 || size.width < 2 {
+    if filter.tile().is_none_or(|tile| tile.len() != 4) {
         return Ok(());
     }
     let colour = |y: usize, x: usize| filter.colours()[y * size.width + x];
@@ -136,6 +135,12 @@ pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoic
         return Ok(());
     }
     let [(y, x), _] = diagonals[twins];
+    let help = match cfa {
+        FilterChoice::Tile(_) => {
+            "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0"
+        }
+        FilterChoice::Picture(_) => "the picture of the filter is shifted by a pixel",
+    };
     Err(Error::mismatch(
         format!(
             "the two {} pixels of a tile of {cfa} differ by {:.0} % all over the picture, and the other two do not",
@@ -143,7 +148,7 @@ pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoic
             100.0 * same
         ),
         "cfa",
-        "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0",
+        help,
     ))
 }
 
@@ -237,7 +242,7 @@ mod tests {
     fn quad_mosaics_show_at_any_corner_and_stripes_do_not_count() {
         let rggb = [[0.7, 1.0], [1.0, 0.5]];
         for (row, column) in [(0, 0), (0, 1), (1, 0), (3, 3)] {
-            let seen = seen_at(|y, x| rggb[(y + row) / 2 % 2][(x + column) / 2 % 2]).unwrap();
+            let seen = seen_at(|y, x| rggb[((y + row) >> 1) % 2][((x + column) >> 1) % 2]).unwrap();
             assert_eq!(seen.side, 4, "{row}, {column}");
             assert!((0.4..0.6).contains(&seen.contrast), "{seen:?}");
         }

@@ -110,6 +110,7 @@ impl Capture {
             counter: Vec::new(),
             dark: None,
             filter: None,
+            filter_contradiction: None,
             stored: vec![0; size.pixels()],
             stored_sums: Vec::new(),
             native: Box::new(MemoryFrames { size, frames }),

@@ -22,6 +22,8 @@ pub struct Summary {
     pub histogram: Vec<u64>,
     /// Fraction of samples at the largest possible count, if that is known.
     pub saturated: Option<f64>,
+    /// The same fraction of the pixels behind red, green, blue and white, of captures whose colours are read.
+    pub saturated_colours: Option<[f64; 4]>,
     /// Photons per pixel and output frame: incident, detected, DN. Absent without a known sensor.
     pub ppp: Ppp,
     /// Agreement of the picture with the bit order in use; packed captures only.
@@ -83,11 +85,17 @@ impl Summary {
         let mut sums = vec![0u32; size.pixels()];
         let mut counts = vec![0u16; size.pixels()];
         let mut histogram = vec![0u64; 1 << 16];
+        let mut saturated_colours = [0u64; 4];
         for &frame in &sampled {
             capture.read(frame, &mut counts)?;
             for (sum, &count) in sums.iter_mut().zip(&counts) {
                 *sum += u32::from(count);
                 histogram[usize::from(count)] += 1;
+            }
+            if let (Some(filter), Some(max)) = (&capture.filter, capture.max_count()) {
+                for (&colour, &count) in filter.colours().iter().zip(&counts) {
+                    saturated_colours[colour as usize] += u64::from(count == max);
+                }
             }
         }
         if let (Some(filter), Some(cfa)) = (&capture.filter, &capture.info.cfa) {
@@ -108,6 +116,10 @@ impl Summary {
             mean: total / samples,
             histogram,
             saturated,
+            saturated_colours: capture.filter.as_ref().map(|filter| {
+                let pixels = filter.shares().map(|share| (share * samples).max(1.0));
+                std::array::from_fn(|k| saturated_colours[k] as f64 / pixels[k])
+            }),
             ppp,
             bit_order,
             mosaic: if capture.info.cfa.is_none() { mosaic_contrast(&sums, size) } else { None },

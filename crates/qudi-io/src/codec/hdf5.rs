@@ -175,9 +175,9 @@ fn metadata(
     let Ok(metadata) = serde_json::from_str::<serde_json::Value>(&text) else { return Ok(()) };
     if let Some(pattern) = metadata["cfa_pattern"].as_str() {
         let mono = ["", "none", "mono", "monochrome"].contains(&pattern.to_lowercase().as_str());
-        if !mono && options.cfa.is_none() {
+        if !mono {
             info.cfa = pattern.parse().ok();
-            if info.cfa.is_none() {
+            if info.cfa.is_none() && options.cfa.is_none() {
                 return Err(Error::data(
                     format!("a capture behind a colour filter array ({pattern})"),
                     path,

@@ -9,7 +9,7 @@ use crate::report::{Bar, Report, counted};
 use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
 use qudi_core::colour::FilterChoice;
-use qudi_io::capture::Capture;
+use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
 use qudi_io::writer::{BurstFormat, BurstWriter};
@@ -21,6 +21,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     let options = args.reading.options(MaskChoice::None);
     refuse_taken(&args.output, overwrite)?;
     let mut capture = open(args, &options)?;
+    check_filter(&mut capture, report)?;
     let max_count = largest_count(&mut capture, args)?;
     let format = BurstFormat::for_path(&args.output, max_count, !args.unpacked)?;
     if args.unpacked && !(format == BurstFormat::NpyU8 && max_count == 1) {
@@ -145,12 +146,26 @@ fn conversion(
     })
 }
 
-/// Returns the colour filter of the frames as they are read: tiles are turned and cropped with them, a
-/// picture is of the stored frames.
+/// Returns the colour filter of the frames, turned and cropped as they are, if it is a tile that repeats.
 fn converted_filter(capture: &Capture) -> Option<FilterChoice> {
-    let (filter, choice) = (capture.filter()?, capture.info().cfa.as_ref()?);
-    let tile = filter.first_tile(choice.tile()?.side())?;
-    tile.parse().ok()
+    capture.filter()?.tile()?.parse().ok()
+}
+
+/// Refuses a colour filter that the picture contradicts, and warns of one that a record cannot hold.
+fn check_filter(capture: &mut Capture, report: &Report) -> Result<()> {
+    if capture.filter().is_none() {
+        return Ok(());
+    }
+    Summary::measure(capture, None, None)?;
+    if let Some(contradiction) = capture.filter_contradiction() {
+        report.warning(contradiction);
+    }
+    if let (None, Some(cfa)) = (converted_filter(capture), &capture.info().cfa) {
+        report.warning(&format!(
+            "the record does not keep the colour filter {cfa}, which is no tile that repeats: when the converted frames are read, name a picture of it of their size with --cfa FILE"
+        ));
+    }
+    Ok(())
 }
 
 /// Returns the largest count that can appear: known, or the limit of the sample type that the counts need.

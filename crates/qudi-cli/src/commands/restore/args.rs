@@ -67,9 +67,9 @@ pub(crate) struct Restore {
     #[arg(long, value_name = "R,G,B", conflicts_with = "gray")]
     pub(crate) wb: Option<Gains>,
     /// Tone curve of what is written: none (values follow the light, as in the clip), or srgb, which
-    /// brightens shadows for the eye
-    #[arg(long, value_name = "CURVE", default_value = "none")]
-    pub(crate) tonemap: Tonemap,
+    /// brightens shadows for the eye [default: none; srgb for pictures in colour]
+    #[arg(long, value_name = "CURVE")]
+    pub(crate) tonemap: Option<Tonemap>,
     /// Frames per second of what plays (.gif, .mp4, Y4M) [default: 25; the capture's own rate is in the
     /// manifest]
     #[arg(long, value_name = "RATE", allow_negative_numbers = true, value_parser = number::real(number::PLAYED_FPS))]
@@ -92,7 +92,8 @@ pub(crate) struct Restore {
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) chi_map: Option<PathBuf>,
-    /// Write a picture of the first, middle and last frame: counts above, restored below
+    /// Write a picture of the first, middle and last frame: counts above, restored below (of colours,
+    /// their luma)
     #[arg(long, value_name = "PNG", value_hint = ValueHint::FilePath)]
     pub(crate) side_by_side: Option<PathBuf>,
     /// Write a page that plays: counts, restored frames, uncertainty and misfit under a slider, the settings

@@ -83,7 +83,8 @@ pub(crate) fn run(
     };
     receiver.start(&settings, frames.map(|_| part.end - part.start))?;
     let map = ChiSquareMap::new(job.capture().size(), frames, &job.acquisition);
-    let mut sink = Sink { receiver, map, tonemap: plan.tonemap };
+    let map = map.behind(job.capture().filter().cloned());
+    let mut sink = Sink { receiver, map, tonemap: plan.tonemap() };
     job.run(part, &mut sink, &plan.network, report)?;
     let results = job.results(&plan, sink.map.chi_square())?;
     crate::capture::remarks(job.capture(), report);

@@ -3,6 +3,7 @@
 use super::page::RestoredPage;
 use crate::error::Result;
 use qudi_core::atomic_file::Overwrite;
+use qudi_core::colour::ColourFilter;
 use qudi_core::metrics::Consistency;
 use qudi_core::restorer::Acquisition;
 use qudi_core::{Error, Frame, Size};
@@ -22,6 +23,8 @@ pub(super) struct ChiSquareMap {
     keep_latest: bool,
     /// Frames measured so far.
     measured: u64,
+    /// The colour filter in front of the pixels, if there is one.
+    filter: Option<ColourFilter>,
     /// The page, if one is written.
     page: Option<RestoredPage>,
 }
@@ -41,8 +44,15 @@ impl ChiSquareMap {
             pictures: Vec::new(),
             keep_latest: pictures.is_none(),
             measured: 0,
+            filter: None,
             page: None,
         }
+    }
+
+    /// Sets the colour filter of the capture. Luma alone says nothing of counts behind it: it has no
+    /// chi-square.
+    pub(super) fn behind(self, filter: Option<ColourFilter>) -> Self {
+        Self { filter, ..self }
     }
 
     /// Adds the page that shows the frames.
@@ -60,23 +70,32 @@ impl ChiSquareMap {
         if let Some(page) = &mut self.page {
             page.add(restored, counts);
         }
-        self.measure(restored, counts)
+        self.show(restored, counts);
+        if self.filter.is_some() {
+            return Ok(());
+        }
+        self.consistency.add(restored, counts, &self.acquisition).map(drop)
     }
 
-    /// Adds the colours of the next frame, of which every pixel sees `seen`.
+    /// Adds the colours of the next frame.
     pub(super) fn add_colour(
         &mut self,
         restored: &[Frame; 3],
-        seen: &Frame,
         counts: &[u16],
     ) -> qudi_core::Result<()> {
         if let Some(page) = &mut self.page {
             page.add_colour(restored, counts);
         }
-        self.measure(seen, counts)
+        let Some(filter) = &self.filter else {
+            return Err(Error::request("colours of a gray capture", "cfa", "report this as a bug"));
+        };
+        let (seen, luma) = (filter.mosaic(restored), filter.luma(restored));
+        self.show(&luma, counts);
+        self.consistency.add(&seen, counts, &self.acquisition).map(drop)
     }
 
-    fn measure(&mut self, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {
+    /// Keeps the frame for the picture, if it is one of those shown.
+    fn show(&mut self, restored: &Frame, counts: &[u16]) {
         if self.keep_latest || self.shown.contains(&self.measured) {
             if self.keep_latest {
                 self.pictures.truncate(self.shown.len());
@@ -87,7 +106,6 @@ impl ChiSquareMap {
             self.pictures.push((self.measured, [counts, restored.clone()]));
         }
         self.measured += 1;
-        self.consistency.add(restored, counts, &self.acquisition).map(drop)
     }
 
     /// Adds the uncertainty of the frame that was added last to the page.
@@ -101,13 +119,13 @@ impl ChiSquareMap {
         self.consistency.chi_square()
     }
 
-    /// Returns the chi-square of every pixel.
-    pub(super) fn map(&self) -> Frame {
-        self.consistency.map()
+    /// Returns the chi-square of every pixel, if frames were measured.
+    pub(super) fn map(&self) -> Option<Frame> {
+        self.chi_square().map(|_| self.consistency.map())
     }
 
-    /// Composes counts above and restored frames below: the first, the middle (not for a pipe without length)
-    /// and the last.
+    /// Composes counts above and restored frames (of colours, their luma) below: the first, the middle (not
+    /// for a pipe without length) and the last.
     pub(super) fn side_by_side(&self) -> Option<Picture> {
         let size = self.pictures.first()?.1[0].size;
         let mut picture = Picture::new(size, 2, self.pictures.len(), 1);

@@ -7,7 +7,6 @@ use super::uncertainty::UncertaintyFile;
 use super::y4m;
 use crate::colour::{Rendering, encoded, is_linear};
 use crate::error::Result;
-use qudi_core::colour::ColourFilter;
 use qudi_core::{Error, Frame, linear_to_srgb, srgb_to_linear};
 use qudi_io::capture::Capture;
 use qudi_io::restore::{FolderRun, FrameFolder, RestoreSink, Schedule};
@@ -30,8 +29,6 @@ struct ColourOutput {
     rendering: Rendering,
     /// True if the file holds the sensor's own colours in linear light.
     is_linear: bool,
-    /// What every pixel sees of the colours.
-    filter: ColourFilter,
 }
 
 /// A place for frames.
@@ -54,13 +51,8 @@ impl Output {
         let (path, size) = (Path::new(&plan.output), capture.size());
         let (fps, overwrite) = (plan.played_fps, plan.overwrite);
         let planes = if rendering.is_some() { Planes::Rgb } else { Planes::Gray };
-        let is_linear = is_linear(path, plan.tiff) && plan.tonemap == Tonemap::None;
-        let filter = capture.filter().cloned();
-        let colour = rendering.zip(filter).map(|(rendering, filter)| ColourOutput {
-            rendering,
-            is_linear,
-            filter,
-        });
+        let is_linear = is_linear(path, plan.tiff) && plan.tonemap() == Tonemap::None;
+        let colour = rendering.map(|rendering| ColourOutput { rendering, is_linear });
         let place = if plan.output == "-" {
             y4m::write_header(size, fps)?;
             Place::Pipe
@@ -69,7 +61,7 @@ impl Output {
         } else {
             Place::File(Some(ClipWriter::create(path, size, planes, plan.tiff, fps, overwrite)?))
         };
-        Ok(Self { place, tonemap: plan.tonemap, colour })
+        Ok(Self { place, tonemap: plan.tonemap(), colour })
     }
 
     /// Returns how many frames from the start of `range` on an earlier run finished.
@@ -120,9 +112,9 @@ impl Output {
         frame
     }
 
-    /// Writes the colours of picture `number`, and returns what every pixel sees of them.
-    fn push_colour(&mut self, number: u64, restored: &[Frame; 3]) -> qudi_core::Result<Frame> {
-        let Some(ColourOutput { rendering, is_linear, filter }) = &self.colour else {
+    /// Writes the colours of picture `number`.
+    fn push_colour(&mut self, number: u64, restored: &[Frame; 3]) -> qudi_core::Result<()> {
+        let Some(ColourOutput { rendering, is_linear }) = &self.colour else {
             return Err(Error::request("colours of a gray capture", "cfa", "report this as a bug"));
         };
         let shown;
@@ -137,7 +129,7 @@ impl Output {
             Place::File(Some(writer)) => writer.push_colour(planes)?,
             Place::File(None) | Place::Pipe => {}
         }
-        Ok(filter.mosaic(restored))
+        Ok(())
     }
 
     /// Writes picture `number`, and returns it as a reader of the file sees it, where that differs.
@@ -196,8 +188,8 @@ impl RestoreSink for Sink<'_> {
         restored: &[Frame; 3],
         counts: &[u16],
     ) -> qudi_core::Result<()> {
-        let seen = self.output.push_colour(number, restored)?;
-        self.map.as_mut().map_or(Ok(()), |map| map.add_colour(restored, &seen, counts))
+        self.output.push_colour(number, restored)?;
+        self.map.as_mut().map_or(Ok(()), |map| map.add_colour(restored, counts))
     }
 
     fn frame(&mut self, number: u64, restored: &Frame, counts: &[u16]) -> qudi_core::Result<()> {

@@ -40,8 +40,8 @@ pub(super) struct About<'a> {
     pub(super) text: &'a str,
     pub(super) warnings: &'a [String],
     pub(super) settings: &'a Value,
-    /// Chi-square of every pixel.
-    pub(super) misfit: Frame,
+    /// Chi-square of every pixel, where it is measured.
+    pub(super) misfit: Option<Frame>,
     /// Light and change of the capture over time.
     pub(super) strip: Option<String>,
 }
@@ -133,11 +133,12 @@ impl RestoredPage {
                 "the standard deviation of its errors that the method predicts, in units of white";
             scene.layers.push(layer.into_map(MAX_UNCERTAINTY, meaning));
         }
-        let misfit = map_url(&about.misfit, MAX_CHI_SQUARE);
-        let meaning =
-            "chi-square of the counts of every pixel given the result: 1 where it explains them";
-        let misfit = Layer::new("misfit", Kind::Map, vec![misfit]);
-        scene.layers.push(misfit.into_map(MAX_CHI_SQUARE, meaning));
+        if let Some(misfit) = about.misfit {
+            let misfit = map_url(&misfit, MAX_CHI_SQUARE);
+            let meaning = "chi-square of the counts of every pixel given the result: 1 where it explains them";
+            let misfit = Layer::new("misfit", Kind::Map, vec![misfit]);
+            scene.layers.push(misfit.into_map(MAX_CHI_SQUARE, meaning));
+        }
         let settings = serde_json::to_string_pretty(about.settings).unwrap_or_default();
         let context = json!({
             "title": about.capture,
@@ -174,7 +175,7 @@ mod tests {
             text: "</pre><script>alert(2)</script>",
             warnings: &["<b>".to_owned()],
             settings: &json!({"capture": "</script><script>alert(3)</script>"}),
-            misfit: Frame::filled(SIZE, 1.0),
+            misfit: Some(Frame::filled(SIZE, 1.0)),
             strip: None,
         };
         let page = page(Some(3), 3).html(about).unwrap_or_else(|e| panic!("{e:?}"));

@@ -31,7 +31,8 @@ pub(super) struct Plan {
     pub(super) sum: Option<Sum>,
     /// Native frames from one picture to the next, if not every frame becomes one.
     pub(super) every: Option<u64>,
-    pub(super) tonemap: Tonemap,
+    /// The tone curve, if one is named.
+    pub(super) tonemap: Option<Tonemap>,
     /// True if luma alone is asked for.
     pub(super) gray: bool,
     /// True if luma alone is restored of a capture behind a colour filter.
@@ -134,6 +135,11 @@ impl Plan {
         let extension = Path::new(&self.output).extension();
         let extension = extension.map(|e| e.to_string_lossy().to_lowercase());
         self.output == "-" || matches!(extension.as_deref(), Some("gif" | "mp4"))
+    }
+
+    /// Returns the tone curve of gray frames.
+    pub(super) fn tonemap(&self) -> Tonemap {
+        self.tonemap.unwrap_or(Tonemap::None)
     }
 
     /// Returns the capture as the plan names it.

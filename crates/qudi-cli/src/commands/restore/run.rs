@@ -11,7 +11,7 @@ use crate::args::{Global, Shard};
 use crate::capture::{
     AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
 };
-use crate::colour::{Rendering, dng_tags};
+use crate::colour::{Rendering, dng_tags, is_linear};
 use crate::commands::look::strip::strip;
 use crate::device;
 use crate::error::{CliError, Result};
@@ -69,7 +69,7 @@ pub(crate) fn run(
     let part = plan.shard.map_or(0..frames, |shard| shard.range(frames));
     let page = plan.html.is_some().then(|| job.page(&plan));
     let map = ChiSquareMap::new(job.capture().size(), known, &job.acquisition);
-    let mut map = map.with_page(page);
+    let mut map = map.behind(job.capture().filter().cloned()).with_page(page);
     let done = output.finished(part.clone());
     if done > 0 && plan.html.is_some() && job.rendering.is_some() {
         let help = "leave it out, or write into another folder";
@@ -211,7 +211,7 @@ impl Job {
     fn page(&self, plan: &Plan) -> RestoredPage {
         let (size, max_count) = (self.capture().size(), self.acquisition.sensor.max_count());
         let pictures = self.schedule.instants.pictures(self.capture());
-        RestoredPage::new(size, max_count, plan.tonemap, self.rendering.clone(), pictures)
+        RestoredPage::new(size, max_count, plan.tonemap(), self.rendering.clone(), pictures)
     }
 
     /// Returns the settings that the pictures depend on, for the manifest and `--json`.
@@ -261,7 +261,7 @@ impl Job {
                 settings["dng"] = dng_tags(choice, filter, acquisition, rendering);
             }
         }
-        if plan.tonemap != Tonemap::None {
+        if plan.tonemap() != Tonemap::None {
             settings["tonemap"] = json!("srgb");
         }
         if let Some(fps) = capture.fps().or(sensor_fps(acquisition)) {
@@ -381,7 +381,21 @@ fn rendering(
         ));
     }
     if plan.luma_alone {
+        if plan.chi_square_map.is_some() {
+            return Err(CliError::new(
+                "luma alone says nothing of the counts behind each colour",
+                "--chi-map",
+                "leave it out, or restore colours, without --gray",
+            ));
+        }
         return Ok(None);
+    }
+    if plan.tonemap == Some(Tonemap::None) && !is_linear(Path::new(&plan.output), plan.tiff) {
+        return Err(CliError::new(
+            format!("pictures of colours have the curve of sRGB, as {} would", plan.output),
+            "--tonemap none",
+            "leave it out, or write linear light into .npy, or .tif with --float",
+        ));
     }
     Ok(Some(Rendering::new(plan.white_balance, capture, summary, acquisition)))
 }

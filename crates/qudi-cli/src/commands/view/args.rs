@@ -2,7 +2,7 @@
 
 use crate::args::given::Given;
 use crate::args::{Network, Reading, Steps, number};
-use crate::commands::restore::args::{Restore, Tonemap};
+use crate::commands::restore::args::Restore;
 use crate::methods::Method;
 use clap::{Args as ClapArgs, ValueHint};
 use std::path::PathBuf;
@@ -60,7 +60,7 @@ impl View {
             challenge: false,
             overlap: 3,
             every: None,
-            tonemap: Tonemap::None,
+            tonemap: None,
             fps: None,
             shard: None,
             float: false,
