@@ -1,6 +1,6 @@
 //! Captures behind a colour filter array: simulated, described, restored, scored.
 
-use crate::support::{npy_bytes, refused, run, scratch};
+use crate::support::{npy_bytes, qudi, refused, run, scratch};
 use std::path::{Path, PathBuf};
 
 const FRAMES: usize = 11;
@@ -32,6 +32,15 @@ fn exposed(name: &str, cfa: &str) -> PathBuf {
     let simulate = "simulate clip.npy -o m.npy --truth t.npy --ppp 3.25 --seed 3 --cfa";
     run(&folder, &format!("{simulate} {cfa}"));
     folder
+}
+
+/// Runs the program, which must succeed, and returns all that it prints.
+fn printed(folder: &Path, args: &str) -> String {
+    let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
+    let text = [output.stdout, output.stderr].concat();
+    let text = String::from_utf8_lossy(&text).split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(output.status.success(), "{args}: {text}");
+    text
 }
 
 fn document(folder: &Path, args: &str) -> serde_json::Value {
@@ -146,4 +155,80 @@ fn phases_that_the_picture_contradicts_are_refused() {
     run(&folder, &format!("{info} rggb"));
     refused(&folder, &format!("{info} rggb@0,1"), &["two green pixels", "rggb@0,1"]);
     run(&folder, &format!("{info} bggr"));
+    let converted = "convert f.npy -o g.npy --bits 3 --cfa";
+    refused(&folder, &format!("{converted} grbg"), &["two green pixels", "grbg@0,0"]);
+    let colours = [[0, 255, 0], [255, 0, 0], [0, 0, 255], [0, 255, 0]];
+    let pixel = |x: u32, y: u32| image::Rgb(colours[(y % 2 * 2 + x % 2) as usize]);
+    image::RgbImage::from_fn(160, 160, pixel).save(folder.join("shifted.png")).unwrap();
+    refused(&folder, &format!("{info} shifted.png"), &["two green pixels", "shifted.png"]);
+}
+
+/// Writes a flat red clip, and exposes it behind a filter as `m.npy`.
+fn flat_red(name: &str) -> PathBuf {
+    let folder = scratch(name);
+    let pixels = (0..FRAMES * 64 * 64).flat_map(|_| [0.8f32, 0.2, 0.2]);
+    let bytes: Vec<u8> = pixels.flat_map(f32::to_le_bytes).collect();
+    let shape = format!("({FRAMES}, 64, 64, 3)");
+    std::fs::write(folder.join("red.npy"), npy_bytes("<f4", &shape, &bytes)).unwrap();
+    run(&folder, "simulate red.npy -o m.npy --cfa bggr --ppp 8 --seed 2");
+    folder
+}
+
+#[test]
+fn one_saturated_colour_is_warned_of() {
+    let folder = flat_red("colour-saturated");
+    let text = printed(&folder, "info m.npy");
+    assert!(text.contains("of the samples behind red are saturated"), "{text}");
+}
+
+#[test]
+fn luma_is_shown_next_to_counts() {
+    let folder = flat_red("colour-side-by-side");
+    run(&folder, "restore m.npy -o c.npy --method average --side-by-side s.png");
+    // Behind the filter, neighbours in a row of green and red differ; in luma, they do not.
+    let picture = image::open(folder.join("s.png")).unwrap().to_luma16();
+    let value = |x: u32, y: u32| f64::from(picture.get_pixel(x, y).0[0]) / 65535.0;
+    let step = |x: u32, y: u32| (value(x - 1, y) - 2.0 * value(x, y) + value(x + 1, y)).abs();
+    let bottom = picture.height() - 20;
+    let rough = |y: u32| (10..50).map(|x| step(x, y)).sum::<f64>() / 40.0;
+    assert!(rough(bottom).max(rough(bottom + 1)) < 0.4, "{} {}", rough(bottom), rough(bottom + 1));
+}
+
+#[test]
+fn filters_that_the_record_contradicts_are_warned_of() {
+    let folder = exposed("colour-contradiction", "rggb");
+    let text = |args: &str| printed(&folder, args);
+    let named = text("info m.npy --cfa bggr");
+    assert!(named.contains("records the colour filter rggb@0,0, and bggr@0,0 is named"), "{named}");
+    let same = text("info m.npy --cfa grbg@0,1");
+    assert!(!same.contains("records the colour filter"), "{same}");
+    let gray = text("info m.npy --sensor qudi-paper");
+    assert!(gray.contains("the named sensor has none"), "{gray}");
+}
+
+#[test]
+fn converted_captures_keep_tiles_and_say_that_pictures_are_lost() {
+    let folder = exposed("colour-convert", "rggb");
+    let colours = [[255, 0, 0], [0, 255, 0], [0, 255, 0], [0, 0, 255]];
+    let pixel = |x: u32, y: u32| image::Rgb(colours[(y % 2 * 2 + x % 2) as usize]);
+    let mut filter = image::RgbImage::from_fn(WIDTH as u32, HEIGHT as u32, pixel);
+    filter.save(folder.join("rggb.png")).unwrap();
+    printed(&folder, "convert m.npy -o tile.npy --cfa rggb.png --crop 1:64,0:96");
+    assert!(run(&folder, "info tile.npy").contains("gbrg@0,0: mean counts red"));
+    filter.put_pixel(4, 4, image::Rgb([255; 3]));
+    filter.save(folder.join("other.png")).unwrap();
+    let text = printed(&folder, "convert m.npy -o picture.npy --cfa other.png");
+    assert!(text.contains("does not keep the colour filter other.png"), "{text}");
+}
+
+#[test]
+fn luma_alone_has_no_misfit_and_colours_have_their_curve() {
+    let folder = exposed("colour-luma", "rggb");
+    let restore = "restore m.npy --method average";
+    let gray = document(&folder, &format!("{restore} -o g.npy --gray --html g.html --json"));
+    assert!(gray["results"]["chi_square"].is_null(), "{gray}");
+    assert!(!std::fs::read_to_string(folder.join("g.html")).unwrap().contains("misfit"));
+    refused(&folder, &format!("{restore} -o h.npy --gray --chi-map c.png"), &["luma", "--chi-map"]);
+    refused(&folder, &format!("{restore} -o f --tonemap none"), &["curve of sRGB", "--float"]);
+    run(&folder, &format!("{restore} -o c.npy --tonemap none"));
 }
