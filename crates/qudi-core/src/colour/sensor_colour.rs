@@ -122,7 +122,11 @@ mod tests {
         sensor.colour = Some(SensorColour { efficiency, ..SensorColour::default() });
         let error = sensor.validate().unwrap_err();
         assert!(error.to_string().contains("colour.efficiency of red is 0"), "{error}");
-        assert!(error.help().unwrap().contains("lies between 0.000001 and 1"), "{:?}", error.help());
+        assert!(
+            error.help().unwrap().contains("lies between 0.000001 and 1"),
+            "{:?}",
+            error.help()
+        );
         let matrix = Some([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 0.0, 1.0]]);
         sensor.colour = Some(SensorColour { matrix, ..SensorColour::default() });
         assert!(sensor.validate().unwrap_err().to_string().contains("singular"));
