@@ -87,6 +87,39 @@ impl std::fmt::Debug for Capture {
 }
 
 impl Capture {
+    /// Creates a capture of the native frames `range` whose frames and pixels nothing is known of yet.
+    fn unjudged(
+        path: &Path,
+        native: Box<dyn CountFrames>,
+        info: CaptureInfo,
+        [view, usual]: [View; 2],
+        range: Range<u64>,
+    ) -> Self {
+        Self {
+            path: path.to_owned(),
+            info,
+            view,
+            usual,
+            range,
+            end: None,
+            complete: false,
+            sum: 1,
+            repair: Repair::default(),
+            bad: BadPixels::default(),
+            findings: FrameFindings::default(),
+            stand_ins: BTreeMap::new(),
+            boundaries: Vec::new(),
+            timeline: Vec::new(),
+            counter: Vec::new(),
+            dark: None,
+            filter: None,
+            filter_contradiction: None,
+            stored: vec![0; native.size().pixels()],
+            stored_sums: Vec::new(),
+            native,
+        }
+    }
+
     /// Turns, crops and sums native frames as `options` say, and plans their repair.
     fn assemble(
         path: &Path,
@@ -143,27 +176,11 @@ impl Capture {
         }
         check_sum(sum, range.end - range.start, &info)?;
         let mut capture = Self {
-            path: path.to_owned(),
-            info,
-            view,
-            usual,
-            range,
             end: options.end,
-            complete: false,
             sum,
-            repair: Repair::default(),
-            bad: BadPixels::default(),
-            findings: FrameFindings::default(),
-            stand_ins: BTreeMap::new(),
-            boundaries: Vec::new(),
-            timeline: Vec::new(),
-            counter: Vec::new(),
-            dark: None,
             filter,
             filter_contradiction,
-            stored: vec![0; stored.pixels()],
-            stored_sums: Vec::new(),
-            native,
+            ..Self::unjudged(path, native, info, [view, usual], range)
         };
         capture.note_end();
         pixel_map::plan(&mut capture, options, sensor)?;

@@ -1,15 +1,13 @@
 //! Opening captures: from a path, a pipe, or an array that a caller holds.
 
+use super::Capture;
 use super::view::View;
-use super::{Capture, FrameFindings};
 use crate::codec::{self, GivenArray};
 use crate::description::{CaptureInfo, ReadOptions, keep_pedestal, with_pedestal};
 use crate::frames::memory::MemoryFrames;
 use crate::frames::pipe::STDIN;
-use qudi_core::bad_pixels::{BadPixels, Repair};
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Error, Result, Size};
-use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -92,28 +90,10 @@ impl Capture {
         info.max_count = Some(sensor.max_count());
         info.binary = sensor.response == Response::Binary;
         info.sensor = Some(sensor.clone());
-        Ok(Self {
-            path: place.to_owned(),
-            info,
-            view: View { size, from: None },
-            usual: View { size, from: None },
-            range: 0..frames.len() as u64,
-            end: None,
-            complete: true,
-            sum: 1,
-            repair: Repair::default(),
-            bad: BadPixels::default(),
-            findings: FrameFindings::default(),
-            stand_ins: BTreeMap::new(),
-            boundaries: Vec::new(),
-            timeline: Vec::new(),
-            counter: Vec::new(),
-            dark: None,
-            filter: None,
-            filter_contradiction: None,
-            stored: vec![0; size.pixels()],
-            stored_sums: Vec::new(),
-            native: Box::new(MemoryFrames { size, frames }),
-        })
+        let view = View { size, from: None };
+        let range = 0..frames.len() as u64;
+        let native = Box::new(MemoryFrames { size, frames });
+        let capture = Self::unjudged(place, native, info, [view.clone(), view], range);
+        Ok(Self { complete: true, ..capture })
     }
 }
