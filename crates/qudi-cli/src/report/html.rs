@@ -74,9 +74,9 @@ impl From<&Table> for TableView {
     }
 }
 
-/// Encodes a PNG for the page.
-pub(crate) fn data_url(png: &[u8]) -> String {
-    format!("data:image/png;base64,{}", STANDARD.encode(png))
+/// Encodes a picture for the page; `kind` is its format, as in `png`.
+pub(crate) fn data_url(kind: &str, picture: &[u8]) -> String {
+    format!("data:image/{kind};base64,{}", STANDARD.encode(picture))
 }
 
 #[cfg(test)]

@@ -1,8 +1,6 @@
 //! Pictures that play on a page: frames of several methods under one slider, moved by `templates/player.js`.
 
 use super::html::{TableView, data_url};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
 use jpeg_encoder::{ColorType, Encoder};
 use qudi_core::{Frame, Size};
 use serde::Serialize;
@@ -190,12 +188,12 @@ pub(crate) fn frame_distance(size: Size, frames: u64) -> u64 {
 
 /// Encodes a picture as a JPEG data URL; 0 is black and 1 is white.
 pub(crate) fn picture_url(frame: &Frame, quality: u8) -> String {
-    jpeg_url(&jpeg(frame, quality))
+    data_url("jpeg", &jpeg(frame, quality))
 }
 
 /// Encodes red, green and blue of a picture as a JPEG data URL.
 pub(crate) fn colour_url(planes: &[Frame; 3], quality: u8) -> String {
-    jpeg_url(&colour_jpeg(planes, quality))
+    data_url("jpeg", &colour_jpeg(planes, quality))
 }
 
 /// Encodes a map as a JPEG data URL, whose white is `max`.
@@ -207,7 +205,7 @@ pub(crate) fn map_url(map: &Frame, max: f32) -> String {
 /// Encodes counts as a data URL: as PNG, or as JPEG where that is smaller.
 pub(crate) fn counts_url(frame: &Frame, quality: u8) -> String {
     let (png, jpeg) = (png(frame), jpeg(frame, quality));
-    if png.len() <= jpeg.len() { data_url(&png) } else { jpeg_url(&jpeg) }
+    if png.len() <= jpeg.len() { data_url("png", &png) } else { data_url("jpeg", &jpeg) }
 }
 
 /// Encodes a frame as a gray JPEG.
@@ -265,10 +263,6 @@ pub(crate) fn png(frame: &Frame) -> Vec<u8> {
 pub(crate) fn counts_frame(size: Size, counts: &[u16], max_count: u16) -> Frame {
     let full = f32::from(max_count);
     Frame { size, data: counts.iter().map(|&count| f32::from(count) / full).collect() }
-}
-
-fn jpeg_url(jpeg: &[u8]) -> String {
-    format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg))
 }
 
 fn samples(frame: &Frame) -> Vec<u8> {

@@ -80,7 +80,7 @@ pub(crate) fn page(source: &Source<'_>) -> Result<String> {
             summary: summary(&steps),
             plots: plots(&steps, &validations).iter().filter_map(Plot::draw).collect(),
             table: validations.last().map(|last| TableView::from(&clips(last))),
-            picture: source.picture.map(data_url),
+            picture: source.picture.map(|png| data_url("png", png)),
             made: made(source.recipe),
             documents: [
                 Document { title: "Recipe", text: source.recipe },
