@@ -5,7 +5,7 @@ use super::capture;
 use super::record::{origin, record_document};
 use crate::args::Global;
 use crate::error::{CliError, Result};
-use crate::methods::learned_names;
+use crate::methods::{QUDI_DIFFUSION, QUDI_REGRESSION, learned_names};
 use crate::report::Report;
 use crate::settings::{Settings, recipe_keys, toml_text};
 use crate::weights::Weights;
@@ -114,12 +114,12 @@ fn sensors(report: &Report) -> Result<()> {
 /// Describes the networks in the program.
 fn built_in_weights(report: &Report) -> Result<()> {
     let methods =
-        [("qudi-regression", NetworkKind::Regression), ("qudi-diffusion", NetworkKind::Window)];
+        [(QUDI_REGRESSION, NetworkKind::Regression), (QUDI_DIFFUSION, NetworkKind::Diffusion)];
     let (mut texts, mut documents) = (Vec::new(), Map::new());
     for (method, kind) in methods {
         let (text, document) = weights(&Weights::BuiltIn(kind))?;
-        texts.push(format!("method      {method}\n{text}"));
-        documents.insert(method.to_owned(), document);
+        texts.push(format!("method      {}\n{text}", method.name));
+        documents.insert(method.name.to_owned(), document);
     }
     report.result(&texts.join("\n\n"), || Value::Object(documents))
 }
