@@ -51,7 +51,7 @@ def interpolated(plane, row, column, size):
 
 
 def demosaiced(planes, letters, size):
-    """Colours of the planes of a tile, those of one colour averaged."""
+    """Returns red, green and blue from the planes of a tile; planes of one colour are averaged."""
     of = {c: [] for c in "rgb"}
     for k, letter in enumerate(letters):
         of[letter].append(interpolated(planes[k], k // 2, k % 2, size))

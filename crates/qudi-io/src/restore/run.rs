@@ -77,21 +77,29 @@ pub fn run(
     }
     let mut first_frame = 0;
     for (part, pictures) in parts {
-        let wanted = numbers.start.max(pictures.start)..numbers.end.min(pictures.end);
+        let common = numbers.start.max(pictures.start)..numbers.end.min(pictures.end);
         let acquisition = Acquisition { first_frame, ..acquisition.clone() };
         first_frame += (part.end - part.start) / u64::from(capture.summed());
-        if wanted.is_empty() {
+        if common.is_empty() {
             continue;
         }
-        let before = wanted.start - numbers.start;
+        let before = common.start - numbers.start;
         let total = numbers.end.min(schedule.instants.pictures(capture).unwrap_or(numbers.end));
         let mut on = |done, _| on(before + done, Some(total - numbers.start));
         let mut sink = Renumbered { sink, first: pictures.start };
-        let wanted = wanted.start - pictures.start..wanted.end - pictures.start;
+        let numbers_in_part = common.start - pictures.start..common.end - pictures.start;
         capture.in_part(&part, |capture| {
             let windows = schedule.windows.over(capture.frames());
             let schedule = Schedule { windows, ..*schedule };
-            run_part(restorer, capture, &schedule, wanted, &acquisition, &mut sink, &mut on)
+            run_part(
+                restorer,
+                capture,
+                &schedule,
+                numbers_in_part,
+                &acquisition,
+                &mut sink,
+                &mut on,
+            )
         })?;
     }
     Ok(())
