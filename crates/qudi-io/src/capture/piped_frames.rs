@@ -51,12 +51,10 @@ mod tests {
         let good = |add: u16| (0..64).map(|i| i % 5 + add).collect::<Vec<u16>>();
         let mut piped = PipedFrames::default();
         let mut notes = Vec::new();
-        let frames = [good(0), vec![65535; 64], good(1), vec![0; 64], good(0), good(0)];
-        let read: Vec<_> = (0..).zip(frames).map(|(number, mut frame)| {
-            notes.extend(piped.judge(number, &mut frame, size));
-            frame
-        });
-        let read: Vec<_> = read.collect();
+        let mut read = [good(0), vec![65535; 64], good(1), vec![0; 64], good(0), good(0)];
+        for (number, frame) in (0..).zip(&mut read) {
+            notes.extend(piped.judge(number, frame, size));
+        }
         assert_eq!(read, [good(0), good(0), good(1), good(1), good(0), good(0)]);
         assert_eq!(notes.len(), 2, "{notes:?}");
     }
