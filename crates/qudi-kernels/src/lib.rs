@@ -33,5 +33,5 @@ pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
 pub use operations::count_operations;
 pub use precision::{ComputePrecision, with_precision};
-pub use residual_stack::{Stack, residual_stack};
+pub use residual_stack::{Stack, StackParameters, residual_stack};
 pub use warp::warp;
