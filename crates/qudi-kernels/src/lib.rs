@@ -37,7 +37,7 @@ pub use frames::frames;
 #[cfg(feature = "libtorch")]
 pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
-pub use operations::count_operations;
+pub use operations::{add_operations, count_operations};
 pub use pixel_norm::pixel_norm;
 pub use precision::{ComputePrecision, with_precision};
 pub use resample::{Resampling, resampled};
