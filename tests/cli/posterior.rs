@@ -1,5 +1,6 @@
-//! The built-in diffusion draws from a posterior: its noise matters, its draws spread about as far as it errs,
-//! and they carry no grid. Bounds are what the shipped weights keep (docs/model-card.md), with room for chance.
+//! The built-in diffusion draws from a posterior: its noise matters, its draws spread about as far as it
+//! errs, and they carry no grid. Bounds are what the shipped weights keep (docs/model-card.md), with room
+//! for chance.
 
 use crate::support::{run, scratch};
 use burn::tensor::{Device, Tensor};

@@ -37,7 +37,7 @@ pub(crate) fn run(
     let page_file = Output::open(Some(&page), overwrite)?;
     let animation = demo.animate.then(|| path.with_extension("gif"));
     let animation_file = Output::open(animation.as_deref(), overwrite)?;
-    let sensor = settings.sensor(&demo.sensor)?;
+    let sensor = settings.sensor(&demo.sensor)?.as_read();
     let mut bar = report.bar();
     let mut restored = Vec::new();
     for scene in scenes()? {
