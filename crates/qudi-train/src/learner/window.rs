@@ -44,6 +44,10 @@ impl Learner for Window {
         batch.upload(device);
     }
 
+    fn parts(batch: Batch, count: usize) -> Vec<Batch> {
+        batch.parts(count)
+    }
+
     fn loss<'a>(&'a self, batch: &'a Batch, context: &Context<'a>) -> Result<Loss<'a>> {
         let train = &context.recipe.train;
         let conditioning = batch.conditioning(context.device);
@@ -75,7 +79,9 @@ impl Learner for Window {
         if let Some(lpips) = context.perceptual {
             let images = (prediction.x0 + 1.0) * 0.5;
             let quiet = with_little_noise(example.timesteps, &schedule);
-            let distance = perceptual_loss(lpips, &images, &example, &quiet);
+            let of_batch = with_little_noise(batch.timesteps_of_all(), &schedule);
+            let share = batch.share(quiet.len(), of_batch.len());
+            let distance = perceptual_loss(lpips, &images, &example, &quiet) * share;
             sum.add("perceptual", weights.perceptual, distance);
         }
         let before = |frames: &Tensor<4>| {
