@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-/// Missing sums, times the sums of the shorter stretch beside them, from which on nothing is followed across
+/// Missing sums, times the sums of the shorter stretch next to them, from which on nothing is followed across
 /// them: short stretches need their neighbours, and a few frames hardly matter in a long sum.
 const MIN_GAP: u64 = 20;
 
