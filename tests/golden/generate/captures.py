@@ -85,9 +85,6 @@ with h5py.File(out / "hdf5/contiguous.h5", "w") as f:
     f.create_dataset("counts", data=counts.astype(">u2"))
 with h5py.File(out / "hdf5/packed.h5", "w") as f:
     f.create_dataset("frames", data=np.packbits(np.tile(bits, (40, 1, 1)), axis=2), chunks=(16, 12, 3), compression="gzip")
-with h5py.File(out / "hdf5/soft.h5", "w") as f:
-    f["frames"] = counts
-    f["again"] = h5py.SoftLink("/frames")
 with h5py.File(out / "hdf5/master.h5", "w") as f:
     f["data_000001"] = h5py.ExternalLink("chunked.h5", "/run/counts")
     f["data_000002"] = h5py.ExternalLink("contiguous.h5", "/counts")
