@@ -27,6 +27,8 @@ mod outputs;
 mod pages;
 #[path = "cli/places.rs"]
 mod places;
+#[path = "cli/release.rs"]
+mod release;
 #[path = "cli/report.rs"]
 mod report;
 #[path = "cli/restore.rs"]
