@@ -1,4 +1,4 @@
-//! The archives of a release: `cargo binstall` looks for what the workflow makes, and finds the program in it.
+//! Archives of a release: `cargo binstall` looks for what the workflow makes, and finds the program in it.
 
 use crate::root;
 use std::collections::BTreeMap;
