@@ -39,8 +39,8 @@ COMMANDS = {
     "demo.png": "demo --diffusion -o demo.png",
 }
 
-# What is photographed: the page, its width, the element (the top of the page by default), the pictures under the
-# slider, its place, and the frame.
+# What is photographed: the page, its size, the element (by default the top of the page), the place of the
+# slider and the pictures under it.
 SHOTS = {
     "demo-page": dict(page="demo.html", after="demo.png", width=1280, height=900, split=0.5),
     "look": dict(page="look.html", needs=["burst.npy"], width=1200, height=860, split=0.5),
