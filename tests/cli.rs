@@ -27,6 +27,8 @@ mod outputs;
 mod pages;
 #[path = "cli/places.rs"]
 mod places;
+#[path = "cli/posterior.rs"]
+mod posterior;
 #[path = "cli/release.rs"]
 mod release;
 #[path = "cli/report.rs"]

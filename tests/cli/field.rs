@@ -79,7 +79,7 @@ fn sums_frames_by_itself_and_says_why() {
 #[test]
 fn pedestal_of_a_simulated_camera_is_subtracted_again() {
     let folder = scratch("field-pedestal");
-    let simulate = "simulate scene:text --size 32x48 --frames 11 --bits 8 --gain 4 --seed 3 -o";
+    let simulate = "simulate scene:text --size 32x48 --frames 11 --bits 8 --gain 4 --set sensor.read_noise=0 --seed 3 -o";
     run(&folder, &format!("{simulate} plain.npy"));
     run(&folder, &format!("{simulate} raised.npy --offset 20"));
     let bytes = |name: &str| std::fs::read(folder.join(name)).unwrap();
@@ -393,6 +393,111 @@ fn nothing_reaches_over_a_cut() {
     assert_eq!(page["findings"]["cuts"], serde_json::json!([220]));
     let page = std::fs::read_to_string(folder.join("both-look.html")).unwrap();
     assert!(page.contains("<title>cut: frame 220</title>"));
+}
+
+/// Missing numbers end a part, unless they hardly matter.
+#[test]
+fn nothing_reaches_over_missing_frames() {
+    let folder = scratch("field-gap");
+    let scene = "simulate scene:text --size 32x48 --frames 30 --ppp 3 --seed 3 --speed 1";
+    run(&folder, &format!("{scene} -o all"));
+    let place = folder.join("all");
+    for number in 9..14 {
+        std::fs::remove_file(place.join(format!("frame_{number:06}.png"))).unwrap();
+    }
+    std::fs::remove_file(place.join("burst.json")).unwrap();
+    let restore =
+        "restore all --sensor qudi-paper --bits 3 --gain 1.077 --ppp 3 --exposure 0.4 --mask none";
+    let values = |name: &str| {
+        let bytes = std::fs::read(folder.join(name)).unwrap();
+        bytes[bytes.iter().position(|&byte| byte == b'\n').unwrap() + 1..].to_vec()
+    };
+    for method in ["average", "qbp"] {
+        let run_part = |name: &str, part: &str| {
+            run(&folder, &format!("{restore} --method {method} {part} -o {name}.npy -f"));
+            values(&format!("{name}.npy"))
+        };
+        let parts = [run_part("before", "--end 9"), run_part("after", "--start 9")].concat();
+        assert!(run_part("whole", "") == parts, "{method}");
+    }
+    let text = said(&folder, &format!("{restore} --method average -o frames"));
+    assert!(text.contains("numbers 9 to 13 are missing"), "{text}");
+    let manifest = std::fs::read_to_string(folder.join("frames/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_str(&manifest).unwrap();
+    assert_eq!(manifest["settings"]["parts"], serde_json::json!([[0, 9], [9, 25]]));
+    assert_eq!(manifest["results"]["findings"]["missing"], serde_json::json!([9]));
+}
+
+/// Noise about the pedestal of a simulated camera is drawn, kept by `convert`, and restored without bias.
+#[test]
+fn noise_below_the_pedestal_is_simulated() {
+    let folder = scratch("field-simulated-noise");
+    let sensor = "base = \"ideal\"\nbits = 12\ngain = 2\nread_noise = 1.5\n";
+    std::fs::write(folder.join("plain.toml"), sensor).unwrap();
+    let dark =
+        "simulate scene:text --size 32x48 --frames 44 --ppp 0.05 --seed 3 --sensor plain.toml";
+    run(&folder, &format!("{dark} --offset 100 -o c.npy"));
+    let bytes = std::fs::read(folder.join("c.npy")).unwrap();
+    let counts = bytes[bytes.len() - 2 * 44 * 32 * 48..].chunks_exact(2);
+    let counts = counts.map(|count| f64::from(u16::from_le_bytes([count[0], count[1]])));
+    let (sum, below) = counts
+        .fold((0.0, 0), |(sum, below), count| (sum + count, below + usize::from(count < 100.0)));
+    let pixels = (44 * 32 * 48) as f64;
+    // 0.1 DN of light above the pedestal, and a standard error of 0.012.
+    assert!((sum / pixels - 100.1).abs() < 0.05, "{}", sum / pixels);
+    assert!(below as f64 > 0.35 * pixels, "{below}");
+    run(&folder, "convert c.npy -o d.tif");
+    let mean = |capture: &str| {
+        let args =
+            format!("restore {capture} --method mle --ppp 1 --exposure 1 --mask none -o o.npy -f");
+        run(&folder, &args);
+        let npy = std::fs::read(folder.join("o.npy")).unwrap();
+        let values = npy[npy.len() - 4 * 44 * 32 * 48..].chunks_exact(4);
+        let values = values.map(|v| f64::from(f32::from_le_bytes([v[0], v[1], v[2], v[3]])));
+        values.sum::<f64>() / pixels
+    };
+    for capture in ["c.npy", "d.tif"] {
+        let mean = mean(capture);
+        assert!((mean - 0.05).abs() < 0.025, "{capture}: {mean}");
+    }
+    let info: Value = serde_json::from_str(&run(&folder, "info d.tif --json")).unwrap();
+    let light = info["ppp"]["incident"].as_f64().unwrap();
+    assert!((light - 0.05).abs() < 0.025, "{light}");
+    // Methods are compared without the pedestal, too.
+    let score = |sensor: &str| {
+        let args = format!(
+            "eval scene:text --size 32x48 --frames 11 --ppp 3 --method mle --json {sensor}"
+        );
+        let scores: Value = serde_json::from_str(&run(&folder, &args)).unwrap();
+        scores.to_string()
+    };
+    std::fs::write(folder.join("raised.toml"), format!("{sensor}offset = 100\n")).unwrap();
+    let (plain, raised) = (score("--sensor plain.toml"), score("--sensor raised.toml"));
+    let psnr = |text: &str| {
+        let at = text.find("\"psnr\"").unwrap_or_else(|| panic!("{text}"));
+        text[at + 7..].split([',', '}']).next().unwrap().parse::<f64>().unwrap()
+    };
+    assert!((psnr(&plain) - psnr(&raised)).abs() < 1.0, "{plain}\n{raised}");
+}
+
+/// A converted capture keeps its sensor and its light.
+#[test]
+fn conversions_keep_the_sensor() {
+    let folder = scratch("field-converted");
+    let simulate =
+        "simulate scene:text --size 32x48 --frames 40 --sensor swissspad2 --ppp 0.5 --seed 2";
+    run(&folder, &format!("{simulate} -o c.npy"));
+    run(&folder, "convert c.npy -o d.npy --sum 4");
+    let info = |args: &str| serde_json::from_str::<Value>(&run(&folder, args)).unwrap();
+    let (summed, converted) = (info("info c.npy --sum 4 --json"), info("info d.npy --json"));
+    for key in ["ppp", "mean", "max_count"] {
+        assert_eq!(converted[key], summed[key], "{key}");
+    }
+    let of = |name: &str, args: &str| {
+        run(&folder, &format!("restore {args} --method mle -o {name}"));
+        std::fs::read(folder.join(name)).unwrap()
+    };
+    assert!(of("one.npy", "c.npy --sum 4") == of("two.npy", "d.npy"));
 }
 
 #[test]

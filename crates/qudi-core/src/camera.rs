@@ -74,7 +74,9 @@ impl Camera {
                 "lower the light or raise the exposure value",
             ));
         }
-        let law = CountLaw::new(sensor, gain);
+        // Noise about the pedestal is drawn with it.
+        let is_noisy = sensor.response == Response::Linear && sensor.read_noise > 0.0;
+        let law = CountLaw::new(sensor, gain).above(if is_noisy { sensor.offset } else { 0.0 });
         if law.dead_time() > 0.0 && electrons_per_value > MAX_ARRIVALS {
             return Err(Error::request(
                 format!("{electrons_per_value:e} arrivals in a white pixel with a dead time"),
@@ -98,7 +100,7 @@ impl Camera {
             streams: Streams::new(seed),
             electrons_per_value,
             dark,
-            table: CountTable::new(&law, brightest),
+            table: if law.pedestal > 0.0 { None } else { CountTable::new(&law, brightest) },
             single: if binary { CountTable::new(&single_law, brightest / n) } else { None },
             law,
             previous: Vec::new(),
@@ -155,22 +157,20 @@ impl Camera {
                 }
             }
         };
-        for &pixel in &self.maps.dead {
-            counts[pixel] = 0;
-        }
-        self.add_pedestal(&mut counts);
-        Ok(counts)
-    }
-
-    /// Adds the pedestal of a linear sensor, also to dead pixels.
-    fn add_pedestal(&self, counts: &mut [u16]) {
-        if self.sensor.offset > 0.0 && self.sensor.response == Response::Linear {
-            let offset = self.sensor.offset.round() as u16;
-            let most = self.sensor.max_count();
-            for count in counts {
+        let offset = match self.sensor.response {
+            Response::Linear => self.sensor.offset.round() as u16,
+            Response::Binary => 0,
+        };
+        let most = self.sensor.max_count();
+        if offset > 0 && self.law.pedestal == 0.0 {
+            for count in &mut counts {
                 *count = count.saturating_add(offset).min(most);
             }
         }
+        for &pixel in &self.maps.dead {
+            counts[pixel] = offset.min(most);
+        }
+        Ok(counts)
     }
 
     fn check(&self, instants: &[&Frame]) -> Result<()> {

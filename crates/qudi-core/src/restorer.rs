@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::frame::{Frame, Size};
-use crate::sensor::{DarkRate, Sensor};
+use crate::sensor::{DarkRate, Response, Sensor};
 
 /// Counts of consecutive frames, `[frames][height][width]`.
 #[derive(Clone, Copy, Debug)]
@@ -104,14 +104,20 @@ impl Restored {
 
 impl Acquisition {
     /// Creates the acquisition of a capture by `sensor`, with the sensor's own gain at `ppp` incident photons
-    /// per pixel and frame and an image of mean level `mean_level`; seed 0, first frame 0, no dark map.
+    /// per pixel and frame and an image of mean level `mean_level`; seed 0, first frame 0, no dark map. The
+    /// sensor's pedestal is counted as dark electrons.
     ///
     /// # Errors
     /// [`Error`](crate::Error) if the sensor has no gain at this light.
-    pub fn new(sensor: Sensor, ppp: f64, mean_level: f64) -> Result<Self> {
+    pub fn new(mut sensor: Sensor, ppp: f64, mean_level: f64) -> Result<Self> {
         let gain = sensor.gain_at(ppp)?;
         let (seed, first_frame, dark, pedestal) = (0, 0, None, 0.0);
-        Ok(Self { seed, first_frame, ppp, mean_level, sensor, gain, dark, pedestal })
+        let offset = match sensor.response {
+            Response::Linear => std::mem::take(&mut sensor.offset),
+            Response::Binary => 0.0,
+        };
+        Self { seed, first_frame, ppp, mean_level, sensor, gain, dark, pedestal }
+            .with_pedestal(offset)
     }
 
     /// Counts the cross-talk and the afterpulses of the sensor as light, as many as there are at the mean

@@ -32,6 +32,9 @@ use crate::error::{Error, Result};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+/// Standard deviations of the read noise that are kept below zero.
+const KEPT_SIGMAS: f64 = 3.0;
+
 /// Response of a pixel to light.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
@@ -185,6 +188,24 @@ impl Sensor {
             Gain::Fixed(_) | Gain::Unit | Gain::Fwc => self.gain_at(1.0).ok(),
             Gain::Quiver | Gain::Auto => None,
         }
+    }
+
+    /// Returns the part of a pedestal of `offset` DN that is kept in counts, so that read noise below zero is
+    /// not cut off; none where the gain follows the light.
+    pub fn kept_pedestal(&self, offset: f64) -> f64 {
+        let Some(gain) = self.fixed_gain().filter(|_| self.response == Response::Linear) else {
+            return 0.0;
+        };
+        let noise = self.read_noise;
+        let electrons = if noise > 0.0 { (KEPT_SIGMAS * noise).max(noise * noise) } else { 0.0 };
+        (electrons * gain).ceil().min(offset.floor())
+    }
+
+    /// Returns the sensor of counts as they are read: of the pedestal, the part that is kept.
+    #[must_use]
+    pub fn as_read(mut self) -> Self {
+        self.offset = self.kept_pedestal(self.offset);
+        self
     }
 
     /// Estimates the incident photons per pixel and output frame linearly from counts: the sum of

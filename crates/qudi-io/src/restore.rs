@@ -1,5 +1,6 @@
 //! Restoring a capture window by window, to frames in a folder or anywhere else.
 
+mod changed_settings;
 mod frame_folder;
 mod inputs;
 mod instants;

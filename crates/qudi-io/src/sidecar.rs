@@ -122,6 +122,15 @@ pub struct Conversion {
     /// Colour filter of the converted frames.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cfa: Option<FilterChoice>,
+    /// Sensor of the converted frames, if the capture's record names it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<Sensor>,
+    /// Gain in DN/e-, if the capture's record knows it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gain: Option<f64>,
+    /// Light of the converted frames, if the capture's record knows it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub light: Option<Light>,
 }
 
 /// A record of either kind.
@@ -151,6 +160,9 @@ impl Sidecar {
             )
         })?;
         check_version(conversion.version, path)?;
+        if let Some(sensor) = &conversion.sensor {
+            sensor.validate()?;
+        }
         Ok(Self::Converted(Box::new(conversion)))
     }
 }

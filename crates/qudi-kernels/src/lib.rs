@@ -10,17 +10,21 @@
 
 mod attention;
 mod backend;
+mod block_differences;
 pub mod conv;
 #[cfg(feature = "flex")]
 mod exp;
 #[cfg(feature = "flex")]
 mod flex;
+mod frames;
 pub mod group_norm;
 #[cfg(feature = "libtorch")]
 mod libtorch;
 mod matrix_units;
 mod operations;
+mod pixel_norm;
 mod precision;
+mod resample;
 mod residual_stack;
 #[cfg(feature = "flex")]
 mod uninitialised;
@@ -28,10 +32,14 @@ mod warp;
 
 pub use attention::attention;
 pub use backend::{is_flex, with_stock_operations};
+pub use block_differences::block_differences;
+pub use frames::frames;
 #[cfg(feature = "libtorch")]
 pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
-pub use operations::count_operations;
+pub use operations::{add_operations, count_operations};
+pub use pixel_norm::pixel_norm;
 pub use precision::{ComputePrecision, with_precision};
-pub use residual_stack::{Stack, residual_stack};
+pub use resample::{Resampling, resampled};
+pub use residual_stack::{Stack, StackParameters, residual_stack};
 pub use warp::warp;

@@ -17,6 +17,11 @@ pub fn count_operations<T>(run: impl FnOnce() -> T) -> (T, u64) {
     (result, OPERATIONS.get() - before)
 }
 
+/// Adds operations that another thread has counted for this one.
+pub fn add_operations(count: u64) {
+    OPERATIONS.set(OPERATIONS.get() + count);
+}
+
 /// Counts a convolution with so many weights at so many places.
 pub(crate) fn count(weights: usize, places: usize, device: &Device) {
     let passes = if matches!(device.as_dispatch(), DispatchDevice::Autodiff(_)) { 3 } else { 1 };

@@ -9,6 +9,8 @@
 mod amx;
 #[cfg(feature = "flex")]
 mod backward;
+#[cfg(feature = "flex")]
+mod buffer;
 #[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
 #[cfg(feature = "flex")]
@@ -34,9 +36,10 @@ use crate::precision::ComputePrecision;
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 use extension::{INPUTS, StackBackend};
+use std::cell::OnceCell;
 
 /// The sizes of a stack of residual blocks.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct Stack {
     /// Number of images.
     pub images: usize,
@@ -52,6 +55,20 @@ pub struct Stack {
     pub blocks: usize,
     /// True if activations have 16 bits (bfloat16).
     pub bf16: bool,
+    /// The parameters as the matrix unit reads them.
+    #[cfg(feature = "flex")]
+    packed: weights::Packed,
+}
+
+/// The parameters of a stack of residual blocks, made ready once for several uses.
+#[derive(Debug)]
+pub struct StackParameters {
+    /// Weight `[outputs, inputs, 3, 3]` and bias `[outputs]`: the entry, then two for every block.
+    convolutions: Vec<(Tensor<4>, Tensor<1>)>,
+    /// All of them one after the other, for the fused operation.
+    joined: OnceCell<Tensor<1>>,
+    #[cfg(feature = "flex")]
+    packed: weights::Packed,
 }
 
 impl Stack {
@@ -77,43 +94,90 @@ impl Stack {
 /// # Panics
 /// If the shapes do not fit.
 pub fn residual_stack(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> Tensor<4> {
-    let stack = stack_of(inputs, convolutions);
-    if is_fused(&inputs[0], &stack) {
-        return fused(inputs, convolutions, stack);
-    }
-    let conv = |inputs: &[Tensor<4>], number: usize, addend, activation| {
-        let (weight, bias) = convolutions[number].clone();
-        conv_2d(inputs, weight, bias, Options { addend, activation, ..Options::default() })
-    };
-    let mut x = conv(inputs, 0, None, Activation::Relu);
-    for block in 0..stack.blocks {
-        let hidden = conv(std::slice::from_ref(&x), 1 + 2 * block, None, Activation::Relu);
-        x = conv(&[hidden], 2 + 2 * block, Some(x), Activation::None);
-    }
-    x
+    StackParameters::new(convolutions.to_vec()).apply(inputs)
 }
 
-fn stack_of(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> Stack {
-    let [images, _, height, width] = inputs[0].dims();
-    let [features, ..] = convolutions[0].0.dims();
-    let stack = Stack {
-        images,
-        height,
-        width,
-        inputs: inputs.iter().map(|input| input.dims()[1]).collect(),
-        features,
-        blocks: (convolutions.len() - 1) / 2,
-        bf16: ComputePrecision::reduces(&inputs[0]),
-    };
-    assert_eq!(convolutions.len(), 1 + 2 * stack.blocks, "an entry, and two for every block");
-    for (input, &channels) in inputs.iter().zip(&stack.inputs) {
-        assert_eq!(input.dims(), [images, channels, height, width], "inputs of one stack");
+impl StackParameters {
+    /// Takes the convolutions of a stack: the entry, then two for every block.
+    pub fn new(convolutions: Vec<(Tensor<4>, Tensor<1>)>) -> Self {
+        Self {
+            convolutions,
+            joined: OnceCell::new(),
+            #[cfg(feature = "flex")]
+            packed: weights::Packed::default(),
+        }
     }
-    for ((weight, bias), [inputs, outputs]) in convolutions.iter().zip(stack.convolutions()) {
-        assert_eq!(weight.dims(), [outputs, inputs, 3, 3], "a weight of the stack");
-        assert_eq!(bias.dims(), [outputs], "one bias for every output channel");
+
+    /// Computes [`residual_stack`].
+    ///
+    /// # Panics
+    /// If the shapes do not fit.
+    pub fn apply(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
+        let stack = self.stack(inputs);
+        if is_fused(&inputs[0], &stack) {
+            return self.fused(inputs, stack);
+        }
+        let conv = |inputs: &[Tensor<4>], number: usize, addend, activation| {
+            let (weight, bias) = self.convolutions[number].clone();
+            conv_2d(inputs, weight, bias, Options { addend, activation, ..Options::default() })
+        };
+        let mut x = conv(inputs, 0, None, Activation::Relu);
+        for block in 0..stack.blocks {
+            let hidden = conv(std::slice::from_ref(&x), 1 + 2 * block, None, Activation::Relu);
+            x = conv(&[hidden], 2 + 2 * block, Some(x), Activation::None);
+        }
+        x
     }
-    stack
+
+    fn stack(&self, inputs: &[Tensor<4>]) -> Stack {
+        let [images, _, height, width] = inputs[0].dims();
+        let [features, ..] = self.convolutions[0].0.dims();
+        let stack = Stack {
+            images,
+            height,
+            width,
+            inputs: inputs.iter().map(|input| input.dims()[1]).collect(),
+            features,
+            blocks: (self.convolutions.len() - 1) / 2,
+            bf16: ComputePrecision::reduces(&inputs[0]),
+            #[cfg(feature = "flex")]
+            packed: self.packed.clone(),
+        };
+        assert_eq!(self.convolutions.len(), 1 + 2 * stack.blocks, "an entry, and two per block");
+        for (input, &channels) in inputs.iter().zip(&stack.inputs) {
+            assert_eq!(input.dims(), [images, channels, height, width], "inputs of one stack");
+        }
+        let sizes = stack.convolutions();
+        for ((weight, bias), [inputs, outputs]) in self.convolutions.iter().zip(sizes) {
+            assert_eq!(weight.dims(), [outputs, inputs, 3, 3], "a weight of the stack");
+            assert_eq!(bias.dims(), [outputs], "one bias for every output channel");
+        }
+        stack
+    }
+
+    fn fused(&self, inputs: &[Tensor<4>], stack: Stack) -> Tensor<4> {
+        if inputs.len() > INPUTS {
+            let joined = Tensor::cat(inputs.to_vec(), 1);
+            let stack = Stack { inputs: vec![stack.channels()], ..stack };
+            return self.fused(&[joined], stack);
+        }
+        let parameters = self.joined.get_or_init(|| {
+            let flat = self.convolutions.iter().flat_map(|(weight, bias)| {
+                let values = weight.shape().num_elements();
+                [weight.clone().reshape([values]), bias.clone()]
+            });
+            Tensor::cat(flat.collect(), 0)
+        });
+        let weights = self.convolutions.iter().map(|(weight, _)| weight.shape().num_elements());
+        let places = stack.images * stack.height * stack.width;
+        count(weights.sum(), places, &inputs[0].device());
+        let parameters = parameters.clone().into_dispatch();
+        let unused = Tensor::<1>::zeros([1], &inputs[0].device()).into_dispatch();
+        let mut list = inputs.iter().map(|input| input.clone().into_dispatch());
+        let [a, b, c, d, e, f, g]: [_; INPUTS] =
+            std::array::from_fn(|_| list.next().unwrap_or_else(|| unused.clone()));
+        Tensor::from_dispatch(Dispatch::residual_stack(a, b, c, d, e, f, g, parameters, stack))
+    }
 }
 
 /// Returns true if the stack is computed as one operation.
@@ -125,24 +189,4 @@ fn is_fused(input: &Tensor<4>, stack: &Stack) -> bool {
             && stack.features.is_multiple_of(32)
     };
     stack.images * stack.height * stack.width > 0 && (is_recorded(input) || fits_tiles())
-}
-
-fn fused(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)], stack: Stack) -> Tensor<4> {
-    if inputs.len() > INPUTS {
-        let joined = Tensor::cat(inputs.to_vec(), 1);
-        let stack = Stack { inputs: vec![stack.channels()], ..stack };
-        return fused(&[joined], convolutions, stack);
-    }
-    let weights = convolutions.iter().map(|(weight, _)| weight.shape().num_elements()).sum();
-    count(weights, stack.images * stack.height * stack.width, &inputs[0].device());
-    let flat = convolutions.iter().flat_map(|(weight, bias)| {
-        let values = weight.shape().num_elements();
-        [weight.clone().reshape([values]), bias.clone()]
-    });
-    let parameters = Tensor::cat(flat.collect(), 0).into_dispatch();
-    let unused = Tensor::<1>::zeros([1], &inputs[0].device()).into_dispatch();
-    let mut list = inputs.iter().map(|input| input.clone().into_dispatch());
-    let [a, b, c, d, e, f]: [_; INPUTS] =
-        std::array::from_fn(|_| list.next().unwrap_or_else(|| unused.clone()));
-    Tensor::from_dispatch(Dispatch::residual_stack(a, b, c, d, e, f, parameters, stack))
 }

@@ -3,6 +3,7 @@
 use burn::tensor::Tensor;
 use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::{AvgPoolOptions, PadMode};
+use qudi_kernels::{Resampling, resampled};
 
 /// Reshapes `[bursts * frames, c, h, w]` to `[bursts, frames, c, h, w]`.
 pub fn by_burst(x: Tensor<4>, frames: usize) -> Tensor<5> {
@@ -19,6 +20,9 @@ pub fn pixel_unshuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
     }
+    if let Some(result) = resampled(&x, Resampling::Unshuffle(fold)) {
+        return result;
+    }
     let [images, channels, height, width] = x.dims();
     let [h, w] = [height / fold, width / fold];
     x.reshape([images, channels, h, fold, w, fold]).permute([0, 1, 3, 5, 2, 4]).reshape([
@@ -33,6 +37,9 @@ pub fn pixel_unshuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
 pub fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
     if fold == 1 {
         return x;
+    }
+    if let Some(result) = resampled(&x, Resampling::Shuffle(fold)) {
+        return result;
     }
     let [images, channels, h, w] = x.dims();
     let planes = channels / (fold * fold);
@@ -50,7 +57,7 @@ pub fn pixel_shuffle(x: Tensor<4>, fold: usize) -> Tensor<4> {
 /// - x: `[images, channels, height, width]`
 /// - result: `[images, channels, height / 2, width / 2]`
 pub fn avg_pool2(x: Tensor<4>) -> Tensor<4> {
-    avg_pool2d(x, AvgPoolOptions::new([2, 2]))
+    resampled(&x, Resampling::Pool).unwrap_or_else(|| avg_pool2d(x, AvgPoolOptions::new([2, 2])))
 }
 
 /// Averages squares of `scale` x `scale` pixels; `scale` must be a power of two.
@@ -61,10 +68,10 @@ pub fn shrink(mut x: Tensor<4>, scale: usize) -> Tensor<4> {
     x
 }
 
-/// Doubles the size with bilinear interpolation, half-pixel centres and repeated edges. It is composed of
-/// simple operations, because Burn's interpolation has no gradient on GPUs.
+/// Doubles the size with bilinear interpolation, half-pixel centres and repeated edges. On graphics cards it
+/// is composed of simple operations, because Burn's interpolation has no gradient there.
 pub fn upsample2(x: Tensor<4>) -> Tensor<4> {
-    upsample2_axis(upsample2_axis(x, 2), 3)
+    resampled(&x, Resampling::Upsample).unwrap_or_else(|| upsample2_axis(upsample2_axis(x, 2), 3))
 }
 
 fn upsample2_axis(x: Tensor<4>, axis: usize) -> Tensor<4> {

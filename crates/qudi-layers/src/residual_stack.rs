@@ -3,7 +3,7 @@
 use super::conv::{Bias, Conv2d};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use qudi_kernels::residual_stack;
+use qudi_kernels::StackParameters;
 
 /// An entry convolution with ReLU, then residual blocks: `x + second(relu(first(x)))`.
 #[derive(Module, Debug)]
@@ -27,16 +27,20 @@ impl ResidualStack {
         Self { entry: conv(inputs), blocks: (0..blocks).map(block).collect() }
     }
 
+    /// Makes the parameters ready for several uses.
+    pub fn parameters(&self) -> StackParameters {
+        let blocks = self.blocks.iter().flat_map(|block| [&block.first, &block.second]);
+        let convolutions = std::iter::once(&self.entry).chain(blocks);
+        let convolutions = convolutions.map(|conv| (conv.weight(), conv.bias_or_zeros()));
+        StackParameters::new(convolutions.collect())
+    }
+
     /// Computes the features of `inputs`, which are joined by channel.
     ///
     /// # Shapes
     /// - inputs: `[images, channels, height, width]` each
     /// - output: `[images, features, height, width]`
     pub fn forward(&self, inputs: &[Tensor<4>]) -> Tensor<4> {
-        let blocks = self.blocks.iter().flat_map(|block| [&block.first, &block.second]);
-        let convolutions = std::iter::once(&self.entry).chain(blocks);
-        let convolutions: Vec<_> =
-            convolutions.map(|conv| (conv.weight(), conv.bias_or_zeros())).collect();
-        residual_stack(inputs, &convolutions)
+        self.parameters().apply(inputs)
     }
 }

@@ -32,7 +32,7 @@ fn pack(recipe: &Recipe, folder: &Path) -> Pack {
         }
     }
     let path = folder.join("pack.zip");
-    write_pack(&sources, folder, &path, Overwrite::No, &mut |_| ControlFlow::Continue(()))
+    write_pack(&sources, folder, &path, Overwrite::No, None, &mut |_| ControlFlow::Continue(()))
         .expect("a pack");
     Pack::open(&path, &sources).expect("the pack")
 }

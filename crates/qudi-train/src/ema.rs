@@ -1,6 +1,8 @@
 //! An exponential moving average of the network's parameters, which generalises better than the last ones.
 
 use burn::tensor::Tensor;
+use qudi_kernels::is_flex;
+use rayon::prelude::*;
 
 /// The average, in the order of [`parameters`](crate::parameters).
 #[derive(Clone, Debug)]
@@ -22,6 +24,13 @@ impl Ema {
         let keep = self.decay.min((1 + steps) as f64 / (10 + steps) as f64);
         let learning = || learns.iter().enumerate().filter(|(_, learns)| **learns);
         if learning().next().is_none() {
+            return;
+        }
+        if is_flex(&parameters[0].device()) {
+            let average = self.average.par_iter_mut().zip(parameters).zip(learns);
+            average.filter(|(_, learns)| **learns).for_each(|((average, parameter), _)| {
+                *average = average.clone() * keep + parameter.clone() * (1.0 - keep);
+            });
             return;
         }
         // As one tensor: a graphics card takes as long for one layer as for all.

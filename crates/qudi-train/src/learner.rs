@@ -65,6 +65,12 @@ pub trait Learner: Module + Sync {
     /// Copies a batch to the device that its loss is computed on.
     fn upload(_batch: &mut Self::Batch, _device: &Device) {}
 
+    /// Splits a batch into at most `count` parts of equal size whose mean loss is the loss of the batch. One
+    /// part where the loss is no mean over samples.
+    fn parts(batch: Self::Batch, _count: usize) -> Vec<Self::Batch> {
+        vec![batch]
+    }
+
     /// Returns the restorer of validations, by a network that is outside autodiff on `device`.
     ///
     /// # Errors

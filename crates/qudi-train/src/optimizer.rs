@@ -8,6 +8,8 @@ mod learning_rate;
 mod muon;
 
 use burn::tensor::Tensor;
+use qudi_kernels::is_flex;
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -38,9 +40,12 @@ pub struct Optimizer {
     /// The number of steps taken.
     pub steps: u64,
     groups: Vec<Group>,
+    /// True on a device other than the processor, which moves one group after the other.
+    joins: bool,
 }
 
-/// Values that move together, as one tensor: a graphics card takes as long for one layer as for all.
+/// Values that move together, as one tensor: a graphics card takes as long for one layer as for all. On the
+/// processor every layer is a group of its own, and threads take one each.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Group {
     /// Rows and columns of each layer that Muon moves; none for values that Adam moves.
@@ -59,18 +64,19 @@ impl Optimizer {
         prefers_adam: fn(&str) -> bool,
     ) -> Self {
         let zeros = || values.iter().map(Tensor::zeros_like).collect();
+        let joins = values.first().is_some_and(|value| !is_flex(&value.device()));
         let mut groups: Vec<Group> = Vec::new();
         for (place, (name, shape)) in shapes.into_iter().enumerate() {
             let matrix = match kind {
                 OptimizerKind::Muon if !prefers_adam(name) => muon::matrix(shape),
                 _ => None,
             };
-            match groups.iter_mut().find(|group| group.matrix == matrix) {
+            match groups.iter_mut().find(|group| joins && group.matrix == matrix) {
                 Some(group) => group.members.push(place),
                 None => groups.push(Group { matrix, members: vec![place] }),
             }
         }
-        Self { mean: zeros(), square: zeros(), steps: 0, groups }
+        Self { mean: zeros(), square: zeros(), steps: 0, groups, joins }
     }
 
     /// Returns the state of Adam for all values.
@@ -92,36 +98,61 @@ impl Optimizer {
         self.steps += 1;
         let steps = self.steps as f64;
         let bias = BETA.map(|beta| 1.0 - beta.powf(steps));
-        for group in &self.groups {
+        let (means, squares) = (&self.mean, &self.square);
+        let moved = |group: &Group| {
             let gradient = group.joined(gradients) * scale.clone();
             let kept = if group.matrix.is_some() { muon::MOMENTUM } else { BETA[0] };
-            let mean = group.joined(&self.mean) * kept + gradient.clone() * (1.0 - kept);
-            group.put(&mut self.mean, &mean);
-            let step = if let Some(matrix) = group.matrix {
+            let mean = group.joined(means) * kept + gradient.clone() * (1.0 - kept);
+            let (step, square) = if let Some(matrix) = group.matrix {
                 // Nesterov's momentum: the mean as the next gradient like this one would make it.
-                let ahead = mean * kept + gradient * (1.0 - kept);
-                muon::step(ahead, group.members.len(), matrix) * lr
+                let ahead = mean.clone() * kept + gradient * (1.0 - kept);
+                (muon::step(ahead, group.members.len(), matrix) * lr, None)
             } else {
-                let square = group.joined(&self.square) * BETA[1];
+                let square = group.joined(squares) * BETA[1];
                 let square = square + gradient.powi_scalar(2) * (1.0 - BETA[1]);
-                group.put(&mut self.square, &square);
-                mean / ((square / bias[1]).sqrt() + EPSILON) * (lr / bias[0])
+                let size = (square.clone() / bias[1]).sqrt() + EPSILON;
+                (mean.clone() / size * (lr / bias[0]), Some(square))
             };
-            let moved = group.joined(&values) - step;
-            group.put(&mut values, &moved);
+            Moved { values: group.joined(&values) - step, mean, square }
+        };
+        let moved: Vec<Moved> = if self.joins {
+            self.groups.iter().map(moved).collect()
+        } else {
+            self.groups.par_iter().map(moved).collect()
+        };
+        for (group, moved) in self.groups.iter().zip(moved) {
+            group.put(&mut self.mean, &moved.mean);
+            if let Some(square) = &moved.square {
+                group.put(&mut self.square, square);
+            }
+            group.put(&mut values, &moved.values);
         }
         values
     }
 }
 
+/// The members of a group after a step.
+struct Moved {
+    values: Tensor<1>,
+    mean: Tensor<1>,
+    square: Option<Tensor<1>>,
+}
+
 impl Group {
     /// Returns the members of a list, one after the other.
     fn joined(&self, list: &[Tensor<1>]) -> Tensor<1> {
+        if let [place] = self.members.as_slice() {
+            return list[*place].clone();
+        }
         Tensor::cat(self.members.iter().map(|&place| list[place].clone()).collect(), 0)
     }
 
     /// Puts the parts of what [`joined`](Self::joined) made back into a list.
     fn put(&self, list: &mut [Tensor<1>], joined: &Tensor<1>) {
+        if let [place] = self.members.as_slice() {
+            list[*place] = joined.clone();
+            return;
+        }
         let mut first = 0;
         for &place in &self.members {
             let [count] = list[place].dims();

@@ -1,6 +1,7 @@
 //! The network during training: its weights, their average, the optimizer's state.
 
 mod loss_values;
+mod parts;
 
 use super::ema::Ema;
 use super::learner::{Context, Learner, Loss};
@@ -13,6 +14,7 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::{Error, Result, Size};
 use qudi_kernels::{ComputePrecision, is_flex, with_precision};
 use qudi_layers::tensor::read;
+use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -20,6 +22,7 @@ use std::time::Instant;
 
 pub use loss_values::LossValues;
 use loss_values::UnreadLoss;
+use parts::{PARTS, Workers};
 
 /// The result of a step.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -59,6 +62,8 @@ pub struct Trainer<L> {
     /// Whether each parameter learns.
     learns: Vec<bool>,
     unread: Option<Unread>,
+    /// Threads for the parts of batches on the processor.
+    workers: Workers,
     /// True if each part of a step waits for the device, so that its time is the device's.
     pub(super) waits: bool,
 }
@@ -129,6 +134,7 @@ impl<L: Learner> Trainer<L> {
             perceptual,
             learns,
             unread: None,
+            workers: Workers::default(),
             waits: false,
         })
     }
@@ -171,10 +177,11 @@ impl<L: Learner> Trainer<L> {
     /// [`Error`] if the data or the device fails, or the loss of the step before was not finite.
     pub fn begin_step(&mut self, prefetcher: &mut Prefetcher<L>) -> Result<Option<StepReport>> {
         let start = Instant::now();
-        let count = self.recipe.train.accumulate;
-        let batches = (0..count).map(|_| prefetcher.next_batch()).collect::<Result<Vec<_>>>()?;
+        let batches = 0..self.recipe.train.accumulate;
+        let batches = batches.map(|_| prefetcher.next_batch()).collect::<Result<Vec<_>>>()?;
         let data_s = start.elapsed().as_secs_f64();
-        let passes = self.passes(&batches)?;
+        let passes = self.passes(batches)?;
+        let count = passes.len();
         let start = Instant::now();
         let mut sum: Option<Vec<Tensor<1>>> = None;
         let mut losses = Vec::with_capacity(count);
@@ -249,10 +256,18 @@ impl<L: Learner> Trainer<L> {
         Ok(Some(report))
     }
 
-    /// Computes the gradients of all batches, in their order, on the first device.
-    fn passes(&self, batches: &[L::Batch]) -> Result<Vec<Pass>> {
+    /// Computes the gradients of all batches, or of equal parts of them, in their order, on the first device.
+    fn passes(&self, batches: Vec<L::Batch>) -> Result<Vec<Pass>> {
         let main = self.devices[0].clone().inner();
         if self.devices.len() == 1 {
+            let whole = batches.len();
+            // Several parts on the processor, the same on any number of threads.
+            let parts = if is_flex(&main) { PARTS } else { 1 };
+            let batches = batches.into_iter().flat_map(|batch| L::parts(batch, parts));
+            let batches: Vec<_> = batches.collect();
+            if batches.len() > whole {
+                return self.parallel_passes(&batches);
+            }
             return batches.iter().map(|batch| self.pass(&self.network, batch, 0)).collect();
         }
         let weights = parameters(&self.network);
@@ -353,5 +368,9 @@ fn unsupported(precision: ComputePrecision, device: &Device) -> Error {
 
 /// Computes the Euclidean norm over all lists, `[1]`.
 fn norm(gradients: &[Tensor<1>]) -> Tensor<1> {
+    if is_flex(&gradients[0].device()) {
+        let squares = gradients.par_iter().map(|list| list.clone().powi_scalar(2).sum());
+        return Tensor::cat(squares.collect(), 0).sum().sqrt();
+    }
     Tensor::cat(gradients.to_vec(), 0).powi_scalar(2).sum().sqrt()
 }

@@ -113,7 +113,7 @@ impl Validator {
                 "make the pack again from this recipe",
             ));
         }
-        let sensor = Sensor::load(&config.sensor)?;
+        let sensor = Sensor::load(&config.sensor)?.as_read();
         Ok(Some(Self { config, clips, sensor }))
     }
 

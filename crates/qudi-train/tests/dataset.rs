@@ -5,8 +5,8 @@ use image::{GrayImage, Luma};
 use qudi_core::Error;
 use qudi_core::atomic_file::Overwrite;
 use qudi_train::dataset::{
-    ClipWindow, DataConfig, Dataset, LightRange, Pack, PackedSource, Sample, SensorMix,
-    SourceConfig, SourceKind, write_pack,
+    ClipWindow, DataConfig, Dataset, LightRange, Pack, PackProgress, PackedSource, Sample,
+    SensorMix, SourceConfig, SourceKind, write_pack,
 };
 use std::io::Write;
 use std::ops::ControlFlow;
@@ -71,7 +71,7 @@ fn all_sources() -> DataConfig {
 /// Packs files.
 fn pack(sources: &[PackedSource], folder: &Path) -> Result<PathBuf, Error> {
     let path = folder.join("pack.zip");
-    write_pack(sources, folder, &path, Overwrite::Yes, &mut |_| ControlFlow::Continue(()))?;
+    write_pack(sources, folder, &path, Overwrite::Yes, None, &mut |_| ControlFlow::Continue(()))?;
     Ok(path)
 }
 
@@ -108,7 +108,8 @@ fn packs_hold_what_files_hold() {
     });
     let path = folder.path().join("pack.zip");
     let go_on = &mut |_: &_| ControlFlow::Continue(());
-    let psnr = write_pack(&sources, folder.path(), &path, Overwrite::No, go_on).unwrap().unwrap();
+    let psnr =
+        write_pack(&sources, folder.path(), &path, Overwrite::No, None, go_on).unwrap().unwrap();
     assert!((40.0..60.0).contains(&psnr), "{psnr} dB");
     let pack = Pack::open(&path, &sources).unwrap();
     let clips = pack.clips().iter();
@@ -370,6 +371,31 @@ fn names_all_unreadable_clips_at_once() {
     }
 }
 
+/// Clips that cannot be read are left out on request, and a source without any other is refused all the same.
+#[test]
+fn leaves_unreadable_clips_out_on_request() {
+    let folder = tempfile::tempdir().unwrap();
+    files(folder.path());
+    let clips = folder.path().join("clips");
+    std::fs::write(clips.join("c0/3.png"), b"no image").unwrap();
+    let sources = super_config("clips").packed_sources();
+    let path = folder.path().join("other.zip");
+    let pack = |skipped: &mut Vec<String>| {
+        let go_on = &mut |_: &PackProgress| ControlFlow::Continue(());
+        write_pack(&sources, folder.path(), &path, Overwrite::Yes, Some(skipped), go_on)
+    };
+    let mut skipped = Vec::new();
+    pack(&mut skipped).unwrap();
+    assert!(skipped.len() == 1 && skipped[0].contains("c0"), "{skipped:?}");
+    let names: Vec<_> =
+        Pack::open(&path, &sources).unwrap().clips().iter().map(|clip| clip.name.clone()).collect();
+    assert_eq!(names.len(), 1);
+    std::fs::write(clips.join("c1/0.png"), b"no image").unwrap();
+    let mut skipped = Vec::new();
+    let error = pack(&mut skipped).unwrap_err();
+    assert!(skipped.is_empty() && error.to_string().contains("2 of 2 clips"), "{error}");
+}
+
 fn super_config(from: &str) -> DataConfig {
     config(vec![source("clips", SourceKind::Clips, &[from])])
 }
@@ -377,7 +403,14 @@ fn super_config(from: &str) -> DataConfig {
 fn pack_in(config: &DataConfig, folder: &Path) -> Result<PathBuf, Error> {
     let (path, sources) = (folder.join("other.zip"), config.packed_sources());
     let result =
-        write_pack(&sources, folder, &path, Overwrite::No, &mut |_| ControlFlow::Continue(()));
+        write_pack(
+            &sources,
+            folder,
+            &path,
+            Overwrite::No,
+            None,
+            &mut |_| ControlFlow::Continue(()),
+        );
     assert!(result.is_ok() || !path.exists(), "a failed pack left a file");
     result.map(|_| path)
 }

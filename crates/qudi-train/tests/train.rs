@@ -7,6 +7,7 @@ use qudi_core::Error;
 use qudi_model::checkpoint::load;
 use qudi_model::diffusion::Diffusion;
 use qudi_model::regression::Regression;
+use qudi_model::window::Window;
 use qudi_model::{init_parameters, parameter_shapes};
 use qudi_train::dataset::Dataset;
 use qudi_train::diffusion::Batch;
@@ -91,6 +92,33 @@ fn weights_do_not_depend_on_the_number_of_workers() {
     let loss = &steps[0].loss;
     let expected = loss.term("prediction") + 0.2 * loss.term("pre") + 30.0 * loss.term("flow");
     assert!((loss.total - expected).abs() < 1e-6 * loss.total);
+}
+
+/// Returns a small window network, whose batches pass in parts.
+fn window(changes: &[(&str, &str)]) -> Recipe {
+    const NETWORK: &str = "kind = \"window\"\nwidths = [32, 32, 32]\nflow = [32, 32, 32]\nstate = 32\n\
+        cell_blocks = 1\n\n[data]";
+    let tiny = include_str!("../../../tests/golden/tiny.toml");
+    let (before, others) = tiny.split_once("[network]").unwrap();
+    let (_, data) = others.split_once("[data]").unwrap();
+    shortened(&format!("{before}[network]\n{NETWORK}{data}"), changes)
+}
+
+/// Four samples in parts, on one or three threads, and the same samples at once: several devices take whole
+/// batches.
+#[test]
+fn parts_of_a_batch_take_the_step_of_the_batch() {
+    let recipe = window(&[("train.batch", "4")]);
+    let on_threads = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| trained_as::<Window>(&recipe, &[Device::flex()], 1))
+    };
+    let ((one, parts), (three, _)) = (on_threads(1), on_threads(3));
+    assert!(one == three, "weights differ");
+    let (_, whole) = trained_as::<Window>(&recipe, &[Device::flex(), Device::flex()], 1);
+    let (parts, whole) = (&parts[0], &whole[0]);
+    assert!((parts.loss.total - whole.loss.total).abs() < 1e-4 * whole.loss.total.abs());
+    assert!((parts.norm - whole.norm).abs() < 1e-3 * whole.norm, "{} {}", parts.norm, whole.norm);
 }
 
 /// Two devices with a batch each, one device with both in turn, and one device with both at once.

@@ -85,6 +85,15 @@ with h5py.File(out / "hdf5/contiguous.h5", "w") as f:
     f.create_dataset("counts", data=counts.astype(">u2"))
 with h5py.File(out / "hdf5/packed.h5", "w") as f:
     f.create_dataset("frames", data=np.packbits(np.tile(bits, (40, 1, 1)), axis=2), chunks=(16, 12, 3), compression="gzip")
+with h5py.File(out / "hdf5/soft.h5", "w") as f:
+    f["frames"] = counts
+    f["again"] = h5py.SoftLink("/frames")
+with h5py.File(out / "hdf5/master.h5", "w") as f:
+    f["data_000001"] = h5py.ExternalLink("chunked.h5", "/run/counts")
+    f["data_000002"] = h5py.ExternalLink("contiguous.h5", "/counts")
+with h5py.File(out / "hdf5/mixed.h5", "w") as f:
+    f["data_000001"] = counts[:2]
+    f["data_000002"] = h5py.ExternalLink("contiguous.h5", "/counts")
 with h5py.File(out / "mat/matlab73.mat", "w", userblock_size=512) as f:
     d = f.create_dataset("OUTPUT", data=np.ascontiguousarray(counts.transpose(0, 2, 1)), chunks=(2, 20, 12), compression="gzip")
     d.attrs["MATLAB_class"] = np.bytes_(b"uint8")

@@ -71,7 +71,10 @@ impl Source<'_> {
     }
 
     fn open_pipe(&self, named: Option<Sensor>, settings: &Settings) -> Result<OpenedCapture> {
-        let capture = self.input.open(self.options, named.as_ref())?;
+        let mut capture = self.input.open(self.options, named.as_ref())?;
+        if self.judged > 0 {
+            capture.judge_while_reading();
+        }
         let known = named.or(known_sensor(&capture)?);
         let sensor = known.map(|sensor| settings.adjusted(sensor)).transpose()?;
         Ok(OpenedCapture { capture, sensor })

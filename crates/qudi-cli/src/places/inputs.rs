@@ -113,8 +113,13 @@ impl Inputs<'_> {
     fn capture(&mut self, path: &Path, reading: &Reading, sensor: Option<&str>) {
         self.list.extend(files_of(path));
         for record in [beside(path), path.join("burst.json")] {
-            if let Ok(Sidecar::Simulated(record)) = Sidecar::load(&record) {
-                self.maps(&record.simulation.sensor);
+            let sensor = match Sidecar::load(&record) {
+                Ok(Sidecar::Simulated(record)) => Some(record.simulation.sensor),
+                Ok(Sidecar::Converted(conversion)) => conversion.sensor,
+                Err(_) => None,
+            };
+            if let Some(sensor) = sensor {
+                self.maps(&sensor);
             }
         }
         for file in reading.files() {

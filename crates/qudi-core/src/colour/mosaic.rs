@@ -89,7 +89,15 @@ impl FromStr for Mosaic {
         };
         let mosaic = Self { letters, corner };
         let side = mosaic.side();
-        if corner.0 >= side || corner.1 >= side { Err(wanted()) } else { Ok(mosaic) }
+        let Self { letters, corner: (row, column) } = &mosaic;
+        if row.max(column) >= &side {
+            return Err(format!(
+                "a tile of {side} x {side} pixels begins at a row and a column below {side}: {letters}@{row},{column} is {letters}@{},{}",
+                row % side,
+                column % side
+            ));
+        }
+        Ok(mosaic)
     }
 }
 
@@ -148,6 +156,12 @@ mod tests {
         assert_eq!(letters("rggb@1,0"), "gbgbrgrg");
         assert_eq!(letters("quad-rggb"), "rrggrrgg");
         assert_eq!("quad-rggb".parse::<Mosaic>().unwrap().pattern(), "rrggrrggggbbggbb");
+    }
+
+    #[test]
+    fn corners_outside_the_tile_are_named_inside() {
+        let words = "rggb@5,7".parse::<Mosaic>().unwrap_err();
+        assert!(words.ends_with("rggb@5,7 is rggb@1,1"), "{words}");
     }
 
     #[test]

@@ -32,14 +32,14 @@ impl CountLaw {
         }
     }
 
-    /// Adds read noise, applies the gain, rounds half to even and clips.
+    /// Adds read noise, applies the gain, adds the pedestal, rounds half to even and clips.
     pub(crate) fn digitise(&self, electrons: f64, rng: &mut impl Rng) -> u16 {
         let mut voltage = electrons.min(self.full_well);
         if self.read_noise > 0.0 {
             let z: f64 = StandardNormal.sample(rng);
             voltage += self.read_noise * z;
         }
-        let value = (self.gain * voltage).round_ties_even();
+        let value = (self.gain * voltage + self.pedestal).round_ties_even();
         value.clamp(0.0, f64::from(self.max_count)) as u16
     }
 }

@@ -4,6 +4,9 @@
 
 use super::{Response, Sensor};
 
+/// Arrivals in a dead time beyond which a counter is saturated.
+const MAX_DEAD_TIMES: f64 = 10.0;
+
 /// Distribution of the number of electrons, and their conversion into an output value.
 #[derive(Clone, Debug)]
 pub struct CountLaw {
@@ -15,6 +18,8 @@ pub struct CountLaw {
     pub(crate) full_well: f64,
     /// Dead time as a fraction of the exposure; 0 for none.
     pub(crate) dead_time: f64,
+    /// DN that are added before values below zero are cut off, where counts are drawn; 0 for none.
+    pub(crate) pedestal: f64,
 }
 
 impl CountLaw {
@@ -27,7 +32,14 @@ impl CountLaw {
             read_noise: sensor.read_noise,
             full_well: sensor.full_well.electrons(),
             dead_time: sensor.dead_time(),
+            pedestal: 0.0,
         }
+    }
+
+    /// Draws counts above a pedestal of `dn`, so that noise below it is not cut off.
+    pub(crate) fn above(mut self, dn: f64) -> Self {
+        self.pedestal = dn;
+        self
     }
 
     /// Returns the law of one binary frame of a summed sensor.
@@ -92,11 +104,14 @@ impl CountLaw {
 
     /// Returns the limit of the mean output for unbounded light.
     fn largest_mean(&self) -> f64 {
-        if self.response == Response::Binary || self.full_well.is_infinite() {
+        // A counter that is dead for a while after each count has room for so many.
+        let room = if self.dead_time > 0.0 { self.dead_time.recip().ceil() } else { f64::INFINITY };
+        let most = self.full_well.min(room);
+        if self.response == Response::Binary || most.is_infinite() {
             return f64::from(self.max_count);
         }
-        let (low, high) = self.uncertain_outputs(self.full_well);
-        low as f64 + (low..high).map(|j| self.exceeds(j, self.full_well)).sum::<f64>()
+        let (low, high) = self.uncertain_outputs(most);
+        low as f64 + (low..high).map(|j| self.exceeds(j, most)).sum::<f64>()
     }
 
     /// Computes the expected detections per output frame whose mean output value is `mean`: the inverse of
@@ -105,8 +120,9 @@ impl CountLaw {
     pub fn detections_for_mean(&self, mean: f64) -> f64 {
         let largest = self.largest_mean();
         let target = mean.min(largest - 0.5f64.min(0.5 * largest));
+        let brightest = if self.dead_time > 0.0 { MAX_DEAD_TIMES / self.dead_time } else { 1e9 };
         let mut high = 1.0;
-        while self.mean(high) < target && high < 1e9 {
+        while self.mean(high) < target && high < brightest {
             high *= 2.0;
         }
         let mut low = 0.0;
@@ -291,6 +307,17 @@ mod tests {
         for (k, y) in [(1.0, 0), (2.0, 1), (3.0, 2), (4.0, 2), (5.0, 2), (6.0, 3)] {
             assert_eq!((0..7).filter(|&j| law.exceeds(j, k) > 0.5).count(), y, "{k} electrons");
         }
+    }
+
+    /// Counts that a dead time leaves no room for are saturated, and found soon.
+    #[test]
+    fn dead_time_bounds_the_inverse_response() {
+        let mut law = law(8, 1.0, 0.0);
+        law.dead_time = 0.01;
+        let detections = law.detections_for_mean(250.0);
+        assert!((900.0..1100.0).contains(&detections), "{detections}");
+        let back = law.detections_for_mean(law.mean(30.0));
+        assert!((back - 30.0).abs() < 1e-6, "{back}");
     }
 
     #[test]

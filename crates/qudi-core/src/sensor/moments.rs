@@ -27,7 +27,8 @@ impl CountMoments {
         } else if law.response == Response::Binary {
             full * 5.0
         } else if law.dead_time() > 0.0 {
-            law.detections_for_mean(0.98 * full).min(100.0 / law.dead_time())
+            let room = (1.0 - 0.98 * full / law.gain * law.dead_time()).max(0.0);
+            (0.98 * full / law.gain / room).min(100.0 / law.dead_time())
         } else {
             full / law.gain
         };

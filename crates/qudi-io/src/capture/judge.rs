@@ -5,23 +5,26 @@ mod counter;
 mod exceptions;
 mod findings;
 mod frame_statistics;
+mod gaps;
+mod pass;
 mod scene_changes;
 mod timeline;
 
 pub use findings::FrameFindings;
+pub(super) use frame_statistics::FrameStatistics;
 pub use timeline::Stretch;
 
 use super::Capture;
+use super::piped_frames::PipedFrames;
 use crate::description::ReadOptions;
 use crate::frames::every_nth::EveryNth;
 use crate::frames::shifted::Shifted;
-use counter::{Counter, Edges};
+use counter::Counter;
 use exceptions::{alternation, first_run, judge};
-use frame_statistics::{Blocks, FrameStatistics};
+use gaps::long_gaps;
 use qudi_core::Result;
 use qudi_core::sensor::{Response, Sensor};
-use rayon::prelude::*;
-use scene_changes::{Change, Groups, most_likely_place};
+use std::cmp::Reverse;
 use std::ops::Range;
 
 /// Share of the frames beyond which they are no exceptions.
@@ -40,7 +43,7 @@ impl Capture {
     /// Judges the frames in one pass over at most `limit` bytes, in stretches of a longer capture, and
     /// applies what is found: a good frame stands in for a broken one, a frame that is stored several times
     /// is read once, values at the upper end of their words are shifted, and parts end at cuts. `options` and
-    /// `sensor` are the ones it was opened with. Captures that can be read once only are not judged.
+    /// `sensor` are the ones it was opened with. Pipes are judged while they are read.
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the capture cannot be read.
@@ -50,19 +53,24 @@ impl Capture {
         options: &ReadOptions,
         sensor: Option<&Sensor>,
     ) -> Result<()> {
-        if self.forward_only() || self.length().is_none() || self.native_frames() < 2 {
+        if self.length().is_none() || self.native_frames() < 2 {
             return Ok(());
         }
         let pixels = self.native.size().pixels();
         let bytes = if self.info.packing.is_some() { pixels.div_ceil(8) } else { 2 * pixels };
-        let gaps = self.info.gaps.iter().filter(|gap| self.range.contains(gap));
-        let missing = gaps.copied().collect();
-        let mut findings = FrameFindings { missing, ..FrameFindings::default() };
+        let mut findings = FrameFindings::default();
+        let gaps = self.info.gaps.iter().filter(|(frame, _)| self.range.contains(frame));
+        self.gaps = gaps.copied().collect();
         let mut seen: Vec<FrameStatistics> = Vec::new();
         let mut times = Vec::new();
-        for stretch in stretches(self.native_frames(), limit / bytes as u64) {
+        let mut all = stretches(self.native_frames(), limit / bytes as u64);
+        if self.forward_only() {
+            all.truncate(1);
+        }
+        for stretch in all {
             let first = self.range.start + stretch.start;
-            let (frames, groups, edges) = self.look_at(first..self.range.start + stretch.end)?;
+            let (frames, groups, mut edges) =
+                self.look_at(first..self.range.start + stretch.end)?;
             let size = self.native.size();
             self.timeline.push(Stretch::new(first, frames.len(), &groups, size));
             judge(&frames, first, &mut findings);
@@ -71,11 +79,14 @@ impl Capture {
                 if change.is_cut { &mut findings.cuts } else { &mut findings.light_steps }.push(at);
             }
             if let Some(counter) = edges.counter() {
-                self.take_counter(counter, first, &mut findings);
+                self.take_counter(counter, first);
             }
             times.push(findings.stored_times.take());
             seen.extend(frames);
         }
+        self.gaps.sort_unstable_by_key(|&(frame, missing)| (frame, Reverse(missing)));
+        self.gaps.dedup_by_key(|(frame, _)| *frame);
+        findings.missing = self.gaps.iter().map(|(frame, _)| *frame).collect();
         findings.looked_at = seen.len() as u64;
         findings.alternates = alternation(&seen);
         let bits = seen.iter().fold(0, |bits, frame| bits | frame.bits);
@@ -90,7 +101,7 @@ impl Capture {
             replan = true;
         }
         let share = findings.replaced().len() as f64 / seen.len() as f64;
-        self.boundaries = findings.boundaries();
+        self.boundaries = self.boundaries_for(&findings, self.sum);
         let replaced = share <= MAX_SHARE;
         if replaced {
             self.replace(&findings.replaced());
@@ -102,25 +113,19 @@ impl Capture {
         self.info.notes.extend(findings.notes(replaced));
         self.findings = findings;
         if replan {
+            self.held.clear();
             super::pixel_map::plan(self, options, sensor)?;
         }
         Ok(())
     }
 
-    /// Looks at stored frames: numbers of each, their blocks in groups, and where counters are.
-    fn look_at(&mut self, frames: Range<u64>) -> Result<(Vec<FrameStatistics>, Groups, Edges)> {
-        let mut groups = Groups::new((frames.end - frames.start) as usize);
-        let (mut seen, mut edges) = (Vec::new(), Edges::default());
-        self.for_each(frames, |frame, blocks, counts| {
-            seen.push(frame);
-            groups.push(&blocks);
-            edges.push(counts);
-        })?;
-        Ok((seen, groups, edges))
+    /// Judges frames when they are read, since they come once: the one before stands in for a broken one.
+    pub fn judge_while_reading(&mut self) {
+        self.piped = Some(PipedFrames::default());
     }
 
     /// Notes a frame counter, whose pixels are repaired, and the frames that it misses.
-    fn take_counter(&mut self, counter: Counter, first: u64, findings: &mut FrameFindings) {
+    fn take_counter(&mut self, counter: Counter, first: u64) {
         let Counter { pixels, jumps } = counter;
         if self.counter.is_empty() {
             self.info.notes.push(format!(
@@ -137,58 +142,17 @@ impl Capture {
                 first + frame
             ));
         }
-        findings.missing.extend(jumps.iter().map(|(frame, _)| first + frame));
+        self.gaps.extend(jumps.iter().map(|(frame, count)| (first + frame, *count)));
     }
 
-    /// Looks at each of the stored frames, without unpacking packed ones, which have no counts then.
-    fn for_each(
-        &mut self,
-        frames: Range<u64>,
-        mut take: impl FnMut(FrameStatistics, Blocks, &[u16]),
-    ) -> Result<()> {
-        let size = self.native.size();
-        let frame_bytes = size.height * size.width.div_ceil(8);
-        let mut is_packed = self.info.packing.is_some();
-        let (mut bytes, mut counts) = (Vec::new(), Vec::new());
-        let mut next = frames.start;
-        while next < frames.end {
-            let at_once = if is_packed { frame_bytes } else { 2 * size.pixels() };
-            let n = ((PIECE_BYTES / at_once).max(1) as u64).min(frames.end - next);
-            bytes.resize(if is_packed { n as usize * frame_bytes } else { 0 }, 0);
-            if is_packed && !self.native.copy_packed(next, &mut bytes)? {
-                is_packed = false;
-                continue;
-            }
-            if is_packed {
-                let looks = bytes.par_chunks_exact(frame_bytes);
-                let looks = looks.map(|frame| FrameStatistics::of_packed(frame, size));
-                for (frame, blocks) in looks.collect::<Vec<_>>() {
-                    take(frame, blocks, &[]);
-                }
-            } else {
-                counts.resize(n as usize * size.pixels(), 0);
-                for (number, counts) in (next..).zip(counts.chunks_exact_mut(size.pixels())) {
-                    self.native.read(number, counts)?;
-                }
-                let looks = counts.par_chunks_exact(size.pixels());
-                let looks: Vec<_> = looks.map(|frame| FrameStatistics::of(frame, size)).collect();
-                for ((frame, blocks), counts) in looks.into_iter().zip(counts.chunks(size.pixels()))
-                {
-                    take(frame, blocks, counts);
-                }
-            }
-            next += n;
-        }
-        Ok(())
-    }
-
-    /// Returns the number of frames between `first` and a change, among `frames` frames.
-    fn place_of(&mut self, change: Change, first: u64, frames: usize) -> Result<u64> {
-        let near = change.at.saturating_sub(change.reach)..(change.at + change.reach).min(frames);
-        let mut counts = Vec::with_capacity(near.len());
-        let stored = first + near.start as u64..first + near.end as u64;
-        self.for_each(stored, |_, Blocks(blocks), _| counts.push(blocks.map(f64::from)))?;
-        Ok((near.start + most_likely_place(&counts)) as u64)
+    /// Returns the first frames of parts that have nothing to do with those before, where `sum` frames are
+    /// summed.
+    pub(super) fn boundaries_for(&self, findings: &FrameFindings, sum: u32) -> Vec<u64> {
+        let changes = findings.cuts.iter().chain(&findings.light_steps).copied();
+        let mut frames: Vec<u64> = changes.chain(long_gaps(&self.gaps, &self.range, sum)).collect();
+        frames.sort_unstable();
+        frames.dedup();
+        frames
     }
 
     /// Returns what was found out about single frames.
@@ -248,6 +212,9 @@ impl Capture {
         let once = EveryNth::new(frames, times, self.range.start + first);
         findings.stored_times = Some(times);
         findings.renumber(|frame| once.holding(frame));
+        for (frame, missing) in &mut self.gaps {
+            (*frame, *missing) = (once.holding(*frame), missing.div_ceil(times));
+        }
         for stretch in &mut self.timeline {
             stretch.first = once.holding(stretch.first);
             stretch.step = stretch.step.div_ceil(times);
@@ -291,9 +258,6 @@ impl crate::frames::CountFrames for NoFrames {
         Ok(())
     }
 }
-
-/// Bytes that are read at once.
-const PIECE_BYTES: usize = 1 << 20;
 
 /// Fewest frames of a stretch.
 const MIN_STRETCH: u64 = 12;

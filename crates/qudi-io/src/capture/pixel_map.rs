@@ -34,14 +34,14 @@ pub(crate) fn plan(
     let mut named = None;
     if let Some(sensor) = sensor {
         if let Some(map) = &sensor.defects.dark_map {
-            capture.dark = Some(load(capture, Path::new(map))?.data);
+            capture.dark = Some(load_rates(capture, Path::new(map))?.data);
         }
         if let Some(map) = &sensor.defects.bad_pixels {
             named = Some(nonzero(&load(capture, Path::new(map))?));
         }
     }
     if let Some(path) = options.dcr.as_ref().filter(|_| calibrated.is_none()) {
-        let rates = load(capture, path)?;
+        let rates = load_rates(capture, path)?;
         let hot = (0..rates.data.len()).filter(|&i| rates.data[i] > HOT_PER_SECOND).collect();
         named = Some(BadPixels { hot, ..BadPixels::default() });
         if let Some(fps) = capture.info.fps.or(sensor.and_then(|sensor| sensor.fps)) {
@@ -59,6 +59,7 @@ pub(crate) fn plan(
         let mask = known.mask(capture.size());
         let stored = capture.view.stored(&mask, capture.native.size(), false);
         capture.native.ignore(&stored);
+        capture.held.clear();
     }
     capture.bad = match known {
         Some(known) => known,
@@ -125,6 +126,24 @@ fn find(capture: &mut Capture) -> Result<BadPixels> {
 fn nonzero(map: &Frame) -> BadPixels {
     let hot = (0..map.data.len()).filter(|&i| map.data[i] != 0.0).collect();
     BadPixels { hot, ..BadPixels::default() }
+}
+
+/// Loads a map of dark rates.
+fn load_rates(capture: &Capture, path: &Path) -> Result<Frame> {
+    let rates = load(capture, path)?;
+    match rates.data.iter().position(|rate| !rate.is_finite()) {
+        Some(at) => Err(Error::data(
+            format!(
+                "a dark rate of {} at row {}, column {}",
+                rates.data[at],
+                at / rates.size.width,
+                at % rates.size.width
+            ),
+            path,
+            "replace it by 0, and name the pixel in a mask if it is bad",
+        )),
+        None => Ok(rates),
+    }
 }
 
 /// Loads a map of the frames as they are read without turn and crop, turned and cropped like them; or one of

@@ -190,7 +190,12 @@ fn check_bit_order(capture: &mut Capture, sampled: &[u64]) -> Result<Option<BitO
     let mut sums = vec![0u32; stored.pixels()];
     for &look in sampled {
         let first = capture.range.start + capture.begins(look);
-        capture.native.add(first..first + u64::from(capture.sum), &mut sums)?;
+        if capture.sum == 1 {
+            capture.native.add(first..first + 1, &mut sums)?;
+            continue;
+        }
+        capture.sum_stored(first..first + u64::from(capture.sum))?;
+        sums.iter_mut().zip(&capture.stored_sums).for_each(|(sum, one)| *sum += one);
     }
     let z_score = match packing.axis {
         PackAxis::Height => {

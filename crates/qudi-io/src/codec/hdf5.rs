@@ -56,15 +56,17 @@ fn open(
         }
     })
     .map_err(damaged)?;
-    if found.is_empty() {
-        let links = linked_files(path);
-        if !links.is_empty() {
-            return Err(Error::data(
-                format!("it links to datasets in other files: {}", links.join(", ")),
-                path,
-                "give one of these files instead",
-            ));
-        }
+    // What lies in other files would be missing without a word.
+    let links = if options.array.is_none() { linked_files(path) } else { Vec::new() };
+    if !links.is_empty() {
+        return Err(Error::data(
+            format!(
+                "it links to datasets in other files, which are not followed: {}",
+                links.join(", ")
+            ),
+            path,
+            "give one of these files, or a folder with nothing but them; read a dataset that lies in this one with `array`; or merge them in Python: numpy.save('capture.npy', numpy.concatenate([file[name] for name in DATASETS]))",
+        ));
     }
     found.sort_by(|(a, _), (b, _)| qudi_core::natural_order::natural_order(&a.path, &b.path));
     if options.array.is_none() {

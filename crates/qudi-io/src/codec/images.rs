@@ -62,7 +62,7 @@ fn open(
 ) -> Result<Box<dyn CountFrames>> {
     let Numbered { files, notes, gaps } = numbered(files(probe)?);
     info.notes.extend(notes);
-    info.gaps = gaps.into_iter().map(|file| file as u64).collect();
+    info.gaps = gaps.into_iter().map(|(file, missing)| (file as u64, missing)).collect();
     let recorded = described(&probe.path.join("burst.json"), info);
     let frames = open_files(files, &probe.path, recorded.is_some(), options, info)?;
     match recorded {

@@ -146,6 +146,10 @@ pub(crate) fn described(path: &Path, info: &mut CaptureInfo) -> Option<BurstLayo
             let known = conversion.preset.as_deref().and_then(preset);
             info.preset = known.map(|preset| preset.name);
             info.cfa = conversion.cfa;
+            info.gain = conversion.gain;
+            info.ppp = conversion.light.map(|light| light.ppp);
+            info.mean_level = conversion.light.map(|light| light.mean_level);
+            info.sensor = conversion.sensor;
             conversion.burst
         }
     };

@@ -1,4 +1,4 @@
-//! A folder of numbered parts, each a stack of frames: multi-page TIFF, or NumPy arrays.
+//! A folder of numbered parts, each a stack of frames: multi-page TIFF, NumPy arrays, or HDF5 files.
 
 use super::tiff::{is_of_set, is_stack};
 use super::{Format, Recognition};
@@ -12,7 +12,7 @@ use std::path::PathBuf;
 pub(crate) const FORMAT: Format = Format {
     name: "parts",
     title: "folder of stacks",
-    options: super::ARRAY_OPTIONS,
+    options: super::ARRAYS_OPTIONS,
     probe: |probe| {
         let files = if probe.is_folder { files(probe)? } else { Vec::new() };
         let reason = "numbered stacks in the folder";
@@ -28,10 +28,10 @@ pub(super) fn holds_stacks(probe: &Probe) -> Result<bool> {
 
 /// Lists the parts in a folder; none if they are single frames or captures of their own.
 fn files(probe: &Probe) -> Result<Vec<PathBuf>> {
-    for extensions in [["tif", "tiff"], ["npy", "npy"]] {
+    for extensions in [["tif", "tiff"], ["npy", "npy"], ["npz", "npz"], ["h5", "hdf5"]] {
         let mut files = probe.files(&extensions)?;
         files.retain(|file| file.parent() == Some(&probe.path));
-        let stacks = extensions[0] == "npy" || files.iter().take(2).any(|file| is_stack(file));
+        let stacks = extensions[0] != "tif" || files.iter().take(2).any(|file| is_stack(file));
         let beside = probe.path.join("transforms.json").is_file();
         if !stacks || beside || files.is_empty() {
             continue;
@@ -90,7 +90,9 @@ fn open(
         reasons: std::mem::take(&mut info.reasons),
         ..about
     };
-    info.gaps = gaps.into_iter().map(|part| lengths[..part].iter().sum()).collect();
+    let gap =
+        |(part, missing): (usize, u64)| (lengths[..part].iter().sum(), missing * lengths[part - 1]);
+    info.gaps = gaps.into_iter().map(gap).collect();
     info.notes.extend(notes);
     info.notes.push(format!("{} parts are read one after the other", files.len()));
     let options = options.clone();

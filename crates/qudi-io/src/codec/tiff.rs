@@ -147,6 +147,9 @@ fn channel_of(
     path: &Path,
 ) -> Result<Box<dyn CountFrames>> {
     let pages = frames.frames();
+    if let Some(about) = &description {
+        refuse_other_axes(about, path)?;
+    }
     let Some(Description { channels, run, program, .. }) = description.filter(|d| d.channels > 1)
     else {
         return Ok(frames);
@@ -176,6 +179,26 @@ fn channel_of(
             format!("channels count from 0 to {}, and every one has as many pages", channels - 1),
         )),
     }
+}
+
+/// Refuses stacks whose pages are more than instants and channels.
+fn refuse_other_axes(about: &Description, path: &Path) -> Result<()> {
+    let Description { slices, series, program, .. } = about;
+    let (what, index) = match (*slices, *series) {
+        (2.., _) => {
+            (format!("a stack of {slices} slices at every instant"), "tifffile.imread(NAME)[:, 0]")
+        }
+        (_, 2..) => (
+            format!("{series} images, each with frames of its own"),
+            "tifffile.imread(NAME, series=0)",
+        ),
+        _ => return Ok(()),
+    };
+    Err(Error::data(
+        format!("{what}, as {program}'s description says"),
+        path,
+        format!("save the frames of one, as in Python: tifffile.imwrite('one.tif', {index})"),
+    ))
 }
 
 /// Opens the pages in the order of the file.

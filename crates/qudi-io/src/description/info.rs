@@ -70,9 +70,9 @@ pub struct CaptureInfo {
     pub cfa: Option<FilterChoice>,
     /// Camera preset that this format belongs to.
     pub preset: Option<&'static str>,
-    /// Frames before which numbers are missing.
+    /// Frames before which numbers are missing, and how many frames that are.
     #[serde(skip)]
-    pub gaps: Vec<u64>,
+    pub gaps: Vec<(u64, u64)>,
     /// Notes for the user.
     #[serde(rename = "remarks")]
     pub notes: Vec<String>,

@@ -2,10 +2,7 @@
 //! not cut off.
 
 use super::options::ReadOptions;
-use qudi_core::sensor::{Response, Sensor};
-
-/// Standard deviations of the read noise that are kept below zero.
-const KEPT_SIGMAS: f64 = 3.0;
+use qudi_core::sensor::Sensor;
 
 /// Returns `options` with the sensor's pedestal and threshold, if they set neither.
 pub(crate) fn with_pedestal(options: &ReadOptions, sensor: Option<&Sensor>) -> ReadOptions {
@@ -29,12 +26,7 @@ pub(crate) fn keep_pedestal(options: &mut ReadOptions, sensor: Option<&Sensor>) 
     if !options.signed {
         return 0.0;
     }
-    let Some(gain) = sensor.fixed_gain().filter(|_| sensor.response == Response::Linear) else {
-        return 0.0;
-    };
-    let noise = sensor.read_noise;
-    let electrons = if noise > 0.0 { (KEPT_SIGMAS * noise).max(noise * noise) } else { 0.0 };
-    let kept = (electrons * gain).ceil().min(offset.floor());
+    let kept = sensor.kept_pedestal(offset);
     options.offset = Some(offset - kept);
     kept
 }

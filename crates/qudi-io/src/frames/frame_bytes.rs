@@ -198,6 +198,10 @@ impl Picked {
     }
 }
 
+/// Bytes of a long piece that one thread reads.
+#[cfg(unix)]
+const SHARED_BYTES: usize = 1 << 18;
+
 pub(crate) struct Files {
     segments: Vec<Segment>,
     firsts: Vec<u64>,
@@ -310,8 +314,7 @@ impl Files {
                 self.open = Some((at, file));
             }
             let (_, file) = self.open.as_mut().expect("opened above");
-            file.seek(SeekFrom::Start(start + within * self.frame_bytes as u64))
-                .and_then(|_| file.read_exact(piece))
+            read_exact_at(file, start + within * self.frame_bytes as u64, piece)
                 .map_err(|e| Error::io(format!("read frame {first} of"), path, e))?;
             if let Some(checksum) = &mut self.checksum {
                 let segment = &self.segments[at];
@@ -333,6 +336,25 @@ impl Files {
         let compared = File::open(path).and_then(|mut file| checksum.whole(&mut file));
         compared.map_err(|e| unverified(e, path))
     }
+}
+
+/// Fills `bytes` from byte `start` of a file on; long pieces by several threads.
+#[cfg(unix)]
+fn read_exact_at(file: &mut File, start: u64, bytes: &mut [u8]) -> std::io::Result<()> {
+    use rayon::prelude::*;
+    use std::os::unix::fs::FileExt;
+    if bytes.len() < 2 * SHARED_BYTES {
+        return file.read_exact_at(bytes, start);
+    }
+    let shares = bytes.par_chunks_mut(SHARED_BYTES).enumerate();
+    shares.try_for_each(|(n, bytes)| file.read_exact_at(bytes, start + (n * SHARED_BYTES) as u64))
+}
+
+/// Fills `bytes` from byte `start` of a file on.
+#[cfg(not(unix))]
+fn read_exact_at(file: &mut File, start: u64, bytes: &mut [u8]) -> std::io::Result<()> {
+    file.seek(SeekFrom::Start(start))?;
+    file.read_exact(bytes)
 }
 
 /// Returns the error of data whose checksum was not compared, or differs.

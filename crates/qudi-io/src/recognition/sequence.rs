@@ -6,6 +6,9 @@ use std::path::{Path, PathBuf};
 /// Files of the usual pattern, from which on others are strangers.
 const MIN_FILES: usize = 3;
 
+/// Missing frames of a gap across which nothing is known.
+const LONG_GAP: u64 = 1 << 32;
+
 /// Gaps that are listed.
 const MAX_LISTED: usize = 4;
 
@@ -34,8 +37,8 @@ pub(crate) struct Numbered {
     pub(crate) files: Vec<PathBuf>,
     /// Notes on missing numbers, and on files that were skipped.
     pub(crate) notes: Vec<String>,
-    /// Files before which numbers are missing.
-    pub(crate) gaps: Vec<usize>,
+    /// Files before which numbers are missing, and how many.
+    pub(crate) gaps: Vec<(usize, u64)>,
 }
 
 /// Drops files whose names are of another pattern than most.
@@ -68,14 +71,14 @@ pub(crate) fn numbered(files: Vec<PathBuf>) -> Numbered {
     Numbered { files: kept, notes, gaps: gaps.unwrap_or_default() }
 }
 
-/// Describes the numbers that are missing between the first and the last, and returns the files after them.
-fn missing(files: &[PathBuf]) -> Option<(String, Vec<usize>)> {
+/// Describes the numbers that are missing between the first and the last, and returns the files after them,
+/// each with how many are missing.
+fn missing(files: &[PathBuf]) -> Option<(String, Vec<(usize, u64)>)> {
     let numbers: Option<Vec<(String, u64)>> = files.iter().map(|file| pattern(file).1).collect();
     let numbers = numbers?;
     let before = &numbers.first()?.0;
-    // Another number counts, too: nothing is known of the order.
     if numbers.iter().any(|(other, _)| other != before) {
-        return None;
+        return sequences(&numbers);
     }
     let numbers: Vec<u64> = numbers.into_iter().map(|(_, number)| number).collect();
     let steps = || numbers.windows(2).map(|pair| pair[1].saturating_sub(pair[0]));
@@ -88,12 +91,37 @@ fn missing(files: &[PathBuf]) -> Option<(String, Vec<usize>)> {
     };
     let gaps: Vec<String> = after.iter().map(gap).collect();
     // Numbers without any regularity have gaps everywhere.
-    if gaps.is_empty() || 4 * gaps.len() > numbers.len() {
+    if gaps.is_empty() || gaps.len() > 1 && 4 * gaps.len() > numbers.len() {
         return None;
     }
     let more = if gaps.len() > MAX_LISTED { ", and more" } else { "" };
     let list = gaps[..gaps.len().min(MAX_LISTED)].join(", ");
+    let missing = |n: usize| (numbers[n] - numbers[n - 1]) / step - 1;
+    let after = after.into_iter().map(|n| (n, missing(n))).collect();
     Some((format!("numbers {list}{more} are missing: the scene jumps there"), after))
+}
+
+/// Describes sequences that follow each other, where all names of one have the same beginning, and returns
+/// the first files of all but the first one: nothing is known of what lies between.
+fn sequences(numbers: &[(String, u64)]) -> Option<(String, Vec<(usize, u64)>)> {
+    let runs: Vec<_> = numbers.chunk_by(|(one, _), (other, _)| one == other).collect();
+    let goes_on = |pair: &[&[(String, u64)]]| {
+        pair[0].last().zip(pair[1].first()).is_some_and(|(last, first)| first.1 == last.1 + 1)
+    };
+    if runs.iter().any(|run| run.len() < MIN_FILES) || runs.windows(2).any(goes_on) {
+        return None;
+    }
+    let firsts = runs.iter().scan(0, |at, run| {
+        *at += run.len();
+        Some((*at, LONG_GAP))
+    });
+    let note = format!(
+        "names begin with {} to {}: {} sequences are read one after the other, and nothing is followed from one to the next; name a folder with one of them, if they are of several cameras",
+        runs[0][0].0,
+        runs[runs.len() - 1][0].0,
+        runs.len()
+    );
+    Some((note, firsts.take(runs.len() - 1).collect()))
 }
 
 #[cfg(test)]
@@ -106,13 +134,20 @@ mod tests {
             |range: std::ops::Range<u32>| range.map(|n| PathBuf::from(format!("f_{n:04}.png")));
         let files: Vec<_> = names(0..9).chain(names(14..30)).collect();
         let Numbered { files: kept, notes, gaps } = numbered(files);
-        assert_eq!((kept.len(), notes.len(), gaps), (25, 1, vec![9]));
+        assert_eq!((kept.len(), notes.len(), gaps), (25, 1, vec![(9, 5)]));
         assert!(notes[0].starts_with("numbers 9 to 13 are missing"), "{notes:?}");
         let mut files: Vec<_> = names(0..30).collect();
         files.push(PathBuf::from("mean.png"));
         let Numbered { files: kept, notes, .. } = numbered(files);
         assert_eq!(kept.len(), 30);
         assert!(notes[0].contains("`mean.png`"), "{notes:?}");
+        let of_camera = |camera: u32| (0..15).map(move |n| format!("cam{camera}_f{n:03}.png"));
+        let files = of_camera(1).chain(of_camera(2)).map(PathBuf::from).collect();
+        let Numbered { files: kept, notes, gaps } = numbered(files);
+        assert_eq!((kept.len(), gaps), (30, vec![(15, LONG_GAP)]));
+        assert!(notes[0].contains("cam1_f to cam2_f: 2 sequences"), "{notes:?}");
+        let one_of_three = ["rec_0.tif", "rec_2.tif", "rec_3.tif"].map(PathBuf::from).to_vec();
+        assert_eq!(numbered(one_of_three).gaps, [(1, 1)]);
         for plain in [["a.png", "b.png", "c.png"], ["f0.png", "f10.png", "f20.png"]] {
             let files: Vec<_> = plain.iter().map(PathBuf::from).collect();
             assert_eq!(numbered(files.clone()), Numbered { files, ..Numbered::default() });

@@ -1,6 +1,7 @@
 //! A folder of restored frames that survives an interruption: finished frames stay, and a manifest describes
 //! how they were made, so that no other frames are mixed in.
 
+use super::changed_settings::{difference, written};
 use super::inputs::Inputs;
 use super::lock::{FolderLock, Share};
 use crate::writer::{encode_colour_png16, encode_png16, frame_name, is_frame_below, is_frame_name};
@@ -110,7 +111,7 @@ impl FrameFolder {
         if was != is {
             return refuse(format!("frames made by {was} lie there, and this is {is}"));
         }
-        if let Some((key, was, is)) = difference(&found["settings"], &self.run.settings) {
+        if let Some((key, was, is)) = difference(&found["settings"], &written(&self.run.settings)) {
             return refuse(format!(
                 "frames made with other settings lie there: {key} was {was}, now {is}"
             ));
@@ -283,36 +284,6 @@ fn program() -> String {
     format!("qudi {}", env!("CARGO_PKG_VERSION"))
 }
 
-/// Values of settings that have another name by now: the key, the former value, the value.
-const RENAMED: &[(&str, &str, &str)] =
-    &[("method", "guide", "qbp-refined"), ("spacing", "learnt", "log-logistic")];
-
-/// Returns the first key whose value differs, with both values.
-fn difference(was: &Value, is: &Value) -> Option<(String, String, String)> {
-    match (was, is) {
-        (Value::Object(was), Value::Object(is)) => {
-            let keys = was.keys().chain(is.keys());
-            keys.into_iter().find_map(|key| {
-                let (was, is) = (was.get(key), is.get(key));
-                let (was, is) = (was.unwrap_or(&Value::Null), is.unwrap_or(&Value::Null));
-                if RENAMED
-                    .iter()
-                    .any(|(name, former, now)| key == name && was == former && is == now)
-                {
-                    return None;
-                }
-                let (below, was, is) = difference(was, is)?;
-                let name = if below.is_empty() { key.clone() } else { format!("{key}.{below}") };
-                Some((name, was, is))
-            })
-        }
-        // A number may be parsed from text as another kind of number.
-        (Value::Number(a), Value::Number(b)) if a.as_f64() == b.as_f64() => None,
-        (was, is) if was == is => None,
-        (was, is) => Some((String::new(), was.to_string(), is.to_string())),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -325,6 +296,17 @@ mod tests {
 
     fn image() -> Frame {
         Frame::from_fn(SIZE, |x, y| (x + y) as f32 / 7.3)
+    }
+
+    #[test]
+    fn numbers_that_are_read_with_another_last_bit_are_equal() {
+        let folder = tempfile::tempdir().unwrap();
+        let settings =
+            json!({"exposure": 0.433_395_034_419_726_04_f64, "ppp": 4.522_505_326_704_543_f64});
+        for _ in 0..3 {
+            let path = folder.path().join("out");
+            FrameFolder::open(&path, SIZE, run(settings.clone()), Overwrite::No).unwrap();
+        }
     }
 
     #[test]

@@ -365,3 +365,77 @@ fn rejects_impossible_colour_arrays_and_reads_folders_of_raw_files() {
     let words = refusal(open(&folder.path().join("raw"), &options));
     assert!(words.contains("no capture in a known format"), "{words}");
 }
+
+/// Compressed captures are judged, too: reading them again starts over.
+#[test]
+fn compressed_captures_are_judged() {
+    let folder = scratch();
+    let (frames, side) = (24, 16);
+    let mut bytes: Vec<u8> =
+        (0..frames * side * side).map(|i| ((i * 7 + i / 256 * 13) % 23) as u8).collect();
+    let sound = bytes.clone();
+    bytes[12 * side * side..13 * side * side].fill(255);
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    gzip.write_all(&npy("|u1", "False", "(24, 16, 16)", &bytes)).unwrap();
+    let path = write(folder.path(), "a.npy.gz", &gzip.finish().unwrap());
+    let mut capture = open(&path, &plain()).unwrap();
+    capture.judge_frames(u64::MAX, &plain(), None).unwrap();
+    assert_eq!(capture.findings().saturated, [12]);
+    let read = counts(&mut capture);
+    let frame = |t: usize| {
+        let bytes = &sound[t * side * side..][..side * side];
+        bytes.iter().map(|&byte| u16::from(byte)).collect::<Vec<_>>()
+    };
+    assert!(read[12] == frame(11) || read[12] == frame(13));
+    assert!(read[14] == frame(14));
+}
+
+/// Slices at every instant are no instants.
+#[test]
+fn rejects_stacks_of_slices_over_time() {
+    let folder = scratch();
+    let save = |name: &str, description: &str| {
+        let path = folder.path().join(name);
+        let file = std::fs::File::create(&path).unwrap();
+        let mut encoder = tiff::encoder::TiffEncoder::new(file).unwrap();
+        for _ in 0..6 {
+            let mut image = encoder.new_image::<tiff::encoder::colortype::Gray8>(4, 4).unwrap();
+            let tag = tiff::tags::Tag::ImageDescription;
+            image.encoder().write_tag(tag, description).unwrap();
+            image.write_data(&[3; 16]).unwrap();
+        }
+        path
+    };
+    let imagej = save("a.tif", "ImageJ=1.54f\nimages=6\nslices=2\nframes=3\nhyperstack=true\n");
+    let words = refusal(open(&imagej, &plain()));
+    assert!(words.contains("2 slices at every instant") && words.contains("[:, 0]"), "{words}");
+    let pixels = "<Pixels SizeC=\"1\" SizeZ=\"1\" SizeT=\"3\"/>";
+    let series =
+        save("b.ome.tif", &format!("<OME><Image>{pixels}</Image><Image>{pixels}</Image></OME>"));
+    let words = refusal(open(&series, &plain()));
+    assert!(words.contains("2 images") && words.contains("series=0"), "{words}");
+    let plain_stack = save("c.tif", "ImageJ=1.54f\nimages=6\nslices=6\n");
+    assert_eq!(open(&plain_stack, &plain()).unwrap().frames(), 6);
+}
+
+/// Sums that are held are the ones of the file, also after others.
+#[test]
+fn held_sums_are_those_of_the_file() {
+    let folder = scratch();
+    let bytes: Vec<u8> = (0..40 * 16 * 16).map(|i| (i * 31 % 7) as u8).collect();
+    let path = write(folder.path(), "a.npy", &npy("|u1", "False", "(40, 16, 16)", &bytes));
+    let options = ReadOptions { sum: Some(4), bits: Some(3), ..plain() };
+    let mut capture = open(&path, &options).unwrap();
+    let first = counts(&mut capture);
+    assert!(counts(&mut capture) == first);
+    let expected = |sum: usize, from: usize| {
+        let of = |i: usize| (from..from + sum).map(|t| u16::from(bytes[t * 256 + i])).sum();
+        (0..256).map(of).collect::<Vec<u16>>()
+    };
+    assert_eq!(first[3], expected(4, 12));
+    let mut one = vec![0; 256];
+    capture.read_from(13, &mut one).unwrap();
+    assert_eq!(one, expected(4, 13));
+    let mut capture = capture.summed_by(5, &options, None).unwrap();
+    assert_eq!(counts(&mut capture)[2], expected(5, 10));
+}

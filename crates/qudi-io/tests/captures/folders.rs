@@ -106,6 +106,20 @@ fn holes_and_strangers_are_named() {
 }
 
 #[test]
+fn dark_rates_are_numbers() {
+    let folder = scratch();
+    let bytes: Vec<u8> = (0..6).flat_map(frame).collect();
+    let path = write(folder.path(), "a.npy", &npy("|u1", "False", "(6, 16, 16)", &bytes));
+    let mut rates = [1.0f32; SIDE * SIDE];
+    rates[SIDE + 2] = f32::NAN;
+    let rates: Vec<u8> = rates.iter().flat_map(|rate| rate.to_le_bytes()).collect();
+    let dcr = write(folder.path(), "dcr.npy", &npy("<f4", "False", "(16, 16)", &rates));
+    let options = ReadOptions { dcr: Some(dcr), ..ReadOptions::default() };
+    let words = refusal(open(&path, &options));
+    assert!(words.contains("NaN at row 1, column 2") && words.contains("dcr.npy"), "{words}");
+}
+
+#[test]
 fn maps_turn_with_the_frames() {
     let folder = scratch();
     let bytes: Vec<u8> = (0..6).flat_map(frame).collect();

@@ -69,7 +69,7 @@ fn every_file_holds_the_same_frames() {
 #[test]
 fn reads_hdf5_captures() {
     let three_bit = expected("counts.npy");
-    for name in ["chunked.h5", "contiguous.h5", "matlab73.mat", "mono.ubi.h5"] {
+    for name in ["chunked.h5", "contiguous.h5", "soft.h5", "matlab73.mat", "mono.ubi.h5"] {
         assert_eq!(frames(name, &plain()), three_bit, "{name}");
     }
     let mono = open(&golden("mono.ubi.h5"), &plain()).unwrap();
@@ -80,6 +80,30 @@ fn reads_hdf5_captures() {
     assert!((colours[1] - 0.5).abs() < 0.03, "{colours:?}");
     let trimmed = ReadOptions { size: Some("12x20".parse().unwrap()), ..plain() };
     assert_eq!(frames("packed.h5", &trimmed)[6 * 39..], expected("bits.npy"));
+}
+
+#[cfg(feature = "hdf5")]
+#[test]
+fn links_to_other_hdf5_files_are_named_and_not_followed() {
+    for (name, files) in [("master.h5", "chunked.h5, contiguous.h5"), ("mixed.h5", "contiguous.h5")]
+    {
+        let words = refusal(open(&golden(name), &plain()));
+        assert!(words.contains(&format!("not followed: {files}")), "{words}");
+        assert!(words.contains("numpy.concatenate") && words.contains("`array`"), "{words}");
+    }
+    // What lies in the file is read by name.
+    let inside = ReadOptions { array: Some("data_000001".into()), ..plain() };
+    assert_eq!(
+        counts(&mut open(&golden("mixed.h5"), &inside).unwrap()),
+        expected("counts.npy")[..2]
+    );
+    // A folder with nothing but the data is read part by part.
+    let folder = tempfile::tempdir().unwrap();
+    for n in 1..=3 {
+        std::fs::copy(golden("chunked.h5"), folder.path().join(format!("data_{n}.h5"))).unwrap();
+    }
+    let mut capture = open(folder.path(), &plain()).unwrap();
+    assert_eq!(counts(&mut capture), vec![expected("counts.npy"); 3].concat());
 }
 
 #[cfg(not(feature = "hdf5"))]

@@ -1,4 +1,5 @@
 //! The gradients of a stack, from its features back to its inputs.
+#![allow(unsafe_code)]
 
 use super::Stack;
 use super::forward::{
@@ -6,7 +7,7 @@ use super::forward::{
     of_group,
 };
 use super::grid::{BLOCK, TILE};
-use super::layout::{CHANNELS, Line};
+use super::layout::{CHANNELS, Line, Shared};
 use super::unit::{Finish, Gradient};
 use super::weights::{TAPS, Tiles};
 use crate::uninitialised::written;
@@ -14,59 +15,97 @@ use rayon::prelude::*;
 
 const PLAIN: Finish<'_> = Finish { bias: None, addend: None, relu: false, mask: None };
 
-/// Computes the gradients for every input, `[images, channels, height, width]`, and for the flat parameters.
+/// Computes the gradients for the inputs that `requested` names, `[images, channels, height, width]`, and for
+/// the flat parameters.
 pub(super) fn backward(
     stack: &Stack,
     activations: &Activations,
     parameters: &[f32],
     gradient: &[f32],
-) -> (Vec<Vec<f32>>, Vec<f32>) {
+    requested: &[bool],
+) -> (Vec<Option<Vec<f32>>>, Vec<f32>) {
     let convolutions = convolutions(stack, parameters);
-    let tiles: Vec<Tiles> =
-        convolutions.par_iter().map(|conv| Tiles::backward(conv.weight, conv.sizes)).collect();
+    let tiles = stack.packed.backward(&convolutions);
     let groups = groups(stack);
     let images = groups[0].images;
+    let pixels = stack.height * stack.width;
+    let lengths = stack.inputs.iter().map(|channels| stack.images * channels * pixels);
+    let inputs =
+        lengths.zip(requested).map(|(length, requested)| requested.then(|| Planes::new(length)));
+    let mut inputs: Vec<Option<Planes>> = inputs.collect();
+    let targets = inputs.iter_mut().map(|planes| planes.as_mut().map(Planes::shared));
+    let targets: Vec<Option<Shared<f32>>> = targets.collect();
     let work = |(number, (group, activations)): (usize, (&Stack, &GroupActivations))| {
         let gradient = of_group(gradient, group, number * images, stack.features);
-        let (inputs, sums) = backward_group(group, activations, &tiles, gradient);
-        let mut first = 0;
-        let planes = stack.inputs.iter().map(|&channels| {
-            first += channels;
-            let length = group.images * channels * stack.height * stack.width;
-            written(length, |planes| {
-                inputs.write_planes(&activations.grid, first - channels, channels, planes);
-            })
-        });
-        (planes.collect::<Vec<_>>(), sums)
-    };
-    let parts: Vec<(Vec<Vec<f32>>, Vec<Gradient>)> =
-        groups.par_iter().zip(&activations.0).enumerate().map(work).collect();
-    let mut inputs: Vec<Vec<f32>> = vec![Vec::new(); stack.inputs.len()];
-    let mut sums: Vec<Vec<Gradient>> = convolutions.iter().map(|_| Vec::new()).collect();
-    for (planes, group_sums) in parts {
-        for (input, planes) in inputs.iter_mut().zip(planes) {
-            if input.is_empty() {
-                *input = planes;
-            } else {
-                input.extend(planes);
+        let (gradient, sums) = backward_group(group, activations, tiles, gradient);
+        if requested.contains(&true) {
+            let grid = &activations.grid;
+            let inputs = convolve(grid, &gradient, &tiles[0], PLAIN);
+            let mut first = 0;
+            for (to, &channels) in targets.iter().zip(&stack.inputs) {
+                if let Some(to) = to {
+                    let place = number * images * channels * pixels;
+                    let length = group.images * channels * pixels;
+                    // SAFETY: images of this group, in memory of all.
+                    let to = unsafe { std::slice::from_raw_parts_mut(to.at(place), length) };
+                    inputs.write_planes(grid, first, channels, to);
+                }
+                first += channels;
             }
         }
+        sums
+    };
+    let parts: Vec<Vec<Gradient>> =
+        groups.par_iter().zip(&activations.0).enumerate().map(work).collect();
+    let mut sums: Vec<Vec<Gradient>> = convolutions.iter().map(|_| Vec::new()).collect();
+    for group_sums in parts {
         for (sums, sum) in sums.iter_mut().zip(group_sums) {
             sums.push(sum);
         }
     }
-    // Summed in the order of the groups: the result does not depend on threads.
-    let flat = sums.into_par_iter().zip(&convolutions).map(|(sums, conv)| {
-        let all = sums.into_iter().reduce(Gradient::plus).expect("a group");
-        let mut values = unpacked(&all, conv.sizes);
-        values.extend_from_slice(&all.bias[..conv.sizes[1]]);
-        values
+    let flat = written(parameters.len(), |mut rest| {
+        let lengths = convolutions.iter().map(|conv| conv.weight.len() + conv.bias.len());
+        let parts: Vec<&mut [f32]> = lengths
+            .map(|length| rest.split_off_mut(..length).expect("values of a convolution"))
+            .collect();
+        // Summed in the order of the groups: the result does not depend on threads.
+        let work = parts.into_par_iter().zip(sums).zip(&convolutions);
+        work.for_each(|((to, sums), conv)| {
+            let all = sums.into_iter().reduce(Gradient::plus).expect("a group");
+            let (weight, bias) = to.split_at_mut(conv.weight.len());
+            unpack(&all, conv.sizes, weight);
+            bias.copy_from_slice(&all.bias[..conv.sizes[1]]);
+        });
     });
-    let flat: Vec<Vec<f32>> = flat.collect();
-    (inputs, flat.concat())
+    // SAFETY: the groups have written all images.
+    let inputs = inputs.into_iter().map(|planes| planes.map(|planes| unsafe { planes.written() }));
+    (inputs.collect(), flat)
 }
 
-/// Computes the gradients for the joined inputs of a group and for every convolution.
+/// The gradient of an input, which the groups write.
+struct Planes(Vec<f32>, usize);
+
+impl Planes {
+    fn new(length: usize) -> Self {
+        Self(Vec::with_capacity(length), length)
+    }
+
+    fn shared(&mut self) -> Shared<f32> {
+        Shared(self.0.as_mut_ptr())
+    }
+
+    /// Returns the values.
+    ///
+    /// # Safety
+    /// All must have been written.
+    unsafe fn written(mut self) -> Vec<f32> {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.set_len(self.1) };
+        self.0
+    }
+}
+
+/// Computes the gradients for what the entry's convolution makes of a group, and for every convolution.
 fn backward_group(
     stack: &Stack,
     activations: &GroupActivations,
@@ -88,27 +127,28 @@ fn backward_group(
         convolve_into(grid, &between, &tiles[first], finish, &mut gradient);
     }
     if stack.blocks == 0 {
-        for (value, &feature) in gradient.values.iter_mut().zip(&features[0].values) {
+        for (value, &feature) in gradient.values.iter_mut().zip(features[0].values.iter()) {
             *value = if feature == 0 { 0 } else { *value };
         }
     }
     sums.push(correlate(grid, input, &gradient));
     sums.reverse();
-    (convolve(grid, &gradient, &tiles[0], PLAIN), sums)
+    (gradient, sums)
 }
 
-/// Returns sums as the gradient of a weight, `[outputs, inputs, 3, 3]`.
-fn unpacked(sums: &Gradient, [inputs, outputs]: [usize; 2]) -> Vec<f32> {
+/// Writes sums as the gradient of a weight, `[outputs, inputs, 3, 3]`.
+fn unpack(sums: &Gradient, [inputs, outputs]: [usize; 2], to: &mut [f32]) {
     const { assert!(BLOCK == 2 * TILE && BLOCK == CHANNELS) };
     let [wide, high] = [inputs, outputs].map(|channels| channels.div_ceil(BLOCK));
-    let mut values = vec![0.0; inputs * outputs * TAPS];
-    for (output, weight) in values.chunks_exact_mut(inputs * TAPS).enumerate() {
-        for (input, weight) in weight.chunks_exact_mut(TAPS).enumerate() {
-            for (tap, weight) in weight.iter_mut().enumerate() {
-                let block = (tap * wide + input / BLOCK) * high + output / BLOCK;
-                *weight = sums.blocks[block].0[input % BLOCK][output % BLOCK];
+    for (output, weight) in to.chunks_exact_mut(inputs * TAPS).enumerate() {
+        for (input, weight) in weight.chunks_mut(BLOCK * TAPS).enumerate() {
+            for tap in 0..TAPS {
+                let block = &sums.blocks[(tap * wide + input) * high + output / BLOCK];
+                let row = &block.0[output % BLOCK];
+                for (weight, &sum) in weight.chunks_exact_mut(TAPS).zip(row) {
+                    weight[tap] = sum;
+                }
             }
         }
     }
-    values
 }

@@ -10,7 +10,7 @@ use burn::backend::{Autodiff, Backend, backend_extension};
 use std::fmt::Debug;
 
 /// Inputs of one call; longer lists are joined first.
-pub(super) const INPUTS: usize = 6;
+pub(super) const INPUTS: usize = 7;
 
 /// Backends with fused stacks.
 ///
@@ -30,6 +30,7 @@ pub trait StackBackend: Backend {
         d: FloatTensor<Self>,
         e: FloatTensor<Self>,
         f: FloatTensor<Self>,
+        g: FloatTensor<Self>,
         parameters: FloatTensor<Self>,
         stack: Stack,
     ) -> FloatTensor<Self>;
@@ -47,13 +48,14 @@ pub trait StackGradients: Backend {
         stack: &Stack,
     ) -> (FloatTensor<Self>, Self::Activations);
 
-    /// Returns the gradients for every input and for the parameters.
+    /// Returns the gradients for the inputs, at least for those that are `requested`, and for the parameters.
     fn residual_stack_gradients(
         parameters: FloatTensor<Self>,
         gradient: FloatTensor<Self>,
         activations: &Self::Activations,
         stack: &Stack,
-    ) -> (Vec<FloatTensor<Self>>, FloatTensor<Self>);
+        requested: &[bool],
+    ) -> (Vec<Option<FloatTensor<Self>>>, FloatTensor<Self>);
 }
 
 #[cfg(feature = "flex")]
@@ -89,10 +91,11 @@ mod flex {
             d: FlexTensor,
             e: FlexTensor,
             f: FlexTensor,
+            g: FlexTensor,
             parameters: FlexTensor,
             stack: Stack,
         ) -> FlexTensor {
-            let inputs = [a, b, c, d, e, f].into_iter().take(stack.inputs.len()).collect();
+            let inputs = [a, b, c, d, e, f, g].into_iter().take(stack.inputs.len()).collect();
             computed(inputs, parameters, &stack, false).0
         }
     }
@@ -113,13 +116,15 @@ mod flex {
             gradient: FlexTensor,
             activations: &Arc<Activations>,
             stack: &Stack,
-        ) -> (Vec<FlexTensor>, FlexTensor) {
+            requested: &[bool],
+        ) -> (Vec<Option<FlexTensor>>, FlexTensor) {
             let (parameters, gradient) = (contiguous(parameters), contiguous(gradient));
-            let (inputs, flat) =
-                backward(stack, activations, values(&parameters), values(&gradient));
+            let (parameters, gradient) = (values(&parameters), values(&gradient));
+            let (inputs, flat) = backward(stack, activations, parameters, gradient, requested);
             let parts = inputs.into_iter().zip(&stack.inputs);
             let parts = parts.map(|(part, &channels)| {
-                tensor(part, [stack.images, channels, stack.height, stack.width])
+                let shape = [stack.images, channels, stack.height, stack.width];
+                part.map(|part| tensor(part, shape))
             });
             let count = flat.len();
             (parts.collect(), tensor(flat, [count]))
@@ -143,10 +148,11 @@ mod libtorch {
             d: TchTensor,
             e: TchTensor,
             f: TchTensor,
+            g: TchTensor,
             parameters: TchTensor,
             stack: Stack,
         ) -> TchTensor {
-            let inputs = [a, b, c, d, e, f].into_iter().take(stack.inputs.len());
+            let inputs = [a, b, c, d, e, f, g].into_iter().take(stack.inputs.len());
             let all: Vec<_> = inputs.chain([parameters]).collect();
             unrecorded(&all, |values| torch::forward(values, &stack))
         }
@@ -169,10 +175,11 @@ mod libtorch {
             gradient: TchTensor,
             record: &Recorded,
             _stack: &Stack,
-        ) -> (Vec<TchTensor>, TchTensor) {
+            _wanted: &[bool],
+        ) -> (Vec<Option<TchTensor>>, TchTensor) {
             let mut gradients = record.gradients(&gradient);
             let flat = gradients.pop().expect("parameters come last");
-            (gradients, flat)
+            (gradients.into_iter().map(Some).collect(), flat)
         }
     }
 }
@@ -203,11 +210,13 @@ impl<B: StackBackend + StackGradients> Backward<B, PARENTS> for Step {
     ) {
         let gradient = grads.consume::<B>(&ops.node);
         let State { parameters, activations, stack } = ops.state;
+        let parents = &ops.parents[..stack.inputs.len()];
+        let requested: Vec<bool> = parents.iter().map(Option::is_some).collect();
         let (inputs, flat) =
-            B::residual_stack_gradients(parameters, gradient, &activations, &stack);
-        let used = ops.parents[..stack.inputs.len()].iter().zip(inputs);
-        for (parent, part) in used.chain(std::iter::once((&ops.parents[INPUTS], flat))) {
-            if let Some(node) = parent {
+            B::residual_stack_gradients(parameters, gradient, &activations, &stack, &requested);
+        let used = parents.iter().zip(inputs);
+        for (parent, part) in used.chain(std::iter::once((&ops.parents[INPUTS], Some(flat)))) {
+            if let (Some(node), Some(part)) = (parent, part) {
                 grads.register::<B>(node.id, part);
             }
         }
@@ -223,10 +232,11 @@ impl<B: StackBackend + StackGradients, C: CheckpointStrategy> StackBackend for A
         d: FloatTensor<Self>,
         e: FloatTensor<Self>,
         f: FloatTensor<Self>,
+        g: FloatTensor<Self>,
         parameters: FloatTensor<Self>,
         stack: Stack,
     ) -> FloatTensor<Self> {
-        let tensors = [a, b, c, d, e, f, parameters];
+        let tensors = [a, b, c, d, e, f, g, parameters];
         let nodes = tensors.each_ref().map(|tensor| tensor.node());
         let forward = |tensors: [FloatTensor<Self>; PARENTS], stack: &Stack| {
             let mut tensors: Vec<_> = tensors.into_iter().map(|t| t.into_primitive()).collect();

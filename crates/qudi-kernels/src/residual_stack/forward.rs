@@ -115,8 +115,7 @@ pub(super) fn forward(
     keeps: bool,
 ) -> (Vec<f32>, Arc<Activations>) {
     let convolutions = convolutions(stack, parameters);
-    let tiles: Vec<Tiles> =
-        convolutions.par_iter().map(|conv| Tiles::forward(conv.weight, conv.sizes)).collect();
+    let tiles = stack.packed.forward(&convolutions);
     let groups = groups(stack);
     let images = groups[0].images;
     let group_size = images * stack.features * stack.height * stack.width;
@@ -128,7 +127,7 @@ pub(super) fn forward(
                 (of_group(values, group, number * images, channels), channels)
             });
             let inputs: Vec<_> = inputs.collect();
-            let activations = forward_group(group, &inputs, &convolutions, &tiles);
+            let activations = forward_group(group, &inputs, &convolutions, tiles);
             let last = &activations.features[stack.blocks];
             last.write_planes(&activations.grid, 0, stack.features, output);
             keeps.then_some(activations)

@@ -1,8 +1,10 @@
 //! Images between planes of 32 bits and lines of bfloat16 with channels last.
 #![allow(unsafe_code)]
 
+use super::buffer::Buffer;
 use super::grid::{Grid, TILE};
 use crate::conv::upper;
+use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
 /// Channels of a block: one row of a tile.
@@ -11,7 +13,7 @@ pub(super) const CHANNELS: usize = 32;
 /// A line of pixels, bfloat16, channels last. Places that are no pixels are zero.
 #[derive(Clone, Debug)]
 pub(super) struct Line {
-    pub(super) values: Vec<u16>,
+    pub(super) values: Buffer,
     pub(super) channels: usize,
 }
 
@@ -46,12 +48,9 @@ impl Line {
     ///
     /// # Safety
     /// Every block must be written before it is read.
-    #[allow(clippy::uninit_vec)]
     pub(super) unsafe fn unwritten(grid: &Grid, channels: usize) -> Self {
-        let length = grid.length() * channels;
-        let mut values: Vec<u16> = Vec::with_capacity(length);
         // SAFETY: the caller's promise.
-        unsafe { values.set_len(length) };
+        let mut values = unsafe { Buffer::unwritten(grid.length() * channels) };
         values[..grid.first() * channels].fill(0);
         values[grid.last() * channels..].fill(0);
         Self { values, channels }
@@ -74,35 +73,7 @@ impl Line {
                 (0..count).map(move |c| &values[(image * count + c) * pixels..][..pixels])
             });
             let planes: Vec<&[f32]> = planes.collect();
-            for (block, planes) in planes.chunks(CHANNELS).enumerate() {
-                for row in 0..grid.height {
-                    for column in (0..grid.width).step_by(TILE) {
-                        let count = TILE.min(grid.width - column);
-                        let mut tile = [[0u32; TILE]; TILE];
-                        for (pair, tile) in planes.chunks(2).zip(&mut tile) {
-                            let at = row * grid.width + column;
-                            let low = &pair[0][at..at + count];
-                            for (to, &low) in tile.iter_mut().zip(low) {
-                                *to = u32::from(narrow(low));
-                            }
-                            if let Some(high) = pair.get(1) {
-                                for (to, &high) in tile.iter_mut().zip(&high[at..at + count]) {
-                                    *to |= u32::from(narrow(high)) << 16;
-                                }
-                            }
-                        }
-                        let place = grid.row(image, row) + column;
-                        for k in 0..count {
-                            let at = (place + k) * channels + block * CHANNELS;
-                            // SAFETY: a pixel's channels, which no other image has; the line is long enough.
-                            let to = unsafe { std::slice::from_raw_parts_mut(to.at(at), CHANNELS) };
-                            for (to, row) in to.chunks_exact_mut(2).zip(&tile) {
-                                (to[0], to[1]) = (row[k] as u16, (row[k] >> 16) as u16);
-                            }
-                        }
-                    }
-                }
-            }
+            Arch::new().dispatch(Join { grid, image, planes: &planes, channels, to });
         });
         line
     }
@@ -111,27 +82,110 @@ impl Line {
     pub(super) fn write_planes(&self, grid: &Grid, first: usize, count: usize, to: &mut [f32]) {
         let pixels = grid.height * grid.width;
         to.par_chunks_exact_mut(count * pixels).enumerate().for_each(|(image, planes)| {
-            for channel in (0..count).step_by(TILE) {
-                let channels = TILE.min(count - channel);
-                for row in 0..grid.height {
-                    for column in (0..grid.width).step_by(TILE) {
-                        let columns = TILE.min(grid.width - column);
-                        let mut tile = [[0.0f32; TILE]; TILE];
-                        for k in 0..columns {
-                            let place = grid.row(image, row) + column + k;
-                            let at = place * self.channels + first + channel;
-                            let values = &self.values[at..at + channels];
-                            for (tile, &value) in tile.iter_mut().zip(values) {
-                                tile[k] = widen(value);
+            Arch::new().dispatch(Separate { grid, image, line: self, first, count, planes });
+        });
+    }
+}
+
+/// Sixteen pixels of sixteen channels, or of as many pairs.
+pub(super) type Tile = [[u32; TILE]; TILE];
+
+/// Swaps rows and columns.
+#[inline(always)]
+pub(super) fn transposed(tile: &Tile) -> Tile {
+    let mut result = [[0; TILE]; TILE];
+    for (row, values) in tile.iter().enumerate() {
+        for (column, &value) in values.iter().enumerate() {
+            result[column][row] = value;
+        }
+    }
+    result
+}
+
+/// Writes the planes of an image to a line.
+struct Join<'a> {
+    grid: &'a Grid,
+    image: usize,
+    planes: &'a [&'a [f32]],
+    channels: usize,
+    to: Shared<u16>,
+}
+
+impl WithSimd for Join<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { grid, image, planes, channels, to } = self;
+        for (block, planes) in planes.chunks(CHANNELS).enumerate() {
+            for row in 0..grid.height {
+                for column in (0..grid.width).step_by(TILE) {
+                    let count = TILE.min(grid.width - column);
+                    let at = row * grid.width + column;
+                    let mut pairs = [[0; TILE]; TILE];
+                    for (pair, to) in planes.chunks(2).zip(&mut pairs) {
+                        for (to, &low) in to.iter_mut().zip(&pair[0][at..at + count]) {
+                            *to = upper(low);
+                        }
+                        if let Some(high) = pair.get(1) {
+                            for (to, &high) in to.iter_mut().zip(&high[at..at + count]) {
+                                *to |= upper(high) << 16;
                             }
                         }
-                        for (c, tile) in tile.iter().enumerate().take(channels) {
-                            let at = (channel + c) * pixels + row * grid.width + column;
-                            planes[at..at + columns].copy_from_slice(&tile[..columns]);
+                    }
+                    let pixels = transposed(&pairs);
+                    let place = grid.row(image, row) + column;
+                    for (k, pixel) in pixels.iter().enumerate().take(count) {
+                        let at = to.at((place + k) * channels + block * CHANNELS);
+                        // SAFETY: a pixel's channels, which no other image has; the line is long enough.
+                        unsafe { at.cast::<[u32; TILE]>().write_unaligned(*pixel) };
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Writes channels of an image's line to its planes.
+struct Separate<'a> {
+    grid: &'a Grid,
+    image: usize,
+    line: &'a Line,
+    first: usize,
+    count: usize,
+    planes: &'a mut [f32],
+}
+
+impl WithSimd for Separate<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { grid, image, line, first, count, planes } = self;
+        let pixels = grid.height * grid.width;
+        for channel in (0..count).step_by(TILE) {
+            let channels = TILE.min(count - channel);
+            for row in 0..grid.height {
+                for column in (0..grid.width).step_by(TILE) {
+                    let columns = TILE.min(grid.width - column);
+                    let mut tile = [[0; TILE]; TILE];
+                    for (k, to) in tile.iter_mut().enumerate().take(columns) {
+                        let place = grid.row(image, row) + column + k;
+                        let at = place * line.channels + first + channel;
+                        for (to, &value) in to.iter_mut().zip(&line.values[at..at + channels]) {
+                            *to = u32::from(value) << 16;
+                        }
+                    }
+                    let rows = transposed(&tile);
+                    for (c, row_of_channel) in rows.iter().enumerate().take(channels) {
+                        let at = (channel + c) * pixels + row * grid.width + column;
+                        let to = &mut planes[at..at + columns];
+                        for (to, &bits) in to.iter_mut().zip(row_of_channel) {
+                            *to = f32::from_bits(bits);
                         }
                     }
                 }
             }
-        });
+        }
     }
 }

@@ -77,7 +77,7 @@ fn fused_stacks_compute_what_single_convolutions_do() {
         Case {
             images: 1,
             size: [30, 41],
-            inputs: vec![1, 2, 3, 4, 5, 6, 7],
+            inputs: vec![1, 2, 3, 4, 5, 6, 7, 8],
             features: 32,
             blocks: 1,
         },

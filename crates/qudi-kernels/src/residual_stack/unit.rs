@@ -1,8 +1,9 @@
 //! A matrix unit, and the loops around it.
 #![allow(unsafe_code)]
 
+use super::buffer::Buffer;
 use super::grid::{BLOCK, Grid, TILE};
-use super::layout::{CHANNELS, Line, Shared, narrow, widen};
+use super::layout::{CHANNELS, Line, Shared, narrow, transposed, widen};
 use super::weights::{TAPS, TILE_VALUES, Tiles};
 use rayon::prelude::*;
 
@@ -168,51 +169,44 @@ impl Finish<'_> {
     ) {
         let bits = u32::from(grid.pixels[2 * block]) | u32::from(grid.pixels[2 * block + 1]) << 16;
         let bias: [f32; CHANNELS] = match self.bias {
-            Some(bias) => std::array::from_fn(|c| bias[output + c]),
+            Some(bias) => *bias[output..].first_chunk().expect("a bias for every output"),
             None => [0.0; CHANNELS],
         };
+        let (has_addend, has_mask) = (self.addend.is_some(), self.mask.is_some());
         for (pixel, sums) in sums.0.iter().enumerate() {
             let at = (grid.first() + block * BLOCK + pixel) * outputs + output;
-            if bits >> pixel & 1 == 0 {
-                // SAFETY: the caller's promise.
-                unsafe { to.at(at).write_bytes(0, CHANNELS) };
-                continue;
-            }
-            let mut values = *sums;
-            for (value, bias) in values.iter_mut().zip(&bias) {
-                *value += bias;
-            }
-            if let Some(addend) = self.addend {
-                for (c, value) in values.iter_mut().enumerate() {
-                    // SAFETY: the addend is a line of the same shape.
-                    *value += widen(unsafe { *addend.add(at + c) });
-                }
-            }
-            if self.relu {
-                for value in &mut values {
-                    *value = value.max(0.0);
-                }
-            }
             let mut result = [0; CHANNELS];
-            for (to, &value) in result.iter_mut().zip(&values) {
-                *to = narrow(value);
-            }
-            if let Some(mask) = self.mask {
-                let mask = &mask.values[at..at + CHANNELS];
-                for (to, &mask) in result.iter_mut().zip(mask) {
-                    *to = if mask == 0 { 0 } else { *to };
+            if bits >> pixel & 1 != 0 {
+                // SAFETY: a pixel's channels lie next to each other; addend and mask are lines of this shape.
+                let read = |line: *const u16| unsafe { line.add(at).cast::<Channels>().read() };
+                let addend = self.addend.map_or([0; CHANNELS], read);
+                let mask = self.mask.map_or([0; CHANNELS], |mask| read(mask.values.as_ptr()));
+                // One loop over all: vector units take it whole.
+                for c in 0..CHANNELS {
+                    let mut value = sums[c] + bias[c];
+                    if has_addend {
+                        value += widen(addend[c]);
+                    }
+                    if self.relu {
+                        value = value.max(0.0);
+                    }
+                    let is_masked = has_mask && mask[c] == 0;
+                    result[c] = if is_masked { 0 } else { narrow(value) };
                 }
             }
             // SAFETY: the caller's promise.
-            unsafe { to.at(at).copy_from_nonoverlapping(result.as_ptr(), CHANNELS) };
+            unsafe { to.at(at).cast::<Channels>().write(result) };
         }
     }
 }
 
+/// Channels of a block of a pixel.
+type Channels = [u16; CHANNELS];
+
 /// The gradient of a convolution's weights as sums, and of its bias.
 #[derive(Clone, Debug)]
 pub(super) struct Gradient {
-    /// `[tap][input / 32][output / 32]` blocks of sums, inputs by outputs.
+    /// `[tap][input / 32][output / 32]` blocks of sums, outputs by inputs.
     pub(super) blocks: Vec<Sums>,
     pub(super) bias: Vec<f32>,
 }
@@ -231,8 +225,11 @@ pub(super) type AddChunk<U> =
 /// Memory for a chunk of pixels.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    planes: Vec<u16>,
-    pairs: Vec<u32>,
+    /// The gradient, `[outputs][pixels]`.
+    planes: Buffer,
+    /// Inputs of neighbouring pixels as pairs, `[pixels / 2][inputs]`: pairs that begin with an even pixel,
+    /// and with an odd one. So every tap finds its pixels in whole cache lines.
+    pairs: [Buffer; 2],
 }
 
 /// Correlates inputs with the gradient of what a convolution made of them.
@@ -298,16 +295,22 @@ pub(super) unsafe fn add_chunk<U: Unit>(
 ) {
     let (first, count) = (grid.first() + start * BLOCK, (end - start) * BLOCK);
     let border = grid.pitch() + 1;
-    let stride = (count + 2 * border).next_multiple_of(BLOCK) + BLOCK;
-    transpose(inputs, first - border, count + 2 * border, stride, &mut scratch.planes);
-    interleave(gradient, first, count, &mut scratch.pairs, &mut sums.bias);
+    // Rows of planes are whole cache lines, and do not all begin at the same place of the cache.
+    let stride = count + BLOCK;
+    transpose(gradient, first, count, stride, &mut scratch.planes);
+    add_pixels(gradient, first, count, &mut sums.bias);
+    let Scratch { planes, pairs } = scratch;
+    for (odd, pairs) in pairs.iter_mut().enumerate() {
+        interleave(inputs, first - border + odd, count / 2 + border - odd, pairs);
+    }
     let [wide, high] = [inputs.channels, gradient.channels].map(|channels| channels / CHANNELS);
     for input in 0..wide {
-        let planes = scratch.planes.as_ptr().wrapping_add(input * CHANNELS * stride);
         for output in 0..high {
-            let pairs = scratch.pairs.as_ptr().cast::<u16>().wrapping_add(output * 2 * CHANNELS);
+            let left = planes.as_ptr().wrapping_add(output * CHANNELS * stride);
             for tap in 0..TAPS {
-                let left = planes.wrapping_add(border.wrapping_add_signed(grid.tap(tap)));
+                let place = border.wrapping_add_signed(grid.tap(tap));
+                let row = place / 2 * 2 * inputs.channels;
+                let right = pairs[place % 2].as_ptr().wrapping_add(row + input * 2 * CHANNELS);
                 let block = &mut sums.blocks[(tap * wide + input) * high + output];
                 // SAFETY: sums are blocks of their own; tiles lie within the scratch memory.
                 unsafe {
@@ -315,10 +318,10 @@ pub(super) unsafe fn add_chunk<U: Unit>(
                     unit.add(&Products {
                         left: [left, left.wrapping_add(TILE * stride)],
                         left_row: 2 * stride,
-                        right: [pairs, pairs.wrapping_add(2 * TILE)],
-                        right_row: 4 * gradient.channels,
+                        right: [right, right.wrapping_add(2 * TILE)],
+                        right_row: 4 * inputs.channels,
                         steps: count / BLOCK,
-                        step: [2 * BLOCK, 4 * gradient.channels * TILE],
+                        step: [2 * BLOCK, 4 * inputs.channels * TILE],
                     });
                     unit.store(block);
                 }
@@ -329,37 +332,49 @@ pub(super) unsafe fn add_chunk<U: Unit>(
 
 /// Writes pixels with channels last as planes, `[channels][stride]`.
 #[inline(always)]
-fn transpose(line: &Line, first: usize, count: usize, stride: usize, planes: &mut Vec<u16>) {
-    planes.resize(line.channels * stride, 0);
+fn transpose(line: &Line, first: usize, count: usize, stride: usize, planes: &mut Buffer) {
+    planes.resize(line.channels * stride);
+    let planes = planes.pairs_mut();
     for pixel in (0..count).step_by(BLOCK) {
-        let columns = BLOCK.min(count - pixel);
-        for channel in (0..line.channels).step_by(CHANNELS) {
-            let mut tile = [[0u16; BLOCK]; CHANNELS];
-            for k in 0..columns {
-                let at = (first + pixel + k) * line.channels + channel;
-                let values = &line.values[at..at + CHANNELS];
-                for (tile, &value) in tile.iter_mut().zip(values) {
-                    tile[k] = value;
+        for channel in (0..line.channels).step_by(TILE) {
+            // Pairs of pixels by channels, then channels by pairs.
+            let mut pairs = [[0; TILE]; TILE];
+            for (k, to) in pairs.iter_mut().enumerate() {
+                let at = (first + pixel + 2 * k) * line.channels + channel;
+                let (low, high) = (&line.values[at..], &line.values[at + line.channels..]);
+                for (to, (&low, &high)) in to.iter_mut().zip(low.iter().zip(high)) {
+                    *to = u32::from(low) | u32::from(high) << 16;
                 }
             }
-            for (c, tile) in tile.iter().enumerate() {
-                planes[(channel + c) * stride + pixel..][..BLOCK].copy_from_slice(tile);
+            for (c, row) in transposed(&pairs).iter().enumerate() {
+                planes[((channel + c) * stride + pixel) / 2..][..TILE].copy_from_slice(row);
             }
         }
     }
 }
 
-/// Writes neighbouring pixels as pairs, `[count / 2][channels]`, and adds all pixels to `sums`.
+/// Writes `count` pairs of neighbouring pixels from `first` on, `[count][channels]`.
 #[inline(always)]
-fn interleave(line: &Line, first: usize, count: usize, pairs: &mut Vec<u32>, sums: &mut [f32]) {
+fn interleave(line: &Line, first: usize, count: usize, pairs: &mut Buffer) {
     let channels = line.channels;
-    pairs.resize(count / 2 * channels, 0);
-    let pixels = &line.values[first * channels..(first + count) * channels];
-    for (to, two) in pairs.chunks_exact_mut(channels).zip(pixels.chunks_exact(2 * channels)) {
+    pairs.resize(2 * count * channels);
+    let pixels = &line.values[first * channels..(first + 2 * count) * channels];
+    let rows = pairs.pairs_mut().chunks_exact_mut(channels);
+    for (to, two) in rows.zip(pixels.chunks_exact(2 * channels)) {
         let (one, other) = two.split_at(channels);
         for ((to, &low), &high) in to.iter_mut().zip(one).zip(other) {
             *to = u32::from(low) | u32::from(high) << 16;
         }
+    }
+}
+
+/// Adds all pixels to `sums`, two at a time.
+#[inline(always)]
+fn add_pixels(line: &Line, first: usize, count: usize, sums: &mut [f32]) {
+    let channels = line.channels;
+    let pixels = &line.values[first * channels..(first + count) * channels];
+    for two in pixels.chunks_exact(2 * channels) {
+        let (one, other) = two.split_at(channels);
         for ((sum, &low), &high) in sums.iter_mut().zip(one).zip(other) {
             *sum += widen(low) + widen(high);
         }

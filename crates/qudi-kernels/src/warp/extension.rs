@@ -21,12 +21,13 @@ pub trait WarpBackend: Backend {
 
 /// Backends with the gradients of the fused warp.
 pub trait WarpGradients: Backend {
-    /// Computes the gradients of [`warp`](super::warp) for `x` and `flow`.
+    /// Computes the gradients of [`warp`](super::warp) for `x` and `flow`, at least those that are `requested`.
     fn warp_gradients(
         x: FloatTensor<Self>,
         flow: FloatTensor<Self>,
         gradient: FloatTensor<Self>,
-    ) -> [FloatTensor<Self>; 2];
+        requested: [bool; 2],
+    ) -> [Option<FloatTensor<Self>>; 2];
 }
 
 #[cfg(feature = "flex")]
@@ -51,12 +52,14 @@ mod flex {
             x: FlexTensor,
             flow: FlexTensor,
             gradient: FlexTensor,
-        ) -> [FlexTensor; 2] {
+            requested: [bool; 2],
+        ) -> [Option<FlexTensor>; 2] {
             let (x, flow, gradient) = (contiguous(x), contiguous(flow), contiguous(gradient));
             let shape = x.shape().dims::<4>();
-            let (dx, dflow) =
-                native::gradients(shape, values(&x), values(&flow), values(&gradient));
-            [tensor(dx, shape), tensor(dflow, flow.shape().dims::<4>())]
+            let [dx, dflow] =
+                native::gradients(shape, values(&x), values(&flow), values(&gradient), requested);
+            let of_flow = flow.shape().dims::<4>();
+            [dx.map(|dx| tensor(dx, shape)), dflow.map(|dflow| tensor(dflow, of_flow))]
         }
     }
 }
@@ -92,10 +95,15 @@ mod libtorch {
     }
 
     impl WarpGradients for LibTorch {
-        fn warp_gradients(x: TchTensor, flow: TchTensor, gradient: TchTensor) -> [TchTensor; 2] {
+        fn warp_gradients(
+            x: TchTensor,
+            flow: TchTensor,
+            gradient: TchTensor,
+            _wanted: [bool; 2],
+        ) -> [Option<TchTensor>; 2] {
             let (_, record) = recorded(vec![x, flow], sampled);
             let mut gradients = record.gradients(&gradient).into_iter();
-            std::array::from_fn(|_| gradients.next().expect("two inputs"))
+            std::array::from_fn(|_| gradients.next())
         }
     }
 }
@@ -115,9 +123,10 @@ impl<B: WarpBackend + WarpGradients> Backward<B, 2> for Step {
     ) {
         let gradient = grads.consume::<B>(&ops.node);
         let [x, flow] = ops.state.map(|id| checkpointer.retrieve_node_output(id));
-        let parts = B::warp_gradients(x, flow, gradient);
+        let requested = ops.parents.each_ref().map(Option::is_some);
+        let parts = B::warp_gradients(x, flow, gradient, requested);
         for (parent, part) in ops.parents.iter().zip(parts) {
-            if let Some(node) = parent {
+            if let (Some(node), Some(part)) = (parent, part) {
                 grads.register::<B>(node.id, part);
             }
         }

@@ -90,43 +90,58 @@ pub(super) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
     })
 }
 
-/// Computes the gradients of `x` and `flow`.
+/// Computes the gradients of `x` and `flow`, those that are `requested`.
 pub(super) fn gradients(
     shape: [usize; 4],
     x: &[f32],
     flow: &[f32],
     gradient: &[f32],
-) -> (Vec<f32>, Vec<f32>) {
+    requested: [bool; 2],
+) -> [Option<Vec<f32>>; 2] {
     let [_, channels, height, width] = shape;
     let plane = height * width;
-    let mut dx = vec![0.0; x.len()];
-    let mut dflow = vec![0.0; flow.len()];
-    let images = dx.par_chunks_mut(channels * plane).zip(dflow.par_chunks_mut(2 * plane));
-    let images = images.zip(x.par_chunks(channels * plane)).zip(flow.par_chunks(2 * plane));
-    images.zip(gradient.par_chunks(channels * plane)).for_each(
-        |((((dx, dflow), x), flow), gradient)| {
+    let (image, of_flow) = (channels * plane, 2 * plane);
+    let dx = requested[0].then(|| {
+        let mut dx = vec![0.0; x.len()];
+        let images = dx.par_chunks_mut(image).zip(flow.par_chunks(of_flow));
+        images.zip(gradient.par_chunks(image)).for_each(|((dx, flow), gradient)| {
             let places = places(flow, height, width);
-            let (x_flow, y_flow) = dflow.split_at_mut(plane);
-            let planes = dx.chunks_mut(plane).zip(x.chunks(plane)).zip(gradient.chunks(plane));
-            for ((dx, x), gradient) in planes {
-                for (at, (place, &gradient)) in places.iter().zip(gradient).enumerate() {
+            for (dx, gradient) in dx.chunks_mut(plane).zip(gradient.chunks(plane)) {
+                for (place, &gradient) in places.iter().zip(gradient) {
                     let [a, b, c, d] = place.corners.map(|corner| corner as usize);
                     let (right, below) = (place.right, place.below);
                     dx[a] += gradient * (1.0 - right) * (1.0 - below);
                     dx[b] += gradient * right * (1.0 - below);
                     dx[c] += gradient * (1.0 - right) * below;
                     dx[d] += gradient * right * below;
+                }
+            }
+        });
+        dx
+    });
+    let dflow = requested[1].then(|| {
+        let mut dflow = vec![0.0; flow.len()];
+        let images = dflow.par_chunks_mut(of_flow).zip(flow.par_chunks(of_flow));
+        let images = images.zip(x.par_chunks(image)).zip(gradient.par_chunks(image));
+        images.for_each(|(((dflow, flow), x), gradient)| {
+            let places = places(flow, height, width);
+            let (x_flow, y_flow) = dflow.split_at_mut(plane);
+            for (x, gradient) in x.chunks(plane).zip(gradient.chunks(plane)) {
+                for (at, (place, &gradient)) in places.iter().zip(gradient).enumerate() {
+                    let [a, b, c, d] = place.corners.map(|corner| x[corner as usize]);
+                    let (right, below) = (place.right, place.below);
                     if place.free[0] {
-                        let slope = (x[b] - x[a]) * (1.0 - below) + (x[d] - x[c]) * below;
+                        let slope = (b - a) * (1.0 - below) + (d - c) * below;
                         x_flow[at] += gradient * slope;
                     }
                     if place.free[1] {
-                        let slope = (x[c] - x[a]) * (1.0 - right) + (x[d] - x[b]) * right;
+                        let slope = (c - a) * (1.0 - right) + (d - b) * right;
                         y_flow[at] += gradient * slope;
                     }
                 }
             }
-        },
-    );
-    (dx, dflow)
+        });
+        dflow
+    });
+    [dx, dflow]
 }

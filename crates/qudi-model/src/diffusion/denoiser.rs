@@ -28,6 +28,9 @@ pub trait Denoiser: Debug {
     /// Encodes everything that does not depend on the step.
     fn encode(&self, conditioning: &Conditioning) -> Self::Encoded;
 
+    /// Returns the memory of the encoding, in bytes.
+    fn encoded_bytes(encoded: &Self::Encoded) -> usize;
+
     /// Predicts the clean frames, about in [-1, 1]: `[bursts * frames, 1, height, width]`.
     fn denoise(
         &self,
@@ -57,6 +60,10 @@ impl Denoiser for Diffusion {
 
     fn encode(&self, conditioning: &Conditioning) -> Encoded {
         Self::encode(self, conditioning)
+    }
+
+    fn encoded_bytes(encoded: &Encoded) -> usize {
+        encoded.bytes()
     }
 
     fn denoise(

@@ -78,6 +78,16 @@ pub struct EncodedMeasurement {
     frames: usize,
 }
 
+impl Encoded {
+    /// Returns the memory of all tensors, in bytes.
+    pub(super) fn bytes(&self) -> usize {
+        let EncodedMeasurement { low, input, .. } = &self.measurement;
+        let planes = [&input.linear_estimate, &input.sigma, &input.counts, &input.planes];
+        let all = [&self.pre, low].into_iter().chain(planes);
+        all.map(|x| x.shape().num_elements() * size_of::<f32>()).sum()
+    }
+}
+
 /// Pre-denoised frames.
 #[derive(Clone, Debug)]
 pub struct Predenoised {

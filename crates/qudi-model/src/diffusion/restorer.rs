@@ -16,9 +16,18 @@ use burn::tensor::{Device, Tensor};
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Result};
-use qudi_kernels::{ComputePrecision, with_precision};
+use qudi_kernels::{ComputePrecision, is_flex, with_precision};
 use qudi_layers::tensor::{read, to_tensor};
 use qudi_layers::{TILE, Tiling};
+use std::cell::RefCell;
+use std::ops::Range;
+
+/// Pixels of the frames that pass through the network at once, on devices other than the processor: two tiles
+/// of 512 x 512 in windows of 11 frames.
+const BATCH_PIXELS: usize = 1 << 23;
+
+/// The largest number of bytes of encoded tiles that are kept for later steps. A single tile is always kept.
+const MAX_KEPT_BYTES: usize = 1 << 30;
 
 /// Options of sampling.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,6 +68,8 @@ pub struct DiffusionRestorer<N: Denoiser> {
     options: SampleOptions,
     device: Device,
     window: usize,
+    /// Pixels of the frames of a batch of tiles; a batch has at least one tile.
+    batch_pixels: usize,
 }
 
 /// A window, padded.
@@ -68,8 +79,15 @@ struct Window<'a, E> {
     counts: CountPlanes,
     frames: usize,
     tiling: Tiling,
-    /// The encoded tile, kept for all steps where there is only one: it takes memory.
-    encoded: Option<E>,
+    /// Numbers of the tiles that pass through the network at once.
+    batches: Vec<Range<usize>>,
+    kept: RefCell<Kept<E>>,
+}
+
+/// Encoded batches of tiles that later steps use again.
+struct Kept<E> {
+    batches: Vec<Option<E>>,
+    bytes: usize,
 }
 
 impl<N: Denoiser> DiffusionRestorer<N> {
@@ -92,7 +110,10 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         let Model { network, config, window } = model;
         check_tile(options.tile, N::multiple(&config))?;
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-        Ok(Self { network, config, schedule, options, device: device.clone(), window })
+        // The processor's results do not depend on batches, and small ones stay in its caches.
+        let batch_pixels = if is_flex(device) { 0 } else { BATCH_PIXELS };
+        let device = device.clone();
+        Ok(Self { network, config, schedule, options, device, window, batch_pixels })
     }
 
     fn restored(&self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<Restored> {
@@ -114,18 +135,20 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         acquisition: &'a Acquisition,
     ) -> Window<'a, N::Encoded> {
         let tiling = Tiling::new(burst.size, N::multiple(&self.config), self.options.tile);
-        let mut window = Window {
+        let frames = burst.frames.len();
+        let (count, pixels) = (tiling.tiles.count(), tiling.tiles.tile.pixels() * frames);
+        let tiles = (self.batch_pixels / pixels).clamp(1, count);
+        let batches = (0..count).step_by(tiles).map(|first| first..(first + tiles).min(count));
+        let batches: Vec<_> = batches.collect();
+        Window {
             acquisition,
             sensor: sensor_tensor(acquisition, &self.device),
             counts: CountPlanes::new(burst, acquisition).map(|plane| tiling.padded(plane)),
-            frames: burst.frames.len(),
+            frames,
             tiling,
-            encoded: None,
-        };
-        if window.tiling.tiles.count() == 1 {
-            window.encoded = Some(self.encode(&window, 0));
+            kept: RefCell::new(Kept { batches: vec![None; batches.len()], bytes: 0 }),
+            batches,
         }
-        window
     }
 
     /// Draws one sample of a window, padded, in [-1, 1].
@@ -136,8 +159,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             let frames = (window.acquisition.first_frame..).take(window.frames);
             frames.flat_map(|frame| noise.frame(frame, step, pixels)).collect()
         };
-        let tiles = &window.tiling.tiles;
-        let mut flows: Vec<Option<N::Flows>> = vec![None; tiles.count()];
+        let mut flows: Vec<Option<N::Flows>> = vec![None; window.batches.len()];
         let SampleOptions { sampler, steps, spacing, .. } = self.options;
         let steps = sampler.steps(&self.schedule, steps, spacing);
         let count = steps.len();
@@ -148,9 +170,14 @@ impl<N: Denoiser> DiffusionRestorer<N> {
                 flows.fill(None);
             }
             let mut prediction = vec![0.0; x.len()];
-            for (tile, flows) in flows.iter_mut().enumerate() {
-                let part = self.predict(window, tile, simulated.as_ref(), [x, x0], step, flows)?;
-                tiles.blend(tile, &part, &mut prediction);
+            for (batch, flows) in flows.iter_mut().enumerate() {
+                let parts =
+                    self.predict(window, batch, simulated.as_ref(), [x, x0], step, flows)?;
+                let tiles = window.batches[batch].clone();
+                let length = parts.len() / tiles.len();
+                for (tile, part) in tiles.zip(parts.chunks_exact(length)) {
+                    window.tiling.tiles.blend(tile, part, &mut prediction);
+                }
             }
             Ok(prediction)
         };
@@ -178,55 +205,64 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         model.measure(&images, window.tiling.size, acquisition.first_frame, seed).map(Some)
     }
 
-    /// Predicts the clean image of tile `number`, in [-1, 1], from the noisy image and the previous
+    /// Predicts the clean images of the tiles of a batch, in [-1, 1], from the noisy image and the previous
     /// estimate.
     fn predict(
         &self,
         window: &Window<'_, N::Encoded>,
-        number: usize,
+        batch: usize,
         simulated: Option<&CountPlanes>,
         [x, x0]: [&[f32]; 2],
         step: &Step,
         flows: &mut Option<N::Flows>,
     ) -> Result<Vec<f32>> {
-        let tensor = |images: &[f32]| self.tile(window, number, images);
-        let fresh;
-        let encoded = if let Some(encoded) = &window.encoded {
-            encoded
-        } else {
-            fresh = self.encode(window, number);
-            &fresh
-        };
+        let tensor = |images: &[f32]| self.tiles(window, batch, images);
+        let tiles = window.batches[batch].len();
+        let encoded = self.encoded(window, batch);
         let simulated = simulated.map(|planes| Simulated {
             y: tensor(&planes.y),
             u: tensor(&planes.u),
-            exists: vec![true],
+            exists: vec![true; tiles],
         });
         let has_previous = step.number > 1 && self.network.uses(Part::SelfConditioning);
         let state = DiffusionState {
             x_t: tensor(x),
             x0_prev: tensor(x0),
-            has_previous: vec![has_previous],
-            timesteps: vec![step.timestep],
+            has_previous: vec![has_previous; tiles],
+            timesteps: vec![step.timestep; tiles],
         };
-        let image = read(self.network.denoise(encoded, simulated.as_ref(), &state, flows))?;
+        let image = read(self.network.denoise(&encoded, simulated.as_ref(), &state, flows))?;
         Ok(image.into_iter().map(|value| value.clamp(-1.0, 1.0)).collect())
     }
 
-    /// Crops tile `number` of images of the whole frame.
-    fn tile(&self, window: &Window<'_, N::Encoded>, number: usize, images: &[f32]) -> Tensor<4> {
+    /// Crops the tiles of a batch from images of the whole frame, as bursts one after the other.
+    fn tiles(&self, window: &Window<'_, N::Encoded>, batch: usize, images: &[f32]) -> Tensor<4> {
         let tiles = &window.tiling.tiles;
-        to_tensor(tiles.crop(number, images), tiles.tile, &self.device)
+        let numbers = window.batches[batch].clone();
+        let values = numbers.flat_map(|number| tiles.crop(number, images)).collect();
+        to_tensor(values, tiles.tile, &self.device)
     }
 
-    /// Encodes what does not depend on the step, of tile `number`.
-    fn encode(&self, window: &Window<'_, N::Encoded>, number: usize) -> N::Encoded {
-        self.network.encode(&Conditioning {
-            counts: self.tile(window, number, &window.counts.y),
-            linear_estimate: self.tile(window, number, &window.counts.u),
-            sensor: window.sensor.clone(),
+    /// Returns what does not depend on the step, of a batch of tiles: kept from an earlier step or sample, or
+    /// computed now.
+    fn encoded(&self, window: &Window<'_, N::Encoded>, batch: usize) -> N::Encoded {
+        let mut kept = window.kept.borrow_mut();
+        if let Some(encoded) = &kept.batches[batch] {
+            return encoded.clone();
+        }
+        let encoded = self.network.encode(&Conditioning {
+            counts: self.tiles(window, batch, &window.counts.y),
+            linear_estimate: self.tiles(window, batch, &window.counts.u),
+            sensor: window.sensor.clone().repeat_dim(0, window.batches[batch].len()),
             frames: window.frames,
-        })
+        });
+        let bytes = kept.bytes + N::encoded_bytes(&encoded);
+        let used_again = self.options.steps * self.options.samples > 1;
+        if used_again && (bytes <= MAX_KEPT_BYTES || window.batches.len() == 1) {
+            kept.bytes = bytes;
+            kept.batches[batch] = Some(encoded.clone());
+        }
+        encoded
     }
 }
 
@@ -281,5 +317,48 @@ impl Moments {
         let variance = pairs
             .map(|(sum, squares)| (squares - sum * sum / self.count) / (self.count - 1.0).max(1.0));
         variance.map(|variance| variance.max(0.0).sqrt()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::window::{Window, WindowConfig};
+    use qudi_core::Size;
+    use qudi_core::sensor::Sensor;
+
+    fn config() -> WindowConfig {
+        WindowConfig { widths: [32; 3], flow: [32; 3], state: 32, cell_blocks: 1 }
+    }
+
+    /// Restores a window of several tiles in batches of so many pixels.
+    fn restore(batch_pixels: usize) -> Vec<f32> {
+        let (size, device) = (Size { height: 48, width: 80 }, Device::flex());
+        let pixel = |i: usize, t: usize| ((i * 7 + t * 13 + i / size.width) % 8) as u16;
+        let frame = |t: usize| (0..size.pixels()).map(|i| pixel(i, t)).collect();
+        let counts: Vec<Vec<u16>> = (0..3).map(frame).collect();
+        let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
+        let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
+        let network: Window = config().init(1, &device);
+        let model = Model { network, config: config(), window: 11 };
+        let options = SampleOptions { steps: 3, tile: 32, ..SampleOptions::default() };
+        let mut restorer =
+            DiffusionRestorer::new(model, options, &device).unwrap_or_else(|e| panic!("{e}"));
+        restorer.batch_pixels = batch_pixels;
+        let burst = BurstView { size, frames: &counts };
+        let window = restorer.window_of(burst, &acquisition);
+        assert_eq!(window.tiling.tiles.count(), 6, "the batches of this test");
+        let restored = restorer.restored(burst, &acquisition).unwrap_or_else(|e| panic!("{e}"));
+        restored.frames.into_iter().flat_map(|frame| frame.data).collect()
+    }
+
+    /// A batch of four tiles and one of two give what single tiles do.
+    #[test]
+    fn batches_of_tiles_are_tiles_one_by_one() {
+        let single = restore(0);
+        let batches = restore(4 * 3 * 32 * 32);
+        let pairs = single.iter().zip(&batches);
+        assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-4), "batches differ from tiles");
+        assert!(single.iter().any(|&value| value != single[0]), "a flat picture tests nothing");
     }
 }

@@ -28,6 +28,10 @@ impl Denoiser for Window {
         Self::encode(self, conditioning)
     }
 
+    fn encoded_bytes(encoded: &EncodedWindow) -> usize {
+        encoded.bytes()
+    }
+
     fn denoise(
         &self,
         encoded: &EncodedWindow,

@@ -139,9 +139,8 @@ impl FlowLevel {
             let found = soft_match(reference.clone(), near, RADIUS[level], frames - 1).detach();
             flow = flow + found;
         }
-        let warped = warp(Tensor::cat(vec![other, neighbour], 1), flow.clone());
-        let other = warped.clone().narrow(1, 0, COMPARED);
-        let difference = (warped.narrow(1, COMPARED, 1) - reference.clone()) * DIFFERENCE;
+        let other = warp(other, flow.clone());
+        let difference = (warp(neighbour, flow.clone()) - reference.clone()) * DIFFERENCE;
         let motion = flow.clone().detach() * DISPLACEMENT;
         let related = related(&motion, frames - 1);
         let signed = reference * 2.0 - 1.0;

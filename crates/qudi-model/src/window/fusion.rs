@@ -7,9 +7,9 @@ use super::input::MIDDLE;
 use super::merging::{Gate, MERGED, Merged};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use qudi_kernels::warp;
+use qudi_kernels::{StackParameters, frames, warp};
 use qudi_layers::ResidualStack;
-use qudi_layers::resample::{by_burst, upsample2};
+use qudi_layers::resample::upsample2;
 
 /// Planes of the pre-denoised frames and of the linear estimate at half the resolution.
 const IMAGES: usize = 4;
@@ -81,35 +81,31 @@ impl Fusion {
         // hundred times as large.
         let flow = WindowFlow { pairs: flow.pairs.clone().detach(), ..*flow };
         let whole_flow = WindowFlow { pairs: upsample2(flow.pairs.clone()) * 2.0, scale: 1 };
-        let of_frames = |x: &Tensor<4>| -> Vec<Tensor<4>> {
-            let [_, channels, height, width] = x.dims();
-            let bursts_of = by_burst(x.clone(), count);
-            let one = |frame| bursts_of.clone().narrow(1, frame, 1);
-            (0..count).map(|k| one(k).reshape([bursts, channels, height, width])).collect()
-        };
+        let of_frames = |x: &Tensor<4>| frames(x, count);
         let images_of_frames = Tensor::cat(vec![window.restored.clone(), window.linear.clone()], 1);
-        let (frames, features) = (of_frames(&images_of_frames), of_frames(window.features));
+        let (images_of, features) = (of_frames(&images_of_frames), of_frames(window.features));
         let [restored, linear] = window.whole.map(of_frames);
-        let step = |cell: &ResidualStack,
+        let between = self.gate.parameters();
+        let step = |cell: &StackParameters,
                     frame: usize,
                     last: Option<(usize, &Passed)>,
                     more: Option<&Tensor<4>>| {
-            let own = frames[frame].clone();
+            let own = images_of[frame].clone();
             let (hidden, difference, merged) = match last {
                 Some((neighbour, passed)) => {
                     let next = neighbour > frame;
                     let along = flow.of_frame(frame, next, count);
-                    let both = vec![passed.hidden.clone(), frames[neighbour].clone()];
-                    let both = warp(Tensor::cat(both, 1), along);
-                    let aligned = both.clone().narrow(1, state, 2 * IMAGES);
+                    let hidden = warp(passed.hidden.clone(), along.clone());
+                    let aligned = warp(images_of[neighbour].clone(), along);
                     let merged = self.gate.merge(
+                        &between,
                         &passed.merged,
                         linear[frame].clone(),
                         restored[frame].clone(),
                         features[frame].clone(),
                         whole_flow.of_frame(frame, next, count),
                     );
-                    (both.narrow(1, 0, state), (aligned - own.clone()) * DIFFERENCE, merged)
+                    (hidden, (aligned - own.clone()) * DIFFERENCE, merged)
                 }
                 None => (
                     Tensor::zeros([bursts, state, h, w], &own.device()),
@@ -123,19 +119,20 @@ impl Fusion {
             let mut inputs = vec![features[frame].clone(), hidden, Tensor::cat(images, 1)];
             inputs.extend(more.cloned());
             inputs.push(merged.planes());
-            Passed { hidden: normalized(cell.forward(&inputs)), merged }
+            Passed { hidden: normalized(cell.apply(&inputs)), merged }
         };
+        let [backward, forward] = [&self.backward, &self.forward].map(ResidualStack::parameters);
         let mut later: Vec<Passed> = Vec::with_capacity(count);
         for frame in (0..count).rev() {
             let last = later.last().map(|passed| (frame + 1, passed));
-            let passed = step(&self.backward, frame, last, None);
+            let passed = step(&backward, frame, last, None);
             later.push(passed);
         }
         later.reverse();
         let mut earlier: Vec<Passed> = Vec::with_capacity(count);
         for (frame, later) in later.iter().enumerate() {
             let last = earlier.last().map(|passed| (frame - 1, passed));
-            let passed = step(&self.forward, frame, last, Some(&later.hidden));
+            let passed = step(&forward, frame, last, Some(&later.hidden));
             earlier.push(passed);
         }
         let sides = [&earlier, &later];

@@ -3,6 +3,7 @@
 use super::config::LEVELS;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
+use qudi_kernels::pixel_norm;
 use qudi_layers::resample::{avg_pool2, pixel_shuffle};
 use qudi_layers::{Bias, Conv2d, ResidualStack};
 
@@ -91,6 +92,5 @@ impl ImageHead {
 pub(super) fn normalized(x: Tensor<4>) -> Tensor<4> {
     /// Added to the mean square.
     const FLOOR: f32 = 0.05;
-    let square = x.clone().powi_scalar(2).mean_dim(1) + FLOOR;
-    x / square.sqrt()
+    pixel_norm(x, FLOOR)
 }

@@ -4,6 +4,7 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::softmax;
 use burn::tensor::module::unfold4d;
 use burn::tensor::ops::{PadMode, UnfoldOptions};
+use qudi_kernels::block_differences;
 use qudi_layers::resample::mean_around;
 
 /// How sharply the best match wins.
@@ -32,12 +33,13 @@ pub(super) fn soft_match(
     radius: usize,
     pairs_of_burst: usize,
 ) -> Tensor<4> {
-    let [pairs, _, h, w] = reference.dims();
+    if reference.is_autodiff() {
+        let (reference, neighbour) = (reference.inner(), neighbour.inner());
+        return Tensor::from_inner(soft_match(reference, neighbour, radius, pairs_of_burst));
+    }
     let side = 2 * radius + 1;
-    let padded = neighbour.pad((radius, radius, radius, radius), PadMode::Edge);
-    let options = UnfoldOptions::new([1, 1], [0, 0], [1, 1]);
-    let candidates = unfold4d(padded, [side, side], options).reshape([pairs, side * side, h, w]);
-    let difference = mean_around((candidates - reference).powi_scalar(2), BLOCK_RADIUS);
+    let difference = block_differences(&reference, &neighbour, radius)
+        .unwrap_or_else(|| composed_differences(&reference, neighbour, radius));
     let difference = mean_of_pairs_around(difference, pairs_of_burst);
     let floor = difference.clone().mean_dim(1) * MEAN_SHARE + NOISE_FLOOR;
     let offset = |at: usize| at as f32 - radius as f32;
@@ -56,6 +58,16 @@ pub(super) fn soft_match(
     let weights = softmax(difference.clone() * -SHARPNESS / floor - prior, 1);
     let expected = |axis: usize| (weights.clone() * plane(&move |v| v[axis])).sum_dim(1);
     Tensor::cat(vec![expected(0), expected(1)], 1)
+}
+
+/// Computes [`block_differences`] by Burn's operations.
+fn composed_differences(reference: &Tensor<4>, neighbour: Tensor<4>, radius: usize) -> Tensor<4> {
+    let [pairs, _, h, w] = reference.dims();
+    let side = 2 * radius + 1;
+    let padded = neighbour.pad((radius, radius, radius, radius), PadMode::Edge);
+    let options = UnfoldOptions::new([1, 1], [0, 0], [1, 1]);
+    let candidates = unfold4d(padded, [side, side], options).reshape([pairs, side * side, h, w]);
+    mean_around((candidates - reference.clone()).powi_scalar(2), BLOCK_RADIUS)
 }
 
 /// Averages the differences of every pair of frames with the differences of the pairs before and after, whose
@@ -96,6 +108,20 @@ mod tests {
         let flat = image(&|_, _| 0.5);
         let flow = read(soft_match(flat.clone(), flat, 3, 1)).unwrap_or_else(|e| panic!("{e}"));
         assert!(at(&flow, 0).abs() < 1e-4 && at(&flow, 1).abs() < 1e-4);
+    }
+
+    /// One operation computes what Burn's do, bit for bit.
+    #[test]
+    fn differences_are_the_composed_ones() {
+        let image = |frequency: f32| {
+            let values: Vec<f32> = (0..3 * 10 * 17).map(|i| (i as f32 * frequency).sin()).collect();
+            let shape = [3, 1, 10, 17];
+            Tensor::<4>::from_data(TensorData::new(values, shape), &Device::flex())
+        };
+        let (reference, neighbour) = (image(0.37), image(0.41));
+        let values = |x| read(x).unwrap_or_else(|e| panic!("{e}"));
+        let native = block_differences(&reference, &neighbour, 3).expect("flex has it");
+        assert_eq!(values(native), values(composed_differences(&reference, neighbour, 3)));
     }
 
     /// Pairs are averaged with their neighbours of the same burst only.

@@ -6,7 +6,7 @@ use super::input::MIDDLE;
 use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
-use qudi_kernels::warp;
+use qudi_kernels::{StackParameters, warp};
 use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
 use qudi_layers::{Bias, Conv2d};
 
@@ -47,7 +47,14 @@ impl Gate {
         }
     }
 
+    /// Makes the first convolution ready for several frames.
+    pub(super) fn parameters(&self) -> StackParameters {
+        StackParameters::new(vec![(self.hidden.weight(), self.hidden.bias_or_zeros())])
+    }
+
     /// Merges the linear estimates of frames with what is merged of their neighbours, along the flow.
+    ///
+    /// `between` are the [parameters](Self::parameters).
     ///
     /// # Shapes
     /// - linear, restored: `[images, 1, H, W]` in image units
@@ -55,6 +62,7 @@ impl Gate {
     /// - flow: `[images, 2, H, W]` in pixels
     pub(super) fn merge(
         &self,
+        between: &StackParameters,
         neighbours: &Merged,
         linear: Tensor<4>,
         restored: Tensor<4>,
@@ -66,7 +74,7 @@ impl Gate {
         let (mean, frames) = (both.clone().narrow(1, 0, 1), both.narrow(1, 1, 1));
         let difference = pixel_unshuffle((mean.clone() - restored) * SCALE, FOLD);
         let inputs = [features, difference, pixel_unshuffle(frames.clone().log(), FOLD)];
-        let gate = self.out.linear(&[self.hidden.relu(&inputs)]) + OPEN;
+        let gate = self.out.linear(&[between.apply(&inputs)]) + OPEN;
         let used = sigmoid(pixel_shuffle(gate, FOLD)) * frames;
         let frames = used.clone() + 1.0;
         Merged { mean: (mean * used + linear) / frames.clone(), frames }

@@ -94,6 +94,14 @@ impl EncodedWindow {
         &self.error_sigma
     }
 
+    /// Returns the memory of all tensors, in bytes.
+    pub(super) fn bytes(&self) -> usize {
+        let single = [&self.restored, &self.merged, &self.merged_planes];
+        let flows = self.flow.iter().map(|flow| &flow.pairs);
+        let all = single.into_iter().chain(flows).chain(&self.features);
+        all.map(|x| x.shape().num_elements() * size_of::<f32>()).sum()
+    }
+
     /// Returns the same outside autodiff.
     #[must_use]
     pub fn inner(&self) -> Self {

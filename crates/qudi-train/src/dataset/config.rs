@@ -153,7 +153,7 @@ impl SensorMix {
             sensor.frames_summed = frames;
             sensor.validate()?;
         }
-        Ok(sensor)
+        Ok(sensor.as_read())
     }
 }
 

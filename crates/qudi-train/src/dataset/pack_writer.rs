@@ -37,8 +37,9 @@ struct Image {
 }
 
 /// Decodes every clip and still of `sources`, below the folder `data`, into one pack. Returns the mean PSNR
-/// of training frames, as decoded from the pack, against their downscaled sources. `on` receives every clip,
-/// and returns `Break` to stop.
+/// of training frames, as decoded from the pack, against their downscaled sources. Clips that cannot be read
+/// are left out and named in `skipped`, or refused if there is no such list. `on` receives every clip, and
+/// returns `Break` to stop.
 ///
 /// # Errors
 /// [`Error`] if something cannot be read or written; [`Error::Interrupted`] if asked to stop.
@@ -47,6 +48,7 @@ pub fn write_pack(
     data: &Path,
     path: &Path,
     overwrite: Overwrite,
+    skipped: Option<&mut Vec<String>>,
     on: &mut dyn FnMut(&PackProgress) -> ControlFlow<()>,
 ) -> Result<Option<f64>> {
     let mut jobs = Vec::new();
@@ -89,6 +91,11 @@ pub fn write_pack(
             return Err(Error::Interrupted);
         }
     }
+    let is_left = |source: &PackedSource| index.clips.iter().any(|clip| clip.source == source.name);
+    let skipped = skipped.filter(|_| sources.iter().all(is_left));
+    if let Some(skipped) = skipped {
+        skipped.append(&mut unreadable);
+    }
     if !unreadable.is_empty() {
         return Err(Error::data(
             format!(
@@ -97,7 +104,7 @@ pub fn write_pack(
                 unreadable.join("; ")
             ),
             data,
-            "repair these files or move them out of the sources; nothing was packed",
+            "repair these files or move them out of the sources (`skip-bad` leaves them out, if a source has others); nothing was packed",
         ));
     }
     store(&mut zip, INDEX, &index.signed(digest), path)?;

@@ -216,7 +216,8 @@ pub fn loss_terms(
         },
     );
     if let Some(lpips) = perceptual {
-        sum.add("perceptual", weights.perceptual, perceptual_loss(lpips, &image, example));
+        let later = after_the_start(example.timesteps);
+        sum.add("perceptual", weights.perceptual, perceptual_loss(lpips, &image, example, &later));
     }
     let of_images = sum.total();
     // Where nothing moves, there is nothing to learn of it.
@@ -232,19 +233,28 @@ pub fn loss_terms(
     Ok(LossTerms { sum, recomputation })
 }
 
-/// Computes the perceptual distance of all predictions but those at the last timestep, which stay the
-/// posterior mean. Zero if there are no others.
-fn perceptual_loss(lpips: &Lpips, images: &Tensor<4>, example: &Example<'_>) -> Tensor<1> {
-    let frames = example.conditioning.frames;
-    let timesteps = example.timesteps;
-    let later: Vec<_> =
-        (0..timesteps.len()).filter(|&n| timesteps[n] < NUM_TIMESTEPS - 1).collect();
-    if later.is_empty() {
+/// Returns the samples at other timesteps than the last, whose predictions stay the posterior mean.
+fn after_the_start(timesteps: &[usize]) -> Vec<usize> {
+    (0..timesteps.len()).filter(|&n| timesteps[n] < NUM_TIMESTEPS - 1).collect()
+}
+
+/// Computes the perceptual distance of the predictions of some samples, `[1]`; zero of none.
+///
+/// # Shapes
+/// - images: `[bursts * frames, 1, height, width]` in image units
+pub(super) fn perceptual_loss(
+    lpips: &Lpips,
+    images: &Tensor<4>,
+    example: &Example<'_>,
+    samples: &[usize],
+) -> Tensor<1> {
+    if samples.is_empty() {
         return images.clone().mean() * 0.0;
     }
+    let frames = example.conditioning.frames;
     let only = |images: &Tensor<4>| {
         let burst = |&number: &usize| images.clone().narrow(0, number * frames, frames);
-        Tensor::cat(later.iter().map(burst).collect(), 0)
+        Tensor::cat(samples.iter().map(burst).collect(), 0)
     };
     lpips.loss(only(images), only(&example.truth))
 }

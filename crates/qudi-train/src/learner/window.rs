@@ -1,6 +1,6 @@
 //! The diffusion that encodes a window once, as it learns.
 
-use super::diffusion::{Batch, Example, noisy_images, previous_timestep};
+use super::diffusion::{Batch, Example, noisy_images, perceptual_loss, previous_timestep};
 use super::{Context, Learner, Loss, Origin, WeightedSum, learning, load_fitting, save_described};
 use crate::burst_cache::BurstSampler;
 use crate::loss::log_mean_square;
@@ -44,6 +44,10 @@ impl Learner for Window {
         batch.upload(device);
     }
 
+    fn parts(batch: Batch, count: usize) -> Vec<Batch> {
+        batch.parts(count)
+    }
+
     fn loss<'a>(&'a self, batch: &'a Batch, context: &Context<'a>) -> Result<Loss<'a>> {
         let train = &context.recipe.train;
         let conditioning = batch.conditioning(context.device);
@@ -70,8 +74,16 @@ impl Learner for Window {
         let weights = train.loss();
         let mut sum = WeightedSum::default();
         // Errors in units of what they usually are: no light level drowns another.
-        let error = (prediction.x0 - truth.clone()) / prediction.c_out;
+        let error = (prediction.x0.clone() - truth.clone()) / prediction.c_out;
         sum.add("prediction", weights.prediction, log_mean_square(error));
+        if let Some(lpips) = context.perceptual {
+            let images = (prediction.x0 + 1.0) * 0.5;
+            let quiet = with_little_noise(example.timesteps, &schedule);
+            let of_batch = with_little_noise(batch.timesteps_of_all(), &schedule);
+            let share = batch.share(quiet.len(), of_batch.len());
+            let distance = perceptual_loss(lpips, &images, &example, &quiet) * share;
+            sum.add("perceptual", weights.perceptual, distance);
+        }
         let before = |frames: &Tensor<4>| {
             let error = frames.clone() * 2.0 - 1.0 - truth.clone();
             log_mean_square(error / encoded.error_sigma().clone())
@@ -118,6 +130,14 @@ impl Learner for Window {
     fn prefers_adam(name: &str) -> bool {
         name.starts_with("flow.") || name.ends_with("out.weight")
     }
+}
+
+/// Returns the samples whose noise hides little: only there the prediction is about what the sampler leaves.
+fn with_little_noise(timesteps: &[usize], schedule: &NoiseSchedule) -> Vec<usize> {
+    /// Noise over signal in images from -1 to 1, about what one step leaves wrong.
+    const LITTLE: f64 = 0.1;
+    let quietest = schedule.timestep_with_noise(LITTLE);
+    (0..timesteps.len()).filter(|&n| timesteps[n] <= quietest).collect()
 }
 
 /// Makes the network's own estimate from noisier images, without gradient; none at the noisiest timestep,

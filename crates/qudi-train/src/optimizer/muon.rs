@@ -42,14 +42,28 @@ const LEAST_NORM: f32 = 1e-7;
 
 /// Returns the matrices, `[count, rows, columns]`, with singular values between about 0.7 and 1.2; zeros stay
 /// zeros.
+///
+/// Every round multiplies `x` by a polynomial of `x x^T`. Rows are few and columns many, so that the rounds
+/// multiply the square matrices alone, and their product is applied to `x` once.
 fn orthogonalized(matrices: Tensor<3>) -> Tensor<3> {
     let squares = matrices.clone().powi_scalar(2).sum_dim(2).sum_dim(1);
-    let mut x = matrices / squares.sqrt().clamp_min(LEAST_NORM);
+    let x = matrices / squares.sqrt().clamp_min(LEAST_NORM);
+    let [_, rows, _] = x.dims();
     let [a, b, c] = NEWTON_SCHULZ;
-    for _ in 0..ROUNDS {
-        let square = x.clone().matmul(x.clone().swap_dims(1, 2));
-        let polynomial = square.clone() * b + square.clone().matmul(square) * c;
-        x = x.clone() * a + polynomial.matmul(x);
+    let identity = Tensor::<2>::eye(rows, &x.device()).unsqueeze::<3>() * a;
+    let mut gram = x.clone().matmul(x.clone().swap_dims(1, 2));
+    let mut product: Option<Tensor<3>> = None;
+    for round in 1..=ROUNDS {
+        let square = gram.clone().matmul(gram.clone());
+        let polynomial = gram.clone() * b + square * c + identity.clone();
+        if round < ROUNDS {
+            // All of them are functions of one matrix, and commute.
+            gram = polynomial.clone().matmul(polynomial.clone()).matmul(gram);
+        }
+        product = Some(match product {
+            None => polynomial,
+            Some(product) => polynomial.matmul(product),
+        });
     }
-    x
+    product.expect("at least one round").matmul(x)
 }

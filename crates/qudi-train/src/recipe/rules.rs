@@ -1,7 +1,8 @@
 //! Rules of recipes.
 
 use super::{
-    LearningPart, NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default, stage,
+    LearningPart, LossConfig, NetworkRecipe, Recipe, TrainConfig, ValidationConfig, is_default,
+    stage,
 };
 use crate::loss::lpips::PerceptualKind;
 use qudi_baselines::method::Sizes;
@@ -37,15 +38,11 @@ impl Recipe {
                 check(&[
                     (
                         "train.loss",
-                        weight(loss.flow) && weight(loss.pre),
+                        weight(loss.flow) && weight(loss.pre) && weight(loss.perceptual),
                         "must have weights of 0 or more",
                     ),
                     ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
-                    (
-                        "train.loss.term",
-                        loss.term == PerceptualKind::None,
-                        "must be \"none\" for this network",
-                    ),
+                    perceptual_rule(loss),
                     ("train.ablate", is_default(&self.train.ablate), "is for the other diffusion"),
                     ("train.learns", self.train.learns.is_empty(), "is for the regression"),
                     (
@@ -156,11 +153,7 @@ impl Recipe {
                 "must have weights of 0 or more",
             ),
             ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
-            (
-                "train.loss.term",
-                (loss.term == PerceptualKind::None) == (loss.perceptual == 0.0),
-                "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
-            ),
+            perceptual_rule(loss),
             (
                 "train.learns",
                 !others.iter().any(|part| train.learns.contains(part)),
@@ -217,6 +210,15 @@ impl Recipe {
         }
         check(&self.sample_rules(1, sizes.multiple()))
     }
+}
+
+/// Returns the rule of the perceptual term and its weight.
+fn perceptual_rule(loss: LossConfig) -> Rule<'static> {
+    (
+        "train.loss.term",
+        (loss.term == PerceptualKind::None) == (loss.perceptual == 0.0),
+        "and train.loss.perceptual belong together: a term and its weight, or \"none\" and 0",
+    )
 }
 
 fn check(rules: &[Rule<'_>]) -> Result<()> {

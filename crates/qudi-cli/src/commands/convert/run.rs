@@ -6,9 +6,10 @@ use crate::capture::{is_pipe, refuse_terminal, remarks, sum_by_itself};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::{Bar, Report, counted};
-use qudi_core::Error;
 use qudi_core::atomic_file::refuse_taken;
 use qudi_core::colour::FilterChoice;
+use qudi_core::sensor::Sensor;
+use qudi_core::{Error, Light};
 use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_io::sidecar::{BurstLayout, Conversion, VERSION};
@@ -63,7 +64,7 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     capture.verify()?;
     let frames = frame;
     let layout = BurstLayout::of_counts(format, frames, size, max_count, capture.fps());
-    let record = conversion(args, &options, &capture, layout)?;
+    let record = conversion(args, &options, &capture, layout, report)?;
     let bytes = serde_json::to_vec_pretty(&record)
         .map_err(|e| CliError::new(e, args.output.display(), "report this as a bug"))?;
     writer.finish(&bytes, overwrite)?;
@@ -78,8 +79,10 @@ pub(crate) fn run(args: &Convert, global: &Global, report: &Report) -> Result<()
     report.result(&text, || serde_json::to_value(&record).unwrap_or(Value::Null))
 }
 
-/// Opens the capture, from a file or a pipe, summed as requested.
+/// Opens the capture, from a file or a pipe, summed as requested. Noise below a recorded pedestal keeps its
+/// sign, as the record says.
 fn open(args: &Convert, options: &ReadOptions) -> Result<Capture> {
+    let options = &ReadOptions { signed: true, ..options.clone() };
     let capture = if is_pipe(&args.capture) {
         refuse_terminal("cat burst.npy | qudi convert - -o out.tif")?;
         Capture::from_pipe(std::io::stdin(), options, None)?
@@ -129,8 +132,11 @@ fn conversion(
     options: &ReadOptions,
     capture: &Capture,
     burst: BurstLayout,
+    report: &Report,
 ) -> Result<Conversion> {
     let about = capture.info();
+    let sensor = converted_sensor(capture, options, report);
+    let light = about.ppp.zip(about.mean_level).filter(|_| sensor.is_some());
     let absolute =
         |path: &Path| std::path::absolute(path).map_err(|e| Error::io("find the capture", path, e));
     Ok(Conversion {
@@ -143,7 +149,35 @@ fn conversion(
         format: about.format.to_owned(),
         read: options.clone(),
         cfa: converted_filter(capture),
+        gain: about.gain.filter(|_| sensor.is_some()),
+        light: light
+            .map(|(ppp, mean_level)| Light { ppp: ppp * f64::from(capture.summed()), mean_level }),
+        sensor,
     })
+}
+
+/// Returns the sensor of the converted frames, if the capture's record names one. Maps do not fit frames that
+/// are turned, cropped, or of one colour.
+fn converted_sensor(capture: &Capture, options: &ReadOptions, report: &Report) -> Option<Sensor> {
+    let recorded = capture.info().sensor.as_ref()?;
+    let Ok(mut sensor) = capture.output_sensor(recorded) else {
+        report.warning(&format!(
+            "the record of the converted frames names no sensor, since `{}` takes no such sums: name one with --sensor when they are read",
+            recorded.name
+        ));
+        return None;
+    };
+    sensor.offset = capture.info().pedestal;
+    let defects = &mut sensor.defects;
+    let has_maps = defects.dark_map.is_some() || defects.bad_pixels.is_some();
+    let moved = options.orient.is_some() || options.crop.is_some() || options.channel.is_some();
+    if has_maps && moved {
+        (defects.dark_map, defects.bad_pixels) = (None, None);
+        report.warning(
+            "the record of the converted frames names no maps of dark rates and bad pixels, which do not fit turned or cropped frames: find them again with `qudi calibrate`",
+        );
+    }
+    Some(sensor)
 }
 
 /// Returns the colour filter of the frames, turned and cropped as they are, if it is a tile that repeats.

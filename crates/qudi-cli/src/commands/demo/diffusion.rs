@@ -1,5 +1,5 @@
-//! The picture of `qudi demo --diffusion`, of what more steps draw: one step, ten steps with two draws of noise,
-//! the mean of several, and the truth, with errors and spread below.
+//! The picture of `qudi demo --diffusion`, of what more steps draw: one step, ten steps with two draws of
+//! noise, the mean of several, and the truth, with errors and spread below.
 
 use super::animation::middle;
 use super::restored::{CENTRE, ExposedScene, rms, stop_if_asked};

@@ -40,7 +40,7 @@ pub(crate) fn run(
     let page_file = Output::open(Some(&page), overwrite)?;
     let animation_file = Output::open(animation.as_deref(), overwrite)?;
     let diffusion_file = Output::open(diffusion.as_deref(), overwrite)?;
-    let sensor = settings.sensor(&demo.sensor)?;
+    let sensor = settings.sensor(&demo.sensor)?.as_read();
     let mut bar = report.bar();
     let (mut restored, mut sampled) = (Vec::new(), Vec::new());
     for scene in scenes()? {

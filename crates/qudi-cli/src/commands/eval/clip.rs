@@ -9,6 +9,7 @@ use qudi_burst::motion::estimate_flow;
 use qudi_core::fitting_mean_level;
 use qudi_core::flow::Flow;
 use qudi_core::restorer::Acquisition;
+use qudi_core::sensor::Sensor;
 use qudi_core::{Error, USUAL_MEAN_LEVEL};
 use qudi_io::sidecar::{BurstLayout, ClipDigest, Record, VERSION, beside};
 use qudi_io::writer::{BurstFormat, BurstWriter};
@@ -114,10 +115,11 @@ impl Clip {
                 .map_err(|e| CliError::new(e, path.display(), "report this as a bug"))?;
             writer.finish(&bytes, plan.overwrite)?;
         }
-        let acquisition = Acquisition::new(sensor.clone(), summary.light.ppp, USUAL_MEAN_LEVEL)?;
+        let above_pedestal = Sensor { offset: 0.0, ..sensor.clone() };
+        let acquisition = Acquisition::new(above_pedestal, summary.light.ppp, USUAL_MEAN_LEVEL)?;
         let mut acquisition = acquisition.with_seed(exposing.seed);
         acquisition.gain = summary.gain;
-        acquisition = acquisition.without_echoes()?;
+        acquisition = acquisition.without_echoes()?.with_pedestal(sensor.offset)?;
         acquisition.mean_level = if let Some(mean_level) = plan.mean_level {
             mean_level
         } else {

@@ -61,7 +61,7 @@ impl Exposing {
             sensor.validate()?;
         }
         Ok(Self {
-            sensor,
+            sensor: sensor.as_read(),
             seed,
             sampling: Sampling {
                 frames: Some(frames),

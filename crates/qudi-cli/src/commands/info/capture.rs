@@ -152,7 +152,11 @@ pub(crate) fn describe(
         None => {
             let largest = summary.histogram.len() - 1;
             let bits = usize::BITS - largest.leading_zeros();
-            line("largest", format!("{largest}; if counts have {bits} bits, say --bits {bits}"));
+            let depth = match bits {
+                0 => "no frame has a count".to_owned(),
+                _ => format!("if counts have {bits} bits, say --bits {bits}"),
+            };
+            line("largest", format!("{largest}; {depth}"));
         }
     }
     if let (Some(colours), Some(cfa)) = (summary.colours, &about.cfa) {

@@ -48,6 +48,9 @@ const FEW_PICTURES: u64 = 10;
 /// [`Method::cost`]: crate::methods::Method::cost
 const INSTANT_COST: f64 = 0.065;
 
+/// Seconds of an instant that is not restored twice.
+const LONG_INSTANT: f64 = 2.0;
+
 pub(crate) fn run(
     args: &Look,
     settings: &Settings,
@@ -97,9 +100,8 @@ pub(crate) fn run(
     let mut forecast = Value::Null;
     match acquired {
         Ok(CaptureAcquisition { acquisition, .. }) => {
-            let start = Instant::now();
-            let instant = restore_instant(&counts, &capture, &acquisition, rendering.as_ref())?;
-            let seconds = start.elapsed().as_secs_f64();
+            let colours = rendering.as_ref();
+            let (instant, seconds) = timed_instant(&counts, &capture, &acquisition, colours)?;
             restored = Some(instant);
             if let Some(CliError::Error { what, help, .. }) = unknown {
                 line(&not_yet(&what, help.as_deref()));
@@ -204,6 +206,26 @@ fn read_window(capture: &mut Capture) -> Result<(u64, Vec<Vec<u16>>)> {
         capture.read(frame, counts)?;
     }
     Ok((first, frames))
+}
+
+/// Restores the instant in the middle, and returns its time in seconds: of the faster of two runs, since the
+/// first one prepares what all others use.
+fn timed_instant(
+    frames: &[Vec<u16>],
+    capture: &Capture,
+    acquisition: &Acquisition,
+    rendering: Option<&Rendering>,
+) -> Result<(Shown, f64)> {
+    let mut seconds = f64::INFINITY;
+    loop {
+        let start = Instant::now();
+        let instant = restore_instant(frames, capture, acquisition, rendering)?;
+        let own = start.elapsed().as_secs_f64();
+        if seconds.is_finite() || own > LONG_INSTANT {
+            return Ok((instant, seconds.min(own)));
+        }
+        seconds = own;
+    }
 }
 
 /// Aligns and merges sums, and returns the one in the middle.

@@ -23,6 +23,9 @@ pub(crate) struct Train {
     /// Decoded data in one file; made from --data if it is not there [default: pack.zip in the run's folder]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) pack: Option<PathBuf>,
+    /// Leave out clips that cannot be read, each with a warning, when the pack is made
+    #[arg(long)]
+    pub(crate) skip_bad: bool,
     /// Folder for the bursts of recipes with train.crops, with their reference estimates: those there are not
     /// drawn again
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath)]

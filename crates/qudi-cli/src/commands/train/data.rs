@@ -46,9 +46,16 @@ pub(super) fn make_pack(plan: &Plan, overwrite: Overwrite, report: &Report) -> R
     };
     let mut bar = report.bar();
     let sources = plan.recipe.packed_sources();
-    Ok(write_pack(&sources, data, &plan.pack, overwrite, &mut |progress| {
+    let mut skipped = Vec::new();
+    let list = plan.skip_bad.then_some(&mut skipped);
+    let psnr = write_pack(&sources, data, &plan.pack, overwrite, list, &mut |progress| {
         let [done, total] = progress.done;
         bar.update("decoding", done as u64, Some(total as u64));
         interrupt::check()
-    })?)
+    })?;
+    drop(bar);
+    for clip in skipped {
+        report.warning(&format!("left out of the pack, since it cannot be read: {clip}"));
+    }
+    Ok(psnr)
 }

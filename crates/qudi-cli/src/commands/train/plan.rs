@@ -41,6 +41,8 @@ pub(super) struct Plan {
     /// Threads that draw samples.
     pub(super) workers: usize,
     pub(super) backbones: Option<PathBuf>,
+    /// True if clips that cannot be read are left out of the pack.
+    pub(super) skip_bad: bool,
     pub(super) overwrite: Overwrite,
 }
 
@@ -74,6 +76,7 @@ impl Plan {
             end: args.seconds.map(|seconds| Instant::now() + Duration::from_secs_f64(seconds)),
             workers: args.workers.unwrap_or_else(default_workers),
             backbones: args.backbones.clone(),
+            skip_bad: args.skip_bad,
             overwrite: global.overwrite(),
         })
     }

@@ -1,5 +1,7 @@
 //! Frame counters that cameras write into the first pixels of the first row, or the last of the last one.
 
+use qudi_core::Size;
+
 /// Pixels at the beginning of the first row and at the end of the last one that are looked at.
 const EDGE: usize = 32;
 
@@ -15,13 +17,29 @@ const MIN_SHARE: f64 = 0.8;
 /// Share of the frames in which a higher digit of a counter changes at most.
 const RARE: f64 = 0.125;
 
+/// The same share of bytes of packed frames, whose higher digits are carries of a byte.
+const RARE_BYTE: f64 = 1.0 / 64.0;
+
 /// Pixels next to a counter that may be its higher digits.
 const DIGITS: usize = 8;
 
-/// Pixels of consecutive frames where counters are.
+/// A frame as it is stored.
+#[derive(Clone, Copy)]
+pub(super) enum Stored<'a> {
+    /// One count per pixel.
+    Counts(&'a [u16]),
+    /// 8 pixels to the byte along rows.
+    Packed(&'a [u8], Size),
+}
+
+/// Values of consecutive frames where counters are: counts, or bytes of packed ones.
 #[derive(Debug, Default)]
 pub(super) struct Edges {
-    /// Pixels of a frame.
+    /// Values of a frame.
+    length: usize,
+    /// Values that are looked at on each side.
+    edge: usize,
+    /// Pixels of a value.
     pixels: usize,
     /// Values of each frame: first the ones of the first row, then of the last row.
     values: Vec<u16>,
@@ -37,41 +55,72 @@ pub(super) struct Counter {
 }
 
 impl Edges {
-    /// Adds the counts of a frame.
-    pub(super) fn push(&mut self, counts: &[u16]) {
-        if counts.len() >= 4 * EDGE && self.values.len() < MAX_FRAMES * 2 * EDGE {
-            self.pixels = counts.len();
-            self.values.extend(&counts[..EDGE]);
-            self.values.extend(&counts[counts.len() - EDGE..]);
+    /// Adds a frame.
+    pub(super) fn push(&mut self, frame: Stored<'_>) {
+        match frame {
+            Stored::Counts(counts) if counts.len() >= 4 * EDGE => {
+                (self.length, self.edge, self.pixels) = (counts.len(), EDGE, 1);
+                if self.values.len() < MAX_FRAMES * 2 * EDGE {
+                    self.values.extend(&counts[..EDGE]);
+                    self.values.extend(&counts[counts.len() - EDGE..]);
+                }
+            }
+            Stored::Packed(bytes, size) if size.width.is_multiple_of(8) && bytes.len() >= EDGE => {
+                let edge = EDGE / 8;
+                (self.length, self.edge, self.pixels) = (bytes.len(), edge, 8);
+                if self.values.len() < MAX_FRAMES * 2 * edge {
+                    let ends = bytes[..edge].iter().chain(&bytes[bytes.len() - edge..]);
+                    self.values.extend(ends.map(|&byte| u16::from(byte)));
+                }
+            }
+            _ => {}
         }
     }
 
-    /// Finds the counter, if there is one.
-    pub(super) fn counter(&self) -> Option<Counter> {
-        let frames = self.values.len() / (2 * EDGE);
+    /// Finds the counter, if there is one: in bytes also one whose bits are in the other order.
+    pub(super) fn counter(&mut self) -> Option<Counter> {
+        let found = self.find();
+        if found.is_some() || self.pixels != 8 {
+            return found;
+        }
+        for value in &mut self.values {
+            *value = u16::from((*value as u8).reverse_bits());
+        }
+        self.find()
+    }
+
+    fn find(&self) -> Option<Counter> {
+        let edge = self.edge;
+        if edge == 0 {
+            return None;
+        }
+        let frames = self.values.len() / (2 * edge);
         let values = |at: usize| {
-            self.values.iter().copied().skip(at).step_by(2 * EDGE).collect::<Vec<u16>>()
+            self.values.iter().copied().skip(at).step_by(2 * edge).collect::<Vec<u16>>()
         };
         let of_one = |values: &[u16]| steps(values).iter().filter(|&&step| step == 1).count();
         let counts = |at: &usize| {
             frames >= MIN_FRAMES && of_one(&values(*at)) as f64 >= MIN_SHARE * (frames - 1) as f64
         };
-        let found: Vec<usize> = (0..2 * EDGE).filter(counts).collect();
+        let found: Vec<usize> = (0..2 * edge).filter(counts).collect();
         let (first, last) = (*found.first()?, *found.last()?);
         // Higher digits next to it hardly change.
+        let rare = if self.pixels == 1 { RARE } else { RARE_BYTE };
         let is_digit = |&at: &usize| {
             let values = values(at);
             let changes = values.windows(2).filter(|pair| pair[0] != pair[1]).count();
-            changes as f64 <= RARE * frames as f64
+            changes as f64 <= rare * frames as f64
         };
-        let side = if first < EDGE { 0..EDGE } else { EDGE..2 * EDGE };
+        let side = if first < edge { 0..edge } else { edge..2 * edge };
         let last = if side.contains(&last) { last } else { side.end - 1 };
         let before = (side.start..first).rev().take(DIGITS).take_while(is_digit).count();
         let after = (last + 1..side.end).take(DIGITS).take_while(is_digit).count();
-        let place = |at: usize| if at < EDGE { at } else { self.pixels - 2 * EDGE + at };
+        let place = |at: usize| if at < edge { at } else { self.length - 2 * edge + at };
+        let pixels = (first - before..=last + after).map(place);
+        let pixels = pixels.flat_map(|at| at * self.pixels..(at + 1) * self.pixels);
         let jumps = (1..).zip(steps(&values(first))).filter(|&(_, step)| (2..128).contains(&step));
         Some(Counter {
-            pixels: (first - before..=last + after).map(place).collect(),
+            pixels: pixels.collect(),
             jumps: jumps.map(|(frame, step)| (frame, u64::from(step) - 1)).collect(),
         })
     }
@@ -110,7 +159,7 @@ mod tests {
             };
             let mut counts: Vec<u16> = (0..PIXELS).map(|_| noise()).collect();
             write(number, &mut counts);
-            edges.push(&counts);
+            edges.push(Stored::Counts(&counts));
         }
         edges
     }
@@ -134,6 +183,29 @@ mod tests {
         };
         let found = edges(&numbers, digits).counter().unwrap();
         assert_eq!((found.pixels, found.jumps), ((0..4).collect(), vec![]));
+    }
+
+    #[test]
+    fn counters_of_packed_frames_are_found() {
+        let size = Size { height: 24, width: 32 };
+        let mut state = 7_u32;
+        let mut noise = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 24) as u8
+        };
+        for reversed in [false, true] {
+            let mut edges = Edges::default();
+            for number in (1000_u32..1030).chain(1033..1050) {
+                let mut bytes: Vec<u8> = (0..96).map(|_| noise()).collect();
+                bytes[..4].copy_from_slice(&number.to_be_bytes());
+                if reversed {
+                    bytes.iter_mut().for_each(|byte| *byte = byte.reverse_bits());
+                }
+                edges.push(Stored::Packed(&bytes, size));
+            }
+            let found = edges.counter().unwrap();
+            assert_eq!((found.pixels, found.jumps), ((0..32).collect(), vec![(30, 3)]));
+        }
     }
 
     #[test]

@@ -40,13 +40,6 @@ impl FrameFindings {
         frames
     }
 
-    /// Returns the first frames of parts that have nothing to do with those before, in rising order.
-    pub(super) fn boundaries(&self) -> Vec<u64> {
-        let mut frames: Vec<u64> = self.cuts.iter().chain(&self.light_steps).copied().collect();
-        frames.sort_unstable();
-        frames
-    }
-
     /// Gives the frames other numbers; several may get the same one.
     pub(super) fn renumber(&mut self, number: impl Fn(u64) -> u64) {
         let lists = [&mut self.empty, &mut self.saturated, &mut self.outlying, &mut self.repeated];

@@ -1,5 +1,6 @@
 //! Numbers of single frames, from one look at each.
 
+use multiversion::multiversion;
 use qudi_core::Size;
 
 /// Blocks along each side of a frame.
@@ -14,17 +15,20 @@ pub(super) const CONSTANT_SHARE: f64 = 0.95;
 /// Rows of bits that are counted in bytes, eight to the pixel, before these overflow.
 const MAX_BYTE_ROWS: usize = 31;
 
+/// Elements of a row that are looked at together.
+const LANE: usize = 32;
+
 /// Numbers of one frame.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct FrameStatistics {
+pub(in crate::capture) struct FrameStatistics {
     /// Sum of all counts.
-    pub(super) sum: u64,
+    pub(in crate::capture) sum: u64,
     /// Pixels with counts.
     pub(super) lit: u32,
     /// Largest count.
     pub(super) largest: u16,
     /// True if nearly all pixels have the largest count.
-    pub(super) is_constant: bool,
+    pub(in crate::capture) is_constant: bool,
     /// All counts, bit by bit.
     pub(super) bits: u16,
     /// Hash of all counts.
@@ -33,7 +37,7 @@ pub(super) struct FrameStatistics {
 
 /// Sums of the counts in the blocks of frames.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Blocks(pub(super) [u32; BLOCKS]);
+pub(in crate::capture) struct Blocks(pub(super) [u32; BLOCKS]);
 
 /// A hash over words, in four lanes that do not wait for each other.
 struct Hash([u64; 4]);
@@ -57,27 +61,89 @@ impl Hash {
     }
 }
 
-/// Returns the row of blocks that row `y` of a frame belongs to.
-fn band(y: usize, height: usize) -> usize {
-    y * SIDE / height
+/// Returns the first row of a frame that belongs to row `band` of blocks.
+fn first_row(band: usize, height: usize) -> usize {
+    (band * height).div_ceil(SIDE)
+}
+
+/// Returns the elements of a row from number `from` on, and zeros after its end.
+#[inline]
+fn lane<T: Copy + Default>(row: &[T], from: usize) -> [T; LANE] {
+    let rest = &row[from..];
+    rest.first_chunk().copied().unwrap_or_else(|| {
+        let mut lane = [T::default(); LANE];
+        lane[..rest.len()].copy_from_slice(rest);
+        lane
+    })
+}
+
+/// Numbers of some rows of a frame.
+#[derive(Default)]
+struct Rows {
+    lit: u32,
+    bits: u16,
+    largest: u16,
+}
+
+/// Sums each column of some rows of counts, and looks at all of them.
+#[multiversion(targets("x86_64+avx2"))]
+fn add_rows(rows: &[u16], sums: &mut [u32]) -> Rows {
+    let width = sums.len();
+    let mut seen = Rows::default();
+    for (n, sums) in sums.chunks_mut(LANE).enumerate() {
+        let (mut all, mut lit) = ([0u32; LANE], [0u32; LANE]);
+        let (mut bits, mut largest) = ([0u16; LANE], [0u16; LANE]);
+        for row in rows.chunks_exact(width) {
+            for (i, count) in lane(row, n * LANE).into_iter().enumerate() {
+                all[i] += u32::from(count);
+                lit[i] += u32::from(count > 0);
+                bits[i] |= count;
+                largest[i] = largest[i].max(count);
+            }
+        }
+        sums.copy_from_slice(&all[..sums.len()]);
+        seen.lit += lit.iter().sum::<u32>();
+        seen.bits |= bits.iter().fold(0, |bits, lane| bits | lane);
+        seen.largest = largest.iter().fold(seen.largest, |most, &lane| most.max(lane));
+    }
+    seen
+}
+
+/// Counts the ones in each column of bytes of at most [`MAX_BYTE_ROWS`] rows.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl+avx512bitalg", "x86_64+avx2"))]
+fn count_ones(rows: &[u8], ones: &mut [u8]) {
+    let row_bytes = ones.len();
+    for (n, ones) in ones.chunks_mut(LANE).enumerate() {
+        let mut sums = [0u8; LANE];
+        for row in rows.chunks_exact(row_bytes) {
+            for (sum, byte) in sums.iter_mut().zip(lane(row, n * LANE)) {
+                *sum += byte.count_ones() as u8;
+            }
+        }
+        ones.copy_from_slice(&sums[..ones.len()]);
+    }
 }
 
 impl FrameStatistics {
     /// Looks at the counts of a frame.
-    pub(super) fn of(counts: &[u16], size: Size) -> (Self, Blocks) {
+    pub(in crate::capture) fn of(counts: &[u16], size: Size) -> (Self, Blocks) {
         let mut blocks = [0u32; BLOCKS];
         let mut own = Self::default();
         let width = size.width.div_ceil(SIDE);
-        for (y, row) in counts.chunks_exact(size.width).enumerate() {
-            let blocks = &mut blocks[band(y, size.height) * SIDE..][..SIDE];
-            for (block, part) in blocks.iter_mut().zip(row.chunks(width)) {
-                *block += part.iter().map(|&count| u32::from(count)).sum::<u32>();
+        let mut sums = vec![0u32; size.width];
+        for (at, blocks) in blocks.chunks_exact_mut(SIDE).enumerate() {
+            let rows = first_row(at, size.height)..first_row(at + 1, size.height);
+            if rows.is_empty() {
+                continue;
             }
-            for part in row.chunks(1 << 12) {
-                own.lit += u32::from(part.iter().map(|&count| u16::from(count > 0)).sum::<u16>());
+            let rows = &counts[rows.start * size.width..rows.end * size.width];
+            let seen = add_rows(rows, &mut sums);
+            own.lit += seen.lit;
+            own.bits |= seen.bits;
+            own.largest = own.largest.max(seen.largest);
+            for (block, part) in blocks.iter_mut().zip(sums.chunks(width)) {
+                *block = part.iter().sum();
             }
-            own.bits |= row.iter().fold(0, |bits, &count| bits | count);
-            own.largest = row.iter().fold(own.largest, |most, &count| most.max(count));
         }
         let mut hash = Hash::new();
         let (sixteens, rest) = counts.as_chunks::<16>();
@@ -105,20 +171,14 @@ impl FrameStatistics {
         let row_bytes = size.width.div_ceil(8);
         let width = row_bytes.div_ceil(SIDE);
         let mut ones = vec![0u8; row_bytes];
-        let mut rows = 0;
-        for (y, row) in bytes.chunks_exact(row_bytes).enumerate() {
-            for (ones, byte) in ones.iter_mut().zip(row) {
-                *ones += byte.count_ones() as u8;
-            }
-            rows += 1;
-            let next = band(y + 1, size.height);
-            let own = band(y, size.height);
-            if rows == MAX_BYTE_ROWS || next > own {
-                for (block, part) in blocks[own * SIDE..].iter_mut().zip(ones.chunks(width)) {
+        for (at, blocks) in blocks.chunks_exact_mut(SIDE).enumerate() {
+            let rows = first_row(at, size.height)..first_row(at + 1, size.height);
+            let rows = &bytes[rows.start * row_bytes..rows.end * row_bytes];
+            for rows in rows.chunks(MAX_BYTE_ROWS * row_bytes) {
+                count_ones(rows, &mut ones);
+                for (block, part) in blocks.iter_mut().zip(ones.chunks(width)) {
                     *block += part.iter().map(|&ones| u32::from(ones)).sum::<u32>();
                 }
-                ones.fill(0);
-                rows = 0;
             }
         }
         let mut hash = Hash::new();

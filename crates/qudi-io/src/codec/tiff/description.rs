@@ -7,6 +7,10 @@ pub(super) struct Description {
     pub(super) images: Option<u64>,
     /// Channels of the stack.
     pub(super) channels: u64,
+    /// Planes of one instant, one above the other; 1 where planes are instants.
+    pub(super) slices: u64,
+    /// Images of their own, each with all axes.
+    pub(super) series: u64,
     /// Pages between a channel and the next one of the same instant.
     pub(super) run: u64,
     /// Frames per second.
@@ -36,11 +40,18 @@ fn imagej(text: &str) -> Description {
     Description {
         images: number("images"),
         channels: number("channels").unwrap_or(1),
+        slices: slices(number("slices"), number("frames")),
+        series: 1,
         run: 1,
         fps: fps.filter(|fps| fps.is_finite() && *fps > 0.0),
         files: Vec::new(),
         program: "ImageJ",
     }
+}
+
+/// Returns the planes of one instant, where there are instants, too: programs also call instants slices.
+fn slices(slices: Option<u64>, instants: Option<u64>) -> u64 {
+    if instants.is_some_and(|instants| instants > 1) { slices.unwrap_or(1) } else { 1 }
 }
 
 /// Parses the attributes of the first `<Pixels ...>` of OME-XML.
@@ -79,6 +90,8 @@ fn ome(text: &str) -> Option<Description> {
     Some(Description {
         images: None,
         channels: (extent("SizeC").unwrap_or(1) / samples.unwrap_or(1)).max(1),
+        slices: slices(extent("SizeZ"), extent("SizeT")),
+        series: text.matches("<Pixels ").count() as u64,
         run,
         fps: fps.filter(|fps| fps.is_finite()),
         files: files(text),

@@ -29,6 +29,8 @@ pub struct Batch {
     numbers: Vec<f32>,
     acquisitions: Vec<Acquisition>,
     timesteps: Vec<usize>,
+    /// Timesteps of the batch that this is a part of; the same for a whole batch.
+    timesteps_of_all: Vec<usize>,
     uploaded: Option<Box<Uploaded>>,
 }
 
@@ -59,6 +61,7 @@ impl Batch {
             numbers: Vec::new(),
             acquisitions: Vec::new(),
             timesteps: Vec::new(),
+            timesteps_of_all: Vec::new(),
             uploaded: None,
         };
         for sample in (number * count as u64..).take(count) {
@@ -78,6 +81,7 @@ impl Batch {
             batch.timesteps.push(if at_start { NUM_TIMESTEPS - 1 } else { timestep });
             batch.acquisitions.push(drawn.acquisition);
         }
+        batch.timesteps_of_all.clone_from(&batch.timesteps);
         Ok(batch)
     }
 
@@ -89,6 +93,46 @@ impl Batch {
     /// Returns true if there are no samples.
     pub fn is_empty(&self) -> bool {
         self.acquisitions.is_empty()
+    }
+
+    /// Splits the batch into at most `count` parts with as many samples each.
+    pub(in crate::learner) fn parts(self, count: usize) -> Vec<Self> {
+        let all = self.len();
+        let count = (1..=count.min(all)).rev().find(|&n| all.is_multiple_of(n)).unwrap_or(1);
+        if count == 1 {
+            return vec![self];
+        }
+        let samples = all / count;
+        let part = |number: usize| {
+            let first = number * samples;
+            let planes = |values: &[f32]| share(values, number, count).to_vec();
+            Self {
+                number: self.number,
+                size: self.size,
+                frames: self.frames,
+                counts: self.counts.map(planes),
+                truth: planes(&self.truth),
+                noise: planes(&self.noise),
+                numbers: planes(&self.numbers),
+                acquisitions: self.acquisitions[first..first + samples].to_vec(),
+                timesteps: self.timesteps[first..first + samples].to_vec(),
+                timesteps_of_all: self.timesteps_of_all.clone(),
+                uploaded: None,
+            }
+        };
+        (0..count).map(part).collect()
+    }
+
+    /// Returns the timesteps of the batch that this is a part of.
+    pub(in crate::learner) fn timesteps_of_all(&self) -> &[usize] {
+        &self.timesteps_of_all
+    }
+
+    /// Returns the factor of a mean over `count` samples of this part that makes the mean over parts the mean
+    /// over the `of_batch` samples of the batch: 1 for a whole batch.
+    pub(in crate::learner) fn share(&self, count: usize, of_batch: usize) -> f32 {
+        let parts = self.timesteps_of_all.len() as f32 / self.timesteps.len() as f32;
+        parts * count as f32 / of_batch.max(1) as f32
     }
 
     /// Copies the batch to `device` ahead of its use.
@@ -133,4 +177,10 @@ impl Batch {
             timesteps: &self.timesteps,
         }
     }
+}
+
+/// Returns part `number` of `count` equal parts.
+fn share(values: &[f32], number: usize, count: usize) -> &[f32] {
+    let length = values.len() / count;
+    &values[number * length..(number + 1) * length]
 }
