@@ -29,6 +29,8 @@ mod pages;
 mod places;
 #[path = "cli/posterior.rs"]
 mod posterior;
+#[path = "cli/release.rs"]
+mod release;
 #[path = "cli/report.rs"]
 mod report;
 #[path = "cli/restore.rs"]

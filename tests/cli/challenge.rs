@@ -148,9 +148,60 @@ fn refuses_what_is_no_set_of_the_challenge() {
         .output()
         .unwrap();
     assert_eq!(output.status.code(), Some(2));
+    refused(
+        &folder,
+        "restore set --challenge --backbones . -o out.zip",
+        &["no weights of LPIPS", "scripts/convert/lpips.py"],
+    );
+    let output =
+        qudi(&folder).args(["restore", "x.npy", "--backbones", ".", "-o", "o"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2), "--backbones needs --challenge");
+    assert!(!folder.join("out.zip.unfinished").exists());
     RgbImage::new(8, 8).save(set.join("attic/000000.png")).unwrap();
     refused(&folder, "restore set --challenge -o out.zip", &["true picture of 8 x 8"]);
     std::fs::write(set.join("attic/000000.npy"), npy_bytes("|u1", "(2, 4, 6)", &[0; 48])).unwrap();
     refused(&folder, "restore set --challenge -o out.zip", &["no packed cube"]);
     assert!(!folder.join("out.zip").exists());
+}
+
+/// A killed run goes on after the last finished picture, and makes the same archive; a run with other
+/// settings is refused.
+#[test]
+fn goes_on_after_an_interruption() {
+    let folder = scratch("challenge-resumed");
+    for number in 0..12 {
+        write_cube(&folder.join("set"), &format!("attic/{number:06}"), 128, true, still);
+    }
+    let command = "restore set --challenge --method qbp-bm3d --sum 8";
+    let mut killed = std::process::Command::new(env!("CARGO_BIN_EXE_qudi"))
+        .current_dir(&folder)
+        .args(format!("{command} -o out.zip -q").split(' '))
+        .spawn()
+        .unwrap();
+    let second = folder.join("out.zip.unfinished/frame_000001.png");
+    let end = std::time::Instant::now() + std::time::Duration::from_mins(2);
+    while !second.exists() {
+        assert!(std::time::Instant::now() < end, "no picture appeared");
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    killed.kill().unwrap();
+    killed.wait().unwrap();
+    assert!(!folder.join("out.zip").exists(), "nothing half-written");
+    refused(
+        &folder,
+        "restore set --challenge --method qbp-bm3d --sum 4 -o out.zip",
+        &["other settings", "sum was"],
+    );
+    let printed = run(&folder, &format!("{command} -o out.zip --json"));
+    let document: serde_json::Value = serde_json::from_str(&printed).unwrap();
+    let resumed = document["resumed_pictures"].as_u64().unwrap();
+    assert!((2..12).contains(&resumed), "{resumed}");
+    assert_eq!(document["methods"], serde_json::json!(["qbp-bm3d"]));
+    assert!(!folder.join("out.zip.unfinished").exists());
+    let printed = run(&folder, &format!("{command} -o whole.zip --json"));
+    let whole: serde_json::Value = serde_json::from_str(&printed).unwrap();
+    assert_eq!(whole["resumed_pictures"], 0);
+    assert_eq!(document["scores"], whole["scores"]);
+    let archives = ["out.zip", "whole.zip"].map(|name| std::fs::read(folder.join(name)).unwrap());
+    assert_eq!(archives[0], archives[1]);
 }

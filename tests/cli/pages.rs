@@ -92,7 +92,11 @@ fn names_with_markup_are_shown_and_do_not_run() {
     let name = "<img src=x onerror=document.title='run'><script>document.title='run'<&.npy";
     run(&folder, "simulate scene:text --size 32x40 --frames 5 --seed 1 -o b.npy -q");
     std::fs::rename(folder.join("b.npy"), folder.join(name)).unwrap();
-    std::fs::rename(folder.join("b.npy.json"), folder.join(format!("{name}.json"))).unwrap();
+    // Its record names a sensor like markup, too.
+    let record = std::fs::read_to_string(folder.join("b.npy.json")).unwrap();
+    let mut record: serde_json::Value = serde_json::from_str(&record).unwrap();
+    record["simulation"]["sensor"]["name"] = "<img src=x onerror=document.title='run'>".into();
+    std::fs::write(folder.join(format!("{name}.json")), record.to_string()).unwrap();
     for args in [
         vec!["look", name, "-o", "page.html", "-q"],
         vec!["restore", name, "--method", "mle", "-o", "o.npy", "--html", "page.html", "-q", "-f"],
@@ -112,6 +116,81 @@ fn names_with_markup_are_shown_and_do_not_run() {
         );
         assert!(browser.said.is_empty(), "{command}: {:?}", browser.said);
     }
+}
+
+/// Pages are opened where nothing may be written, and after they were moved.
+#[cfg(unix)]
+#[test]
+fn pages_need_no_rights_and_no_place() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = scratch("pages-sealed");
+    run(&folder, "simulate scene:text --size 32x40 --frames 5 --seed 1 -o b.npy -q");
+    run(&folder, "look b.npy -o look.html -q");
+    run(&folder, "restore b.npy --method mle -o o.npy --html restore.html -q");
+    run(&folder, "eval b.npy --capture --method mle --html eval.html -q");
+    let sealed = folder.join("sealed #1? é");
+    std::fs::create_dir(&sealed).unwrap();
+    for page in ["look.html", "restore.html", "eval.html"] {
+        std::fs::rename(folder.join(page), sealed.join(page)).unwrap();
+        let mode = std::fs::Permissions::from_mode(0o444);
+        std::fs::set_permissions(sealed.join(page), mode).unwrap();
+    }
+    std::fs::set_permissions(&sealed, std::fs::Permissions::from_mode(0o555)).unwrap();
+    if let Some(mut browser) = Browser::start(&folder) {
+        for page in ["look.html", "restore.html", "eval.html"] {
+            browser.open(&url(&sealed.join(page)), 1000);
+            browser.wait_for(DRAWN);
+            assert!(browser.said.is_empty(), "{page}: {:?}", browser.said);
+        }
+    }
+    // The administrator may write anywhere but where the kernel keeps its own files.
+    let is_open = std::fs::write(sealed.join("probe"), "").is_ok();
+    let place = if is_open { Path::new("/proc") } else { sealed.as_path() };
+    std::fs::set_permissions(&sealed, std::fs::Permissions::from_mode(0o755)).unwrap();
+    if is_open && !cfg!(target_os = "linux") {
+        return;
+    }
+    if !is_open {
+        std::fs::set_permissions(&sealed, std::fs::Permissions::from_mode(0o555)).unwrap();
+    }
+    let before = crate::support::listing(&folder);
+    for args in [
+        "look b.npy -o",
+        "restore b.npy --method mle -o frames --html",
+        "eval b.npy --capture --method mle --html",
+        "eval scene:text --size 32x40 --frames 3 --method mle --html",
+    ] {
+        let page = place.join("page.html");
+        let args: Vec<_> = args.split(' ').map(Into::into).chain([page.into_os_string()]).collect();
+        let output = crate::support::qudi(&folder).args(&args).output().unwrap();
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{args:?}: {text}");
+        for part in ["error: cannot create the output", "where: ", "page.html", "help: "] {
+            assert!(text.contains(part), "{args:?}: no `{part}` in\n{text}");
+        }
+        assert_eq!(crate::support::listing(&folder), before, "{args:?}: nothing half-written");
+    }
+    std::fs::set_permissions(&sealed, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+/// The page of a training plays its validation.
+#[test]
+fn a_training_plays_its_validation() {
+    let folder = scratch("pages-train");
+    run(
+        &folder,
+        "train tiny -o run --device cpu -q --set train.steps=2 --set data.crop=32 --set data.frames=3 \
+         --set validation.crop=32 --set validation.frames=5 --set validation.every=1",
+    );
+    let report = folder.join("run/report.html");
+    assert!(std::fs::metadata(&report).unwrap().len() < 3_000_000);
+    let Some(mut browser) = Browser::start(&folder) else { return };
+    browser.open(&url(&report), 1000);
+    browser.wait_for(DRAWN);
+    let layers = "[...document.querySelector('[data-side=left]').options].map(o => o.text).join()";
+    assert_eq!(browser.evaluate(layers), "counts,restored,truth,error of restored");
+    assert_eq!(browser.evaluate("document.querySelector('.time').max"), "4");
+    assert!(browser.said.is_empty(), "{:?}", browser.said);
 }
 
 #[test]

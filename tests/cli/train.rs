@@ -59,7 +59,8 @@ fn tiny_recipe_trains_without_files() {
         "weights.safetensors",
     ];
     assert_eq!(names, expected);
-    let samples = (0..=7).map(|n| format!("step-{:07}.png", 100 * n)).collect::<Vec<_>>();
+    let pictures = (0..=7).map(|n| format!("step-{:07}.png", 100 * n));
+    let samples: Vec<_> = std::iter::once("loops.json".to_owned()).chain(pictures).collect();
     assert_eq!(listing(&run_folder.join("samples")), samples);
     let metrics = std::fs::read_to_string(run_folder.join("metrics.jsonl")).unwrap();
     let lines: Vec<serde_json::Value> =

@@ -16,10 +16,14 @@ struct View {
 
 impl View {
     fn start(folder: &Path, args: &str) -> Self {
+        Self::start_with(folder, &args.split_whitespace().collect::<Vec<_>>())
+    }
+
+    fn start_with(folder: &Path, args: &[&str]) -> Self {
         let mut process = Command::new(env!("CARGO_BIN_EXE_qudi"))
             .current_dir(folder)
             .arg("view")
-            .args(args.split_whitespace())
+            .args(args)
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
@@ -179,6 +183,28 @@ fn plays_in_a_browser() {
     let errors: Vec<_> =
         browser.said.iter().filter(|said| !said.to_string().contains("favicon")).collect();
     assert!(errors.is_empty(), "{errors:?}");
+}
+
+/// A capture and the sensor of its record have names like markup: they are shown, and do not run.
+#[test]
+fn names_with_markup_are_text() {
+    const MARKUP: &str = "<img src=x onerror=document.title='run'>";
+    let folder = capture("view-markup");
+    let name = format!("{MARKUP}.npy");
+    std::fs::rename(folder.join("b.npy"), folder.join(&name)).unwrap();
+    let record = std::fs::read_to_string(folder.join("b.npy.json")).unwrap();
+    let mut record: serde_json::Value = serde_json::from_str(&record).unwrap();
+    record["simulation"]["sensor"]["name"] = MARKUP.into();
+    std::fs::write(folder.join(format!("{name}.json")), record.to_string()).unwrap();
+    let view = View::start_with(&folder, &[name.as_str(), "--device", "cpu"]);
+    let page = view.get("", "");
+    assert!(page.contains("&lt;img src=x") && !page.contains("<img src=x"), "{page}");
+    assert!(page.matches("&lt;img src=x").count() > 1, "the sensor's name, too");
+    let Some(mut browser) = Browser::start(&folder) else { return };
+    browser.open(&view.url, 1000);
+    browser.wait_for("document.querySelector('.player').player.incomplete === false");
+    assert_ne!(browser.evaluate("document.title"), "run");
+    assert_eq!(browser.evaluate("document.images.length"), 0);
 }
 
 #[test]

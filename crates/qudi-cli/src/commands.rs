@@ -30,7 +30,7 @@ pub(crate) mod convert {
 pub(crate) mod demo {
     mod animation;
     pub(crate) mod args;
-    mod grid;
+    mod diffusion;
     mod html;
     mod picture;
     mod restored;
@@ -78,7 +78,9 @@ pub(crate) mod light {
 
 pub(crate) mod look {
     pub(crate) mod args;
+    mod mosaic;
     pub(crate) mod run;
+    mod shown;
     pub(crate) mod strip;
 }
 
@@ -117,6 +119,7 @@ pub(crate) mod train {
     pub(crate) mod args;
     mod data;
     mod environment;
+    mod loops;
     mod pictures;
     mod plan;
     mod report;

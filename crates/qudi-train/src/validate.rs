@@ -37,9 +37,16 @@ pub struct ValidationClip {
     pub psnr: f64,
     /// SSIM.
     pub ssim: f64,
-    /// Counts, restored and true image of the middle frame.
+    /// Counts, restored and true images: all frames at the first light level, the middle one at others.
     #[serde(skip)]
-    pub strip: [Frame; 3],
+    pub pictures: Vec<[Frame; 3]>,
+}
+
+impl ValidationClip {
+    /// Returns counts, restored and true image of the middle frame.
+    pub fn middle(&self) -> &[Frame; 3] {
+        &self.pictures[self.pictures.len() / 2]
+    }
 }
 
 /// Quality on all clips.
@@ -121,7 +128,7 @@ impl Validator {
     /// [`Error`] if the device fails.
     pub fn measure(&self, restorer: &mut dyn Restorer, step: u64) -> Result<Validation> {
         let mut clips = Vec::new();
-        for &ppp in &self.config.ppp {
+        for (level, &ppp) in self.config.ppp.iter().enumerate() {
             for (number, (name, truth)) in self.clips.iter().enumerate() {
                 let size = truth[0].size;
                 let mean = truth.iter().map(Frame::mean).sum::<f64>() / truth.len() as f64;
@@ -142,18 +149,18 @@ impl Validator {
                 };
                 let middle = truth.len() / 2;
                 let full = f32::from(self.sensor.max_count());
-                let seen = counts[middle].iter().map(|&count| f32::from(count) / full).collect();
+                let picture = |t: usize| {
+                    let seen = counts[t].iter().map(|&count| f32::from(count) / full).collect();
+                    [Frame { size, data: seen }, restored[t].clone(), truth[t].clone()]
+                };
+                let shown = if level == 0 { 0..truth.len() } else { middle..middle + 1 };
                 clips.push(ValidationClip {
                     name: name.clone(),
                     ppp,
                     psnr_a: mean(gain_aligned_psnr),
                     psnr: mean(psnr),
                     ssim: mean(|a, b| ssim(a, b).unwrap_or(f64::NAN)),
-                    strip: [
-                        Frame { size, data: seen },
-                        restored[middle].clone(),
-                        truth[middle].clone(),
-                    ],
+                    pictures: shown.map(picture).collect(),
                 });
             }
         }

@@ -13,7 +13,8 @@ NAME of network NET (`vgg`, `alex`) is sqrt(6 / fan-in) * uniform("NET.NAME") an
 `distances.safetensors`: `p`, `q` [2, 64, 75] are images in 255ths, `q` a blurred, darker, noisy `p`.
 Per kind, computed in float64: `KIND/distance` [2], and of the gradient of their mean by `p`
 `KIND/gradient` [67]: its largest magnitude, its norm, its product with uniform("probe.p"), and its values
-at the flat indices 149 i.
+at the flat indices 149 i. `lpips-alex/colour` [1] is the distance of the colours p[0], p[1], q[0] from q[0],
+p[1], q[1], which are passed from 0 to 1 (`normalize=False`).
 
 `zip.pth` and `plain.pth` are the two layouts of torch.save: `a.weight` [2, 3], `b.weight` [3, 2, 1, 1] (both
 uniform(name)), `half` (16 bits), `turned` (not in rows) and `bad` (holds a NaN). `code.pth` calls a function.
@@ -89,6 +90,12 @@ def lpips_distance(model: lpips.LPIPS, p: Tensor, q: Tensor) -> Tensor:
     return model(gray(p), gray(q), normalize=True).flatten()
 
 
+def colour_distance(model: lpips.LPIPS, p: Tensor, q: Tensor) -> Tensor:
+    p, q = ((x[:, 0].double() / 255).float().double() for x in (p, q))
+    first, second = torch.stack([p[0], p[1], q[0]]), torch.stack([q[0], p[1], q[1]])
+    return model(first[None], second[None], normalize=False).flatten().detach().float()
+
+
 def add(tensors: dict[str, Tensor], kind: str, distance, p: Tensor, q: Tensor) -> None:
     p = (p.double() / 255).float().double().requires_grad_()
     q = (q.double() / 255).float().double()
@@ -143,6 +150,8 @@ def main() -> None:
     for net in NETS:
         model = formula(net)[0].double()
         add(tensors, f"lpips-{net}", lambda p, q: lpips_distance(model, p, q), p, q)
+        if net == "alex":
+            tensors["lpips-alex/colour"] = colour_distance(model, p, q)
     save_file(tensors, OUT / "distances.safetensors")
     state_dicts()
     for path in OUT.iterdir():

@@ -87,7 +87,8 @@ pub(crate) fn describe_sum(
 ) -> String {
     let native = capture.info().fps.or(sensor.and_then(|sensor| sensor.fps));
     let rate = native.map_or(String::new(), |fps| {
-        format!(", which makes {:.4} frames per second", fps / f64::from(choice.frames))
+        let summed = (1e4 * fps / f64::from(choice.frames)).round() / 1e4;
+        format!(", which makes {summed} frames per second")
     });
     format!(
         "{} frames are summed into one{rate}: {}; --sum N sums another number",

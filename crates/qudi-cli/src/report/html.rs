@@ -82,6 +82,9 @@ pub(crate) fn data_url(kind: &str, picture: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::report::player::{Kind, Layer, Scene};
+    use crate::report::svg::{Axis, Curve, Plot, Point};
+    use qudi_core::Size;
     use serde_json::json;
 
     #[test]
@@ -92,6 +95,67 @@ mod tests {
         let page = render("eval.html", context).unwrap_or_else(|e| panic!("{e:?}"));
         assert!(page.contains("&lt;script&gt;alert(1)") && page.contains("a &amp; b"));
         assert!(!page.contains("<script>alert") && !page.contains("<b>\u{1b}"), "{page}");
+    }
+
+    /// Every text of every page is markup here, and stays text.
+    #[test]
+    fn no_page_takes_text_for_markup() {
+        const MARKUP: &str = "<img src=x onerror=alert(1)></script><script>alert(2)</script>";
+        let size = Size { height: 4, width: 4 };
+        let table =
+            || TableView { headings: vec![MARKUP.to_owned()], rows: vec![vec![MARKUP.to_owned()]] };
+        let player = || {
+            let mut scene = Scene::new(MARKUP, size, 1);
+            (scene.caption, scene.notes) = (vec![MARKUP.to_owned()], vec![MARKUP.to_owned()]);
+            let layer = Layer::new(MARKUP, Kind::Restored, vec![MARKUP.to_owned()]);
+            scene.layers = vec![layer.with_note(MARKUP).into_map(1.0, MARKUP)];
+            scene.table = Some(table());
+            scene.player()
+        };
+        let point = |at| Point { x: at, y: at, error: 0.5 };
+        let plot = || {
+            Plot {
+                title: MARKUP.to_owned(),
+                caption: MARKUP.to_owned(),
+                x: Axis::linear(MARKUP),
+                y: Axis::linear(MARKUP),
+                curves: vec![Curve {
+                    name: MARKUP.to_owned(),
+                    points: vec![point(1.0), point(2.0)],
+                }],
+            }
+            .draw()
+        };
+        for page in
+            ["demo.html", "eval.html", "look.html", "restore.html", "train.html", "view.html"]
+        {
+            let context = json!({
+                "title": MARKUP,
+                "about": MARKUP,
+                "documents": [{"title": MARKUP, "text": MARKUP}],
+                "frames": MARKUP,
+                "has_truth": true,
+                "lead": MARKUP,
+                "light": MARKUP,
+                "looks": [{"title": MARKUP, "table": table()}],
+                "made": [MARKUP],
+                "picture": "data:,",
+                "players": [player(), player()],
+                "plots": [plot()],
+                "quality": plot(),
+                "settings": MARKUP,
+                "summary": [MARKUP],
+                "table": table(),
+                "text": MARKUP,
+                "warnings": [MARKUP],
+            });
+            let rendered = render(page, context).unwrap_or_else(|e| panic!("{page}: {e:?}"));
+            assert_eq!(rendered.matches("<script").count(), 3, "{page}: two scenes and the player");
+            assert!(
+                !rendered.contains("<img src=x") && rendered.contains("&lt;img src=x"),
+                "{page}"
+            );
+        }
     }
 
     #[test]

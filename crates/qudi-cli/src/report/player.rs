@@ -218,7 +218,12 @@ pub(crate) fn colour_jpeg(planes: &[Frame; 3], quality: u8) -> Vec<u8> {
     let [red, green, blue] = planes.each_ref().map(samples);
     let pixels = red.into_iter().zip(green).zip(blue);
     let pixels: Vec<u8> = pixels.flat_map(|((red, green), blue)| [red, green, blue]).collect();
-    encoded(&pixels, planes[0].size, ColorType::Rgb, quality)
+    encoded_rgb(&pixels, planes[0].size, quality)
+}
+
+/// Encodes red, green and blue samples as a JPEG.
+pub(crate) fn encoded_rgb(samples: &[u8], size: Size, quality: u8) -> Vec<u8> {
+    encoded(samples, size, ColorType::Rgb, quality)
 }
 
 fn encoded(samples: &[u8], size: Size, colour: ColorType, quality: u8) -> Vec<u8> {

@@ -1,10 +1,10 @@
 //! The animated picture of `qudi demo --animate`: counts, the best classical method, QuDi and the truth, side
 //! by side, from the first frame to the last and back.
 
-use super::grid::{Grid, Pixels};
 use super::restored::{CENTRE, RestoredScene};
 use super::scenes::{FRAMES, SIZE};
 use crate::error::{CliError, Result};
+use crate::report::grid::{Grid, Pixels};
 use crate::report::player::counts_frame;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
@@ -81,7 +81,7 @@ fn panels(scene: &RestoredScene, t: usize, side: usize) -> Pixels {
 }
 
 /// Cuts out the middle of a frame.
-fn middle(frame: &Frame, side: usize) -> Frame {
+pub(super) fn middle(frame: &Frame, side: usize) -> Frame {
     let (top, left) = ((frame.size.height - side) / 2, (frame.size.width - side) / 2);
     let rows = (top..top + side).flat_map(|y| &frame.row(y)[left..left + side]);
     Frame { size: Size { height: side, width: side }, data: rows.copied().collect() }

@@ -17,6 +17,10 @@ pub(crate) struct Demo {
     /// (GIF, at most 2 MB)
     #[arg(long)]
     pub(crate) animate: bool,
+    /// Write a picture of what the diffusion draws as well, next to the other: one step, ten steps with two
+    /// draws of noise, the mean and the spread of eight, errors, truth (.jpg, at most 150 kB)
+    #[arg(long = "diffusion")]
+    pub(crate) with_diffusion: bool,
     /// Sensor: a name or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = "qudi-paper")]
     pub(crate) sensor: String,

@@ -1,8 +1,8 @@
 //! The picture of `qudi demo`: for every scene a row of frames, and a row of errors below it.
 
-use super::grid::Grid;
 use super::restored::{CENTRE, RestoredScene, rms};
 use super::scenes::{FRAMES, SIZE};
+use crate::report::grid::Grid;
 use crate::report::player::counts_frame;
 use qudi_core::Frame;
 

@@ -3,6 +3,7 @@
 
 use super::animation::gif;
 use super::args::Demo;
+use super::diffusion;
 use super::html::html;
 use super::picture::picture;
 use super::restored::{Contender, ExposedScene, RestoredScene, rms};
@@ -27,21 +28,28 @@ pub(crate) fn run(
 ) -> Result<()> {
     let path = demo.output.clone().unwrap_or_else(|| PathBuf::from("qudi-demo.png"));
     let page = path.with_extension("html");
-    if page == path {
-        let help = "name a .png; the page lies next to it";
-        return Err(CliError::new("the picture and the page are one file", path.display(), help));
+    let animation = demo.animate.then(|| path.with_extension("gif"));
+    let diffusion = demo.with_diffusion.then(|| path.with_extension("jpg"));
+    if [Some(&page), animation.as_ref(), diffusion.as_ref()].contains(&Some(&path)) {
+        let help = "name a .png; the other files lie next to it";
+        return Err(CliError::new("two of the files have this name", path.display(), help));
     }
     let overwrite =
         if global.force || demo.output.is_none() { Overwrite::Yes } else { Overwrite::No };
     let picture_file = Output::open(Some(&path), overwrite)?;
     let page_file = Output::open(Some(&page), overwrite)?;
-    let animation = demo.animate.then(|| path.with_extension("gif"));
     let animation_file = Output::open(animation.as_deref(), overwrite)?;
+    let diffusion_file = Output::open(diffusion.as_deref(), overwrite)?;
     let sensor = settings.sensor(&demo.sensor)?.as_read();
     let mut bar = report.bar();
-    let mut restored = Vec::new();
+    let (mut restored, mut sampled) = (Vec::new(), Vec::new());
     for scene in scenes()? {
         let exposed = ExposedScene::new(scene, &sensor, demo.ppp, demo.seed, &mut bar)?;
+        // The first scene is a photograph.
+        if demo.with_diffusion && sampled.is_empty() {
+            let options = demo.network.options(demo.steps.steps, &demo.given);
+            sampled = diffusion::picture(&exposed, &options, &mut bar)?;
+        }
         let contenders = contenders(demo, &exposed)?;
         restored.push(exposed.restore(contenders, &mut bar)?);
     }
@@ -61,11 +69,12 @@ pub(crate) fn run(
     if let Some(scene) = restored.first() {
         animation_file.write(|| gif(scene))?;
     }
+    diffusion_file.write(|| Ok(sampled))?;
     let text: String =
         restored.iter().map(|scene| scene.table().to_text() + &text(scene)).collect();
     let mut text = format!("{text}{}   {foot}\n{}\n", path.display(), page.display());
-    if let Some(animation) = &animation {
-        let _ = writeln!(text, "{}", animation.display());
+    for further in animation.iter().chain(&diffusion) {
+        let _ = writeln!(text, "{}", further.display());
     }
     report.result(&text, || {
         let scenes = restored.iter().map(|scene| {
@@ -76,6 +85,7 @@ pub(crate) fn run(
             "picture": path,
             "page": page,
             "animation": animation,
+            "diffusion": diffusion,
             "seed": demo.seed,
             "figures": scenes.collect::<serde_json::Map<_, _>>(),
         })

@@ -2,15 +2,17 @@
 
 use super::clip::stem;
 use super::exposing::{FRAMES, SEED};
-use super::html::{Pictures, cut, loop_frames};
+use super::html::{Pictures, loop_frames};
 use super::metrics::CHI_SQUARE;
 use super::plan::{Contender, Plan};
 use super::score::{FrameScore, Row, Score};
 use crate::capture::{CaptureAcquisition, Input, LightOverrides, Source, SummedCapture, remarks};
+use crate::commands::look::strip::strip;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
 use crate::report::Report;
+use crate::report::middle::cut;
 use crate::report::player::counts_frame;
 use crate::settings::Settings;
 use qudi_core::Frame;
@@ -83,7 +85,8 @@ pub(crate) fn evaluate_capture(
         counts.push(counts_frame(capture.size(), &read, acquisition.sensor.max_count()));
     }
     let mut pictures =
-        Pictures::new(clip.clone(), acquisition.ppp, shown.clone().collect(), &counts);
+        Pictures::new(clip.clone(), acquisition.ppp, shown.clone().collect(), &counts)
+            .with_strip(strip(capture.timeline(), capture.findings()));
     let mut rows = Vec::new();
     let mut bar = report.bar();
     for (n, contender) in plan.contenders.iter().enumerate() {

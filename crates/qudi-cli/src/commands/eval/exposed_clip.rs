@@ -2,7 +2,7 @@
 
 use super::args::External;
 use super::external::ExternalFrames;
-use super::html::{Pictures, cut};
+use super::html::Pictures;
 use super::metrics::{Compared, aligned, scaled};
 use super::perceptual::Perceptual;
 use super::plan::{Contender, Plan};
@@ -10,6 +10,7 @@ use super::score::{Added, Cost, FlowKind, FrameScore, Score};
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::memory::PeakMemory;
+use crate::report::middle::cut;
 use crate::report::player::counts_frame;
 use qudi_burst::motion::warping_error;
 use qudi_core::flow::Flow;

@@ -6,14 +6,12 @@ use super::table::summary;
 use crate::error::Result;
 use crate::report::Table;
 use crate::report::html::{TableView, render};
+use crate::report::middle::{cut, cut_size};
 use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, picture_url};
 use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
 use qudi_core::{Frame, Size};
 use serde::Serialize;
 use std::fmt::Write;
-
-/// Largest side of the pictures: they are cut to the middle.
-const CROP: usize = 224;
 
 /// Bytes of all pictures of a page, about.
 const PICTURES_BYTES: usize = 12_000_000;
@@ -39,6 +37,8 @@ pub(crate) struct Pictures {
     /// Restored frames by method.
     restored: Vec<(String, Vec<String>)>,
     captions: Vec<String>,
+    /// Light and change of a capture over time.
+    strip: Option<String>,
 }
 
 /// The context of the template.
@@ -66,14 +66,19 @@ impl Pictures {
     pub(crate) fn new(clip: String, ppp: f64, numbers: Vec<u64>, counts: &[Frame]) -> Self {
         let size = counts.first().map_or(Size { height: 1, width: 1 }, |counts| counts.size);
         let counts = counts.iter().map(|counts| counts_url(&cut(counts), QUALITY)).collect();
-        let (truth, restored, captions) = (None, Vec::new(), Vec::new());
-        Self { clip, ppp, size, numbers, counts, truth, restored, captions }
+        let (truth, restored, captions, strip) = (None, Vec::new(), Vec::new(), None);
+        Self { clip, ppp, size, numbers, counts, truth, restored, captions, strip }
     }
 
     /// Adds the truth of the shown frames.
     pub(crate) fn with_truth(self, truth: &[Frame]) -> Self {
         let truth = truth.iter().map(|truth| picture_url(&cut(truth), QUALITY)).collect();
         Self { truth: Some(truth), ..self }
+    }
+
+    /// Adds light and change of the capture over time.
+    pub(crate) fn with_strip(self, strip: Option<String>) -> Self {
+        Self { strip, ..self }
     }
 
     /// Adds the restored frames of a method, and takes them out of its score.
@@ -114,6 +119,7 @@ impl Pictures {
             (scene.left, scene.right) = (scene.right, scene.right + 1);
         }
         scene.notes.clone_from(&self.captions);
+        scene.strip.clone_from(&self.strip);
         scene.player()
     }
 }
@@ -122,19 +128,6 @@ impl Pictures {
 pub(crate) fn loop_frames(pictures: usize) -> usize {
     let fitting = PICTURES_BYTES / (PICTURE_BYTES * pictures.max(1));
     if fitting < MIN_LOOP_FRAMES { 1 } else { fitting.min(MAX_LOOP_FRAMES) }
-}
-
-/// Returns the size that [`cut`] cuts to.
-fn cut_size(size: Size) -> Size {
-    Size { height: size.height.min(CROP), width: size.width.min(CROP) }
-}
-
-/// Cuts a frame to its middle, which the page shows.
-pub(crate) fn cut(frame: &Frame) -> Frame {
-    let size = cut_size(frame.size);
-    let (top, left) = ((frame.size.height - size.height) / 2, (frame.size.width - size.width) / 2);
-    let rows = (top..top + size.height).flat_map(|y| &frame.row(y)[left..left + size.width]);
-    Frame { size, data: rows.copied().collect() }
 }
 
 /// Renders the page.
@@ -284,15 +277,5 @@ mod tests {
         assert_eq!(loop_frames(4), MAX_LOOP_FRAMES);
         assert_eq!(loop_frames(231), 3);
         assert_eq!(loop_frames(1000), 1);
-    }
-
-    #[test]
-    fn cuts_the_middle_and_keeps_small_frames_whole() {
-        let size = Size { height: 40, width: 300 };
-        let frame = Frame::from_fn(size, |x, _| x as f32 / 300.0);
-        let middle = cut(&frame);
-        assert_eq!(middle.size, Size { height: 40, width: 224 });
-        assert_eq!(middle.row(3)[0], frame.row(3)[38]);
-        assert_eq!(cut(&middle), middle);
     }
 }

@@ -1,29 +1,36 @@
 //! `qudi look`: an overview of a capture.
 
 use super::args::Look;
+use super::mosaic::{gray_world, interpolated};
+use super::shown::Shown;
 use super::strip::strip;
 use crate::args::given::Given;
 use crate::args::{Global, Network};
 use crate::capture::{
-    CaptureAcquisition, Input, LightOverrides, Source, SummedCapture, unknown_sensor, warnings,
+    AlignedCapture, CaptureAcquisition, Input, LightOverrides, Source, SummedCapture,
+    unknown_sensor, warnings,
 };
+use crate::colour::Rendering;
 use crate::commands::info::capture::describe;
 use crate::error::{CliError, Result};
 use crate::methods::default::default_method;
 use crate::places::default_look;
+use crate::report::grid::Grid;
 use crate::report::html::render;
-use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, counts_url, picture_url};
+use crate::report::player::{Kind, Layer, Player, QUALITY, Scene, colour_url, counts_url};
 use crate::report::{Output, Report, counted, duration};
 use crate::settings::Settings;
 use qudi_burst::{ColourRestorer, PostFilter, Qbp};
 use qudi_core::restorer::{Acquisition, BurstView, Restorer};
 use qudi_core::sensor::{Response, Sensor};
-use qudi_core::{Frame, linear_to_srgb};
-use qudi_io::capture::Capture;
+use qudi_core::{Frame, Size};
+use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::MaskChoice;
 use qudi_io::writer::Picture;
+use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// Sums of the window that one instant is restored from.
@@ -31,6 +38,10 @@ const WINDOW: u64 = 11;
 
 /// Bytes of frames that are judged, which takes less than a second.
 pub(crate) const JUDGED_BYTES: u64 = 1 << 30;
+
+/// Seconds from which on fewer pictures are suggested, and their number.
+const LONG_RUN: f64 = 60.0;
+const FEW_PICTURES: u64 = 10;
 
 /// Rough time in seconds for aligning and merging one instant, where methods take [`Method::cost`].
 ///
@@ -46,18 +57,7 @@ pub(crate) fn run(
     global: &Global,
     report: &Report,
 ) -> Result<()> {
-    let output = match &args.output {
-        Some(output) => output.clone(),
-        None => default_look(&args.capture),
-    };
-    let picture_only = match output.extension().map(|e| e.to_string_lossy().to_lowercase()) {
-        Some(extension) if extension == "html" => false,
-        Some(extension) if extension == "png" => true,
-        _ => {
-            let help = "use a name that ends in .html, or .png for the pictures alone";
-            return Err(CliError::new("a look is .html or .png", output.display(), help));
-        }
-    };
+    let (output, picture_only) = output(args)?;
     let file = Output::open(Some(&output), global.overwrite())?;
     let options = args.reading.options(MaskChoice::Auto);
     let source = Source {
@@ -78,7 +78,7 @@ pub(crate) fn run(
     let mut line = |value: &str| {
         let _ = writeln!(text, "restore    {value}");
     };
-    let mean = for_the_eye(summary.picture(&capture, sensor.as_ref(), gain));
+    let mean = summary.picture(&capture, sensor.as_ref(), gain);
     let unknown = sensor.is_none().then(|| unknown_sensor(&capture));
     let acquired = match sensor {
         Some(sensor) => CaptureAcquisition::new(&light, &mut capture, &sensor, &summary),
@@ -87,8 +87,12 @@ pub(crate) fn run(
             CaptureAcquisition::new(&light, &mut capture, &sensor, &summary)
         }),
     };
-    let mut picture = Picture::new(mean.size, 1, 2, 1);
-    picture.place(0, 0, &["MEAN"], &mean);
+    let acquisition = acquired.as_ref().ok().map(|acquired| &acquired.acquisition);
+    let rendering = rendering(&capture, &summary, acquisition);
+    let mean = match (capture.filter(), &rendering) {
+        (Some(filter), Some(rendering)) => Shown::colour(&interpolated(&mean, filter), rendering),
+        _ => Shown::gray(mean),
+    };
     let part = capture.longest_part();
     let (first, counts) = capture.in_part(&part, read_window)?;
     let first = first + part.start / u64::from(capture.summed());
@@ -96,14 +100,19 @@ pub(crate) fn run(
     let mut forecast = Value::Null;
     match acquired {
         Ok(CaptureAcquisition { acquisition, .. }) => {
-            let (instant, seconds) = timed_instant(&counts, &capture, &acquisition)?;
-            let instant = for_the_eye(instant.with_white_at_highlights());
-            picture.place(0, 1, &["ONE INSTANT"], &instant);
+            let colours = rendering.as_ref();
+            let (instant, seconds) = timed_instant(&counts, &capture, &acquisition, colours)?;
             restored = Some(instant);
             if let Some(CliError::Error { what, help, .. }) = unknown {
                 line(&not_yet(&what, help.as_deref()));
             } else {
-                let (words, document) = plan(&capture, &acquisition, seconds)?;
+                // What is bad was looked for already.
+                let source = Source { judged: 0, ..source };
+                let seen = match &sum {
+                    Some(_) => seen_acquisition(&source, settings, &capture, &acquisition)?,
+                    None => acquisition,
+                };
+                let (words, document) = plan(&capture, &seen, seconds)?;
                 line(&words);
                 forecast = document;
             }
@@ -112,18 +121,19 @@ pub(crate) fn run(
         Err(other) => return Err(other),
     }
     if picture_only {
-        file.write(|| Ok(picture.to_png()?))?;
+        file.write(|| png(capture.size(), &mean, restored.as_ref()))?;
     } else {
         file.write(|| {
             let pictures = Pictures {
+                capture: &capture,
                 mean: &mean,
                 instant: restored.as_ref(),
                 counts: &counts,
-                strip: strip(capture.timeline(), capture.findings()),
+                rendering: rendering.as_ref(),
             };
             let context = json!({
                 "title": args.capture.display().to_string(),
-                "players": [pictures.player(first, capture.frames(), summary.sampled)],
+                "players": [pictures.player(first, summary.sampled)],
                 "text": text,
             });
             render("look.html", context)
@@ -142,6 +152,32 @@ pub(crate) fn run(
             "findings": capture.findings(),
             "restore": forecast,
         })
+    })
+}
+
+/// Returns the file that is written, and whether it holds the pictures alone.
+fn output(args: &Look) -> Result<(PathBuf, bool)> {
+    let output = args.output.clone().unwrap_or_else(|| default_look(&args.capture));
+    match output.extension().map(|e| e.to_string_lossy().to_lowercase()).as_deref() {
+        Some("html") => Ok((output, false)),
+        Some("png") => Ok((output, true)),
+        _ => {
+            let help = "use a name that ends in .html, or .png for the pictures alone";
+            Err(CliError::new("a look is .html or .png", output.display(), help))
+        }
+    }
+}
+
+/// Returns the rendering of the colours of a mosaic; `acquisition` is none where the light is unknown.
+fn rendering(
+    capture: &Capture,
+    summary: &Summary,
+    acquisition: Option<&Acquisition>,
+) -> Option<Rendering> {
+    capture.filter()?;
+    Some(match acquisition {
+        Some(acquisition) => Rendering::new(None, capture, summary, acquisition),
+        None => gray_world(summary.colours),
     })
 }
 
@@ -178,11 +214,12 @@ fn timed_instant(
     frames: &[Vec<u16>],
     capture: &Capture,
     acquisition: &Acquisition,
-) -> Result<(Frame, f64)> {
+    rendering: Option<&Rendering>,
+) -> Result<(Shown, f64)> {
     let mut seconds = f64::INFINITY;
     loop {
         let start = Instant::now();
-        let instant = restore_instant(frames, capture, acquisition)?;
+        let instant = restore_instant(frames, capture, acquisition, rendering)?;
         let own = start.elapsed().as_secs_f64();
         if seconds.is_finite() || own > LONG_INSTANT {
             return Ok((instant, seconds.min(own)));
@@ -196,62 +233,116 @@ fn restore_instant(
     frames: &[Vec<u16>],
     capture: &Capture,
     acquisition: &Acquisition,
-) -> Result<Frame> {
+    rendering: Option<&Rendering>,
+) -> Result<Shown> {
     let view = BurstView { size: capture.size(), frames };
     let mut method: Box<dyn Restorer> = Box::new(Qbp::new(PostFilter::Bm3d));
     if let Some(filter) = capture.filter() {
-        method = Box::new(ColourRestorer::new(method, filter.clone(), false));
+        method = Box::new(ColourRestorer::new(method, filter.clone(), true));
     }
-    Ok(method.restore_frames(view, acquisition, &[frames.len() / 2])?.frames.swap_remove(0))
+    let mut restored = method.restore_frames(view, acquisition, &[frames.len() / 2])?;
+    Ok(match (&restored.colour, rendering) {
+        (Some(colour), Some(rendering)) => Shown::colour(&colour[0], rendering),
+        _ => Shown::gray(restored.frames.swap_remove(0).with_white_at_highlights()),
+    })
+}
+
+/// Encodes the mean next to one instant.
+fn png(size: Size, mean: &Shown, instant: Option<&Shown>) -> Result<Vec<u8>> {
+    let list = [Some(("MEAN", mean)), instant.map(|instant| ("ONE INSTANT", instant))];
+    let list = (0..).zip(list.into_iter().flatten());
+    if let Shown::Colour(_) = mean {
+        let mut grid = Grid::new(size, 1, 2, 1);
+        for (column, (label, shown)) in list {
+            grid.place(0, column, &[label], shown.planes());
+        }
+        return grid.png();
+    }
+    let mut picture = Picture::new(size, 1, 2, 1);
+    for (column, (label, shown)) in list {
+        picture.place(0, column, &[label], shown.planes()[0]);
+    }
+    Ok(picture.to_png()?)
 }
 
 /// The pictures of the page.
 struct Pictures<'a> {
-    mean: &'a Frame,
+    capture: &'a Capture,
+    mean: &'a Shown,
     /// One instant, where the light is known.
-    instant: Option<&'a Frame>,
+    instant: Option<&'a Shown>,
     /// The sums that the instant is made of.
     counts: &'a [Vec<u16>],
-    /// Light and change over time.
-    strip: Option<String>,
+    /// Rendering of colours, of a mosaic.
+    rendering: Option<&'a Rendering>,
 }
 
 impl Pictures<'_> {
-    /// Returns the pictures as the template plays them; `first` is the number of the first sum of the
-    /// capture's `total`, and `averaged` the number of frames in the mean.
-    fn player(&self, first: u64, total: u64, averaged: u64) -> Player {
-        let (size, frames) = (self.mean.size, self.counts.len());
+    /// Returns the pictures as the template plays them; `first` is the number of the first sum, and
+    /// `averaged` the number of frames in the mean.
+    fn player(&self, first: u64, averaged: u64) -> Player {
+        let (size, frames) = (self.capture.size(), self.counts.len());
         let brightest = self.counts.iter().flatten().copied().max().unwrap_or(0);
         let full = f32::from(brightest.max(1));
         let gray = |counts: &Vec<u16>| Frame {
             size,
             data: counts.iter().map(|&count| f32::from(count) / full).collect(),
         };
-        let counts = self.counts.iter().map(|counts| counts_url(&gray(counts), QUALITY));
+        let colours = self.capture.filter().zip(self.rendering);
+        let url = |counts: &Vec<u16>| match colours {
+            Some((filter, rendering)) => {
+                colour_url(&rendering.rendered(&interpolated(&gray(counts), filter)), QUALITY)
+            }
+            None => counts_url(&gray(counts), QUALITY),
+        };
+        let counts = self.counts.par_iter().map(url);
         let mut scene = Scene::new("Mean, counts, one instant", size, frames as u64);
-        scene.caption = vec![format!(
+        scene.notes = vec![format!(
             "The mean of {averaged} frames, response inverted, bad pixels repaired; {frames} sums around the middle \
              of the capture; and one instant, for which these are aligned and merged. Mean and instant are brightened \
              for the eye (sRGB), white at the 99.5th percentile."
         )];
+        if let Some(rendering) = self.rendering {
+            scene.notes.push(format!(
+                "Colours of mean and counts are interpolated from the pixels that see them, and balanced: {}.",
+                rendering.describe()
+            ));
+        }
         let numbers = first..first + frames as u64;
         scene.numbers = Some(numbers.collect());
-        scene.total = Some(total);
+        scene.total = Some(self.capture.frames());
         scene.layers = vec![
-            Layer::new("mean", Kind::Restored, vec![picture_url(self.mean, QUALITY)]),
+            Layer::new("mean", Kind::Restored, vec![self.mean.url()]),
             Layer::new("counts", Kind::Counts, counts.collect()),
         ];
         if let Some(instant) = self.instant {
-            let frames = vec![picture_url(instant, QUALITY)];
-            scene.layers.push(Layer::new("one instant", Kind::Restored, frames));
+            scene.layers.push(Layer::new("one instant", Kind::Restored, vec![instant.url()]));
         }
         scene.right = scene.layers.len() - 1;
-        scene.strip.clone_from(&self.strip);
+        scene.strip = strip(self.capture.timeline(), self.capture.findings());
         scene.player()
     }
 }
 
-/// Describes what `qudi restore` would do, and about how long that takes.
+/// Returns the acquisition that the default method sees: of aligned sums, where plain ones are kept short.
+fn seen_acquisition(
+    source: &Source<'_>,
+    settings: &Settings,
+    capture: &Capture,
+    acquisition: &Acquisition,
+) -> Result<Acquisition> {
+    let summed = SummedCapture::new(source.open(settings)?, source)?;
+    let sensor = summed.required_sensor()?;
+    let aligned = AlignedCapture::new(summed, source, &sensor, None, None)?;
+    let Some(alignment) = aligned.alignment else { return Ok(acquisition.clone()) };
+    let mut seen = acquisition.clone();
+    let ratio = alignment.native_frames() as f64 / f64::from(capture.summed());
+    seen.ppp *= ratio;
+    seen.sensor.frames_summed = (f64::from(seen.sensor.frames_summed) * ratio).round() as u32;
+    Ok(seen)
+}
+
+/// Describes what `qudi restore` would do with frames like `acquisition`, and about how long that takes.
 fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(String, Value)> {
     let usual =
         default_method(&Network::default().options(None, &Given::default()), capture, acquisition)?;
@@ -260,19 +351,18 @@ fn plan(capture: &Capture, acquisition: &Acquisition, seconds: f64) -> Result<(S
     let time = duration(total);
     let reason = usual.reason.map_or(String::new(), |reason| format!(" ({reason})"));
     let sensor = &acquisition.sensor.name;
+    let few = if total > LONG_RUN && pictures > 2 * FEW_PICTURES {
+        let every = pictures * u64::from(capture.summed()) / FEW_PICTURES;
+        let time = duration(total * FEW_PICTURES as f64 / pictures as f64);
+        format!("--every {every} makes {FEW_PICTURES}, in about {time}")
+    } else {
+        "--every N makes fewer".to_owned()
+    };
     let words = format!(
-        "`qudi restore` makes {} by {}{reason}, sensor {sensor}, in about {time}; --every N makes fewer",
+        "`qudi restore` makes {} by {}{reason}, sensor {sensor}, in about {time}; {few}",
         counted(pictures, "picture"),
         usual.method.name
     );
     let document = json!({"method": usual.method.name, "pictures": pictures, "seconds": total});
     Ok((words, document))
-}
-
-/// Applies the tone curve of screens.
-fn for_the_eye(mut frame: Frame) -> Frame {
-    for value in &mut frame.data {
-        *value = linear_to_srgb(*value);
-    }
-    frame
 }

@@ -81,7 +81,8 @@ pub(crate) struct Restore {
     #[arg(long)]
     pub(crate) float: bool,
     /// CAPTURE is a set of the Single Photon Challenge (SCENE/FRAME.npy), OUT the .zip that its site takes:
-    /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there
+    /// the last picture of every cube in colour, scored where SCENE/FRAME.png is there. Killed, it goes on
+    /// after the last finished picture
     #[arg(long, conflicts_with_all = [
         "sensor", "ppp", "gain", "mean_level", "overlap", "every", "gray", "wb", "tonemap", "fps", "shard", "float",
         "chi_map", "side_by_side", "html", "uncertainty", "format", "bitorder", "pack_axis", "size", "orient",
@@ -89,6 +90,10 @@ pub(crate) struct Restore {
         "frames_per_file", "start", "end", "crop", "mask", "dcr", "lenient",
     ])]
     pub(crate) challenge: bool,
+    /// With --challenge: score LPIPS as well, as the site does, with the weights of AlexNet in this folder
+    /// (docs/training.md says how to get them)
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, requires = "challenge")]
+    pub(crate) backbones: Option<PathBuf>,
     /// Write the misfit of every pixel: chi-square of the counts given the result, .npy or .png
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) chi_map: Option<PathBuf>,

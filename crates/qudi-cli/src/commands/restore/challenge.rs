@@ -6,27 +6,31 @@
 //! binary sensor.
 
 mod cube;
+mod perceptual;
+mod progress;
 mod scores;
 mod submission;
 
 use super::args::Restore;
 use super::plan::Plan;
-use super::run::Job;
+use super::run::{Job, network_settings};
 use crate::args::{Global, Sum};
 use crate::capture::{Input, Source};
 use crate::error::{CliError, Result};
 use crate::interrupt;
-use crate::report::Report;
+use crate::methods::{Method, QUDI};
+use crate::report::{Report, counted};
 use crate::settings::Settings;
 use cube::{COLOURS, Cube};
 use image::{Rgb, RgbImage};
+use perceptual::Perceptual;
+use progress::Progress;
 use qudi_core::{Frame, linear_to_srgb};
 use qudi_io::capture::Capture;
 use qudi_io::description::{BitOrder, MaskChoice, PackAxis, ReadOptions};
 use qudi_io::restore::RestoreSink;
 use scores::Score;
-use serde_json::json;
-use std::collections::BTreeSet;
+use serde_json::{Value, json};
 use std::path::Path;
 use std::rc::Rc;
 use submission::{MAX_BYTES, Submission};
@@ -50,27 +54,50 @@ pub(super) fn run(
     plan.sensor = Some(SENSOR.to_owned());
     plan.light.white = Some(WHITE);
     let cubes = Cube::find(&plan.capture)?;
+    let perceptual = args.backbones.as_deref();
+    let perceptual =
+        perceptual.map(|folder| Perceptual::load(folder, &plan.network.device)).transpose()?;
     let mut archive = Submission::create(Path::new(&plan.output), plan.overwrite)?;
-    let (mut scores, mut methods, mut bar) = (Vec::new(), BTreeSet::new(), report.bar());
-    for (done, cube) in (0..).zip(&cubes) {
-        bar.update("restoring", done, Some(cubes.len() as u64));
+    let mut progress = Progress::open(
+        Path::new(&plan.output),
+        &plan.capture,
+        &cubes,
+        run_settings(&plan, &cubes)?,
+        plan.overwrite,
+    )?;
+    let (mut scores, mut bar) = (Vec::new(), report.bar());
+    let resumed = progress.finished();
+    for (number, cube) in cubes.iter().enumerate() {
+        bar.update("restoring", number as u64, Some(cubes.len() as u64));
         let truth = cube.truth()?;
-        let picture = restored(cube, &mut plan, settings, &mut methods)?;
+        let picture = if number < resumed {
+            progress.read(number, cube.size())?
+        } else {
+            let (picture, method) = restored(cube, &mut plan, settings)?;
+            progress.push(number, &picture, method)?;
+            picture
+        };
         archive.add(&cube.name, &picture)?;
-        scores.extend(truth.map(|truth| Score::new(&cube.name, &picture, &truth)));
+        if let Some(truth) = truth {
+            scores.push(Score::new(&cube.name, &picture, &truth, perceptual.as_ref())?);
+        }
         if interrupt::check().is_break() {
             return Err(CliError::Interrupted);
         }
     }
     drop(bar);
     let bytes = archive.finish()?;
+    let methods: Vec<String> = progress.methods.iter().cloned().collect();
+    progress.remove();
     if bytes > MAX_BYTES {
         report.warning(&format!("{bytes} bytes: the site takes at most {MAX_BYTES}"));
     }
-    let methods: Vec<_> = methods.into_iter().collect();
-    let (count, method) = (cubes.len(), methods.join(", "));
-    let noun = if count == 1 { "picture" } else { "pictures" };
-    let mut text = format!("{}   {count} {noun} by {method}\n", plan.output);
+    let made = counted(cubes.len() as u64, "picture");
+    let mut text = format!("{}   {made} by {}\n", plan.output, methods.join(", "));
+    if resumed > 0 {
+        text +=
+            &format!("  {:<12}{} there already\n", "resumed", counted(resumed as u64, "picture"));
+    }
     if !scores.is_empty() {
         text += &format!("  {:<12}of {} of them\n", "truth", scores.len());
     }
@@ -80,23 +107,39 @@ pub(super) fn run(
             "output": plan.output,
             "pictures": cubes.iter().map(|cube| format!("{}.png", cube.name)).collect::<Vec<_>>(),
             "methods": methods,
+            "resumed_pictures": resumed,
             "bytes": bytes,
             "scores": scores::document(&scores),
         })
     })
 }
 
-/// Restores the picture of a cube, colour by colour. The first colour that is not dark decides the method,
-/// and the sums where they are not aligned.
+/// Returns the settings that the pictures depend on.
+fn run_settings(plan: &Plan, cubes: &[Cube]) -> Result<Value> {
+    let network: Option<&Method> = plan.method.or(Method::by_name(QUDI.name));
+    let network = network.map(|method| network_settings(method, &plan.network)).transpose()?;
+    Ok(json!({
+        "pictures": cubes.iter().map(|cube| &cube.name).collect::<Vec<_>>(),
+        "sensor": SENSOR,
+        "white": WHITE,
+        "method": plan.method.map(|method| method.name),
+        "network": network,
+        "sum": plan.sum.map(|sum| format!("{sum:?}")),
+        "seed": plan.light.seed,
+        "overlap": plan.overlap,
+    }))
+}
+
+/// Restores the picture of a cube, colour by colour, and returns it with its method; none for a dark one. The
+/// first colour that is not dark decides the method, and the sums where they are not aligned.
 fn restored(
     cube: &Cube,
     plan: &mut Plan,
     settings: &Settings,
-    methods: &mut BTreeSet<String>,
-) -> Result<RgbImage> {
+) -> Result<(RgbImage, Option<String>)> {
     let given = (plan.method, plan.sum);
     let mut planes = [const { None }; COLOURS];
-    let mut is_decided = false;
+    let mut decided = None;
     for colour in ORDER {
         if cube.is_dark(colour)? {
             continue;
@@ -115,9 +158,8 @@ fn restored(
         let mut sink = First(None);
         job.run(0..1, &mut sink, &plan.network, &silent())?;
         planes[colour] = sink.0;
-        if !is_decided {
-            is_decided = true;
-            methods.insert(job.method_text());
+        if decided.is_none() {
+            decided = Some(job.method_text());
             (plan.method, plan.sum) =
                 (Some(job.method), job.plain_sum().map(Sum::Frames).or(plan.sum));
         }
@@ -128,10 +170,11 @@ fn restored(
         let value = plane.as_ref().map_or(0.0, |plane| plane.data[at]);
         (255.0 * linear_to_srgb(value.clamp(0.0, 1.0))).round() as u8
     };
-    Ok(RgbImage::from_fn(size.width as u32, size.height as u32, |x, y| {
+    let picture = RgbImage::from_fn(size.width as u32, size.height as u32, |x, y| {
         let at = y as usize * size.width + x as usize;
         Rgb([0, 1, 2].map(|colour: usize| sample(&planes[colour], at)))
-    }))
+    });
+    Ok((picture, decided))
 }
 
 /// Returns a colour of a cube as a capture that the plan reads.

@@ -60,8 +60,9 @@ pub(crate) fn run(
     }
     let settings = job.settings(&plan)?;
     let run = job.folder_run(&plan, &settings)?;
-    let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
+    // Where the page cannot be written, no folder of frames is begun.
     let page_file = PageFile::open(plan.html.as_deref(), plan.overwrite)?;
+    let mut output = Output::open(&plan, job.capture(), job.rendering.clone(), run)?;
     let start = Instant::now();
     // A pipe may not say how many frames come.
     let known = job.schedule.instants.pictures(job.capture());
@@ -455,7 +456,7 @@ fn sensor_fps(acquisition: &Acquisition) -> Option<f64> {
 }
 
 /// Returns the settings of the network on which the frames depend, if the method is a network.
-fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<Value>> {
+pub(super) fn network_settings(method: &Method, options: &NetworkOptions) -> Result<Option<Value>> {
     Ok(match method.kind {
         Kind::Classical(_) => None,
         Kind::Learned { method, .. } => {

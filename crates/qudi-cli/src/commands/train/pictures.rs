@@ -9,10 +9,10 @@ use qudi_train::ValidationClip;
 pub(crate) fn strip(clips: &[ValidationClip]) -> Picture {
     let first = clips.first().map_or(0.0, |clip| clip.ppp);
     let clips: Vec<_> = clips.iter().filter(|clip| clip.ppp == first).collect();
-    let size = clips[0].strip[0].size;
+    let size = clips[0].middle()[0].size;
     let mut picture = Picture::new(size, clips.len(), 3, 2);
     for (row, clip) in clips.iter().enumerate() {
-        let [counts, restored, truth] = &clip.strip;
+        let [counts, restored, truth] = clip.middle();
         // As measured: after the best gain, since counts do not tell the exposure.
         let gain = best_gain(restored, truth) as f32;
         let shown = Frame { size, data: restored.data.iter().map(|value| value * gain).collect() };

@@ -1,7 +1,9 @@
-//! The page of a training run: curves, the last pictures, recipe, environment.
+//! The page of a training run: curves, the last validation as loops and as pictures, recipe, environment.
 
+use super::loops::Loop;
 use crate::error::Result;
 use crate::report::html::{TableView, data_url, render};
+use crate::report::player::Player;
 use crate::report::svg::{Axis, Curve, Drawing, Plot, Point};
 use crate::report::{Cell, Column, Table};
 use serde::Serialize;
@@ -46,6 +48,8 @@ pub(crate) struct Source<'a> {
     pub(crate) environment: &'a str,
     /// The last validation's PNG.
     pub(crate) picture: Option<&'a [u8]>,
+    /// The last validation's loops.
+    pub(crate) loops: Vec<Loop>,
 }
 
 /// The context of the template.
@@ -53,6 +57,9 @@ pub(crate) struct Source<'a> {
 struct Page<'a> {
     title: &'a str,
     summary: Vec<String>,
+    /// Quality over the steps, next to the loops.
+    quality: Option<Drawing>,
+    players: Vec<Player>,
     plots: Vec<Drawing>,
     table: Option<TableView>,
     picture: Option<String>,
@@ -68,7 +75,7 @@ struct Document<'a> {
 }
 
 /// Renders the page.
-pub(crate) fn page(source: &Source<'_>) -> Result<String> {
+pub(crate) fn page(source: Source<'_>) -> Result<String> {
     let lines = source.metrics.lines();
     let lines: Vec<Value> = lines.filter_map(|line| serde_json::from_str(line).ok()).collect();
     let of_kind = |kind: &str| lines.iter().filter(|line| line["kind"] == kind).collect();
@@ -78,6 +85,8 @@ pub(crate) fn page(source: &Source<'_>) -> Result<String> {
         Page {
             title: "Training run",
             summary: summary(&steps),
+            quality: psnr(&validations).draw(),
+            players: source.loops.into_iter().map(Loop::player).collect(),
             plots: plots(&steps, &validations).iter().filter_map(Plot::draw).collect(),
             table: validations.last().map(|last| TableView::from(&clips(last))),
             picture: source.picture.map(|png| data_url("png", png)),
@@ -117,15 +126,23 @@ fn made(recipe: &str) -> String {
     }
 }
 
+/// Creates a plot over the steps.
+fn plot(title: &str, caption: &str, y: Axis, curves: Vec<Curve>) -> Plot {
+    let (title, caption) = (title.to_owned(), caption.to_owned());
+    Plot { title, caption, x: Axis::linear("step"), y, curves }
+}
+
+/// Plots the quality of validations.
+fn psnr(validations: &[&Value]) -> Plot {
+    plot(
+        "Validation: PSNR",
+        "PSNR after the best gain, mean over validation clips, at each light level. Higher is better.",
+        Axis::linear("dB"),
+        quality(validations, "psnr_a"),
+    )
+}
+
 fn plots(steps: &[&Value], validations: &[&Value]) -> Vec<Plot> {
-    let step_axis = || Axis::linear("step");
-    let plot = |title: &str, caption: &str, y: Axis, curves: Vec<Curve>| Plot {
-        title: title.to_owned(),
-        caption: caption.to_owned(),
-        x: step_axis(),
-        y,
-        curves,
-    };
     // With predicted uncertainty, whose term is a logarithm, the total may be negative.
     let on_log_axis = |curve: &Curve| {
         curve.points.iter().all(|p| p.y >= 0.0) && curve.points.iter().any(|p| p.y > 0.0)
@@ -147,12 +164,6 @@ fn plots(steps: &[&Value], validations: &[&Value]) -> Vec<Plot> {
             vec![uncertainty],
         ));
     }
-    plots.push(plot(
-        "Validation: PSNR",
-        "PSNR after the best gain, mean over validation clips, at each light level. Higher is better.",
-        Axis::linear("dB"),
-        quality(validations, "psnr_a"),
-    ));
     plots.push(plot(
         "Validation: SSIM",
         "Structural similarity, mean over validation clips, at each light level. Higher is better.",
@@ -252,9 +263,14 @@ mod tests {
 not json
 ";
 
+    /// A loop whose clip is named like markup.
+    const LOOPS: &str = r#"[{"clip": "</script><b>dog", "ppp": 3.25, "step": 2, "psnr_a": 21.5, "height": 8,
+        "width": 8, "counts": ["data:,\"><script>"], "restored": ["data:,r"], "truth": ["data:,t"]}]"#;
+
     fn made_of(metrics: &str, recipe: &str) -> String {
-        let source = Source { metrics, recipe, environment: "{}", picture: Some(b"png") };
-        page(&source).unwrap_or_else(|e| panic!("{e:?}"))
+        let loops = serde_json::from_str(LOOPS).unwrap_or_else(|e| panic!("{e}"));
+        page(Source { metrics, recipe, environment: "{}", picture: Some(b"png"), loops })
+            .unwrap_or_else(|e| panic!("{e:?}"))
     }
 
     #[test]
@@ -268,9 +284,15 @@ not json
             "&lt;dog&gt;",
             "21.50",
             "Restored by diffusion in 4 steps.",
+            "&lt;&#x2f;script&gt;&lt;b&gt;dog, 3.25 photons",
+            "After 2 steps: PSNR 21.50 dB",
+            r#"data:,\"\u003e\u003cscript\u003e"#,
         ] {
             assert!(page.contains(part), "{part}");
         }
+        assert_eq!(page.matches("<script").count(), 2, "ours: the data and the player");
+        let [curve, loops] = ["Validation: PSNR", "class=\"player\""].map(|part| page.find(part));
+        assert!(curve < loops && loops < page.find("<h2>Loss"), "next to their curve");
     }
 
     #[test]

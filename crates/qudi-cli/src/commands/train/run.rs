@@ -24,7 +24,7 @@ use qudi_model::regression::Regression;
 use qudi_model::window::Window;
 use qudi_train::dataset::Pack;
 use qudi_train::loss::lpips::Lpips;
-use qudi_train::{From, Learner, NetworkRecipe, Origin, Run, Validation, WEIGHTS, draw_bursts};
+use qudi_train::{From, Learner, NetworkRecipe, Origin, Run, WEIGHTS, draw_bursts};
 use serde_json::json;
 use std::path::Path;
 
@@ -163,7 +163,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     }
     write_report(folder)?;
     let weights = folder.join(WEIGHTS);
-    let means = last.as_ref().map(Validation::means).unwrap_or_default();
+    let means = last.unwrap_or_default();
     let quality: Vec<_> = means
         .iter()
         .map(|(ppp, [psnr_a, psnr, ssim])| {

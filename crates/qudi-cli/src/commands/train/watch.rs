@@ -1,6 +1,7 @@
 //! Watching a run: progress, pictures, report.
 
 use super::environment::ENVIRONMENT;
+use super::loops::{Loop, loops};
 use super::pictures::strip;
 use super::report::{Source, page};
 use crate::error::{CliError, Result};
@@ -8,6 +9,8 @@ use crate::interrupt;
 use crate::report::{Bar, Report};
 use qudi_core::Error;
 use qudi_core::atomic_file::{Overwrite, PendingFile};
+use qudi_core::limits::RECORD_BYTES;
+use qudi_core::regular_file::read_limited;
 use qudi_train::{Event, METRICS, RECIPE, Recipe, StepReport, Validation};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -15,6 +18,9 @@ use std::time::Instant;
 
 /// Folder of pictures in a run's folder.
 pub(super) const SAMPLES: &str = "samples";
+
+/// Loops of the last validation, in the folder of pictures.
+const LOOPS: &str = "loops.json";
 
 /// Name of the report.
 pub(super) const REPORT: &str = "report.html";
@@ -27,6 +33,9 @@ pub(crate) fn quality_text(means: &[(f64, [f64; 3])]) -> String {
     means.iter().map(one).collect::<Vec<_>>().join("; ")
 }
 
+/// Means of psnr-a, PSNR and SSIM at every light level.
+pub(crate) type Means = Vec<(f64, [f64; 3])>;
+
 /// Shows a run's progress and writes its pictures.
 pub(crate) struct Watch<'a> {
     report: &'a Report,
@@ -38,7 +47,8 @@ pub(crate) struct Watch<'a> {
     taken: u64,
     /// Moving average of the loss.
     loss: Option<f64>,
-    last: Option<Validation>,
+    /// Means of the last validation.
+    last: Option<Means>,
     error: Option<CliError>,
     /// The time to stop.
     end: Option<Instant>,
@@ -98,8 +108,8 @@ impl<'a> Watch<'a> {
         self.bar.learning(text, step.step, self.steps);
     }
 
-    /// Returns the last validation, or the error of watching.
-    pub(crate) fn finish(self) -> Result<Option<Validation>> {
+    /// Returns the means of the last validation, or the error of watching.
+    pub(crate) fn finish(self) -> Result<Option<Means>> {
         match self.error {
             Some(error) => Err(error),
             None => Ok(self.last),
@@ -117,12 +127,14 @@ impl<'a> Watch<'a> {
             quality_text(&validation.means())
         );
         self.bar.above(&text, self.report);
-        self.last = Some(validation.clone());
+        self.last = Some(validation.means());
         let folder = self.folder.join(SAMPLES);
         let made = std::fs::create_dir_all(&folder);
         made.map_err(|e| Error::io("make the folder of pictures", &folder, e))?;
         let name = format!("step-{:07}.png", validation.step);
         strip(&validation.clips).save(&folder.join(name), Overwrite::Yes)?;
+        let loops = serde_json::to_string(&loops(validation)).unwrap_or_default();
+        write(&folder, LOOPS, loops.as_bytes())?;
         write_report(self.folder)
     }
 }
@@ -138,14 +150,21 @@ pub(crate) fn write_report(folder: &Path) -> Result<()> {
         let path = folder.join(name);
         std::fs::read_to_string(&path).map_err(|e| Error::io("read the run", &path, e))
     };
-    let pictures = std::fs::read_dir(folder.join(SAMPLES)).into_iter().flatten().flatten();
-    let last: Option<PathBuf> = pictures.map(|entry| entry.path()).max();
+    let samples = folder.join(SAMPLES);
+    let pictures = std::fs::read_dir(&samples).into_iter().flatten().flatten();
+    let pictures = pictures.map(|entry| entry.path());
+    let last: Option<PathBuf> =
+        pictures.filter(|path| path.extension().is_some_and(|kind| kind == "png")).max();
     let picture = last.and_then(|path| std::fs::read(path).ok());
-    let text = page(&Source {
+    // A page without loops is better than none.
+    let loops = read_limited(&samples.join(LOOPS), RECORD_BYTES, "read the loops").ok();
+    let loops = loops.and_then(|text| serde_json::from_slice::<Vec<Loop>>(&text).ok());
+    let text = page(Source {
         metrics: &read(METRICS)?,
         recipe: &read(RECIPE)?,
         environment: &read(ENVIRONMENT)?,
         picture: picture.as_deref(),
+        loops: loops.unwrap_or_default(),
     })?;
     write(folder, REPORT, text.as_bytes())
 }

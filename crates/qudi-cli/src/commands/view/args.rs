@@ -58,6 +58,7 @@ impl View {
             gray: false,
             wb: None,
             challenge: false,
+            backbones: None,
             overlap: 3,
             every: None,
             tonemap: None,

@@ -1,7 +1,7 @@
 //! The distances and their gradients against the authors' LPIPS (tests/golden/generate/perceptual.py).
 #![allow(clippy::unwrap_used)]
 
-use super::{Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
+use super::{Input, Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
 use crate::cases::uniform;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
@@ -33,14 +33,16 @@ fn weights(net: &str, name: &str, shape: &[usize]) -> Vec<f32> {
 /// Returns the distances with the reference's weights, made once on flex: VGG16's take a while.
 fn lpips(name: &str) -> Lpips {
     static ALL: OnceLock<Vec<Lpips>> = OnceLock::new();
-    let all = ALL.get_or_init(|| NETS.map(|(name, net)| make(name, net, &Device::flex())).into());
+    let all = ALL.get_or_init(|| {
+        NETS.map(|(name, net)| make(name, net, Input::Gray, &Device::flex())).into()
+    });
     let at = NETS.iter().position(|net| net.0 == name).unwrap();
     all[at].clone()
 }
 
-fn make(name: &str, net: Net, device: &Device) -> Lpips {
+fn make(name: &str, net: Net, input: Input, device: &Device) -> Lpips {
     let mut weights = |weight: &str, shape: &[usize]| Ok(weights(name, weight, shape));
-    Lpips::new(net, &mut weights, device).unwrap()
+    Lpips::new(net, input, &mut weights, device).unwrap()
 }
 
 /// The golden file.
@@ -131,7 +133,28 @@ fn gradients_in_sixteen_bits_point_the_same_way() {
 fn distances_on_ndarray_match_reference() {
     #[allow(deprecated)] // asked for by name
     let device = Device::ndarray();
-    distances_agree("alex", &make("alex", Net::Alex, &device), &device);
+    distances_agree("alex", &make("alex", Net::Alex, Input::Gray, &device), &device);
+}
+
+/// Red, green and blue are planes of the golden images, not scaled: as torchmetrics passes them by default.
+#[test]
+fn distances_of_colours_match_reference() {
+    let (golden, device) = (Golden::open(), Device::flex());
+    let (p, q) = (golden.image("p", &device), golden.image("q", &device));
+    let plane = |images: &Tensor<4>, n: usize| images.clone().narrow(0, n, 1);
+    let first = Tensor::cat(vec![plane(&p, 0), plane(&p, 1), plane(&q, 0)], 1);
+    let second = Tensor::cat(vec![plane(&q, 0), plane(&p, 1), plane(&q, 1)], 1);
+    let lpips = make("alex", Net::Alex, Input::Colour, &device);
+    let got = read(lpips.distances(first, second)).unwrap()[0];
+    let expected = golden.values("lpips-alex/colour")[0];
+    assert!((got / expected - 1.0).abs() < 1e-4, "{got}, reference {expected}");
+    // Three equal planes in [-1, 1] are gray.
+    let [p3, q3] = [&p, &q].map(|gray| Tensor::cat(vec![gray.clone() * 2.0 - 1.0; 3], 1));
+    let colour = read(lpips.distances(p3, q3)).unwrap();
+    let gray = read(self::lpips("alex").distances(p, q)).unwrap();
+    for (colour, gray) in colour.iter().zip(gray) {
+        assert!((colour / gray - 1.0).abs() < 1e-4, "{colour} {gray}");
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Colour frames side by side under labels: a grid for each of red, green and blue.
 
+use super::player::encoded_rgb;
 use crate::error::{CliError, Result};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -7,22 +8,22 @@ use qudi_core::{Frame, Size};
 use qudi_io::writer::Picture;
 
 /// A grid of equally large colour frames with lines of text above each.
-pub(super) struct Grid([Picture; 3]);
+pub(crate) struct Grid([Picture; 3]);
 
 /// Red, green and blue of every pixel.
-pub(super) struct Pixels {
-    pub(super) size: Size,
-    pub(super) rgb: Vec<u8>,
+pub(crate) struct Pixels {
+    pub(crate) size: Size,
+    pub(crate) rgb: Vec<u8>,
 }
 
 impl Grid {
     /// Creates an empty grid.
-    pub(super) fn new(cell: Size, rows: usize, columns: usize, lines: usize) -> Self {
+    pub(crate) fn new(cell: Size, rows: usize, columns: usize, lines: usize) -> Self {
         Self([(); 3].map(|()| Picture::new(cell, rows, columns, lines)))
     }
 
     /// Places red, green and blue of a frame with its labels into a cell.
-    pub(super) fn place(
+    pub(crate) fn place(
         &mut self,
         row: usize,
         column: usize,
@@ -35,7 +36,7 @@ impl Grid {
     }
 
     /// Returns the pixels of the grid.
-    pub(super) fn pixels(self) -> Pixels {
+    pub(crate) fn pixels(self) -> Pixels {
         let planes = self.0.map(Picture::into_frame);
         let size = planes[0].size;
         let value = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
@@ -43,8 +44,14 @@ impl Grid {
         Pixels { size, rgb: (0..size.pixels()).flat_map(pixel).collect() }
     }
 
+    /// Encodes the grid as a JPEG.
+    pub(crate) fn jpeg(self, quality: u8) -> Vec<u8> {
+        let Pixels { size, rgb } = self.pixels();
+        encoded_rgb(&rgb, size, quality)
+    }
+
     /// Encodes the grid as a PNG.
-    pub(super) fn png(self) -> Result<Vec<u8>> {
+    pub(crate) fn png(self) -> Result<Vec<u8>> {
         let Pixels { size, rgb } = self.pixels();
         let mut png = Vec::new();
         let (width, height) = (size.width as u32, size.height as u32);
