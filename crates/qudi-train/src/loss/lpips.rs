@@ -8,7 +8,7 @@ mod backbone;
 mod convolution;
 #[cfg(test)]
 mod golden_tests;
-mod gray;
+mod input;
 mod weight_files;
 
 use backbone::{Backbone, Weights};
@@ -21,6 +21,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 pub(crate) use backbone::Net;
+pub use input::Images;
 pub use weight_files::cache_folder;
 
 /// The perceptual term of a recipe.
@@ -113,12 +114,25 @@ impl Lpips {
         kind.net().map_or(Ok(()), |net| weight_files::find(net, folder).map(drop))
     }
 
-    /// Reads the weights of `kind` onto `device`: from `folder`, if one is given, or else from
-    /// [`cache_folder`]. Gives nothing for [`PerceptualKind::None`].
+    /// Reads the weights of `kind` onto `device` to compare gray images: from `folder`, if one is given, or
+    /// else from [`cache_folder`]. Gives nothing for [`PerceptualKind::None`].
     ///
     /// # Errors
     /// [`Error`] if weights are missing (it says which and where to get them), or do not fit.
     pub fn load(
+        kind: PerceptualKind,
+        folder: Option<&Path>,
+        device: &Device,
+    ) -> Result<Option<Self>> {
+        Self::load_for(Images::Gray, kind, folder, device)
+    }
+
+    /// Reads the weights of `kind` as [`load`](Self::load) does, to compare `images` of a kind.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn load_for(
+        images: Images,
         kind: PerceptualKind,
         folder: Option<&Path>,
         device: &Device,
@@ -130,15 +144,15 @@ impl Lpips {
             let file = if name.starts_with("lin") { &heads } else { &backbone };
             file.read(name, shape)
         };
-        Ok(Some(Self::new(net, &mut weights, &device.clone().inner())?))
+        Ok(Some(Self::new(net, images, &mut weights, &device.clone().inner())?))
     }
 
     /// Asks for the weights by name: torchvision's (`features.0.weight`) and LPIPS's (`lin0.model.1.weight`).
     ///
     /// # Errors
     /// Those of `weights`.
-    fn new(net: Net, weights: &mut Weights<'_>, device: &Device) -> Result<Self> {
-        let backbone = Backbone::new(net.layers(), weights, device)?;
+    fn new(net: Net, images: Images, weights: &mut Weights<'_>, device: &Device) -> Result<Self> {
+        let backbone = Backbone::new(net.layers(), images, weights, device)?;
         let heads = backbone.taps.iter().enumerate().map(|(tap, &channels)| {
             let head = weights(&format!("lin{tap}.model.1.weight"), &[1, channels, 1, 1])?;
             Ok(Tensor::from_data(TensorData::new(head, [1, channels]), device))
@@ -167,8 +181,8 @@ impl Lpips {
     /// Returns the mean over all images of the distance of `p` from `q`.
     ///
     /// # Shapes
-    /// - p, q: `[images, 1, height, width]` in [0, 1], of a size that [`check`](Self::check) accepts, on the
-    ///   device of the weights, with autodiff or without
+    /// - p, q: `[images, 1, height, width]` in [0, 1] (3 planes of [`Images::Colour`]), of a size that
+    ///   [`check`](Self::check) accepts, on the device of the weights, with autodiff or without
     /// - output: `[1]`
     pub fn loss(&self, p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
         self.distances(p, q).mean()
@@ -182,7 +196,7 @@ impl Lpips {
     pub fn distances(&self, p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
         assert_eq!(p.dims(), q.dims(), "images to compare");
         let images = p.dims()[0];
-        let [p, q] = [p, q].map(|images| self.backbone.forward(gray::planes(images)));
+        let [p, q] = [p, q].map(|images| self.backbone.forward(input::with_ones(images)));
         let mut sum = Tensor::zeros([images, 1], &p[0].device());
         for ((p, q), head) in p.into_iter().zip(q).zip(&self.heads) {
             let [_, channels, height, width] = p.dims();

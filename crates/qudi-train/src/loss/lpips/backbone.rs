@@ -2,6 +2,7 @@
 //! builds them.
 
 use super::convolution::Convolution;
+use super::input::Images;
 use burn::tensor::module::max_pool2d;
 use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
@@ -112,12 +113,13 @@ enum Step {
 }
 
 impl Backbone {
-    /// Reads the weights of `layers` onto `device`.
+    /// Reads the weights of `layers` onto `device`, for images of a kind.
     ///
     /// # Errors
     /// Those of `weights`.
     pub(super) fn new(
         layers: &[Layer],
+        images: Images,
         weights: &mut Weights<'_>,
         device: &Device,
     ) -> Result<Self> {
@@ -131,8 +133,8 @@ impl Backbone {
                     let bias = weights(&format!("{name}.bias"), &[outputs])?;
                     let mut inputs = channels;
                     if steps.is_empty() {
-                        weight = super::gray::fold(&weight, kernel * kernel);
-                        inputs = super::gray::PLANES;
+                        weight = images.fold(&weight, kernel * kernel);
+                        inputs = images.planes();
                     }
                     channels = outputs;
                     let sizes = [outputs, inputs, kernel];
@@ -157,7 +159,7 @@ impl Backbone {
     /// Computes the features at every tap.
     ///
     /// # Shapes
-    /// - planes: `[images, 2, height, width]`, as [`super::gray::planes`] gives them
+    /// - planes: `[images, planes, height, width]`, as [`super::input::with_ones`] gives them
     /// - output: `[images, channels, rows, columns]` per tap
     pub(super) fn forward(&self, planes: Tensor<4>) -> Vec<Tensor<4>> {
         let (mut x, mut taps) = (planes, Vec::with_capacity(self.taps.len()));

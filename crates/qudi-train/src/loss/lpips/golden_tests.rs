@@ -1,7 +1,7 @@
 //! The distances and their gradients against the authors' LPIPS (tests/golden/generate/perceptual.py).
 #![allow(clippy::unwrap_used)]
 
-use super::{Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
+use super::{Images, Lpips, Net, PERCEPTUAL_KINDS, PerceptualKind};
 use crate::cases::uniform;
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
@@ -33,14 +33,15 @@ fn weights(net: &str, name: &str, shape: &[usize]) -> Vec<f32> {
 /// Returns the distances with the reference's weights, made once on flex: VGG16's take a while.
 fn lpips(name: &str) -> Lpips {
     static ALL: OnceLock<Vec<Lpips>> = OnceLock::new();
-    let all = ALL.get_or_init(|| NETS.map(|(name, net)| make(name, net, &Device::flex())).into());
+    let gray = |(name, net)| make(name, net, Images::Gray, &Device::flex());
+    let all = ALL.get_or_init(|| NETS.map(gray).into());
     let at = NETS.iter().position(|net| net.0 == name).unwrap();
     all[at].clone()
 }
 
-fn make(name: &str, net: Net, device: &Device) -> Lpips {
+fn make(name: &str, net: Net, images: Images, device: &Device) -> Lpips {
     let mut weights = |weight: &str, shape: &[usize]| Ok(weights(name, weight, shape));
-    Lpips::new(net, &mut weights, device).unwrap()
+    Lpips::new(net, images, &mut weights, device).unwrap()
 }
 
 /// The golden file.
@@ -64,6 +65,23 @@ impl Golden {
         let bytes = file.tensor(name).unwrap();
         bytes.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
     }
+}
+
+/// Gray images have the same distance as colours of three equal planes, and a change of hue has one.
+#[test]
+fn colours_of_equal_planes_are_gray_images() {
+    let device = Device::flex();
+    let (gray, colour) = (lpips("alex"), make("alex", Net::Alex, Images::Colour, &device));
+    let golden = Golden::open();
+    let (p, q) = (golden.image("p", &device), golden.image("q", &device));
+    let three = |plane: &Tensor<4>| Tensor::cat(vec![plane.clone(); 3], 1);
+    let expected = read(gray.distances(p.clone(), q.clone())).unwrap();
+    let got = read(colour.distances(three(&p), three(&q))).unwrap();
+    for (got, expected) in got.iter().zip(expected) {
+        assert!((got - expected).abs() < 1e-4 * expected, "{got} {expected}");
+    }
+    let tinted = Tensor::cat(vec![p.clone(), p.clone(), p.clone() * 0.5], 1);
+    assert!(read(colour.distances(three(&p), tinted)).unwrap()[0] > 1e-3);
 }
 
 fn gradient(lpips: &Lpips, p: &Tensor<4>, q: &Tensor<4>) -> Vec<f32> {
@@ -131,7 +149,7 @@ fn gradients_in_sixteen_bits_point_the_same_way() {
 fn distances_on_ndarray_match_reference() {
     #[allow(deprecated)] // asked for by name
     let device = Device::ndarray();
-    distances_agree("alex", &make("alex", Net::Alex, &device), &device);
+    distances_agree("alex", &make("alex", Net::Alex, Images::Gray, &device), &device);
 }
 
 #[test]
