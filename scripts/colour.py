@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """Compares restored colours of photographs in motion behind a colour filter: QuDi, what is known, and bounds.
 
-    python3 scripts/colour.py QUDI FOLDER [--ppp 3.25,9.75] [--pictures 1,5] [--cfa rggb] [--size HxW]
+    python3 scripts/colour.py QUDI FOLDER [--ppp 3.25,9.75] [--pictures 1,5] [--cfa rggb | --rgbw] [--size HxW]
 
 Needs NumPy. Every picture moves by 0.7 and -0.45 pixels a frame for 11 frames, in linear light, and is exposed
 behind the filter with the sensor of `qudi simulate`. The middle frame is scored after one common gain.
 
     average     the mean of 11 frames, demosaiced bilinearly
+    each        every frame demosaiced bilinearly, its three planes restored apart
     apart       the four planes of a Bayer filter restored apart, interpolated bilinearly
     qudi        `qudi restore`
     full        three full planes of the same light each, restored apart: the ceiling
@@ -25,7 +26,9 @@ import zlib
 import numpy as np
 
 MIDDLE = 5
-LUMA = np.array([0.25, 0.5, 0.25])
+
+# Shares of red, green, blue and white pixels of a fixed random filter.
+RGBW = {"r": 0.0807, "g": 0.0807, "b": 0.0807, "w": 0.7579}
 
 
 def psnr(estimate, truth, border=4):
@@ -56,6 +59,20 @@ def demosaiced(planes, letters, size):
     for k, letter in enumerate(letters):
         of[letter].append(interpolated(planes[k], k // 2, k % 2, size))
     return np.stack([np.mean(of[c], 0) for c in "rgb"], -1)
+
+
+def rgbw_filter(size):
+    """A random filter, the same in every run: pure colours for `--cfa FILE.png`."""
+    colours = {"r": (255, 0, 0), "g": (0, 255, 0), "b": (0, 0, 255), "w": (255, 255, 255)}
+    shares = np.array(list(RGBW.values()))
+    drawn = np.random.default_rng(61).choice(4, size, p=shares / shares.sum())
+    return np.array(list(colours.values()), np.uint8)[drawn]
+
+
+def luma_weights(pixels):
+    """Weights of red, green and blue in the mean of what the pixels of a filter see."""
+    share = [float((pixels == np.array(c)).all(-1).mean()) for c in ((255, 0, 0), (0, 255, 0), (0, 0, 255))]
+    return np.array(share) + (1 - sum(share)) / 3
 
 
 def best_gain(planes, truth):
@@ -98,11 +115,24 @@ class Runner:
         self.run("restore", capture, "-o", name, "--force", "--mask", "none", *words)
         return np.load(self.folder / name), time.time() - start
 
+    def luma(self, cfa, picture, size):
+        """Writes the filter, if it is random, and returns the weights of luma."""
+        if not self.arguments.rgbw:
+            tile = cfa.split("@")[0]
+            return np.array([tile.count(c) for c in "rgb"]) / len(tile)
+        probe = ["simulate", picture, "-o", "size.npy", "--cfa", "rggb", "--force", "--frames", 1, *size]
+        self.run(*probe)
+        pixels = rgbw_filter(np.load(self.folder / "size.npy").shape[1:])
+        write_png(self.folder / cfa, pixels)
+        return luma_weights(pixels)
+
     def scores(self, picture, ppp):
         arguments = self.arguments
         size = ["--size", arguments.size] if arguments.size else []
+        cfa = "rgbw.png" if arguments.rgbw else arguments.cfa
+        weights = self.luma(cfa, picture, size)
         self.run(
-            *["simulate", picture, "-o", "m.npy", "--truth", "t.npy", "--cfa", arguments.cfa, "--force"],
+            *["simulate", picture, "-o", "m.npy", "--truth", "t.npy", "--cfa", cfa, "--force"],
             *["--motion", "pan:0.7,-0.45", "--frames", 11, "--ppp", ppp, "--seed", 1, *size],
         )
         truth = np.load(self.folder / "t.npy")
@@ -113,28 +143,41 @@ class Runner:
         out = {}
         colour, out["seconds"] = self.restored("m.npy", "c.npy")
         out["qudi"] = psnr(colour[MIDDLE], middle)
-        out["luma"] = psnr(colour[MIDDLE] @ LUMA, middle @ LUMA)
-        document = json.loads(self.run("eval", "t.npy", "--restored", "c.npy", "--json"))
+        out["luma"] = psnr(colour[MIDDLE] @ weights, middle @ weights)
+        backbones = ["--backbones", arguments.backbones] if arguments.backbones else []
+        for name, frames in (("t1.npy", truth), ("c1.npy", colour)):
+            np.save(self.folder / name, frames[MIDDLE : MIDDLE + 1].astype(np.float32))
+        document = json.loads(self.run("eval", "t1.npy", "--restored", "c1.npy", "--json", *backbones))
         out["ciede"], out["zipper"] = document["ciede2000_median"], document["zipper"]
+        for net in ("alex", "vgg"):
+            if document.get(f"lpips_{net}") is not None:
+                out[f"lpips {net}"] = document[f"lpips_{net}"]
         if arguments.quick:
             return out
         pictures = {"truth": middle, "qudi": colour[MIDDLE]}
-        tile = arguments.cfa.split("@")[0]
+        tile = cfa.split("@")[0]
         if len(tile) == 4 and set(tile) <= set("rgb"):
+            self.run("simulate", "--from", "m.npy.json", "-o", "g.npy", "--force")
+            all_counts = np.load(self.folder / "g.npy")
+            gray = ["--sensor", "qudi-paper", "--bits", 3, "--ppp", ppp, "--exposure", level, "--sum", 1]
             planes = []
             for k in range(4):
-                self.run("simulate", "--from", "m.npy.json", "-o", "g.npy", "--force")
-                counts = np.load(self.folder / "g.npy")[:, k // 2 :: 2, k % 2 :: 2]
-                np.save(self.folder / "p.npy", counts)
-                gray = ["--sensor", "qudi-paper", "--bits", 3, "--ppp", ppp, "--exposure", level, "--sum", 1]
+                np.save(self.folder / "p.npy", all_counts[:, k // 2 :: 2, k % 2 :: 2])
                 planes.append(self.restored("p.npy", "po.npy", *gray)[0][MIDDLE])
                 average = self.restored("p.npy", "pa.npy", *gray, "--method", "average")[0][MIDDLE]
                 planes[-1] = (planes[-1], average)
             pictures["apart"] = demosaiced([p for p, _ in planes], tile, frame_size)
             pictures["average"] = demosaiced([a for _, a in planes], tile, frame_size)
+            frames = [demosaiced([c[k // 2 :: 2, k % 2 :: 2] for k in range(4)], tile, frame_size) for c in all_counts]
+            each = []
+            for k in range(3):
+                rounded = np.stack([frame[..., k] for frame in frames]) + 0.5
+                np.save(self.folder / "p.npy", rounded.astype(np.uint8))
+                each.append(self.restored("p.npy", "po.npy", *gray)[0][MIDDLE])
+            out["each"] = psnr(np.stack(each, -1), middle)
             out["apart"] = psnr(pictures["apart"], middle)
             out["average"] = psnr(pictures["average"], middle)
-            counts = np.load(self.folder / "g.npy")[MIDDLE].astype(float)
+            counts = all_counts[MIDDLE].astype(float)
             mosaic = np.zeros((*frame_size, 3))
             for k, letter in enumerate(tile):
                 mosaic[k // 2 :: 2, k % 2 :: 2, "rgb".index(letter)] = counts[k // 2 :: 2, k % 2 :: 2]
@@ -146,7 +189,7 @@ class Runner:
                 parts = [part for panel in panels for part in (panel, gap)][:-1]
                 write_png(arguments.picture, np.concatenate(parts, 1))
         full = []
-        for name, clip in [("gray", truth @ LUMA), *[(k, truth[..., k]) for k in range(3)]]:
+        for name, clip in [("gray", truth @ weights), *[(k, truth[..., k]) for k in range(3)]]:
             np.save(self.folder / "k.npy", clip.astype(np.float32))
             self.run("simulate", "k.npy", "-o", "f.npy", *light)
             restored, seconds = self.restored("f.npy", "fo.npy")
@@ -165,6 +208,8 @@ def main():
     parser.add_argument("--ppp", default="3.25,9.75")
     parser.add_argument("--pictures", help="names without extension")
     parser.add_argument("--cfa", default="rggb")
+    parser.add_argument("--rgbw", action="store_true", help="a random filter of 75.8 %% white pixels")
+    parser.add_argument("--backbones", help="folder of the weights of LPIPS")
     parser.add_argument("--size")
     parser.add_argument("--picture", help="write mosaic, average, QuDi and truth of the last picture, .png")
     parser.add_argument("--quick", action="store_true", help="restore with QuDi alone")

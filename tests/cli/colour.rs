@@ -65,6 +65,50 @@ fn colours_of_a_mosaic_are_restored() {
 }
 
 #[test]
+fn three_full_planes_are_restored_together() {
+    let folder = scratch("colour-full");
+    clip(&folder);
+    let clip = std::fs::read(folder.join("clip.npy")).unwrap();
+    let values = &clip[clip.len() - 4 * 3 * FRAMES * HEIGHT * WIDTH..];
+    let mut counts = vec![0; 3 * FRAMES * HEIGHT * WIDTH];
+    for k in 0..3 {
+        let plane: Vec<u8> =
+            values.chunks_exact(12).flat_map(|v| v[4 * k..4 * k + 4].to_vec()).collect();
+        let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH})");
+        std::fs::write(folder.join("p.npy"), npy_bytes("<f4", &shape, &plane)).unwrap();
+        let simulate =
+            "simulate p.npy -o q.npy --unpacked --exposure 0.35 --ppp 3.25 --transfer as-is";
+        run(&folder, &format!("{simulate} --seed {k} --force"));
+        let bytes = std::fs::read(folder.join("q.npy")).unwrap();
+        let plane = &bytes[bytes.len() - FRAMES * HEIGHT * WIDTH..];
+        for (i, &count) in plane.iter().enumerate() {
+            counts[3 * i + k] = count;
+        }
+    }
+    let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH}, 3)");
+    std::fs::write(folder.join("full.npy"), npy_bytes("|u1", &shape, &counts)).unwrap();
+    let restore =
+        "restore full.npy --sensor qudi-paper --bits 3 --ppp 3.25 --exposure 0.35 --sum 1";
+    run(&folder, &format!("{restore} -o c.npy --method qbp-refined"));
+    let scores = document(&folder, "eval clip.npy --restored c.npy --json");
+    assert!(scores["cpsnr_linear"].as_f64().unwrap() > 30.0, "{scores}");
+    run(&folder, &format!("{restore} -o g.npy --method average --gray"));
+    assert_eq!(npy_shape(&folder.join("g.npy")), format!("({FRAMES}, {HEIGHT}, {WIDTH})"));
+    run(&folder, &format!("{restore} -o one.npy --method average --channel 2"));
+    assert_eq!(npy_shape(&folder.join("one.npy")), format!("({FRAMES}, {HEIGHT}, {WIDTH})"));
+    refused(&folder, &format!("{restore} -o x.npy --cfa rggb"), &["every pixel has all colours"]);
+}
+
+#[test]
+fn uncertainties_are_of_every_colour() {
+    let folder = exposed("colour-uncertainty", "rggb");
+    run(&folder, "restore m.npy -o c.npy --uncertainty u.npy");
+    assert_eq!(npy_shape(&folder.join("u.npy")), npy_shape(&folder.join("c.npy")));
+    run(&folder, "restore m.npy -o g.npy --gray --uncertainty v.npy");
+    assert_eq!(npy_shape(&folder.join("v.npy")), npy_shape(&folder.join("g.npy")));
+}
+
+#[test]
 fn pictures_are_balanced_and_the_manifest_has_the_names_of_dng() {
     let folder = exposed("colour-picture", "gbrg");
     let restore = "restore m.npy --method average --wb 2,1,0.5 --end 3";
@@ -122,7 +166,8 @@ fn contradictions_are_refused() {
     let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH}, 3)");
     let counts = vec![1; FRAMES * HEIGHT * WIDTH * 3];
     std::fs::write(folder.join("clip8.npy"), npy_bytes("|u1", &shape, &counts)).unwrap();
-    refused(&folder, full, &["a colour capture of 3 channels"]);
+    refused(&folder, full, &["a colour filter in front of a capture of 3 channels"]);
+    refused(&folder, "info clip8.npy", &["a colour capture of 3 channels", "--channel"]);
     run(&folder, "simulate scene:text --size 64x96 --frames 3 -o gray.npy --seed 1");
     refused(&folder, "restore gray.npy -o x.npy --gray", &["the capture is gray", "--gray"]);
     refused(&folder, "restore gray.npy -o x.npy --wb 1,1,1", &["the capture is gray", "--wb"]);

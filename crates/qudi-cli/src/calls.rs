@@ -100,24 +100,28 @@ pub fn sensor(name: &str) -> Result<Sensor, CliError> {
     Ok(Sensor::load(name)?)
 }
 
-/// Writes frames of `size` to a `.npy`, `.tif`, `.gif` or `.mp4` file, or to a folder of PNG; nothing is left
-/// behind if `frames` ends with an error.
+/// Writes frames of `size`, each of one plane, or of three of red, green and blue, to a `.npy`, `.tif`,
+/// `.gif` or `.mp4` file, or to a folder of PNG; nothing is left behind if `frames` ends with an error.
 ///
 /// # Errors
 /// [`CliError`] if the place is taken and `force` is false, if it cannot be written, or the error of a frame.
 pub fn write_frames(
     path: &Path,
     size: Size,
+    planes: Planes,
     float: bool,
     fps: f64,
     force: bool,
-    frames: &mut dyn Iterator<Item = qudi_core::Result<Frame>>,
+    frames: &mut dyn Iterator<Item = qudi_core::Result<Vec<Frame>>>,
 ) -> Result<(), CliError> {
     let overwrite = if force { Overwrite::Yes } else { Overwrite::No };
     let samples = if float { TiffSamples::F32 } else { TiffSamples::U16 };
-    let mut writer = ClipWriter::create(path, size, Planes::Gray, samples, fps, overwrite)?;
+    let mut writer = ClipWriter::create(path, size, planes, samples, fps, overwrite)?;
     for frame in frames {
-        writer.push(&frame?)?;
+        match <[Frame; 3]>::try_from(frame?) {
+            Ok(colours) => writer.push_colour(&colours)?,
+            Err(planes) => planes.iter().try_for_each(|plane| writer.push(plane))?,
+        }
     }
     Ok(writer.finish()?)
 }

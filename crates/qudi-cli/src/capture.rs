@@ -4,6 +4,7 @@
 mod acquisition;
 mod aligned;
 mod input;
+mod planes;
 mod source;
 mod summed;
 pub(crate) mod warnings;
@@ -11,6 +12,7 @@ pub(crate) mod warnings;
 pub(crate) use acquisition::{CaptureAcquisition, LightOverrides, checked_mean_level};
 pub(crate) use aligned::{AlignedCapture, Alignment};
 pub use input::Input;
+pub(crate) use planes::OtherPlanes;
 pub(crate) use source::{Source, is_pipe, refuse_terminal, required_sensor, unknown_sensor};
 pub(crate) use summed::{SummedCapture, describe_sum, sum_by_itself};
 

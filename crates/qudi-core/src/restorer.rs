@@ -43,6 +43,8 @@ pub struct Restored {
     pub std: Option<Vec<Frame>>,
     /// Red, green and blue of each frame, of captures behind a colour filter; `frames` are their luma.
     pub colour: Option<Vec<[Frame; 3]>>,
+    /// The standard deviations of `colour`, where the method predicts the errors of luma.
+    pub colour_std: Option<Vec<[Frame; 3]>>,
 }
 
 /// A method: turns all frames of a window into images at once.
@@ -84,7 +86,7 @@ pub trait Restorer {
 impl Restored {
     /// Creates gray frames, with the standard deviations that the method predicts.
     pub fn gray(frames: Vec<Frame>, std: Option<Vec<Frame>>) -> Self {
-        Self { frames, std, colour: None }
+        Self { frames, std, colour: None, colour_std: None }
     }
 
     /// Selects the frames `numbers` of a window that was restored whole, in that order.
@@ -97,8 +99,14 @@ impl Restored {
             return self;
         }
         let select = |frames: Vec<Frame>| numbers.iter().map(|&n| frames[n].clone()).collect();
-        let colour = self.colour.map(|colour| numbers.iter().map(|&n| colour[n].clone()).collect());
-        Self { frames: select(self.frames), std: self.std.map(select), colour }
+        let of_colours =
+            |colour: Vec<[Frame; 3]>| numbers.iter().map(|&n| colour[n].clone()).collect();
+        Self {
+            frames: select(self.frames),
+            std: self.std.map(select),
+            colour: self.colour.map(of_colours),
+            colour_std: self.colour_std.map(of_colours),
+        }
     }
 }
 

@@ -367,6 +367,11 @@ impl Capture {
         self.filter.as_ref()
     }
 
+    /// Returns true if its frames have colours: behind a filter, or in three full planes.
+    pub fn has_colours(&self) -> bool {
+        self.filter.is_some() || self.info.full_colour
+    }
+
     /// Returns how the filter in use contradicts the one that the capture records, as a sentence.
     pub fn filter_contradiction(&self) -> Option<&str> {
         self.filter_contradiction.as_deref()

@@ -1,9 +1,10 @@
 //! Keyword arguments instead of flags in the texts of the command line.
 
 /// Flags whose value may be a word.
-const WORDS: [&str; 10] = [
+const WORDS: [&str; 11] = [
     "axes",
     "bitorder",
+    "cfa",
     "device",
     "format",
     "mask",

@@ -25,6 +25,7 @@ const SIGNAL_PERIOD: Duration = Duration::from_millis(50);
 enum Event {
     /// Settings, and the number of frames if it is known.
     Start(Value, Option<u64>),
+    /// Values of a frame; of colours, pixel by pixel.
     Frame(Vec<f32>),
     Sigma(Vec<f32>),
     Message(Message),
@@ -190,7 +191,21 @@ impl Receiver for Sender {
         self.send(Event::Frame(frame.data.clone()))
     }
 
+    fn colour(&mut self, frame: &[Frame; 3]) -> qudi_core::Result<()> {
+        self.send(Event::Frame(interleaved(frame)))
+    }
+
     fn uncertainty(&mut self, sigma: &Frame) -> qudi_core::Result<()> {
         self.send(Event::Sigma(sigma.data.clone()))
     }
+
+    fn colour_uncertainty(&mut self, sigma: &[Frame; 3]) -> qudi_core::Result<()> {
+        self.send(Event::Sigma(interleaved(sigma)))
+    }
+}
+
+/// Returns the values of three planes pixel by pixel.
+fn interleaved([red, green, blue]: &[Frame; 3]) -> Vec<f32> {
+    let pixels = red.data.iter().zip(&green.data).zip(&blue.data);
+    pixels.flat_map(|((&r, &g), &b)| [r, g, b]).collect()
 }

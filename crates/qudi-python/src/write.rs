@@ -3,15 +3,18 @@
 use crate::errors::exception;
 use pyo3::prelude::*;
 use qudi_core::{Error, Frame, Size};
+use qudi_io::writer::Planes;
 use std::path::PathBuf;
 
-/// Writes frames, each the bytes of its float32 values in C order, as `path` says by its extension.
+/// Writes frames, each the bytes of its float32 values in C order, as `path` says by its extension. `planes`
+/// is 1 for gray frames, and 3 for colours, which are the last axis.
 #[pyfunction]
-#[pyo3(signature = (path, size, frames, *, float, fps, force))]
+#[pyo3(signature = (path, size, planes, frames, *, float, fps, force))]
 pub(crate) fn write_frames(
     py: Python<'_>,
     path: PathBuf,
     size: (usize, usize),
+    planes: usize,
     frames: &Bound<'_, PyAny>,
     float: bool,
     fps: f64,
@@ -28,9 +31,11 @@ pub(crate) fn write_frames(
         py.check_signals().map_err(&mut failed)?;
         let bytes: Vec<u8> = frame.and_then(|frame| frame.extract()).map_err(&mut failed)?;
         let values = bytes.chunks_exact(4).map(|b| f32::from_ne_bytes([b[0], b[1], b[2], b[3]]));
-        Ok(Frame { size, data: values.collect() })
+        let plane = |k: usize| values.clone().skip(k).step_by(planes).collect();
+        Ok((0..planes).map(|k| Frame { size, data: plane(k) }).collect())
     });
-    let written = qudi_cli::write_frames(&path, size, float, fps, force, &mut frames);
+    let colours = if planes == 3 { Planes::Rgb } else { Planes::Gray };
+    let written = qudi_cli::write_frames(&path, size, colours, float, fps, force, &mut frames);
     drop(frames);
     match raised {
         Some(raised) => Err(raised),

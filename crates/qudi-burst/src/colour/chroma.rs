@@ -1,16 +1,11 @@
 //! Chroma: the ratios of red, green and blue to luma at every pixel.
 
-use super::guided::{Guide, guided};
-use super::{CountResponse, MergedColours};
-use qudi_core::colour::{Colour, ColourFilter};
+use super::guided::{Averages, Guide, guided};
+use super::{CountResponse, Exposures, MergedColours};
 use qudi_core::{Frame, Size};
 
-/// Standard deviation in pixels of the Gaussian that finds a first luma: as noisy as its use allows, since
-/// the counts of a pixel decide where they tell enough.
-const FIRST_LUMA_SIGMA: f32 = 1.5;
-
 /// Ratio of the widths of Gaussians for first chroma and for the guided one.
-const FIRST_CHROMA_WIDTH: f32 = 0.7;
+pub(super) const FIRST_CHROMA_WIDTH: f32 = 0.7;
 
 /// Largest ratio of a colour to luma.
 const MAX_RATIO: f32 = 12.0;
@@ -23,11 +18,13 @@ const MIN_LUMA: f32 = 1e-3;
 pub(super) struct Chroma {
     pub(super) size: Size,
     pub(super) ratios: [Vec<f32>; 3],
+    /// Variances of the errors of ratios.
+    pub(super) variances: [Vec<f32>; 3],
 }
 
-/// The filter, its response, and the mean light of its colours.
+/// The exposures of a capture, their response, and the mean light of their colours.
 pub(super) struct Colours<'a> {
-    pub(super) filter: &'a ColourFilter,
+    pub(super) exposures: &'a Exposures<'a>,
     pub(super) response: &'a CountResponse,
     /// Mean light of red, green, blue and white pixels, in image units.
     pub(super) mean: [f32; 4],
@@ -38,51 +35,41 @@ pub(super) struct Colours<'a> {
 impl Colours<'_> {
     /// Returns the mean of luma.
     pub(super) fn mean_luma(&self) -> f32 {
-        let shares = self.filter.shares();
+        let shares = self.exposures.shares();
         shares.iter().zip(self.mean).map(|(&share, mean)| share as f32 * mean).sum()
     }
 
-    /// Computes luma and chroma from the counts around every pixel.
-    pub(super) fn first(&self, merged: &MergedColours) -> (Frame, Chroma) {
-        let size = merged.size;
-        let mut luma = vec![0.0; size.pixels()];
-        for (colour, share) in self.filter.shares().into_iter().enumerate() {
-            if share > 0.0 {
-                let mean = self.mean[colour];
-                let light = merged.light(colour, self.response, FIRST_LUMA_SIGMA, mean);
-                for (luma, light) in luma.iter_mut().zip(light) {
-                    *luma += share as f32 * light;
-                }
-            }
-        }
-        let least = MIN_LUMA * self.mean_luma();
-        for luma in &mut luma {
-            *luma = luma.max(least);
-        }
-        let sigma = (FIRST_CHROMA_WIDTH * self.sigma).max(FIRST_LUMA_SIGMA);
-        let ratios = std::array::from_fn(|k| {
+    /// Returns the least luma that has a colour.
+    pub(super) fn least_luma(&self) -> f32 {
+        MIN_LUMA * self.mean_luma()
+    }
+
+    /// Returns the ratios of sensor colours to luma over all counts around every pixel.
+    pub(super) fn around(&self, merged: &MergedColours, luma: &[f32], sigma: f32) -> [Vec<f32>; 3] {
+        let least = self.least_luma();
+        std::array::from_fn(|k| {
             let light = merged.light(k, self.response, sigma, self.mean[k]);
-            let local = merged.luma(k, &luma, sigma);
+            let local = merged.luma(k, luma, sigma);
             light.iter().zip(local).map(|(light, luma)| light / luma.max(least)).collect()
-        });
-        (Frame { size, data: luma }, self.constrained(size, ratios))
+        })
     }
 
     /// Computes chroma from the counts around every pixel whose luma and chroma are alike.
     pub(super) fn refined(&self, merged: &MergedColours, luma: &Frame) -> Chroma {
-        let least = MIN_LUMA * self.mean_luma();
-        let guide = Guide::new(merged, luma, least);
-        let first = self.constrained(merged.size, guided(&guide, self.response, self.sigma, None));
+        let guide = Guide::new(merged, luma, self.least_luma());
+        let first = self.shrunk(merged, luma, guided(&guide, self.response, self.sigma, None));
+        let first = self.constrained(merged.size, first);
         let second = guided(&guide, self.response, self.sigma, Some(&first));
-        self.constrained(merged.size, second)
+        self.constrained(merged.size, self.shrunk(merged, luma, second))
     }
 
     /// Divides ratios of sensor colours to luma by their efficiencies, and scales them so that their luma is
     /// 1.
-    fn constrained(&self, size: Size, mut ratios: [Vec<f32>; 3]) -> Chroma {
-        let weights = self.filter.luma_weights().map(|weight| weight as f32);
-        let efficiency = self.filter.efficiency().map(|efficiency| efficiency as f32);
+    pub(super) fn constrained(&self, size: Size, averages: Averages) -> Chroma {
+        let weights = self.exposures.luma_weights();
+        let efficiency = self.exposures.efficiency();
         let neutral = 1.0 / weights.iter().sum::<f32>();
+        let Averages { mut ratios, mut variances } = averages;
         for i in 0..size.pixels() {
             let mut sum = 0.0;
             for k in 0..3 {
@@ -90,11 +77,14 @@ impl Colours<'_> {
                 ratios[k][i] = ratio;
                 sum += weights[k] * ratio;
             }
-            for ratios in &mut ratios {
-                ratios[i] = if sum > MIN_LUMA { ratios[i] / sum } else { neutral };
+            for k in 0..3 {
+                ratios[k][i] = if sum > MIN_LUMA { ratios[k][i] / sum } else { neutral };
+                if let Some(variance) = variances[k].get_mut(i) {
+                    *variance /= (efficiency[k] * sum.max(MIN_LUMA)).powi(2);
+                }
             }
         }
-        Chroma { size, ratios }
+        Chroma { size, ratios, variances }
     }
 }
 
@@ -111,9 +101,15 @@ impl Chroma {
             Frame { size: self.size, data: product.collect() }
         })
     }
-}
 
-/// Returns the response of every colour.
-pub(super) fn responses(filter: &ColourFilter) -> [[f32; 3]; 4] {
-    Colour::ALL.map(|colour| filter.response(colour).map(|weight| weight as f32))
+    /// Returns the standard deviations of colours from the ones of luma, `sigma`, and of the ratios.
+    pub(super) fn uncertainty(&self, luma: &Frame, sigma: &Frame) -> [Frame; 3] {
+        std::array::from_fn(|k| {
+            let of_pixel = |i: usize| {
+                let of_ratio = luma.data[i] * self.variances[k][i].sqrt();
+                (self.ratios[k][i] * sigma.data[i]).hypot(of_ratio)
+            };
+            Frame { size: self.size, data: (0..self.size.pixels()).map(of_pixel).collect() }
+        })
+    }
 }

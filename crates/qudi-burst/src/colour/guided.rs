@@ -69,6 +69,19 @@ impl<'a> Guide<'a> {
     }
 }
 
+/// Ratios of sensor colours to luma, averaged over counts around every pixel.
+pub(super) struct Averages {
+    pub(super) ratios: [Vec<f32>; 3],
+    /// Variances of the ratios by the noise of the counts.
+    pub(super) variances: [Vec<f32>; 3],
+}
+
+/// Share of the weight in a Gaussian average that the square of its weights has.
+const SQUARED: f32 = 0.5;
+
+/// Variance of a ratio of which no count tells.
+const UNKNOWN: f32 = 10.0;
+
 /// Sums of one row.
 struct RowSums {
     counts: [Vec<f32>; 3],
@@ -84,12 +97,12 @@ pub(super) fn guided(
     response: &CountResponse,
     sigma: f32,
     previous: Option<&Chroma>,
-) -> [Vec<f32>; 3] {
+) -> Averages {
     let MergedColours { size, counts, weights } = guide.merged;
     let Size { height, width } = *size;
     let radius = (RADIUS * sigma).ceil() as isize;
     let zeros = || std::array::from_fn(|_| vec![0.0f32; width]);
-    let rows: Vec<[Vec<f32>; 3]> = (0..height)
+    let rows: Vec<[Vec<[f32; 2]>; 3]> = (0..height)
         .into_par_iter()
         .map(|y| {
             let mut sums = RowSums {
@@ -144,17 +157,25 @@ pub(super) fn guided(
                 let ratio = |x: usize| {
                     let weight = sums.weights[k][x];
                     if weight < 1e-6 {
-                        return previous.map_or(1.0, |chroma| chroma.ratios[k][here + x]);
+                        let ratio = previous.map_or(1.0, |chroma| chroma.ratios[k][here + x]);
+                        return [ratio, UNKNOWN];
                     }
                     let light = response.image(sums.counts[k][x] / weight).max(0.0);
-                    let luma = sums.luma[k][x] / weight;
-                    light / luma.max(1e-9 + 1e-3 * guide.own[here + x])
+                    let luma = (sums.luma[k][x] / weight).max(1e-9 + 1e-3 * guide.own[here + x]);
+                    let there = response.at(light, response.dark);
+                    let noise = there.variance * SQUARED / (there.slope * there.slope * weight);
+                    [light / luma, (noise / (luma * luma)).min(UNKNOWN)]
                 };
                 (0..width).map(ratio).collect()
             })
         })
         .collect();
-    std::array::from_fn(|k| rows.iter().flat_map(|row| row[k].iter().copied()).collect())
+    let column =
+        |k: usize, of: usize| rows.iter().flat_map(move |row| row[k].iter().map(move |v| v[of]));
+    Averages {
+        ratios: std::array::from_fn(|k| column(k, 0).collect()),
+        variances: std::array::from_fn(|k| column(k, 1).collect()),
+    }
 }
 
 /// Sets squared differences of logarithms of luma, halved.

@@ -1,11 +1,11 @@
 //! Counts of all frames of a window, added along the motion for each colour by itself.
 
-use super::CountResponse;
 use super::guided::gaussian;
 use super::motion::Displaced;
+use super::{CountResponse, Exposures};
 use qudi_core::Size;
-use qudi_core::colour::{Colour, ColourFilter};
-use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::colour::Colour;
+use qudi_core::restorer::Acquisition;
 
 /// Difference of the logarithms of luma at which a displaced count has lost much of its weight.
 const MISFIT: f32 = 0.3;
@@ -24,31 +24,33 @@ pub(super) struct MergedColours {
 }
 
 impl MergedColours {
-    /// Adds the counts of `burst`, each frame displaced to the frame that is looked for. Counts whose luma
-    /// does not fit there get little weight. `mean` is the mean of luma.
+    /// Adds the counts of all exposures, each frame displaced to the frame that is looked for. Counts whose
+    /// luma does not fit there get little weight. `mean` is the mean of luma.
     pub(super) fn new(
-        burst: BurstView<'_>,
+        exposures: &Exposures<'_>,
         acquisition: &Acquisition,
-        filter: &ColourFilter,
         response: &CountResponse,
         displaced: &[Displaced<'_>],
         mean: f32,
     ) -> Self {
-        let size = burst.size;
+        let size = exposures.size;
         let zeros = || std::array::from_fn(|_| vec![0.0f32; size.pixels()]);
         let mut merged = Self { size, counts: zeros(), weights: zeros() };
         let floor = DARK_LUMA * mean;
         let slope = response.at(mean, response.dark).slope / response.per_unit;
         let typical = f64::from(response.dark);
-        for (counts, displaced) in burst.frames.iter().zip(displaced) {
-            for (i, &count) in counts.iter().enumerate() {
+        for (t, displaced) in displaced.iter().enumerate() {
+            for i in 0..size.pixels() {
                 let (place, [here, there]) = displaced.place(i % size.width, i / size.width);
                 let misfit =
                     ((here.max(0.0) + floor) / (there.max(0.0) + floor)).ln() * (1.0 / MISFIT);
                 // Dark counts of this pixel that an ordinary one has not.
                 let excess = (acquisition.dark_of(i, typical) - typical) as f32;
-                let count = f32::from(count) - slope * excess;
-                merged.add(filter.colours()[i], place, count, (-0.5 * misfit * misfit).exp());
+                let weight = (-0.5 * misfit * misfit).exp();
+                for exposure in &exposures.each {
+                    let count = f32::from(exposure.frames[t][i]) - slope * excess;
+                    merged.add(exposure.filter.colours()[i], place, count, weight);
+                }
             }
         }
         merged

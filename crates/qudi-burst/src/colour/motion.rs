@@ -1,7 +1,8 @@
 //! Motion of a capture behind a colour filter, found on sums of 2 x 2 counts.
 
-use super::CountResponse;
+use super::exposures::Exposure;
 use super::gray_counts::rounded;
+use super::{CountResponse, Exposures};
 use crate::motion::constant_velocity::ConstantVelocity;
 use crate::motion::flow::spread;
 use crate::motion::hypotheses::select_on_estimates;
@@ -9,13 +10,13 @@ use crate::motion::reference_frames::ReferenceFrames;
 use crate::patch::PatchMotion;
 use crate::prepared_burst::PreparedBurst;
 use crate::reference::ReferenceEstimate;
-use qudi_core::colour::{Colour, ColourFilter};
+use qudi_core::colour::Colour;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::{Gain, Response, Sensor};
 use qudi_core::{Frame, Result, Size};
 use std::sync::OnceLock;
 
-/// Counts that are added: 2 x 2.
+/// Counts of an exposure that are added: 2 x 2.
 const ADDED: u32 = 4;
 
 /// Approximate variance of the reference estimate's errors, in units of the counts' variance.
@@ -48,30 +49,30 @@ pub(super) struct Displaced<'a> {
 impl QuadMotion {
     /// Finds the motion of a window. `mean` is the mean light of each colour, in image units.
     pub(super) fn find(
-        burst: BurstView<'_>,
+        exposures: &Exposures<'_>,
         acquisition: &Acquisition,
-        filter: &ColourFilter,
         response: &CountResponse,
         mean: [f32; 4],
     ) -> Result<Self> {
-        let of_quads = acquisition_of_quads(acquisition);
-        let size = Size { height: burst.size.height / 2, width: burst.size.width / 2 };
+        let of_quads = acquisition_of_quads(acquisition, ADDED * exposures.each.len() as u32);
+        let whole = exposures.size;
+        let size = Size { height: whole.height / 2, width: whole.width / 2 };
         let most = u32::from(of_quads.sensor.max_count());
-        let quads: Vec<Vec<u16>> = burst
-            .frames
-            .iter()
-            .enumerate()
-            .map(|(t, counts)| {
-                let gray = balanced(counts, t, burst.size, acquisition, filter, response, mean);
-                let at = |y: usize, x: usize| u32::from(gray[y * burst.size.width + x]);
-                let quad = |i: usize| {
+        let luma: f32 =
+            exposures.shares().iter().zip(mean).map(|(&share, mean)| share as f32 * mean).sum();
+        let quads = |t: usize| {
+            let mut sums = vec![0u32; size.pixels()];
+            for exposure in &exposures.each {
+                let gray = balanced(exposure, t, whole, acquisition, response, (mean, luma));
+                let at = |y: usize, x: usize| u32::from(gray[y * whole.width + x]);
+                for (i, sum) in sums.iter_mut().enumerate() {
                     let (y, x) = (2 * (i / size.width), 2 * (i % size.width));
-                    let sum = at(y, x) + at(y, x + 1) + at(y + 1, x) + at(y + 1, x + 1);
-                    sum.min(most) as u16
-                };
-                (0..size.pixels()).map(quad).collect()
-            })
-            .collect();
+                    *sum += at(y, x) + at(y, x + 1) + at(y + 1, x) + at(y + 1, x + 1);
+                }
+            }
+            sums.into_iter().map(|sum| sum.min(most) as u16).collect()
+        };
+        let quads: Vec<Vec<u16>> = (0..exposures.frames()).map(quads).collect();
         let view = BurstView { size, frames: &quads };
         let estimate = ReferenceEstimate::compute(view, &of_quads)?;
         let ReferenceEstimate { frames: luma, mean_counts, burst, velocity, .. } = estimate;
@@ -119,17 +120,16 @@ impl Displaced<'_> {
 
 /// Scales the counts of a frame from the mean light of their colours to the mean of luma.
 fn balanced(
-    counts: &[u16],
+    exposure: &Exposure<'_>,
     frame: usize,
     size: Size,
     acquisition: &Acquisition,
-    filter: &ColourFilter,
     response: &CountResponse,
-    mean: [f32; 4],
+    (mean, luma): ([f32; 4], f32),
 ) -> Vec<u16> {
-    let shares = filter.shares();
-    let white_alone = shares[Colour::White as usize] > MOSTLY_WHITE;
-    let luma: f32 = shares.iter().zip(mean).map(|(&share, mean)| share as f32 * mean).sum();
+    let Exposure { frames, filter } = exposure;
+    let counts = &frames[frame];
+    let white_alone = filter.shares()[Colour::White as usize] > MOSTLY_WHITE;
     let target = response.at(luma, response.dark);
     let of_colour = mean.map(|mean| response.at(mean, response.dark));
     let scaled = |i: usize| {
@@ -156,18 +156,19 @@ fn balanced(
     rounded(&values, size, frame, acquisition)
 }
 
-/// Returns the acquisition of sums of 2 x 2 counts.
-fn acquisition_of_quads(acquisition: &Acquisition) -> Acquisition {
+/// Returns the acquisition of sums of `added` counts.
+fn acquisition_of_quads(acquisition: &Acquisition, added: u32) -> Acquisition {
     let mut sensor: Sensor = acquisition.sensor.clone();
     match sensor.response {
-        Response::Binary => sensor.frames_summed = (ADDED * sensor.frames_summed).min(65_535),
+        Response::Binary => sensor.frames_summed = (added * sensor.frames_summed).min(65_535),
         Response::Linear => {
-            sensor.bits = (sensor.bits + 2).min(16);
-            sensor.dark = sensor.dark.times(f64::from(ADDED));
-            sensor.read_noise *= f64::from(ADDED).sqrt();
+            let bits = added.next_power_of_two().trailing_zeros() as u8;
+            sensor.bits = (sensor.bits + bits).min(16);
+            sensor.dark = sensor.dark.times(f64::from(added));
+            sensor.read_noise *= f64::from(added).sqrt();
             sensor.gain = Gain::Fixed(acquisition.gain);
         }
     }
-    let ppp = f64::from(ADDED) * acquisition.ppp;
+    let ppp = f64::from(added) * acquisition.ppp;
     Acquisition { sensor, ppp, dark: None, ..acquisition.clone() }
 }

@@ -139,6 +139,7 @@ impl Reading {
             dcr: given.dcr,
             lenient: given.lenient,
             signed: false,
+            full_colour: false,
         }
     }
 }

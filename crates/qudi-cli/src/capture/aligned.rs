@@ -131,8 +131,9 @@ impl AlignedCapture {
         let readable = capture.length().is_some() && !capture.forward_only();
         let aligns = method.is_none_or(|method| method.aligns);
         let known = sensor.dark_per_frame().is_ok();
-        // Sums that are aligned by whole pixels would mix the colours of a filter.
-        let aligns = aligns && capture.filter().is_none();
+        // Sums that are aligned by whole pixels would mix the colours of a filter, and only one of three full
+        // planes is seen here.
+        let aligns = aligns && !capture.has_colours();
         let short = |choice: &SumChoice| choice.limit == SumLimit::Motion && !choice.still;
         match choice.filter(short) {
             Some(choice) if readable && aligns && known => {

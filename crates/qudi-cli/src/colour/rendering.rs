@@ -27,6 +27,10 @@ impl Rendering {
         let colour = acquisition.sensor.colour.clone().unwrap_or_default();
         let known = given.map(|gains| (gains, "given"));
         let known = known.or(colour.white_balance.map(|gains| (Gains(gains), "of the sensor")));
+        if known.is_none() && capture.filter().is_none() {
+            let gains_source = "none: planes as they are";
+            return Self { gains: Gains([1.0; 3]), gains_source, colour };
+        }
         let (gains, gains_source) = known.unwrap_or_else(|| {
             let guessed = guessed_gains(capture, summary, acquisition);
             (guessed, "a guess: the brightest things are taken for gray")

@@ -86,6 +86,11 @@ impl ColourFilter {
         Self { size, colours, efficiency: [1.0; 4] }.complete(&mosaic.to_string())
     }
 
+    /// Creates a filter of one colour, as in front of one of three full planes.
+    pub fn uniform(colour: Colour, size: Size) -> Self {
+        Self { size, colours: vec![colour; size.pixels()], efficiency: [1.0; 4] }
+    }
+
     /// Creates a filter from a picture of it: a pure red, green, blue or white pixel for each pixel.
     ///
     /// # Errors

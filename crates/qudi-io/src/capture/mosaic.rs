@@ -13,13 +13,16 @@ pub(super) enum MosaicPart {
     Plane(MosaicPlane),
 }
 
-/// Returns the part of a mosaic that is read; `None` for captures without one. The filter is the user's, the
-/// file's, or the sensor's.
+/// Returns the part of a mosaic that is read; `None` for captures without one, as with full planes. The
+/// filter is the user's, the file's, or the sensor's.
 pub(super) fn mosaic_part(
     info: &mut CaptureInfo,
     options: &ReadOptions,
     sensor: Option<&Sensor>,
 ) -> Result<Option<MosaicPart>> {
+    if info.full_colour {
+        return Ok(None);
+    }
     let of_sensor = || {
         let sensor = sensor.or(info.sensor.as_ref())?;
         sensor.colour.as_ref()?.cfa.clone()

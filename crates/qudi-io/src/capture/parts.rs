@@ -13,6 +13,13 @@ impl Capture {
         edges.windows(2).map(|edge| edge[0] - start..edge[1] - start).collect()
     }
 
+    /// Divides the capture into the parts of another, of the same frames.
+    #[must_use]
+    pub fn divided_as(mut self, other: &Self) -> Self {
+        self.boundaries.clone_from(&other.boundaries);
+        self
+    }
+
     /// Returns the longest part.
     pub fn longest_part(&self) -> Range<u64> {
         self.parts().into_iter().max_by_key(|part| part.end - part.start).unwrap_or_default()

@@ -92,6 +92,7 @@ impl Array {
         let axes = if self.fortran { axes.reversed() } else { axes };
         let at = axes.frame_position();
         let Layout { dims, colours, index } = self.layout(axes, options)?;
+        info.full_colour |= options.takes_colours(colours.number());
         let volumes = matches!(colours, Colours::Volumes(n) if n > 1);
         if at != 0 || volumes {
             self.spool()?;

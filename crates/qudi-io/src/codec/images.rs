@@ -101,11 +101,12 @@ pub(crate) fn open_files(
     for file in &files {
         require_regular(file, "open the image")?;
     }
-    let (size, samples, full) = gray(first, options.channel)?;
+    info.full_colour |= options.takes_colours(colours_of(first));
+    let channel = options.channel_of(colours_of(first));
+    let (size, samples, full) = gray(first, channel)?;
     if lossy(first) {
         info.notes.push("JPEG is lossy: its values are not photon counts".to_owned());
     }
-    let channel = options.channel;
     let mut images = Images { files, size, scale: Scale::Counts, channel };
     if let Some(scale) = Scale::asked(options, f32::from(full), info) {
         images.scale = scale;
@@ -165,6 +166,12 @@ fn lossy(path: &Path) -> bool {
     let mut magic = [0; 3];
     let read = File::open(path).and_then(|mut file| file.read_exact(&mut magic));
     read.is_ok() && magic == [0xff, 0xd8, 0xff]
+}
+
+/// Returns 3 for images of red, green and blue that differ, and 1 for all others.
+fn colours_of(image: &Path) -> usize {
+    let is_coloured = gray(image, None).is_err() && gray(image, Some(2)).is_ok();
+    if is_coloured { 3 } else { 1 }
 }
 
 /// Reads the gray samples of an image, or of one channel, with its size and full scale.

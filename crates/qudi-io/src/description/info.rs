@@ -68,6 +68,8 @@ pub struct CaptureInfo {
     pub mean_level: Option<f64>,
     /// Colour filter array, if the file, the user or the sensor names it.
     pub cfa: Option<FilterChoice>,
+    /// True if the file holds red, green and blue at every pixel, and colours were asked for.
+    pub full_colour: bool,
     /// Camera preset that this format belongs to.
     pub preset: Option<&'static str>,
     /// Frames before which numbers are missing, and how many frames that are.
@@ -109,6 +111,7 @@ impl CaptureInfo {
             sensor: None,
             pedestal: 0.0,
             gain: None,
+            full_colour: false,
             ppp: None,
             mean_level: None,
             cfa: None,

@@ -24,6 +24,10 @@ pub struct ReadOptions {
     pub axes: Option<Axes>,
     /// Colour channel to read, from 0; for a mosaic, the letter of its pattern.
     pub channel: Option<usize>,
+    /// True to take the three planes of a colour capture for its colours, and to read the one of green where
+    /// no channel is named.
+    #[serde(skip)]
+    pub full_colour: bool,
     /// Colour filter array in front of the pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cfa: Option<FilterChoice>,
@@ -64,7 +68,20 @@ pub struct ReadOptions {
     pub signed: bool,
 }
 
+/// Channel of green.
+const GREEN: usize = 1;
+
 impl ReadOptions {
+    /// Returns the channel to read, out of `channels`: the one that is named, or green of three full planes.
+    pub(crate) fn channel_of(&self, channels: usize) -> Option<usize> {
+        self.channel.or(self.takes_colours(channels).then_some(GREEN))
+    }
+
+    /// Returns true if so many channels are taken for colours.
+    pub(crate) fn takes_colours(&self, channels: usize) -> bool {
+        self.full_colour && self.cfa.is_none() && channels == 3
+    }
+
     /// Returns the options for reading a container. The channel of a mosaic is a plane of its pattern, not an
     /// axis of the array.
     pub(crate) fn of_container(&self, mosaic: bool) -> Self {

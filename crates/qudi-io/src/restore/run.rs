@@ -35,6 +35,15 @@ pub trait RestoreSink {
         let _ = (number, uncertainty);
         Ok(())
     }
+
+    /// Takes the uncertainties of red, green and blue of frame `number`, right after the one of its luma.
+    ///
+    /// # Errors
+    /// The sink's own; the run ends with it.
+    fn colour_uncertainty(&mut self, number: u64, uncertainty: &[Frame; 3]) -> Result<()> {
+        let _ = (number, uncertainty);
+        Ok(())
+    }
 }
 
 /// Refuses restored frames that hold NaN or infinite values, and names the first.
@@ -123,6 +132,30 @@ impl RestoreSink for Renumbered<'_> {
     fn uncertainty(&mut self, number: u64, uncertainty: &Frame) -> Result<()> {
         self.sink.uncertainty(self.first + number, uncertainty)
     }
+
+    fn colour_uncertainty(&mut self, number: u64, uncertainty: &[Frame; 3]) -> Result<()> {
+        self.sink.colour_uncertainty(self.first + number, uncertainty)
+    }
+}
+
+/// The planes of colours in windows that overlap.
+#[derive(Default)]
+struct ColourFade([CrossFade; 3]);
+
+impl ColourFade {
+    fn push(&mut self, first: u64, colours: &[[Frame; 3]], weight: impl Fn(u64) -> f32 + Copy) {
+        for (k, plane) in self.0.iter_mut().enumerate() {
+            let frames = colours.iter().map(|colours| colours[k].clone()).collect();
+            plane.push(first, frames, weight);
+        }
+    }
+
+    /// Returns the next colours, if no later window changes them.
+    fn pop(&mut self, until: u64) -> Option<[Frame; 3]> {
+        let [red, green, blue] = &mut self.0;
+        let (red, green, blue) = (red.pop(until)?, green.pop(until)?, blue.pop(until)?);
+        Some([red.1, green.1, blue.1])
+    }
 }
 
 /// Restores pictures of a capture without cuts.
@@ -186,6 +219,9 @@ fn run_centred(
         if let Some(uncertainty) = restored.std {
             sink.uncertainty(picture, &uncertainty[0])?;
         }
+        if let Some(uncertainty) = restored.colour_std {
+            sink.colour_uncertainty(picture, &uncertainty[0])?;
+        }
     }
     Ok(())
 }
@@ -206,8 +242,9 @@ fn run_windows(
     let mut first_held = 0;
     let mut restored_until = 0;
     let mut fade = CrossFade::default();
-    let mut planes: [CrossFade; 3] = Default::default();
+    let mut planes = ColourFade::default();
     let mut uncertainties = CrossFade::default();
+    let mut colour_uncertainties = ColourFade::default();
     for number in windows.first_with(first).. {
         // A pipe tells its length at its end. The place of this window and the next one is certain once the
         // next one is complete, or no more frames arrive.
@@ -248,13 +285,13 @@ fn run_windows(
             let weight = |picture| windows.weight(number, instants.frame_of(picture));
             fade.push(before, restored.frames, weight);
             if let Some(colours) = restored.colour {
-                for (k, plane) in planes.iter_mut().enumerate() {
-                    let frames = colours.iter().map(|colours| colours[k].clone()).collect();
-                    plane.push(before, frames, weight);
-                }
+                planes.push(before, &colours, weight);
             }
             if let Some(uncertainty) = restored.std {
                 uncertainties.push(before, uncertainty, weight);
+            }
+            if let Some(uncertainty) = restored.colour_std {
+                colour_uncertainties.push(before, &uncertainty, weight);
             }
         }
         restored_until = restored_here.end;
@@ -264,17 +301,17 @@ fn run_windows(
         while let Some((picture, image)) = fade.pop(until) {
             let requested = pictures.contains(&picture);
             let frame = instants.frame_of(picture);
-            let colour = planes.each_mut().map(|plane| plane.pop(until).map(|(_, frame)| frame));
             let counts = &counts[(frame - first_held) as usize];
-            match colour {
+            match planes.pop(until) {
                 _ if !requested => {}
-                [Some(red), Some(green), Some(blue)] => {
-                    sink.colour(picture, &[red, green, blue], counts)?;
-                }
-                _ => sink.frame(picture, &image, counts)?,
+                Some(colours) => sink.colour(picture, &colours, counts)?,
+                None => sink.frame(picture, &image, counts)?,
             }
             if let Some((_, uncertainty)) = uncertainties.pop(until).filter(|_| requested) {
                 sink.uncertainty(picture, &uncertainty)?;
+            }
+            if let Some(uncertainty) = colour_uncertainties.pop(until).filter(|_| requested) {
+                sink.colour_uncertainty(picture, &uncertainty)?;
             }
         }
     }

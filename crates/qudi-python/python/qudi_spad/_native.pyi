@@ -59,6 +59,7 @@ def version() -> str: ...
 def write_frames(
     path: str | os.PathLike[str],
     size: tuple[int, int],
+    planes: int,
     frames: Iterable[bytes],
     *,
     float: bool,

@@ -28,9 +28,10 @@ class Result:
     Attributes
     ----------
     frames : ndarray of float32
-        ``[frames, rows, columns]``; 1 is full scale, values follow the light.
+        ``[frames, rows, columns]``; 1 is full scale, values follow the light. Of captures behind a colour filter
+        ``[frames, rows, columns, 3]``: the sensor's own red, green and blue, without white balance.
     sigma : ndarray of float32 or None
-        The standard deviation of every pixel's error, in the unit of `frames`, from methods that predict it.
+        The standard deviation of every value's error, in the unit of `frames`, from methods that predict it.
     manifest : dict
         ``settings``, on which the frames depend (method, weights, light, sensor), and ``results`` (``chi_square``,
         warnings).
@@ -52,6 +53,7 @@ def restore(
     steps: int | None = None,
     samples: int = 1,
     every: int | None = None,
+    cfa: str | None = None,
     device: str = "auto",
     progress: bool | Progress | None = None,
     **options: object,
@@ -80,6 +82,9 @@ def restore(
         Reverse steps and samples of the method "qudi-diffusion".
     every : int, optional
         Restores one frame for every so many frames of the capture.
+    cfa : str, optional
+        The colour filter in front of the pixels, as in "rggb@0,0", or a picture of it (docs/colour.md); by default
+        the one that sensor or record name. ``gray=True`` restores luma alone, ``tonemap="srgb"`` colours for the eye.
     device : str
         "auto", "cpu", or a graphics card as in "wgpu:1".
     progress : bool or callable, optional
@@ -105,7 +110,7 @@ def restore(
         If a file cannot be read.
     """
     names = {"sensor": sensor, "ppp": ppp, "sum": sum, "method": method, "steps": steps, "samples": samples}
-    run = _start(capture, {**names, "every": every, "device": device}, options)
+    run = _start(capture, {**names, "every": every, "cfa": cfa, "device": device}, options)
     frames, sigma = _Stack(), _Stack()
     shown: _Bar | None = None
     manifest: dict[str, Any] = {}
@@ -151,7 +156,7 @@ def restore_iter(capture: Input, /, *, sigma: bool = False, **options: Any) -> I
     Yields
     ------
     ndarray of float32
-        ``[rows, columns]``.
+        ``[rows, columns]``, or ``[rows, columns, 3]`` of captures behind a colour filter.
 
     Raises
     ------
@@ -199,8 +204,14 @@ def _size(start: tuple[str, int | None]) -> tuple[tuple[int, int], int | None]:
 
 
 def _frame(values: bytes, size: tuple[int, int]) -> Frames:
-    frame: Frames = np.frombuffer(values, np.float32).reshape(size).copy()
+    frame: Frames = _shaped(values, size).copy()
     return frame
+
+
+def _shaped(values: bytes, size: tuple[int, int]) -> Frames:
+    """Returns the values of a gray frame, or of one of three colours."""
+    frame: Frames = np.frombuffer(values, np.float32)
+    return frame.reshape(size if frame.size == size[0] * size[1] else (*size, 3))
 
 
 class _Stack:
@@ -217,12 +228,13 @@ class _Stack:
         self._size, self._total = size, total
 
     def push(self, values: bytes) -> None:
+        frame = _shaped(values, self._size)
         if self._frames is None and self._total is not None:
-            self._frames = np.empty((self._total, *self._size), np.float32)
+            self._frames = np.empty((self._total, *frame.shape), np.float32)
         if self._frames is not None:
-            self._frames[self.count] = np.frombuffer(values, np.float32).reshape(self._size)
+            self._frames[self.count] = frame
         else:
-            self._more.append(_frame(values, self._size))
+            self._more.append(frame.copy())
         self.count += 1
 
     def array(self) -> Frames:

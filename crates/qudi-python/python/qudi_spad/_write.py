@@ -33,7 +33,8 @@ def write(
         Counts: ``.npy`` (bits are packed), ``.tif``, or a folder of PNG, with a record next to it. Frames: ``.npy``,
         ``.tif``, ``.gif``, ``.mp4`` (through ffmpeg), or a folder of 16-bit PNG.
     array : array
-        ``[frames, rows, columns]``: whole numbers or bools are counts, floats are frames in which 1 is white.
+        ``[frames, rows, columns]``: whole numbers or bools are counts, floats are frames in which 1 is white. Floats of
+        shape ``[frames, rows, columns, 3]`` are colours, written as they are.
     overwrite : bool
         True replaces what is there.
     fps : float
@@ -51,13 +52,15 @@ def write(
         If the place is taken or cannot be written.
     """
     values = np.asarray(array)
-    if values.ndim != 3 or 0 in values.shape:
+    is_colour = values.dtype.kind == "f" and values.ndim == 4 and values.shape[-1] == 3
+    if not (values.ndim == 3 or is_colour) or 0 in values.shape:
         raise ValueError(
             f"an array of shape {values.shape}\n  where: {os.fspath(path)}\n  help: give frames, rows and columns"
         )
     if values.dtype.kind == "f":
         size = values.shape[1], values.shape[2]
-        _native.write_frames(os.fspath(path), size, _bytes(values), float=float, fps=fps, force=overwrite)
+        planes, frames = 3 if is_colour else 1, _bytes(values)
+        _native.write_frames(os.fspath(path), size, planes, frames, float=float, fps=fps, force=overwrite)
         return
     with tempfile.TemporaryDirectory(prefix="qudi-spad-") as folder:
         counts = os.path.join(folder, "counts.npy")

@@ -13,7 +13,6 @@ mod weight_files;
 
 use backbone::{Backbone, Weights};
 use burn::tensor::{Device, Tensor, TensorData};
-use input::Input;
 use qudi_core::nearest::nearest;
 use qudi_core::{Error, Result, Size};
 use qudi_layers::StateDict;
@@ -22,6 +21,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 pub(crate) use backbone::Net;
+pub use input::Images;
 pub use weight_files::cache_folder;
 
 /// The perceptual term of a recipe.
@@ -100,7 +100,6 @@ const SQUARED_FLOOR: f32 = 1e-10;
 #[derive(Clone, Debug)]
 pub struct Lpips {
     net: Net,
-    input: Input,
     backbone: Backbone,
     /// Weights of the channels of every tap, `[1, channels]`.
     heads: Vec<Tensor<2>>,
@@ -115,8 +114,8 @@ impl Lpips {
         kind.net().map_or(Ok(()), |net| weight_files::find(net, folder).map(drop))
     }
 
-    /// Reads the weights of `kind` for gray images onto `device`: from `folder`, if one is given, or else
-    /// from [`cache_folder`]. Gives nothing for [`PerceptualKind::None`].
+    /// Reads the weights of `kind` onto `device` to compare gray images: from `folder`, if one is given, or
+    /// else from [`cache_folder`]. Gives nothing for [`PerceptualKind::None`].
     ///
     /// # Errors
     /// [`Error`] if weights are missing (it says which and where to get them), or do not fit.
@@ -125,23 +124,15 @@ impl Lpips {
         folder: Option<&Path>,
         device: &Device,
     ) -> Result<Option<Self>> {
-        Self::load_for(Input::Gray, kind, folder, device)
+        Self::load_for(Images::Gray, kind, folder, device)
     }
 
-    /// Reads the weights of `kind` for images in colour, otherwise like [`load`](Self::load).
+    /// Reads the weights of `kind` as [`load`](Self::load) does, to compare `images` of a kind.
     ///
     /// # Errors
-    /// As for [`load`](Self::load).
-    pub fn load_colour(
-        kind: PerceptualKind,
-        folder: Option<&Path>,
-        device: &Device,
-    ) -> Result<Option<Self>> {
-        Self::load_for(Input::Colour, kind, folder, device)
-    }
-
-    fn load_for(
-        input: Input,
+    /// As [`load`](Self::load).
+    pub fn load_for(
+        images: Images,
         kind: PerceptualKind,
         folder: Option<&Path>,
         device: &Device,
@@ -153,20 +144,20 @@ impl Lpips {
             let file = if name.starts_with("lin") { &heads } else { &backbone };
             file.read(name, shape)
         };
-        Ok(Some(Self::new(net, input, &mut weights, &device.clone().inner())?))
+        Ok(Some(Self::new(net, images, &mut weights, &device.clone().inner())?))
     }
 
     /// Asks for the weights by name: torchvision's (`features.0.weight`) and LPIPS's (`lin0.model.1.weight`).
     ///
     /// # Errors
     /// Those of `weights`.
-    fn new(net: Net, input: Input, weights: &mut Weights<'_>, device: &Device) -> Result<Self> {
-        let backbone = Backbone::new(net.layers(), input, weights, device)?;
+    fn new(net: Net, images: Images, weights: &mut Weights<'_>, device: &Device) -> Result<Self> {
+        let backbone = Backbone::new(net.layers(), images, weights, device)?;
         let heads = backbone.taps.iter().enumerate().map(|(tap, &channels)| {
             let head = weights(&format!("lin{tap}.model.1.weight"), &[1, channels, 1, 1])?;
             Ok(Tensor::from_data(TensorData::new(head, [1, channels]), device))
         });
-        Ok(Self { net, input, heads: heads.collect::<Result<_>>()?, backbone })
+        Ok(Self { net, heads: heads.collect::<Result<_>>()?, backbone })
     }
 
     /// Checks that images of this size can be compared.
@@ -190,9 +181,8 @@ impl Lpips {
     /// Returns the mean over all images of the distance of `p` from `q`.
     ///
     /// # Shapes
-    /// - p, q: `[images, 1, height, width]` in [0, 1], or of weights for colour `[images, 3, height, width]`
-    ///   as the network takes them (LPIPS maps [0, 1] to [-1, 1]); of a size that [`check`](Self::check)
-    ///   accepts, on the device of the weights, with autodiff or without
+    /// - p, q: `[images, 1, height, width]` in [0, 1] (3 planes of [`Images::Colour`]), of a size that
+    ///   [`check`](Self::check) accepts, on the device of the weights, with autodiff or without
     /// - output: `[1]`
     pub fn loss(&self, p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
         self.distances(p, q).mean()
@@ -205,7 +195,6 @@ impl Lpips {
     /// - output: `[images]`
     pub fn distances(&self, p: Tensor<4>, q: Tensor<4>) -> Tensor<1> {
         assert_eq!(p.dims(), q.dims(), "images to compare");
-        assert_eq!(p.dims()[1], self.input.images(), "planes of an image");
         let images = p.dims()[0];
         let [p, q] = [p, q].map(|images| self.backbone.forward(input::with_ones(images)));
         let mut sum = Tensor::zeros([images, 1], &p[0].device());

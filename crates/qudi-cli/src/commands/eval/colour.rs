@@ -1,13 +1,16 @@
 //! Restored colours against true ones: both in files, in linear light.
 
+use super::perceptual::Perceptual;
 use crate::error::{CliError, Result};
 use crate::report::Report;
+use burn::tensor::Device;
 use palette::color_difference::Ciede2000;
 use palette::white_point::D65;
 use palette::{IntoColor, Lab, LinSrgb};
 use qudi_core::metrics::{colour_psnr, common_gain, gain_aligned_psnr, zipper_error};
 use qudi_core::npy::Header;
 use qudi_core::{Error, Frame, Size, linear_to_srgb};
+use qudi_train::loss::lpips::{Images, PerceptualKind};
 use serde_json::json;
 use std::fmt::Write;
 use std::io::Read;
@@ -27,10 +30,23 @@ struct ColourScore {
     zipper: f64,
     /// PSNR of luma in linear light, after its own gain.
     luma: f64,
+    /// LPIPS of sRGB values after the common gain, with AlexNet and VGG16, where their weights are given.
+    lpips: [Option<f64>; 2],
 }
 
-/// Scores the frames of `restored` against the same frames of `truth`.
-pub(super) fn score_files(truth: &Path, restored: &Path, report: &Report) -> Result<()> {
+/// Networks of [`ColourScore::lpips`].
+const LPIPS: [PerceptualKind; 2] = [PerceptualKind::LpipsAlex, PerceptualKind::LpipsVgg];
+
+/// Scores the frames of `restored` against the same frames of `truth`, with the weights of LPIPS in the
+/// folder `backbones`.
+pub(super) fn score_files(
+    truth: &Path,
+    restored: &Path,
+    backbones: Option<&Path>,
+    report: &Report,
+) -> Result<()> {
+    let load = |folder| Perceptual::load(folder, Images::Colour, Device::flex());
+    let perceptual = backbones.map(load).transpose()?;
     let [mut truths, mut others] = [truth, restored].map(ColourClip::open);
     let (truths, others) = match (&mut truths, &mut others) {
         (Ok(truths), Ok(others)) => (truths, others),
@@ -49,7 +65,7 @@ pub(super) fn score_files(truth: &Path, restored: &Path, report: &Report) -> Res
     }
     let mut scores = Vec::new();
     for _ in 0..truths.frames {
-        scores.push(score(&others.next()?, &truths.next()?));
+        scores.push(score(&others.next()?, &truths.next()?, perceptual.as_ref())?);
     }
     let mean = |of: fn(&ColourScore) -> f64| {
         scores.iter().map(of).sum::<f64>() / scores.len().max(1) as f64
@@ -57,6 +73,10 @@ pub(super) fn score_files(truth: &Path, restored: &Path, report: &Report) -> Res
     let (linear, srgb) = (mean(|s| s.linear), mean(|s| s.srgb));
     let (difference, zipper) = (mean(|s| s.difference), mean(|s| s.zipper));
     let luma = mean(|s| s.luma);
+    let [alex, vgg] = [0, 1].map(|n| {
+        let values: Option<Vec<f64>> = scores.iter().map(|score| score.lpips[n]).collect();
+        values.map(|values| values.iter().sum::<f64>() / scores.len().max(1) as f64)
+    });
     let mut text = String::new();
     let _ = writeln!(text, "{} frames, means:", scores.len());
     for (name, value) in [
@@ -68,6 +88,11 @@ pub(super) fn score_files(truth: &Path, restored: &Path, report: &Report) -> Res
     ] {
         let _ = writeln!(text, "  {name:<21}{value}");
     }
+    for (name, value) in [("LPIPS (AlexNet)", alex), ("LPIPS (VGG16)", vgg)] {
+        if let Some(value) = value {
+            let _ = writeln!(text, "  {name:<21}{value:.4}");
+        }
+    }
     report.result(&text, || {
         json!({
             "frames": scores.len(),
@@ -76,20 +101,42 @@ pub(super) fn score_files(truth: &Path, restored: &Path, report: &Report) -> Res
             "ciede2000_median": difference,
             "zipper": zipper,
             "psnr_luma": luma,
+            "lpips_alex": alex,
+            "lpips_vgg": vgg,
         })
     })
 }
 
 /// Scores a frame after the best common gain.
-fn score(restored: &[Frame; 3], truth: &[Frame; 3]) -> ColourScore {
+fn score(
+    restored: &[Frame; 3],
+    truth: &[Frame; 3],
+    perceptual: Option<&Perceptual>,
+) -> Result<ColourScore> {
     let gain = common_gain(restored, truth);
-    ColourScore {
+    let mut lpips = [None; 2];
+    if let Some(perceptual) = perceptual {
+        let (shown, seen) = (encoded(restored, gain as f32), encoded(truth, 1.0));
+        for (value, kind) in lpips.iter_mut().zip(LPIPS) {
+            *value = perceptual.distance_of_planes(kind, shown.each_ref(), seen.each_ref())?;
+        }
+    }
+    Ok(ColourScore {
         linear: colour_psnr(restored, truth, gain, |value| value),
         srgb: colour_psnr(restored, truth, gain, linear_to_srgb),
         difference: median_difference(restored, truth, gain as f32),
         zipper: zipper_error(restored, truth, gain),
         luma: gain_aligned_psnr(&luma(restored), &luma(truth)),
-    }
+        lpips,
+    })
+}
+
+/// Returns sRGB values of linear light, which is multiplied with `gain` and clipped.
+fn encoded(planes: &[Frame; 3], gain: f32) -> [Frame; 3] {
+    planes.each_ref().map(|plane| {
+        let value = |value: &f32| linear_to_srgb((gain * value).clamp(0.0, 1.0));
+        Frame { size: plane.size, data: plane.data.iter().map(value).collect() }
+    })
 }
 
 fn luma(planes: &[Frame; 3]) -> Frame {

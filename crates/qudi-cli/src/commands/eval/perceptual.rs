@@ -1,10 +1,10 @@
 //! LPIPS of restored frames, where its weights are given.
 
 use crate::error::{CliError, Result};
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use qudi_core::Frame;
 use qudi_layers::tensor::{read, to_tensor};
-use qudi_train::loss::lpips::{Lpips, PerceptualKind};
+use qudi_train::loss::lpips::{Images, Lpips, PerceptualKind};
 use std::path::Path;
 
 /// LPIPS with the weights that there are.
@@ -15,15 +15,17 @@ pub(crate) struct Perceptual {
 }
 
 impl Perceptual {
-    /// Reads the weights in `folder` onto `device`.
+    /// Reads the weights in `folder` onto `device`, for images of a kind.
     ///
     /// # Errors
     /// [`CliError`] if there are none, or they do not fit.
-    pub(super) fn load(folder: &Path, device: Device) -> Result<Self> {
+    pub(super) fn load(folder: &Path, images: Images, device: Device) -> Result<Self> {
         let mut nets = Vec::new();
         for kind in [PerceptualKind::LpipsAlex, PerceptualKind::LpipsVgg] {
             if Lpips::find(kind, Some(folder)).is_ok() {
-                nets.extend(Lpips::load(kind, Some(folder), &device)?.map(|net| (kind, net)));
+                nets.extend(
+                    Lpips::load_for(images, kind, Some(folder), &device)?.map(|net| (kind, net)),
+                );
             }
         }
         if nets.is_empty() {
@@ -46,10 +48,21 @@ impl Perceptual {
         image: &Frame,
         truth: &Frame,
     ) -> Result<Option<f64>> {
+        self.distance_of_planes(kind, [image], [truth])
+    }
+
+    /// Computes the distance of an image of several planes, as [`distance`](Self::distance) does.
+    pub(super) fn distance_of_planes<const N: usize>(
+        &self,
+        kind: PerceptualKind,
+        image: [&Frame; N],
+        truth: [&Frame; N],
+    ) -> Result<Option<f64>> {
         let Some((_, net)) = self.nets.iter().find(|(of, _)| *of == kind) else { return Ok(None) };
         let small = |e| CliError::new(e, "--backbones", "use larger frames, or leave it out");
-        net.check(truth.size).map_err(small)?;
-        let tensor = |frame: &Frame| to_tensor(frame.data.clone(), frame.size, &self.device);
+        net.check(truth[0].size).map_err(small)?;
+        let plane = |frame: &Frame| to_tensor(frame.data.clone(), frame.size, &self.device);
+        let tensor = |planes: [&Frame; N]| Tensor::cat(planes.map(plane).to_vec(), 1);
         let values = read(net.distances(tensor(image), tensor(truth)))?;
         Ok(values.first().map(|&value| f64::from(value)))
     }

@@ -17,6 +17,7 @@ use qudi_core::PppDefinition;
 use qudi_core::atomic_file::Overwrite;
 use qudi_io::description::{MaskChoice, ReadOptions};
 use qudi_layers::Provenance;
+use qudi_train::loss::lpips::Images;
 use std::path::PathBuf;
 use std::rc::Rc;
 
@@ -108,7 +109,7 @@ impl Plan {
             None => None,
             Some(folder) => {
                 let device = device::open(&network.device)?.device;
-                Some(Rc::new(Perceptual::load(folder, device)?))
+                Some(Rc::new(Perceptual::load(folder, Images::Gray, device)?))
             }
         };
         let plan = Self {

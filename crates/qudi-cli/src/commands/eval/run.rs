@@ -33,7 +33,8 @@ pub(crate) fn run(
     report: &Report,
 ) -> Result<()> {
     if let Some(restored) = &args.restored {
-        return score_files(Path::new(&args.data), restored, report);
+        let backbones = args.backbones.as_deref();
+        return score_files(Path::new(&args.data), restored, backbones, report);
     }
     let overwrite = global.overwrite();
     let output = |path: &Option<PathBuf>| Output::open(path.as_deref(), overwrite);

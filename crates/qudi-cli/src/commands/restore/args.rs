@@ -104,8 +104,8 @@ pub(crate) struct Restore {
     /// Write a page that plays: counts, restored frames, uncertainty and misfit under a slider, the settings
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) html: Option<PathBuf>,
-    /// Write the uncertainty of every pixel, .npy: the sigma that the network predicts, or that over
-    /// --samples K
+    /// Write the uncertainty of every pixel, or of every colour of it, .npy: the sigma that the network
+    /// predicts, or that over --samples K
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub(crate) uncertainty: Option<PathBuf>,
     #[command(flatten)]

@@ -7,6 +7,7 @@ use super::plan::Plan;
 use super::run::Job;
 use crate::args::Global;
 use crate::capture::{Input, Source};
+use crate::colour::{Rendering, encoded};
 use crate::error::{CliError, Result};
 use crate::report::Report;
 use crate::settings::Settings;
@@ -28,11 +29,23 @@ pub trait Receiver {
     /// The receiver's own; the run ends with it.
     fn frame(&mut self, frame: &Frame) -> qudi_core::Result<()>;
 
+    /// Takes red, green and blue of the next frame, of captures behind a colour filter.
+    ///
+    /// # Errors
+    /// The receiver's own; the run ends with it.
+    fn colour(&mut self, frame: &[Frame; 3]) -> qudi_core::Result<()>;
+
     /// Takes the uncertainty of the frame that came last, from methods that predict it.
     ///
     /// # Errors
     /// The receiver's own; the run ends with it.
     fn uncertainty(&mut self, sigma: &Frame) -> qudi_core::Result<()>;
+
+    /// Takes the uncertainties of red, green and blue of the frame that came last, in place of a gray one.
+    ///
+    /// # Errors
+    /// The receiver's own; the run ends with it.
+    fn colour_uncertainty(&mut self, sigma: &[Frame; 3]) -> qudi_core::Result<()>;
 }
 
 /// A sink that hands frames to a receiver and measures their chi-square.
@@ -40,6 +53,8 @@ struct Sink<'a> {
     receiver: &'a mut dyn Receiver,
     map: ChiSquareMap,
     tonemap: Tonemap,
+    /// Rendering of colours for the eye, where colours are restored.
+    rendering: Option<Rendering>,
 }
 
 impl RestoreSink for Sink<'_> {
@@ -48,8 +63,22 @@ impl RestoreSink for Sink<'_> {
         self.map.add(restored, counts)
     }
 
+    fn colour(&mut self, _: u64, restored: &[Frame; 3], counts: &[u16]) -> qudi_core::Result<()> {
+        match &self.rendering {
+            Some(rendering) if self.tonemap == Tonemap::Srgb => {
+                self.receiver.colour(&encoded(&rendering.rendered(restored)))?;
+            }
+            _ => self.receiver.colour(restored)?,
+        }
+        self.map.add_colour(restored, counts)
+    }
+
     fn uncertainty(&mut self, _: u64, sigma: &Frame) -> qudi_core::Result<()> {
-        self.receiver.uncertainty(sigma)
+        if self.rendering.is_some() { Ok(()) } else { self.receiver.uncertainty(sigma) }
+    }
+
+    fn colour_uncertainty(&mut self, _: u64, sigma: &[Frame; 3]) -> qudi_core::Result<()> {
+        self.receiver.colour_uncertainty(sigma)
     }
 }
 
@@ -65,7 +94,7 @@ pub(crate) fn run(
 ) -> Result<Value> {
     refuse_files(&args)?;
     let shard = args.shard.take();
-    let plan = Plan { luma_alone: true, ..Plan::new(&args, global, false)? };
+    let plan = Plan::new(&args, global, false)?;
     let source = match input {
         Some(input) => Source { input, ..plan.source() },
         None => plan.source(),
@@ -84,7 +113,8 @@ pub(crate) fn run(
     receiver.start(&settings, frames.map(|_| part.end - part.start))?;
     let map = ChiSquareMap::new(job.capture().size(), frames, &job.acquisition);
     let map = map.behind(job.capture().filter().cloned());
-    let mut sink = Sink { receiver, map, tonemap: plan.tonemap() };
+    let rendering = job.rendering.clone();
+    let mut sink = Sink { receiver, map, tonemap: plan.tonemap(), rendering };
     job.run(part, &mut sink, &plan.network, report)?;
     let results = job.results(&plan, sink.map.chi_square())?;
     crate::capture::remarks(job.capture(), report);
@@ -104,7 +134,6 @@ fn refuse_files(args: &Restore) -> Result<()> {
         (args.uncertainty.is_some(), "--uncertainty"),
         (args.float, "--float"),
         (args.fps.is_some(), "--fps"),
-        (args.wb.is_some(), "--wb"),
     ];
     let Some((_, flag)) = given.into_iter().find(|(given, _)| *given) else { return Ok(()) };
     Err(CliError::new("no file is written", flag, "leave it out: frames and sigma are returned"))

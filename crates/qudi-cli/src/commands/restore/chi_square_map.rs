@@ -86,10 +86,11 @@ impl ChiSquareMap {
         if let Some(page) = &mut self.page {
             page.add_colour(restored, counts);
         }
-        let Some(filter) = &self.filter else {
-            return Err(Error::request("colours of a gray capture", "cfa", "report this as a bug"));
+        // The counts of three full planes are the ones of green.
+        let (seen, luma) = match &self.filter {
+            Some(filter) => (filter.mosaic(restored), filter.luma(restored)),
+            None => (restored[1].clone(), restored[1].clone()),
         };
-        let (seen, luma) = (filter.mosaic(restored), filter.luma(restored));
         self.show(&luma, counts);
         self.consistency.add(&seen, counts, &self.acquisition).map(drop)
     }

@@ -182,6 +182,10 @@ impl RestoreSink for Sink<'_> {
         self.uncertainty.push(sigma)
     }
 
+    fn colour_uncertainty(&mut self, _: u64, sigma: &[Frame; 3]) -> qudi_core::Result<()> {
+        self.uncertainty.push_colour(sigma)
+    }
+
     fn colour(
         &mut self,
         number: u64,

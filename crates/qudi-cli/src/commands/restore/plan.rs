@@ -86,11 +86,13 @@ impl Plan {
         if let Some(method) = args.method {
             network.check_methods(&[method])?;
         }
+        let mut read = args.reading.options(MaskChoice::Auto);
+        read.full_colour = read.channel.is_none();
         let plan = Self {
             capture: args.capture.clone(),
             output: args.output.clone(),
             sensor: args.sensor.clone(),
-            read: args.reading.options(MaskChoice::Auto),
+            read,
             sum: args.reading.sum(),
             every: args.every,
             tonemap: args.tonemap,

@@ -9,7 +9,8 @@ use super::plan::Plan;
 use super::uncertainty::UncertaintyFile;
 use crate::args::{Global, Shard};
 use crate::capture::{
-    AlignedCapture, Alignment, CaptureAcquisition, Source, SummedCapture, remarks, warnings,
+    AlignedCapture, Alignment, CaptureAcquisition, OtherPlanes, Source, SummedCapture, remarks,
+    warnings,
 };
 use crate::colour::{Rendering, dng_tags, is_linear};
 use crate::commands::look::strip::strip;
@@ -26,9 +27,12 @@ use qudi_burst::ColourRestorer;
 use qudi_core::colour::FilterChoice;
 use qudi_core::progress::{Observer, observed};
 use qudi_core::restorer::{Acquisition, Restorer};
+use qudi_core::sensor::Sensor;
 use qudi_io::capture::{Capture, Summary};
 use qudi_io::description::MaskChoice;
-use qudi_io::restore::{FolderRun, Inputs, RestoreSink, Schedule, Share, run as run_method};
+use qudi_io::restore::{
+    FolderRun, Inputs, Instants, RestoreSink, Schedule, Share, run as run_method,
+};
 use serde_json::{Value, json};
 use std::cell::RefCell;
 use std::fmt::Write as _;
@@ -177,9 +181,18 @@ impl Job {
         let warnings = warnings::of_capture(capture, &summary, Some(&sensor));
         let saturated = warnings::saturation(capture, &summary, Some(&sensor)).is_some();
         let rendering = rendering(plan, capture, &summary, &acquisition)?;
-        let (method, (restorer, choice)) = restorer(plan, &mut aligned, &acquisition, report)?;
+        let (method, (restorer, choice)) =
+            restorer(plan, source, &sensor, &mut aligned, &acquisition, report)?;
         let overlap = plan.overlap * aligned.frames_per_sum();
         let schedule = aligned.schedule(restorer.as_ref(), overlap, plan.every)?;
+        if matches!(schedule.instants, Instants::Centred { .. }) && is_full_colour(&aligned.capture)
+        {
+            return Err(CliError::new(
+                "pictures between the sums of three planes of colour",
+                "--every",
+                "leave it out, or read one plane as gray with --channel 0 to 2",
+            ));
+        }
         Ok(Self {
             aligned,
             acquisition,
@@ -255,6 +268,10 @@ impl Job {
         }
         if let Some(every) = plan.every {
             settings["every"] = json!(every);
+        }
+        if is_full_colour(capture) {
+            settings["full_colour"] = json!(true);
+            settings["gray"] = json!(plan.luma_alone);
         }
         if let Some(filter) = capture.filter() {
             settings["gray"] = json!(plan.luma_alone);
@@ -372,7 +389,7 @@ fn rendering(
     summary: &Summary,
     acquisition: &Acquisition,
 ) -> Result<Option<Rendering>> {
-    if capture.filter().is_none() {
+    if !capture.has_colours() {
         let given = plan.gray.then_some("--gray").or(plan.white_balance.map(|_| "--wb"));
         let Some(flag) = given else { return Ok(None) };
         return Err(CliError::new(
@@ -391,7 +408,8 @@ fn rendering(
         }
         return Ok(None);
     }
-    if plan.tonemap == Some(Tonemap::None) && !is_linear(Path::new(&plan.output), plan.tiff) {
+    let shown = plan.output != "-" && !is_linear(Path::new(&plan.output), plan.tiff);
+    if plan.tonemap == Some(Tonemap::None) && shown {
         return Err(CliError::new(
             format!("pictures of colours have the curve of sRGB, as {} would", plan.output),
             "--tonemap none",
@@ -401,9 +419,16 @@ fn rendering(
     Ok(Some(Rendering::new(plan.white_balance, capture, summary, acquisition)))
 }
 
+/// Returns true for captures of three full planes.
+fn is_full_colour(capture: &Capture) -> bool {
+    capture.info().full_colour
+}
+
 /// Makes the restorer of the named method, or of the default one, for this capture.
 fn restorer(
     plan: &Plan,
+    source: &Source<'_>,
+    sensor: &Sensor,
     aligned: &mut AlignedCapture,
     acquisition: &Acquisition,
     report: &Report,
@@ -418,6 +443,11 @@ fn restorer(
     let (restorer, choice) =
         aligned.capture.in_part(&part, |capture| method.restorer(capture, &seen, &plan.network))?;
     let restorer = aligned.around(restorer);
+    if is_full_colour(&aligned.capture) {
+        let planes = Box::new(OtherPlanes::open(source, sensor, &aligned.capture)?);
+        let coloured = ColourRestorer::of_planes(restorer, planes, !plan.luma_alone);
+        return Ok((method, (Box::new(coloured), choice)));
+    }
     let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
     let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.luma_alone);
     Ok((method, (Box::new(coloured), choice)))

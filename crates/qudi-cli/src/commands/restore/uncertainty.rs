@@ -6,11 +6,11 @@ use crate::methods::network::OwnNetwork;
 use crate::methods::{Method, QUDI};
 use qudi_core::Frame;
 use qudi_io::capture::Capture;
-use qudi_io::writer::ArrayWriter;
+use qudi_io::writer::{ArrayWriter, Planes};
 
-/// A `.npy` file of uncertainties, float32 `[frames, height, width]`, or none.
+/// A `.npy` file of uncertainties, float32 `[frames, height, width]`, with 3 colours last if any, or none.
 #[derive(Debug)]
-pub(super) struct UncertaintyFile(Option<ArrayWriter>);
+pub(super) struct UncertaintyFile(Option<(ArrayWriter, Planes)>);
 
 impl UncertaintyFile {
     /// Creates the file that the plan asks for. An earlier run that finished some frames wrote no uncertainty
@@ -50,16 +50,36 @@ impl UncertaintyFile {
             ));
         }
         let size = capture.size();
-        let shape = [size.height, size.width];
-        Ok(Self(Some(ArrayWriter::create(path, plan.overwrite, "<f4", &shape)?)))
+        let coloured = capture.has_colours() && !plan.luma_alone;
+        let planes = if coloured { Planes::Rgb } else { Planes::Gray };
+        let shape = [size.height, size.width, 3];
+        let shape = if coloured { &shape[..] } else { &shape[..2] };
+        Ok(Self(Some((ArrayWriter::create(path, plan.overwrite, "<f4", shape)?, planes))))
     }
 
+    /// Takes the uncertainty of a gray frame, or of the luma of colours.
     pub(super) fn push(&mut self, sigma: &Frame) -> qudi_core::Result<()> {
-        let values = sigma.data.iter().copied();
-        self.0.as_mut().map_or(Ok(()), |writer| writer.push_f32(values))
+        match &mut self.0 {
+            Some((writer, Planes::Gray)) => writer.push_f32(sigma.data.iter().copied()),
+            _ => Ok(()),
+        }
+    }
+
+    /// Takes the uncertainties of red, green and blue.
+    pub(super) fn push_colour(&mut self, sigma: &[Frame; 3]) -> qudi_core::Result<()> {
+        match &mut self.0 {
+            Some((writer, Planes::Rgb)) => writer.push_f32(interleaved(sigma)),
+            _ => Ok(()),
+        }
     }
 
     pub(super) fn finish(self) -> Result<()> {
-        Ok(self.0.map_or(Ok(()), ArrayWriter::finish)?)
+        Ok(self.0.map_or(Ok(()), |(writer, _)| writer.finish())?)
     }
+}
+
+/// Returns the values of three planes pixel by pixel.
+fn interleaved([red, green, blue]: &[Frame; 3]) -> impl ExactSizeIterator<Item = f32> {
+    let value = move |i: usize| [&red.data, &green.data, &blue.data][i % 3][i / 3];
+    (0..3 * red.data.len()).map(value)
 }

@@ -24,7 +24,7 @@ pub(super) enum Colours {
 }
 
 impl Colours {
-    fn number(self) -> usize {
+    pub(super) fn number(self) -> usize {
         match self {
             Self::Interleaved(n) | Self::Planes(n) | Self::Volumes(n) => n,
         }
@@ -83,12 +83,20 @@ impl Array {
 
     /// Returns the channel that is read, out of `channels`.
     fn channel(&self, channels: usize, options: &ReadOptions) -> Result<usize> {
-        match (channels, options.channel) {
+        match (channels, options.channel_of(channels)) {
             (1, None | Some(0)) => Ok(0),
             (1, Some(index)) => Err(Error::request(
                 format!("channel {index} of a gray capture, shape {:?}", self.shape),
                 "channel",
                 "leave it out: there is no colour to choose from",
+            )),
+            (3, None) if options.cfa.is_some() => Err(Error::request(
+                format!(
+                    "a colour filter in front of a capture of 3 channels, shape {:?}",
+                    self.shape
+                ),
+                "cfa",
+                "leave it out: every pixel has all colours",
             )),
             (_, None) => Err(self.fault(
                 format!("a colour capture of {channels} channels, shape {:?}", self.shape),

@@ -109,7 +109,7 @@ fn chosen_sample(
         ));
     };
     let colours = samples - usize::from(opacity);
-    match options.channel.filter(|_| !of_pages) {
+    match options.channel_of(colours).filter(|_| !of_pages) {
         None if colours == 1 => Ok((samples, 0)),
         None => Err(Error::data(
             format!("colour images of {colours} channels"),
@@ -140,7 +140,9 @@ impl TiffPages {
         let mut decoder = decoder(path)?;
         let color = decoder.colortype().map_err(|e| fault(path, e))?;
         let samples = chosen_sample(color, options, of_pages, path)?;
-        let bits = samples_of(color).map_or(8, |(_, bits, _)| bits);
+        let (number, bits, opacity) = samples_of(color).unwrap_or((1, 8, false));
+        let takes_colours = options.takes_colours(number - usize::from(opacity));
+        info.full_colour |= takes_colours && !of_pages;
         let planes = decoder.find_tag(Tag::PlanarConfiguration).map_err(|e| fault(path, e))?;
         if samples.0 > 1 && planes.and_then(|tag| tag.into_u16().ok()) == Some(2) {
             return Err(Error::data(

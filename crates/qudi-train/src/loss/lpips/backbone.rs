@@ -2,7 +2,7 @@
 //! builds them.
 
 use super::convolution::Convolution;
-use super::input::Input;
+use super::input::Images;
 use burn::tensor::module::max_pool2d;
 use burn::tensor::ops::MaxPoolOptions;
 use burn::tensor::{Device, Tensor};
@@ -113,13 +113,13 @@ enum Step {
 }
 
 impl Backbone {
-    /// Reads the weights of `layers` for images like `input` onto `device`.
+    /// Reads the weights of `layers` onto `device`, for images of a kind.
     ///
     /// # Errors
     /// Those of `weights`.
     pub(super) fn new(
         layers: &[Layer],
-        input: Input,
+        images: Images,
         weights: &mut Weights<'_>,
         device: &Device,
     ) -> Result<Self> {
@@ -133,8 +133,8 @@ impl Backbone {
                     let bias = weights(&format!("{name}.bias"), &[outputs])?;
                     let mut inputs = channels;
                     if steps.is_empty() {
-                        weight = input.fold(&weight, kernel * kernel);
-                        inputs = input.planes();
+                        weight = images.fold(&weight, kernel * kernel);
+                        inputs = images.planes();
                     }
                     channels = outputs;
                     let sizes = [outputs, inputs, kernel];

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor};
 use image::RgbImage;
 use qudi_core::Size;
 use qudi_layers::tensor::{read, to_tensor};
-use qudi_train::loss::lpips::{Lpips, PerceptualKind};
+use qudi_train::loss::lpips::{Images, Lpips, PerceptualKind};
 use std::path::Path;
 
 /// LPIPS with its weights.
@@ -29,7 +29,7 @@ impl Perceptual {
         };
         let kind = PerceptualKind::LpipsAlex;
         Lpips::find(kind, Some(folder)).map_err(|_| missing())?;
-        let net = Lpips::load_colour(kind, Some(folder), &device)?.ok_or_else(missing)?;
+        let net = Lpips::load_for(Images::Colour, kind, Some(folder), &device)?.ok_or_else(missing)?;
         Ok(Self { net, device })
     }
 
@@ -44,7 +44,9 @@ impl Perceptual {
         }
         let plane = |image: &RgbImage, colour: usize| {
             let values = image.as_raw().iter().skip(colour).step_by(3);
-            to_tensor(values.map(|&value| f32::from(value) / 255.0).collect(), size, &self.device)
+            // The distance maps [0, 1] to [-1, 1] itself: this undoes it.
+            let value = |&value: &u8| (f32::from(value) / 255.0 + 1.0) * 0.5;
+            to_tensor(values.map(value).collect(), size, &self.device)
         };
         let planes = |image| Tensor::cat((0..3).map(|colour| plane(image, colour)).collect(), 1);
         let values = read(self.net.distances(planes(picture), planes(truth)))?;

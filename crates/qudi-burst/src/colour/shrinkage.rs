@@ -1,0 +1,116 @@
+//! Averages of chroma, drawn to the ones of wider surroundings where their noise explains the difference.
+//!
+//! An average differs from its surroundings by noise of known variance `v`, and by colour. The variance `s` of
+//! the colours is estimated around every pixel as what the differences have beyond noise; `s / (s + v)` of a
+//! difference is then kept (empirical Bayes). Dark and even areas keep little, edges of colour all.
+
+use super::chroma::Colours;
+use super::guided::{Averages, gaussian};
+use super::{CountResponse, MergedColours};
+use qudi_core::{Frame, Size};
+
+/// Width of the surroundings, in units of the width of the averages.
+const WIDTH: f32 = 3.0;
+
+/// Part of the squared differences that counts as noise, in units of the noise that is expected.
+const NOISE: f32 = 1.5;
+
+/// Least variance.
+const MIN_VARIANCE: f32 = 1e-9;
+
+impl Colours<'_> {
+    /// Draws ratios to the ones of their surroundings, and these to the ones of the whole frame.
+    pub(super) fn shrunk(
+        &self,
+        merged: &MergedColours,
+        luma: &Frame,
+        averages: Averages,
+    ) -> Averages {
+        let size = merged.size;
+        let sigma = WIDTH * self.sigma;
+        let wide = self.around(merged, &luma.data, sigma);
+        let Averages { mut ratios, mut variances } = averages;
+        for (k, mut wide) in wide.into_iter().enumerate() {
+            let mean = ratio_of_means(merged, &luma.data, k, self.response);
+            let mut noise = gaussian(&variances[k], size, sigma);
+            for noise in &mut noise {
+                *noise /= WIDTH * WIDTH;
+            }
+            let excess = Excess::new(&wide, |_| mean, &noise);
+            let spread = excess.of_frame();
+            shrink(&mut wide, &mut noise, |_| mean, |_| spread);
+            let excess = Excess::new(&ratios[k], |i| wide[i], &variances[k]);
+            let spread = excess.around(size, sigma);
+            shrink(&mut ratios[k], &mut variances[k], |i| wide[i], |i| spread[i]);
+            for (variance, noise) in variances[k].iter_mut().zip(&noise) {
+                *variance += noise;
+            }
+        }
+        Averages { ratios, variances }
+    }
+}
+
+/// Squared differences beyond noise, weighted by the inverse of its variance, and these weights.
+struct Excess {
+    weighted: Vec<f32>,
+    weights: Vec<f32>,
+}
+
+impl Excess {
+    fn new(values: &[f32], centre: impl Fn(usize) -> f32, noise: &[f32]) -> Self {
+        let weights: Vec<f32> = noise.iter().map(|noise| 1.0 / noise.max(MIN_VARIANCE)).collect();
+        let weighted = |(i, value): (usize, &f32)| {
+            let difference = value - centre(i);
+            weights[i] * difference * difference - NOISE
+        };
+        Self { weighted: values.iter().enumerate().map(weighted).collect(), weights }
+    }
+
+    /// Returns the variance of values of one law.
+    fn of_frame(&self) -> f32 {
+        let (weighted, weights): (f32, f32) =
+            (self.weighted.iter().sum(), self.weights.iter().sum());
+        (weighted / weights.max(f32::MIN_POSITIVE)).max(0.0)
+    }
+
+    /// Returns the variance around every pixel.
+    fn around(&self, size: Size, sigma: f32) -> Vec<f32> {
+        let weighted = gaussian(&self.weighted, size, sigma);
+        let weights = gaussian(&self.weights, size, sigma);
+        let variance = |(excess, weight): (&f32, &f32)| excess / weight.max(f32::MIN_POSITIVE);
+        weighted.iter().zip(&weights).map(variance).map(|variance| variance.max(0.0)).collect()
+    }
+}
+
+/// Keeps of the differences from `centre` the part that their spread has of their variance, and of the noise
+/// as much.
+fn shrink(
+    values: &mut [f32],
+    noise: &mut [f32],
+    centre: impl Fn(usize) -> f32,
+    spread: impl Fn(usize) -> f32,
+) {
+    for (i, (value, noise)) in values.iter_mut().zip(noise).enumerate() {
+        let kept = spread(i) / (spread(i) + *noise).max(MIN_VARIANCE);
+        *value = centre(i) + kept * (*value - centre(i));
+        *noise *= kept;
+    }
+}
+
+/// Returns the ratio of a sensor colour to luma over all counts.
+fn ratio_of_means(
+    merged: &MergedColours,
+    luma: &[f32],
+    colour: usize,
+    response: &CountResponse,
+) -> f32 {
+    let (counts, weights) = (&merged.counts[colour], &merged.weights[colour]);
+    let (mut count, mut weight, mut seen) = (0.0f64, 0.0f64, 0.0f64);
+    for ((&c, &w), &luma) in counts.iter().zip(weights).zip(luma) {
+        count += f64::from(c);
+        weight += f64::from(w);
+        seen += f64::from(w * luma);
+    }
+    let light = response.image((count / weight.max(1e-9)) as f32).max(0.0);
+    light / (seen / weight.max(1e-9)).max(1e-9) as f32
+}
