@@ -347,7 +347,8 @@ fn transpose(line: &Line, first: usize, count: usize, stride: usize, planes: &mu
                 }
             }
             for (c, row) in transposed(&pairs).iter().enumerate() {
-                planes[((channel + c) * stride + pixel) / 2..][..TILE].copy_from_slice(row);
+                let first_value = (channel + c) * stride + pixel;
+                planes[first_value / 2..][..TILE].copy_from_slice(row);
             }
         }
     }
