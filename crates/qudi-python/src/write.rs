@@ -6,21 +6,21 @@ use qudi_core::{Error, Frame, Size};
 use qudi_io::writer::Planes;
 use std::path::PathBuf;
 
-/// Writes frames, each the bytes of its float32 values in C order, as `path` says by its extension. `planes`
-/// is 1 for gray frames, and 3 for colours, which are the last axis.
+/// Writes frames, each the bytes of its float32 values in C order, as `path` says by its extension. `shape`
+/// has rows, columns and planes: 1 of gray frames, and 3 of colours.
 #[pyfunction]
-#[pyo3(signature = (path, size, planes, frames, *, float, fps, force))]
+#[pyo3(signature = (path, shape, frames, *, float, fps, force))]
 pub(crate) fn write_frames(
     py: Python<'_>,
     path: PathBuf,
-    size: (usize, usize),
-    planes: usize,
+    shape: (usize, usize, usize),
     frames: &Bound<'_, PyAny>,
     float: bool,
     fps: f64,
     force: bool,
 ) -> PyResult<()> {
-    let size = Size::new(size.0, size.1, "shape").map_err(|error| exception(error.into()))?;
+    let (rows, columns, planes) = shape;
+    let size = Size::new(rows, columns, "shape").map_err(|error| exception(error.into()))?;
     let mut raised = None;
     let mut failed = |error: PyErr| {
         let text = error.to_string();

@@ -58,8 +58,7 @@ def sensor_toml(json: str) -> str: ...
 def version() -> str: ...
 def write_frames(
     path: str | os.PathLike[str],
-    size: tuple[int, int],
-    planes: int,
+    shape: tuple[int, int, int],
     frames: Iterable[bytes],
     *,
     float: bool,

@@ -58,9 +58,8 @@ def write(
             f"an array of shape {values.shape}\n  where: {os.fspath(path)}\n  help: give frames, rows and columns"
         )
     if values.dtype.kind == "f":
-        size = values.shape[1], values.shape[2]
-        planes, frames = 3 if is_colour else 1, _bytes(values)
-        _native.write_frames(os.fspath(path), size, planes, frames, float=float, fps=fps, force=overwrite)
+        shape = (values.shape[1], values.shape[2], 3 if is_colour else 1)
+        _native.write_frames(os.fspath(path), shape, _bytes(values), float=float, fps=fps, force=overwrite)
         return
     with tempfile.TemporaryDirectory(prefix="qudi-spad-") as folder:
         counts = os.path.join(folder, "counts.npy")
