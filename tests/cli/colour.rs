@@ -76,8 +76,7 @@ fn three_full_planes_are_restored_together() {
             values.chunks_exact(12).flat_map(|v| v[4 * k..4 * k + 4].to_vec()).collect();
         let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH})");
         std::fs::write(folder.join("p.npy"), npy_bytes("<f4", &shape, &plane)).unwrap();
-        let simulate =
-            "simulate p.npy -o q.npy --unpacked --exposure 0.35 --ppp 3.25 --transfer as-is";
+        let simulate = "simulate p.npy -o q.npy --exposure 0.35 --ppp 3.25 --transfer as-is";
         run(&folder, &format!("{simulate} --seed {k} --force"));
         let bytes = std::fs::read(folder.join("q.npy")).unwrap();
         let plane = &bytes[bytes.len() - FRAMES * HEIGHT * WIDTH..];

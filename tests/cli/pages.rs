@@ -6,11 +6,13 @@ use std::path::Path;
 
 fn url(path: &Path) -> String {
     let path = path.display().to_string();
-    let escape = |c: char| match c {
-        'a'..='z' | 'A'..='Z' | '0'..='9' | '/' | '.' | '-' | '_' => c.to_string(),
-        other => format!("%{:02X}", other as u32),
+    let escape = |byte: u8| match byte {
+        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => {
+            char::from(byte).to_string()
+        }
+        other => format!("%{other:02X}"),
     };
-    format!("file://{}", path.chars().map(escape).collect::<String>())
+    format!("file://{}", path.bytes().map(escape).collect::<String>())
 }
 
 /// A sum over the pixels of the large picture, which differs for different pictures.

@@ -239,8 +239,12 @@ fn ppp(
         let largest = sums.iter().copied().max().unwrap_or(0);
         let fits = f64::from(largest) <= f64::from(native.max_count()) * per_frame * sampled;
         gain.or(native.fixed_gain()).filter(|_| fits).map(|gain| {
-            let seen = CountLaw::new(&native, gain).detections_for_mean(dn / per_frame);
-            (seen - capture.info.pedestal / gain).max(0.0) * per_frame
+            let pedestal = capture.info.pedestal / gain;
+            let mean = dn / per_frame;
+            let by_law = CountLaw::new(&native, gain).detections_for_mean(mean) - pedestal;
+            // The law ends at zero, which counts on a pedestal do not reach.
+            let seen = if pedestal > 0.0 { by_law.max(mean / gain - pedestal) } else { by_law };
+            seen.max(0.0) * per_frame
         })
     };
     let dark = match &capture.dark {

@@ -29,7 +29,8 @@ impl Perceptual {
         };
         let kind = PerceptualKind::LpipsAlex;
         Lpips::find(kind, Some(folder)).map_err(|_| missing())?;
-        let net = Lpips::load_for(Images::Colour, kind, Some(folder), &device)?.ok_or_else(missing)?;
+        let net =
+            Lpips::load_for(Images::Colour, kind, Some(folder), &device)?.ok_or_else(missing)?;
         Ok(Self { net, device })
     }
 
