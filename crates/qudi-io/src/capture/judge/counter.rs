@@ -109,7 +109,7 @@ impl Edges {
         let is_digit = |&at: &usize| {
             let values = values(at);
             let changes = values.windows(2).filter(|pair| pair[0] != pair[1]).count();
-            changes as f64 <= rare * frames as f64
+            changes as f64 <= (rare * frames as f64).max(1.0)
         };
         let side = if first < edge { 0..edge } else { edge..2 * edge };
         let last = if side.contains(&last) { last } else { side.end - 1 };
