@@ -1,8 +1,8 @@
 //! Stacks of residual blocks at one resolution, with their gradients.
 //!
-//! On processors with a matrix unit for bfloat16 (AMX) a stack is one operation: between its convolutions
-//! activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and bias, ReLU
-//! and shortcut are applied to each tile of sums. On LibTorch it is one operation, too, with channels last.
+//! On processors that multiply bfloat16 (AMX, AVX512-BF16 by AMD) a stack is one operation: between its
+//! convolutions activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and
+//! bias, ReLU and shortcut are applied to each tile of sums. On LibTorch it is one operation, too, with channels last.
 //! Elsewhere, and on a processor with 32 bits, a stack is composed of single convolutions.
 
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
@@ -25,6 +25,8 @@ mod tests;
 mod torch;
 #[cfg(feature = "flex")]
 mod unit;
+#[cfg(all(feature = "flex", target_arch = "x86_64"))]
+mod vectors;
 #[cfg(feature = "flex")]
 mod weights;
 
@@ -55,6 +57,8 @@ pub struct Stack {
     pub blocks: usize,
     /// True if activations have 16 bits (bfloat16).
     pub bf16: bool,
+    /// The units that multiply, on the processor.
+    pub units: MatrixUnits,
     /// The parameters as the matrix unit reads them.
     #[cfg(feature = "flex")]
     packed: weights::Packed,
@@ -140,6 +144,7 @@ impl StackParameters {
             features,
             blocks: (self.convolutions.len() - 1) / 2,
             bf16: ComputePrecision::reduces(&inputs[0]),
+            units: MatrixUnits::current(),
             #[cfg(feature = "flex")]
             packed: self.packed.clone(),
         };
@@ -185,7 +190,7 @@ fn is_fused(input: &Tensor<4>, stack: &Stack) -> bool {
     let fits_tiles = || {
         is_native(input)
             && stack.bf16
-            && MatrixUnits::current() == MatrixUnits::Amx
+            && stack.units != MatrixUnits::F32
             && stack.features.is_multiple_of(32)
     };
     stack.images * stack.height * stack.width > 0 && (is_recorded(input) || fits_tiles())

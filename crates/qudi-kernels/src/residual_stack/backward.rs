@@ -40,7 +40,7 @@ pub(super) fn backward(
         let (gradient, sums) = backward_group(group, activations, tiles, gradient);
         if requested.contains(&true) {
             let grid = &activations.grid;
-            let inputs = convolve(grid, &gradient, &tiles[0], PLAIN);
+            let inputs = convolve(stack.units, grid, &gradient, &tiles[0], PLAIN);
             let mut first = 0;
             for (to, &channels) in targets.iter().zip(&stack.inputs) {
                 if let Some(to) = to {
@@ -117,21 +117,21 @@ fn backward_group(
     let mut gradient = Line::from_planes(grid, &[(gradient, stack.features)]);
     for block in (0..stack.blocks).rev() {
         let (first, second) = (1 + 2 * block, 2 + 2 * block);
-        sums.push(correlate(grid, &hidden[block], &gradient));
+        sums.push(correlate(stack.units, grid, &hidden[block], &gradient));
         let finish = Finish { mask: Some(&hidden[block]), ..PLAIN };
-        let between = convolve(grid, &gradient, &tiles[second], finish);
-        sums.push(correlate(grid, &features[block], &between));
+        let between = convolve(stack.units, grid, &gradient, &tiles[second], finish);
+        sums.push(correlate(stack.units, grid, &features[block], &between));
         // What passes through the ReLU of the entry is all that is left to do after the first block.
         let mask = (block == 0).then_some(&features[0]);
         let finish = Finish { addend: Some(gradient.values.as_ptr()), mask, ..PLAIN };
-        convolve_into(grid, &between, &tiles[first], finish, &mut gradient);
+        convolve_into(stack.units, grid, &between, &tiles[first], finish, &mut gradient);
     }
     if stack.blocks == 0 {
         for (value, &feature) in gradient.values.iter_mut().zip(features[0].values.iter()) {
             *value = if feature == 0 { 0 } else { *value };
         }
     }
-    sums.push(correlate(grid, input, &gradient));
+    sums.push(correlate(stack.units, grid, input, &gradient));
     sums.reverse();
     (gradient, sums)
 }

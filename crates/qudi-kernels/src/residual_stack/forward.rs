@@ -6,6 +6,7 @@ use super::grid::Grid;
 use super::layout::{Line, Shared};
 use super::unit::{self, Finish, Gradient};
 use super::weights::{TAPS, Tiles};
+use crate::matrix_units::MatrixUnits;
 use crate::uninitialised::written;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -68,16 +69,23 @@ pub(super) fn of_group<'a>(
     &values[first * image..(first + stack.images) * image]
 }
 
-/// Convolves a line on this machine's unit.
-pub(super) fn convolve(grid: &Grid, from: &Line, tiles: &Tiles, finish: Finish<'_>) -> Line {
+/// Convolves a line on one of this machine's units.
+pub(super) fn convolve(
+    units: MatrixUnits,
+    grid: &Grid,
+    from: &Line,
+    tiles: &Tiles,
+    finish: Finish<'_>,
+) -> Line {
     // SAFETY: the convolution writes every block.
     let mut to = unsafe { Line::unwritten(grid, tiles.outputs) };
-    convolve_into(grid, from, tiles, finish, &mut to);
+    convolve_into(units, grid, from, tiles, finish, &mut to);
     to
 }
 
 /// Convolves a line into another one, which may be the addend.
 pub(super) fn convolve_into(
+    units: MatrixUnits,
     grid: &Grid,
     from: &Line,
     tiles: &Tiles,
@@ -88,21 +96,40 @@ pub(super) fn convolve_into(
     let to = Shared(to.values.as_mut_ptr());
     // SAFETY: stacks are fused only where the unit is available; lines have the grid's length.
     unsafe {
-        #[cfg(all(not(test), target_arch = "x86_64"))]
-        unit::convolve(grid, from, tiles, finish, to, super::amx::band);
-        #[cfg(any(test, not(target_arch = "x86_64")))]
-        unit::convolve(grid, from, tiles, finish, to, unit::convolve_band::<unit::Model>);
+        match units {
+            #[cfg(all(not(test), target_arch = "x86_64"))]
+            MatrixUnits::Amx => {
+                unit::convolve(grid, from, tiles, finish, to, super::amx::band);
+            }
+            #[cfg(all(not(test), target_arch = "x86_64"))]
+            MatrixUnits::Avx512Bf16 => {
+                unit::convolve(grid, from, tiles, finish, to, super::vectors::band);
+            }
+            _ => {
+                unit::convolve(grid, from, tiles, finish, to, unit::convolve_band::<unit::Model>);
+            }
+        }
     }
 }
 
-/// Correlates inputs with a gradient on this machine's unit.
-pub(super) fn correlate(grid: &Grid, inputs: &Line, gradient: &Line) -> Gradient {
+/// Correlates inputs with a gradient on one of this machine's units.
+pub(super) fn correlate(
+    units: MatrixUnits,
+    grid: &Grid,
+    inputs: &Line,
+    gradient: &Line,
+) -> Gradient {
     // SAFETY: as in `convolve_into`.
     unsafe {
-        #[cfg(all(not(test), target_arch = "x86_64"))]
-        return unit::correlate(grid, inputs, gradient, super::amx::chunk);
-        #[cfg(any(test, not(target_arch = "x86_64")))]
-        return unit::correlate(grid, inputs, gradient, unit::add_chunk::<unit::Model>);
+        match units {
+            #[cfg(all(not(test), target_arch = "x86_64"))]
+            MatrixUnits::Amx => unit::correlate(grid, inputs, gradient, super::amx::chunk),
+            #[cfg(all(not(test), target_arch = "x86_64"))]
+            MatrixUnits::Avx512Bf16 => {
+                unit::correlate(grid, inputs, gradient, super::vectors::chunk)
+            }
+            _ => unit::correlate(grid, inputs, gradient, unit::add_chunk::<unit::Model>),
+        }
     }
 }
 
@@ -149,7 +176,7 @@ fn forward_group(
     let apply = |from: &Line, number: usize, relu: bool, addend: Option<&Line>| {
         let bias = Some(convolutions[number].bias);
         let addend = addend.map(|line| line.values.as_ptr());
-        convolve(&grid, from, &tiles[number], Finish { bias, addend, relu, mask: None })
+        convolve(stack.units, &grid, from, &tiles[number], Finish { bias, addend, relu, mask: None })
     };
     let mut features = vec![apply(&input, 0, true, None)];
     let mut hidden = Vec::with_capacity(stack.blocks);

@@ -66,9 +66,10 @@ fn run(case: &Case, units: MatrixUnits, bias: f32) -> Vec<Vec<f32>> {
 #[test]
 #[allow(clippy::print_stderr)]
 fn fused_stacks_compute_what_single_convolutions_do() {
-    if !MatrixUnits::Amx.is_available() {
-        eprintln!("skipped: this machine has no AMX");
-        return;
+    let units = [MatrixUnits::Amx, MatrixUnits::Avx512Bf16];
+    let available: Vec<_> = units.iter().filter(|units| units.is_available()).collect();
+    if available.is_empty() {
+        eprintln!("skipped: this machine has no units for bfloat16");
     }
     let cases = [
         Case { images: 1, size: [1, 1], inputs: vec![3], features: 32, blocks: 0 },
@@ -85,16 +86,24 @@ fn fused_stacks_compute_what_single_convolutions_do() {
     for case in cases {
         // Activations have 8 bits, and ReLUs of tiny sums turn: fewer do where most are above zero.
         for (bias, tolerance) in [(0.0, 0.08), (6.0, 0.03)] {
-            let fused = run(&case, MatrixUnits::Amx, bias);
             let single = run(&case, MatrixUnits::F32, bias);
-            assert_eq!(fused.len(), single.len());
-            for (number, (fused, single)) in fused.iter().zip(&single).enumerate() {
+            for &units in &available {
+                let fused = run(&case, *units, bias);
                 assert_eq!(fused.len(), single.len());
-                let size = single.iter().map(|v| v * v).sum::<f32>().sqrt();
-                let error = fused.iter().zip(single).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
-                let share = error.sqrt() / size;
-                assert!(share < tolerance, "{:?}, bias {bias}, {number}: {share}", case.size);
+                for (number, (fused, single)) in fused.iter().zip(&single).enumerate() {
+                    let share = difference(fused, single);
+                    let what = format!("{units}, {:?}, bias {bias}, {number}", case.size);
+                    assert!(share < tolerance, "{what}: {share}");
+                }
             }
         }
     }
+}
+
+/// Root mean square of the differences, as a share of the values'.
+fn difference(values: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(values.len(), expected.len());
+    let size = expected.iter().map(|v| v * v).sum::<f32>();
+    let error = values.iter().zip(expected).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+    (error / size).sqrt()
 }

@@ -383,11 +383,9 @@ fn add_pixels(line: &Line, first: usize, count: usize, sums: &mut [f32]) {
 }
 
 /// The unit's results by plain loops: tests run on it, and need no unit.
-#[cfg(any(test, not(target_arch = "x86_64")))]
 #[derive(Debug)]
 pub(super) struct Model(Box<[[f32; BLOCK]; BLOCK]>);
 
-#[cfg(any(test, not(target_arch = "x86_64")))]
 impl Unit for Model {
     unsafe fn configured() -> Self {
         Self(Box::new([[0.0; BLOCK]; BLOCK]))
