@@ -10,6 +10,7 @@
 //! filter and multiplied with it.
 
 mod chroma;
+mod evidence;
 mod exposures;
 mod gray_counts;
 mod guided;
@@ -21,6 +22,7 @@ mod restorer;
 mod shrinkage;
 
 use chroma::Chroma;
+use evidence::Evidence;
 use exposures::Exposures;
 use gray_counts::GrayCounts;
 use merged::MergedColours;

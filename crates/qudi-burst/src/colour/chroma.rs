@@ -1,11 +1,14 @@
 //! Chroma: the ratios of red, green and blue to luma at every pixel.
 
 use super::guided::{Averages, Guide, guided};
-use super::{CountResponse, Exposures, MergedColours};
+use super::{CountResponse, Evidence, Exposures, MergedColours};
 use qudi_core::{Frame, Size};
 
 /// Ratio of the widths of Gaussians for first chroma and for the guided one.
-pub(super) const FIRST_CHROMA_WIDTH: f32 = 0.7;
+const FIRST_CHROMA_WIDTH: f32 = 0.7;
+
+/// Standard deviation in pixels of the Gaussian that finds the luma and the chroma that corrections begin with.
+pub(super) const BLURRED_SIGMA: f32 = 1.5;
 
 /// Largest ratio of a colour to luma.
 const MAX_RATIO: f32 = 12.0;
@@ -47,20 +50,35 @@ impl Colours<'_> {
     /// Returns the ratios of sensor colours to luma over all counts around every pixel.
     pub(super) fn around(&self, merged: &MergedColours, luma: &[f32], sigma: f32) -> [Vec<f32>; 3] {
         let least = self.least_luma();
-        std::array::from_fn(|k| {
+        let first = std::array::from_fn(|k| {
             let light = merged.light(k, self.response, sigma, self.mean[k]);
             let local = merged.luma(k, luma, sigma);
             light.iter().zip(local).map(|(light, luma)| light / luma.max(least)).collect()
-        })
+        });
+        let evidence = Evidence::new(merged, self.response, luma, &first);
+        std::array::from_fn(|k| evidence.around(merged, self.response, k, sigma, &first[k]))
     }
 
     /// Computes chroma from the counts around every pixel whose luma and chroma are alike.
     pub(super) fn refined(&self, merged: &MergedColours, luma: &Frame) -> Chroma {
-        let guide = Guide::new(merged, luma, self.least_luma());
-        let first = self.shrunk(merged, luma, guided(&guide, self.response, self.sigma, None));
-        let first = self.constrained(merged.size, first);
-        let second = guided(&guide, self.response, self.sigma, Some(&first));
-        self.constrained(merged.size, self.shrunk(merged, luma, second))
+        let guide = Guide::new(luma, self.least_luma());
+        let sigma = self.first_sigma();
+        let around = self.around(merged, &guide.luma, sigma);
+        let evidence = Evidence::new(merged, self.response, &guide.luma, &around);
+        let first = guided(&guide, &evidence, merged.size, self.sigma, (&around, None));
+        let first = self.constrained(merged.size, self.shrunk(merged, &evidence, first));
+        let efficiency = self.exposures.efficiency();
+        let seen: [Vec<f32>; 3] = std::array::from_fn(|k| {
+            first.ratios[k].iter().map(|ratio| ratio * efficiency[k]).collect()
+        });
+        let evidence = Evidence::new(merged, self.response, &guide.luma, &seen);
+        let second = guided(&guide, &evidence, merged.size, self.sigma, (&seen, Some(&first)));
+        self.constrained(merged.size, self.shrunk(merged, &evidence, second))
+    }
+
+    /// Returns the standard deviation in pixels over which a first chroma is averaged.
+    pub(super) fn first_sigma(&self) -> f32 {
+        (FIRST_CHROMA_WIDTH * self.sigma).max(BLURRED_SIGMA)
     }
 
     /// Divides ratios of sensor colours to luma by their efficiencies, and scales them so that their luma is

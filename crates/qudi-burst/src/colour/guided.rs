@@ -1,6 +1,6 @@
 //! Averages over the counts around a pixel: all of them, or those whose luma and chroma are like its own.
 
-use super::{Chroma, CountResponse, MergedColours};
+use super::{Chroma, Evidence};
 use multiversion::multiversion;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
@@ -46,26 +46,21 @@ pub(super) fn gaussian(values: &[f32], size: Size, sigma: f32) -> Vec<f32> {
     out
 }
 
-/// Counts with the luma that guides their averages.
-pub(super) struct Guide<'a> {
-    merged: &'a MergedColours,
+/// The luma that guides averages.
+pub(super) struct Guide {
     /// Logarithm of luma, in units of [`LUMA_SIGMA`].
     logarithm: Vec<f32>,
-    /// Luma times the weights of red, green and blue counts.
-    luma: [Vec<f32>; 3],
-    own: Vec<f32>,
+    pub(super) luma: Vec<f32>,
 }
 
-impl<'a> Guide<'a> {
+impl Guide {
     /// Takes the luma that guides; it is at least `least`.
-    pub(super) fn new(merged: &'a MergedColours, luma: &Frame, least: f32) -> Self {
-        let own: Vec<f32> = luma.data.iter().map(|luma| luma.max(least)).collect();
+    pub(super) fn new(luma: &Frame, least: f32) -> Self {
+        let luma: Vec<f32> = luma.data.iter().map(|luma| luma.max(least)).collect();
         // Differences of very dark pixels are noise.
         let floor = 20.0 * least;
-        let logarithm = own.iter().map(|luma| (luma + floor).ln() / LUMA_SIGMA).collect();
-        let weighted = |k: usize| merged.weights[k].iter().zip(&own).map(|(w, luma)| w * luma);
-        let luma = std::array::from_fn(|k| weighted(k).collect());
-        Self { merged, logarithm, luma, own }
+        let logarithm = luma.iter().map(|luma| (luma + floor).ln() / LUMA_SIGMA).collect();
+        Self { logarithm, luma }
     }
 }
 
@@ -85,21 +80,21 @@ const UNKNOWN: f32 = 10.0;
 /// Sums of one row.
 struct RowSums {
     counts: [Vec<f32>; 3],
-    weights: [Vec<f32>; 3],
-    luma: [Vec<f32>; 3],
+    slopes: [Vec<f32>; 3],
+    variances: [Vec<f32>; 3],
     alike: Vec<f32>,
 }
 
 /// Returns the ratios of sensor colours to luma, averaged with a Gaussian of standard deviation `sigma` over
-/// pixels whose luma is alike, and whose chroma is alike in `previous`.
+/// pixels whose luma is alike, and whose chroma is alike in `previous`; `otherwise` where no count tells.
 pub(super) fn guided(
-    guide: &Guide<'_>,
-    response: &CountResponse,
+    guide: &Guide,
+    evidence: &Evidence,
+    size: Size,
     sigma: f32,
-    previous: Option<&Chroma>,
+    (otherwise, previous): (&[Vec<f32>; 3], Option<&Chroma>),
 ) -> Averages {
-    let MergedColours { size, counts, weights } = guide.merged;
-    let Size { height, width } = *size;
+    let Size { height, width } = size;
     let radius = (RADIUS * sigma).ceil() as isize;
     let zeros = || std::array::from_fn(|_| vec![0.0f32; width]);
     let rows: Vec<[Vec<[f32; 2]>; 3]> = (0..height)
@@ -107,8 +102,8 @@ pub(super) fn guided(
         .map(|y| {
             let mut sums = RowSums {
                 counts: zeros(),
-                weights: zeros(),
-                luma: zeros(),
+                slopes: zeros(),
+                variances: zeros(),
                 alike: vec![0.0; width],
             };
             let here = y * width;
@@ -135,36 +130,25 @@ pub(super) fn guided(
                     }
                     likeness(alike, (-near).exp());
                     for k in 0..3 {
-                        add_weighted(
-                            &mut sums.counts[k][first..],
-                            alike,
-                            &counts[k][other.clone()],
-                        );
-                        add_weighted(
-                            &mut sums.weights[k][first..],
-                            alike,
-                            &weights[k][other.clone()],
-                        );
-                        add_weighted(
-                            &mut sums.luma[k][first..],
-                            alike,
-                            &guide.luma[k][other.clone()],
-                        );
+                        let Evidence { counts, slopes, variances } = evidence;
+                        for (sums, values) in [
+                            (&mut sums.counts[k], &counts[k]),
+                            (&mut sums.slopes[k], &slopes[k]),
+                            (&mut sums.variances[k], &variances[k]),
+                        ] {
+                            add_weighted(&mut sums[first..], alike, &values[other.clone()]);
+                        }
                     }
                 }
             }
             std::array::from_fn(|k| {
                 let ratio = |x: usize| {
-                    let weight = sums.weights[k][x];
-                    if weight < 1e-6 {
-                        let ratio = previous.map_or(1.0, |chroma| chroma.ratios[k][here + x]);
-                        return [ratio, UNKNOWN];
+                    let slope = sums.slopes[k][x];
+                    if slope < f32::MIN_POSITIVE {
+                        return [otherwise[k][here + x], UNKNOWN];
                     }
-                    let light = response.image(sums.counts[k][x] / weight).max(0.0);
-                    let luma = (sums.luma[k][x] / weight).max(1e-9 + 1e-3 * guide.own[here + x]);
-                    let there = response.at(light, response.dark);
-                    let noise = there.variance * SQUARED / (there.slope * there.slope * weight);
-                    [light / luma, (noise / (luma * luma)).min(UNKNOWN)]
+                    let noise = SQUARED * sums.variances[k][x] / (slope * slope);
+                    [(sums.counts[k][x] / slope).max(0.0), noise.min(UNKNOWN)]
                 };
                 (0..width).map(ratio).collect()
             })

@@ -1,13 +1,10 @@
 //! Luma from the counts of all colours, and its corrections by them.
 
 use super::MergedColours;
-use super::chroma::{Chroma, Colours, FIRST_CHROMA_WIDTH};
+use super::chroma::{BLURRED_SIGMA, Chroma, Colours};
 use super::gray_counts::MIN_SEEN;
 use super::guided::{Averages, gaussian};
 use qudi_core::Frame;
-
-/// Standard deviation in pixels of the Gaussian that finds the luma that corrections begin with.
-const BLURRED_SIGMA: f32 = 1.5;
 
 /// Number of corrections of the first luma.
 const CORRECTIONS: usize = 3;
@@ -43,8 +40,7 @@ impl Colours<'_> {
         for luma in &mut luma {
             *luma = luma.max(least);
         }
-        let sigma = (FIRST_CHROMA_WIDTH * self.sigma).max(BLURRED_SIGMA);
-        let ratios = self.around(merged, &luma, sigma);
+        let ratios = self.around(merged, &luma, self.first_sigma());
         let chroma = self.constrained(size, Averages { ratios, variances: Default::default() });
         let mut luma = Frame { size, data: luma };
         for _ in 0..CORRECTIONS {

@@ -6,14 +6,11 @@
 
 use super::chroma::Colours;
 use super::guided::{Averages, gaussian};
-use super::{CountResponse, MergedColours};
-use qudi_core::{Frame, Size};
+use super::{Evidence, MergedColours};
+use qudi_core::Size;
 
 /// Width of the surroundings, in units of the width of the averages.
 const WIDTH: f32 = 3.0;
-
-/// Part of the squared differences that counts as noise, in units of the noise that is expected.
-const NOISE: f32 = 1.5;
 
 /// Least variance.
 const MIN_VARIANCE: f32 = 1e-9;
@@ -23,15 +20,15 @@ impl Colours<'_> {
     pub(super) fn shrunk(
         &self,
         merged: &MergedColours,
-        luma: &Frame,
+        evidence: &Evidence,
         averages: Averages,
     ) -> Averages {
         let size = merged.size;
         let sigma = WIDTH * self.sigma;
-        let wide = self.around(merged, &luma.data, sigma);
         let Averages { mut ratios, mut variances } = averages;
-        for (k, mut wide) in wide.into_iter().enumerate() {
-            let mean = ratio_of_means(merged, &luma.data, k, self.response);
+        for k in 0..3 {
+            let mut wide = evidence.around(merged, self.response, k, sigma, &ratios[k]);
+            let mean = evidence.mean(k);
             let mut noise = gaussian(&variances[k], size, sigma);
             for noise in &mut noise {
                 *noise /= WIDTH * WIDTH;
@@ -61,7 +58,7 @@ impl Excess {
         let weights: Vec<f32> = noise.iter().map(|noise| 1.0 / noise.max(MIN_VARIANCE)).collect();
         let weighted = |(i, value): (usize, &f32)| {
             let difference = value - centre(i);
-            weights[i] * difference * difference - NOISE
+            weights[i] * difference * difference - 1.0
         };
         Self { weighted: values.iter().enumerate().map(weighted).collect(), weights }
     }
@@ -95,22 +92,4 @@ fn shrink(
         *value = centre(i) + kept * (*value - centre(i));
         *noise *= kept;
     }
-}
-
-/// Returns the ratio of a sensor colour to luma over all counts.
-fn ratio_of_means(
-    merged: &MergedColours,
-    luma: &[f32],
-    colour: usize,
-    response: &CountResponse,
-) -> f32 {
-    let (counts, weights) = (&merged.counts[colour], &merged.weights[colour]);
-    let (mut count, mut weight, mut seen) = (0.0f64, 0.0f64, 0.0f64);
-    for ((&c, &w), &luma) in counts.iter().zip(weights).zip(luma) {
-        count += f64::from(c);
-        weight += f64::from(w);
-        seen += f64::from(w * luma);
-    }
-    let light = response.image((count / weight.max(1e-9)) as f32).max(0.0);
-    light / (seen / weight.max(1e-9)).max(1e-9) as f32
 }
