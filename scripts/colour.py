@@ -11,6 +11,7 @@ behind the filter with the sensor of `qudi simulate`. The middle frame is scored
     apart       the four planes of a Bayer filter restored apart, interpolated bilinearly
     qudi        `qudi restore`
     full        three full planes of the same light each, restored apart: the ceiling
+    together    these planes as one capture, restored together
     luma        luma of `qudi restore`, and the gray restoration of luma through the same light
 """
 
@@ -138,7 +139,8 @@ class Runner:
         truth = np.load(self.folder / "t.npy")
         record = json.loads((self.folder / "m.npy.json").read_text())
         level = record["light"]["exposure"]
-        light = ["--exposure", level, "--ppp", ppp, "--seed", 2, "--force", "--transfer", "as-is"]
+        light = ["--exposure", level, "--ppp", ppp, "--force", "--transfer", "as-is"]
+        gray = ["--sensor", "qudi-paper", "--bits", 3, "--ppp", ppp, "--exposure", level, "--sum", 1]
         middle, frame_size = truth[MIDDLE], truth.shape[1:3]
         out = {}
         colour, out["seconds"] = self.restored("m.npy", "c.npy")
@@ -159,7 +161,6 @@ class Runner:
         if len(tile) == 4 and set(tile) <= set("rgb"):
             self.run("simulate", "--from", "m.npy.json", "-o", "g.npy", "--force")
             all_counts = np.load(self.folder / "g.npy")
-            gray = ["--sensor", "qudi-paper", "--bits", 3, "--ppp", ppp, "--exposure", level, "--sum", 1]
             planes = []
             for k in range(4):
                 np.save(self.folder / "p.npy", all_counts[:, k // 2 :: 2, k % 2 :: 2])
@@ -188,16 +189,20 @@ class Runner:
                 gap = np.full((frame_size[0], 6, 3), 255, np.uint8)
                 parts = [part for panel in panels for part in (panel, gap)][:-1]
                 write_png(arguments.picture, np.concatenate(parts, 1))
-        full = []
-        for name, clip in [("gray", truth @ weights), *[(k, truth[..., k]) for k in range(3)]]:
+        full, planes = [], []
+        for seed, (name, clip) in enumerate([("gray", truth @ weights), *[(k, truth[..., k]) for k in range(3)]]):
             np.save(self.folder / "k.npy", clip.astype(np.float32))
-            self.run("simulate", "k.npy", "-o", "f.npy", *light)
+            self.run("simulate", "k.npy", "-o", "f.npy", *light, "--seed", 2 + seed)
             restored, seconds = self.restored("f.npy", "fo.npy")
             if name == "gray":
                 out["gray luma"], out["gray seconds"] = psnr(restored[MIDDLE], clip[MIDDLE]), seconds
             else:
                 full.append(restored[MIDDLE])
+                planes.append(np.load(self.folder / "f.npy"))
         out["full"] = psnr(np.stack(full, -1), middle)
+        np.save(self.folder / "p.npy", np.stack(planes, -1))
+        restored, out["together seconds"] = self.restored("p.npy", "po.npy", *gray)
+        out["together"] = psnr(restored[MIDDLE], middle)
         return out
 
 
