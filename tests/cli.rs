@@ -47,6 +47,8 @@ mod support;
 mod train;
 #[path = "cli/view.rs"]
 mod view;
+#[path = "cli/warnings.rs"]
+mod warnings;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")

@@ -1,11 +1,11 @@
-//! Real captures without a manual: automatic sums, chosen instants, warnings, a first look.
+//! Real captures without a manual: automatic sums, chosen instants, a first look.
 
 use crate::support::{listing, npy_bytes, qudi, refused, run, scratch};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// Creates a folder with `c.npy`: binary frames of a bright square that moves by `speed` pixels a frame.
-fn capture(name: &str, frames: usize, rate: f64, speed: f64) -> PathBuf {
+pub(crate) fn capture(name: &str, frames: usize, rate: f64, speed: f64) -> PathBuf {
     let folder = scratch(name);
     let (height, width) = (32, 48);
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
@@ -30,7 +30,7 @@ fn capture(name: &str, frames: usize, rate: f64, speed: f64) -> PathBuf {
     folder
 }
 
-fn said(folder: &Path, args: &str) -> String {
+pub(crate) fn said(folder: &Path, args: &str) -> String {
     let output = qudi(folder).args(args.split_whitespace()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{args}: {text}");
@@ -137,26 +137,6 @@ fn clips_repeat_frames_and_rows_roll() {
 }
 
 #[test]
-fn warns_of_mosaics() {
-    let folder = scratch("field-mosaic");
-    let (height, width, frames) = (128, 160, 40);
-    let mut state = 1_u64;
-    let mut counts = Vec::new();
-    for i in 0..frames * height * width {
-        let (x, y) = (i % width, i / width % height);
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-        let filter = [[8, 5], [5, 3]][y % 2][x % 2];
-        counts.push((filter + (state >> 62)) as u8);
-    }
-    let shape = format!("({frames}, {height}, {width})");
-    std::fs::write(folder.join("m.npy"), npy_bytes("|u1", &shape, &counts)).unwrap();
-    let text = run(&folder, "info m.npy --bits 4");
-    assert!(text.contains("--cfa rggb@0,0"), "{text}");
-    let text = run(&folder, "info m.npy --bits 4 --cfa rggb --channel 0");
-    assert!(!text.contains("colour filter array: name it"), "{text}");
-}
-
-#[test]
 fn pictures_of_chosen_instants_are_those_of_all() {
     let folder = capture("field-every", 132, 0.2, 0.0);
     let restore = "restore c.npy --sensor swissspad2 --method mle --sum 3";
@@ -208,34 +188,6 @@ fn tone_curve_and_rate_apply_to_what_is_written() {
 }
 
 #[test]
-fn warns_of_what_makes_a_result_doubtful() {
-    let folder = capture("field-warn", 77, 0.2, 0.0);
-    let ones = npy_bytes("|u1", "(22, 16, 2)", &[0xff; 22 * 16 * 2]);
-    std::fs::write(folder.join("ones.npy"), ones).unwrap();
-    let info: Value =
-        serde_json::from_str(&run(&folder, "info ones.npy --pack-axis width --json")).unwrap();
-    assert!(info["warnings"][0].as_str().unwrap().contains("saturated"), "{info}");
-    // Means of frames vary less than counts.
-    let even = npy_bytes("|u1", "(22, 16, 16)", &[3; 22 * 16 * 16]);
-    std::fs::write(folder.join("even.npy"), even).unwrap();
-    let args = "restore even.npy --bits 3 --sensor swissspad2 --method mle -o even";
-    let text = said(&folder, args);
-    assert!(text.contains("warning: chi-square is") && text.contains("averaged"), "{text}");
-    let manifest = std::fs::read(folder.join("even/manifest.json")).unwrap();
-    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
-    let warnings = manifest["results"]["warnings"].as_array().unwrap();
-    assert!(warnings.iter().any(|w| w.as_str().unwrap().contains("chi-square")), "{manifest}");
-}
-
-#[test]
-fn default_method_says_why_it_is_not_the_network() {
-    let folder = capture("field-dim", 120, 0.005, 0.0);
-    let text = said(&folder, "restore c.npy --sensor swissspad2 --sum 5 -o dim.npy");
-    assert!(text.contains("detections per pixel and frame; the weights were trained"), "{text}");
-    assert!(text.contains("restoring by qbp-refined"), "{text}");
-}
-
-#[test]
 fn looks_at_a_capture_on_one_page() {
     let folder = capture("field-look", 220, 0.2, 0.0);
     let text = run(&folder, "look c.npy --sensor swissspad2");
@@ -262,16 +214,6 @@ fn looks_at_simulated_binary_frames_with_their_recorded_sensor() {
     assert!(text.contains("`qudi restore` makes 21 pictures by"), "{text}");
     let page = std::fs::read_to_string(folder.join("b-look.html")).unwrap();
     assert!(page.contains("\"numbers\":[5,") && page.contains("\"total\":21"));
-}
-
-#[test]
-fn saturated_samples_are_warned_of_where_the_sensor_knows_full_scale() {
-    let folder = scratch("field-saturated");
-    let counts = npy_bytes("|u1", "(4, 64, 64)", &[7; 4 * 64 * 64]);
-    std::fs::write(folder.join("c.npy"), counts).unwrap();
-    let text = said(&folder, "restore c.npy --sensor qudi-paper --ppp 26 --method mle -o o.npy");
-    assert!(text.contains("100.0 % of the samples are saturated"), "{text}");
-    assert!(!text.contains("vary less"), "{text}");
 }
 
 #[test]

@@ -8,6 +8,7 @@ mod auto_sum;
 mod calibrate;
 mod depth;
 mod filter;
+mod frame_axis;
 mod held_sums;
 mod judge;
 mod mosaic;

@@ -45,6 +45,12 @@ pub(crate) fn of_capture(
             "pixels of a tile of {side} x {side} differ by {percent:.0} % all over the picture, as behind a colour filter array: name it (--cfa {example}, or the phase that your camera has), or colours are restored as texture"
         ));
     }
+    if let Some(axes) = summary.likely_axes {
+        warnings.push(format!(
+            "what was read as frames looks like rows of the scene over time: if frames lie along another axis of the array, say so (--axes {} for a NumPy array)",
+            axes.name()
+        ));
+    }
     if let (Some(recorded), Some(found)) = (capture.info().ppp, summary.ppp.incident) {
         let recorded = recorded * f64::from(capture.summed());
         if !LIGHT_RATIO_RANGE.contains(&(found / recorded)) {

@@ -1,8 +1,9 @@
 //! A capture in numbers: rates, light, saturation, histogram, bit order, bad pixels.
 
 use super::Capture;
+use super::frame_axis::likely_axes;
 use super::mosaic::{MosaicContrast, check_phase, mosaic_contrast};
-use crate::description::{BitOrder, PackAxis};
+use crate::description::{Axes, BitOrder, PackAxis};
 use crate::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_core::PppDefinition;
 use qudi_core::Result;
@@ -33,6 +34,8 @@ pub struct Summary {
     /// Mean count of a pixel behind red, green, blue and white, of captures whose colours are read; none of
     /// colours that the filter lacks.
     pub colours: Option<[Option<f64>; 4]>,
+    /// Axes that the array seems to have, where what was read as frames looks like rows of the scene.
+    pub likely_axes: Option<Axes>,
     /// Sum of the measured frames, repaired.
     pub sums: Vec<u32>,
 }
@@ -84,10 +87,12 @@ impl Summary {
         let sampled = capture.sample_frames();
         let mut sums = vec![0u32; size.pixels()];
         let mut counts = vec![0u16; size.pixels()];
+        let mut totals = Vec::with_capacity(sampled.len());
         let mut histogram = vec![0u64; 1 << 16];
         let mut saturated_colours = [0u64; 4];
         for &frame in &sampled {
             capture.read(frame, &mut counts)?;
+            totals.push(counts.iter().map(|&count| f64::from(count)).sum());
             for (sum, &count) in sums.iter_mut().zip(&counts) {
                 *sum += u32::from(count);
                 histogram[usize::from(count)] += 1;
@@ -124,6 +129,7 @@ impl Summary {
             bit_order,
             mosaic: if capture.info.cfa.is_none() { mosaic_contrast(&sums, size) } else { None },
             colours: capture.filter.as_ref().map(|filter| colour_means(&sums, looked, filter)),
+            likely_axes: likely_axes(&sums, &totals, size),
             sums,
         })
     }

@@ -35,9 +35,9 @@ pub(crate) const FORMAT: Format = Format {
     open,
 };
 
-const EXTENSIONS: &[&str] = &["png", "tif", "tiff", "jpg", "jpeg"];
+const EXTENSIONS: &[&str] = &["png", "tif", "tiff", "pgm", "pbm", "ppm", "pnm", "jpg", "jpeg"];
 /// Extensions of a single image; a single TIFF is a stack.
-const SINGLE_EXTENSIONS: &[&str] = &["png", "jpg", "jpeg"];
+const SINGLE_EXTENSIONS: &[&str] = &["png", "pgm", "pbm", "ppm", "pnm", "jpg", "jpeg"];
 
 /// Lists the images of the folder; folders in it are captures of their own.
 fn files(probe: &Probe) -> Result<Vec<PathBuf>> {
@@ -95,7 +95,7 @@ pub(crate) fn open_files(
         return Err(Error::data(
             "the folder holds no images",
             place,
-            "put frames into it as PNG or TIFF",
+            "put frames into it as PNG, TIFF or PGM",
         ));
     };
     for file in &files {

@@ -191,6 +191,18 @@ pub enum Axes {
 }
 
 impl Axes {
+    /// Returns the name of the order on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Thw => "thw",
+            Self::Twh => "twh",
+            Self::Hwt => "hwt",
+            Self::Wht => "wht",
+            Self::Htw => "htw",
+            Self::Wth => "wth",
+        }
+    }
+
     /// Returns the position of the frame axis.
     pub(crate) fn frame_position(self) -> usize {
         match self {

@@ -106,6 +106,29 @@ fn holes_and_strangers_are_named() {
 }
 
 #[test]
+fn portable_maps_are_counts_and_bits() {
+    let folder = scratch();
+    for t in 0..7 {
+        let header = format!("P5\n{SIDE} {SIDE}\n255\n").into_bytes();
+        write(folder.path(), &format!("f{t}.pgm"), &[header, frame(t)].concat());
+    }
+    let mut capture = open(folder.path(), &plain()).unwrap();
+    assert!(counts(&mut capture) == expected(7));
+    // In PBM a set bit is black: no photon.
+    let bits = scratch();
+    for t in 0..4u8 {
+        let header = format!("P4\n{SIDE} {SIDE}\n").into_bytes();
+        write(bits.path(), &format!("f{t}.pbm"), &[header, vec![0xf0 >> t; 2 * SIDE]].concat());
+    }
+    let mut capture = open(bits.path(), &plain()).unwrap();
+    let row = |t: usize| (0..SIDE).map(move |x| u16::from(0xf0u8 >> t << (x % 8) & 0x80 == 0));
+    for (t, frame) in counts(&mut capture).iter().enumerate() {
+        let expected: Vec<u16> = (0..SIDE).flat_map(|_| row(t)).collect();
+        assert_eq!(*frame, expected, "{t}");
+    }
+}
+
+#[test]
 fn dark_rates_are_numbers() {
     let folder = scratch();
     let bytes: Vec<u8> = (0..6).flat_map(frame).collect();

@@ -1,0 +1,104 @@
+//! Signs that an axis of an array was taken for the frames', and is not.
+//!
+//! Where rows of the scene are read as frames, the mean picture is a row's mean over time: it changes along one
+//! of its axes, and hardly along the other, while the light changes from frame to frame.
+
+use crate::description::Axes;
+use qudi_core::Size;
+
+/// Least number of frames, rows and columns for an answer.
+const MIN_EXTENT: usize = 16;
+
+/// Largest variance along the axis of time, in units of the variance along the other one.
+const MAX_ALONG_TIME: f64 = 0.2;
+
+/// Least standard deviation of the frames' light, in units of its mean: rows of scenes differ.
+const MIN_CHANGE: f64 = 0.05;
+
+/// Returns the axes that the array seems to have, if the ones that it was read with, frames first, seem wrong.
+/// `sums` is the sum of the measured frames, and `totals` has the sum of the counts of each.
+pub(super) fn likely_axes(sums: &[u32], totals: &[f64], size: Size) -> Option<Axes> {
+    if totals.len() < MIN_EXTENT || size.height < MIN_EXTENT || size.width < MIN_EXTENT {
+        return None;
+    }
+    let (mean, variance) = moments(totals.iter().copied());
+    if variance.sqrt() < MIN_CHANGE * mean {
+        return None;
+    }
+    let value = |y: usize, x: usize| f64::from(sums[y * size.width + x]);
+    // Variance between the lines of an axis, and within them.
+    let along = |lines: usize, length: usize, value: &dyn Fn(usize, usize) -> f64| {
+        let of_line = |line| moments((0..length).map(move |at| value(line, at)));
+        let (means, variances): (Vec<f64>, Vec<f64>) = (0..lines).map(of_line).unzip();
+        let (within, _) = moments(variances.into_iter());
+        let (_, between) = moments(means.into_iter());
+        (within, between)
+    };
+    let (within, between) = along(size.height, size.width, &value);
+    if within < MAX_ALONG_TIME * between {
+        return Some(Axes::Hwt);
+    }
+    let (within, between) = along(size.width, size.height, &|x, y| value(y, x));
+    (within < MAX_ALONG_TIME * between).then_some(Axes::Htw)
+}
+
+/// Returns mean and variance.
+fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
+    let count = values.clone().count() as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    (mean, values.map(|value| (value - mean).powi(2)).sum::<f64>() / count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_core::random::{Domain, Streams, uniform};
+
+    /// Sums of a noisy moving scene of 40 x 48 pixels and 60 frames, and of each frame, as read with frames along
+    /// `axes`.
+    fn seen(axes: Axes) -> Option<Axes> {
+        let (height, width, frames) = (40, 48, 60);
+        let mut rng = Streams::new(8).row(Domain::Photons, 0, 0);
+        let size = match axes {
+            Axes::Thw => Size { height, width },
+            Axes::Hwt => Size { height: width, width: frames },
+            _ => Size { height: frames, width },
+        };
+        let mut sums = vec![0u32; size.pixels()];
+        let mut totals = vec![0.0; if axes == Axes::Thw { frames } else { height }];
+        for t in 0..frames {
+            for y in 0..height {
+                for x in 0..width {
+                    let (u, v) = (0.2 * x as f64 + 0.005 * t as f64, 0.13 * y as f64);
+                    let light = 2.0 + (u + v).sin() + 0.6 * (2.0 * v).cos() + 0.3 * (3.0 * u).sin();
+                    let count = (light + 2.0 * uniform(&mut rng)).floor() as u32;
+                    let (frame, row, column) = match axes {
+                        Axes::Thw => (t, y, x),
+                        Axes::Hwt => (y, x, t),
+                        _ => (y, t, x),
+                    };
+                    sums[row * size.width + column] += count;
+                    totals[frame] += f64::from(count);
+                }
+            }
+        }
+        likely_axes(&sums, &totals, size)
+    }
+
+    #[test]
+    fn frames_that_are_rows_of_the_scene_are_found() {
+        assert_eq!(seen(Axes::Thw), None);
+        assert_eq!(seen(Axes::Hwt), Some(Axes::Hwt));
+        assert_eq!(seen(Axes::Htw), Some(Axes::Htw));
+    }
+
+    #[test]
+    fn flicker_and_horizons_alone_are_no_sign() {
+        let size = Size { height: 32, width: 32 };
+        let horizon: Vec<u32> = (0..size.pixels()).map(|i| 100 + (i / 32) as u32).collect();
+        let chart: Vec<u32> = (0..size.pixels()).map(|i| 100 + (i * 37 % 64) as u32).collect();
+        let (steady, flickering) = (vec![1000.0; 40], [800.0, 1200.0].repeat(20));
+        assert_eq!(likely_axes(&horizon, &steady, size), None);
+        assert_eq!(likely_axes(&chart, &flickering, size), None);
+    }
+}
