@@ -14,7 +14,9 @@ fn clip(folder: &Path) {
         for i in 0..HEIGHT * WIDTH {
             let x = (i % WIDTH) as f32 - 0.5 * t as f32;
             let y = (i / WIDTH) as f32 + 0.3 * t as f32;
-            let luma = 0.35 + 0.1 * (0.4 * x + 0.15 * y).sin() + 0.1 * (0.3 * y - 0.35 * x).sin();
+            // It does not repeat itself: motion is known.
+            let (u, v) = (0.5 * x + 3.0 * (0.13 * x).sin(), 0.4 * y + 2.0 * (0.17 * y).cos());
+            let luma = 0.35 + 0.1 * (u + 0.5 * v).sin() + 0.1 * (v - 0.6 * u).sin();
             for k in 0..3 {
                 let hue = 0.07 * x - 0.05 * y + 2.1 * k as f32;
                 bytes.extend((luma * (1.0 + 0.5 * hue.sin())).to_le_bytes());

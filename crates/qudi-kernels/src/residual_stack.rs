@@ -1,9 +1,9 @@
 //! Stacks of residual blocks at one resolution, with their gradients.
 //!
-//! On processors that multiply bfloat16 (AMX, AVX512-BF16 by AMD) a stack is one operation: between its
-//! convolutions activations stay bfloat16 with channels last, so that tiles are loaded straight from them, and
-//! bias, ReLU and shortcut are applied to each tile of sums. On LibTorch it is one operation, too, with channels last.
-//! Elsewhere, and on a processor with 32 bits, a stack is composed of single convolutions.
+//! On processors that multiply bfloat16 (AMX, or AVX512-BF16 by AMD) a stack is one operation: between its
+//! convolutions activations stay bfloat16 with channels last, so that tiles are loaded straight from them,
+//! and bias, ReLU and shortcut are applied to each tile of sums. On LibTorch it is one operation, too, with
+//! channels last. Elsewhere, and on a processor with 32 bits, a stack is composed of single convolutions.
 
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 mod amx;

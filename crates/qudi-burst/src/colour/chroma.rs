@@ -7,7 +7,7 @@ use qudi_core::{Frame, Size};
 /// Ratio of the widths of Gaussians for first chroma and for the guided one.
 const FIRST_CHROMA_WIDTH: f32 = 0.7;
 
-/// Standard deviation in pixels of the Gaussian that finds the luma and the chroma that corrections begin with.
+/// Standard deviation in pixels of the Gaussian that finds the luma and the chroma to begin with.
 pub(super) const BLURRED_SIGMA: f32 = 1.5;
 
 /// Largest ratio of a colour to luma.

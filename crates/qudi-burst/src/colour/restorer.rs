@@ -227,8 +227,8 @@ mod tests {
     const SIZE: Size = Size { height: 64, width: 80 };
     const LIGHT: Light = Light { ppp: 3.25, mean_level: 0.3 };
 
-    /// Red, green and blue of a texture of slowly changing colour, moved by `t` steps. It does not repeat itself:
-    /// motion is known.
+    /// Red, green and blue of a texture of slowly changing colour, moved by `t` steps. It does not repeat
+    /// itself: motion is known.
     fn scene(t: usize, saturation: f32) -> [Frame; 3] {
         let plane = |k: usize| {
             Frame::from_fn(SIZE, |x, y| {

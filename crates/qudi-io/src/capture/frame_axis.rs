@@ -1,7 +1,7 @@
 //! Signs that an axis of an array was taken for the frames', and is not.
 //!
-//! Where rows of the scene are read as frames, the mean picture is a row's mean over time: it changes along one
-//! of its axes, and hardly along the other, while the light changes from frame to frame.
+//! Where rows of the scene are read as frames, the mean picture is a row's mean over time: it changes along
+//! one of its axes, and hardly along the other, while the light changes from frame to frame.
 
 use crate::description::Axes;
 use qudi_core::Size;
@@ -15,8 +15,8 @@ const MAX_ALONG_TIME: f64 = 0.2;
 /// Least standard deviation of the frames' light, in units of its mean: rows of scenes differ.
 const MIN_CHANGE: f64 = 0.05;
 
-/// Returns the axes that the array seems to have, if the ones that it was read with, frames first, seem wrong.
-/// `sums` is the sum of the measured frames, and `totals` has the sum of the counts of each.
+/// Returns the axes that the array seems to have, if the ones that it was read with, frames first, seem
+/// wrong. `sums` is the sum of the measured frames, and `totals` has the sum of the counts of each.
 pub(super) fn likely_axes(sums: &[u32], totals: &[f64], size: Size) -> Option<Axes> {
     if totals.len() < MIN_EXTENT || size.height < MIN_EXTENT || size.width < MIN_EXTENT {
         return None;
@@ -54,8 +54,7 @@ mod tests {
     use super::*;
     use qudi_core::random::{Domain, Streams, uniform};
 
-    /// Sums of a noisy moving scene of 40 x 48 pixels and 60 frames, and of each frame, as read with frames along
-    /// `axes`.
+    /// Judges a noisy moving scene of 40 x 48 pixels and 60 frames whose array has the axes `axes`.
     fn seen(axes: Axes) -> Option<Axes> {
         let (height, width, frames) = (40, 48, 60);
         let mut rng = Streams::new(8).row(Domain::Photons, 0, 0);

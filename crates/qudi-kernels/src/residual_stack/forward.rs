@@ -176,7 +176,13 @@ fn forward_group(
     let apply = |from: &Line, number: usize, relu: bool, addend: Option<&Line>| {
         let bias = Some(convolutions[number].bias);
         let addend = addend.map(|line| line.values.as_ptr());
-        convolve(stack.units, &grid, from, &tiles[number], Finish { bias, addend, relu, mask: None })
+        convolve(
+            stack.units,
+            &grid,
+            from,
+            &tiles[number],
+            Finish { bias, addend, relu, mask: None },
+        )
     };
     let mut features = vec![apply(&input, 0, true, None)];
     let mut hidden = Vec::with_capacity(stack.blocks);

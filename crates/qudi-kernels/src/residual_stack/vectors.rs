@@ -6,8 +6,8 @@ use super::layout::{Line, Shared};
 use super::unit::{Finish, Gradient, Products, Scratch, Sums, Unit, add_chunk, convolve_band};
 use super::weights::Tiles;
 use std::arch::x86_64::{
-    __m512, __m512bh, _mm512_dpbf16_ps, _mm512_load_ps, _mm512_loadu_ps, _mm512_set1_epi32,
-    _mm512_store_ps,
+    __m512, __m512bh, __m512i, _mm512_dpbf16_ps, _mm512_load_ps, _mm512_loadu_epi16,
+    _mm512_set1_epi32, _mm512_store_ps,
 };
 use std::mem::transmute;
 
@@ -63,16 +63,17 @@ unsafe fn add_rows(products: &Products, left: *const u16, rows: &mut [[f32; BLOC
         let mut sums: [[__m512; 2]; ROWS] =
             std::array::from_fn(|row| [0, TILE].map(|at| _mm512_load_ps(&raw const rows[row][at])));
         for number in 0..steps {
-            let left = left.wrapping_byte_add(number * step[0]).cast::<i32>();
+            let left = left.wrapping_byte_add(number * step[0]);
             let right = right.map(|tile| tile.wrapping_byte_add(number * step[1]));
             for pair in 0..TILE {
                 let columns: [__m512bh; 2] = right.map(|tile| {
-                    let row = tile.wrapping_byte_add(pair * right_row).cast::<f32>();
-                    transmute::<__m512, __m512bh>(_mm512_loadu_ps(row))
+                    let row = tile.wrapping_byte_add(pair * right_row).cast::<i16>();
+                    transmute::<__m512i, __m512bh>(_mm512_loadu_epi16(row))
                 });
                 for (row, sums) in sums.iter_mut().enumerate() {
-                    let pair = left.wrapping_byte_add(row * left_row).wrapping_add(pair);
-                    let values = transmute::<_, __m512bh>(_mm512_set1_epi32(pair.read_unaligned()));
+                    let pair = left.wrapping_byte_add(row * left_row).wrapping_add(2 * pair);
+                    let pair = i32::from_le_bytes(pair.cast::<[u8; 4]>().read());
+                    let values = transmute::<__m512i, __m512bh>(_mm512_set1_epi32(pair));
                     for (sums, columns) in sums.iter_mut().zip(columns) {
                         *sums = _mm512_dpbf16_ps(*sums, values, columns);
                     }

@@ -199,7 +199,9 @@ mod tests {
                 let mut bytes: Vec<u8> = (0..96).map(|_| noise()).collect();
                 bytes[..4].copy_from_slice(&number.to_be_bytes());
                 if reversed {
-                    bytes.iter_mut().for_each(|byte| *byte = byte.reverse_bits());
+                    for byte in &mut bytes {
+                        *byte = byte.reverse_bits();
+                    }
                 }
                 edges.push(Stored::Packed(&bytes, size));
             }
