@@ -1,7 +1,7 @@
 //! What merged counts tell of the ratios of colours to luma.
 //!
-//! A pixel behind a colour sees light of luma `L` times a ratio `r`. Around an expected ratio `e` its count has
-//! a mean of nearly `m(L e) + L m'(L e) (r - e)`. So the sum of `count - m(L e) + L m'(L e) e` over some
+//! A pixel behind a colour sees light of luma `L` times a ratio `r`. Around an expected ratio `e` its count
+//! has a mean of nearly `m(L e) + L m'(L e) (r - e)`. So the sum of `count - m(L e) + L m'(L e) e` over some
 //! pixels, divided by the sum of `L m'(L e)`, is their ratio, however much their luma differs and the counts
 //! saturate: a step of Newton's method.
 

@@ -1,8 +1,8 @@
 //! Averages of chroma, drawn to the ones of wider surroundings where their noise explains the difference.
 //!
-//! An average differs from its surroundings by noise of known variance `v`, and by colour. The variance `s` of
-//! the colours is estimated around every pixel as what the differences have beyond noise; `s / (s + v)` of a
-//! difference is then kept (empirical Bayes). Dark and even areas keep little, edges of colour all.
+//! An average differs from its surroundings by noise of known variance `v`, and by colour. The variance `s`
+//! of the colours is estimated around every pixel as what the differences have beyond noise; `s / (s + v)` of
+//! a difference is then kept (empirical Bayes). Dark and even areas keep little, edges of colour all.
 
 use super::chroma::Colours;
 use super::guided::{Averages, gaussian};

@@ -12,7 +12,7 @@ const MIN_EXTENT: usize = 16;
 /// Largest variance along the axis of time, in units of the variance along the other one.
 const MAX_ALONG_TIME: f64 = 0.2;
 
-/// Least standard deviation of the frames' light, in units of its mean: rows of scenes differ.
+/// Least standard deviation of the light of rows of a scene, in units of its mean.
 const MIN_CHANGE: f64 = 0.05;
 
 /// Returns the axes that the array seems to have, if the ones that it was read with, frames first, seem
@@ -26,20 +26,23 @@ pub(super) fn likely_axes(sums: &[u32], totals: &[f64], size: Size) -> Option<Ax
         return None;
     }
     let value = |y: usize, x: usize| f64::from(sums[y * size.width + x]);
-    // Variance between the lines of an axis, and within them.
-    let along = |lines: usize, length: usize, value: &dyn Fn(usize, usize) -> f64| {
-        let of_line = |line| moments((0..length).map(move |at| value(line, at)));
+    // Compares the variance within lines, less the noise that neighbours show, with the one between them.
+    let even_within = |lines: usize, length: usize, value: &dyn Fn(usize, usize) -> f64| {
+        let of_line = |line| {
+            let (mean, variance) = moments((0..length).map(move |at| value(line, at)));
+            let steps = (1..length).map(move |at| value(line, at) - value(line, at - 1));
+            let noise = steps.map(|step| 0.5 * step * step).sum::<f64>() / (length - 1) as f64;
+            (mean, variance - noise)
+        };
         let (means, variances): (Vec<f64>, Vec<f64>) = (0..lines).map(of_line).unzip();
         let (within, _) = moments(variances.into_iter());
-        let (_, between) = moments(means.into_iter());
-        (within, between)
+        let (mean, between) = moments(means.into_iter());
+        between.sqrt() > MIN_CHANGE * mean && within < MAX_ALONG_TIME * between
     };
-    let (within, between) = along(size.height, size.width, &value);
-    if within < MAX_ALONG_TIME * between {
+    if even_within(size.height, size.width, &value) {
         return Some(Axes::Hwt);
     }
-    let (within, between) = along(size.width, size.height, &|x, y| value(y, x));
-    (within < MAX_ALONG_TIME * between).then_some(Axes::Htw)
+    even_within(size.width, size.height, &|x, y| value(y, x)).then_some(Axes::Htw)
 }
 
 /// Returns mean and variance.
@@ -95,7 +98,9 @@ mod tests {
     fn flicker_and_horizons_alone_are_no_sign() {
         let size = Size { height: 32, width: 32 };
         let horizon: Vec<u32> = (0..size.pixels()).map(|i| 100 + (i / 32) as u32).collect();
-        let chart: Vec<u32> = (0..size.pixels()).map(|i| 100 + (i * 37 % 64) as u32).collect();
+        let field = |i: usize| ((i % 32 / 5 + i / 32 / 7) % 2) as u32;
+        let chart: Vec<u32> =
+            (0..size.pixels()).map(|i| 100 + 60 * field(i) + (i / 32) as u32).collect();
         let (steady, flickering) = (vec![1000.0; 40], [800.0, 1200.0].repeat(20));
         assert_eq!(likely_axes(&horizon, &steady, size), None);
         assert_eq!(likely_axes(&chart, &flickering, size), None);
