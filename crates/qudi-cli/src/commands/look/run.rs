@@ -48,6 +48,9 @@ const FEW_PICTURES: u64 = 10;
 /// [`Method::cost`]: crate::methods::Method::cost
 const INSTANT_COST: f64 = 0.065;
 
+/// Time of a picture in colour, in units of a gray one's.
+const COLOUR_COST: f64 = 1.6;
+
 /// Seconds of an instant that is not restored twice.
 const LONG_INSTANT: f64 = 2.0;
 
@@ -208,42 +211,60 @@ fn read_window(capture: &mut Capture) -> Result<(u64, Vec<Vec<u16>>)> {
     Ok((first, frames))
 }
 
-/// Restores the instant in the middle, and returns its time in seconds: of the faster of two runs, since the
-/// first one prepares what all others use.
+/// Restores the instant in the middle, and returns the time in seconds that a picture takes like it: of the
+/// faster of two runs, since the first one prepares what all others use.
 fn timed_instant(
     frames: &[Vec<u16>],
     capture: &Capture,
     acquisition: &Acquisition,
     rendering: Option<&Rendering>,
 ) -> Result<(Shown, f64)> {
+    let coloured = match capture.filter() {
+        Some(_) => Some(restore_instant(frames, capture, acquisition, rendering)?),
+        None => None,
+    };
     let mut seconds = f64::INFINITY;
     loop {
         let start = Instant::now();
-        let instant = restore_instant(frames, capture, acquisition, rendering)?;
+        let gray = restore_gray(frames, capture, acquisition)?;
         let own = start.elapsed().as_secs_f64();
         if seconds.is_finite() || own > LONG_INSTANT {
-            return Ok((instant, seconds.min(own)));
+            let seconds = seconds.min(own);
+            // What colours cost is shared by the pictures of a window.
+            return Ok(match coloured {
+                Some(instant) => (instant, COLOUR_COST * seconds),
+                None => (gray, seconds),
+            });
         }
         seconds = own;
     }
 }
 
-/// Aligns and merges sums, and returns the one in the middle.
+/// Aligns and merges sums as gray ones, and returns the one in the middle.
+fn restore_gray(frames: &[Vec<u16>], capture: &Capture, acquisition: &Acquisition) -> Result<Shown> {
+    let view = BurstView { size: capture.size(), frames };
+    let mut method = Qbp::new(PostFilter::Bm3d);
+    let mut restored = method.restore_frames(view, acquisition, &[frames.len() / 2])?;
+    Ok(Shown::gray(restored.frames.swap_remove(0).with_white_at_highlights()))
+}
+
+/// Aligns and merges sums, in colour where there is a filter, and returns the one in the middle.
 fn restore_instant(
     frames: &[Vec<u16>],
     capture: &Capture,
     acquisition: &Acquisition,
     rendering: Option<&Rendering>,
 ) -> Result<Shown> {
+    let (Some(filter), Some(rendering)) = (capture.filter(), rendering) else {
+        return restore_gray(frames, capture, acquisition);
+    };
     let view = BurstView { size: capture.size(), frames };
-    let mut method: Box<dyn Restorer> = Box::new(Qbp::new(PostFilter::Bm3d));
-    if let Some(filter) = capture.filter() {
-        method = Box::new(ColourRestorer::new(method, filter.clone(), true));
-    }
-    let mut restored = method.restore_frames(view, acquisition, &[frames.len() / 2])?;
-    Ok(match (&restored.colour, rendering) {
-        (Some(colour), Some(rendering)) => Shown::colour(&colour[0], rendering),
-        _ => Shown::gray(restored.frames.swap_remove(0).with_white_at_highlights()),
+    let method = Box::new(Qbp::new(PostFilter::Bm3d));
+    let mut method = ColourRestorer::new(method, filter.clone(), true);
+    let restored = method.restore_frames(view, acquisition, &[frames.len() / 2])?;
+    Ok(match &restored.colour {
+        Some(colour) => Shown::colour(&colour[0], rendering),
+        None => Shown::gray(restored.frames[0].clone().with_white_at_highlights()),
     })
 }
 
