@@ -241,7 +241,11 @@ fn timed_instant(
 }
 
 /// Aligns and merges sums as gray ones, and returns the one in the middle.
-fn restore_gray(frames: &[Vec<u16>], capture: &Capture, acquisition: &Acquisition) -> Result<Shown> {
+fn restore_gray(
+    frames: &[Vec<u16>],
+    capture: &Capture,
+    acquisition: &Acquisition,
+) -> Result<Shown> {
     let view = BurstView { size: capture.size(), frames };
     let mut method = Qbp::new(PostFilter::Bm3d);
     let mut restored = method.restore_frames(view, acquisition, &[frames.len() / 2])?;
