@@ -63,6 +63,15 @@ fn saturated_samples_are_warned_of_where_the_sensor_knows_full_scale() {
 }
 
 #[test]
+fn warns_of_the_other_bit_order() {
+    let folder = capture("warnings-bits", 200, 0.3, 0.0);
+    let args = "restore c.npy --sensor swissspad2 --sum 20 --method mle --force -o o.npy";
+    assert!(!said(&folder, args).contains("--bitorder"));
+    let text = said(&folder, &format!("{args} --bitorder lsb"));
+    assert!(text.contains("stored MSB first: see --bitorder"), "{text}");
+}
+
+#[test]
 fn warns_of_frames_along_another_axis() {
     let folder = scratch("warnings-axes");
     let (height, width, frames) = (48, 40, 60);

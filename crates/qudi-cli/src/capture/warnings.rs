@@ -45,9 +45,16 @@ pub(crate) fn of_capture(
             "pixels of a tile of {side} x {side} differ by {percent:.0} % all over the picture, as behind a colour filter array: name it (--cfa {example}, or the phase that your camera has), or colours are restored as texture"
         ));
     }
+    if let Some(check) = &summary.bit_order
+        && let (Some(seen), true) = (check.seen, check.z_score < 0.0)
+    {
+        warnings.push(format!(
+            "the picture says that the bits of a byte are stored {seen}: see --bitorder"
+        ));
+    }
     if let Some(axes) = summary.likely_axes {
         warnings.push(format!(
-            "what was read as frames looks like rows of the scene over time: if frames lie along another axis of the array, say so (--axes {} for a NumPy array)",
+            "what was read as frames looks like rows of the scene over time: if frames lie along another axis of the array, say so (as in --axes {} for a NumPy array)",
             axes.name()
         ));
     }

@@ -15,17 +15,26 @@ const MAX_ALONG_TIME: f64 = 0.2;
 /// Least standard deviation of the light of rows of a scene, in units of its mean.
 const MIN_CHANGE: f64 = 0.05;
 
+/// Least variance of sums of counts, in units of the one that their noise may have.
+const MIN_EXCESS: f64 = 4.0;
+
+/// Least variance of the difference between the profiles of two halves of the frames, in units of a
+/// profile's: rows of a scene differ in more than their light.
+const MIN_DIFFERENCE: f64 = 0.1;
+
 /// Returns the axes that the array seems to have, if the ones that it was read with, frames first, seem
-/// wrong. `sums` is the sum of the measured frames, and `totals` has the sum of the counts of each.
-pub(super) fn likely_axes(sums: &[u32], totals: &[f64], size: Size) -> Option<Axes> {
+/// wrong. `halves` are the sums of the first and the second half of the measured frames, and `totals` has the
+/// sum of the counts of each frame.
+pub(super) fn likely_axes(halves: &[Vec<u32>; 2], totals: &[f64], size: Size) -> Option<Axes> {
     if totals.len() < MIN_EXTENT || size.height < MIN_EXTENT || size.width < MIN_EXTENT {
         return None;
     }
     let (mean, variance) = moments(totals.iter().copied());
-    if variance.sqrt() < MIN_CHANGE * mean {
+    if variance.sqrt() < MIN_CHANGE * mean || variance < MIN_EXCESS * mean {
         return None;
     }
-    let value = |y: usize, x: usize| f64::from(sums[y * size.width + x]);
+    let of_half = |half: usize, y: usize, x: usize| f64::from(halves[half][y * size.width + x]);
+    let value = |y: usize, x: usize| of_half(0, y, x) + of_half(1, y, x);
     // Compares the variance within lines, less the noise that neighbours show, with the one between them.
     let even_within = |lines: usize, length: usize, value: &dyn Fn(usize, usize) -> f64| {
         let of_line = |line| {
@@ -37,12 +46,31 @@ pub(super) fn likely_axes(sums: &[u32], totals: &[f64], size: Size) -> Option<Ax
         let (means, variances): (Vec<f64>, Vec<f64>) = (0..lines).map(of_line).unzip();
         let (within, _) = moments(variances.into_iter());
         let (mean, between) = moments(means.into_iter());
-        between.sqrt() > MIN_CHANGE * mean && within < MAX_ALONG_TIME * between
+        let noise = MIN_EXCESS * mean / length as f64;
+        between > noise.max((MIN_CHANGE * mean).powi(2)) && within < MAX_ALONG_TIME * between
     };
-    if even_within(size.height, size.width, &value) {
+    // A light that changes leaves the shape of a profile as it is.
+    let profiles_differ =
+        |lines: usize, length: usize, value: &dyn Fn(usize, usize, usize) -> f64| {
+            let profile = |half: usize| -> Vec<f64> {
+                let of_line = |line| (0..length).map(|at| value(half, line, at)).sum::<f64>();
+                let sums: Vec<f64> = (0..lines).map(of_line).collect();
+                let mean = sums.iter().sum::<f64>() / lines as f64;
+                sums.iter().map(|sum| sum / mean.max(f64::MIN_POSITIVE)).collect()
+            };
+            let (first, second) = (profile(0), profile(1));
+            let (_, own) = moments(first.iter().zip(&second).map(|(a, b)| 0.5 * (a + b)));
+            let (_, difference) = moments(first.iter().zip(&second).map(|(a, b)| a - b));
+            difference > MIN_DIFFERENCE * own
+        };
+    let (height, width) = (size.height, size.width);
+    if even_within(height, width, &value) && profiles_differ(height, width, &of_half) {
         return Some(Axes::Hwt);
     }
-    even_within(size.width, size.height, &|x, y| value(y, x)).then_some(Axes::Htw)
+    let turned = |half: usize, x: usize, y: usize| of_half(half, y, x);
+    let differ =
+        even_within(width, height, &|x, y| value(y, x)) && profiles_differ(width, height, &turned);
+    differ.then_some(Axes::Htw)
 }
 
 /// Returns mean and variance.
@@ -66,7 +94,7 @@ mod tests {
             Axes::Hwt => Size { height: width, width: frames },
             _ => Size { height: frames, width },
         };
-        let mut sums = vec![0u32; size.pixels()];
+        let mut halves = [vec![0u32; size.pixels()], vec![0u32; size.pixels()]];
         let mut totals = vec![0.0; if axes == Axes::Thw { frames } else { height }];
         for t in 0..frames {
             for y in 0..height {
@@ -79,12 +107,12 @@ mod tests {
                         Axes::Hwt => (y, x, t),
                         _ => (y, t, x),
                     };
-                    sums[row * size.width + column] += count;
+                    halves[2 * frame / totals.len()][row * size.width + column] += count;
                     totals[frame] += f64::from(count);
                 }
             }
         }
-        likely_axes(&sums, &totals, size)
+        likely_axes(&halves, &totals, size)
     }
 
     #[test]
@@ -95,6 +123,22 @@ mod tests {
     }
 
     #[test]
+    fn dark_captures_are_no_sign() {
+        let size = Size { height: 64, width: 64 };
+        let mut rng = Streams::new(9).row(Domain::Photons, 0, 0);
+        let mut halves = [vec![0u32; size.pixels()], vec![0u32; size.pixels()]];
+        let mut totals = vec![0.0; 40];
+        for (t, total) in totals.iter_mut().enumerate() {
+            for sum in &mut halves[t / 20] {
+                let count = u32::from(uniform(&mut rng) < 0.001);
+                *sum += count;
+                *total += f64::from(count);
+            }
+        }
+        assert_eq!(likely_axes(&halves, &totals, size), None);
+    }
+
+    #[test]
     fn flicker_and_horizons_alone_are_no_sign() {
         let size = Size { height: 32, width: 32 };
         let horizon: Vec<u32> = (0..size.pixels()).map(|i| 100 + (i / 32) as u32).collect();
@@ -102,7 +146,10 @@ mod tests {
         let chart: Vec<u32> =
             (0..size.pixels()).map(|i| 100 + 60 * field(i) + (i / 32) as u32).collect();
         let (steady, flickering) = (vec![1000.0; 40], [800.0, 1200.0].repeat(20));
-        assert_eq!(likely_axes(&horizon, &steady, size), None);
-        assert_eq!(likely_axes(&chart, &flickering, size), None);
+        let twice = |sums: &[u32]| [sums.to_vec(), sums.iter().map(|sum| 2 * sum).collect()];
+        let steep: Vec<u32> = (0..size.pixels()).map(|i| 100 + 5 * (i / 32) as u32).collect();
+        assert_eq!(likely_axes(&twice(&horizon), &steady, size), None);
+        assert_eq!(likely_axes(&twice(&chart), &flickering, size), None);
+        assert_eq!(likely_axes(&twice(&steep), &flickering, size), None, "both at once");
     }
 }

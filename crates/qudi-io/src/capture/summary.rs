@@ -85,12 +85,13 @@ impl Summary {
     ) -> Result<Self> {
         let size = capture.size();
         let sampled = capture.sample_frames();
-        let mut sums = vec![0u32; size.pixels()];
+        let mut halves = [vec![0u32; size.pixels()], vec![0u32; size.pixels()]];
         let mut counts = vec![0u16; size.pixels()];
         let mut totals = Vec::with_capacity(sampled.len());
         let mut histogram = vec![0u64; 1 << 16];
         let mut saturated_colours = [0u64; 4];
-        for &frame in &sampled {
+        for (number, &frame) in sampled.iter().enumerate() {
+            let sums = &mut halves[2 * number / sampled.len()];
             capture.read(frame, &mut counts)?;
             totals.push(counts.iter().map(|&count| f64::from(count)).sum());
             for (sum, &count) in sums.iter_mut().zip(&counts) {
@@ -102,6 +103,11 @@ impl Summary {
                     saturated_colours[colour as usize] += u64::from(count == max);
                 }
             }
+        }
+        let likely_axes = likely_axes(&halves, &totals, size);
+        let [mut sums, second] = halves;
+        for (sum, second) in sums.iter_mut().zip(second) {
+            *sum += second;
         }
         if let (Some(filter), Some(cfa)) = (&capture.filter, &capture.info.cfa) {
             check_phase(&sums, filter, cfa)?;
@@ -129,7 +135,7 @@ impl Summary {
             bit_order,
             mosaic: if capture.info.cfa.is_none() { mosaic_contrast(&sums, size) } else { None },
             colours: capture.filter.as_ref().map(|filter| colour_means(&sums, looked, filter)),
-            likely_axes: likely_axes(&sums, &totals, size),
+            likely_axes,
             sums,
         })
     }

@@ -174,6 +174,60 @@ fn colours_of(image: &Path) -> usize {
     if is_coloured { 3 } else { 1 }
 }
 
+/// Returns samples that a decoder has scaled from `most` to `full` as they are stored.
+fn unscaled(mut samples: Vec<u16>, full: u16, most: u16) -> Vec<u16> {
+    let (full, most) = (u32::from(full), u32::from(most));
+    for sample in &mut samples {
+        *sample = ((u32::from(*sample) * most + full / 2) / full) as u16;
+    }
+    samples
+}
+
+/// Returns the largest possible sample of a portable gray or colour map (PGM, PPM); none of other images.
+///
+/// # Errors
+/// [`Error`] if the file cannot be read, or holds more than one image.
+fn portable_maximum(path: &Path) -> Result<Option<u16>> {
+    /// Bytes of the longest header that is looked at, comments included.
+    const HEADER_BYTES: u64 = 1 << 12;
+    let io = |e| Error::io("read", path, e);
+    let file = File::open(path).map_err(io)?;
+    let length = file.metadata().map_err(io)?.len();
+    let mut header = Vec::new();
+    file.take(HEADER_BYTES).read_to_end(&mut header).map_err(io)?;
+    let (Some(b'P'), Some(kind @ (b'2' | b'3' | b'5' | b'6'))) = (header.first(), header.get(1))
+    else {
+        return Ok(None);
+    };
+    let mut at = 2;
+    let mut number = || -> Option<u64> {
+        loop {
+            match header.get(at)? {
+                b'#' => at += header[at..].iter().position(|&byte| byte == b'\n')?,
+                byte if byte.is_ascii_whitespace() => at += 1,
+                _ => break,
+            }
+        }
+        let digits = header[at..].iter().take_while(|byte| byte.is_ascii_digit()).count();
+        let text = std::str::from_utf8(&header[at..at + digits]).ok()?;
+        at += digits;
+        text.parse().ok()
+    };
+    let (Some(width), Some(height), Some(most)) = (number(), number(), number()) else {
+        return Ok(None);
+    };
+    let samples = width.saturating_mul(height).saturating_mul(if *kind == b'6' { 3 } else { 1 });
+    let bytes = samples.saturating_mul(if most > 255 { 2 } else { 1 });
+    if matches!(kind, b'5' | b'6') && length > (at as u64 + 1).saturating_add(bytes) {
+        return Err(Error::data(
+            "a file of more than one image",
+            path,
+            "save each frame as a file of its own",
+        ));
+    }
+    Ok(u16::try_from(most).ok().filter(|&most| most > 0))
+}
+
 /// Reads the gray samples of an image, or of one channel, with its size and full scale.
 fn gray(path: &Path, channel: Option<usize>) -> Result<(Size, Vec<u16>, u16)> {
     let image = decode_image(path, IMAGE_FRAME_PIXELS)?;
@@ -194,6 +248,10 @@ fn gray(path: &Path, channel: Option<usize>) -> Result<(Size, Vec<u16>, u16)> {
             ));
         }
         other => (other.into_bytes().into_iter().map(u16::from).collect(), 255),
+    };
+    let (samples, full) = match portable_maximum(path)? {
+        Some(most) if most != full => (unscaled(samples, full, most), most),
+        _ => (samples, full),
     };
     let colours = channels - usize::from(alpha);
     let coloured = samples.chunks_exact(channels).any(|p| p[..colours].iter().any(|&v| v != p[0]));

@@ -114,6 +114,17 @@ fn portable_maps_are_counts_and_bits() {
     }
     let mut capture = open(folder.path(), &plain()).unwrap();
     assert!(counts(&mut capture) == expected(7));
+    // Values stay as they are stored, whatever the largest possible one.
+    let deep = scratch();
+    let samples: Vec<u16> = (0..SIDE * SIDE).map(|i| (i * 13 % 4001) as u16).collect();
+    let bytes: Vec<u8> = samples.iter().flat_map(|sample| sample.to_be_bytes()).collect();
+    let header = format!("P5 # twelve bits\n{SIDE} {SIDE} 4095\n").into_bytes();
+    let image = [header, bytes].concat();
+    let path = write(deep.path(), "a.pgm", &image);
+    assert!(counts(&mut open(&path, &plain()).unwrap()) == [samples]);
+    let path = write(deep.path(), "two.pgm", &[image.clone(), image].concat());
+    let words = refusal(open(&path, &plain()));
+    assert!(words.contains("more than one image"), "{words}");
     // In PBM a set bit is black: no photon.
     let bits = scratch();
     for t in 0..4u8 {
