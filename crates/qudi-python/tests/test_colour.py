@@ -21,7 +21,7 @@ def mosaic(scene, tmp_path_factory):
     clip = tmp_path_factory.mktemp("colour") / "clip.npy"
     np.save(clip, scene)
     counts, record = qs.simulate(clip, cfa="rggb", **PAPER)
-    assert counts.shape == (11, 32, 40) and record["sensor"]["colour"]["cfa"] == "rggb@0,0"
+    assert counts.shape == (11, 32, 40) and record["simulation"]["sensor"]["colour"]["cfa"] == "rggb@0,0"
     return counts
 
 
