@@ -61,9 +61,25 @@ fn colours_of_a_mosaic_are_restored() {
     let linear = scores["cpsnr_linear"].as_f64().unwrap();
     assert!(linear > 27.0, "{scores}");
     assert!(scores["ciede2000_median"].as_f64().unwrap() < 6.0, "{scores}");
+    let both = ["eval", "t.npy", "--restored", "c.npy", "--method", "qbp"];
+    let output = qudi(&folder).args(both).output().unwrap();
+    assert!(String::from_utf8_lossy(&output.stderr).contains("cannot be used with"));
     // Without its colours, the clip is far from itself.
     run(&folder, "restore m.npy -o g.npy --method qbp-refined --gray");
     assert_eq!(npy_shape(&folder.join("g.npy")), format!("({FRAMES}, {HEIGHT}, {WIDTH})"));
+}
+
+#[test]
+fn colours_of_images_are_decoded_from_srgb() {
+    let folder = scratch("colour-transfer");
+    let pixel = |x: u32, y: u32| image::Rgb([40 + 2 * x as u8, 90, 60 + 3 * y as u8]);
+    image::RgbImage::from_fn(48, 32, pixel).save(folder.join("s.png")).unwrap();
+    let simulate = "simulate s.png -o m.npy --cfa rggb --ppp 3.25 --frames 2 --seed 1";
+    refused(&folder, &format!("{simulate} --transfer as-is"), &["decoded from sRGB"]);
+    run(&folder, simulate);
+    let record = std::fs::read_to_string(folder.join("m.npy.json")).unwrap();
+    let record: serde_json::Value = serde_json::from_str(&record).unwrap();
+    assert_eq!(record["simulation"]["sampling"]["transfer"], "srgb");
 }
 
 #[test]

@@ -64,8 +64,11 @@ fn saturated_samples_are_warned_of_where_the_sensor_knows_full_scale() {
 
 #[test]
 fn warns_of_the_other_bit_order() {
-    let folder = capture("warnings-bits", 200, 0.3, 0.0);
-    let args = "restore c.npy --sensor swissspad2 --sum 20 --method mle --force -o o.npy";
+    let folder = scratch("warnings-bits");
+    let simulate = "simulate scene:dead-leaves -o c.npy --sensor swissspad2 --seed 1 --frames 400";
+    run(&folder, &format!("{simulate} --ppp 0.5 --size 128x192"));
+    std::fs::remove_file(folder.join("c.npy.json")).unwrap();
+    let args = "restore c.npy --pack-axis width --sensor swissspad2 --sum 50 --method mle --force -o o.npy";
     assert!(!said(&folder, args).contains("--bitorder"));
     let text = said(&folder, &format!("{args} --bitorder lsb"));
     assert!(text.contains("stored MSB first: see --bitorder"), "{text}");
@@ -80,7 +83,7 @@ fn warns_of_frames_along_another_axis() {
     for i in 0..height * width * frames {
         let (x, y) = ((i / frames % width) as f64, (i / (frames * width)) as f64);
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-        let light = 3.0 + 1.5 * (0.3 * x + 0.01 * (i % frames) as f64).sin() + (0.2 * y).cos();
+        let light = 3.0 + (0.3 * x + 0.1 * y + 0.01 * (i % frames) as f64).sin() + (0.2 * y).cos();
         counts.push((light + (state >> 61) as f64 / 4.0) as u8);
     }
     let shape = format!("({height}, {width}, {frames})");

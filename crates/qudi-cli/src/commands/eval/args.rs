@@ -31,7 +31,7 @@ pub(crate) struct Eval {
     /// Score these colours, a .npy of (frames, height, width, 3) in linear light, against DATA, the truth
     /// that `qudi simulate --cfa` wrote: CPSNR, CIEDE2000 and zipper error after one common gain, and LPIPS
     /// of sRGB values with --backbones
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["capture", "table1", "external", "join", "shard", "export_photons", "csv", "markdown", "html", "appearance"], value_hint = ValueHint::FilePath)]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["capture", "table1", "external", "join", "shard", "export_photons", "csv", "markdown", "html", "appearance", "method", "ppp", "ppp_def", "sensor", "clips", "frames", "seed", "protocol", "overlap", "mean_level", "min_psnr", "steps"], value_hint = ValueHint::FilePath)]
     pub(crate) restored: Option<PathBuf>,
     /// Methods to compare
     #[arg(long, value_name = "A,B,...", value_delimiter = ',', default_values = COMPARED, value_parser = methods())]

@@ -6,9 +6,9 @@ use crate::args::number::COUNT;
 use crate::args::tiff_samples::tiff_samples;
 use crate::error::{CliError, Result};
 use crate::settings::Settings;
-use qudi_core::Error;
 use qudi_core::atomic_file::{Overwrite, refuse_taken};
 use qudi_core::colour::FilterChoice;
+use qudi_core::{Error, Transfer};
 use qudi_io::sidecar::Record;
 use qudi_io::writer::{BurstFormat, Planes, TiffSamples};
 use qudi_sim::Simulation;
@@ -204,6 +204,14 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
         *path = std::path::absolute(&*path)
             .map_err(|e| Error::io("find the filter", Path::new(path), e))?;
     }
+    let mut transfer = settings.get("simulate.transfer")?;
+    let has_filter = sensor.colour.as_ref().is_some_and(|colour| colour.cfa.is_some());
+    let is_light = matches!(input, Input::Npy { .. } | Input::Procedural(_));
+    if has_filter && !is_light && transfer == Transfer::AsIs {
+        let reason = "by colours of images and videos, which are decoded from sRGB";
+        settings.refuse(&["simulate.transfer"], reason)?;
+        transfer = Transfer::Srgb;
+    }
     // Drawn seeds stay short enough to be read out and typed.
     let drawn = || RandomState::new().hash_one(0) % 1_000_000;
     Ok(Simulation {
@@ -212,7 +220,7 @@ fn simulation(args: &Simulate, settings: &Settings) -> Result<Simulation> {
             frames,
             instants: settings.get("simulate.instants")?,
             frames_per_image: settings.get("simulate.frames_per_image")?,
-            transfer: settings.get("simulate.transfer")?,
+            transfer,
             white: settings.get("simulate.white")?,
         },
         sensor,
