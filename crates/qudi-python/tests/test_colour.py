@@ -20,7 +20,8 @@ def scene():
 def mosaic(scene, tmp_path_factory):
     clip = tmp_path_factory.mktemp("colour") / "clip.npy"
     np.save(clip, scene)
-    counts, record = qs.simulate(clip, cfa="rggb", **PAPER)
+    # One frame of so few pixels: between seeds its chroma differs by up to 7 %.
+    counts, record = qs.simulate(clip, cfa="rggb", seed=2, **PAPER)
     assert counts.shape == (11, 32, 40) and record["simulation"]["sensor"]["colour"]["cfa"] == "rggb@0,0"
     return counts
 
@@ -29,8 +30,7 @@ def test_a_mosaic_becomes_colours(mosaic, scene, tmp_path):
     result = qs.restore(mosaic, cfa="rggb", method="qbp-refined", **PAPER)
     assert result.frames.shape == scene.shape and result.sigma is None
     middle = result.frames[5, 4:-4, 4:-4]
-    # Chroma of one frame of 3 bits, over so few pixels, differs by 3 % from seed to seed.
-    assert np.allclose(middle.mean((0, 1)) / middle[..., 1].mean(), COLOUR / COLOUR[1], rtol=0.1)
+    assert np.allclose(middle.mean((0, 1)) / middle[..., 1].mean(), COLOUR / COLOUR[1], rtol=0.05)
     first = next(iter(qs.restore_iter(mosaic, cfa="rggb", method="qbp-refined", **PAPER)))
     assert np.array_equal(first, result.frames[0])
     qs.write(tmp_path / "colours.npy", result.frames)
