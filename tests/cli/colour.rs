@@ -215,14 +215,54 @@ fn phases_that_the_picture_contradicts_are_refused() {
     std::fs::remove_file(folder.join("f.npy.json")).unwrap();
     let info = "info f.npy --bits 3 --cfa";
     run(&folder, &format!("{info} rggb"));
-    refused(&folder, &format!("{info} rggb@0,1"), &["two green pixels", "rggb@0,1"]);
+    refused(&folder, &format!("{info} rggb@0,1"), &["differ by", "rggb@0,1", "fit rggb or bggr"]);
     run(&folder, &format!("{info} bggr"));
     let converted = "convert f.npy -o g.npy --bits 3 --cfa";
-    refused(&folder, &format!("{converted} grbg"), &["two green pixels", "grbg@0,0"]);
+    refused(&folder, &format!("{converted} grbg"), &["differ by", "behind grbg"]);
     let colours = [[0, 255, 0], [255, 0, 0], [0, 0, 255], [0, 255, 0]];
     let pixel = |x: u32, y: u32| image::Rgb(colours[(y % 2 * 2 + x % 2) as usize]);
     image::RgbImage::from_fn(160, 160, pixel).save(folder.join("shifted.png")).unwrap();
-    refused(&folder, &format!("{info} shifted.png"), &["two green pixels", "shifted.png"]);
+    refused(&folder, &format!("{info} shifted.png"), &["differ by", "shifted.png"]);
+}
+
+#[test]
+fn the_kind_of_a_filter_shows_in_scenes_of_many_colours() {
+    let folder = exposed("colour-kind", "quad-rggb");
+    std::fs::remove_file(folder.join("m.npy.json")).unwrap();
+    let unnamed = printed(&folder, "info m.npy --bits 3");
+    assert!(unnamed.contains("name it (--cfa quad-rggb or quad-bggr)"), "{unnamed}");
+    refused(&folder, "info m.npy --bits 3 --cfa rggb", &["behind rggb differ", "fit quad-rggb"]);
+    refused(&folder, "info m.npy --bits 3 --cfa quad-rggb@1,0", &["fit quad-rggb or quad-bggr"]);
+    run(&folder, "info m.npy --bits 3 --cfa quad-rggb");
+}
+
+#[test]
+fn channels_are_letters_of_the_filter_that_a_record_or_a_sensor_names() {
+    let folder = exposed("colour-channel", "rggb");
+    let green = run(&folder, "info m.npy --channel 1");
+    assert!(green.contains("32 x 48"), "{green}");
+    std::fs::remove_file(folder.join("m.npy.json")).unwrap();
+    let sensor = "base = \"qudi-paper\"\n[colour]\ncfa = \"rggb@0,0\"\n";
+    std::fs::write(folder.join("camera.toml"), sensor).unwrap();
+    let green = run(&folder, "info m.npy --channel 1 --sensor camera.toml");
+    assert!(green.contains("32 x 48"), "{green}");
+    // Full planes have channels of their own.
+    let shape = format!("({FRAMES}, {HEIGHT}, {WIDTH}, 3)");
+    let counts = vec![1; FRAMES * HEIGHT * WIDTH * 3];
+    std::fs::write(folder.join("planes.npy"), npy_bytes("|u1", &shape, &counts)).unwrap();
+    let plane = printed(&folder, "info planes.npy --channel 1");
+    assert!(plane.contains("64 x 96"), "{plane}");
+}
+
+#[test]
+fn restored_files_that_are_no_linear_light_are_named() {
+    let folder = exposed("colour-doubts", "rggb");
+    run(&folder, "restore m.npy -o c.npy --method qbp-refined");
+    let linear = printed(&folder, "eval t.npy --restored c.npy");
+    assert!(!linear.contains("warning"), "{linear}");
+    run(&folder, "restore m.npy -o s.npy --method qbp-refined --tonemap srgb");
+    let encoded = printed(&folder, "eval t.npy --restored s.npy");
+    assert!(encoded.contains("decoded from sRGB, the restored frames would score"), "{encoded}");
 }
 
 /// Writes a flat red clip, and exposes it behind a filter as `m.npy`.

@@ -38,11 +38,15 @@ pub(crate) fn of_capture(
             100.0 * share
         ));
     }
-    if let Some(mosaic) = summary.mosaic {
+    if let Some(mosaic) = &summary.mosaic {
         let (side, percent) = (mosaic.side, 100.0 * mosaic.contrast);
-        let example = if side == 4 { "quad-rggb@0,0" } else { "rggb@0,0" };
+        let names = match &mosaic.patterns {
+            Some([first, second]) => format!("--cfa {} or {}", first.short(), second.short()),
+            None if side == 4 => "--cfa FILE.png, or the letters of its tile".to_owned(),
+            None => "--cfa rggb, or the phase that your camera has".to_owned(),
+        };
         warnings.push(format!(
-            "pixels of a tile of {side} x {side} differ by {percent:.0} % all over the picture, as behind a colour filter array: name it (--cfa {example}, or the phase that your camera has), or colours are restored as texture"
+            "pixels of a tile of {side} x {side} differ by {percent:.0} % all over the picture, as behind a colour filter array: name it ({names}), or colours are restored as texture"
         ));
     }
     if let Some(check) = &summary.bit_order

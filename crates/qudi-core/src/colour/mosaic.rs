@@ -57,6 +57,21 @@ impl Mosaic {
         char::from(self.letters.as_bytes()[index])
     }
 
+    /// Writes it as briefly as it can be named: `rggb`, `quad-rggb@0,2`.
+    pub fn short(&self) -> String {
+        let letters: Vec<char> = self.letters.chars().collect();
+        let tile: String = [0, 2, 8, 10].iter().filter_map(|&i| letters.get(i)).collect();
+        let letters = if self.side() == 4 && quad(&tile) == self.letters {
+            format!("quad-{tile}")
+        } else {
+            self.letters.clone()
+        };
+        match self.corner {
+            (0, 0) => letters,
+            (row, column) => format!("{letters}@{row},{column}"),
+        }
+    }
+
     /// Lists the option for each plane, as in "`channel 0` (r), 1 (g)".
     pub fn choices(&self) -> String {
         let each = self.letters.chars().enumerate();
@@ -156,6 +171,13 @@ mod tests {
         assert_eq!(letters("rggb@1,0"), "gbgbrgrg");
         assert_eq!(letters("quad-rggb"), "rrggrrgg");
         assert_eq!("quad-rggb".parse::<Mosaic>().unwrap().pattern(), "rrggrrggggbbggbb");
+    }
+
+    #[test]
+    fn short_names_are_read_back() {
+        for text in ["rggb", "gbrg@1,0", "quad-rggb", "quad-bggr@0,3", "wrwgrwgwgwbwgwbw@2,1"] {
+            assert_eq!(text.parse::<Mosaic>().unwrap().short(), text);
+        }
     }
 
     #[test]

@@ -1,7 +1,10 @@
 //! Captures behind a colour filter array: what of it is read, and the detection of a mosaic.
 
+mod neighbours;
+
 use crate::description::{CaptureInfo, ReadOptions};
-use qudi_core::colour::{ColourFilter, FilterChoice, MosaicPlane};
+use neighbours::{Difference, NeighbourDifferences, same_colour};
+use qudi_core::colour::{ColourFilter, FilterChoice, Mosaic, MosaicPlane};
 use qudi_core::sensor::Sensor;
 use qudi_core::{Error, Result, Size};
 
@@ -63,44 +66,60 @@ const MIN_AGREEMENT: f64 = 0.9;
 const MIN_CONTRAST: f64 = 0.02;
 
 /// A difference between the pixels of tiles all over the picture.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct MosaicContrast {
-    /// Rows, and columns, of a tile: 2, or 4 where each colour covers 2 x 2 pixels.
+    /// Rows, and columns, of a tile: 2, or 4.
     pub side: usize,
     /// Difference as a share of the mean.
     pub contrast: f64,
+    /// Filters that the picture fits, if it fits a Bayer pattern: red and blue look alike.
+    pub patterns: Option<[Mosaic; 2]>,
 }
 
-/// Returns by how much the pixels of tiles differ if the picture `sums` looks like a mosaic, or like one
-/// whose colours cover 2 x 2 pixels each (quad Bayer).
+/// Bayer patterns that differ in more than red and blue. The second of a pair has these exchanged.
+const BAYER: [[&str; 2]; 2] = [["rggb@0,0", "bggr@0,0"], ["grbg@0,0", "gbrg@0,0"]];
+
+/// Returns by how much the pixels of tiles differ if the picture `sums` looks like a mosaic.
 pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<MosaicContrast> {
-    if let Some(contrast) = tile_contrast(sums, size, |at| at % 2, |at| at % 2) {
-        return Some(MosaicContrast { side: 2, contrast });
+    let differences = NeighbourDifferences::new(sums, size);
+    let gray = [[true; 16]; 4];
+    let found = differences.as_ref().and_then(|all| Some((all, all.within_colours(&gray)?)));
+    if let Some((differences, Difference { contrast, .. })) = found {
+        let patterns = bayer_patterns(differences);
+        let side = patterns.as_ref().map_or(4, |[pattern, _]| pattern.side());
+        return Some(MosaicContrast { side, contrast, patterns });
     }
-    let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].into_iter();
-    let contrasts = corners.filter_map(|(row, column)| {
-        tile_contrast(sums, size, |y| ((y + row) >> 1) % 2, |x| ((x + column) >> 1) % 2)
+    let contrast = tile_contrast(sums, size)?;
+    Some(MosaicContrast { side: 2, contrast, patterns: None })
+}
+
+/// Returns the Bayer pattern, of single pixels or of 2 x 2, that fits the differences between neighbours
+/// best, and the one with red and blue exchanged.
+fn bayer_patterns(differences: &NeighbourDifferences) -> Option<[Mosaic; 2]> {
+    let quads = (0..8).map(|i| {
+        let corner = format!("@{},{}", i / 4, i % 4);
+        ["quad-rggb", "quad-bggr"].map(|letters| format!("{letters}{corner}"))
     });
-    let contrast = contrasts.max_by(f64::total_cmp)?;
-    Some(MosaicContrast { side: 4, contrast })
+    let all = BAYER.into_iter().map(|pair| pair.map(str::to_owned)).chain(quads);
+    let fitting = all.filter_map(|pair| {
+        let pair = pair.map(|text| text.parse::<Mosaic>().ok());
+        let [Some(first), Some(second)] = pair else { return None };
+        let same = same_colour(|row, column| first.letter(row, column));
+        Some((differences.z_score(&same)?, [first, second]))
+    });
+    fitting.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, pair)| pair)
 }
 
 /// Returns by how much the four colours of tiles differ, as a share of their mean, if the two diagonals
-/// differ everywhere, or rows and columns both. Stripes along one axis come from readout. `row` and `column`
-/// return the row and the column in a tile of 2 x 2 colours.
-fn tile_contrast(
-    sums: &[u32],
-    size: Size,
-    row: impl Fn(usize) -> usize,
-    column: impl Fn(usize) -> usize,
-) -> Option<f64> {
+/// differ everywhere, or rows and columns both. Stripes along one axis come from readout.
+fn tile_contrast(sums: &[u32], size: Size) -> Option<f64> {
     let mut contrasts: [Vec<f64>; 3] = Default::default();
     for top in (0..size.height.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
         for left in (0..size.width.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
             let mut phases = [[0.0; 2]; 2];
             for y in top..top + BLOCK_SIDE {
                 for x in left..left + BLOCK_SIDE {
-                    phases[row(y)][column(x)] += f64::from(sums[y * size.width + x]);
+                    phases[y % 2][x % 2] += f64::from(sums[y * size.width + x]);
                 }
             }
             let [[a, b], [c, d]] = phases;
@@ -117,65 +136,35 @@ fn tile_contrast(
     diagonal.or(rows.and(columns))
 }
 
-/// Contrast of the other two pixels, as a share of the greens', below which the greens are not green.
-const MAX_OTHERS: f64 = 0.5;
-
-/// Refuses a Bayer pattern whose two pixels of one colour differ all over the picture, while the other two do
-/// not: the tile begins a pixel further.
-pub(super) fn check_phase(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
+/// Refuses a pattern whose pixels of one colour differ all over the picture: its phase or its kind is wrong.
+pub(super) fn check_pattern(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
     let size = filter.size();
-    if filter.tile().is_none_or(|tile| tile.len() != 4) {
-        return Ok(());
-    }
-    let colour = |y: usize, x: usize| filter.colours()[y * size.width + x];
-    let diagonals = [[(0, 0), (1, 1)], [(0, 1), (1, 0)]];
-    let twins = diagonals.iter().position(|&[a, b]| colour(a.0, a.1) == colour(b.0, b.1));
-    let Some(twins) = twins else { return Ok(()) };
-    let contrast = |pair: [(usize, usize); 2]| pair_contrast(sums, size, pair);
-    let (same, others) = (contrast(diagonals[twins]), contrast(diagonals[1 - twins]));
-    let Some(same) = same else { return Ok(()) };
-    if others.unwrap_or(0.0) > MAX_OTHERS * same {
-        return Ok(());
-    }
-    let [(y, x), _] = diagonals[twins];
-    let help = match cfa {
-        FilterChoice::Tile(_) => {
-            "the tile begins a pixel further, as in rggb@0,1 instead of rggb@0,0"
+    let Some(tile) = filter.tile() else { return Ok(()) };
+    let side = if tile.len() == 4 { 2 } else { 4 };
+    let letter =
+        |row: usize, column: usize| char::from(tile.as_bytes()[row % side * side + column % side]);
+    let Some(differences) = NeighbourDifferences::new(sums, size) else { return Ok(()) };
+    let Some(found) = differences.within_colours(&same_colour(letter)) else { return Ok(()) };
+    let help = match bayer_patterns(&differences) {
+        Some([first, second]) => format!(
+            "the counts fit {} or {}: name the filter of this camera, and where its tile begins",
+            first.short(),
+            second.short()
+        ),
+        None => {
+            "name the filter of this camera, and the row and column where its tile begins".into()
         }
-        FilterChoice::Picture(_) => "the picture of the filter is shifted by a pixel",
     };
     Err(Error::mismatch(
         format!(
-            "the two {} pixels of a tile of {cfa} differ by {:.0} % all over the picture, and the other two do not",
-            colour(y, x).name(),
-            100.0 * same
+            "neighbouring pixels that are {} behind {} differ by {:.0} % all over the picture",
+            filter.colours()[found.at.0 * size.width + found.at.1].name(),
+            cfa.tile().map_or_else(|| cfa.to_string(), Mosaic::short),
+            100.0 * found.contrast
         ),
         "cfa",
         help,
     ))
-}
-
-/// Returns by how much two pixels of tiles of 2 x 2 differ, as a share of their mean, if they do nearly
-/// everywhere.
-fn pair_contrast(sums: &[u32], size: Size, pair: [(usize, usize); 2]) -> Option<f64> {
-    let mut contrasts = Vec::new();
-    for top in (0..size.height.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
-        for left in (0..size.width.saturating_sub(BLOCK_SIDE - 1)).step_by(BLOCK_SIDE) {
-            let mut totals = [0.0; 2];
-            for (total, (down, across)) in totals.iter_mut().zip(pair) {
-                for y in (top + down..top + BLOCK_SIDE).step_by(2) {
-                    for x in (left + across..left + BLOCK_SIDE).step_by(2) {
-                        *total += f64::from(sums[y * size.width + x]);
-                    }
-                }
-            }
-            let [a, b] = totals;
-            if a + b > 0.0 {
-                contrasts.push(2.0 * (a - b) / (a + b));
-            }
-        }
-    }
-    agreed_contrast(contrasts)
 }
 
 /// Returns the median of the contrasts, if nearly all have the same sign and it is large enough.
@@ -197,10 +186,10 @@ mod tests {
     use qudi_core::random::{Domain, Streams, uniform};
 
     /// Measures a picture with gradients and noise, seen through filters.
-    fn seen(filters: [[f64; 2]; 2]) -> Option<f64> {
+    fn seen(filters: [[f64; 2]; 2]) -> Option<MosaicContrast> {
         let seen = seen_at(|y, x| filters[y % 2][x % 2])?;
         assert_eq!(seen.side, 2);
-        Some(seen.contrast)
+        Some(seen)
     }
 
     /// Measures the picture through the filter that `filter` returns for a row and a column.
@@ -230,14 +219,15 @@ mod tests {
         let check = |text: &str| {
             let cfa: FilterChoice = text.parse().unwrap();
             let filter = ColourFilter::tiled(cfa.tile().unwrap(), size).unwrap();
-            check_phase(&sums, &filter, &cfa)
+            check_pattern(&sums, &filter, &cfa)
         };
         for right in ["rggb", "bggr", "grbg@0,1", "rgbw"] {
             assert!(check(right).is_ok(), "{right}");
         }
-        for wrong in ["grbg", "gbrg", "rggb@0,1"] {
-            let error = check(wrong).unwrap_err().to_string();
-            assert!(error.contains("two green pixels"), "{error}");
+        for wrong in ["grbg", "gbrg", "rggb@0,1", "quad-rggb", "wrwgrwgwgwbwgwbw"] {
+            let error = check(wrong).unwrap_err();
+            assert!(error.to_string().contains("differ by"), "{error}");
+            assert!(error.help().unwrap().contains("fit rggb or bggr"), "{error}");
         }
     }
 
@@ -247,7 +237,14 @@ mod tests {
         for (row, column) in [(0, 0), (0, 1), (1, 0), (3, 3)] {
             let seen = seen_at(|y, x| rggb[((y + row) >> 1) % 2][((x + column) >> 1) % 2]).unwrap();
             assert_eq!(seen.side, 4, "{row}, {column}");
-            assert!((0.4..0.6).contains(&seen.contrast), "{seen:?}");
+            assert!((0.4..0.8).contains(&seen.contrast), "{seen:?}");
+            let corner = format!("@{},{}", (4 - row) % 4, (4 - column) % 4);
+            let expected: Mosaic = format!("quad-rggb{corner}").parse().unwrap();
+            let patterns = seen.patterns.unwrap();
+            let letters = |mosaic: &Mosaic| -> String {
+                (0..16).map(|i| mosaic.letter(i / 4, i % 4)).collect()
+            };
+            assert!(patterns.iter().any(|p| letters(p) == letters(&expected)), "{patterns:?}");
         }
         assert_eq!(seen_at(|_, x| [1.0, 0.8][x / 2 % 2]), None, "pairs of columns of a readout");
     }
@@ -257,7 +254,8 @@ mod tests {
         assert_eq!(seen([[1.0, 1.0], [1.0, 1.0]]), None);
         assert_eq!(seen([[1.0, 0.8], [1.0, 0.8]]), None, "columns of a readout");
         let rggb = seen([[0.7, 1.0], [1.0, 0.5]]).unwrap();
-        assert!((0.4..0.6).contains(&rggb), "{rggb}");
+        assert!((0.2..0.5).contains(&rggb.contrast), "{rggb:?}");
+        assert_eq!(rggb.patterns.unwrap()[0].to_string(), "rggb@0,0");
         // Diagonals alike.
         assert!(seen([[1.0, 0.9], [0.7, 0.6]]).is_some());
     }

@@ -4,12 +4,34 @@ use super::Capture;
 use super::view::View;
 use crate::codec::{self, GivenArray};
 use crate::description::{CaptureInfo, ReadOptions, keep_pedestal, with_pedestal};
+use crate::frames::CountFrames;
 use crate::frames::memory::MemoryFrames;
 use crate::frames::pipe::STDIN;
 use qudi_core::sensor::{Response, Sensor};
 use qudi_core::{Error, Result, Size};
 use std::io::Read;
 use std::path::{Path, PathBuf};
+
+/// Opens the container at `path`. Where its record or the sensor names a filter and the container is gray,
+/// the channel of `options` is a letter of the filter's pattern, which a container knows nothing of.
+fn container(
+    path: &Path,
+    options: &ReadOptions,
+    sensor: Option<&Sensor>,
+) -> Result<(Box<dyn CountFrames>, CaptureInfo)> {
+    if options.channel.is_some() && options.cfa.is_none() {
+        let gray = ReadOptions { channel: None, ..options.clone() };
+        if let Ok((frames, info)) = codec::open(path, &gray) {
+            let of_sensor = |sensor: &Sensor| sensor.colour.as_ref()?.cfa.as_ref().map(|_| ());
+            let named =
+                info.cfa.is_some() || sensor.or(info.sensor.as_ref()).and_then(of_sensor).is_some();
+            if named && !info.full_colour {
+                return Ok((frames, info));
+            }
+        }
+    }
+    codec::open(path, options)
+}
 
 impl Capture {
     /// Opens the capture at `path`. Its dark map and bad pixels come from `sensor`, if `options` name none.
@@ -20,14 +42,14 @@ impl Capture {
         let mut options = with_pedestal(options, sensor);
         let named = options.offset.is_some() || options.threshold.is_some();
         let kept = keep_pedestal(&mut options, sensor);
-        let (native, mut info) = codec::open(path, &options)?;
+        let (native, mut info) = container(path, &options, sensor)?;
         info.pedestal = kept;
         // A record next to the file may name a sensor with a pedestal, above which its counts were taken.
         let recorded = info.sensor.as_ref().map_or(0.0, |sensor| sensor.offset);
         if recorded > 0.0 && !named {
             options.offset = Some(recorded);
             let kept = keep_pedestal(&mut options, info.sensor.as_ref());
-            let (native, mut info) = codec::open(path, &options)?;
+            let (native, mut info) = container(path, &options, sensor)?;
             info.pedestal = kept;
             return Self::assemble(path, native, info, &options, sensor);
         }

@@ -2,7 +2,7 @@
 
 use super::Capture;
 use super::frame_axis::likely_axes;
-use super::mosaic::{MosaicContrast, check_phase, mosaic_contrast};
+use super::mosaic::{MosaicContrast, check_pattern, mosaic_contrast};
 use crate::description::{Axes, BitOrder, PackAxis};
 use crate::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_core::PppDefinition;
@@ -110,7 +110,7 @@ impl Summary {
             *sum += second;
         }
         if let (Some(filter), Some(cfa)) = (&capture.filter, &capture.info.cfa) {
-            check_phase(&sums, filter, cfa)?;
+            check_pattern(&sums, filter, cfa)?;
         }
         let largest = histogram.iter().rposition(|&n| n > 0).unwrap_or(0);
         histogram.truncate(largest + 1);

@@ -53,6 +53,8 @@ pub(crate) struct Images {
     size: Size,
     scale: Scale,
     channel: Option<usize>,
+    /// Largest sample that the first image can hold.
+    full: u16,
 }
 
 fn open(
@@ -107,7 +109,7 @@ pub(crate) fn open_files(
     if lossy(first) {
         info.notes.push("JPEG is lossy: its values are not photon counts".to_owned());
     }
-    let mut images = Images { files, size, scale: Scale::Counts, channel };
+    let mut images = Images { files, size, scale: Scale::Counts, channel, full };
     if let Some(scale) = Scale::asked(options, f32::from(full), info) {
         images.scale = scale;
     } else if !recorded {
@@ -117,6 +119,27 @@ pub(crate) fn open_files(
 }
 
 impl Images {
+    /// Reads the samples of one image, which is like the first.
+    fn samples(&self, number: usize) -> Result<Vec<u16>> {
+        let path = &self.files[number];
+        let (size, samples, full) = gray(path, self.channel)?;
+        if size != self.size {
+            return Err(Error::data(
+                format!("an image of {size} among images of {}", self.size),
+                path,
+                "frames of one capture have one size",
+            ));
+        }
+        if full != self.full {
+            return Err(Error::data(
+                format!("samples up to {full} among images of samples up to {}", self.full),
+                path,
+                "frames of one capture have one depth: save all images alike",
+            ));
+        }
+        Ok(samples)
+    }
+
     /// Infers the scale from a few images: their values may be multiples of a step.
     fn infer_scale(
         &mut self,
@@ -133,7 +156,7 @@ impl Images {
         let mut values = distinct(first);
         let mut ladders = vec![infer_levels(&values, full)];
         for i in spread(self.files.len()) {
-            let more = distinct(gray(&self.files[i], self.channel)?.1);
+            let more = distinct(self.samples(i)?);
             ladders.push(infer_levels(&more, full));
             values.extend(more);
             values = distinct(values);
@@ -264,15 +287,17 @@ fn gray(path: &Path, channel: Option<usize>) -> Result<(Size, Vec<u16>, u16)> {
             ));
         }
         Some(channel) if channel >= colours => {
-            return Err(Error::data(
-                format!("channel {channel} of an image of {colours}"),
-                path,
-                if colours == 1 {
-                    "leave `channel` out: there is no colour to choose from".to_owned()
-                } else {
-                    format!("channels count from 0 to {}", colours - 1)
-                },
-            ));
+            let (what, help) = if colours == 1 {
+                (
+                    format!("a gray image, and channel {channel} is read"),
+                    "frames of one capture are all gray or all in colour: leave `channel` out if they are gray"
+                        .to_owned(),
+                )
+            } else {
+                let help = format!("channels count from 0 to {}", colours - 1);
+                (format!("channel {channel} of an image of {colours}"), help)
+            };
+            return Err(Error::data(what, path, help));
         }
         chosen => chosen.unwrap_or(0),
     };
@@ -290,14 +315,7 @@ impl CountFrames for Images {
 
     fn read(&mut self, frame: u64, counts: &mut [u16]) -> Result<()> {
         let path = &self.files[frame as usize];
-        let (size, samples, _) = gray(path, self.channel)?;
-        if size != self.size {
-            return Err(Error::data(
-                format!("an image of {size} among images of {}", self.size),
-                path,
-                "frames of one capture have one size",
-            ));
-        }
+        let samples = self.samples(frame as usize)?;
         for (count, &value) in counts.iter_mut().zip(&samples) {
             let value = f32::from(value);
             *count = self.scale.count(value).ok_or_else(|| no_count(value, frame, path))?;

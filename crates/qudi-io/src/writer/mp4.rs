@@ -13,6 +13,22 @@ use std::process::{Child, Stdio};
 /// Name of the unfinished film in its folder.
 const FILM: &str = "film.mp4";
 
+/// Even sides and half-resolution colour, which players want, in the matrix of BT.709.
+const FILTERS: &str = "scale=out_color_matrix=bt709:out_range=tv,pad=ceil(iw/2)*2:ceil(ih/2)*2";
+
+/// What the film says of its colours: the primaries and the curve of sRGB, the matrix and range of BT.709.
+/// Players guess what a film does not say, by its size.
+const COLOUR_TAGS: [&str; 8] = [
+    "-color_primaries",
+    "bt709",
+    "-color_trc",
+    "iec61966-2-1",
+    "-colorspace",
+    "bt709",
+    "-color_range",
+    "tv",
+];
+
 /// A film being written.
 #[derive(Debug)]
 pub struct Mp4Writer {
@@ -50,9 +66,9 @@ impl Mp4Writer {
         let spawned = ffmpeg()
             .args(["-nostdin", "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", pixels])
             .args(["-s", shape.as_str(), "-r", rate.as_str(), "-i", "-"])
-            // Players want even sides and half-resolution colour.
-            .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16"])
-            .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"])
+            .args(["-vf", FILTERS, "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p"])
+            .args(COLOUR_TAGS)
+            .args(["-movflags", "+faststart"])
             .arg(url)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())

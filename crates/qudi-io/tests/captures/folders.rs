@@ -125,6 +125,14 @@ fn portable_maps_are_counts_and_bits() {
     let path = write(deep.path(), "two.pgm", &[image.clone(), image].concat());
     let words = refusal(open(&path, &plain()));
     assert!(words.contains("more than one image"), "{words}");
+    // Images of one folder are alike.
+    let mixed = scratch();
+    let eight = [format!("P5\n{SIDE} {SIDE}\n255\n").into_bytes(), frame(0)].concat();
+    write(mixed.path(), "f0.pgm", &eight);
+    let seven = [format!("P5\n{SIDE} {SIDE}\n7\n").into_bytes(), vec![3; SIDE * SIDE]].concat();
+    write(mixed.path(), "f1.pgm", &seven);
+    let words = refusal(open(mixed.path(), &plain()));
+    assert!(words.contains("samples up to 7 among images of samples up to 255"), "{words}");
     // In PBM a set bit is black: no photon.
     let bits = scratch();
     for t in 0..4u8 {

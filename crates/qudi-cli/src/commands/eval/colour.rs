@@ -1,9 +1,12 @@
 //! Restored colours against true ones: both in files, in linear light.
 
+mod doubts;
+
 use super::perceptual::Perceptual;
 use crate::error::{CliError, Result};
 use crate::report::Report;
 use burn::tensor::Device;
+use doubts::Doubts;
 use palette::color_difference::Ciede2000;
 use palette::white_point::D65;
 use palette::{IntoColor, Lab, LinSrgb};
@@ -64,8 +67,15 @@ pub(super) fn score_files(
         ));
     }
     let mut scores = Vec::new();
+    let mut doubts = Doubts::default();
     for _ in 0..truths.frames {
-        scores.push(score(&others.next()?, &truths.next()?, perceptual.as_ref())?);
+        let (restored, truth) = (others.next()?, truths.next()?);
+        let score = score(&restored, &truth, perceptual.as_ref())?;
+        doubts.add(&restored, &truth, score.linear);
+        scores.push(score);
+    }
+    for doubt in doubts.remarks(scores.len()) {
+        report.warning(&doubt);
     }
     let mean = |of: fn(&ColourScore) -> f64| {
         scores.iter().map(of).sum::<f64>() / scores.len().max(1) as f64
