@@ -305,6 +305,27 @@ fn reads_videos_through_ffmpeg() {
 }
 
 #[test]
+fn films_say_what_their_colours_are() {
+    let folder = scratch("film-tags");
+    simulate(&folder, "scene:dead-leaves --size 33x48 --frames 3 --seed 1 -o m.npy");
+    // An imitation of ffmpeg keeps its arguments and writes a file.
+    let script = "#!/bin/sh\ncat > /dev/null\necho \"$@\" > words\nfor last; do :; done\necho film > \"${last#file:}\"\n";
+    Command::new("sh")
+        .args(["-c", "cat > ffmpeg && chmod 755 ffmpeg"])
+        .current_dir(&folder)
+        .write_stdin(script)
+        .assert()
+        .success();
+    let path = format!("{}:/usr/bin:/bin", folder.display());
+    let restore = ["restore", "m.npy", "--method", "average", "-o", "film.mp4"];
+    qudi(&folder).args(restore).env("PATH", path).assert().success();
+    let words = std::fs::read_to_string(folder.join("words")).unwrap();
+    for tag in ["out_color_matrix=bt709", "-colorspace bt709", "-color_range tv", "iec61966-2-1"] {
+        assert!(words.contains(tag), "{tag}: {words}");
+    }
+}
+
+#[test]
 fn settings_come_in_layers() {
     let folder = scratch("layers");
     std::fs::write(

@@ -264,7 +264,7 @@ impl Array {
             }
             (Sample::U8 | Sample::U16 { .. }, Some(full)) => {
                 let samples = sampled.chunks_exact(self.sample.bytes());
-                let values = samples.map(|bytes| self.sample.decode(bytes) as u16).collect();
+                let values = samples.map(|bytes| self.sample.decode(bytes) as u16);
                 Ok(Scale::seen(values, full as u16, info))
             }
             _ => Ok(Scale::Counts),

@@ -40,9 +40,17 @@ impl Scale {
     }
 
     /// Infers the scale from some values, in any order.
-    pub(crate) fn seen(mut values: Vec<u16>, full: u16, info: &mut CaptureInfo) -> Self {
-        values.sort_unstable();
-        values.dedup();
+    pub(crate) fn seen(
+        values: impl IntoIterator<Item = u16>,
+        full: u16,
+        info: &mut CaptureInfo,
+    ) -> Self {
+        let mut is_seen = vec![false; 1 << 16];
+        for value in values {
+            is_seen[usize::from(value)] = true;
+        }
+        let values: Vec<u16> =
+            (0..=u16::MAX).filter(|&value| is_seen[usize::from(value)]).collect();
         let Some(levels) = infer_levels(&values, full) else { return Self::Counts };
         info.max_count = Some(levels);
         info.notes.push(format!(

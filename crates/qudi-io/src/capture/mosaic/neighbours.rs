@@ -133,8 +133,8 @@ impl NeighbourDifferences {
         clearest.1
     }
 
-    /// Returns the standard errors by which neighbours of two colours differ more than those of one, if all
-    /// of one colour are alike.
+    /// Returns the standard errors by which neighbours of two colours differ more than neighbours of one, if
+    /// all of one colour are alike.
     pub(super) fn z_score(&self, same: &SameColour) -> Option<f64> {
         if self.within_colours(same).is_some() {
             return None;
