@@ -7,9 +7,10 @@
 //! chroma: the ratios of the colours to luma. They turn the counts of every pixel into counts that a gray
 //! pixel would have there ([`GrayCounts`]), which the method restores like any others. The chroma is then
 //! smoothed again, guided by the restored luma ([`Chroma`]), which is corrected by the counts behind the
-//! filter and multiplied with it.
+//! filter and multiplied with it. A network can correct both ([`ColourCorrector`]).
 
 mod chroma;
+mod corrector;
 mod evidence;
 mod exposures;
 mod gray_counts;
@@ -22,6 +23,7 @@ mod restorer;
 mod shrinkage;
 
 use chroma::Chroma;
+pub use corrector::{ColourCorrector, ColourEvidence, CorrectedColours};
 use evidence::Evidence;
 use exposures::Exposures;
 use gray_counts::GrayCounts;

@@ -24,7 +24,7 @@ mod temporal_filter;
 
 pub use aligned_burst::{AlignedBurst, AlignedFrame, Alignments};
 pub use aligned_sums::{AlignedSums, choose_count};
-pub use colour::{ColourRestorer, PlaneFrames};
+pub use colour::{ColourCorrector, ColourEvidence, ColourRestorer, CorrectedColours, PlaneFrames};
 pub use denoise::bm3d::bm3d;
 pub use denoise::vst::{Transform, VarianceStabilizer};
 pub use methods::{Average, Mle, PatchFlow, PostFilter, Qbp, QbpSettings, TransformDenoise};

@@ -3,7 +3,9 @@
 use crate::error::{CliError, Result};
 use burn::tensor::Device;
 use qudi_core::Error;
+use qudi_model::ComputePrecision;
 use qudi_model::checkpoint::{Description, Network, describe, describe_bytes, load, load_bytes};
+use qudi_model::colour::ColourNetwork;
 use qudi_model::config::NetworkKind;
 use sha2::{Digest, Sha256};
 use std::fmt;
@@ -27,6 +29,11 @@ static REGRESSION: BuiltIn = BuiltIn {
 static DIFFUSION: BuiltIn = BuiltIn {
     bytes: include_bytes!("../weights/diffusion.safetensors"),
     sha256: include_str!("../weights/diffusion.sha256"),
+};
+
+static COLOUR: BuiltIn = BuiltIn {
+    bytes: include_bytes!("../weights/colour.safetensors"),
+    sha256: include_str!("../weights/colour.sha256"),
 };
 
 /// Place of weights.
@@ -89,6 +96,14 @@ pub(crate) fn recipes_of(path: &Path) -> Vec<String> {
     description.map(|description| description.provenance.recipes).unwrap_or_default()
 }
 
+/// Reads the network that corrects colours, for the processor.
+pub(crate) fn colour_network() -> Result<ColourNetwork> {
+    let device = Device::flex();
+    let precision = ComputePrecision::fastest(&device);
+    let bytes = COLOUR.verified()?;
+    Ok(ColourNetwork::of_bytes(bytes, Path::new(NAME), precision, &device)?)
+}
+
 fn built_in(kind: NetworkKind) -> &'static BuiltIn {
     match kind {
         NetworkKind::Regression => &REGRESSION,
@@ -134,6 +149,8 @@ mod tests {
             assert_eq!(description.provenance.licence, "MIT OR Apache-2.0");
             assert_eq!(description.preset.as_deref(), Some(preset));
         }
-        assert!(REGRESSION.bytes.len() + DIFFUSION.bytes.len() <= 10 << 20);
+        colour_network().unwrap_or_else(|e| panic!("{e:?}"));
+        let all = [&REGRESSION, &DIFFUSION, &COLOUR].map(|weights| weights.bytes.len());
+        assert!(all.iter().sum::<usize>() <= 10 << 20);
     }
 }

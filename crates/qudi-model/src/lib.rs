@@ -3,7 +3,8 @@
 //! [`regression`] aligns a window on a reference estimate and corrects it frame by frame: the default method.
 //! [`diffusion`] is the paper's system, which samples from photons alone. They share what describes counts
 //! ([`counts`]) and sensors ([`sensor`]), and the format of weights ([`checkpoint`]), which name their kind
-//! ([`config`]). The device of a tensor decides the backend; this crate chooses none.
+//! ([`config`]). [`colour`] corrects colours behind a filter. The device of a tensor decides the backend;
+//! this crate chooses none.
 #![warn(missing_docs)]
 
 pub mod aligned;
@@ -11,6 +12,7 @@ pub mod aligned;
 #[path = "../../../tests/golden/cases.rs"]
 mod cases;
 pub mod checkpoint;
+pub mod colour;
 pub mod config;
 pub mod counts;
 pub mod diffusion;

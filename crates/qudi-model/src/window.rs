@@ -8,7 +8,7 @@ mod config;
 mod denoiser;
 mod flow;
 mod fusion;
-mod hourglass;
+pub(crate) mod hourglass;
 mod initial;
 mod input;
 mod matching;

@@ -2,7 +2,6 @@
 
 use super::MergedColours;
 use super::chroma::{BLURRED_SIGMA, Chroma, Colours};
-use super::gray_counts::MIN_SEEN;
 use super::guided::{Averages, gaussian};
 use qudi_core::Frame;
 
@@ -65,18 +64,7 @@ impl Colours<'_> {
         part: f32,
     ) -> Frame {
         let size = merged.size;
-        let (mut evidence, mut information) = (vec![0.0; size.pixels()], vec![0.0; size.pixels()]);
-        for (colour, seen) in self.exposures.responses().into_iter().enumerate() {
-            for (i, &weight) in merged.weights[colour].iter().enumerate() {
-                if weight > 0.0 {
-                    let share = chroma.seen(i, seen).max(MIN_SEEN);
-                    let own = self.response.at(share * luma.data[i], self.response.dark);
-                    let told = share * own.slope / own.variance;
-                    evidence[i] += told * (merged.counts[colour][i] - weight * own.mean);
-                    information[i] += told * share * own.slope * weight;
-                }
-            }
-        }
+        let (evidence, information) = self.luma_score(merged, &luma, chroma);
         let evidence = gaussian(&evidence, size, sigma);
         let information = gaussian(&information, size, sigma);
         let least = self.least_luma();

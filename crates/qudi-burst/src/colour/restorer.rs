@@ -2,7 +2,9 @@
 
 use super::chroma::Colours;
 use super::exposures::Exposure;
-use super::{Chroma, CountResponse, Exposures, GrayCounts, MergedColours, QuadMotion};
+use super::{
+    Chroma, ColourCorrector, CountResponse, Exposures, GrayCounts, MergedColours, QuadMotion,
+};
 use qudi_core::colour::{Colour, ColourFilter};
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
@@ -42,6 +44,7 @@ pub struct ColourRestorer {
     source: Source,
     /// True if colours are restored, and not luma alone.
     with_chroma: bool,
+    corrector: Option<Box<dyn ColourCorrector>>,
 }
 
 impl fmt::Debug for ColourRestorer {
@@ -55,7 +58,7 @@ impl fmt::Debug for ColourRestorer {
 impl ColourRestorer {
     /// Creates a method that restores luma with `method`, and colours too if `with_chroma` is set.
     pub fn new(method: Box<dyn Restorer>, filter: ColourFilter, with_chroma: bool) -> Self {
-        Self { method, source: Source::Mosaic(filter), with_chroma }
+        Self { method, source: Source::Mosaic(filter), with_chroma, corrector: None }
     }
 
     /// Creates a method for captures of three full planes; it restores bursts of the green one, and reads
@@ -65,7 +68,13 @@ impl ColourRestorer {
         planes: Box<dyn PlaneFrames>,
         with_chroma: bool,
     ) -> Self {
-        Self { method, source: Source::Planes(planes), with_chroma }
+        Self { method, source: Source::Planes(planes), with_chroma, corrector: None }
+    }
+
+    /// Sets the network that corrects restored colours.
+    #[must_use]
+    pub fn with_corrector(self, corrector: Box<dyn ColourCorrector>) -> Self {
+        Self { corrector: Some(corrector), ..self }
     }
 
     /// Restores luma from the gray counts of each exposure apart, and averages it.
@@ -197,10 +206,15 @@ impl Restorer for ColourRestorer {
             let merged = merged(frame);
             let chroma = colours.refined(&merged, &luma);
             let luma = colours.completed(&merged, luma, &chroma);
-            (luma, chroma)
+            match &self.corrector {
+                None => Ok((luma, chroma)),
+                Some(network) => {
+                    colours.corrected_by(network.as_ref(), &merged, (luma, chroma), frame)
+                }
+            }
         };
         let restored: Vec<(Frame, Chroma)> =
-            numbers.par_iter().zip(frames).map(completed).collect();
+            numbers.par_iter().zip(frames).map(completed).collect::<Result<_>>()?;
         let (colour, colour_std) = if self.with_chroma {
             let colour = restored.iter().map(|(luma, chroma)| chroma.coloured(luma)).collect();
             let uncertainty = |((luma, chroma), sigma): (&(Frame, Chroma), &Frame)| {

@@ -11,11 +11,11 @@ use qudi_layers::{Bias, Conv2d, ResidualStack};
 const HANDED_UP: usize = 32;
 
 /// Features at half, a quarter and an eighth of the resolution, finest first.
-pub(super) type Pyramid = [Tensor<4>; LEVELS];
+pub(crate) type Pyramid = [Tensor<4>; LEVELS];
 
 /// Residual stacks from fine to coarse and back.
 #[derive(Module, Debug)]
-pub(super) struct Hourglass {
+pub(crate) struct Hourglass {
     encoder: Vec<ResidualStack>,
     up: Vec<Conv2d>,
     decoder: Vec<ResidualStack>,
@@ -23,7 +23,7 @@ pub(super) struct Hourglass {
 
 impl Hourglass {
     /// Creates the layers for so many `inputs` and so many planes of `conditions` at the coarser levels.
-    pub(super) fn zeros(
+    pub(crate) fn zeros(
         inputs: usize,
         conditions: usize,
         widths: [usize; LEVELS],
@@ -50,7 +50,7 @@ impl Hourglass {
     /// # Shapes
     /// - inputs: `[images, channels, h, w]` each
     /// - conditions: `[images, planes, 1, 1]`, the same at every place of the coarser levels
-    pub(super) fn forward(&self, inputs: &[Tensor<4>], conditions: Option<&Tensor<4>>) -> Pyramid {
+    pub(crate) fn forward(&self, inputs: &[Tensor<4>], conditions: Option<&Tensor<4>>) -> Pyramid {
         let finest = self.encoder[0].forward(inputs);
         let coarser = |level: usize, finer: &Tensor<4>| {
             let pooled = avg_pool2(finer.clone());

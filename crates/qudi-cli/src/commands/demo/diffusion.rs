@@ -94,7 +94,7 @@ fn sample(
     let choice = QUDI_DIFFUSION.as_own().unwrap_or(network::NetworkChoice::Best);
     let (restorer, _) = network::restorer(choice, &options, &acquisition, SIZE)?;
     let view = BurstView { size: SIZE, frames: &scene.counts };
-    let mut restorer = scene.behind_filter(restorer);
+    let mut restorer = scene.behind_filter(restorer)?;
     let mut restored = restorer.restore_frames(view, &acquisition, &[CENTRE])?;
     let (frame, truth) = (restored.frames.swap_remove(0), &scene.truths[CENTRE]);
     let gain = best_gain(&frame, truth) as f32;

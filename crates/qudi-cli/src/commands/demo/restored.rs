@@ -2,10 +2,10 @@
 
 use super::scenes::{DemoScene, FRAMES, Planes, SIZE};
 use super::uncertainty::Uncertainty;
+use crate::colour::behind_filter;
 use crate::error::{CliError, Result};
 use crate::interrupt;
 use crate::report::{Bar, Cell, Column, Table};
-use qudi_burst::ColourRestorer;
 use qudi_core::colour::ColourFilter;
 use qudi_core::metrics::{Statistics, best_gain, gain_aligned_psnr, psnr, ssim};
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
@@ -116,12 +116,10 @@ impl ExposedScene {
     }
 
     /// Makes a method see the filter, if there is one.
-    pub(super) fn behind_filter(&self, restorer: Box<dyn Restorer>) -> Box<dyn Restorer> {
+    pub(super) fn behind_filter(&self, restorer: Box<dyn Restorer>) -> Result<Box<dyn Restorer>> {
         match &self.colour {
-            Some(ColourTruth { filter, .. }) => {
-                Box::new(ColourRestorer::new(restorer, filter.clone(), true))
-            }
-            None => restorer,
+            Some(ColourTruth { filter, .. }) => behind_filter(restorer, filter, true),
+            None => Ok(restorer),
         }
     }
 

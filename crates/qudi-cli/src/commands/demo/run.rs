@@ -118,11 +118,10 @@ fn contenders(demo: &Demo, exposed: &ExposedScene) -> Result<Vec<Contender>> {
         let (restorer, how) = network::restorer(NetworkChoice::Best, &options, acquisition, SIZE)?;
         contenders.push(Contender { label: "QUDI", restorer, how: format!("the network{how}") });
     }
-    let seeing = |contender: Contender| Contender {
-        restorer: exposed.behind_filter(contender.restorer),
-        ..contender
+    let seeing = |contender: Contender| -> Result<Contender> {
+        Ok(Contender { restorer: exposed.behind_filter(contender.restorer)?, ..contender })
     };
-    Ok(contenders.into_iter().map(seeing).collect())
+    contenders.into_iter().map(seeing).collect()
 }
 
 /// Returns the command that makes the same pictures.

@@ -12,7 +12,7 @@ use crate::capture::{
     AlignedCapture, Alignment, CaptureAcquisition, OtherPlanes, Source, SummedCapture, remarks,
     warnings,
 };
-use crate::colour::{Rendering, dng_tags, is_linear};
+use crate::colour::{Rendering, behind_filter, dng_tags, is_linear};
 use crate::commands::look::strip::strip;
 use crate::device;
 use crate::error::{CliError, Result};
@@ -449,8 +449,8 @@ fn restorer(
         return Ok((method, (Box::new(coloured), choice)));
     }
     let Some(filter) = aligned.capture.filter() else { return Ok((method, (restorer, choice))) };
-    let coloured = ColourRestorer::new(restorer, filter.clone(), !plan.luma_alone);
-    Ok((method, (Box::new(coloured), choice)))
+    let coloured = behind_filter(restorer, filter, !plan.luma_alone)?;
+    Ok((method, (coloured, choice)))
 }
 
 /// Returns the default method; prints the reason if it is not the network.
