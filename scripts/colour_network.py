@@ -12,7 +12,8 @@ height, width) in linear light and `NAME-weights.npy` (3,), the weights of red, 
 planes of evidence and the layers are the ones of crates/qudi-model/src/colour.
 
 The loss of an image is the logarithm of its squared error in linear light and of its distance in CIELAB, both
-in units of the errors without the network, after one common gain.
+in units of the errors without the network, after one common gain. The program makes less of a correction of
+ratios where colours are even; training does not, which gave 0.03 to 0.07 dB more (one seed each).
 """
 
 import argparse
@@ -33,11 +34,6 @@ HANDED_UP = 32
 # How far an output of 1 moves a ratio, and a logarithm of luma.
 RATIO_STEP = 0.3
 LUMA_STEP = 0.1
-
-# Root mean square of the ratios' differences from their means, around a pixel, at which half of a correction is
-# made, and the width of that surrounding.
-EVEN = 0.1
-EVEN_WIDTH = 4.0
 
 CROP = 96
 BATCH = 8
@@ -129,25 +125,10 @@ def features(evidence):
 def colours(evidence, weights, output):
     """Returns corrected colours, in units of the mean of luma."""
     weights = weights[:, :, None, None]
-    before = evidence[:, 1:4]
-    ratios = torch.clamp(before + RATIO_STEP * output[:, :3], 0, 12)
+    ratios = torch.clamp(evidence[:, 1:4] + RATIO_STEP * output[:, :3], 0, 12)
     ratios = ratios / torch.clamp((ratios * weights).sum(1, keepdim=True), min=1e-3)
-    ratios = before + share_kept(before) * (ratios - before)
     luma = evidence[:, :1] * torch.exp(torch.clamp(LUMA_STEP * output[:, 3:], -1, 1))
     return luma * ratios
-
-
-def share_kept(ratios):
-    """Returns the share of corrections that is made, (images, 1, height, width): little where colours are even."""
-    squares = ((ratios - ratios.mean((2, 3), keepdim=True)) ** 2).amax(1, keepdim=True)
-    radius = math.ceil(3 * EVEN_WIDTH)
-    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / EVEN_WIDTH) ** 2)
-    total = torch.ones_like(squares)
-    for shape, padding in (((1, 1, -1, 1), (radius, 0)), ((1, 1, 1, -1), (0, radius))):
-        squares = F.conv2d(squares, taps.view(shape), padding=padding)
-        total = F.conv2d(total, taps.view(shape), padding=padding)
-    mean = squares / total
-    return mean / (mean + EVEN**2)
 
 
 def lab(colour):

@@ -142,7 +142,7 @@ mod tests {
     use crate::cases::{File, parameter};
     use qudi_core::Size;
 
-    /// The network with weights by formula.
+    /// Creates the network with weights by formula.
     fn network(device: &Device) -> ColourNetwork {
         let layers = init_parameters(Layers::zeros(device), parameter);
         ColourNetwork { layers, precision: ComputePrecision::F32, device: device.clone() }

@@ -33,8 +33,6 @@ def main():
     # Sides become multiples of eight by mirroring the lower rows.
     evidence[:, :, 20:] = evidence[:, :, 15:19].flip(2)
     luma = torch.tensor([[0.25, 0.5, 0.25]])
-    # The program makes the share of a correction elsewhere.
-    colour_network.share_kept = lambda ratios: torch.ones_like(ratios[:, :1])
     with torch.no_grad():
         output = network(colour_network.features(evidence))
         colours = colour_network.colours(evidence, luma, output)
