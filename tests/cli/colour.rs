@@ -234,6 +234,14 @@ fn the_kind_of_a_filter_shows_in_scenes_of_many_colours() {
     refused(&folder, "info m.npy --bits 3 --cfa rggb", &["behind rggb differ", "fit quad-rggb"]);
     refused(&folder, "info m.npy --bits 3 --cfa quad-rggb@1,0", &["fit quad-rggb or quad-bggr"]);
     run(&folder, "info m.npy --bits 3 --cfa quad-rggb");
+    // Filters are named by the stored frame, whatever is read of it.
+    let part = "info m.npy --bits 3 --crop 1:64,2:96 --orient flip-h";
+    let unnamed = printed(&folder, part);
+    assert!(unnamed.contains("name it (--cfa quad-"), "{unnamed}");
+    assert!(
+        unnamed.contains("quad-rggb or quad-bggr") || unnamed.contains("quad-bggr or quad-rggb")
+    );
+    run(&folder, &format!("{part} --cfa quad-rggb"));
 }
 
 #[test]

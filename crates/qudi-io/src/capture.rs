@@ -82,6 +82,8 @@ pub struct Capture {
     filter: Option<ColourFilter>,
     /// How the filter in use contradicts the one that the capture records.
     filter_contradiction: Option<String>,
+    /// True if the capture records the filter in use.
+    filter_is_recorded: bool,
     stored: Vec<u16>,
     stored_sums: Vec<u32>,
     held: HeldSums,
@@ -127,6 +129,7 @@ impl Capture {
             dark: None,
             filter: None,
             filter_contradiction: None,
+            filter_is_recorded: false,
             stored: vec![0; native.size().pixels()],
             stored_sums: Vec::new(),
             held: HeldSums::default(),
@@ -169,6 +172,7 @@ impl Capture {
             }
             _ => None,
         };
+        let filter_is_recorded = recorded.is_some() && recorded == info.cfa;
         let filter_contradiction = recorded.and_then(|recorded| {
             let of_sensor = || sensor?.colour.as_ref()?.cfa.as_ref();
             let given = options.cfa.as_ref().or_else(of_sensor);
@@ -195,6 +199,7 @@ impl Capture {
             sum,
             filter,
             filter_contradiction,
+            filter_is_recorded,
             ..Self::unjudged(path, native, info, [view, usual], range)
         };
         capture.note_end();

@@ -27,6 +27,7 @@ pub(crate) fn of_capture(
 ) -> Vec<String> {
     let mut warnings = Vec::new();
     warnings.extend(capture.filter_contradiction().map(str::to_owned));
+    warnings.extend(summary.filter_doubt.clone());
     warnings.extend(saturation(capture, summary, sensor));
     let bad = capture.bad_pixels();
     let share = (bad.len() + bad.doubtful) as f64 / capture.size().pixels() as f64;

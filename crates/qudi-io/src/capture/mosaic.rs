@@ -79,13 +79,42 @@ pub struct MosaicContrast {
 /// Bayer patterns that differ in more than red and blue. The second of a pair has these exchanged.
 const BAYER: [[&str; 2]; 2] = [["rggb@0,0", "bggr@0,0"], ["grbg@0,0", "gbrg@0,0"]];
 
-/// Returns by how much the pixels of tiles differ if the picture `sums` looks like a mosaic.
-pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<MosaicContrast> {
+/// A picture, and where its pixels are stored: filters are named by the stored frame.
+pub(super) struct PlacedSums<'a> {
+    pub(super) sums: &'a [u32],
+    pub(super) size: Size,
+    /// Stored pixel of each pixel; `None` if they are the same.
+    pub(super) from: Option<&'a [u32]>,
+    /// Columns of the stored frame.
+    pub(super) stored_width: usize,
+}
+
+impl PlacedSums<'_> {
+    /// Returns the pattern of the stored frame that is `seen` in the picture, among the Bayer patterns.
+    fn stored(&self, seen: &Mosaic) -> Option<Mosaic> {
+        let Some(from) = self.from else { return Some(seen.clone()) };
+        let mut letters = [None; 16];
+        for (i, &place) in from.iter().enumerate() {
+            let (row, column) =
+                (place as usize / self.stored_width, place as usize % self.stored_width);
+            let letter = seen.letter(i / self.size.width, i % self.size.width);
+            letters[row % 4 * 4 + column % 4] = Some(letter);
+        }
+        let fits = |pattern: &Mosaic| {
+            (0..16).all(|i| letters[i].is_none_or(|letter| pattern.letter(i / 4, i % 4) == letter))
+        };
+        bayer_names().flatten().filter_map(|name| name.parse().ok()).find(fits)
+    }
+}
+
+/// Returns by how much the pixels of tiles differ if the picture looks like a mosaic.
+pub(super) fn mosaic_contrast(picture: &PlacedSums<'_>) -> Option<MosaicContrast> {
+    let &PlacedSums { sums, size, .. } = picture;
     let differences = NeighbourDifferences::new(sums, size);
     let gray = [[true; 16]; 4];
     let found = differences.as_ref().and_then(|all| Some((all, all.within_colours(&gray)?)));
     if let Some((differences, Difference { contrast, .. })) = found {
-        let patterns = bayer_patterns(differences);
+        let patterns = bayer_patterns(differences, picture);
         let side = patterns.as_ref().map_or(4, |[pattern, _]| pattern.side());
         return Some(MosaicContrast { side, contrast, patterns });
     }
@@ -93,21 +122,30 @@ pub(super) fn mosaic_contrast(sums: &[u32], size: Size) -> Option<MosaicContrast
     Some(MosaicContrast { side: 2, contrast, patterns: None })
 }
 
-/// Returns the Bayer pattern, of single pixels or of 2 x 2, that fits the differences between neighbours
-/// best, and the one with red and blue exchanged.
-fn bayer_patterns(differences: &NeighbourDifferences) -> Option<[Mosaic; 2]> {
+/// Returns the names of all Bayer patterns, of single pixels or of 2 x 2, in pairs that differ in red and
+/// blue.
+fn bayer_names() -> impl Iterator<Item = [String; 2]> {
     let quads = (0..8).map(|i| {
         let corner = format!("@{},{}", i / 4, i % 4);
         ["quad-rggb", "quad-bggr"].map(|letters| format!("{letters}{corner}"))
     });
-    let all = BAYER.into_iter().map(|pair| pair.map(str::to_owned)).chain(quads);
-    let fitting = all.filter_map(|pair| {
+    BAYER.into_iter().map(|pair| pair.map(str::to_owned)).chain(quads)
+}
+
+/// Returns the Bayer pattern that fits the differences between neighbours best, and the one with red and blue
+/// exchanged, by the stored frame.
+fn bayer_patterns(
+    differences: &NeighbourDifferences,
+    picture: &PlacedSums<'_>,
+) -> Option<[Mosaic; 2]> {
+    let fitting = bayer_names().filter_map(|pair| {
         let pair = pair.map(|text| text.parse::<Mosaic>().ok());
         let [Some(first), Some(second)] = pair else { return None };
         let same = same_colour(|row, column| first.letter(row, column));
         Some((differences.z_score(&same)?, [first, second]))
     });
-    fitting.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, pair)| pair)
+    let (_, [first, second]) = fitting.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some([picture.stored(&first)?, picture.stored(&second)?])
 }
 
 /// Returns by how much the four colours of tiles differ, as a share of their mean, if the two diagonals
@@ -136,34 +174,44 @@ fn tile_contrast(sums: &[u32], size: Size) -> Option<f64> {
     diagonal.or(rows.and(columns))
 }
 
-/// Refuses a pattern whose pixels of one colour differ all over the picture: its phase or its kind is wrong.
-pub(super) fn check_pattern(sums: &[u32], filter: &ColourFilter, cfa: &FilterChoice) -> Result<()> {
+/// Compares neighbours behind one colour of a tile: where they differ all over the picture, its phase or its
+/// kind is wrong.
+///
+/// Refuses it if another pattern fits. Returns a warning otherwise, since static scenes of fine texture look
+/// so, too, and where the capture records the filter.
+pub(super) fn check_pattern(
+    picture: &PlacedSums<'_>,
+    filter: &ColourFilter,
+    cfa: &FilterChoice,
+    is_recorded: bool,
+) -> Result<Option<String>> {
     let size = filter.size();
-    let Some(tile) = filter.tile() else { return Ok(()) };
+    let Some(tile) = filter.tile() else { return Ok(None) };
     let side = if tile.len() == 4 { 2 } else { 4 };
     let letter =
         |row: usize, column: usize| char::from(tile.as_bytes()[row % side * side + column % side]);
-    let Some(differences) = NeighbourDifferences::new(sums, size) else { return Ok(()) };
-    let Some(found) = differences.within_colours(&same_colour(letter)) else { return Ok(()) };
-    let help = match bayer_patterns(&differences) {
-        Some([first, second]) => format!(
+    let Some(differences) = NeighbourDifferences::new(picture.sums, size) else { return Ok(None) };
+    let Some(found) = differences.within_colours(&same_colour(letter)) else { return Ok(None) };
+    let what = format!(
+        "neighbouring pixels that are {} behind {} differ by {:.0} % all over the picture",
+        filter.colours()[found.at.0 * size.width + found.at.1].name(),
+        cfa.tile().map_or_else(|| cfa.to_string(), Mosaic::short),
+        100.0 * found.contrast
+    );
+    let patterns = bayer_patterns(&differences, picture);
+    let Some([first, second]) = patterns.filter(|_| !is_recorded) else {
+        return Ok(Some(format!(
+            "{what}: its kind or phase is wrong, or the scene has static texture as fine as its tiles"
+        )));
+    };
+    Err(Error::mismatch(
+        what,
+        "cfa",
+        format!(
             "the counts fit {} or {}: name the filter of this camera, and where its tile begins",
             first.short(),
             second.short()
         ),
-        None => {
-            "name the filter of this camera, and the row and column where its tile begins".into()
-        }
-    };
-    Err(Error::mismatch(
-        format!(
-            "neighbouring pixels that are {} behind {} differ by {:.0} % all over the picture",
-            filter.colours()[found.at.0 * size.width + found.at.1].name(),
-            cfa.tile().map_or_else(|| cfa.to_string(), Mosaic::short),
-            100.0 * found.contrast
-        ),
-        "cfa",
-        help,
     ))
 }
 
@@ -185,6 +233,42 @@ mod tests {
     use super::*;
     use qudi_core::random::{Domain, Streams, uniform};
 
+    fn placed(sums: &[u32], size: Size) -> PlacedSums<'_> {
+        PlacedSums { sums, size, from: None, stored_width: size.width }
+    }
+
+    #[test]
+    fn patterns_are_named_by_the_stored_frame() {
+        // A part of 8 x 8 of a frame of 10 x 12, from row 1 and column 0 on, mirrored.
+        let size = Size { height: 8, width: 8 };
+        let from: Vec<u32> = (0..64).map(|i| (i / 8 + 1) * 12 + 7 - i % 8).collect();
+        let picture = PlacedSums { sums: &[], size, from: Some(&from), stored_width: 12 };
+        let stored = |seen: &str| picture.stored(&seen.parse().unwrap()).unwrap().short();
+        // Its stored columns alternate blue and green from the second row of rggb on.
+        assert_eq!(stored("bggr"), "rggb");
+        assert_eq!(stored("rggb"), "bggr");
+        assert_eq!(stored("quad-rggb@1,2"), "quad-bggr@0,2");
+    }
+
+    #[test]
+    fn recorded_filters_and_textures_that_fit_no_pattern_are_warned_of() {
+        let size = Size { height: 64, width: 96 };
+        let filter = ColourFilter::tiled(&"rggb".parse().unwrap(), size).unwrap();
+        let cfa: FilterChoice = "rggb".parse().unwrap();
+        let sums = |rates: [[u32; 2]; 2]| -> Vec<u32> {
+            (0..size.pixels()).map(|i| rates[i / size.width % 2][i % size.width % 2]).collect()
+        };
+        let phase = sums([[100, 60], [40, 100]]);
+        let check = |sums: &[u32], is_recorded| {
+            check_pattern(&placed(sums, size), &filter, &cfa, is_recorded)
+        };
+        assert!(check(&phase, false).is_err());
+        assert!(check(&phase, true).unwrap().unwrap().contains("differ by"));
+        // All four differ.
+        let texture = sums([[100, 60], [20, 128]]);
+        assert!(check(&texture, false).unwrap().unwrap().contains("static texture"));
+    }
+
     /// Measures a picture with gradients and noise, seen through filters.
     fn seen(filters: [[f64; 2]; 2]) -> Option<MosaicContrast> {
         let seen = seen_at(|y, x| filters[y % 2][x % 2])?;
@@ -202,7 +286,7 @@ mod tests {
             let noise = 1.0 + 0.4 * (uniform(&mut rng) - 0.5);
             (light * noise * filter(y, x)) as u32
         };
-        mosaic_contrast(&(0..size.pixels()).map(value).collect::<Vec<_>>(), size)
+        mosaic_contrast(&placed(&(0..size.pixels()).map(value).collect::<Vec<_>>(), size))
     }
 
     #[test]
@@ -219,10 +303,10 @@ mod tests {
         let check = |text: &str| {
             let cfa: FilterChoice = text.parse().unwrap();
             let filter = ColourFilter::tiled(cfa.tile().unwrap(), size).unwrap();
-            check_pattern(&sums, &filter, &cfa)
+            check_pattern(&placed(&sums, size), &filter, &cfa, false)
         };
         for right in ["rggb", "bggr", "grbg@0,1", "rgbw"] {
-            assert!(check(right).is_ok(), "{right}");
+            assert_eq!(check(right).unwrap(), None, "{right}");
         }
         for wrong in ["grbg", "gbrg", "rggb@0,1", "quad-rggb", "wrwgrwgwgwbwgwbw"] {
             let error = check(wrong).unwrap_err();

@@ -2,7 +2,7 @@
 
 use super::Capture;
 use super::frame_axis::likely_axes;
-use super::mosaic::{MosaicContrast, check_pattern, mosaic_contrast};
+use super::mosaic::{MosaicContrast, PlacedSums, check_pattern, mosaic_contrast};
 use crate::description::{Axes, BitOrder, PackAxis};
 use crate::recognition::{Z_SCORE_THRESHOLD, bit_order_z_score};
 use qudi_core::PppDefinition;
@@ -31,6 +31,8 @@ pub struct Summary {
     pub bit_order: Option<BitOrderCheck>,
     /// Difference between the pixels of tiles, where the picture looks like an unnamed colour filter array.
     pub mosaic: Option<MosaicContrast>,
+    /// Doubt about the filter in use: pixels of one colour differ.
+    pub filter_doubt: Option<String>,
     /// Mean count of a pixel behind red, green, blue and white, of captures whose colours are read; none of
     /// colours that the filter lacks.
     pub colours: Option<[Option<f64>; 4]>,
@@ -109,9 +111,20 @@ impl Summary {
         for (sum, second) in sums.iter_mut().zip(second) {
             *sum += second;
         }
-        if let (Some(filter), Some(cfa)) = (&capture.filter, &capture.info.cfa) {
-            check_pattern(&sums, filter, cfa)?;
-        }
+        let picture = PlacedSums {
+            sums: &sums,
+            size,
+            from: capture.view.from.as_deref(),
+            stored_width: capture.native.size().width,
+        };
+        let filter_doubt = match (&capture.filter, &capture.info.cfa) {
+            (Some(filter), Some(cfa)) => {
+                check_pattern(&picture, filter, cfa, capture.filter_is_recorded)?
+            }
+            _ => None,
+        };
+        let unnamed = capture.info.cfa.is_none();
+        let mosaic = unnamed.then(|| mosaic_contrast(&picture)).flatten();
         let largest = histogram.iter().rposition(|&n| n > 0).unwrap_or(0);
         histogram.truncate(largest + 1);
         let samples = sampled.len() as f64 * size.pixels() as f64;
@@ -133,7 +146,8 @@ impl Summary {
             }),
             ppp,
             bit_order,
-            mosaic: if capture.info.cfa.is_none() { mosaic_contrast(&sums, size) } else { None },
+            mosaic,
+            filter_doubt,
             colours: capture.filter.as_ref().map(|filter| colour_means(&sums, looked, filter)),
             likely_axes,
             sums,

@@ -38,6 +38,9 @@ const MIN_CONTRAST: f64 = 0.06;
 /// Largest energy of alike neighbours in units of the one of different colours.
 const MAX_ALIKE: f64 = 0.5;
 
+/// Largest energy of alike neighbours in units of the one of different colours, for a pattern to fit.
+const MAX_ALIKE_OF_FIT: f64 = 0.3;
+
 /// Which neighbours in every direction, at every place of a tile, are behind one colour.
 pub(super) type SameColour = [[bool; PLACES]; 4];
 
@@ -137,6 +140,23 @@ impl NeighbourDifferences {
     /// all of one colour are alike.
     pub(super) fn z_score(&self, same: &SameColour) -> Option<f64> {
         if self.within_colours(same).is_some() {
+            return None;
+        }
+        let (mut alike, mut different) = (0.0, 0.0);
+        for (means, same) in self.means.iter().zip(same) {
+            let number = same.iter().filter(|&&same| same).count();
+            if number == 0 || number == PLACES {
+                continue;
+            }
+            for (mean, &same) in means.iter().zip(same) {
+                if same {
+                    alike += mean / number as f64;
+                } else {
+                    different += mean / (PLACES - number) as f64;
+                }
+            }
+        }
+        if alike > MAX_ALIKE_OF_FIT * different {
             return None;
         }
         let of_block = |block: usize| {
