@@ -35,8 +35,8 @@ pub(super) fn scenes() -> Result<[DemoScene; 2]> {
             name: "photograph",
             about: "A photograph that turns, pans and comes nearer, behind a price tag that passes in the opposite \
                     direction, seen through a Bayer filter (Grocery Store Dataset, Marcus Klasson, MIT licence). \
-                    The built-in regression was not trained on this collection; the built-in diffusion was. Numbers \
-                    are of luma.",
+                    The built-in regression was not trained on this collection; the built-in diffusion and the \
+                    network for colours were. Numbers are of luma.",
             planes: Planes::Colour(Box::new(photograph()?)),
         },
         DemoScene {
