@@ -67,13 +67,18 @@ impl Colours<'_> {
         let evidence = Evidence::new(merged, self.response, &guide.luma, &around);
         let first = guided(&guide, &evidence, merged.size, self.sigma, (&around, None));
         let first = self.constrained(merged.size, self.shrunk(merged, &evidence, first));
-        let efficiency = self.exposures.efficiency();
-        let seen: [Vec<f32>; 3] = std::array::from_fn(|k| {
-            first.ratios[k].iter().map(|ratio| ratio * efficiency[k]).collect()
-        });
+        let seen = self.seen_ratios(&first);
         let evidence = Evidence::new(merged, self.response, &guide.luma, &seen);
         let second = guided(&guide, &evidence, merged.size, self.sigma, (&seen, Some(&first)));
         self.constrained(merged.size, self.shrunk(merged, &evidence, second))
+    }
+
+    /// Returns the ratios of sensor colours to luma.
+    pub(super) fn seen_ratios(&self, chroma: &Chroma) -> [Vec<f32>; 3] {
+        let efficiency = self.exposures.efficiency();
+        std::array::from_fn(|k| {
+            chroma.ratios[k].iter().map(|ratio| ratio * efficiency[k]).collect()
+        })
     }
 
     /// Returns the standard deviation in pixels over which a first chroma is averaged.

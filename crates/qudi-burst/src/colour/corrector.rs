@@ -1,7 +1,6 @@
 //! Corrections of restored colours by a network, and what it is told.
 
 use super::chroma::{Chroma, Colours};
-use super::gray_counts::MIN_SEEN;
 use super::guided::gaussian;
 use super::{Evidence, MergedColours};
 use qudi_core::{Frame, Result, Size};
@@ -84,9 +83,7 @@ impl Colours<'_> {
         let weights = self.exposures.luma_weights();
         let total: f32 = weights.iter().sum();
         let efficiency = self.exposures.efficiency();
-        let seen: [Vec<f32>; 3] = std::array::from_fn(|k| {
-            chroma.ratios[k].iter().map(|ratio| ratio * efficiency[k]).collect()
-        });
+        let seen = self.seen_ratios(chroma);
         let evidence = Evidence::new(merged, self.response, &luma.data, &seen);
         let mean = self.mean_luma().max(f32::MIN_POSITIVE);
         let mut planes = Vec::with_capacity(ColourEvidence::PLANES * pixels);
@@ -115,30 +112,6 @@ impl Colours<'_> {
         planes.extend(information.iter().zip(&luma.data).map(precision));
         let weights = weights.map(|weight| weight / total);
         ColourEvidence { size, frame, planes, weights }
-    }
-
-    /// Returns the score of luma over the counts of all colours, and its information (Fisher's), whose root
-    /// is the standard deviation of the score.
-    pub(super) fn luma_score(
-        &self,
-        merged: &MergedColours,
-        luma: &Frame,
-        chroma: &Chroma,
-    ) -> (Vec<f32>, Vec<f32>) {
-        let pixels = luma.size.pixels();
-        let (mut score, mut information) = (vec![0.0; pixels], vec![0.0; pixels]);
-        for (colour, seen) in self.exposures.responses().into_iter().enumerate() {
-            for (i, &weight) in merged.weights[colour].iter().enumerate() {
-                if weight > 0.0 {
-                    let share = chroma.seen(i, seen).max(MIN_SEEN);
-                    let own = self.response.at(share * luma.data[i], self.response.dark);
-                    let told = share * own.slope / own.variance;
-                    score[i] += told * (merged.counts[colour][i] - weight * own.mean);
-                    information[i] += told * share * own.slope * weight;
-                }
-            }
-        }
-        (score, information)
     }
 }
 

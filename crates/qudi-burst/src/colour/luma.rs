@@ -2,6 +2,7 @@
 
 use super::MergedColours;
 use super::chroma::{BLURRED_SIGMA, Chroma, Colours};
+use super::gray_counts::MIN_SEEN;
 use super::guided::{Averages, gaussian};
 use qudi_core::Frame;
 
@@ -73,5 +74,29 @@ impl Colours<'_> {
             (luma + step).clamp(RANGE[0] * luma.max(0.0), RANGE[1] * luma.max(0.0)).max(least)
         };
         Frame { size, data: luma.data.iter().enumerate().map(value).collect() }
+    }
+
+    /// Returns the score of luma over the counts of all colours, and its information (Fisher's), whose root
+    /// is the standard deviation of the score.
+    pub(super) fn luma_score(
+        &self,
+        merged: &MergedColours,
+        luma: &Frame,
+        chroma: &Chroma,
+    ) -> (Vec<f32>, Vec<f32>) {
+        let pixels = luma.size.pixels();
+        let (mut score, mut information) = (vec![0.0; pixels], vec![0.0; pixels]);
+        for (colour, seen) in self.exposures.responses().into_iter().enumerate() {
+            for (i, &weight) in merged.weights[colour].iter().enumerate() {
+                if weight > 0.0 {
+                    let share = chroma.seen(i, seen).max(MIN_SEEN);
+                    let own = self.response.at(share * luma.data[i], self.response.dark);
+                    let told = share * own.slope / own.variance;
+                    score[i] += told * (merged.counts[colour][i] - weight * own.mean);
+                    information[i] += told * share * own.slope * weight;
+                }
+            }
+        }
+        (score, information)
     }
 }

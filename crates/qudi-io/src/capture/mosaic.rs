@@ -186,10 +186,10 @@ pub(super) fn check_pattern(
     is_recorded: bool,
 ) -> Result<Option<String>> {
     let size = filter.size();
-    let Some(tile) = filter.tile() else { return Ok(None) };
-    let side = if tile.len() == 4 { 2 } else { 4 };
-    let letter =
-        |row: usize, column: usize| char::from(tile.as_bytes()[row % side * side + column % side]);
+    if filter.tile().is_none() {
+        return Ok(None);
+    }
+    let letter = |row: usize, column: usize| filter.colours()[row * size.width + column].letter();
     let Some(differences) = NeighbourDifferences::new(picture.sums, size) else { return Ok(None) };
     let Some(found) = differences.within_colours(&same_colour(letter)) else { return Ok(None) };
     let what = format!(
