@@ -1,7 +1,8 @@
-//! Operations that Burn's flex backend lacks or computes slowly, with their gradients.
+//! Operations that Burn's flex backend lacks or computes slowly, with their gradients where learning needs
+//! them.
 //!
-//! Every operation takes tensors of any device. On flex it is computed here, on LibTorch it is LibTorch's
-//! own; elsewhere it is composed of Burn's own operations with the same result.
+//! Every operation takes tensors of any device. On flex it is computed here, on LibTorch most are
+//! LibTorch's own; elsewhere it is composed of Burn's own operations with the same result.
 #![warn(missing_docs)]
 // Vector code must be inlined into the functions that are compiled for the machine's vector unit.
 #![allow(clippy::inline_always)]
@@ -26,6 +27,7 @@ mod pixel_norm;
 mod precision;
 mod resample;
 mod residual_stack;
+mod tv_flow;
 #[cfg(feature = "flex")]
 mod uninitialised;
 mod warp;
@@ -42,4 +44,5 @@ pub use pixel_norm::pixel_norm;
 pub use precision::{ComputePrecision, with_precision};
 pub use resample::{Resampling, resampled};
 pub use residual_stack::{Stack, StackParameters, residual_stack};
-pub use warp::warp;
+pub use tv_flow::tv_flow;
+pub use warp::{warp, warp_cubic};

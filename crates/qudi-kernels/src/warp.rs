@@ -1,5 +1,6 @@
 //! Backward warping by optical flow.
 
+pub(crate) mod cubic;
 #[allow(unreachable_pub)] // the macro wants public traits
 mod extension;
 #[cfg(feature = "flex")]
@@ -10,6 +11,16 @@ use burn::backend::Dispatch;
 use burn::tensor::ops::{GridSampleOptions, GridSamplePaddingMode, InterpolateMode};
 use burn::tensor::{Device, Tensor, TensorData};
 use extension::WarpBackend;
+
+/// How values between pixels are computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(unreachable_pub)] // part of public traits
+pub enum Interpolation {
+    /// From four pixels.
+    Bilinear,
+    /// From sixteen, by cubic convolution.
+    Cubic,
+}
 
 /// Samples `x` at `(column + flow_x, row + flow_y)` with bilinear interpolation. Coordinates are clamped to
 /// the grid (`grid_sample` with `align_corners` and border padding). The flow gets no gradient where a
@@ -22,7 +33,8 @@ pub fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
     let [images, _, height, width] = x.dims();
     assert_eq!(flow.dims(), [images, 2, height, width], "one flow for every pixel");
     if is_native(&x) || is_recorded(&x) {
-        return Tensor::from_dispatch(Dispatch::warp(x.into_dispatch(), flow.into_dispatch()));
+        let (x, flow) = (x.into_dispatch(), flow.into_dispatch());
+        return Tensor::from_dispatch(Dispatch::warp(x, flow, Interpolation::Bilinear));
     }
     let device = flow.device();
     let pixels = flow.permute([0, 2, 3, 1]) + positions(height, width, &device);
@@ -33,6 +45,22 @@ pub fn warp(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
         .with_padding_mode(GridSamplePaddingMode::Border)
         .with_align_corners(true);
     x.grid_sample_2d(pixels * scale - 1.0, options)
+}
+
+/// Samples `x` as [`warp`] does, but with cubic convolution (Keys 1981, `a = -0.75` as in PyTorch), which
+/// keeps fine detail. Pixels beyond the edge are those at the edge. The flow gets no gradient.
+///
+/// # Shapes
+/// As for [`warp`].
+pub fn warp_cubic(x: Tensor<4>, flow: Tensor<4>) -> Tensor<4> {
+    let [images, _, height, width] = x.dims();
+    assert_eq!(flow.dims(), [images, 2, height, width], "one flow for every pixel");
+    let flow = flow.detach();
+    if is_native(&x) || is_recorded(&x) {
+        let (x, flow) = (x.into_dispatch(), flow.into_dispatch());
+        return Tensor::from_dispatch(Dispatch::warp(x, flow, Interpolation::Cubic));
+    }
+    cubic::composed(x, flow)
 }
 
 /// Returns the column and row of every pixel, `[1, height, width, 2]`.

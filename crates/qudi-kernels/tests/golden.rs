@@ -9,7 +9,7 @@ use burn::tensor::{Device, Tensor};
 use cases::{Case, File};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
-use qudi_kernels::warp;
+use qudi_kernels::{tv_flow, warp, warp_cubic};
 
 fn devices() -> [Device; 2] {
     #[allow(deprecated)] // selected by name
@@ -150,6 +150,30 @@ fn warps_match_pytorch() {
                 inputs.push(("flow", &flow));
             }
             check::<1, 1>(&case, y, &inputs, &[], &[]);
+        }
+    }
+}
+
+#[test]
+fn cubic_warps_match_pytorch() {
+    let file = File::open("kernels/warp_cubic");
+    for device in devices() {
+        for case in file.cases() {
+            let x: Tensor<4> = case.input("x", &device).require_grad();
+            let y = warp_cubic(x.clone(), case.input("flow", &device));
+            check::<1, 1>(&case, y, &[("x", &x)], &[], &[]);
+        }
+    }
+}
+
+#[test]
+fn tv_flows_match_pytorch() {
+    let file = File::open("kernels/tv_flow");
+    for device in devices() {
+        for case in file.cases() {
+            let [reference, neighbour, start] =
+                ["reference", "neighbour", "start"].map(|name| case.input(name, &device));
+            case.check_output("y", tv_flow(reference, neighbour, start).inner());
         }
     }
 }

@@ -5,7 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
-use qudi_kernels::{residual_stack, warp};
+use qudi_kernels::{residual_stack, warp, warp_cubic};
 
 fn wave<const D: usize>(seed: f32, shape: [usize; D], device: &Device) -> Tensor<D> {
     let count: usize = shape.iter().product();
@@ -83,6 +83,10 @@ fn stacks() {
 fn warps() {
     let shapes = [[2, 3, 6, 5], [2, 2, 6, 5]];
     assert_same(&shapes, &|x| warp(x[0].clone(), x[1].clone() * 1.7));
+    assert_same(&shapes[..1], &|x| {
+        let flow = wave(1.0, [2, 2, 6, 5], &x[0].device()).detach();
+        warp_cubic(x[0].clone(), flow * 1.7)
+    });
 }
 
 /// A recorded value stays as it was, whatever is computed in place of its source meanwhile.

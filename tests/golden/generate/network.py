@@ -58,12 +58,49 @@ def gn(channels: int) -> nn.GroupNorm:
 
 def warp(x: Tensor, flow: Tensor) -> Tensor:
     """x at (column + flow_x, row + flow_y), flow in pixels of x's own grid."""
+    return sampled(x, flow, "bilinear")
+
+
+def warp_cubic(x: Tensor, flow: Tensor) -> Tensor:
+    """The same with cubic convolution, a = -0.75."""
+    return sampled(x, flow, "bicubic")
+
+
+def sampled(x: Tensor, flow: Tensor, mode: str) -> Tensor:
+    """x along the flow, with a mode of `grid_sample`."""
     height, width = x.shape[2:]
     columns = torch.arange(width, dtype=x.dtype, device=x.device) + flow[:, 0]
     rows = torch.arange(height, dtype=x.dtype, device=x.device)[:, None] + flow[:, 1]
     # A grid of one cell has nothing to scale by; any coordinate is clamped to 0 there.
     grid = torch.stack([columns * 2 / max(width - 1, 1) - 1, rows * 2 / max(height - 1, 1) - 1], dim=3)
-    return F.grid_sample(x, grid, mode="bilinear", padding_mode="border", align_corners=True)
+    return F.grid_sample(x, grid, mode=mode, padding_mode="border", align_corners=True)
+
+
+def tv_flow(reference: Tensor, neighbour: Tensor, flow: Tensor) -> Tensor:
+    """TV-L1 flow of one level (Zach, Pock and Bischof 2007), from a start."""
+    weight, theta, tau = 8.0, 0.3, 0.25
+    p = [torch.zeros_like(flow), torch.zeros_like(flow)]
+    for _ in range(4):
+        warped = warp_cubic(neighbour, flow)
+        padded = F.pad(warped, (1, 1, 1, 1), mode="replicate")
+        gx = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / 2
+        gy = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / 2
+        square = gx.square() + gy.square() + 1e-9
+        rest = warped - reference - gx * flow[:, :1] - gy * flow[:, 1:]
+        for _ in range(8):
+            rho = rest + gx * flow[:, :1] + gy * flow[:, 1:]
+            length = (rho / square).clamp(-weight * theta, weight * theta)
+            v = flow - torch.cat([length * gx, length * gy], 1)
+            flow = v
+            for _ in range(2):
+                ux, uy = torch.zeros_like(flow), torch.zeros_like(flow)
+                ux[..., :-1] = flow[..., 1:] - flow[..., :-1]
+                uy[..., :-1, :] = flow[..., 1:, :] - flow[..., :-1, :]
+                norm = 1 + tau / theta * (ux.square() + uy.square()).sqrt()
+                p = [(p[0] + tau / theta * ux) / norm, (p[1] + tau / theta * uy) / norm]
+                left, up = F.pad(p[0], (1, 0))[..., :-1], F.pad(p[1], (0, 0, 1, 0))[..., :-1, :]
+                flow = v + theta * (p[0] - left + p[1] - up)
+    return flow
 
 
 def up2(x: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ from torch import Tensor, nn
 from uniform import affine, gaussian, parameter, uniform
 
 OUT = network.ROOT / "tests/golden"
-KERNELS = {"conv", "group_norm", "warp"}
+KERNELS = {"conv", "group_norm", "warp", "warp_cubic", "tv_flow"}
 Tensors = dict[str, Tensor]
 
 
@@ -305,6 +305,27 @@ def warp_file() -> File:
     file.case("zero", run, zero, about=about, constant=("flow",))
     file.case("fraction", run, x | {"flow": spread((2, 2, 6, 9), 0.1, 1.3)}, about=about)
     file.case("far", run, x | {"flow": spread((2, 2, 6, 9), 0.0, 30.0)}, about=about)
+    return file
+
+
+def warp_cubic_file() -> File:
+    file = File("warp_cubic")
+    run = lambda x, flow: {"y": network.warp_cubic(x, flow)}
+    x = {"x": spread((2, 3, 6, 9))}
+    about = {"operation": "bicubic warp, a = -0.75; no gradient of the flow"}
+    for case, flow in (("fraction", (0.1, 1.3)), ("far", (0.0, 30.0))):
+        inputs = x | {"flow": spread((2, 2, 6, 9), *flow)}
+        file.case(case, run, inputs, about=about, constant=("flow",))
+    return file
+
+
+def tv_flow_file() -> File:
+    file = File("tv_flow")
+    images = {name: spread((2, 1, 10, 13), 0.5, 0.1) for name in ("reference", "neighbour")}
+    inputs = images | {"start": spread((2, 2, 10, 13), 0.0, 0.5)}
+    run = lambda reference, neighbour, start: {"y": network.tv_flow(reference, neighbour, start)}
+    about = {"operation": "TV-L1 flow of one level"}
+    file.case("level", run, inputs, about=about, constant=tuple(inputs))
     return file
 
 
@@ -591,6 +612,8 @@ FILES: dict[str, Callable[[], File]] = {
     "conv": conv_file,
     "group_norm": norm_file,
     "warp": warp_file,
+    "warp_cubic": warp_cubic_file,
+    "tv_flow": tv_flow_file,
     "resample": resample_file,
     "blocks": block_file,
     "pre_trust": lambda: pre_file("pre_trust", motions=2, trust=4),
