@@ -24,8 +24,9 @@ fn prepared(name: &str) -> PathBuf {
 }
 
 fn weights(path: &Path, value: f32) {
-    let network = NetworkConfig::preset("tiny").unwrap();
-    let NetworkConfig::Diffusion(sizes) = &network else { panic!("tiny is a diffusion") };
+    let text = std::fs::read_to_string(crate::root().join("tests/golden/tiny.toml")).unwrap();
+    let network = NetworkConfig::parse(&text, "tiny").unwrap();
+    let NetworkConfig::Diffusion(sizes) = &network else { panic!("a diffusion") };
     let module = sizes.init(1, &Device::flex());
     let module = init_parameters(module, |_, shape| vec![value; shape.iter().product()]);
     let description = Description {
@@ -254,8 +255,7 @@ fn graphics_card_matches_the_processor() {
         eprintln!("skipped: needs a graphics card, or a driver that imitates one");
         return;
     }
-    let only =
-        "arithmetic,joining,warp,softmax,group norm,matrix product,convolution 1x1,convolution 3x3";
+    let only = "arithmetic,joining,warp,TV-L1,softmax,group norm,matrix product,convolution 1x1,convolution 3x3";
     let device = ["selftest", "--device", "wgpu:0", "--only", only];
     let output = qudi(&folder).args(device).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);

@@ -185,8 +185,9 @@ mod tests {
 
     #[test]
     fn kinds_are_named_in_recipes() {
-        let kinds = ["tiny", "small"].map(|name| NetworkConfig::preset(name).unwrap().kind());
-        assert_eq!(kinds, [NetworkKind::Diffusion, NetworkKind::Regression]);
+        let kinds =
+            ["tiny", "small", "paper"].map(|name| NetworkConfig::preset(name).unwrap().kind());
+        assert_eq!(kinds, [NetworkKind::Window, NetworkKind::Regression, NetworkKind::Diffusion]);
         let text = "[network]\nkind = \"regression\"\nfold = 2\nunet = 3\n";
         let error = NetworkConfig::parse(text, "wrong").unwrap_err().to_string();
         assert!(error.contains("unet"), "{error}");

@@ -1,9 +1,11 @@
 //! The diffusion that encodes a window once.
 //!
-//! Pre-denoiser, flow and fusion see the captured counts alone and run once a window; the U-Net runs in every
-//! reverse step. All of it is wide plain convolutions at half the resolution and below. The paper's order,
+//! Pre-denoiser, flow and fusion see the captured counts alone and run once a window; the U-Net and the merge
+//! of its predictions run in every reverse step. All networks are wide plain convolutions at half the
+//! resolution and below. The paper's order,
 //! with everything in every step, is [`diffusion`](crate::diffusion).
 
+mod agreement;
 mod config;
 mod denoiser;
 mod flow;
@@ -15,8 +17,10 @@ mod matching;
 mod merging;
 mod network;
 mod predenoiser;
+mod refinement;
 mod unet;
 
 pub use config::WindowConfig;
 pub use flow::WindowFlow;
+pub(crate) use initial::added_later;
 pub use network::{EncodedWindow, Window, WindowPrediction};

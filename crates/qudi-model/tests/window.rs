@@ -7,7 +7,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::tensor::read;
-use qudi_layers::{Provenance, parameter_shapes};
+use qudi_layers::{Provenance, init_parameters, parameter_shapes};
 use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Conditioning;
@@ -113,13 +113,44 @@ fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> V
     largest.1
 }
 
-/// Both orders of computation belong to one method: the help of the error must name a method that exists.
+/// Weights of programs that did not merge predicted frames are still read, and merge by the formula.
 #[test]
-fn weights_of_another_kind_are_refused_with_the_method_that_takes_them() {
+fn weights_without_agreement_are_read_and_parts_of_it_are_refused() {
     let device = Device::flex();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("window.safetensors");
-    let description = Description {
+    let description = description();
+    save(&CONFIG.init(1, &device), &description, Precision::Single, &path, Overwrite::Yes).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let without = |left_out: &dyn Fn(&str) -> bool| {
+        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+        let kept = file.tensors().into_iter().filter(|(name, _)| !left_out(name));
+        let former = safetensors::serialize(kept, header.metadata().clone()).unwrap();
+        std::fs::write(&path, former).unwrap();
+        load::<Window>(&path, &device)
+    };
+    let (former, _) = without(&|name| name.starts_with("agreement.")).unwrap();
+    // The same network with an agreement that corrects nothing.
+    let formula = init_parameters(CONFIG.init(1, &device), |name, shape| {
+        if name.starts_with("agreement.") {
+            return vec![0.0; shape.iter().product()];
+        }
+        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        let data = file.tensor(name).unwrap().data();
+        data.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+    });
+    let conditioning = conditioning(4, &device);
+    let state = state(4, 60, &device);
+    let got = predicted(&former, &conditioning, &state);
+    assert_eq!(got, predicted(&formula, &conditioning, &state));
+    assert_ne!(got, predicted(&CONFIG.init(1, &device), &conditioning, &state));
+    let error = without(&|name| name == "agreement.out.bias").unwrap_err();
+    assert!(error.to_string().contains("`agreement.out.bias` is missing"), "{error}");
+}
+
+fn description() -> Description {
+    Description {
         preset: None,
         network: NetworkConfig::Window(CONFIG),
         window: 11,
@@ -134,7 +165,16 @@ fn weights_of_another_kind_are_refused_with_the_method_that_takes_them() {
             recipes: Vec::new(),
         },
         sampling: None,
-    };
+    }
+}
+
+/// Both orders of computation belong to one method: the help of the error must name a method that exists.
+#[test]
+fn weights_of_another_kind_are_refused_with_the_method_that_takes_them() {
+    let device = Device::flex();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("window.safetensors");
+    let description = description();
     let network = CONFIG.init(1, &device);
     save(&network, &description, Precision::Half, &path, Overwrite::Yes).unwrap();
     let (_, read) = load::<Window>(&path, &device).unwrap();

@@ -1,4 +1,4 @@
-//! What a device must get right: every operation of the network with its gradients, and two small
+//! What a device must get right: every operation of the network with its gradients, and three small
 //! networks whole.
 
 use crate::loss::reconstruction;
@@ -8,15 +8,20 @@ use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::Result;
 use qudi_kernels::conv::{Activation, Options, conv_2d, conv_3d};
 use qudi_kernels::group_norm::{self, Norm, group_norm};
-use qudi_kernels::{ComputePrecision, warp, with_precision, with_stock_operations};
+use qudi_kernels::{
+    ComputePrecision, tv_flow, warp, warp_cubic, with_precision, with_stock_operations,
+};
 use qudi_layers::init_parameters;
 use qudi_layers::tensor::read;
 use qudi_model::aligned::Aligned;
 use qudi_model::config::NetworkConfig;
+use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
+use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{Conditioning, Simulated};
 use qudi_model::regression::RegressionConfig;
 use qudi_model::sensor::SENSOR_NUMBERS;
+use qudi_model::window::WindowConfig;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
 pub const TOLERANCE: f32 = 2e-3;
@@ -110,6 +115,8 @@ pub const CHECKS: &[Check] = &[
     Check::exact("arithmetic", arithmetic),
     Check::exact("joining and slicing", joining),
     Check::exact("warp", warping),
+    Check::exact("cubic warp", cubic_warping),
+    Check::exact("TV-L1 flow", refining_flow),
     Check::exact("group norm", normalising),
     Check::exact("matrix product", products),
     Check::exact("softmax", attention),
@@ -125,6 +132,7 @@ pub const CHECKS: &[Check] = &[
     }),
     Check::exact("regression", regression),
     Check::exact("diffusion", diffusion),
+    Check::exact("window", window),
 ];
 
 /// Repeatable values in [-1, 1).
@@ -181,6 +189,19 @@ fn warping(device: &Device) -> Result<Vec<Vec<f32>>> {
     let x = values(5, [2, 3, 12, 20], &device).require_grad();
     let flow = (values(6, [2, 2, 12, 20], &device) * 3.3).require_grad();
     with_gradients(warp(x.clone(), flow.clone()), &[x, flow])
+}
+
+fn cubic_warping(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let x = values(5, [2, 3, 12, 20], &device).require_grad();
+    let flow = values(6, [2, 2, 12, 20], &device) * 3.3;
+    with_gradients(warp_cubic(x.clone(), flow), &[x])
+}
+
+fn refining_flow(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let image = |seed| values(seed, [2, 1, 12, 20], device) * 0.2 + 0.5;
+    let start = values(20, [2, 2, 12, 20], device) * 0.5;
+    Ok(vec![read(tv_flow(image(18), image(19), start))?])
 }
 
 fn normalising(device: &Device) -> Result<Vec<Vec<f32>>> {
@@ -273,12 +294,24 @@ fn regression(device: &Device) -> Result<Vec<Vec<f32>>> {
     ])
 }
 
-/// Runs a diffusion of the sizes of `tiny` on a burst of four frames: prediction, pre-denoised frames, flows,
+/// Sizes of a small diffusion.
+const DIFFUSION: &str = r#"
+[network]
+kind = "diffusion"
+fold = 2
+pre = { width = 16, blocks = 2, growth = 8 }
+features = { low = [8, 8, 8], high = [4, 6, 8] }
+flow = { scale = 2, levels = 3, networks = 3, widths = [8, 16, 8, 8], steps = [1, 3, 6] }
+fusion = { level = 1, widths = [16, 16, 16], growth = 8 }
+unet = { width = 16, multipliers = [1, 2, 2], blocks = 1, attention = [], embedding = 32, predicts = "correction" }
+"#;
+
+/// Runs a small diffusion on a burst of four frames: prediction, pre-denoised frames, flows,
 /// and the loss's gradient for the noisy image.
 fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
-    let NetworkConfig::Diffusion(config) = NetworkConfig::preset("tiny")? else {
-        unreachable!("tiny is a diffusion")
+    let NetworkConfig::Diffusion(config) = NetworkConfig::parse(DIFFUSION, "self-test")? else {
+        unreachable!("its kind is diffusion")
     };
     let network = config.init(1, &device);
     let image = |seed| image(seed, &device);
@@ -301,6 +334,33 @@ fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
         read(prediction.x0.inner())?,
         read(prediction.d.inner())?,
         read(prediction.flows.to_next.inner())?,
+        x_t.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?,
+    ])
+}
+
+/// Runs a small window diffusion on a burst of four frames: prediction, learnt flow, and the loss's gradient
+/// for the noisy image.
+fn window(device: &Device) -> Result<Vec<Vec<f32>>> {
+    let device = device.clone().autodiff();
+    let config = WindowConfig { widths: [16; 3], flow: [8; 3], state: 16, cell_blocks: 1 };
+    let network = config.init(1, &device);
+    let image = |seed| image(seed, &device);
+    let encoded = network.encode(&Conditioning {
+        counts: image(29) * 0.5,
+        linear_estimate: image(30),
+        sensor: values(31, [1, SENSOR_NUMBERS], &device),
+        frames: 4,
+    });
+    let x_t = values(32, [4, 1, 32, 48], &device).require_grad();
+    let x0_prev = values(33, [4, 1, 32, 48], &device);
+    let (has_previous, timesteps) = (vec![true], vec![300]);
+    let state = DiffusionState { x_t: x_t.clone(), x0_prev, has_previous, timesteps };
+    let x0 = network.predict(&encoded, &state, &NoiseSchedule::cosine(NUM_TIMESTEPS)).x0;
+    let loss = reconstruction((x0.clone() + 1.0) * 0.5, image(34));
+    let grads = loss.backward();
+    Ok(vec![
+        read(x0.inner())?,
+        read(encoded.flow[0].pairs.clone().inner())?,
         x_t.grad(&grads).map_or(Ok(vec![f32::NAN]), read)?,
     ])
 }

@@ -208,8 +208,9 @@ mod tests {
 
     #[test]
     fn rejects_invalid_sizes_by_key() {
-        let NetworkConfig::Diffusion(mut config) = NetworkConfig::preset("tiny").unwrap() else {
-            panic!("tiny is a diffusion");
+        let NetworkConfig::Diffusion(mut config) = NetworkConfig::preset("paper-mini").unwrap()
+        else {
+            panic!("paper-mini is a diffusion");
         };
         config.unet.embedding = 7;
         let error = config.checked().unwrap_err();

@@ -77,9 +77,6 @@ impl Fusion {
         let count = window.count;
         let [images, _, h, w] = window.features.dims();
         let bursts = images / count;
-        // The flow learns from true frames: the gradient of what is warped here is mostly noise, and a
-        // hundred times as large.
-        let flow = WindowFlow { pairs: flow.pairs.clone().detach(), ..*flow };
         let whole_flow = WindowFlow { pairs: upsample2(flow.pairs.clone()) * 2.0, scale: 1 };
         let of_frames = |x: &Tensor<4>| frames(x, count);
         let images_of_frames = Tensor::cat(vec![window.restored.clone(), window.linear.clone()], 1);

@@ -6,7 +6,7 @@ use super::input::MIDDLE;
 use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor};
-use qudi_kernels::{StackParameters, warp};
+use qudi_kernels::{StackParameters, warp, warp_cubic};
 use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
 use qudi_layers::{Bias, Conv2d};
 
@@ -69,9 +69,8 @@ impl Gate {
         features: Tensor<4>,
         flow: Tensor<4>,
     ) -> Merged {
-        let both = Tensor::cat(vec![neighbours.mean.clone(), neighbours.frames.clone()], 1);
-        let both = warp(both, flow);
-        let (mean, frames) = (both.clone().narrow(1, 0, 1), both.narrow(1, 1, 1));
+        let mean = warp_cubic(neighbours.mean.clone(), flow.clone());
+        let frames = warp(neighbours.frames.clone(), flow);
         let difference = pixel_unshuffle((mean.clone() - restored) * SCALE, FOLD);
         let inputs = [features, difference, pixel_unshuffle(frames.clone().log(), FOLD)];
         let gate = self.out.linear(&[between.apply(&inputs)]) + OPEN;

@@ -1,5 +1,6 @@
 //! The whole network: a window is encoded once, every reverse step predicts from that.
 
+use super::agreement::{Agreement, Paths};
 use super::config::{FOLD, WindowConfig};
 use super::flow::{Flow, WindowFlow};
 use super::fusion::{Frames, Fused, Fusion};
@@ -7,6 +8,7 @@ use super::hourglass::normalized;
 use super::initial::initial_values;
 use super::input::{MIDDLE, Measurement};
 use super::predenoiser::PreDenoiser;
+use super::refinement::refined;
 use super::unet::{StepImages, UNet};
 use crate::diffusion::Conditioning;
 use crate::diffusion::schedule::NoiseSchedule;
@@ -30,19 +32,21 @@ pub struct Window {
     flow: Flow,
     fusion: Fusion,
     unet: UNet,
+    agreement: Agreement,
     #[module(skip)]
     state: usize,
 }
 
-/// A window as the U-Net sees it in every step.
+/// A window as U-Net and agreement see it in every step.
 #[derive(Clone, Debug)]
 pub struct EncodedWindow {
     /// Pre-denoised frames in image units, `[bursts * frames, 1, H, W]`.
     pub restored: Tensor<4>,
-    /// Flow on all levels, finest first.
+    /// Learnt flow on all levels, finest first. Fusion and agreement follow the refined one.
     pub flow: Vec<WindowFlow>,
     /// Linear estimates merged along the flow, in image units, `[bursts * frames, 1, H, W]`.
     pub merged: Tensor<4>,
+    paths: Paths,
     features: Vec<Tensor<4>>,
     merged_planes: Tensor<4>,
     sensor: Tensor<4>,
@@ -73,6 +77,7 @@ impl WindowConfig {
             flow: self.init_flow(device),
             fusion: self.init_fusion(device),
             unet: self.init_unet(device),
+            agreement: Agreement::zeros(self.widths[0], device),
             state: self.state,
         }
     }
@@ -98,7 +103,7 @@ impl EncodedWindow {
     pub(super) fn bytes(&self) -> usize {
         let single = [&self.restored, &self.merged, &self.merged_planes];
         let flows = self.flow.iter().map(|flow| &flow.pairs);
-        let all = single.into_iter().chain(flows).chain(&self.features);
+        let all = single.into_iter().chain(flows).chain(self.paths.tensors()).chain(&self.features);
         all.map(|x| x.shape().num_elements() * size_of::<f32>()).sum()
     }
 
@@ -112,6 +117,7 @@ impl EncodedWindow {
             merged: inner(&self.merged),
             merged_planes: inner(&self.merged_planes),
             flow: self.flow.iter().map(flow).collect(),
+            paths: self.paths.inner(),
             features: self.features.iter().map(inner).collect(),
             sensor: inner(&self.sensor),
             error_sigma: inner(&self.error_sigma),
@@ -126,6 +132,7 @@ impl Window {
         let measurement = Measurement::new(conditioning);
         let (restored, pyramid) = self.pre.forward(&measurement);
         let flow = self.flow.forward(&restored, &pyramid, frames);
+        let found = refined(&restored, &measurement.error_sigma, &flow[0], frames);
         let features = normalized(pyramid[0].clone());
         let folded = pixel_unshuffle(restored.clone(), FOLD);
         let window = Frames {
@@ -136,12 +143,13 @@ impl Window {
             count: frames,
         };
         let Fused { states: [earlier, later], merged } =
-            self.fusion.forward(&window, &flow[0], self.state);
+            self.fusion.forward(&window, &found, self.state);
         let image = (folded - MIDDLE) * SCALE;
         EncodedWindow {
             merged_planes: merged.planes(),
             merged: merged.mean,
             restored,
+            paths: Paths::new(&found, frames),
             flow,
             features: vec![features, earlier, later, image],
             sensor: measurement.sensor,
@@ -197,8 +205,10 @@ impl Window {
                 ((bar / (1.0 - bar)).ln() as f32).clamp(-10.0, 10.0)
             })
             .collect();
-        let correction =
+        let (correction, features) =
             self.unet.forward(encoded, step, sensor.clone(), &log_snr, &state.has_previous);
-        WindowPrediction { x0: base + difference + correction * c_out.clone(), c_out }
+        let single = base + difference + correction * c_out.clone();
+        let x0 = self.agreement.forward(single, features, &c_out, &encoded.paths);
+        WindowPrediction { x0, c_out }
     }
 }

@@ -54,7 +54,7 @@ impl WindowConfig {
 }
 
 impl UNet {
-    /// Computes a correction of unit size, `[images, 1, H, W]`.
+    /// Computes a correction of unit size, `[images, 1, H, W]`, and the features that it comes from.
     ///
     /// # Shapes
     /// - sensor: `[images, 11, 1, 1]`
@@ -66,7 +66,7 @@ impl UNet {
         sensor: Tensor<4>,
         log_snr: &[f32],
         has_previous: &[bool],
-    ) -> Tensor<4> {
+    ) -> (Tensor<4>, Tensor<4>) {
         let [count, numbers, ..] = sensor.dims();
         let device = sensor.device();
         let plane = |f: &dyn Fn(usize) -> f32| {
@@ -101,7 +101,7 @@ impl UNet {
             1,
         ));
         inputs.push(encoded.merged_planes().clone());
-        let features = self.hourglass.forward(&inputs, Some(&embedding));
-        self.head.forward(features[0].clone())
+        let [features, ..] = self.hourglass.forward(&inputs, Some(&embedding));
+        (self.head.forward(features.clone()), features)
     }
 }
