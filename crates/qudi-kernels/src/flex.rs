@@ -12,9 +12,10 @@ pub(crate) fn contiguous(tensor: FlexTensor) -> FlexTensor {
     }
 }
 
-/// Returns all values of a contiguous tensor.
+/// Returns all values of a [contiguous] tensor. Its storage may hold more: the first frames of a burst share
+/// the memory of the whole.
 pub(crate) fn values(tensor: &FlexTensor) -> &[f32] {
-    tensor.storage()
+    &tensor.storage()[..tensor.layout().shape().num_elements()]
 }
 
 /// Creates a tensor of `values`.

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_kernels::warp;
+use qudi_kernels::{warp, warp_cubic};
 
 const SIZE: [usize; 2] = [9, 13];
 
@@ -45,6 +45,21 @@ fn warp_by_a_translation_shifts_and_repeats_borders() {
                     "({dx}, {dy}) at {i}: {got}, not {expected}"
                 );
             }
+        }
+    }
+}
+
+/// The first frames of a burst lie in the memory of all: only theirs may be read and written.
+#[test]
+fn the_first_frames_of_a_burst_are_warped_alone() {
+    for device in devices() {
+        let frame = |k: f32| image(|x, y| (0.3 * x + k).sin() + 0.1 * y, &device);
+        let burst = Tensor::cat(vec![frame(0.0), frame(1.0), frame(2.0)], 0);
+        let flow = constant_flow(0.0, 0.0, &device).repeat_dim(0, 2);
+        let first = burst.clone().narrow(0, 0, 2);
+        let expected = values(Tensor::cat(vec![frame(0.0), frame(1.0)], 0));
+        for warped in [warp(first.clone(), flow.clone()), warp_cubic(first, flow)] {
+            assert_eq!(values(warped), expected);
         }
     }
 }

@@ -83,7 +83,7 @@ fn linearized(
 /// differences are worth (Zach et al. 2007, eq. 15).
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma"))]
 fn fit(fixed: &Linearized, flow: &mut [f32]) {
-    const MOST: f32 = LAMBDA * THETA;
+    const MAX_LENGTH: f32 = LAMBDA * THETA;
     let Linearized { gradient: [along_x, along_y], inverse, rest } = fixed;
     let plane = rest.len();
     let (x, y) = flow.split_at_mut(plane);
@@ -91,7 +91,7 @@ fn fit(fixed: &Linearized, flow: &mut [f32]) {
     let (x, inverse) = (&mut x[..plane], &inverse[..plane]);
     for i in 0..plane {
         let difference = rest[i] + (along_x[i] * x[i] + along_y[i] * y[i]);
-        let length = (difference * inverse[i]).clamp(-MOST, MOST);
+        let length = (difference * inverse[i]).clamp(-MAX_LENGTH, MAX_LENGTH);
         x[i] -= length * along_x[i];
         y[i] -= length * along_y[i];
     }

@@ -6,6 +6,8 @@ use crate::uninitialised::fill;
 use burn::tensor::{Int, Tensor};
 #[cfg(feature = "flex")]
 use rayon::prelude::*;
+#[cfg(feature = "flex")]
+use std::ops::Range;
 
 /// Slope of the kernel one pixel away, as in PyTorch.
 const A: f32 = -0.75;
@@ -52,15 +54,28 @@ impl Taps {
     }
 }
 
-/// Calls `visit` with the number of every pixel and its taps along rows and columns; `flow` is
-/// `[2, height, width]`.
+/// Rows of a plane per task.
 #[cfg(feature = "flex")]
-fn visit(flow: &[f32], height: usize, width: usize, mut visit: impl FnMut(usize, Taps, Taps)) {
+const ROWS_PER_TASK: usize = 32;
+
+/// Calls `visit` with the number of every pixel of some rows, counted from the first of them, and its taps
+/// along rows and columns; `flow` is `[2, height, width]`.
+#[cfg(feature = "flex")]
+fn visit(
+    flow: &[f32],
+    rows: Range<usize>,
+    [height, width]: [usize; 2],
+    mut visit: impl FnMut(usize, Taps, Taps),
+) {
     let (x_flow, y_flow) = flow.split_at(height * width);
-    for (at, (dx, dy)) in x_flow.iter().zip(y_flow).enumerate() {
-        let x = Taps::new((at % width) as f32 + dx, width);
-        let y = Taps::new((at / width) as f32 + dy, height);
-        visit(at, x, y);
+    for (row, first) in rows.clone().zip((0..).step_by(width)) {
+        let at = row * width;
+        let displacements = x_flow[at..][..width].iter().zip(&y_flow[at..][..width]);
+        for (column, (dx, dy)) in displacements.enumerate() {
+            let x = Taps::new(column as f32 + dx, width);
+            let y = Taps::new(row as f32 + dy, height);
+            visit(first + column, x, y);
+        }
     }
 }
 
@@ -69,11 +84,17 @@ fn visit(flow: &[f32], height: usize, width: usize, mut visit: impl FnMut(usize,
 pub(crate) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
     let [_, channels, height, width] = shape;
     let plane = height * width;
+    let rows_of = |task: usize| {
+        let first = task * ROWS_PER_TASK;
+        first..(first + ROWS_PER_TASK).min(height)
+    };
     fill(x.len(), |result| {
-        let images = result.par_chunks_mut(channels * plane).zip(x.par_chunks(channels * plane));
-        images.zip(flow.par_chunks(2 * plane)).for_each(|((result, x), flow)| {
-            visit(flow, height, width, |at, columns, rows| {
-                for (result, x) in result.chunks_mut(plane).zip(x.chunks(plane)) {
+        let planes = result.par_chunks_mut(plane).zip(x.par_chunks(plane)).enumerate();
+        planes.for_each(|(number, (result, x))| {
+            let flow = &flow[number / channels * 2 * plane..][..2 * plane];
+            let tasks = result.par_chunks_mut(ROWS_PER_TASK * width).enumerate();
+            tasks.for_each(|(task, result)| {
+                visit(flow, rows_of(task), [height, width], |at, columns, rows| {
                     let row = |row: usize| {
                         let x = &x[row * width..][..width];
                         let values = if columns.inside {
@@ -87,7 +108,7 @@ pub(crate) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
                     };
                     let taps = rows.places.iter().zip(rows.weights);
                     result[at].write(taps.map(|(&place, weight)| row(place) * weight).sum());
-                }
+                });
             });
         });
     })
@@ -101,7 +122,7 @@ pub(super) fn gradient(shape: [usize; 4], flow: &[f32], gradient: &[f32]) -> Vec
     let mut dx = vec![0.0; gradient.len()];
     let images = dx.par_chunks_mut(channels * plane).zip(gradient.par_chunks(channels * plane));
     images.zip(flow.par_chunks(2 * plane)).for_each(|((dx, gradient), flow)| {
-        visit(flow, height, width, |at, columns, rows| {
+        visit(flow, 0..height, [height, width], |at, columns, rows| {
             for (dx, gradient) in dx.chunks_mut(plane).zip(gradient.chunks(plane)) {
                 for (row, weight) in rows.places.iter().zip(rows.weights) {
                     let dx = &mut dx[row * width..][..width];
