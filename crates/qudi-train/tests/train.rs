@@ -18,7 +18,7 @@ use qudi_train::{
 use std::ops::ControlFlow;
 use std::path::Path;
 
-/// Returns the recipe `tiny`, smaller and shorter.
+/// Returns the small diffusion, smaller and shorter.
 fn recipe(changes: &[(&str, &str)]) -> Recipe {
     shortened(include_str!("../../../tests/golden/tiny.toml"), changes)
 }
@@ -351,7 +351,8 @@ fn rejects_bf16_on_devices_without_it() {
 
 #[test]
 fn rejects_wrong_recipes_by_key() {
-    let load = |key: &str, value: &str| Recipe::load("tiny", &[(key.to_owned(), value.to_owned())]);
+    const TINY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/tiny.toml");
+    let load = |key: &str, value: &str| Recipe::load(TINY, &[(key.to_owned(), value.to_owned())]);
     for (key, value, word) in [
         ("train.steps", "0", "train.steps"),
         ("train.lr", "-1", "train.lr"),
