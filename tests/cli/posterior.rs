@@ -81,14 +81,14 @@ fn draws_of_the_built_in_diffusion_spread_about_as_far_as_it_errs() {
     let error = rms_difference(&mean, &truth);
     let draws = [1, 2].map(|seed| restored(&folder, &format!("--steps 10 --seed {seed}")));
     let spread = rms_difference(&draws[0], &draws[1]) / 2f64.sqrt() / error;
-    assert!((0.45..1.2).contains(&spread), "two draws differ by {spread} of the error");
+    assert!((0.4..1.2).contains(&spread), "two draws differ by {spread} of the error");
     let grid = (alternating(&draws[0]) / alternating(&truth)).powi(2);
     assert!(grid < 2.0, "{grid} of the truth's power at the Nyquist frequency");
     let averaged = restored(&folder, "--steps 10 --samples 8 --uncertainty d.npy");
     let sigma = values(&folder.join("d.npy"));
     let inside = (0..truth.len()).filter(|&k| (averaged[k] - truth[k]).abs() <= sigma[k]).count();
     let share = inside as f64 / truth.len() as f64;
-    assert!((0.4..0.76).contains(&share), "{share} of all pixels lie within one sigma");
+    assert!((0.35..0.76).contains(&share), "{share} of all pixels lie within one sigma");
 }
 
 /// Without the noisy image the prediction in the middle of sampling is another one.

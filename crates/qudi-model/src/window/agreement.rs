@@ -13,7 +13,7 @@ use qudi_layers::resample::{
 use qudi_layers::{Bias, Conv2d};
 
 /// Neighbours on either side.
-const REACH: usize = 3;
+const NEIGHBOURS: usize = 3;
 
 /// Planes of an image at half the resolution.
 const IMAGE: usize = FOLD * FOLD;
@@ -44,7 +44,8 @@ pub(super) struct Agreement {
 /// Flow from every frame to the frames around it, on the grid of half the resolution, in its cells.
 #[derive(Clone, Debug)]
 pub(super) struct Paths {
-    /// Flow by `distance - 1` and direction, to later frames first: `[bursts * (frames - distance), 2, h, w]`.
+    /// Flow by `distance - 1` and direction, to later frames first:
+    /// `[bursts * (frames - distance), 2, h, w]`.
     flows: Vec<[Tensor<4>; 2]>,
     frames: usize,
 }
@@ -61,8 +62,8 @@ impl Paths {
         let part = |x: &Tensor<5>, first: usize, count: usize| {
             x.clone().narrow(1, first, count).reshape([bursts * count, 2, h, w])
         };
-        let mut flows: Vec<[Tensor<4>; 2]> = Vec::with_capacity(REACH);
-        for distance in 1..=REACH.min(frames - 1) {
+        let mut flows: Vec<[Tensor<4>; 2]> = Vec::with_capacity(NEIGHBOURS);
+        for distance in 1..=NEIGHBOURS.min(frames - 1) {
             let count = frames - distance;
             let [later, earlier] = &near;
             // First to the neighbour, from there on as the neighbour's flow says.
@@ -95,7 +96,7 @@ impl Paths {
 /// Merges every frame with its neighbours as the formula weights them, without a network.
 ///
 /// # Shapes
-/// As those of [`Agreement::forward`].
+/// As for [`Agreement::forward`].
 pub(super) fn merged(images: Tensor<4>, sigma: &Tensor<4>, paths: &Paths) -> Tensor<4> {
     merge(images, sigma, paths, |difference, _| {
         let [count, _, h, w] = difference.dims();
@@ -258,7 +259,7 @@ mod tests {
     fn paths_are_followed_from_frame_to_frame() {
         let (_, flow) = moving(1.0);
         let paths = Paths::new(&flow, FRAMES);
-        assert_eq!(paths.flows.len(), REACH);
+        assert_eq!(paths.flows.len(), NEIGHBOURS);
         for ([later, earlier], distance) in paths.flows.iter().zip(1u8..) {
             let most = 0.5 * f32::from(distance);
             for (flow, expected) in [(later, most), (earlier, -most)] {

@@ -11,7 +11,7 @@ use qudi_layers::resample::{avg_pool2, upsample2};
 const LEVELS: usize = 4;
 
 /// The smallest side of a level, in cells.
-const SMALLEST: usize = 8;
+const SMALLEST_SIDE: usize = 8;
 
 /// Sigma of the errors of pre-denoised frames, in [0, 1], over the usual sigma of fused frames, in [-1, 1].
 const ERROR: f32 = 0.9;
@@ -39,7 +39,7 @@ pub(super) fn refined(
     while images.len() < LEVELS {
         let finer = &images[images.len() - 1];
         let [.., h, w] = finer.dims();
-        if h.min(w) < 2 * SMALLEST || !h.is_multiple_of(2) || !w.is_multiple_of(2) {
+        if h.min(w) < 2 * SMALLEST_SIDE || !h.is_multiple_of(2) || !w.is_multiple_of(2) {
             break;
         }
         images.push(avg_pool2(finer.clone()));
