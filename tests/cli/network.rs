@@ -239,7 +239,7 @@ fn processor_passes_selftest() {
     let only = "selftest --device cpu --only arithmetic,warp,regression";
     let output = qudi(&folder).args(only.split(' ')).output().unwrap();
     assert!(output.status.success());
-    assert_eq!(String::from_utf8_lossy(&output.stdout).matches(" ok\n").count(), 3);
+    assert_eq!(String::from_utf8_lossy(&output.stdout).matches(" ok\n").count(), 4);
     refused(&folder, "selftest --only nothing", &["--only"]);
 }
 
