@@ -59,7 +59,9 @@ fn the_first_frames_of_a_burst_are_warped_alone() {
         let first = burst.clone().narrow(0, 0, 2);
         let expected = values(Tensor::cat(vec![frame(0.0), frame(1.0)], 0));
         for warped in [warp(first.clone(), flow.clone()), warp_cubic(first, flow)] {
-            assert_eq!(values(warped), expected);
+            let got = values(warped);
+            assert_eq!(got.len(), expected.len());
+            assert!(got.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-5), "{got:?}");
         }
     }
 }
