@@ -3,9 +3,10 @@
     python scripts/compare/training_speed.py --qudi target/release/qudi --pack pack.zip
     python scripts/compare/training_speed.py --qudi ... --pack ... --device libtorch:0 --torch cuda --batch 64
 
-Needs PyTorch. PyTorch's network refines no flow and merges no predictions; the program does both. Both sides take whole steps in bfloat16: forward, losses, backward, an optimizer with momentum
-and Muon's products. PyTorch's samples are noise that lies ready; the program draws its own. Prints samples a
-second of every round, medians, and the ratio of times (below 1: the program is faster).
+Needs PyTorch. PyTorch's network refines no flow and merges no predictions; the program does both. Both sides
+take whole steps in bfloat16: forward, losses, backward, an optimizer with momentum and Muon's products.
+PyTorch's samples are noise that lies ready; the program draws its own. Prints samples a second of every
+round, medians, and the ratio of times (below 1: the program is faster).
 """
 
 import argparse

@@ -2,8 +2,8 @@
 //!
 //! Pre-denoiser, flow and fusion see the captured counts alone and run once a window; the U-Net and the merge
 //! of its predictions run in every reverse step. All networks are wide plain convolutions at half the
-//! resolution and below. The paper's order,
-//! with everything in every step, is [`diffusion`](crate::diffusion).
+//! resolution and below. The paper's order, with everything in every step, is
+//! [`diffusion`](crate::diffusion).
 
 mod agreement;
 mod config;

@@ -1,7 +1,7 @@
 //! Merging of predicted frames: each with its nearest neighbours along the flow, as far as they agree. What a
 //! frame's prediction gets wrong, its neighbours often do not.
 
-use super::config::FOLD;
+use super::config::{FOLD, IMAGE};
 use super::flow::WindowFlow;
 use burn::module::Module;
 use burn::tensor::activation::relu;
@@ -14,9 +14,6 @@ use qudi_layers::{Bias, Conv2d};
 
 /// Neighbours on either side.
 const NEIGHBOURS: usize = 3;
-
-/// Planes of an image at half the resolution.
-const IMAGE: usize = FOLD * FOLD;
 
 /// Channels between the convolutions.
 const HIDDEN: usize = 32;

@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 /// Pixels of a side that become channels before the network and pixels again after it.
 pub(super) const FOLD: usize = 2;
 
+/// Planes of an image at half the resolution.
+pub(super) const IMAGE: usize = FOLD * FOLD;
+
 /// Levels of the pyramids: half, a quarter and an eighth of the resolution.
 pub(super) const LEVELS: usize = 3;
 

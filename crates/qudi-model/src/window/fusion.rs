@@ -1,6 +1,6 @@
 //! Temporal fusion: recurrent states that run through the window, backward first, then forward.
 
-use super::config::WindowConfig;
+use super::config::{IMAGE, WindowConfig};
 use super::flow::WindowFlow;
 use super::hourglass::normalized;
 use super::input::MIDDLE;
@@ -10,9 +10,6 @@ use burn::tensor::{Device, Tensor};
 use qudi_kernels::{StackParameters, frames, warp};
 use qudi_layers::ResidualStack;
 use qudi_layers::resample::upsample2;
-
-/// Planes of the pre-denoised frames and of the linear estimate at half the resolution.
-const IMAGES: usize = 4;
 
 /// Scale of frames around the middle level, and of a frame's difference from its linear estimate.
 const SCALE: f32 = 3.0;
@@ -45,7 +42,7 @@ pub(super) struct Frames<'a> {
 
 impl WindowConfig {
     pub(super) fn init_fusion(&self, device: &Device) -> Fusion {
-        let inputs = self.widths[0] + self.state + 4 * IMAGES + MERGED;
+        let inputs = self.widths[0] + self.state + 4 * IMAGE + MERGED;
         let cell = |inputs| ResidualStack::zeros([inputs, self.state], self.cell_blocks, device);
         Fusion {
             backward: cell(inputs),
@@ -110,8 +107,8 @@ impl Fusion {
                     Merged::single(linear[frame].clone()),
                 ),
             };
-            let restored = own.clone().narrow(1, 0, IMAGES);
-            let noise = (own.narrow(1, IMAGES, IMAGES) - restored.clone()) * SCALE;
+            let restored = own.clone().narrow(1, 0, IMAGE);
+            let noise = (own.narrow(1, IMAGE, IMAGE) - restored.clone()) * SCALE;
             let images = vec![(restored - MIDDLE) * SCALE, noise, difference];
             let mut inputs = vec![features[frame].clone(), hidden, Tensor::cat(images, 1)];
             inputs.extend(more.cloned());

@@ -1,7 +1,7 @@
 //! Merging: the mean of linear estimates along the flow, at full resolution. A recurrent state can hold it no
 //! better, and has to learn to.
 
-use super::config::FOLD;
+use super::config::{FOLD, IMAGE};
 use super::input::MIDDLE;
 use burn::module::Module;
 use burn::tensor::activation::sigmoid;
@@ -9,9 +9,6 @@ use burn::tensor::{Device, Tensor};
 use qudi_kernels::{StackParameters, warp, warp_cubic};
 use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
 use qudi_layers::{Bias, Conv2d};
-
-/// Planes of an image at half the resolution.
-const IMAGE: usize = FOLD * FOLD;
 
 /// Channels between the convolutions of the gate.
 const HIDDEN: usize = 32;

@@ -1,7 +1,7 @@
 //! The U-Net of a reverse step: fused features, the noisy image and the estimate so far in, the clean image
 //! out.
 
-use super::config::{FOLD, WindowConfig};
+use super::config::{FOLD, IMAGE, WindowConfig};
 use super::hourglass::{Hourglass, ImageHead};
 use super::merging::MERGED;
 use super::network::EncodedWindow;
@@ -18,9 +18,6 @@ const STEP_NUMBERS: usize = 6;
 
 /// Channels of the embedding between its layers, and of its result.
 const EMBEDDING: [usize; 2] = [64, 16];
-
-/// Planes of an image at half the resolution.
-const IMAGE: usize = FOLD * FOLD;
 
 /// The U-Net.
 #[derive(Module, Debug)]
