@@ -125,7 +125,8 @@ fn clips_of_one_stem_keep_names_of_their_own() {
 #[test]
 fn rejects_flags_of_another_method() {
     let folder = prepared("safety-flags");
-    for flag in ["--steps 3", "--tile 64", "--samples 2", "--device cpu", "--spacing linear"] {
+    let flags = ["--tile 64", "--samples 2", "--passes 2", "--device cpu", "--spacing linear"];
+    for flag in ["--steps 3"].into_iter().chain(flags) {
         let name = flag.split(' ').next().unwrap();
         let whose = match name {
             "--tile" | "--device" => "is for networks",
@@ -137,6 +138,7 @@ fn rejects_flags_of_another_method() {
         refused(&folder, &format!("bench --size 16x16 --method average {flag}"), &expected);
     }
     refused(&folder, "restore b.npy -o o --device cpu --samples 2", &["--method qudi-diffusion"]);
+    refused(&folder, "restore b.npy -o o --method qudi-diffusion --passes 0", &["from 1 to 10"]);
     refused(&folder, "restore b.npy -o o --method mle --seed 3", &["--seed is for method qudi"]);
     refused(
         &folder,

@@ -191,13 +191,16 @@ fn rejects_short_bursts_and_impossible_options() {
         SampleOptions { steps: 0, ..quick() },
         SampleOptions { steps: 1001, ..quick() },
         SampleOptions { samples: 0, ..quick() },
+        SampleOptions { passes: 0, ..quick() },
+        SampleOptions { passes: 2, ..quick() },
         SampleOptions { tile: 8, ..quick() },
     ] {
         let model = Model { network: config().init(1, &device), config: config(), window: 11 };
         let error = DiffusionRestorer::new(model, options, &device).unwrap_err();
         let field = error.place().unwrap();
         assert!(
-            ["steps", "samples", "tile"].contains(&field.as_str()) && error.help().is_some(),
+            ["steps", "samples", "passes", "tile"].contains(&field.as_str())
+                && error.help().is_some(),
             "{error}"
         );
     }

@@ -45,7 +45,7 @@ fn state(frames: usize, timestep: usize, device: &Device) -> DiffusionState {
 
 fn predicted(network: &Window, conditioning: &Conditioning, state: &DiffusionState) -> Vec<f32> {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    read(network.predict(&network.encode(conditioning), state, &schedule).x0).unwrap()
+    read(network.predict(&network.encode(conditioning, 1), state, &schedule).x0).unwrap()
 }
 
 #[test]
@@ -59,6 +59,22 @@ fn the_first_step_does_not_depend_on_the_noise_and_later_ones_do() {
     let (one, other) = (predict(50), predict(50));
     let difference = one.iter().zip(&other).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert!(difference > 0.01, "{difference}");
+}
+
+/// Passes find other flow, and with it another picture.
+#[test]
+fn a_second_pass_changes_what_frames_are_fused_along() {
+    let device = Device::flex();
+    let network = CONFIG.init(1, &device);
+    let conditioning = conditioning(3, &device);
+    let state = state(3, NUM_TIMESTEPS - 1, &device);
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+    let [one, two] = [1, 2].map(|passes| {
+        let encoded = network.encode(&conditioning, passes);
+        read(network.predict(&encoded, &state, &schedule).x0).unwrap()
+    });
+    assert!(two.iter().all(|value| value.is_finite()));
+    assert_ne!(one, two);
 }
 
 /// With little noise, the noisy image is the answer.
@@ -82,7 +98,7 @@ fn every_parameter_has_a_gradient() {
     let network = CONFIG.init(1, &device);
     let conditioning = conditioning(4, &device);
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    let encoded = network.encode(&conditioning);
+    let encoded = network.encode(&conditioning, 1);
     let mut state = state(4, 60, &device);
     state.has_previous = vec![true];
     let x0 = network.predict(&encoded, &state, &schedule).x0;

@@ -35,7 +35,7 @@ def folder(tmp_path_factory):
     ("name", "options"),
     [
         ("burst.npy", {}),
-        ("burst.npy", {"method": "qudi-diffusion", "steps": 2, "samples": 2, "seed": 7}),
+        ("burst.npy", {"method": "qudi-diffusion", "steps": 2, "samples": 2, "passes": 2, "seed": 7}),
         ("burst.npy", {"method": "qbp", "ppp": 4.0, "every": 3, "tonemap": "srgb"}),
         ("bits.npy", {"sum": 7, "method": "qbp", "crop": "8:56,0:64"}),
         ("bits.npy", {"sensor": "spad512s", "sum": 14, "method": "mle", "mask": "none"}),

@@ -345,12 +345,13 @@ fn window(device: &Device) -> Result<Vec<Vec<f32>>> {
     let config = WindowConfig { widths: [16; 3], flow: [8; 3], state: 16, cell_blocks: 1 };
     let network = config.init(1, &device);
     let image = |seed| image(seed, &device);
-    let encoded = network.encode(&Conditioning {
+    let conditioning = Conditioning {
         counts: image(29) * 0.5,
         linear_estimate: image(30),
         sensor: values(31, [1, SENSOR_NUMBERS], &device),
         frames: 4,
-    });
+    };
+    let encoded = network.encode(&conditioning, 1);
     let x_t = values(32, [4, 1, 32, 48], &device).require_grad();
     let x0_prev = values(33, [4, 1, 32, 48], &device);
     let (has_previous, timesteps) = (vec![true], vec![300]);

@@ -60,10 +60,14 @@ impl OwnNetwork {
 
     /// Returns how frames are made, in words.
     pub(crate) fn mode(&self, options: &NetworkOptions) -> String {
+        let passes = match options.passes {
+            1 => String::new(),
+            passes => format!(" and {passes} passes"),
+        };
         match (self.kind, self.sampling(options).steps) {
             (NetworkKind::Regression, _) => "regression".to_owned(),
-            (_, 1) => "diffusion in 1 step".to_owned(),
-            (_, steps) => format!("diffusion in {steps} steps"),
+            (_, 1) => format!("diffusion in 1 step{passes}"),
+            (_, steps) => format!("diffusion in {steps} steps{passes}"),
         }
     }
 
@@ -95,6 +99,9 @@ impl OwnNetwork {
             settings["spacing"] = json!(sampling.spacing);
             settings["sampler"] = json!(options.sampler_name());
             settings["samples"] = json!(options.samples);
+            if options.passes > 1 {
+                settings["passes"] = json!(options.passes);
+            }
         }
         Ok(settings)
     }
@@ -150,8 +157,8 @@ fn sample_options(
     precision: ComputePrecision,
 ) -> SampleOptions {
     let Sampling { steps, spacing } = own.sampling(options);
-    let NetworkOptions { sampler, samples, tile, .. } = *options;
-    SampleOptions { steps, spacing, sampler, samples, tile, precision }
+    let NetworkOptions { sampler, passes, samples, tile, .. } = *options;
+    SampleOptions { steps, spacing, sampler, passes, samples, tile, precision }
 }
 
 /// Returns the error of a device that failed, with what to do; `problem` is the device's own message.

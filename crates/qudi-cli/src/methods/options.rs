@@ -27,6 +27,8 @@ pub(crate) struct NetworkOptions {
     pub(crate) spacing: Option<TimestepSpacing>,
     /// The sampler.
     pub(crate) sampler: Sampler,
+    /// Passes of encoding.
+    pub(crate) passes: usize,
     /// The number of samples.
     pub(crate) samples: usize,
     /// The device to compute on.

@@ -16,6 +16,9 @@ pub trait Denoiser: Debug {
     /// Flows that a step leaves to the next one.
     type Flows: Clone + Debug;
 
+    /// True if more passes of encoding than one are of use.
+    const ENCODES_IN_PASSES: bool;
+
     /// Returns the number that height and width of the frames are multiples of.
     fn multiple(config: &Self::Config) -> usize;
 
@@ -25,8 +28,8 @@ pub trait Denoiser: Debug {
     /// Returns true if the network uses this part of the method.
     fn uses(&self, part: Part) -> bool;
 
-    /// Encodes everything that does not depend on the step.
-    fn encode(&self, conditioning: &Conditioning) -> Self::Encoded;
+    /// Encodes everything that does not depend on the step, in so many passes.
+    fn encode(&self, conditioning: &Conditioning, passes: usize) -> Self::Encoded;
 
     /// Returns the memory of the encoding, in bytes.
     fn encoded_bytes(encoded: &Self::Encoded) -> usize;
@@ -46,6 +49,8 @@ impl Denoiser for Diffusion {
     type Encoded = Encoded;
     type Flows = Flows;
 
+    const ENCODES_IN_PASSES: bool = false;
+
     fn multiple(config: &DiffusionConfig) -> usize {
         config.multiple()
     }
@@ -58,7 +63,7 @@ impl Denoiser for Diffusion {
         !self.ablation().removes(part)
     }
 
-    fn encode(&self, conditioning: &Conditioning) -> Encoded {
+    fn encode(&self, conditioning: &Conditioning, _: usize) -> Encoded {
         Self::encode(self, conditioning)
     }
 

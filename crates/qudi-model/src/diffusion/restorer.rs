@@ -38,6 +38,9 @@ pub struct SampleOptions {
     pub spacing: TimestepSpacing,
     /// Sampler.
     pub sampler: Sampler,
+    /// Passes of encoding: each one after the first finds the flow between the frames that the one before
+    /// predicts.
+    pub passes: usize,
     /// Samples drawn. Their mean is the result, their standard deviation its uncertainty.
     pub samples: usize,
     /// Side of the tiles that the network sees, in pixels.
@@ -52,6 +55,7 @@ impl Default for SampleOptions {
             steps: 1,
             spacing: TimestepSpacing::default(),
             sampler: Sampler::Ddim,
+            passes: 1,
             samples: 1,
             tile: TILE,
             precision: ComputePrecision::F32,
@@ -106,6 +110,11 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         }
         if options.samples == 0 {
             return Err(Error::request("no samples at all", "samples", "draw at least 1"));
+        }
+        if options.passes == 0 || (options.passes > 1 && !N::ENCODES_IN_PASSES) {
+            let what = format!("{} passes of a network that encodes in one", options.passes);
+            let help = "use 1, or weights of `qudi train window`";
+            return Err(Error::request(what, "passes", help));
         }
         let Model { network, config, window } = model;
         check_tile(options.tile, N::multiple(&config))?;
@@ -250,12 +259,13 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         if let Some(encoded) = &kept.batches[batch] {
             return encoded.clone();
         }
-        let encoded = self.network.encode(&Conditioning {
+        let conditioning = Conditioning {
             counts: self.tiles(window, batch, &window.counts.y),
             linear_estimate: self.tiles(window, batch, &window.counts.u),
             sensor: window.sensor.clone().repeat_dim(0, window.batches[batch].len()),
             frames: window.frames,
-        });
+        };
+        let encoded = self.network.encode(&conditioning, self.options.passes);
         let bytes = kept.bytes + N::encoded_bytes(&encoded);
         let used_again = self.options.steps * self.options.samples > 1;
         if used_again && (bytes <= MAX_KEPT_BYTES || window.batches.len() == 1) {
@@ -341,7 +351,7 @@ mod tests {
         let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
         let network: Window = config().init(1, &device);
         let model = Model { network, config: config(), window: 11 };
-        let options = SampleOptions { steps: 3, tile: 32, ..SampleOptions::default() };
+        let options = SampleOptions { steps: 3, passes: 2, tile: 32, ..SampleOptions::default() };
         let mut restorer =
             DiffusionRestorer::new(model, options, &device).unwrap_or_else(|e| panic!("{e}"));
         restorer.batch_pixels = batch_pixels;

@@ -12,6 +12,8 @@ impl Denoiser for Window {
     type Encoded = EncodedWindow;
     type Flows = ();
 
+    const ENCODES_IN_PASSES: bool = true;
+
     fn multiple(config: &WindowConfig) -> usize {
         config.multiple()
     }
@@ -24,8 +26,8 @@ impl Denoiser for Window {
         part != Part::ForwardModel
     }
 
-    fn encode(&self, conditioning: &Conditioning) -> EncodedWindow {
-        Self::encode(self, conditioning)
+    fn encode(&self, conditioning: &Conditioning, passes: usize) -> EncodedWindow {
+        Self::encode(self, conditioning, passes)
     }
 
     fn encoded_bytes(encoded: &EncodedWindow) -> usize {

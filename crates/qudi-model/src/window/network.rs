@@ -8,7 +8,7 @@ use super::hourglass::normalized;
 use super::initial::initial_values;
 use super::input::{MIDDLE, Measurement};
 use super::predenoiser::PreDenoiser;
-use super::refinement::refined;
+use super::refinement::{flow_between, refined};
 use super::unet::{StepImages, UNet};
 use crate::diffusion::Conditioning;
 use crate::diffusion::schedule::NoiseSchedule;
@@ -126,35 +126,59 @@ impl EncodedWindow {
 }
 
 impl Window {
-    /// Encodes a window.
-    pub fn encode(&self, conditioning: &Conditioning) -> EncodedWindow {
+    /// Encodes a window. Every pass after the first one finds the flow anew, between the clean frames that the
+    /// pass before predicts, and fuses the frames along it.
+    pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> EncodedWindow {
         let frames = conditioning.frames;
         let measurement = Measurement::new(conditioning);
         let (restored, pyramid) = self.pre.forward(&measurement);
-        let flow = self.flow.forward(&restored, &pyramid, frames);
-        let found = refined(&restored, &measurement.error_sigma, &flow[0], frames);
+        let learnt = self.flow.forward(&restored, &pyramid, frames);
         let features = normalized(pyramid[0].clone());
         let folded = pixel_unshuffle(restored.clone(), FOLD);
-        let window = Frames {
-            whole: [&restored, &conditioning.linear_estimate],
-            restored: &folded,
-            linear: &measurement.linear,
-            features: &features,
-            count: frames,
+        let fused = |found: &WindowFlow| {
+            let window = Frames {
+                whole: [&restored, &conditioning.linear_estimate],
+                restored: &folded,
+                linear: &measurement.linear,
+                features: &features,
+                count: frames,
+            };
+            let Fused { states: [earlier, later], merged } =
+                self.fusion.forward(&window, found, self.state);
+            let image = (folded.clone() - MIDDLE) * SCALE;
+            EncodedWindow {
+                merged_planes: merged.planes(),
+                merged: merged.mean,
+                restored: restored.clone(),
+                paths: Paths::new(found, frames),
+                flow: learnt.clone(),
+                features: vec![features.clone(), earlier, later, image],
+                sensor: measurement.sensor.clone(),
+                error_sigma: measurement.error_sigma.clone(),
+            }
         };
-        let Fused { states: [earlier, later], merged } =
-            self.fusion.forward(&window, &found, self.state);
-        let image = (folded - MIDDLE) * SCALE;
-        EncodedWindow {
-            merged_planes: merged.planes(),
-            merged: merged.mean,
-            restored,
-            paths: Paths::new(&found, frames),
-            flow,
-            features: vec![features, earlier, later, image],
-            sensor: measurement.sensor,
-            error_sigma: measurement.error_sigma,
+        let mut found = refined(&restored, &measurement.error_sigma, &learnt[0], frames);
+        let mut encoded = fused(&found);
+        for _ in 1..passes {
+            let clean = self.posterior_mean(&encoded, frames);
+            found = flow_between(clean, &found, frames);
+            encoded = fused(&found);
         }
+        encoded
+    }
+
+    /// Predicts the clean frames in image units from the measurement alone.
+    fn posterior_mean(&self, encoded: &EncodedWindow, frames: usize) -> Tensor<4> {
+        let restored = &encoded.restored;
+        let bursts = restored.dims()[0] / frames;
+        let state = DiffusionState {
+            x_t: restored.zeros_like(),
+            x0_prev: restored.zeros_like(),
+            has_previous: vec![false; bursts],
+            timesteps: vec![NUM_TIMESTEPS - 1; bursts],
+        };
+        let prediction = self.predict(encoded, &state, &NoiseSchedule::cosine(NUM_TIMESTEPS));
+        (prediction.x0 + 1.0) * 0.5
     }
 
     /// Predicts the clean frames from an encoded window and the noisy image.

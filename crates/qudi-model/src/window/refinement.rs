@@ -1,5 +1,5 @@
 //! Refinement of the flow, without learning: TV-L1 between pre-denoised frames that are merged along the flow
-//! so far. In single frames, noise hides fractions of a pixel.
+//! so far, or between predicted frames. In single frames, noise hides fractions of a pixel.
 
 use super::agreement::{Paths, merged};
 use super::flow::{WindowFlow, pairs};
@@ -34,9 +34,31 @@ pub(super) fn refined(
         return WindowFlow { pairs: Tensor::from_inner(refined.pairs), ..refined };
     }
     let merged = merged(restored.clone(), &(sigma.clone() * ERROR), &Paths::new(flow, frames));
-    let mut images = vec![avg_pool2(merged)];
-    let mut start = flow.pairs.clone();
-    while images.len() < LEVELS {
+    let pairs = from_coarse_to_fine(avg_pool2(merged), flow.pairs.clone(), frames, LEVELS);
+    WindowFlow { pairs, ..*flow }
+}
+
+/// Finds the flow between predicted frames, from `flow` at half the resolution on. They hold fine detail, so
+/// that the search ends at the whole resolution.
+///
+/// # Shapes
+/// - images: `[bursts * frames, 1, H, W]` in image units
+pub(super) fn flow_between(images: Tensor<4>, flow: &WindowFlow, frames: usize) -> WindowFlow {
+    let start = upsample2(flow.pairs.clone()) * 2.0;
+    let found = from_coarse_to_fine(images, start, frames, LEVELS + 1);
+    WindowFlow { pairs: avg_pool2(found) * 0.5, ..*flow }
+}
+
+/// Finds the flow of every pair on a pyramid of at most `levels` levels. `start` and the result lie on the
+/// grid of the images, in its cells.
+fn from_coarse_to_fine(
+    images: Tensor<4>,
+    mut start: Tensor<4>,
+    frames: usize,
+    levels: usize,
+) -> Tensor<4> {
+    let mut images = vec![images];
+    while images.len() < levels {
         let finer = &images[images.len() - 1];
         let [.., h, w] = finer.dims();
         if h.min(w) < 2 * SMALLEST_SIDE || !h.is_multiple_of(2) || !w.is_multiple_of(2) {
@@ -53,7 +75,7 @@ pub(super) fn refined(
             found = upsample2(found) * 2.0;
         }
     }
-    WindowFlow { pairs: found, ..*flow }
+    found
 }
 
 #[cfg(test)]
@@ -85,14 +107,18 @@ mod tests {
         let start = |x| Tensor::cat(vec![plane(x), plane(0.1)], 1);
         let pairs = Tensor::cat(vec![start(0.4), start(-0.4)], 0);
         let sigma = Tensor::full([FRAMES, 1, 1, 1], 0.1, &device);
-        let found = refined(&frames, &sigma, &WindowFlow { pairs, scale: 2 }, FRAMES);
-        let middle = found.pairs.narrow(2, 8, 16).narrow(3, 8, 16);
-        for (first, expected) in [(0, 0.65), (FRAMES - 1, -0.65)] {
-            let of_direction = middle.clone().narrow(0, first, FRAMES - 1);
-            for (axis, expected) in [(0, expected), (1, 0.0)] {
-                let error = of_direction.clone().narrow(1, axis, 1) - expected;
-                let error = error.abs().mean().into_scalar::<f32>();
-                assert!(error < 0.12, "axis {axis}: {error} cells from {expected}");
+        let start = WindowFlow { pairs, scale: 2 };
+        let refined = refined(&frames, &sigma, &start, FRAMES);
+        let between = flow_between(frames, &start, FRAMES);
+        for (found, most) in [(refined, 0.12), (between, 0.2)] {
+            let middle = found.pairs.narrow(2, 8, 16).narrow(3, 8, 16);
+            for (first, expected) in [(0, 0.65), (FRAMES - 1, -0.65)] {
+                let of_direction = middle.clone().narrow(0, first, FRAMES - 1);
+                for (axis, expected) in [(0, expected), (1, 0.0)] {
+                    let error = of_direction.clone().narrow(1, axis, 1) - expected;
+                    let error = error.abs().mean().into_scalar::<f32>();
+                    assert!(error < most, "axis {axis}: {error} cells from {expected}");
+                }
             }
         }
     }
