@@ -126,8 +126,8 @@ impl EncodedWindow {
 }
 
 impl Window {
-    /// Encodes a window. Every pass after the first one finds the flow anew, between the clean frames that the
-    /// pass before predicts, and fuses the frames along it.
+    /// Encodes a window. Every pass after the first one finds the flow anew, between the clean frames that
+    /// the pass before predicts, and fuses the frames along it.
     pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> EncodedWindow {
         let frames = conditioning.frames;
         let measurement = Measurement::new(conditioning);
