@@ -24,6 +24,7 @@ mod tests;
 #[cfg(feature = "libtorch")]
 mod torch;
 #[cfg(feature = "flex")]
+mod transposition;
 mod unit;
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 mod vectors;

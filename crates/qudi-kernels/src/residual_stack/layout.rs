@@ -3,9 +3,14 @@
 
 use super::buffer::Buffer;
 use super::grid::{Grid, TILE};
+use super::transposition::transposed;
 use crate::conv::upper;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
+use std::ops::Range;
+
+/// Rows of an image that one thread converts at once.
+const BAND_ROWS: usize = 16;
 
 /// Channels of a block: one row of a tile.
 pub(super) const CHANNELS: usize = 32;
@@ -68,12 +73,15 @@ impl Line {
         }
         let pixels = grid.height * grid.width;
         let to = Shared(line.values.as_mut_ptr());
-        (0..grid.images).into_par_iter().for_each(|image| {
+        let bands = grid.height.div_ceil(BAND_ROWS);
+        (0..grid.images * bands).into_par_iter().for_each(|task| {
+            let (image, first) = (task / bands, task % bands * BAND_ROWS);
+            let rows = first..grid.height.min(first + BAND_ROWS);
             let planes = inputs.iter().flat_map(|&(values, count)| {
                 (0..count).map(move |c| &values[(image * count + c) * pixels..][..pixels])
             });
             let planes: Vec<&[f32]> = planes.collect();
-            Arch::new().dispatch(Join { grid, image, planes: &planes, channels, to });
+            Arch::new().dispatch(Join { grid, image, rows, planes: &planes, channels, to });
         });
         line
     }
@@ -81,31 +89,21 @@ impl Line {
     /// Writes `count` channels from `first` on as planes, `[images, count, height, width]`.
     pub(super) fn write_planes(&self, grid: &Grid, first: usize, count: usize, to: &mut [f32]) {
         let pixels = grid.height * grid.width;
-        to.par_chunks_exact_mut(count * pixels).enumerate().for_each(|(image, planes)| {
-            Arch::new().dispatch(Separate { grid, image, line: self, first, count, planes });
+        // Parts of whole tiles of channels, if that is possible.
+        let part = if count.is_multiple_of(TILE) { TILE } else { count };
+        let parts = count / part;
+        to.par_chunks_exact_mut(part * pixels).enumerate().for_each(|(number, planes)| {
+            let (image, first) = (number / parts, first + number % parts * part);
+            Arch::new().dispatch(Separate { grid, image, line: self, first, count: part, planes });
         });
     }
 }
 
-/// Sixteen pixels of sixteen channels, or of as many pairs.
-pub(super) type Tile = [[u32; TILE]; TILE];
-
-/// Swaps rows and columns.
-#[inline(always)]
-pub(super) fn transposed(tile: &Tile) -> Tile {
-    let mut result = [[0; TILE]; TILE];
-    for (row, values) in tile.iter().enumerate() {
-        for (column, &value) in values.iter().enumerate() {
-            result[column][row] = value;
-        }
-    }
-    result
-}
-
-/// Writes the planes of an image to a line.
+/// Writes rows of the planes of an image to a line.
 struct Join<'a> {
     grid: &'a Grid,
     image: usize,
+    rows: Range<usize>,
     planes: &'a [&'a [f32]],
     channels: usize,
     to: Shared<u16>,
@@ -116,9 +114,9 @@ impl WithSimd for Join<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
-        let Self { grid, image, planes, channels, to } = self;
+        let Self { grid, image, rows, planes, channels, to } = self;
         for (block, planes) in planes.chunks(CHANNELS).enumerate() {
-            for row in 0..grid.height {
+            for row in rows.clone() {
                 for column in (0..grid.width).step_by(TILE) {
                     let count = TILE.min(grid.width - column);
                     let at = row * grid.width + column;
@@ -137,7 +135,7 @@ impl WithSimd for Join<'_> {
                     let place = grid.row(image, row) + column;
                     for (k, pixel) in pixels.iter().enumerate().take(count) {
                         let at = to.at((place + k) * channels + block * CHANNELS);
-                        // SAFETY: a pixel's channels, which no other image has; the line is long enough.
+                        // SAFETY: a pixel's channels, which no other thread writes; the line is long enough.
                         unsafe { at.cast::<[u32; TILE]>().write_unaligned(*pixel) };
                     }
                 }

@@ -3,7 +3,8 @@
 
 use super::buffer::Buffer;
 use super::grid::{BLOCK, Grid, TILE};
-use super::layout::{CHANNELS, Line, Shared, narrow, transposed, widen};
+use super::layout::{CHANNELS, Line, Shared, narrow, widen};
+use super::transposition::transposed;
 use super::weights::{TAPS, TILE_VALUES, Tiles};
 use rayon::prelude::*;
 
