@@ -33,6 +33,7 @@ fn weights(path: &Path, value: f32) {
         preset: Some("tiny".into()),
         network,
         window: 11,
+        passes: 1,
         provenance: Provenance {
             program: "qudi test".into(),
             sensors: vec!["qudi-paper".into()],
@@ -65,6 +66,12 @@ fn restores_a_burst_and_resumes() {
     assert_eq!(frames("whole"), frames("parts"));
     // Other weights or steps are another result: the folder refuses to mix them.
     refused(&folder, &format!("{common} -o whole --steps 3").replace("--steps 2 ", ""), &["whole"]);
+    // Nothing taught these weights to see what a pass before restored.
+    refused(
+        &folder,
+        &format!("{common} -o two.npy --passes 2"),
+        &["2 passes of a network that has learnt one", "where: --passes", "train.passes"],
+    );
     run("info w.safetensors");
     run(&format!("{common} -o s.npy --samples 2 --uncertainty d.npy --sampler ancestral"));
     let header = std::fs::read(folder.join("d.npy")).unwrap();

@@ -167,14 +167,14 @@ fn method(number: usize) -> Result<Box<dyn Restorer>> {
         let file = weights.join("diffusion.safetensors");
         let (network, description) = load::<Window>(&file, &device)?;
         let NetworkConfig::Window(config) = description.network else { return Err(other()) };
-        let model = Model { network, config, window: description.window };
+        let model = Model { network, config, window: description.window, passes: 1 };
         let options = SampleOptions { precision, ..SampleOptions::default() };
         return Ok(Box::new(DiffusionRestorer::new(model, options, &device)?));
     }
     let file = weights.join("regression.safetensors");
     let (network, description) = load::<Regression>(&file, &device)?;
     let NetworkConfig::Regression(config) = description.network else { return Err(other()) };
-    let model = Model { network, config, window: description.window };
+    let model = Model { network, config, window: description.window, passes: 1 };
     Ok(Box::new(RegressionRestorer::new(model, 512, precision, &device)?))
 }
 

@@ -14,6 +14,8 @@ pub struct Model<N, C> {
     pub config: C,
     /// The usual number of frames of a window.
     pub window: usize,
+    /// Passes of encoding that the network has learnt.
+    pub passes: usize,
 }
 
 /// Refuses bursts that are too short.

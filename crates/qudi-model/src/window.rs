@@ -8,6 +8,7 @@
 mod agreement;
 mod config;
 mod denoiser;
+mod encoding;
 mod flow;
 mod fusion;
 pub(crate) mod hourglass;
@@ -21,6 +22,7 @@ mod refinement;
 mod unet;
 
 pub use config::WindowConfig;
+pub use encoding::EncodedWindow;
 pub use flow::WindowFlow;
 pub(crate) use initial::added_later;
-pub use network::{EncodedWindow, Window, WindowPrediction};
+pub use network::{Window, WindowPrediction};

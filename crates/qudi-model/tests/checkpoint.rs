@@ -26,6 +26,7 @@ fn description() -> Description {
         preset: Some("tiny".into()),
         network: NetworkConfig::Diffusion(config()),
         window: 11,
+        passes: 1,
         provenance: Provenance {
             program: "qudi test".into(),
             sensors: vec!["qudi-paper".into()],

@@ -45,7 +45,7 @@ fn values(name: &str, shape: &[usize]) -> Vec<f32> {
 /// Returns a tiny diffusion.
 fn restorer(options: SampleOptions, device: &Device) -> DiffusionRestorer<Diffusion> {
     let network = init_parameters(config().init(2, device), values);
-    let model = Model { network, config: config(), window: 11 };
+    let model = Model { network, config: config(), window: 11, passes: 1 };
     DiffusionRestorer::new(model, options, device).unwrap()
 }
 
@@ -57,7 +57,7 @@ fn regression(tile: usize) -> qudi_core::Result<RegressionRestorer> {
         panic!("not a regression")
     };
     let network = init_parameters(config.init(2, &Device::flex()), values);
-    let model = Model { network, config, window: 11 };
+    let model = Model { network, config, window: 11, passes: 1 };
     RegressionRestorer::new(model, tile, ComputePrecision::F32, &Device::flex())
 }
 
@@ -195,7 +195,8 @@ fn rejects_short_bursts_and_impossible_options() {
         SampleOptions { passes: 2, ..quick() },
         SampleOptions { tile: 8, ..quick() },
     ] {
-        let model = Model { network: config().init(1, &device), config: config(), window: 11 };
+        let model =
+            Model { network: config().init(1, &device), config: config(), window: 11, passes: 1 };
         let error = DiffusionRestorer::new(model, options, &device).unwrap_err();
         let field = error.place().unwrap();
         assert!(

@@ -94,11 +94,17 @@ fn the_prediction_follows_an_image_without_noise() {
 
 #[test]
 fn every_parameter_has_a_gradient() {
+    for passes in [1, 2] {
+        every_parameter_has_a_gradient_in(passes);
+    }
+}
+
+fn every_parameter_has_a_gradient_in(passes: usize) {
     let device = Device::flex().autodiff();
     let network = CONFIG.init(1, &device);
     let conditioning = conditioning(4, &device);
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    let encoded = network.encode(&conditioning, 1);
+    let encoded = network.encode(&conditioning, passes);
     let mut state = state(4, 60, &device);
     state.has_previous = vec![true];
     let x0 = network.predict(&encoded, &state, &schedule).x0;
@@ -108,7 +114,7 @@ fn every_parameter_has_a_gradient() {
     let gradients = loss.backward();
     let lists = largest_gradients(&network, &gradients);
     for ((name, _), largest) in parameter_shapes(&network).iter().zip(lists) {
-        assert!(largest > 0.0, "{name} has no gradient");
+        assert!(largest > 0.0, "{name} has no gradient in pass {passes}");
     }
 }
 
@@ -170,6 +176,7 @@ fn description() -> Description {
         preset: None,
         network: NetworkConfig::Window(CONFIG),
         window: 11,
+        passes: 1,
         provenance: Provenance {
             program: "test".into(),
             sensors: vec!["qudi-paper".into()],

@@ -202,6 +202,7 @@ fn save_described<N: Network>(
         preset: sizes.preset_name().map(str::to_owned),
         network: sizes,
         window: recipe.data.frames.max(11),
+        passes: recipe.train.passes,
         provenance: provenance(recipe, origin),
         sampling,
     };

@@ -18,6 +18,7 @@ use qudi_kernels::ComputePrecision;
 use qudi_model::checkpoint::Sampling;
 use qudi_model::diffusion::Ablation;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
+use qudi_model::restorer::Model;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -101,6 +102,11 @@ pub struct TrainConfig {
     /// `timesteps`. Only of the diffusion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub noise_start_fraction: Option<f64>,
+    /// Passes of encoding that the network learns: batches are encoded in one to so many passes, with equal
+    /// chances. Only of `window`.
+    #[serde(default = "one_pass", skip_serializing_if = "is_one_pass")]
+    #[schemars(skip_serializing_if = "never")]
+    pub passes: usize,
     /// Steps between checkpoints.
     pub checkpoint: u64,
     /// Loss of the diffusion; the other networks have no weights to choose.
@@ -191,6 +197,15 @@ pub struct ValidationConfig {
     pub every: u64,
 }
 
+fn one_pass() -> usize {
+    1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)] // serde passes a reference
+fn is_one_pass(passes: &usize) -> bool {
+    *passes == one_pass()
+}
+
 pub(super) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
@@ -270,8 +285,13 @@ impl Recipe {
         })
     }
 
+    /// Returns the model of a network of this recipe.
+    pub(super) fn model<N, C>(&self, network: N, config: C) -> Model<N, C> {
+        Model { network, config, window: self.window(), passes: self.train.passes }
+    }
+
     /// Returns the number of frames that validations restore at once.
-    pub(super) fn window(&self) -> usize {
+    fn window(&self) -> usize {
         self.validation.as_ref().map_or(self.data.frames.max(11), |validation| validation.frames)
     }
 

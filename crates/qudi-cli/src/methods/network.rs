@@ -129,21 +129,24 @@ pub(crate) fn restorer(
         NetworkKind::Regression => {
             let (network, description) = own.weights.load::<Regression>(&device.device)?;
             let NetworkConfig::Regression(config) = description.network else { unreachable!() };
-            let model = Model { network, config, window: description.window };
+            let Description { window, passes, .. } = description;
+            let model = Model { network, config, window, passes };
             let tile = options.tile;
             Box::new(RegressionRestorer::new(model, tile, precision, &device.device)?)
         }
         NetworkKind::Diffusion => {
             let (network, description) = own.weights.load::<Diffusion>(&device.device)?;
             let NetworkConfig::Diffusion(config) = description.network else { unreachable!() };
-            let model = Model { network, config, window: description.window };
+            let Description { window, passes, .. } = description;
+            let model = Model { network, config, window, passes };
             let options = sample_options(&own, options, precision);
             Box::new(DiffusionRestorer::new(model, options, &device.device)?)
         }
         NetworkKind::Window => {
             let (network, description) = own.weights.load::<Window>(&device.device)?;
             let NetworkConfig::Window(config) = description.network else { unreachable!() };
-            let model = Model { network, config, window: description.window };
+            let Description { window, passes, .. } = description;
+            let model = Model { network, config, window, passes };
             let options = sample_options(&own, options, precision);
             Box::new(DiffusionRestorer::new(model, options, &device.device)?)
         }

@@ -14,12 +14,19 @@ pub struct Description {
     pub network: NetworkConfig,
     /// Number of frames of a window in training.
     pub window: usize,
+    /// Passes of encoding that the network has learnt; those that encode once have learnt one.
+    #[serde(default = "one_pass")]
+    pub passes: usize,
     /// Training data and program.
     #[serde(flatten)]
     pub provenance: Provenance,
     /// Default of sampling; none for a regression.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sampling: Option<Sampling>,
+}
+
+fn one_pass() -> usize {
+    1
 }
 
 /// The default of sampling.

@@ -16,9 +16,6 @@ pub trait Denoiser: Debug {
     /// Flows that a step leaves to the next one.
     type Flows: Clone + Debug;
 
-    /// True if more passes of encoding than one are of use.
-    const ENCODES_IN_PASSES: bool;
-
     /// Returns the number that height and width of the frames are multiples of.
     fn multiple(config: &Self::Config) -> usize;
 
@@ -48,8 +45,6 @@ impl Denoiser for Diffusion {
     type Config = DiffusionConfig;
     type Encoded = Encoded;
     type Flows = Flows;
-
-    const ENCODES_IN_PASSES: bool = false;
 
     fn multiple(config: &DiffusionConfig) -> usize {
         config.multiple()

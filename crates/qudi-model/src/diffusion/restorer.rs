@@ -38,8 +38,7 @@ pub struct SampleOptions {
     pub spacing: TimestepSpacing,
     /// Sampler.
     pub sampler: Sampler,
-    /// Passes of encoding: each one after the first finds the flow between the frames that the one before
-    /// predicts.
+    /// Passes of encoding: each one after the first sees the frames that the one before predicts.
     pub passes: usize,
     /// Samples drawn. Their mean is the result, their standard deviation its uncertainty.
     pub samples: usize,
@@ -111,12 +110,15 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         if options.samples == 0 {
             return Err(Error::request("no samples at all", "samples", "draw at least 1"));
         }
-        if options.passes == 0 || (options.passes > 1 && !N::ENCODES_IN_PASSES) {
-            let what = format!("{} passes of a network that encodes in one", options.passes);
-            let help = "use 1, or weights of `qudi train window`";
+        let Model { network, config, window, passes } = model;
+        if options.passes == 0 || (options.passes > 1 && passes == 1) {
+            let what = match options.passes {
+                0 => "no passes at all".to_owned(),
+                asked => format!("{asked} passes of a network that has learnt one"),
+            };
+            let help = "use 1, or weights of a recipe that sets train.passes, as `window` does";
             return Err(Error::request(what, "passes", help));
         }
-        let Model { network, config, window } = model;
         check_tile(options.tile, N::multiple(&config))?;
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         // The processor's results do not depend on batches, and small ones stay in its caches.
@@ -350,7 +352,7 @@ mod tests {
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
         let network: Window = config().init(1, &device);
-        let model = Model { network, config: config(), window: 11 };
+        let model = Model { network, config: config(), window: 11, passes: 2 };
         let options = SampleOptions { steps: 3, passes: 2, tile: 32, ..SampleOptions::default() };
         let mut restorer =
             DiffusionRestorer::new(model, options, &device).unwrap_or_else(|e| panic!("{e}"));

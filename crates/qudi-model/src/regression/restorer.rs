@@ -41,7 +41,7 @@ impl RegressionRestorer {
         precision: ComputePrecision,
         device: &Device,
     ) -> Result<Self> {
-        let Model { network, config, window } = model;
+        let Model { network, config, window, .. } = model;
         check_tile(tile, config.multiple())?;
         let refinement = Refinement::new(&network, &config, tile, device);
         let aligner = BurstAligner::second(&config, refinement);

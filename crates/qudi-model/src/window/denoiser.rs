@@ -12,8 +12,6 @@ impl Denoiser for Window {
     type Encoded = EncodedWindow;
     type Flows = ();
 
-    const ENCODES_IN_PASSES: bool = true;
-
     fn multiple(config: &WindowConfig) -> usize {
         config.multiple()
     }

@@ -151,6 +151,11 @@ impl FlowLevel {
 }
 
 impl WindowFlow {
+    /// Returns the same outside autodiff.
+    pub(super) fn inner(&self) -> Self {
+        Self { pairs: self.pairs.clone().inner(), ..*self }
+    }
+
     /// Returns the flow of every burst from frame `frame` to the next one, or to the one before:
     /// `[bursts, 2, h, w]`.
     pub(super) fn of_frame(&self, frame: usize, next: bool, frames: usize) -> Tensor<4> {

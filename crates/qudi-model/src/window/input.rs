@@ -48,6 +48,18 @@ impl Measurement {
             error_sigma: usual_error(conditioning.noise_variance()),
         }
     }
+
+    /// Returns the same outside autodiff.
+    pub(super) fn inner(&self) -> Self {
+        let inner = |x: &Tensor<4>| x.clone().inner();
+        Self {
+            linear: inner(&self.linear),
+            planes: inner(&self.planes),
+            local_mean: inner(&self.local_mean),
+            sensor: inner(&self.sensor),
+            error_sigma: inner(&self.error_sigma),
+        }
+    }
 }
 
 /// Sigma of usual errors in [-1, 1] from the variance of the linear estimate's noise in image units. Only a

@@ -29,8 +29,7 @@ pub(super) fn refined(
 ) -> WindowFlow {
     if flow.pairs.is_autodiff() {
         let inner = |x: &Tensor<4>| x.clone().inner();
-        let flow = WindowFlow { pairs: inner(&flow.pairs), ..*flow };
-        let refined = refined(&inner(restored), &inner(sigma), &flow, frames);
+        let refined = refined(&inner(restored), &inner(sigma), &flow.inner(), frames);
         return WindowFlow { pairs: Tensor::from_inner(refined.pairs), ..refined };
     }
     let merged = merged(restored.clone(), &(sigma.clone() * ERROR), &Paths::new(flow, frames));

@@ -2,9 +2,9 @@
 //! out.
 
 use super::config::{FOLD, IMAGE, WindowConfig};
+use super::encoding::EncodedWindow;
 use super::hourglass::{Hourglass, ImageHead};
 use super::merging::MERGED;
-use super::network::EncodedWindow;
 use crate::diffusion::state::per_image;
 use crate::sensor::SENSOR_NUMBERS;
 use burn::module::Module;
@@ -87,7 +87,7 @@ impl UNet {
         let embedding = self.leave.forward(silu(self.enter.forward(described)));
         let [_, planes] = EMBEDDING;
         let embedding = embedding.reshape([count, planes, 1, 1]);
-        let mut inputs = encoded.features().to_vec();
+        let mut inputs = encoded.features.clone();
         let [_, _, h, w] = inputs[0].dims();
         inputs.push(Tensor::cat(
             vec![
@@ -97,7 +97,7 @@ impl UNet {
             ],
             1,
         ));
-        inputs.push(encoded.merged_planes().clone());
+        inputs.push(encoded.merged_planes.clone());
         let [features, ..] = self.hourglass.forward(&inputs, Some(&embedding));
         (self.head.forward(features.clone()), features)
     }

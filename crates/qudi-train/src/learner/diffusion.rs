@@ -18,7 +18,6 @@ use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{Conditioning, Diffusion, DiffusionRestorer, Part, SampleOptions};
-use qudi_model::restorer::Model;
 use rand::rngs::ChaCha8Rng;
 use rand::{Rng, SeedableRng};
 use recomputation::{KeptFrames, Predicted, Recomputation};
@@ -101,7 +100,7 @@ impl Learner for Diffusion {
             ..SampleOptions::default()
         };
         let config = recipe.network.diffusion()?.clone();
-        let model = Model { network: self.clone(), config, window: recipe.window() };
+        let model = recipe.model(self.clone(), config);
         Ok(Box::new(DiffusionRestorer::new(model, options, device)?))
     }
 

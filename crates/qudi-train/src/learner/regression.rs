@@ -15,7 +15,6 @@ use qudi_layers::tensor::to_tensor;
 use qudi_model::aligned::Aligned;
 use qudi_model::config::NetworkConfig;
 use qudi_model::regression::{BurstAligner, Refinement, Regression, RegressionRestorer};
-use qudi_model::restorer::Model;
 use std::path::Path;
 
 /// The samples of one pass.
@@ -91,7 +90,7 @@ impl Learner for Regression {
     /// changes nothing: its last layer is zero.
     fn restorer(&self, recipe: &Recipe, device: &Device) -> Result<Box<dyn Restorer>> {
         let config = recipe.network.regression()?.clone();
-        let model = Model { network: self.clone(), config, window: recipe.window() };
+        let model = recipe.model(self.clone(), config);
         Ok(Box::new(RegressionRestorer::new(model, TILE, ComputePrecision::F32, device)?))
     }
 

@@ -15,10 +15,9 @@ use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{DiffusionRestorer, SampleOptions};
-use qudi_model::restorer::Model;
 use qudi_model::window::{EncodedWindow, Window};
 use rand::rngs::ChaCha8Rng;
-use rand::{Rng, SeedableRng};
+use rand::{Rng, RngExt, SeedableRng};
 use std::path::Path;
 
 impl Learner for Window {
@@ -56,7 +55,8 @@ impl Learner for Window {
         random.set_stream(batch.number);
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
-        let encoded = self.encode(&conditioning, 1);
+        let passes = random.random_range(1..=train.passes);
+        let encoded = self.encode(&conditioning, passes);
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let truth = example.truth.clone() * 2.0 - 1.0;
         let (x0_prev, has_previous) = if from_nothing {
@@ -112,7 +112,7 @@ impl Learner for Window {
             ..SampleOptions::default()
         };
         let config = recipe.network.window()?.clone();
-        let model = Model { network: self.clone(), config, window: recipe.window() };
+        let model = recipe.model(self.clone(), config);
         Ok(Box::new(DiffusionRestorer::new(model, options, device)?))
     }
 

@@ -130,11 +130,15 @@ fn weights(weights: &Weights) -> Result<(String, Value)> {
     let sizes = d.network.parameters(&Device::flex());
     let kind = d.network.kind();
     let steps = d.sampling.map_or(String::new(), |s| format!("; {} steps by default", s.steps));
+    let passes = match d.passes {
+        1 => String::new(),
+        passes => format!("; has learnt {passes} passes"),
+    };
     let preset = d.preset.as_deref().unwrap_or("own sizes");
     let mut lines = vec![
         ("network", format!("{preset}, {sizes} parameters")),
         ("window", format!("{} frames", d.window)),
-        ("restores by", format!("{kind}{steps}")),
+        ("restores by", format!("{kind}{steps}{passes}")),
     ];
     lines.extend(provenance(&d.provenance));
     lines.push(("sha-256", weights.sha256()?));
