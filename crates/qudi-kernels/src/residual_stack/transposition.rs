@@ -26,7 +26,7 @@ fn one_by_one(tile: &Tile) -> Tile {
     std::array::from_fn(|row| std::array::from_fn(|column| tile[column][row]))
 }
 
-/// Exchanges the squares beside the diagonal: halves, then quarters of these, down to single values.
+/// Exchanges the squares off the diagonal: halves, then quarters of these, down to single values.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 #[inline]

@@ -105,7 +105,7 @@ impl EncodedWindow {
 
 impl Window {
     /// Encodes a window. Every pass after the first one sees the clean frames that the pass before predicts:
-    /// it finds the flow between them, fuses the captured frames beside them, and corrects them. Gradients
+    /// it finds the flow between them, fuses the captured frames with them, and corrects them. Gradients
     /// reach the last pass only.
     pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> EncodedWindow {
         let single = self.single_frames(conditioning);
