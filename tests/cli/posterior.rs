@@ -24,8 +24,13 @@ const PPP: f64 = 3.25;
 
 /// Creates a folder with a burst of dead leaves, `b.npy`, and its truth, `t.npy`.
 fn burst(name: &str) -> PathBuf {
+    burst_of("dead-leaves", name)
+}
+
+/// Creates the same of another scene.
+fn burst_of(scene: &str, name: &str) -> PathBuf {
     let folder = scratch(name);
-    let scene = format!("scene:dead-leaves --size {SIDE}x{SIDE} --frames {FRAMES}");
+    let scene = format!("scene:{scene} --size {SIDE}x{SIDE} --frames {FRAMES}");
     run(&folder, &format!("simulate {scene} --ppp {PPP} --seed 5 -o b.npy --truth t.npy -q"));
     folder
 }
@@ -91,14 +96,15 @@ fn draws_of_the_built_in_diffusion_spread_about_as_far_as_it_errs() {
     assert!((0.35..0.76).contains(&share), "{share} of all pixels lie within one sigma");
 }
 
-/// The flow between restored frames is closer to the motion, so that less is blurred.
+/// The flow between restored frames is closer to the motion, so that less is blurred: letters err by 0.95 of
+/// the first pass's error.
 #[test]
 fn a_second_pass_of_the_built_in_diffusion_errs_less() {
-    let folder = burst("posterior-passes");
+    let folder = burst_of("text", "posterior-passes");
     let truth = values(&folder.join("t.npy"));
     let [one, two] = [1, 2]
         .map(|passes| rms_difference(&restored(&folder, &format!("--passes {passes}")), &truth));
-    assert!(two < 0.998 * one, "{two} after the second pass, {one} after the first");
+    assert!(two < 0.98 * one, "{two} after the second pass, {one} after the first");
 }
 
 /// Without the noisy image the prediction in the middle of sampling is another one.
