@@ -25,6 +25,7 @@ mod tests;
 mod torch;
 #[cfg(feature = "flex")]
 mod transposition;
+#[cfg(feature = "flex")]
 mod unit;
 #[cfg(all(feature = "flex", target_arch = "x86_64"))]
 mod vectors;

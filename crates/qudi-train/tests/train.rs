@@ -121,6 +121,19 @@ fn parts_of_a_batch_take_the_step_of_the_batch() {
     assert!((parts.norm - whole.norm).abs() < 1e-3 * whole.norm, "{} {}", parts.norm, whole.norm);
 }
 
+/// With more passes to draw from, the first batch has another loss.
+#[test]
+fn batches_are_encoded_in_one_to_so_many_passes() {
+    let losses = |passes: &str| {
+        let recipe = window(&[("train.batch", "2"), ("train.passes", passes)]);
+        let (_, steps) = trained_as::<Window>(&recipe, &[Device::flex()], 1);
+        steps.into_iter().map(|step| step.loss.term("prediction")).collect::<Vec<_>>()
+    };
+    let (one, many) = (losses("1"), losses("8"));
+    assert_ne!(one[0], many[0]);
+    assert!(many.iter().all(|loss| loss.is_finite()));
+}
+
 /// Two devices with a batch each, one device with both in turn, and one device with both at once.
 #[test]
 fn weights_do_not_depend_on_the_number_of_devices() {
@@ -365,6 +378,7 @@ fn rejects_wrong_recipes_by_key() {
         ("train.learns", "[\"refinement\"]", "regression"),
         ("train.loss.prediction", "0", "train.loss.prediction"),
         ("validation.steps", "0", "validation.steps"),
+        ("train.passes", "2", "train.passes"),
         ("train.learning", "3", "learning"),
         ("trains.steps", "3", "trains.steps"),
         ("data.crop", "50", "data.crop"),
@@ -400,6 +414,7 @@ fn regression_recipes_are_refused_by_key() {
         ("train.learns", "[\"unet\"]", "train.learns"),
         ("train.ablate", "[\"flow\"]", "train.ablate"),
         ("train.noise_start_fraction", "0.3", "train.noise_start_fraction"),
+        ("train.passes", "2", "train.passes"),
         ("validation.steps", "1", "validation.steps"),
         ("network.neighbours", "0", "network.neighbours"),
     ] {
@@ -407,6 +422,11 @@ fn regression_recipes_are_refused_by_key() {
         assert!(error.contains(word), "{key}={value}: {error}");
     }
     assert!(Recipe::load("small", &[]).unwrap().stages().unwrap().len() == 2);
+    for passes in ["0", "9"] {
+        let changes = [("train.passes".to_owned(), passes.to_owned())];
+        let error = Recipe::load("window", &changes).unwrap_err().to_string();
+        assert!(error.contains("train.passes must be from 1 to 8"), "{passes}: {error}");
+    }
 }
 
 /// The weights of the whole network start one that leaves parts out, which learns as if it had been made so.

@@ -125,11 +125,11 @@ pub(crate) fn restorer(
         })?;
     }
     let precision = options.precision(&device)?;
+    let Description { window, passes, .. } = own.description;
     let restorer: Box<dyn Restorer> = match own.kind {
         NetworkKind::Regression => {
             let (network, description) = own.weights.load::<Regression>(&device.device)?;
             let NetworkConfig::Regression(config) = description.network else { unreachable!() };
-            let Description { window, passes, .. } = description;
             let model = Model { network, config, window, passes };
             let tile = options.tile;
             Box::new(RegressionRestorer::new(model, tile, precision, &device.device)?)
@@ -137,7 +137,6 @@ pub(crate) fn restorer(
         NetworkKind::Diffusion => {
             let (network, description) = own.weights.load::<Diffusion>(&device.device)?;
             let NetworkConfig::Diffusion(config) = description.network else { unreachable!() };
-            let Description { window, passes, .. } = description;
             let model = Model { network, config, window, passes };
             let options = sample_options(&own, options, precision);
             Box::new(DiffusionRestorer::new(model, options, &device.device)?)
@@ -145,7 +144,6 @@ pub(crate) fn restorer(
         NetworkKind::Window => {
             let (network, description) = own.weights.load::<Window>(&device.device)?;
             let NetworkConfig::Window(config) = description.network else { unreachable!() };
-            let Description { window, passes, .. } = description;
             let model = Model { network, config, window, passes };
             let options = sample_options(&own, options, precision);
             Box::new(DiffusionRestorer::new(model, options, &device.device)?)

@@ -111,7 +111,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             return Err(Error::request("no samples at all", "samples", "draw at least 1"));
         }
         let Model { network, config, window, passes } = model;
-        if options.passes == 0 || (options.passes > 1 && passes == 1) {
+        if options.passes == 0 || (options.passes > 1 && passes < 2) {
             let what = match options.passes {
                 0 => "no passes at all".to_owned(),
                 asked => format!("{asked} passes of a network that has learnt one"),

@@ -116,8 +116,8 @@ impl Window {
         }
         if single.restored.is_autodiff() {
             let (flow, estimate) = self.valid().estimate(&single.inner(), flow.inner(), passes - 1);
-            let flow = WindowFlow { pairs: Tensor::from_inner(flow.pairs), ..flow };
-            return self.fused(&single, &flow, Some(Tensor::from_inner(estimate)));
+            let estimate = Tensor::from_inner(estimate);
+            return self.fused(&single, &WindowFlow::from_inner(flow), Some(estimate));
         }
         let (flow, estimate) = self.estimate(&single, flow, passes - 1);
         self.fused(&single, &flow, Some(estimate))

@@ -156,6 +156,11 @@ impl WindowFlow {
         Self { pairs: self.pairs.clone().inner(), ..*self }
     }
 
+    /// Returns the same within autodiff, as a constant.
+    pub(super) fn from_inner(flow: Self) -> Self {
+        Self { pairs: Tensor::from_inner(flow.pairs), ..flow }
+    }
+
     /// Returns the flow of every burst from frame `frame` to the next one, or to the one before:
     /// `[bursts, 2, h, w]`.
     pub(super) fn of_frame(&self, frame: usize, next: bool, frames: usize) -> Tensor<4> {

@@ -30,7 +30,7 @@ pub(super) fn refined(
     if flow.pairs.is_autodiff() {
         let inner = |x: &Tensor<4>| x.clone().inner();
         let refined = refined(&inner(restored), &inner(sigma), &flow.inner(), frames);
-        return WindowFlow { pairs: Tensor::from_inner(refined.pairs), ..refined };
+        return WindowFlow::from_inner(refined);
     }
     let merged = merged(restored.clone(), &(sigma.clone() * ERROR), &Paths::new(flow, frames));
     let pairs = from_coarse_to_fine(avg_pool2(merged), flow.pairs.clone(), frames, LEVELS);
