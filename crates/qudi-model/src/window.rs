@@ -8,6 +8,7 @@
 mod agreement;
 mod config;
 mod denoiser;
+mod detail;
 mod encoding;
 mod flow;
 mod fusion;

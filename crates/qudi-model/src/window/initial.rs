@@ -19,15 +19,14 @@ pub(super) fn initial_values(seed: u64, name: &str, shape: &[usize]) -> Vec<f32>
     uniform(seed, name, count, bound)
 }
 
-/// Returns the prefix and the values of a parameter of the module `agreement`, which older weights lack. With
-/// these values the formula alone weights neighbours.
+/// Returns the prefix and the values of a parameter of a module that older weights lack. With these values the
+/// formula of `agreement` alone weights neighbours, and `detail` adds next to nothing.
 pub(crate) fn added_later(name: &str, shape: &[usize]) -> Option<(&'static str, Vec<f32>)> {
-    const MODULE: &str = "agreement.";
-    name.starts_with(MODULE).then(|| {
-        let mut values = initial_values(1, name, shape);
-        if name.ends_with("out.weight") {
-            values.fill(0.0);
-        }
-        (MODULE, values)
-    })
+    const MODULES: [&str; 2] = ["agreement.", "detail."];
+    let module = MODULES.into_iter().find(|module| name.starts_with(module))?;
+    let mut values = initial_values(1, name, shape);
+    if name.ends_with("out.weight") {
+        values.fill(0.0);
+    }
+    Some((module, values))
 }

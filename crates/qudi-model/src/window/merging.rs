@@ -83,6 +83,11 @@ impl Merged {
         Self { frames: linear.ones_like(), mean: linear }
     }
 
+    /// Returns the same outside autodiff.
+    pub(super) fn inner(&self) -> Self {
+        Self { mean: self.mean.clone().inner(), frames: self.frames.clone().inner() }
+    }
+
     /// Joins what is merged from both sides, each with the frame itself, whose linear estimate is `linear`.
     pub(super) fn joined(earlier: &Self, later: &Self, linear: Tensor<4>) -> Self {
         let sum = |merged: &Self| merged.mean.clone() * merged.frames.clone();

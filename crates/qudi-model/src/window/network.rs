@@ -2,6 +2,7 @@
 
 use super::agreement::Agreement;
 use super::config::WindowConfig;
+use super::detail::Detail;
 use super::encoding::EncodedWindow;
 use super::flow::Flow;
 use super::fusion::Fusion;
@@ -26,6 +27,7 @@ pub struct Window {
     pub(super) fusion: Fusion,
     unet: UNet,
     agreement: Agreement,
+    detail: Detail,
     #[module(skip)]
     pub(super) state: usize,
 }
@@ -55,6 +57,7 @@ impl WindowConfig {
             fusion: self.init_fusion(device),
             unet: self.init_unet(device),
             agreement: Agreement::zeros(self.widths[0], device),
+            detail: Detail::zeros(self.widths[0], device),
             state: self.state,
         }
     }
@@ -117,7 +120,11 @@ impl Window {
         let (correction, features) =
             self.unet.forward(encoded, step, sensor.clone(), &log_snr, &flags);
         let single = base + difference + correction * c_out.clone();
-        let x0 = self.agreement.forward(single, features, &c_out, &encoded.paths);
+        let agreed = self.agreement.forward(single, features.clone(), &c_out, &encoded.paths);
+        let merged = encoded.merged.clone() * 2.0 - 1.0;
+        // What the noisy image shows, merged frames need not.
+        let merged = agreed.clone() + (merged - agreed.clone()) * (c_out.clone() / error_sigma.clone());
+        let x0 = self.detail.add(agreed, merged, features, error_sigma);
         WindowPrediction { x0, c_out }
     }
 }

@@ -56,7 +56,10 @@ impl Learner for Window {
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
         let passes = random.random_range(1..=train.passes);
-        let encoded = self.encode(&conditioning, passes);
+        let encoded = match batch.still {
+            true => self.encode_still(&conditioning, passes),
+            false => self.encode(&conditioning, passes),
+        };
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let truth = example.truth.clone() * 2.0 - 1.0;
         let (x0_prev, has_previous) = if from_nothing {
@@ -92,8 +95,9 @@ impl Learner for Window {
         sum.add("merged", weights.pre, before(&encoded.merged));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
-        let flow = flows.reduce(Tensor::add).expect("a level");
-        sum.add("flow", weights.flow, flow);
+        if let Some(flow) = flows.reduce(Tensor::add) {
+            sum.add("flow", weights.flow, flow);
+        }
         let total = sum.total();
         Ok(Loss {
             total: total.clone(),
