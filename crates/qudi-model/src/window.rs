@@ -8,7 +8,6 @@
 mod agreement;
 mod config;
 mod denoiser;
-mod detail;
 mod encoding;
 mod flow;
 mod fusion;

@@ -77,6 +77,45 @@ fn a_second_pass_changes_what_frames_are_fused_along() {
     assert_ne!(one, two);
 }
 
+/// A burst in which nothing moves is its first frame and the mean of all.
+#[test]
+fn still_bursts_are_encoded_by_their_mean() {
+    let device = Device::flex();
+    let network = CONFIG.init(1, &device);
+    let conditioning = conditioning(4, &device);
+    let state = state(1, NUM_TIMESTEPS - 1, &device);
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+    let predicted = |conditioning: &Conditioning, passes| {
+        let encoded = network.encode_still(conditioning, passes);
+        assert!(encoded.flow.is_empty());
+        read(network.predict(&encoded, &state, &schedule).x0).unwrap()
+    };
+    let of_order = |order: [usize; 4]| {
+        let reordered = |x: &Tensor<4>| {
+            let frames = order.map(|frame| x.clone().narrow(0, frame, 1));
+            Tensor::cat(frames.to_vec(), 0)
+        };
+        Conditioning {
+            counts: reordered(&conditioning.counts),
+            linear_estimate: reordered(&conditioning.linear_estimate),
+            ..conditioning.clone()
+        }
+    };
+    let one = predicted(&conditioning, 1);
+    assert_eq!(one.len(), 16 * 24);
+    let differs = |other: &[f32]| {
+        one.iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) > 1e-3
+    };
+    assert!(!differs(&predicted(&of_order([0, 3, 1, 2]), 1)));
+    assert!(differs(&predicted(&of_order([1, 0, 2, 3]), 1)));
+    let brighter = conditioning.linear_estimate.clone();
+    let brighter =
+        Tensor::cat(vec![brighter.clone().narrow(0, 0, 1), brighter.narrow(0, 1, 3) + 0.2], 0);
+    let brighter = Conditioning { linear_estimate: brighter, ..conditioning.clone() };
+    assert!(differs(&predicted(&brighter, 1)));
+    assert!(differs(&predicted(&conditioning, 2)));
+}
+
 /// With little noise, the noisy image is the answer.
 #[test]
 fn the_prediction_follows_an_image_without_noise() {
@@ -135,9 +174,10 @@ fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> V
     largest.1
 }
 
-/// Weights of programs that did not merge predicted frames are still read, and merge by the formula.
+/// Weights of programs that did not merge predicted frames, or whose U-Net did not start from merged frames, are
+/// still read: they merge by the formula, and start from the pre-denoised frames.
 #[test]
-fn weights_without_agreement_are_read_and_parts_of_it_are_refused() {
+fn weights_without_later_parts_are_read_and_pieces_of_these_are_refused() {
     let device = Device::flex();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("window.safetensors");
@@ -152,11 +192,13 @@ fn weights_without_agreement_are_read_and_parts_of_it_are_refused() {
         std::fs::write(&path, former).unwrap();
         load::<Window>(&path, &device)
     };
-    let (former, _) = without(&|name| name.starts_with("agreement.")).unwrap();
-    // The same network with an agreement that corrects nothing.
+    let is_later = |name: &str| ["agreement.", "unet.gate."].iter().any(|m| name.starts_with(m));
+    let (former, _) = without(&is_later).unwrap();
+    // The same network with an agreement that corrects nothing, and a closed gate.
     let formula = init_parameters(CONFIG.init(1, &device), |name, shape| {
-        if name.starts_with("agreement.") {
-            return vec![0.0; shape.iter().product()];
+        if is_later(name) {
+            let value = if name == "unet.gate.bias" { -20.0 } else { 0.0 };
+            return vec![value; shape.iter().product()];
         }
         let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
         let data = file.tensor(name).unwrap().data();
@@ -167,8 +209,10 @@ fn weights_without_agreement_are_read_and_parts_of_it_are_refused() {
     let got = predicted(&former, &conditioning, &state);
     assert_eq!(got, predicted(&formula, &conditioning, &state));
     assert_ne!(got, predicted(&CONFIG.init(1, &device), &conditioning, &state));
-    let error = without(&|name| name == "agreement.out.bias").unwrap_err();
-    assert!(error.to_string().contains("`agreement.out.bias` is missing"), "{error}");
+    for piece in ["agreement.out.bias", "unet.gate.bias"] {
+        let error = without(&|name| name == piece).unwrap_err();
+        assert!(error.to_string().contains(&format!("`{piece}` is missing")), "{error}");
+    }
 }
 
 fn description() -> Description {

@@ -2,13 +2,12 @@
 
 use super::agreement::Agreement;
 use super::config::WindowConfig;
-use super::detail::Detail;
 use super::encoding::EncodedWindow;
 use super::flow::Flow;
 use super::fusion::Fusion;
 use super::initial::initial_values;
 use super::predenoiser::PreDenoiser;
-use super::unet::{StepImages, UNet};
+use super::unet::{Correction, StepImages, UNet};
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::{DiffusionState, per_image};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
@@ -27,7 +26,6 @@ pub struct Window {
     pub(super) fusion: Fusion,
     unet: UNet,
     agreement: Agreement,
-    detail: Detail,
     #[module(skip)]
     pub(super) state: usize,
 }
@@ -57,7 +55,6 @@ impl WindowConfig {
             fusion: self.init_fusion(device),
             unet: self.init_unet(device),
             agreement: Agreement::zeros(self.widths[0], device),
-            detail: Detail::zeros(self.widths[0], device),
             state: self.state,
         }
     }
@@ -117,14 +114,15 @@ impl Window {
                 ((bar / (1.0 - bar)).ln() as f32).clamp(-10.0, 10.0)
             })
             .collect();
-        let (correction, features) =
+        let Correction { correction, gate, features } =
             self.unet.forward(encoded, step, sensor.clone(), &log_snr, &flags);
-        let single = base + difference + correction * c_out.clone();
-        let agreed = self.agreement.forward(single, features.clone(), &c_out, &encoded.paths);
-        let merged = encoded.merged.clone() * 2.0 - 1.0;
-        // What the noisy image shows, merged frames need not.
-        let merged = agreed.clone() + (merged - agreed.clone()) * (c_out.clone() / error_sigma.clone());
-        let x0 = self.detail.add(agreed, merged, features, error_sigma);
+        let seen = base + difference;
+        // Where merged frames are sharp, the U-Net has only their noise left to remove. The less noise the
+        // noisy image has, the less they count.
+        let merged = encoded.merged.clone() * 2.0 - 1.0 - seen.clone();
+        let single = seen + merged * gate * (c_out.clone() / error_sigma.clone());
+        let single = single + correction * c_out.clone();
+        let x0 = self.agreement.forward(single, features, &c_out, &encoded.paths);
         WindowPrediction { x0, c_out }
     }
 }

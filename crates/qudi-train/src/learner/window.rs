@@ -132,7 +132,8 @@ impl Learner for Window {
     /// Steps of Muon have full size whatever the gradient: outputs and flow, whose gradients are noise at
     /// first, would walk at random.
     fn prefers_adam(name: &str) -> bool {
-        name.starts_with("flow.") || name.ends_with("out.weight")
+        ["out.weight", "gate.weight"].iter().any(|end| name.ends_with(end))
+            || name.starts_with("flow.")
     }
 }
 
