@@ -34,8 +34,8 @@ pub struct EncodedWindow {
     /// Features of the frames, states from both sides and pre-denoised frames,
     /// `[bursts * frames, channels, h, w]` each.
     pub(super) features: Vec<Tensor<4>>,
-    /// Planes of the merged frames, `[bursts * frames, 8, h, w]`.
-    pub(super) merged_planes: Tensor<4>,
+    /// Logarithm of the number of merged frames, `[bursts * frames, 4, h, w]`.
+    pub(super) merged_frames: Tensor<4>,
     pub(super) paths: Paths,
     /// The sensor's numbers, `[bursts * frames, 11, 1, 1]`.
     pub(super) sensor: Tensor<4>,
@@ -86,7 +86,7 @@ impl EncodedWindow {
     fn new(single: &SingleFrames, fused: Fused, paths: Paths, estimate: Option<Tensor<4>>) -> Self {
         let Fused { states: [earlier, later], merged } = fused;
         Self {
-            merged_planes: merged.planes(),
+            merged_frames: merged.planes_of_frames(),
             merged: merged.mean,
             restored: single.restored.clone(),
             estimate: estimate.map(|image| image * 2.0 - 1.0),
@@ -105,7 +105,7 @@ impl EncodedWindow {
 
     /// Returns the memory of all tensors, in bytes.
     pub(super) fn bytes(&self) -> usize {
-        let single = [&self.restored, &self.merged, &self.merged_planes];
+        let single = [&self.restored, &self.merged, &self.merged_frames];
         let single = single.into_iter().chain(&self.estimate).chain(&self.features);
         let flows = self.flow.iter().map(|flow| &flow.pairs);
         let all = single.chain(flows).chain(self.paths.tensors());
@@ -119,7 +119,7 @@ impl EncodedWindow {
         Self {
             restored: inner(&self.restored),
             merged: inner(&self.merged),
-            merged_planes: inner(&self.merged_planes),
+            merged_frames: inner(&self.merged_frames),
             flow: self.flow.iter().map(WindowFlow::inner).collect(),
             estimate: self.estimate.as_ref().map(inner),
             paths: self.paths.inner(),

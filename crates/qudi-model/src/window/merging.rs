@@ -95,9 +95,14 @@ impl Merged {
         Self { mean: (sum(earlier) + sum(later) - linear) / frames.clone(), frames }
     }
 
-    /// Returns the planes that networks see, `[images, 8, H / 2, W / 2]`.
+    /// Returns the planes that cells see, `[images, 8, H / 2, W / 2]`.
     pub(super) fn planes(&self) -> Tensor<4> {
         let image = pixel_unshuffle((self.mean.clone() - MIDDLE) * SCALE, FOLD);
-        Tensor::cat(vec![image, pixel_unshuffle(self.frames.clone().log(), FOLD)], 1)
+        Tensor::cat(vec![image, self.planes_of_frames()], 1)
+    }
+
+    /// Returns the logarithm of the number of frames, `[images, 4, H / 2, W / 2]`.
+    pub(super) fn planes_of_frames(&self) -> Tensor<4> {
+        pixel_unshuffle(self.frames.clone().log(), FOLD)
     }
 }

@@ -102,9 +102,11 @@ impl Window {
         let difference = (state.x_t.clone() * signal - base.clone()) * c_skip;
         let clamped =
             |x: Tensor<4>| (x / error_sigma.clone()).clamp(-MAX_DIFFERENCE, MAX_DIFFERENCE);
+        let merged = encoded.merged.clone() * 2.0 - 1.0;
         let step = StepImages {
             noisy: clamped(difference.clone()),
             previous: clamped((base.clone() - predenoised) * has_previous),
+            merged: clamped(merged.clone() - base.clone()),
         };
         let log_snr: Vec<f32> = state
             .timesteps
@@ -119,8 +121,8 @@ impl Window {
         let seen = base + difference;
         // Where merged frames are sharp, the U-Net has only their noise left to remove. The less noise the
         // noisy image has, the less they count.
-        let merged = encoded.merged.clone() * 2.0 - 1.0 - seen.clone();
-        let single = seen + merged * gate * (c_out.clone() / error_sigma.clone());
+        let gate = gate * (c_out.clone() / error_sigma.clone());
+        let single = seen.clone() + (merged - seen) * gate;
         let single = single + correction * c_out.clone();
         let x0 = self.agreement.forward(single, features, &c_out, &encoded.paths);
         WindowPrediction { x0, c_out }

@@ -50,6 +50,8 @@ pub(super) struct StepImages {
     pub(super) noisy: Tensor<4>,
     /// The previous estimate's difference from the pre-denoised frames.
     pub(super) previous: Tensor<4>,
+    /// The merged frames' difference from the base.
+    pub(super) merged: Tensor<4>,
 }
 
 impl WindowConfig {
@@ -113,7 +115,8 @@ impl UNet {
             ],
             1,
         ));
-        inputs.push(encoded.merged_planes.clone());
+        let merged = pixel_unshuffle(images.merged, FOLD);
+        inputs.push(Tensor::cat(vec![merged, encoded.merged_frames.clone()], 1));
         let [features, ..] = self.hourglass.forward(&inputs, Some(&embedding));
         let gate = self.gate.linear(std::slice::from_ref(&features)) + OPEN;
         Correction {
