@@ -22,20 +22,3 @@ pub(super) fn initial_values(seed: u64, name: &str, shape: &[usize]) -> Vec<f32>
     let bound = scale * (6.0 / (count / shape[0]) as f32).sqrt();
     uniform(seed, name, count, bound)
 }
-
-/// Returns the prefix and the values of a parameter of a module that older weights lack. With these values the
-/// formula of `agreement` alone weights neighbours, and the U-Net does not start from merged frames.
-pub(crate) fn added_later(name: &str, shape: &[usize]) -> Option<(&'static str, Vec<f32>)> {
-    const MODULES: [&str; 2] = ["agreement.", "unet.gate."];
-    /// Closes the gate.
-    const CLOSED: f32 = -20.0;
-    let module = MODULES.into_iter().find(|module| name.starts_with(module))?;
-    let mut values = initial_values(1, name, shape);
-    match name {
-        "unet.gate.bias" => values.fill(CLOSED),
-        "unet.gate.weight" => values.fill(0.0),
-        _ if name.ends_with("out.weight") => values.fill(0.0),
-        _ => {}
-    }
-    Some((module, values))
-}
