@@ -20,6 +20,10 @@ use qudi_layers::resample::{by_burst, pixel_unshuffle};
 /// Scale of pre-denoised frames around the middle level among the inputs of the U-Net.
 const SCALE: f32 = 3.0;
 
+/// Scale of features and states among the inputs of the U-Net: they are many, and with steps of one size for
+/// all (Muon) their noise would drown the few images.
+const FEATURES: f32 = 0.15;
+
 /// A window as U-Net and agreement see it in every step.
 #[derive(Clone, Debug)]
 pub struct EncodedWindow {
@@ -31,9 +35,10 @@ pub struct EncodedWindow {
     pub merged: Tensor<4>,
     /// Clean frames that the pass before predicted, about in [-1, 1]: `[bursts * frames, 1, H, W]`.
     pub(super) estimate: Option<Tensor<4>>,
-    /// Features of the frames, states from both sides and pre-denoised frames,
-    /// `[bursts * frames, channels, h, w]` each.
-    pub(super) features: Vec<Tensor<4>>,
+    /// Features of the frames and states from both sides, scaled: `[bursts * frames, channels, h, w]` each.
+    pub(super) features: [Tensor<4>; 3],
+    /// Pre-denoised frames, `[bursts * frames, 4, h, w]`.
+    pub(super) image: Tensor<4>,
     /// Logarithm of the number of merged frames, `[bursts * frames, 4, h, w]`.
     pub(super) merged_frames: Tensor<4>,
     pub(super) paths: Paths,
@@ -92,7 +97,8 @@ impl EncodedWindow {
             estimate: estimate.map(|image| image * 2.0 - 1.0),
             paths,
             flow: single.flow.clone(),
-            features: vec![single.features.clone(), earlier, later, single.image.clone()],
+            features: [single.features.clone(), earlier, later].map(|x| x * FEATURES),
+            image: single.image.clone(),
             sensor: single.measurement.sensor.clone(),
             error_sigma: single.measurement.error_sigma.clone(),
         }
@@ -105,7 +111,7 @@ impl EncodedWindow {
 
     /// Returns the memory of all tensors, in bytes.
     pub(super) fn bytes(&self) -> usize {
-        let single = [&self.restored, &self.merged, &self.merged_frames];
+        let single = [&self.restored, &self.merged, &self.merged_frames, &self.image];
         let single = single.into_iter().chain(&self.estimate).chain(&self.features);
         let flows = self.flow.iter().map(|flow| &flow.pairs);
         let all = single.chain(flows).chain(self.paths.tensors());
@@ -123,7 +129,8 @@ impl EncodedWindow {
             flow: self.flow.iter().map(WindowFlow::inner).collect(),
             estimate: self.estimate.as_ref().map(inner),
             paths: self.paths.inner(),
-            features: self.features.iter().map(inner).collect(),
+            features: self.features.each_ref().map(inner),
+            image: inner(&self.image),
             sensor: inner(&self.sensor),
             error_sigma: inner(&self.error_sigma),
         }

@@ -105,7 +105,8 @@ impl UNet {
         let embedding = self.leave.forward(silu(self.enter.forward(described)));
         let [_, planes] = EMBEDDING;
         let embedding = embedding.reshape([count, planes, 1, 1]);
-        let mut inputs = encoded.features.clone();
+        let mut inputs = encoded.features.to_vec();
+        inputs.push(encoded.image.clone());
         let [_, _, h, w] = inputs[0].dims();
         inputs.push(Tensor::cat(
             vec![

@@ -56,9 +56,10 @@ impl Learner for Window {
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
         let passes = random.random_range(1..=train.passes);
-        let encoded = match batch.still {
-            true => self.encode_still(&conditioning, passes),
-            false => self.encode(&conditioning, passes),
+        let encoded = if batch.still {
+            self.encode_still(&conditioning, passes)
+        } else {
+            self.encode(&conditioning, passes)
         };
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let truth = example.truth.clone() * 2.0 - 1.0;

@@ -26,6 +26,7 @@ pub struct Batch {
     /// True if nothing moves: there is one clean frame of every sample.
     pub still: bool,
     size: Size,
+    /// Captured frames of a sample.
     frames: usize,
     counts: CountPlanes,
     truth: Vec<f32>,
@@ -56,17 +57,18 @@ impl Batch {
         let mut random = ChaCha8Rng::seed_from_u64(recipe.train.seed);
         random.set_stream(number);
         let still = random.random::<f64>() < recipe.train.still_fraction;
-        let (count, frames, clean) = match still {
+        let (count, exposures, clean) = if still {
             // As many frames pass the network.
-            true => (recipe.train.batch * frames, random.random_range(1..=MOST_MERGED), 1),
-            false => (recipe.train.batch, frames, frames),
+            (recipe.train.batch * frames, random.random_range(1..=MOST_MERGED), 1)
+        } else {
+            (recipe.train.batch, frames, frames)
         };
         let size = Size { height: side, width: side };
         let mut batch = Self {
             number,
             still,
             size,
-            frames,
+            frames: exposures,
             counts: CountPlanes::default(),
             truth: Vec::new(),
             noise: Vec::new(),
@@ -77,9 +79,10 @@ impl Batch {
             uploaded: None,
         };
         for sample in (number * count as u64..).take(count) {
-            let drawn = match still {
-                true => bursts.still_sample(sample, frames)?,
-                false => bursts.sample(sample)?.sample,
+            let drawn = if still {
+                bursts.still_sample(sample, exposures)?
+            } else {
+                bursts.sample(sample)?.sample
             };
             let view = BurstView { size, frames: &drawn.counts };
             batch.counts.extend(CountPlanes::new(view, &drawn.acquisition));
