@@ -24,4 +24,5 @@ mod unet;
 pub use config::WindowConfig;
 pub use encoding::EncodedWindow;
 pub use flow::WindowFlow;
+pub(crate) use initial::added_later;
 pub use network::{Window, WindowPrediction};

@@ -7,7 +7,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::Acquisition;
 use qudi_core::sensor::Sensor;
 use qudi_layers::tensor::read;
-use qudi_layers::{Provenance, parameter_shapes};
+use qudi_layers::{Provenance, init_parameters, parameter_shapes};
 use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::diffusion::Conditioning;
@@ -77,45 +77,6 @@ fn a_second_pass_changes_what_frames_are_fused_along() {
     assert_ne!(one, two);
 }
 
-/// A burst in which nothing moves is its first frame and the mean of all.
-#[test]
-fn still_bursts_are_encoded_by_their_mean() {
-    let device = Device::flex();
-    let network = CONFIG.init(1, &device);
-    let conditioning = conditioning(4, &device);
-    let state = state(1, NUM_TIMESTEPS - 1, &device);
-    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    let predicted = |conditioning: &Conditioning, passes| {
-        let encoded = network.encode_still(conditioning, passes);
-        assert!(encoded.flow.is_empty());
-        read(network.predict(&encoded, &state, &schedule).x0).unwrap()
-    };
-    let of_order = |order: [usize; 4]| {
-        let reordered = |x: &Tensor<4>| {
-            let frames = order.map(|frame| x.clone().narrow(0, frame, 1));
-            Tensor::cat(frames.to_vec(), 0)
-        };
-        Conditioning {
-            counts: reordered(&conditioning.counts),
-            linear_estimate: reordered(&conditioning.linear_estimate),
-            ..conditioning.clone()
-        }
-    };
-    let one = predicted(&conditioning, 1);
-    assert_eq!(one.len(), 16 * 24);
-    let differs = |other: &[f32]| {
-        one.iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) > 1e-3
-    };
-    assert!(!differs(&predicted(&of_order([0, 3, 1, 2]), 1)));
-    assert!(differs(&predicted(&of_order([1, 0, 2, 3]), 1)));
-    let brighter = conditioning.linear_estimate.clone();
-    let brighter =
-        Tensor::cat(vec![brighter.clone().narrow(0, 0, 1), brighter.narrow(0, 1, 3) + 0.2], 0);
-    let brighter = Conditioning { linear_estimate: brighter, ..conditioning.clone() };
-    assert!(differs(&predicted(&brighter, 1)));
-    assert!(differs(&predicted(&conditioning, 2)));
-}
-
 /// With little noise, the noisy image is the answer.
 #[test]
 fn the_prediction_follows_an_image_without_noise() {
@@ -174,22 +135,40 @@ fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> V
     largest.1
 }
 
-/// Weights of programs whose U-Net did not start from merged frames would restore something else.
+/// Weights of programs that did not merge predicted frames are still read, and merge by the formula.
 #[test]
-fn weights_without_a_gate_are_refused() {
+fn weights_without_agreement_are_read_and_parts_of_it_are_refused() {
     let device = Device::flex();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("window.safetensors");
-    let network = CONFIG.init(1, &device);
-    save(&network, &description(), Precision::Single, &path, Overwrite::Yes).unwrap();
+    let description = description();
+    save(&CONFIG.init(1, &device), &description, Precision::Single, &path, Overwrite::Yes).unwrap();
     let bytes = std::fs::read(&path).unwrap();
-    let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
-    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
-    let kept = file.tensors().into_iter().filter(|(name, _)| !name.starts_with("unet.gate."));
-    let former = safetensors::serialize(kept, header.metadata().clone()).unwrap();
-    std::fs::write(&path, former).unwrap();
-    let error = load::<Window>(&path, &device).unwrap_err();
-    assert!(error.to_string().contains("`unet.gate.weight` is missing"), "{error}");
+    let without = |left_out: &dyn Fn(&str) -> bool| {
+        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+        let kept = file.tensors().into_iter().filter(|(name, _)| !left_out(name));
+        let former = safetensors::serialize(kept, header.metadata().clone()).unwrap();
+        std::fs::write(&path, former).unwrap();
+        load::<Window>(&path, &device)
+    };
+    let (former, _) = without(&|name| name.starts_with("agreement.")).unwrap();
+    // The same network with an agreement that corrects nothing.
+    let formula = init_parameters(CONFIG.init(1, &device), |name, shape| {
+        if name.starts_with("agreement.") {
+            return vec![0.0; shape.iter().product()];
+        }
+        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        let data = file.tensor(name).unwrap().data();
+        data.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+    });
+    let conditioning = conditioning(4, &device);
+    let state = state(4, 60, &device);
+    let got = predicted(&former, &conditioning, &state);
+    assert_eq!(got, predicted(&formula, &conditioning, &state));
+    assert_ne!(got, predicted(&CONFIG.init(1, &device), &conditioning, &state));
+    let error = without(&|name| name == "agreement.out.bias").unwrap_err();
+    assert!(error.to_string().contains("`agreement.out.bias` is missing"), "{error}");
 }
 
 fn description() -> Description {

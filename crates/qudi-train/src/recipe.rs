@@ -107,11 +107,6 @@ pub struct TrainConfig {
     #[serde(default = "one_pass", skip_serializing_if = "is_one_pass")]
     #[schemars(skip_serializing_if = "never")]
     pub passes: usize,
-    /// Fraction of the batches in which nothing moves: single frames of `train.batch * data.frames` scenes,
-    /// merged with 0 to 10 further ones of the same light. Only of `window`.
-    #[serde(default, skip_serializing_if = "is_default")]
-    #[schemars(skip_serializing_if = "never")]
-    pub still_fraction: f64,
     /// Steps between checkpoints.
     pub checkpoint: u64,
     /// Loss of the diffusion; the other networks have no weights to choose.

@@ -296,33 +296,6 @@ fn static_fraction_of_the_stills_does_not_move() {
 }
 
 /// Light is log-uniform, and the photons are those that it gives.
-/// One clean frame, with new photons in every exposure.
-#[test]
-fn still_samples_expose_one_frame_again_and_again() {
-    const EXPOSURES: usize = 200;
-    let folder = tempfile::tempdir().unwrap();
-    let config = all_sources();
-    let data = dataset(&config, folder.path());
-    for number in 0..12 {
-        let sample = data.still_sample(7, number, EXPOSURES).unwrap();
-        assert!(same(&sample, &data.still_sample(7, number, EXPOSURES).unwrap()));
-        let (truth, counts) = (&sample.truth, &sample.counts);
-        assert_eq!((truth.len(), counts.len()), (1, EXPOSURES));
-        assert_ne!(counts[0], counts[1]);
-        // Means of the halves are the same frame but for noise.
-        let mean = |range: std::ops::Range<usize>| -> Vec<f64> {
-            let length = range.len() as f64;
-            let of = |pixel: usize| counts[range.clone()].iter().map(move |c| f64::from(c[pixel]));
-            (0..counts[0].len()).map(|pixel| of(pixel).sum::<f64>() / length).collect()
-        };
-        let (first, second) = (mean(0..EXPOSURES / 2), mean(EXPOSURES / 2..EXPOSURES));
-        for (a, b) in first.iter().zip(&second) {
-            // Six sigma of the difference, for counts of a variance up to 3.
-            assert!((a - b).abs() < 6.0 * (2.0 * 3.0 / 100.0f64).sqrt(), "{number}: {a} {b}");
-        }
-    }
-}
-
 #[test]
 fn light_is_log_uniform_and_counts_follow_it() {
     let config = config(vec![source("scenes", SourceKind::Scenes, &["dead-leaves"])]);

@@ -134,29 +134,6 @@ fn batches_are_encoded_in_one_to_so_many_passes() {
     assert!(many.iter().all(|loss| loss.is_finite()));
 }
 
-/// Nothing moves in some batches: they have no flow to learn, and as many frames as others, of scenes of their
-/// own.
-#[test]
-fn nothing_moves_in_a_fraction_of_the_batches() {
-    let steps = |fraction: &str| {
-        let recipe = window(&[("train.still_fraction", fraction), ("train.passes", "2")]);
-        trained_as::<Window>(&recipe, &[Device::flex()], 6).1
-    };
-    let still = |steps: &[StepReport]| -> Vec<bool> {
-        steps.iter().map(|step| step.loss.terms.iter().all(|(name, _)| *name != "flow")).collect()
-    };
-    assert_eq!(still(&steps("0")), [false; 6]);
-    assert_eq!(still(&steps("1")), [true; 6]);
-    let some = steps("0.5");
-    assert!(still(&some).contains(&true) && still(&some).contains(&false));
-    assert!(some.iter().all(|step| step.loss.total.is_finite()));
-
-    let recipe = window(&[("train.still_fraction", "1")]);
-    let mut bursts = BurstSampler::new(&recipe, Dataset::new(&recipe.data, None).unwrap(), None);
-    let batch = Batch::draw(&recipe, &mut bursts, 3).unwrap();
-    assert_eq!(batch.len(), recipe.train.batch * recipe.data.frames);
-}
-
 /// Two devices with a batch each, one device with both in turn, and one device with both at once.
 #[test]
 fn weights_do_not_depend_on_the_number_of_devices() {
@@ -402,7 +379,6 @@ fn rejects_wrong_recipes_by_key() {
         ("train.loss.prediction", "0", "train.loss.prediction"),
         ("validation.steps", "0", "validation.steps"),
         ("train.passes", "2", "train.passes"),
-        ("train.still_fraction", "0.5", "train.still_fraction"),
         ("train.learning", "3", "learning"),
         ("trains.steps", "3", "trains.steps"),
         ("data.crop", "50", "data.crop"),
@@ -439,7 +415,6 @@ fn regression_recipes_are_refused_by_key() {
         ("train.ablate", "[\"flow\"]", "train.ablate"),
         ("train.noise_start_fraction", "0.3", "train.noise_start_fraction"),
         ("train.passes", "2", "train.passes"),
-        ("train.still_fraction", "0.5", "train.still_fraction"),
         ("validation.steps", "1", "validation.steps"),
         ("network.neighbours", "0", "network.neighbours"),
     ] {
@@ -451,12 +426,6 @@ fn regression_recipes_are_refused_by_key() {
         let changes = [("train.passes".to_owned(), passes.to_owned())];
         let error = Recipe::load("window", &changes).unwrap_err().to_string();
         assert!(error.contains("train.passes must be from 1 to 8"), "{passes}: {error}");
-    }
-    for fraction in ["-0.1", "1.1", "nan"] {
-        let changes = [("train.still_fraction".to_owned(), fraction.to_owned())];
-        let error = Recipe::load("window", &changes).unwrap_err().to_string();
-        let expected = "train.still_fraction must be from 0 to 1";
-        assert!(error.contains(expected), "{fraction}: {error}");
     }
 }
 

@@ -78,16 +78,6 @@ impl Paths {
         Self { flows, frames }
     }
 
-    /// Returns the paths of single frames, which have no neighbours.
-    pub(super) fn none() -> Self {
-        Self { flows: Vec::new(), frames: 1 }
-    }
-
-    /// Returns the number of frames of a burst.
-    pub(super) fn frames(&self) -> usize {
-        self.frames
-    }
-
     /// Returns all tensors.
     pub(super) fn tensors(&self) -> impl Iterator<Item = &Tensor<4>> {
         self.flows.iter().flatten()

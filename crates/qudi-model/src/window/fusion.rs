@@ -31,7 +31,7 @@ pub(super) struct Frames<'a> {
     /// `[bursts * frames, 1, H, W]` each.
     pub(super) whole: [&'a Tensor<4>; 2],
     /// Pre-denoised frames in image units, `[bursts * frames, 4, h, w]`.
-    pub(super) restored: Tensor<4>,
+    pub(super) restored: &'a Tensor<4>,
     /// Linear estimate in image units, likewise.
     pub(super) linear: &'a Tensor<4>,
     /// Normalized features of the pre-denoiser, `[bursts * frames, width, h, w]`.
@@ -69,18 +69,6 @@ pub(super) struct Fused {
 }
 
 impl Fusion {
-    /// Computes the states of single frames, `[bursts, state, h, w]`, for which `merged` is known.
-    pub(super) fn still(&self, window: &Frames<'_>, merged: Merged, state: usize) -> Fused {
-        let [bursts, _, h, w] = window.features.dims();
-        let images = images_of_cells(&window.restored, window.linear, None);
-        let nothing = Tensor::zeros([bursts, state, h, w], &images.device());
-        let mut inputs = vec![window.features.clone(), nothing, images, merged.planes()];
-        let later = normalized(self.backward.parameters().apply(&inputs));
-        inputs.insert(3, later.clone());
-        let earlier = normalized(self.forward.parameters().apply(&inputs));
-        Fused { states: [earlier, later], merged }
-    }
-
     /// Fuses the frames of every burst.
     pub(super) fn forward(&self, window: &Frames<'_>, flow: &WindowFlow, state: usize) -> Fused {
         let count = window.count;
@@ -120,8 +108,9 @@ impl Fusion {
                 ),
             };
             let restored = own.clone().narrow(1, 0, IMAGE);
-            let images = images_of_cells(&restored, &own.narrow(1, IMAGE, IMAGE), Some(difference));
-            let mut inputs = vec![features[frame].clone(), hidden, images];
+            let noise = (own.narrow(1, IMAGE, IMAGE) - restored.clone()) * SCALE;
+            let images = vec![(restored - MIDDLE) * SCALE, noise, difference];
+            let mut inputs = vec![features[frame].clone(), hidden, Tensor::cat(images, 1)];
             inputs.extend(more.cloned());
             inputs.push(merged.planes());
             Passed { hidden: normalized(cell.apply(&inputs)), merged }
@@ -150,19 +139,6 @@ impl Fusion {
             merged: Merged::joined(&before, &after, window.whole[1].clone()),
         }
     }
-}
-
-/// Returns the images among the inputs of a cell: the frame, its noise, and the differences of its neighbour
-/// from both.
-fn images_of_cells(
-    restored: &Tensor<4>,
-    linear: &Tensor<4>,
-    difference: Option<Tensor<4>>,
-) -> Tensor<4> {
-    let noise = (linear.clone() - restored.clone()) * SCALE;
-    let image = (restored.clone() - MIDDLE) * SCALE;
-    let nothing = || Tensor::cat(vec![restored.zeros_like(); 2], 1);
-    Tensor::cat(vec![image, noise, difference.unwrap_or_else(nothing)], 1)
 }
 
 /// Joins the images of every frame, `[bursts, c, h, w]` each, in the order `[bursts * frames, c, h, w]`.

@@ -83,11 +83,6 @@ impl Merged {
         Self { frames: linear.ones_like(), mean: linear }
     }
 
-    /// Returns the same outside autodiff.
-    pub(super) fn inner(&self) -> Self {
-        Self { mean: self.mean.clone().inner(), frames: self.frames.clone().inner() }
-    }
-
     /// Joins what is merged from both sides, each with the frame itself, whose linear estimate is `linear`.
     pub(super) fn joined(earlier: &Self, later: &Self, linear: Tensor<4>) -> Self {
         let sum = |merged: &Self| merged.mean.clone() * merged.frames.clone();
@@ -95,14 +90,9 @@ impl Merged {
         Self { mean: (sum(earlier) + sum(later) - linear) / frames.clone(), frames }
     }
 
-    /// Returns the planes that cells see, `[images, 8, H / 2, W / 2]`.
+    /// Returns the planes that networks see, `[images, 8, H / 2, W / 2]`.
     pub(super) fn planes(&self) -> Tensor<4> {
         let image = pixel_unshuffle((self.mean.clone() - MIDDLE) * SCALE, FOLD);
-        Tensor::cat(vec![image, self.planes_of_frames()], 1)
-    }
-
-    /// Returns the logarithm of the number of frames, `[images, 4, H / 2, W / 2]`.
-    pub(super) fn planes_of_frames(&self) -> Tensor<4> {
-        pixel_unshuffle(self.frames.clone().log(), FOLD)
+        Tensor::cat(vec![image, pixel_unshuffle(self.frames.clone().log(), FOLD)], 1)
     }
 }

@@ -7,7 +7,7 @@ use super::flow::Flow;
 use super::fusion::Fusion;
 use super::initial::initial_values;
 use super::predenoiser::PreDenoiser;
-use super::unet::{Correction, StepImages, UNet};
+use super::unet::{StepImages, UNet};
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::{DiffusionState, per_image};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
@@ -102,11 +102,9 @@ impl Window {
         let difference = (state.x_t.clone() * signal - base.clone()) * c_skip;
         let clamped =
             |x: Tensor<4>| (x / error_sigma.clone()).clamp(-MAX_DIFFERENCE, MAX_DIFFERENCE);
-        let merged = encoded.merged.clone() * 2.0 - 1.0;
         let step = StepImages {
             noisy: clamped(difference.clone()),
             previous: clamped((base.clone() - predenoised) * has_previous),
-            merged: clamped(merged.clone() - base.clone()),
         };
         let log_snr: Vec<f32> = state
             .timesteps
@@ -116,14 +114,9 @@ impl Window {
                 ((bar / (1.0 - bar)).ln() as f32).clamp(-10.0, 10.0)
             })
             .collect();
-        let Correction { correction, gate, features } =
+        let (correction, features) =
             self.unet.forward(encoded, step, sensor.clone(), &log_snr, &flags);
-        let seen = base + difference;
-        // Where merged frames are sharp, the U-Net has only their noise left to remove. The less noise the
-        // noisy image has, the less they count.
-        let gate = gate * (c_out.clone() / error_sigma.clone());
-        let single = seen.clone() + (merged - seen) * gate;
-        let single = single + correction * c_out.clone();
+        let single = base + difference + correction * c_out.clone();
         let x0 = self.agreement.forward(single, features, &c_out, &encoded.paths);
         WindowPrediction { x0, c_out }
     }

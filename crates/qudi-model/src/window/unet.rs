@@ -8,19 +8,16 @@ use super::merging::MERGED;
 use crate::diffusion::state::per_image;
 use crate::sensor::SENSOR_NUMBERS;
 use burn::module::Module;
-use burn::tensor::activation::{sigmoid, silu};
+use burn::tensor::activation::silu;
 use burn::tensor::{Device, Tensor};
-use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
-use qudi_layers::{Bias, Conv2d, Linear};
+use qudi_layers::Linear;
+use qudi_layers::resample::pixel_unshuffle;
 
 /// Numbers that describe the noise of a step.
 const STEP_NUMBERS: usize = 6;
 
 /// Channels of the embedding between its layers, and of its result.
 const EMBEDDING: [usize; 2] = [64, 16];
-
-/// The gate before it has learnt: `sigmoid(3) = 0.95` of the merged frames.
-const OPEN: f32 = 3.0;
 
 /// The U-Net.
 #[derive(Module, Debug)]
@@ -29,18 +26,6 @@ pub(super) struct UNet {
     leave: Linear,
     hourglass: Hourglass,
     head: ImageHead,
-    gate: Conv2d,
-}
-
-/// What the U-Net computes.
-#[derive(Clone, Debug)]
-pub(super) struct Correction {
-    /// Correction of unit size, `[images, 1, H, W]`.
-    pub(super) correction: Tensor<4>,
-    /// How much of the merged frames the correction starts from, in [0, 1]: `[images, 1, H, W]`.
-    pub(super) gate: Tensor<4>,
-    /// What both come from, `[images, features, H / 2, W / 2]`.
-    pub(super) features: Tensor<4>,
 }
 
 /// The images that a step sees, `[images, 1, H, W]`, in units of usual errors.
@@ -50,8 +35,6 @@ pub(super) struct StepImages {
     pub(super) noisy: Tensor<4>,
     /// The previous estimate's difference from the pre-denoised frames.
     pub(super) previous: Tensor<4>,
-    /// The merged frames' difference from the base.
-    pub(super) merged: Tensor<4>,
 }
 
 impl WindowConfig {
@@ -63,13 +46,12 @@ impl WindowConfig {
             leave: Linear::zeros([between, planes], device),
             hourglass: Hourglass::zeros(inputs, planes, self.widths, device),
             head: ImageHead::zeros(self.widths[0], device),
-            gate: Conv2d::zeros([self.widths[0], IMAGE], 3, Bias::Yes, device),
         }
     }
 }
 
 impl UNet {
-    /// Computes the correction of a step.
+    /// Computes a correction of unit size, `[images, 1, H, W]`, and the features that it comes from.
     ///
     /// # Shapes
     /// - sensor: `[images, 11, 1, 1]`
@@ -81,7 +63,7 @@ impl UNet {
         sensor: Tensor<4>,
         log_snr: &[f32],
         has_previous: &[bool],
-    ) -> Correction {
+    ) -> (Tensor<4>, Tensor<4>) {
         let [count, numbers, ..] = sensor.dims();
         let device = sensor.device();
         let plane = |f: &dyn Fn(usize) -> f32| {
@@ -105,8 +87,7 @@ impl UNet {
         let embedding = self.leave.forward(silu(self.enter.forward(described)));
         let [_, planes] = EMBEDDING;
         let embedding = embedding.reshape([count, planes, 1, 1]);
-        let mut inputs = encoded.features.to_vec();
-        inputs.push(encoded.image.clone());
+        let mut inputs = encoded.features.clone();
         let [_, _, h, w] = inputs[0].dims();
         inputs.push(Tensor::cat(
             vec![
@@ -116,14 +97,8 @@ impl UNet {
             ],
             1,
         ));
-        let merged = pixel_unshuffle(images.merged, FOLD);
-        inputs.push(Tensor::cat(vec![merged, encoded.merged_frames.clone()], 1));
+        inputs.push(encoded.merged_planes.clone());
         let [features, ..] = self.hourglass.forward(&inputs, Some(&embedding));
-        let gate = self.gate.linear(std::slice::from_ref(&features)) + OPEN;
-        Correction {
-            correction: self.head.forward(features.clone()),
-            gate: sigmoid(pixel_shuffle(gate, FOLD)),
-            features,
-        }
+        (self.head.forward(features.clone()), features)
     }
 }

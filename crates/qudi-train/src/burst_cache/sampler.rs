@@ -2,7 +2,7 @@
 
 use super::burst::ConditionedBurst;
 use super::{BurstCache, CachedBurst};
-use crate::dataset::{Dataset, Sample};
+use crate::dataset::Dataset;
 use crate::recipe::{CropsConfig, Recipe};
 use qudi_core::restorer::BurstView;
 use qudi_core::{Error, Result, Size, USUAL_MEAN_LEVEL};
@@ -74,11 +74,6 @@ impl BurstSampler {
             cell.get_or_init(|| burst);
         }
         Ok(cell.get().expect("just filled").crop(crops, &mut random))
-    }
-
-    /// Sample `number` of a scene in which nothing moves: one clean frame, exposed `frames` times.
-    pub(crate) fn still_sample(&self, number: u64, frames: usize) -> Result<Sample> {
-        self.dataset.still_sample(self.seed, number, frames)
     }
 
     /// Burst `number` from the cache, or drawn and cached.

@@ -62,20 +62,6 @@ impl Dataset {
     /// # Errors
     /// [`Error`] if a sensor cannot be used.
     pub fn sample(&self, seed: u64, number: u64) -> Result<Sample> {
-        self.exposed(seed, number, 1)
-    }
-
-    /// Draws sample `number` of `seed` in which nothing moves: one clean frame, exposed `frames` times.
-    ///
-    /// # Errors
-    /// [`Error`] if a sensor cannot be used.
-    pub fn still_sample(&self, seed: u64, number: u64, frames: usize) -> Result<Sample> {
-        let config = DataConfig { frames: 1, ..self.config.clone() };
-        Self { config, ..self.clone() }.exposed(seed, number, frames)
-    }
-
-    /// Draws sample `number` of `seed`, with every frame exposed so many times.
-    fn exposed(&self, seed: u64, number: u64, exposures: usize) -> Result<Sample> {
         let mut rng = Streams::new(seed).row(Domain::Training, number, 0);
         let weights: Vec<f64> = self.config.source.iter().map(|source| source.weight).collect();
         let at = pick(&weights, uniform(&mut rng));
@@ -93,13 +79,9 @@ impl Dataset {
         let mut camera = Camera::new(&sensor, frames[0].size, light, seed)?;
         let mut shutter = RollingShutter::new(&sensor);
         let (mut truth, mut counts) = (Vec::new(), Vec::new());
-        let mut number = 0;
-        for frame in &frames {
+        for (t, frame) in (0..).zip(&frames) {
             let seen = shutter.roll(std::slice::from_ref(frame)).swap_remove(0);
-            for _ in 0..exposures {
-                counts.push(camera.expose(number, &[&seen])?);
-                number += 1;
-            }
+            counts.push(camera.expose(t, &[&seen])?);
             truth.push(seen);
         }
         let acquisition = Acquisition::new(sensor, light.ppp, mean_level)?.with_seed(seed);

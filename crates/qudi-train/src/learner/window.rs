@@ -56,11 +56,7 @@ impl Learner for Window {
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
         let passes = random.random_range(1..=train.passes);
-        let encoded = if batch.still {
-            self.encode_still(&conditioning, passes)
-        } else {
-            self.encode(&conditioning, passes)
-        };
+        let encoded = self.encode(&conditioning, passes);
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let truth = example.truth.clone() * 2.0 - 1.0;
         let (x0_prev, has_previous) = if from_nothing {
@@ -96,9 +92,8 @@ impl Learner for Window {
         sum.add("merged", weights.pre, before(&encoded.merged));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
-        if let Some(flow) = flows.reduce(Tensor::add) {
-            sum.add("flow", weights.flow, flow);
-        }
+        let flow = flows.reduce(Tensor::add).expect("a level");
+        sum.add("flow", weights.flow, flow);
         let total = sum.total();
         Ok(Loss {
             total: total.clone(),
@@ -133,8 +128,7 @@ impl Learner for Window {
     /// Steps of Muon have full size whatever the gradient: outputs and flow, whose gradients are noise at
     /// first, would walk at random.
     fn prefers_adam(name: &str) -> bool {
-        ["out.weight", "gate.weight"].iter().any(|end| name.ends_with(end))
-            || name.starts_with("flow.")
+        name.starts_with("flow.") || name.ends_with("out.weight")
     }
 }
 

@@ -43,11 +43,6 @@ impl Recipe {
                     ),
                     ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
                     perceptual_rule(loss),
-                    (
-                        "train.still_fraction",
-                        (0.0..=1.0).contains(&self.train.still_fraction),
-                        "must be from 0 to 1",
-                    ),
                     ("train.passes", (1..=8).contains(&self.train.passes), "must be from 1 to 8"),
                     ("train.ablate", is_default(&self.train.ablate), "is for the other diffusion"),
                     ("train.learns", self.train.learns.is_empty(), "is for the regression"),
@@ -74,16 +69,11 @@ impl Recipe {
     }
 
     /// Returns the rules of every network.
-    fn common_rules(&self) -> [Rule<'static>; 10] {
+    fn common_rules(&self) -> [Rule<'static>; 9] {
         let train = &self.train;
         let is_window = matches!(&self.network, NetworkRecipe::Qudi(NetworkConfig::Window(_)));
         [
             ("train.passes", is_window || train.passes == 1, "is for the network `window`"),
-            (
-                "train.still_fraction",
-                is_window || train.still_fraction == 0.0,
-                "is for the network `window`",
-            ),
             ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
             ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),
             ("train.accumulate", (1..=4096).contains(&train.accumulate), "must be from 1 to 4096"),

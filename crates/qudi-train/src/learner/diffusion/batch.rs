@@ -2,6 +2,7 @@
 
 use super::Example;
 use crate::burst_cache::BurstSampler;
+use crate::burst_cache::burst::ConditionedBurst;
 use crate::recipe::Recipe;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_core::restorer::{Acquisition, BurstView};
@@ -15,18 +16,12 @@ use qudi_model::sensor::{SENSOR_NUMBERS, sensor_numbers};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
-/// The largest number of frames of a scene in which nothing moves.
-const MOST_MERGED: usize = 11;
-
 /// The samples of one pass of the diffusion.
 #[derive(Clone, Debug)]
 pub struct Batch {
     /// The number of the batch in its run.
     pub number: u64,
-    /// True if nothing moves: there is one clean frame of every sample.
-    pub still: bool,
     size: Size,
-    /// Captured frames of a sample.
     frames: usize,
     counts: CountPlanes,
     truth: Vec<f32>,
@@ -53,22 +48,13 @@ impl Batch {
     /// # Errors
     /// [`qudi_core::Error`] if the data cannot be read.
     pub fn draw(recipe: &Recipe, bursts: &mut BurstSampler, number: u64) -> Result<Self> {
+        let count = recipe.train.batch;
         let (frames, side) = recipe.sample_size();
-        let mut random = ChaCha8Rng::seed_from_u64(recipe.train.seed);
-        random.set_stream(number);
-        let still = random.random::<f64>() < recipe.train.still_fraction;
-        let (count, exposures, clean) = if still {
-            // As many frames pass the network.
-            (recipe.train.batch * frames, random.random_range(1..=MOST_MERGED), 1)
-        } else {
-            (recipe.train.batch, frames, frames)
-        };
         let size = Size { height: side, width: side };
         let mut batch = Self {
             number,
-            still,
             size,
-            frames: exposures,
+            frames,
             counts: CountPlanes::default(),
             truth: Vec::new(),
             noise: Vec::new(),
@@ -79,16 +65,12 @@ impl Batch {
             uploaded: None,
         };
         for sample in (number * count as u64..).take(count) {
-            let drawn = if still {
-                bursts.still_sample(sample, exposures)?
-            } else {
-                bursts.sample(sample)?.sample
-            };
+            let ConditionedBurst { sample: drawn, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
             batch.counts.extend(CountPlanes::new(view, &drawn.acquisition));
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
             let noise = Noise::new(drawn.acquisition.seed, 0);
-            let noise = (0..clean as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
+            let noise = (0..frames as u64).flat_map(|frame| noise.frame(frame, 0, size.pixels()));
             batch.noise.extend(noise);
             batch.numbers.extend(sensor_numbers(&drawn.acquisition));
             let mut random = ChaCha8Rng::seed_from_u64(drawn.acquisition.seed);
@@ -126,7 +108,6 @@ impl Batch {
             let planes = |values: &[f32]| share(values, number, count).to_vec();
             Self {
                 number: self.number,
-                still: self.still,
                 size: self.size,
                 frames: self.frames,
                 counts: self.counts.map(planes),
