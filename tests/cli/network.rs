@@ -72,6 +72,11 @@ fn restores_a_burst_and_resumes() {
         &format!("{common} -o two.npy --passes 2"),
         &["2 passes of a network that has learnt one", "where: --passes", "train.passes"],
     );
+    refused(
+        &folder,
+        &format!("{common} -o two.npy --flow matched"),
+        &["matched flow for a network of another kind", "where: --flow", "learnt"],
+    );
     run("info w.safetensors");
     run(&format!("{common} -o s.npy --samples 2 --uncertainty d.npy --sampler ancestral"));
     let header = std::fs::read(folder.join("d.npy")).unwrap();

@@ -125,7 +125,14 @@ fn clips_of_one_stem_keep_names_of_their_own() {
 #[test]
 fn rejects_flags_of_another_method() {
     let folder = prepared("safety-flags");
-    let flags = ["--tile 64", "--samples 2", "--passes 2", "--device cpu", "--spacing linear"];
+    let flags = [
+        "--tile 64",
+        "--samples 2",
+        "--passes 2",
+        "--flow learnt",
+        "--device cpu",
+        "--spacing linear",
+    ];
     for flag in ["--steps 3"].into_iter().chain(flags) {
         let name = flag.split(' ').next().unwrap();
         let whose = match name {

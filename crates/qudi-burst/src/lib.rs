@@ -11,6 +11,7 @@
 
 mod aligned_burst;
 mod aligned_sums;
+mod burst_motion;
 mod colour;
 mod denoise;
 mod merge;
@@ -24,6 +25,7 @@ mod temporal_filter;
 
 pub use aligned_burst::{AlignedBurst, AlignedFrame, Alignments};
 pub use aligned_sums::{AlignedSums, choose_count};
+pub use burst_motion::{BurstMotion, FoundMotion};
 pub use colour::{ColourCorrector, ColourEvidence, ColourRestorer, CorrectedColours, PlaneFrames};
 pub use denoise::bm3d::bm3d;
 pub use denoise::vst::{Transform, VarianceStabilizer};

@@ -29,4 +29,4 @@ pub use network::{
     Diffusion, Encoded, EncodedMeasurement, Flows, Fused, FusedGradient, Predenoised, Prediction,
     Simulated,
 };
-pub use restorer::{DiffusionRestorer, SampleOptions};
+pub use restorer::{DiffusionRestorer, FlowSource, SampleOptions};

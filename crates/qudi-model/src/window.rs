@@ -16,6 +16,7 @@ mod initial;
 mod input;
 mod matching;
 mod merging;
+mod motion;
 mod network;
 mod predenoiser;
 mod refinement;

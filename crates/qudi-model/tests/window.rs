@@ -3,13 +3,16 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Distribution, Tensor};
+use qudi_burst::BurstMotion;
+use qudi_core::Size;
 use qudi_core::atomic_file::Overwrite;
-use qudi_core::restorer::Acquisition;
+use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
-use qudi_layers::tensor::read;
+use qudi_layers::tensor::{read, to_tensor};
 use qudi_layers::{Provenance, init_parameters, parameter_shapes};
 use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
+use qudi_model::counts::CountPlanes;
 use qudi_model::diffusion::Conditioning;
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
@@ -17,6 +20,7 @@ use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::regression::Regression;
 use qudi_model::sensor::sensor_tensor;
 use qudi_model::window::{Window, WindowConfig};
+use std::sync::Arc;
 
 const CONFIG: WindowConfig =
     WindowConfig { widths: [8, 8, 8], flow: [4, 4, 4], state: 8, cell_blocks: 1 };
@@ -30,6 +34,30 @@ fn conditioning(frames: usize, device: &Device) -> Conditioning {
         linear_estimate: images(),
         sensor: sensor_tensor(&acquisition, device),
         frames,
+        motion: Vec::new(),
+    }
+}
+
+/// Returns a conditioning that comes with the search for motion in counts: a texture that moves by `speed`
+/// pixels a frame.
+fn matched(frames: usize, speed: f32, device: &Device) -> Conditioning {
+    let size = Size { height: 16, width: 24 };
+    let sensor = Sensor::load("qudi-paper").unwrap();
+    let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap();
+    let count = |t: usize, i: usize| {
+        let x = (i % size.width) as f32 - speed * t as f32;
+        let y = (i / size.width) as f32;
+        (3.0 + 2.0 * (0.9 * x).sin() + 2.0 * (0.7 * y + 0.3 * x).cos()).clamp(0.0, 7.0) as u16
+    };
+    let counts: Vec<Vec<u16>> =
+        (0..frames).map(|t| (0..size.pixels()).map(|i| count(t, i)).collect()).collect();
+    let motion = BurstMotion::new(BurstView { size, frames: &counts }, &acquisition);
+    let planes = CountPlanes::new(BurstView { size, frames: &counts }, &acquisition);
+    Conditioning {
+        counts: to_tensor(planes.y, size, device),
+        linear_estimate: to_tensor(planes.u, size, device),
+        motion: vec![Arc::new(motion)],
+        ..conditioning(frames, device)
     }
 }
 
@@ -45,7 +73,7 @@ fn state(frames: usize, timestep: usize, device: &Device) -> DiffusionState {
 
 fn predicted(network: &Window, conditioning: &Conditioning, state: &DiffusionState) -> Vec<f32> {
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    read(network.predict(&network.encode(conditioning, 1), state, &schedule).x0).unwrap()
+    read(network.predict(&network.encode(conditioning, 1).unwrap(), state, &schedule).x0).unwrap()
 }
 
 #[test]
@@ -70,11 +98,49 @@ fn a_second_pass_changes_what_frames_are_fused_along() {
     let state = state(3, NUM_TIMESTEPS - 1, &device);
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
     let [one, two] = [1, 2].map(|passes| {
-        let encoded = network.encode(&conditioning, passes);
+        let encoded = network.encode(&conditioning, passes).unwrap();
         read(network.predict(&encoded, &state, &schedule).x0).unwrap()
     });
     assert!(two.iter().all(|value| value.is_finite()));
     assert_ne!(one, two);
+}
+
+/// Two bursts side by side are followed along their own motion, as each of them alone.
+#[test]
+fn matched_motion_belongs_to_its_burst() {
+    let device = Device::flex();
+    let network = CONFIG.init(1, &device);
+    let bursts = [0.0, 2.0].map(|speed| matched(4, speed, &device));
+    let state = state(4, NUM_TIMESTEPS - 1, &device);
+    let alone = bursts.each_ref().map(|burst| predicted(&network, burst, &state));
+    let both = |of: fn(&Conditioning) -> &Tensor<4>| {
+        Tensor::cat(bursts.iter().map(|burst| of(burst).clone()).collect(), 0)
+    };
+    let joined = Conditioning {
+        counts: both(|burst| &burst.counts),
+        linear_estimate: both(|burst| &burst.linear_estimate),
+        sensor: bursts[0].sensor.clone().repeat_dim(0, 2),
+        frames: 4,
+        motion: bursts.iter().flat_map(|burst| burst.motion.clone()).collect(),
+    };
+    let twice = |x: &Tensor<4>| x.clone().repeat_dim(0, 2);
+    let state = DiffusionState {
+        x_t: twice(&state.x_t),
+        x0_prev: twice(&state.x0_prev),
+        has_previous: vec![false; 2],
+        timesteps: vec![NUM_TIMESTEPS - 1; 2],
+    };
+    let together = predicted(&network, &joined, &state);
+    let pairs = together.iter().zip(alone.iter().flatten());
+    assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-5), "bursts mix");
+    let learnt = Conditioning { motion: Vec::new(), ..bursts[1].clone() };
+    let state = DiffusionState {
+        x_t: state.x_t.narrow(0, 0, 4),
+        x0_prev: state.x0_prev.narrow(0, 0, 4),
+        has_previous: vec![false],
+        timesteps: vec![NUM_TIMESTEPS - 1],
+    };
+    assert_ne!(predicted(&network, &learnt, &state), alone[1], "the motion changes nothing");
 }
 
 /// With little noise, the noisy image is the answer.
@@ -94,17 +160,19 @@ fn the_prediction_follows_an_image_without_noise() {
 
 #[test]
 fn every_parameter_has_a_gradient() {
-    for passes in [1, 2] {
-        every_parameter_has_a_gradient_in(passes);
+    let device = Device::flex().autodiff();
+    for conditioning in [conditioning(4, &device), matched(4, 1.0, &device)] {
+        for passes in [1, 2] {
+            every_parameter_has_a_gradient_in(passes, &conditioning);
+        }
     }
 }
 
-fn every_parameter_has_a_gradient_in(passes: usize) {
+fn every_parameter_has_a_gradient_in(passes: usize, conditioning: &Conditioning) {
     let device = Device::flex().autodiff();
     let network = CONFIG.init(1, &device);
-    let conditioning = conditioning(4, &device);
     let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-    let encoded = network.encode(&conditioning, passes);
+    let encoded = network.encode(conditioning, passes).unwrap();
     let mut state = state(4, 60, &device);
     state.has_previous = vec![true];
     let x0 = network.predict(&encoded, &state, &schedule).x0;

@@ -107,6 +107,11 @@ pub struct TrainConfig {
     #[serde(default = "one_pass", skip_serializing_if = "is_one_pass")]
     #[schemars(skip_serializing_if = "never")]
     pub passes: usize,
+    /// Share of batches that follow the motion that is matched in their counts; the others follow the learnt
+    /// flow. Only of `window`.
+    #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
+    pub matched: f64,
     /// Steps between checkpoints.
     pub checkpoint: u64,
     /// Loss of the diffusion; the other networks have no weights to choose.
@@ -132,6 +137,13 @@ impl TrainConfig {
     /// Returns the fraction of the samples at the noisiest timestep.
     pub(super) fn noise_start_fraction(&self) -> f64 {
         self.noise_start_fraction.unwrap_or(0.0)
+    }
+
+    /// Returns true if batch `number` follows the motion that is matched in its counts. These batches are
+    /// spread evenly.
+    pub(super) fn matches(&self, number: u64) -> bool {
+        let share = |count: u64| (count as f64 * self.matched).floor();
+        share(number + 1) > share(number)
     }
 }
 

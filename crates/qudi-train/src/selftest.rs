@@ -320,6 +320,7 @@ fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
         linear_estimate: image(22),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
         frames: 4,
+        motion: Vec::new(),
     };
     let simulated = Simulated { y: image(24), u: image(25), exists: vec![true] };
     let x_t = values(26, [4, 1, 32, 48], &device).require_grad();
@@ -350,8 +351,9 @@ fn window(device: &Device) -> Result<Vec<Vec<f32>>> {
         linear_estimate: image(30),
         sensor: values(31, [1, SENSOR_NUMBERS], &device),
         frames: 4,
+        motion: Vec::new(),
     };
-    let encoded = network.encode(&conditioning, 1);
+    let encoded = network.encode(&conditioning, 1)?;
     let x_t = values(32, [4, 1, 32, 48], &device).require_grad();
     let x0_prev = values(33, [4, 1, 32, 48], &device);
     let (has_previous, timesteps) = (vec![true], vec![300]);

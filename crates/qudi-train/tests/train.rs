@@ -134,6 +134,20 @@ fn batches_are_encoded_in_one_to_so_many_passes() {
     assert!(many.iter().all(|loss| loss.is_finite()));
 }
 
+/// Every second batch follows the motion in its counts: the first one learns as without.
+#[test]
+fn a_share_of_batches_follows_the_motion_in_their_counts() {
+    let losses = |share: &str| {
+        let recipe = window(&[("train.batch", "2"), ("train.matched", share)]);
+        let (_, steps) = trained_as::<Window>(&recipe, &[Device::flex()], 1);
+        steps.into_iter().map(|step| step.loss.term("prediction")).collect::<Vec<_>>()
+    };
+    let (none, half, all) = (losses("0"), losses("0.5"), losses("1"));
+    assert_eq!(none[0], half[0]);
+    assert_ne!(none[1], half[1]);
+    assert_ne!(none[0], all[0]);
+}
+
 /// Two devices with a batch each, one device with both in turn, and one device with both at once.
 #[test]
 fn weights_do_not_depend_on_the_number_of_devices() {
@@ -379,6 +393,7 @@ fn rejects_wrong_recipes_by_key() {
         ("train.loss.prediction", "0", "train.loss.prediction"),
         ("validation.steps", "0", "validation.steps"),
         ("train.passes", "2", "train.passes"),
+        ("train.matched", "0.5", "train.matched"),
         ("train.learning", "3", "learning"),
         ("trains.steps", "3", "trains.steps"),
         ("data.crop", "50", "data.crop"),
@@ -415,6 +430,7 @@ fn regression_recipes_are_refused_by_key() {
         ("train.ablate", "[\"flow\"]", "train.ablate"),
         ("train.noise_start_fraction", "0.3", "train.noise_start_fraction"),
         ("train.passes", "2", "train.passes"),
+        ("train.matched", "0.5", "train.matched"),
         ("validation.steps", "1", "validation.steps"),
         ("network.neighbours", "0", "network.neighbours"),
     ] {
@@ -427,6 +443,9 @@ fn regression_recipes_are_refused_by_key() {
         let error = Recipe::load("window", &changes).unwrap_err().to_string();
         assert!(error.contains("train.passes must be from 1 to 8"), "{passes}: {error}");
     }
+    let changes = [("train.matched".to_owned(), "1.5".to_owned())];
+    let error = Recipe::load("window", &changes).unwrap_err().to_string();
+    assert!(error.contains("train.matched must be from 0 to 1"), "{error}");
 }
 
 /// The weights of the whole network start one that leaves parts out, which learns as if it had been made so.

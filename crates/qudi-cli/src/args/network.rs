@@ -7,6 +7,7 @@ use clap::{Args as ClapArgs, ValueEnum, ValueHint};
 use qudi_baselines::import::{METHODS, Method};
 use qudi_layers::TILE;
 use qudi_model::ComputePrecision;
+use qudi_model::diffusion::FlowSource;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::{Path, PathBuf};
@@ -29,6 +30,9 @@ pub(crate) struct Network {
     /// before restored, and corrects them: 2 take 1.7 times as long, 3 take 2.4 times [default: 1]
     #[arg(long, value_name = "N", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=10))]
     passes: Option<usize>,
+    /// qudi-diffusion: what finds the motion between frames [default: matched, if the weights can follow it]
+    #[arg(long, value_name = "NAME", groups = [OWN, DIFFUSION])]
+    flow: Option<FlowName>,
     /// qudi-diffusion: samples drawn; the result is their mean, --uncertainty their standard deviation
     /// [default: 1]
     #[arg(long, value_name = "K", groups = [OWN, DIFFUSION], allow_negative_numbers = true, value_parser = number::whole::<usize>(1..=1000))]
@@ -78,6 +82,7 @@ impl Network {
             spacing: self.spacing.map(SpacingName::spacing),
             sampler: self.sampler.map_or_else(Sampler::default, SamplerName::sampler),
             passes: self.passes.unwrap_or(1),
+            flow: self.flow.map(FlowName::source),
             samples: self.samples.unwrap_or(1),
             device: self.device.clone().unwrap_or_else(|| "auto".to_owned()),
             tile: self.tile.unwrap_or(TILE),
@@ -160,6 +165,24 @@ impl SpacingName {
         match self {
             Self::Linear => TimestepSpacing::Linear,
             Self::LogLogistic => TimestepSpacing::LogLogistic,
+        }
+    }
+}
+
+/// What finds the motion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum FlowName {
+    /// Patches, matched on the processor in the counts of all frames and on better frames
+    Matched,
+    /// The network, as in the paper: less exact, in about half the time
+    Learnt,
+}
+
+impl FlowName {
+    fn source(self) -> FlowSource {
+        match self {
+            Self::Matched => FlowSource::Matched,
+            Self::Learnt => FlowSource::Learnt,
         }
     }
 }

@@ -99,6 +99,9 @@ impl OwnNetwork {
             settings["spacing"] = json!(sampling.spacing);
             settings["sampler"] = json!(options.sampler_name());
             settings["samples"] = json!(options.samples);
+            if let Some(flow) = options.flow {
+                settings["flow"] = json!(flow.name());
+            }
             if options.passes > 1 {
                 settings["passes"] = json!(options.passes);
             }
@@ -158,8 +161,8 @@ fn sample_options(
     precision: ComputePrecision,
 ) -> SampleOptions {
     let Sampling { steps, spacing } = own.sampling(options);
-    let NetworkOptions { sampler, passes, samples, tile, .. } = *options;
-    SampleOptions { steps, spacing, sampler, passes, samples, tile, precision }
+    let NetworkOptions { sampler, passes, flow, samples, tile, .. } = *options;
+    SampleOptions { steps, spacing, sampler, passes, flow, samples, tile, precision }
 }
 
 /// Returns the error of a device that failed, with what to do; `problem` is the device's own message.

@@ -8,6 +8,7 @@ use crate::methods::network::OwnNetwork;
 use crate::methods::{Method, QUDI, QUDI_DIFFUSION};
 use qudi_baselines::import;
 use qudi_model::ComputePrecision;
+use qudi_model::diffusion::FlowSource;
 use qudi_model::diffusion::sampler::Sampler;
 use qudi_model::diffusion::timesteps::TimestepSpacing;
 use std::path::PathBuf;
@@ -29,6 +30,8 @@ pub(crate) struct NetworkOptions {
     pub(crate) sampler: Sampler,
     /// Passes of encoding.
     pub(crate) passes: usize,
+    /// What finds the motion; none for the best that the weights can follow.
+    pub(crate) flow: Option<FlowSource>,
     /// The number of samples.
     pub(crate) samples: usize,
     /// The device to compute on.

@@ -2,6 +2,8 @@
 
 use crate::sensor::MEAN_LIGHT_SIGMA;
 use burn::tensor::Tensor;
+use qudi_burst::BurstMotion;
+use std::sync::Arc;
 
 /// The least variance: below it, float arithmetic is the noise.
 const MIN_VARIANCE: f32 = 1e-8;
@@ -21,6 +23,9 @@ pub struct Conditioning {
     pub sensor: Tensor<2>,
     /// Frames of a burst.
     pub frames: usize,
+    /// Finders of the motion in the counts, one for every burst. Without them, networks follow their learnt
+    /// flow.
+    pub motion: Vec<Arc<BurstMotion>>,
 }
 
 impl Conditioning {
@@ -45,6 +50,7 @@ impl Conditioning {
             linear_estimate: one(&self.linear_estimate),
             sensor: self.sensor.clone().narrow(0, number / self.frames, 1),
             frames: 1,
+            motion: Vec::new(),
         }
     }
 
@@ -56,6 +62,7 @@ impl Conditioning {
             linear_estimate: self.linear_estimate.clone().inner(),
             sensor: self.sensor.clone().inner(),
             frames: self.frames,
+            motion: self.motion.clone(),
         }
     }
 }

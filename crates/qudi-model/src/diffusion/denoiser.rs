@@ -5,6 +5,7 @@ use super::network::{Diffusion, Encoded, Flows, Simulated};
 use super::state::DiffusionState;
 use super::{DiffusionConfig, Part};
 use burn::tensor::Tensor;
+use qudi_core::Result;
 use std::fmt::Debug;
 
 /// A network that predicts clean frames in every reverse step.
@@ -25,8 +26,16 @@ pub trait Denoiser: Debug {
     /// Returns true if the network uses this part of the method.
     fn uses(&self, part: Part) -> bool;
 
+    /// Returns true if the network can follow the motion that is found in the counts.
+    fn follows_counts(&self) -> bool {
+        false
+    }
+
     /// Encodes everything that does not depend on the step, in so many passes.
-    fn encode(&self, conditioning: &Conditioning, passes: usize) -> Self::Encoded;
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the device fails.
+    fn encode(&self, conditioning: &Conditioning, passes: usize) -> Result<Self::Encoded>;
 
     /// Returns the memory of the encoding, in bytes.
     fn encoded_bytes(encoded: &Self::Encoded) -> usize;
@@ -58,8 +67,8 @@ impl Denoiser for Diffusion {
         !self.ablation().removes(part)
     }
 
-    fn encode(&self, conditioning: &Conditioning, _: usize) -> Encoded {
-        Self::encode(self, conditioning)
+    fn encode(&self, conditioning: &Conditioning, _: usize) -> Result<Encoded> {
+        Ok(Self::encode(self, conditioning))
     }
 
     fn encoded_bytes(encoded: &Encoded) -> usize {

@@ -13,6 +13,7 @@ use crate::counts::CountPlanes;
 use crate::restorer::{Model, check_frames, check_tile};
 use crate::sensor::sensor_tensor;
 use burn::tensor::{Device, Tensor};
+use qudi_burst::BurstMotion;
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::{Error, Result};
@@ -21,6 +22,7 @@ use qudi_layers::tensor::{read, to_tensor};
 use qudi_layers::{TILE, Tiling};
 use std::cell::RefCell;
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Pixels of the frames that pass through the network at once, on devices other than the processor: two tiles
 /// of 512 x 512 in windows of 11 frames.
@@ -28,6 +30,25 @@ const BATCH_PIXELS: usize = 1 << 23;
 
 /// The largest number of bytes of encoded tiles that are kept for later steps. A single tile is always kept.
 const MAX_KEPT_BYTES: usize = 1 << 30;
+
+/// What finds the motion between frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FlowSource {
+    /// Patches, matched on the processor in the counts of all frames and on better frames.
+    Matched,
+    /// The network, on its device.
+    Learnt,
+}
+
+impl FlowSource {
+    /// Returns the name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Matched => "matched",
+            Self::Learnt => "learnt",
+        }
+    }
+}
 
 /// Options of sampling.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,6 +61,8 @@ pub struct SampleOptions {
     pub sampler: Sampler,
     /// Passes of encoding: each one after the first sees the frames that the one before predicts.
     pub passes: usize,
+    /// What finds the motion; none for the best that the network can follow.
+    pub flow: Option<FlowSource>,
     /// Samples drawn. Their mean is the result, their standard deviation its uncertainty.
     pub samples: usize,
     /// Side of the tiles that the network sees, in pixels.
@@ -55,6 +78,7 @@ impl Default for SampleOptions {
             spacing: TimestepSpacing::default(),
             sampler: Sampler::Ddim,
             passes: 1,
+            flow: None,
             samples: 1,
             tile: TILE,
             precision: ComputePrecision::F32,
@@ -80,11 +104,31 @@ struct Window<'a, E> {
     acquisition: &'a Acquisition,
     sensor: Tensor<2>,
     counts: CountPlanes,
+    /// Counts as they are; none if no motion is found in them.
+    raw: Option<Vec<f32>>,
     frames: usize,
     tiling: Tiling,
     /// Numbers of the tiles that pass through the network at once.
     batches: Vec<Range<usize>>,
     kept: RefCell<Kept<E>>,
+}
+
+impl<E> Window<'_, E> {
+    /// Prepares the search for the motion in the counts of a batch of tiles.
+    fn motion(&self, batch: usize) -> Vec<Arc<BurstMotion>> {
+        let Some(raw) = &self.raw else { return Vec::new() };
+        let tiles = &self.tiling.tiles;
+        let size = tiles.tile;
+        let of = |tile: usize| {
+            let counts = tiles.crop(tile, raw);
+            let frames = counts.chunks_exact(size.pixels());
+            let frames: Vec<Vec<u16>> =
+                frames.map(|frame| frame.iter().map(|&n| n as u16).collect()).collect();
+            let view = BurstView { size, frames: &frames };
+            Arc::new(BurstMotion::new(view, self.acquisition))
+        };
+        self.batches[batch].clone().map(of).collect()
+    }
 }
 
 /// Encoded batches of tiles that later steps use again.
@@ -119,6 +163,10 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             let help = "use 1, or weights of a recipe that sets train.passes, as `window` does";
             return Err(Error::request(what, "passes", help));
         }
+        if options.flow == Some(FlowSource::Matched) && !network.follows_counts() {
+            let help = "use `learnt`, or weights of the network `window`";
+            return Err(Error::request("matched flow for a network of another kind", "flow", help));
+        }
         check_tile(options.tile, N::multiple(&config))?;
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         // The processor's results do not depend on batches, and small ones stay in its caches.
@@ -147,6 +195,9 @@ impl<N: Denoiser> DiffusionRestorer<N> {
     ) -> Window<'a, N::Encoded> {
         let tiling = Tiling::new(burst.size, N::multiple(&self.config), self.options.tile);
         let frames = burst.frames.len();
+        let matched =
+            self.network.follows_counts() && self.options.flow != Some(FlowSource::Learnt);
+        let raw = || -> Vec<f32> { burst.frames.iter().flatten().map(|&n| f32::from(n)).collect() };
         let (count, pixels) = (tiling.tiles.count(), tiling.tiles.tile.pixels() * frames);
         let tiles = (self.batch_pixels / pixels).clamp(1, count);
         let batches = (0..count).step_by(tiles).map(|first| first..(first + tiles).min(count));
@@ -155,6 +206,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             acquisition,
             sensor: sensor_tensor(acquisition, &self.device),
             counts: CountPlanes::new(burst, acquisition).map(|plane| tiling.padded(plane)),
+            raw: matched.then(|| tiling.padded(&raw())),
             frames,
             tiling,
             kept: RefCell::new(Kept { batches: vec![None; batches.len()], bytes: 0 }),
@@ -229,7 +281,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
     ) -> Result<Vec<f32>> {
         let tensor = |images: &[f32]| self.tiles(window, batch, images);
         let tiles = window.batches[batch].len();
-        let encoded = self.encoded(window, batch);
+        let encoded = self.encoded(window, batch)?;
         let simulated = simulated.map(|planes| Simulated {
             y: tensor(&planes.y),
             u: tensor(&planes.u),
@@ -256,25 +308,26 @@ impl<N: Denoiser> DiffusionRestorer<N> {
 
     /// Returns what does not depend on the step, of a batch of tiles: kept from an earlier step or sample, or
     /// computed now.
-    fn encoded(&self, window: &Window<'_, N::Encoded>, batch: usize) -> N::Encoded {
+    fn encoded(&self, window: &Window<'_, N::Encoded>, batch: usize) -> Result<N::Encoded> {
         let mut kept = window.kept.borrow_mut();
         if let Some(encoded) = &kept.batches[batch] {
-            return encoded.clone();
+            return Ok(encoded.clone());
         }
         let conditioning = Conditioning {
             counts: self.tiles(window, batch, &window.counts.y),
             linear_estimate: self.tiles(window, batch, &window.counts.u),
             sensor: window.sensor.clone().repeat_dim(0, window.batches[batch].len()),
             frames: window.frames,
+            motion: window.motion(batch),
         };
-        let encoded = self.network.encode(&conditioning, self.options.passes);
+        let encoded = self.network.encode(&conditioning, self.options.passes)?;
         let bytes = kept.bytes + N::encoded_bytes(&encoded);
         let used_again = self.options.steps * self.options.samples > 1;
         if used_again && (bytes <= MAX_KEPT_BYTES || window.batches.len() == 1) {
             kept.bytes = bytes;
             kept.batches[batch] = Some(encoded.clone());
         }
-        encoded
+        Ok(encoded)
     }
 }
 

@@ -43,6 +43,7 @@ fn whole_network_matches_pytorch() {
             linear_estimate: u.clone(),
             sensor: case.input("sensor", &device),
             frames: case.number("frames"),
+            motion: Vec::new(),
         };
         let exists: Vec<bool> = case.values("flag").iter().map(|&flag| flag > 0.0).collect();
         let has_previous = exists.clone();
@@ -115,7 +116,8 @@ fn ten_sampling_steps_match_pytorch() {
         };
         let (counts, linear_estimate) = planes(&file.bytes("counts"), &file.f32s("u_table"));
         let sensor = Tensor::<1>::from_floats(sensor.as_slice(), &device).unsqueeze();
-        let conditioning = Conditioning { counts, linear_estimate, sensor, frames };
+        let motion = Vec::new();
+        let conditioning = Conditioning { counts, linear_estimate, sensor, frames, motion };
         let encoded = network.encode(&conditioning);
         let (simulated, tables) = (file.bytes("simulated"), file.f32s("u_sim_table"));
         let count = frames * size.pixels();

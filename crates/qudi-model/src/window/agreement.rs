@@ -13,7 +13,7 @@ use qudi_layers::resample::{
 use qudi_layers::{Bias, Conv2d};
 
 /// Neighbours on either side.
-const NEIGHBOURS: usize = 3;
+pub(super) const NEIGHBOURS: usize = 3;
 
 /// Channels between the convolutions.
 const HIDDEN: usize = 32;
@@ -78,9 +78,20 @@ impl Paths {
         Self { flows, frames }
     }
 
+    /// Takes the flow that is known for every distance, from 1: to later frames, then to earlier ones.
+    pub(super) fn of(flows: Vec<[Tensor<4>; 2]>, frames: usize) -> Self {
+        Self { flows, frames }
+    }
+
     /// Returns all tensors.
     pub(super) fn tensors(&self) -> impl Iterator<Item = &Tensor<4>> {
         self.flows.iter().flatten()
+    }
+
+    /// Returns the same inside autodiff, without gradient.
+    pub(super) fn from_inner(paths: Self) -> Self {
+        let flows = paths.flows.into_iter().map(|pair| pair.map(Tensor::from_inner)).collect();
+        Self { flows, frames: paths.frames }
     }
 
     /// Returns the same outside autodiff.

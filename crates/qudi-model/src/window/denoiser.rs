@@ -6,6 +6,7 @@ use crate::diffusion::state::DiffusionState;
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use crate::diffusion::{Conditioning, Denoiser, Part, Simulated};
 use burn::tensor::Tensor;
+use qudi_core::Result;
 
 impl Denoiser for Window {
     type Config = WindowConfig;
@@ -20,11 +21,15 @@ impl Denoiser for Window {
         false
     }
 
+    fn follows_counts(&self) -> bool {
+        true
+    }
+
     fn uses(&self, part: Part) -> bool {
         part != Part::ForwardModel
     }
 
-    fn encode(&self, conditioning: &Conditioning, passes: usize) -> EncodedWindow {
+    fn encode(&self, conditioning: &Conditioning, passes: usize) -> Result<EncodedWindow> {
         Self::encode(self, conditioning, passes)
     }
 

@@ -7,13 +7,14 @@ use super::flow::WindowFlow;
 use super::fusion::{Frames, Fused};
 use super::hourglass::normalized;
 use super::input::{MIDDLE, Measurement};
-use super::refinement::{flow_between, refined};
+use super::motion::{Finder, Motion};
 use crate::diffusion::Conditioning;
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::DiffusionState;
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use burn::module::Module;
 use burn::tensor::Tensor;
+use qudi_core::Result;
 use qudi_layers::resample::pixel_unshuffle;
 
 /// Scale of pre-denoised frames around the middle level among the inputs of the U-Net.
@@ -107,28 +108,29 @@ impl Window {
     /// Encodes a window. Every pass after the first one sees the clean frames that the pass before predicts:
     /// it finds the flow between them, fuses the captured frames with them, and corrects them. Gradients
     /// reach the last pass only.
-    pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> EncodedWindow {
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the device fails.
+    pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> Result<EncodedWindow> {
         let single = self.single_frames(conditioning);
-        let sigma = &single.measurement.error_sigma;
-        let flow = refined(&single.restored, sigma, &single.flow[0], single.count);
-        if passes <= 1 {
-            return self.fused(&single, &flow, None);
+        if !single.restored.is_autodiff() {
+            let (motion, estimate) = self.estimate(&single, conditioning, passes - 1)?;
+            return Ok(self.fused(&single, motion, estimate));
         }
-        if single.restored.is_autodiff() {
-            let (flow, estimate) = self.valid().estimate(&single.inner(), flow.inner(), passes - 1);
-            let estimate = Tensor::from_inner(estimate);
-            return self.fused(&single, &WindowFlow::from_inner(flow), Some(estimate));
-        }
-        let (flow, estimate) = self.estimate(&single, flow, passes - 1);
-        self.fused(&single, &flow, Some(estimate))
+        let (motion, estimate) =
+            self.valid().estimate(&single.inner(), conditioning, passes - 1)?;
+        Ok(self.fused(&single, Motion::from_inner(motion), estimate.map(Tensor::from_inner)))
     }
 
     fn single_frames(&self, conditioning: &Conditioning) -> SingleFrames {
         let measurement = Measurement::new(conditioning);
         let (restored, pyramid) = self.pre.forward(&measurement);
+        // Matched patches take the place of the learnt flow, which still learns.
+        let learnt = conditioning.motion.is_empty() || restored.is_autodiff();
+        let flow = || self.flow.forward(&restored, &pyramid, conditioning.frames);
         SingleFrames {
             linear: conditioning.linear_estimate.clone(),
-            flow: self.flow.forward(&restored, &pyramid, conditioning.frames),
+            flow: if learnt { flow() } else { Vec::new() },
             features: normalized(pyramid[0].clone()),
             image: (pixel_unshuffle(restored.clone(), FOLD) - MIDDLE) * SCALE,
             count: conditioning.frames,
@@ -137,14 +139,20 @@ impl Window {
         }
     }
 
-    /// Predicts the clean frames in image units from the measurement alone in so many passes, and finds the
-    /// flow between them.
+    /// Finds the motion, and predicts the clean frames in image units from the measurement alone in so many
+    /// passes; none in no pass.
     fn estimate(
         &self,
         single: &SingleFrames,
-        mut flow: WindowFlow,
+        conditioning: &Conditioning,
         passes: usize,
-    ) -> (WindowFlow, Tensor<4>) {
+    ) -> Result<(Motion, Option<Tensor<4>>)> {
+        let finder = match single.flow.first() {
+            Some(flow) if conditioning.motion.is_empty() => Finder::Learnt(flow),
+            _ => Finder::Matched(&conditioning.motion),
+        };
+        let mut motion =
+            finder.first(&single.restored, &single.measurement.error_sigma, single.count)?;
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let bursts = single.restored.dims()[0] / single.count;
         let state = DiffusionState {
@@ -155,19 +163,19 @@ impl Window {
         };
         let mut estimate: Option<Tensor<4>> = None;
         for _ in 0..passes {
-            let encoded = self.fused(single, &flow, estimate);
+            let encoded = self.fused(single, motion.clone(), estimate);
             let image = (self.predict(&encoded, &state, &schedule).x0 + 1.0) * 0.5;
-            flow = flow_between(image.clone(), &flow, single.count);
+            motion = finder.next(image.clone(), &motion, single.count)?;
             estimate = Some(image);
         }
-        (flow, estimate.expect("a pass"))
+        Ok((motion, estimate))
     }
 
     /// Fuses the frames along the flow. `estimate` are the clean frames that the pass before predicted.
     fn fused(
         &self,
         single: &SingleFrames,
-        flow: &WindowFlow,
+        Motion { flow, paths }: Motion,
         estimate: Option<Tensor<4>>,
     ) -> EncodedWindow {
         let SingleFrames { measurement, linear, restored, features, count, .. } = single;
@@ -180,13 +188,13 @@ impl Window {
             count: *count,
         };
         let Fused { states: [earlier, later], merged } =
-            self.fusion.forward(&window, flow, self.state);
+            self.fusion.forward(&window, &flow, self.state);
         EncodedWindow {
             merged_planes: merged.planes(),
             merged: merged.mean,
             restored: restored.clone(),
             estimate: estimate.map(|image| image * 2.0 - 1.0),
-            paths: Paths::new(flow, *count),
+            paths,
             flow: single.flow.clone(),
             features: vec![features.clone(), earlier, later, single.image.clone()],
             sensor: measurement.sensor.clone(),

@@ -29,7 +29,7 @@ pub(super) struct Measurement {
 
 impl Measurement {
     pub(super) fn new(conditioning: &Conditioning) -> Self {
-        let Conditioning { counts, linear_estimate, sensor, frames } = conditioning;
+        let Conditioning { counts, linear_estimate, sensor, frames, .. } = conditioning;
         let images = counts.dims()[0];
         let [bursts, numbers] = sensor.dims();
         let mut local_mean = shrink(linear_estimate.clone(), BLOCK);

@@ -16,6 +16,11 @@ const SMALLEST_SIDE: usize = 8;
 /// Sigma of the errors of pre-denoised frames, in [0, 1], over the usual sigma of fused frames, in [-1, 1].
 const ERROR: f32 = 0.9;
 
+/// Returns the usual sigma of pre-denoised frames in [0, 1] from the one of fused frames in [-1, 1].
+pub(super) fn pre_denoised_sigma(sigma: &Tensor<4>) -> Tensor<4> {
+    sigma.clone() * ERROR
+}
+
 /// Refines the flow at half the resolution. No gradient passes.
 ///
 /// # Shapes
@@ -27,12 +32,7 @@ pub(super) fn refined(
     flow: &WindowFlow,
     frames: usize,
 ) -> WindowFlow {
-    if flow.pairs.is_autodiff() {
-        let inner = |x: &Tensor<4>| x.clone().inner();
-        let refined = refined(&inner(restored), &inner(sigma), &flow.inner(), frames);
-        return WindowFlow::from_inner(refined);
-    }
-    let merged = merged(restored.clone(), &(sigma.clone() * ERROR), &Paths::new(flow, frames));
+    let merged = merged(restored.clone(), &pre_denoised_sigma(sigma), &Paths::new(flow, frames));
     let pairs = from_coarse_to_fine(avg_pool2(merged), flow.pairs.clone(), frames, LEVELS);
     WindowFlow { pairs, ..*flow }
 }

@@ -56,7 +56,7 @@ impl Learner for Window {
         // Half of all batches start from nothing, as sampling does.
         let from_nothing = random.next_u64() & 1 == 0;
         let passes = random.random_range(1..=train.passes);
-        let encoded = self.encode(&conditioning, passes);
+        let encoded = self.encode(&conditioning, passes)?;
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let truth = example.truth.clone() * 2.0 - 1.0;
         let (x0_prev, has_previous) = if from_nothing {

@@ -69,11 +69,13 @@ impl Recipe {
     }
 
     /// Returns the rules of every network.
-    fn common_rules(&self) -> [Rule<'static>; 9] {
+    fn common_rules(&self) -> [Rule<'static>; 11] {
         let train = &self.train;
         let is_window = matches!(&self.network, NetworkRecipe::Qudi(NetworkConfig::Window(_)));
         [
             ("train.passes", is_window || train.passes == 1, "is for the network `window`"),
+            ("train.matched", (0.0..=1.0).contains(&train.matched), "must be from 0 to 1"),
+            ("train.matched", is_window || train.matched == 0.0, "is for the network `window`"),
             ("train.steps", (1..=1 << 40).contains(&train.steps), "must be at least 1"),
             ("train.batch", (1..=4096).contains(&train.batch), "must be from 1 to 4096"),
             ("train.accumulate", (1..=4096).contains(&train.accumulate), "must be from 1 to 4096"),

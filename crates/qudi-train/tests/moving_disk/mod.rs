@@ -63,6 +63,7 @@ pub(crate) fn burst([ground, disk]: [f32; 2], size: Size, frames: usize, device:
         linear_estimate: to_tensor(planes.u, size, device),
         sensor: sensor_tensor(&acquisition, device),
         frames,
+        motion: Vec::new(),
     };
     let truth = truth.into_iter().flat_map(|frame| frame.data).collect();
     Burst { counts, conditioning, truth: to_tensor(truth, size, device), acquisition, size }

@@ -5,6 +5,7 @@ use crate::burst_cache::BurstSampler;
 use crate::burst_cache::burst::ConditionedBurst;
 use crate::recipe::Recipe;
 use burn::tensor::{Device, Tensor, TensorData};
+use qudi_burst::BurstMotion;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Result, Size};
 use qudi_layers::tensor::to_tensor;
@@ -15,6 +16,7 @@ use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::sensor::{SENSOR_NUMBERS, sensor_numbers};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
+use std::sync::Arc;
 
 /// The samples of one pass of the diffusion.
 #[derive(Clone, Debug)]
@@ -28,6 +30,8 @@ pub struct Batch {
     noise: Vec<f32>,
     numbers: Vec<f32>,
     acquisitions: Vec<Acquisition>,
+    /// Finders of the motion in the counts; none where the network learns to follow its own flow.
+    motion: Vec<Arc<BurstMotion>>,
     timesteps: Vec<usize>,
     /// Timesteps of the batch that this is a part of; the same for a whole batch.
     timesteps_of_all: Vec<usize>,
@@ -60,13 +64,18 @@ impl Batch {
             noise: Vec::new(),
             numbers: Vec::new(),
             acquisitions: Vec::new(),
+            motion: Vec::new(),
             timesteps: Vec::new(),
             timesteps_of_all: Vec::new(),
             uploaded: None,
         };
+        let matched = recipe.train.matches(number);
         for sample in (number * count as u64..).take(count) {
             let ConditionedBurst { sample: drawn, .. } = bursts.sample(sample)?;
             let view = BurstView { size, frames: &drawn.counts };
+            if matched {
+                batch.motion.push(Arc::new(BurstMotion::new(view, &drawn.acquisition)));
+            }
             batch.counts.extend(CountPlanes::new(view, &drawn.acquisition));
             batch.truth.extend(drawn.truth.into_iter().flat_map(|frame| frame.data));
             let noise = Noise::new(drawn.acquisition.seed, 0);
@@ -114,6 +123,7 @@ impl Batch {
                 truth: planes(&self.truth),
                 noise: planes(&self.noise),
                 numbers: planes(&self.numbers),
+                motion: self.motion.iter().skip(first).take(samples).cloned().collect(),
                 acquisitions: self.acquisitions[first..first + samples].to_vec(),
                 timesteps: self.timesteps[first..first + samples].to_vec(),
                 timesteps_of_all: self.timesteps_of_all.clone(),
@@ -153,6 +163,7 @@ impl Batch {
             linear_estimate: to_tensor(self.counts.u.clone(), self.size, device),
             sensor: Tensor::from_data(numbers, device),
             frames: self.frames,
+            motion: self.motion.clone(),
         }
     }
 

@@ -1,0 +1,181 @@
+//! Motion between the frames of a burst, patch by patch: first from its counts, then on better frames.
+
+use crate::denoise::stabilized::units;
+use crate::methods::{PostFilter, Qbp};
+use crate::motion::block_alignment::BlockAligner;
+use crate::motion::constant_velocity::ConstantVelocity;
+use crate::motion::global_motion::GlobalMotion;
+use crate::motion::hypotheses::{select_on_counts, select_on_estimates};
+use crate::motion::reference_frames::ReferenceFrames;
+use crate::patch::{PatchMotion, SIDE, padded};
+use crate::prepared_burst::PreparedBurst;
+use qudi_core::restorer::{Acquisition, BurstView};
+use qudi_core::{Frame, Size};
+use rayon::prelude::*;
+
+/// Approximate variance of the errors of better frames, in units of the counts' variance.
+const FRAME_ERROR: f32 = 0.1;
+
+/// Finds the motion between the frames of a burst. Every patch of 16 x 16 pixels moves as it matches best,
+/// with constant velocity, with most of the image, or not at all, whichever the counts of all frames make
+/// most likely.
+#[derive(Debug)]
+pub struct BurstMotion {
+    burst: PreparedBurst,
+    velocity: Option<ConstantVelocity>,
+    block_length: usize,
+    /// Image units of one detection.
+    units: f64,
+    /// Dark detections of a pixel.
+    dark: f64,
+}
+
+/// Motion of the patches of every frame to every frame.
+#[derive(Debug)]
+pub struct FoundMotion<'a> {
+    burst: &'a PreparedBurst,
+    /// By reference frame.
+    patches: Vec<PatchMotion>,
+}
+
+impl BurstMotion {
+    /// Prepares a burst. A dark rate that is unknown counts as none.
+    pub fn new(view: BurstView<'_>, acquisition: &Acquisition) -> Self {
+        let burst = PreparedBurst::new(view, acquisition);
+        let velocity = ConstantVelocity::find(&burst, 0.0);
+        let block_length = Qbp::new(PostFilter::None).block_length(acquisition).unwrap_or(1);
+        let dark = acquisition.sensor.dark_per_frame().unwrap_or(0.0);
+        Self { burst, velocity, block_length, units: units(acquisition), dark }
+    }
+
+    /// Returns the size of the frames.
+    pub fn size(&self) -> Size {
+        self.burst.size
+    }
+
+    /// Finds the motion from the counts alone.
+    pub fn on_counts(&self) -> FoundMotion<'_> {
+        let (burst, velocity) = (&self.burst, self.velocity.as_ref());
+        let aligner = BlockAligner::new(burst, self.block_length);
+        let global = GlobalMotion::find(&burst.frames, &burst.moments, 1.0);
+        self.found(|reference| {
+            let (_, matched) = aligner.align(burst, reference);
+            select_on_counts(burst, velocity, global.as_ref(), reference, matched)
+        })
+    }
+
+    /// Finds the motion on better frames of the same burst, in image units.
+    ///
+    /// # Panics
+    /// If there are not as many frames, of the same size.
+    pub fn on_frames(&self, frames: &[Frame]) -> FoundMotion<'_> {
+        let (burst, velocity) = (&self.burst, self.velocity.as_ref());
+        assert_eq!(frames.len(), burst.frames.len(), "a better frame for every frame");
+        let means = frames.iter().map(|frame| {
+            assert_eq!(frame.size, burst.size, "the size of the burst");
+            let mean = |&image: &f32| {
+                let detections = f64::from(image.max(0.0)) / self.units + self.dark;
+                burst.moments.at(detections).0 as f32
+            };
+            let means: Vec<f32> = frame.data.par_iter().map(mean).collect();
+            padded(&means, frame.size, burst.padded_size())
+        });
+        let references = ReferenceFrames::new(burst, means.collect(), FRAME_ERROR);
+        self.found(|reference| {
+            let matched = references.align(burst, reference);
+            select_on_estimates(burst, velocity, &references, reference, matched)
+        })
+    }
+
+    fn found(&self, of: impl Fn(usize) -> PatchMotion + Sync + Send) -> FoundMotion<'_> {
+        let references = 0..self.burst.frames.len();
+        FoundMotion { burst: &self.burst, patches: references.into_par_iter().map(of).collect() }
+    }
+}
+
+impl FoundMotion<'_> {
+    /// Returns the displacement from every pixel of frame `from` to where frame `to` shows the same, right
+    /// and down in pixels. Patches overlap; their displacements are blended.
+    pub fn flow(&self, from: usize, to: usize) -> [Frame; 2] {
+        let patches = &self.patches[from][to];
+        [0, 1].map(|axis| self.burst.blended(|i| [[patches[i][axis]; SIDE]; SIDE]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use qudi_core::sensor::Sensor;
+    use qudi_core::{Camera, Light};
+
+    const FRAMES: usize = 7;
+
+    /// Returns frames of a texture that moves by `speed` pixels a frame, their photons, and their light.
+    fn moving(size: Size, speed: [f32; 2]) -> (Vec<Frame>, Vec<Vec<u16>>, Acquisition) {
+        let truth: Vec<Frame> = (0..FRAMES)
+            .map(|t| {
+                Frame::from_fn(size, |x, y| {
+                    let [x, y] = [x as f32 - speed[0] * t as f32, y as f32 - speed[1] * t as f32];
+                    // Waves in all directions, of lengths of 7 to 60 pixels.
+                    let wave = |k: usize| {
+                        let (angle, length) = (2.4 * k as f32, 7.0 * 1.36f32.powi(k as i32));
+                        let along = x * angle.cos() + y * angle.sin();
+                        (std::f32::consts::TAU * along / length + angle).sin()
+                    };
+                    (0.45 + 0.1 * (0..8).map(wave).sum::<f32>()).clamp(0.02, 1.0)
+                })
+            })
+            .collect();
+        let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
+        let light = Light { ppp: 3.25, mean_level: 0.45 };
+        let mut camera = Camera::new(&sensor, size, light, 1).unwrap_or_else(|e| panic!("{e}"));
+        let expose = |(t, frame): (usize, &Frame)| camera.expose(t as u64, &[frame]);
+        let counts: qudi_core::Result<_> = truth.iter().enumerate().map(expose).collect();
+        let acquisition = Acquisition::new(sensor, light.ppp, light.mean_level);
+        let acquisition = acquisition.unwrap_or_else(|e| panic!("{e}"));
+        (truth, counts.unwrap_or_else(|e| panic!("{e}")), acquisition)
+    }
+
+    /// Returns the mean distance of the flow from `expected`, in pixels, far from the borders.
+    fn error(flow: &[Frame; 2], expected: [f32; 2]) -> f32 {
+        let Size { height, width } = flow[0].size;
+        let inner = (16..height - 16).flat_map(|y| (16..width - 16).map(move |x| y * width + x));
+        let distances: Vec<f32> = inner
+            .map(|i| (flow[0].data[i] - expected[0]).hypot(flow[1].data[i] - expected[1]))
+            .collect();
+        distances.iter().sum::<f32>() / distances.len() as f32
+    }
+
+    /// Counts show the motion to within a fraction of a pixel a frame, true frames much better.
+    #[test]
+    fn motion_is_found_and_better_frames_show_it_better() {
+        let size = Size { height: 64, width: 80 };
+        for speed in [[0.0, 0.0], [1.3, -0.6], [-2.5, 1.0]] {
+            let (truth, counts, acquisition) = moving(size, speed);
+            let motion = BurstMotion::new(BurstView { size, frames: &counts }, &acquisition);
+            for (from, to) in [(3, 4), (3, 2), (1, 4), (6, 3)] {
+                let time = to as f32 - from as f32;
+                let expected = speed.map(|v| v * time);
+                let on_counts = error(&motion.on_counts().flow(from, to), expected);
+                let on_frames = error(&motion.on_frames(&truth).flow(from, to), expected);
+                assert!(
+                    on_counts < 0.2 + 0.2 * time.abs(),
+                    "{speed:?}, {from} to {to}: {on_counts}"
+                );
+                assert!(on_frames < 0.05, "{speed:?}, {from} to {to}: {on_frames}");
+            }
+        }
+    }
+
+    #[test]
+    fn frames_smaller_than_a_patch_have_a_flow() {
+        let size = Size { height: 5, width: 9 };
+        let (truth, counts, acquisition) = moving(size, [0.0; 2]);
+        let motion = BurstMotion::new(BurstView { size, frames: &counts }, &acquisition);
+        for found in [motion.on_counts(), motion.on_frames(&truth)] {
+            let flow = found.flow(0, 2);
+            assert!(flow.iter().all(|axis| axis.size == size));
+            assert!(flow.iter().flat_map(|axis| &axis.data).all(|value| value.is_finite()));
+        }
+    }
+}
