@@ -29,4 +29,5 @@ pub use network::{
     Diffusion, Encoded, EncodedMeasurement, Flows, Fused, FusedGradient, Predenoised, Prediction,
     Simulated,
 };
+pub use qudi_burst::BurstMotion;
 pub use restorer::{DiffusionRestorer, FlowSource, SampleOptions};

@@ -3,7 +3,6 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Distribution, Tensor};
-use qudi_burst::BurstMotion;
 use qudi_core::Size;
 use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::{Acquisition, BurstView};
@@ -13,10 +12,10 @@ use qudi_layers::{Provenance, init_parameters, parameter_shapes};
 use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::counts::CountPlanes;
-use qudi_model::diffusion::Conditioning;
 use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
+use qudi_model::diffusion::{BurstMotion, Conditioning};
 use qudi_model::regression::Regression;
 use qudi_model::sensor::sensor_tensor;
 use qudi_model::window::{Window, WindowConfig};
