@@ -13,7 +13,7 @@ use qudi_core::restorer::{Acquisition, Restorer};
 use qudi_model::ComputePrecision;
 use qudi_model::checkpoint::{Description, Sampling};
 use qudi_model::config::{NetworkConfig, NetworkKind};
-use qudi_model::diffusion::{Diffusion, DiffusionRestorer, SampleOptions};
+use qudi_model::diffusion::{Diffusion, DiffusionRestorer, FlowSource, SampleOptions};
 use qudi_model::regression::{Regression, RegressionRestorer};
 use qudi_model::restorer::Model;
 use qudi_model::window::Window;
@@ -99,7 +99,8 @@ impl OwnNetwork {
             settings["spacing"] = json!(sampling.spacing);
             settings["sampler"] = json!(options.sampler_name());
             settings["samples"] = json!(options.samples);
-            if let Some(flow) = options.flow {
+            if self.kind == NetworkKind::Window {
+                let flow = options.flow.unwrap_or(FlowSource::Matched);
                 settings["flow"] = json!(flow.name());
             }
             if options.passes > 1 {
