@@ -25,7 +25,7 @@ const SCALE: f32 = 3.0;
 pub struct EncodedWindow {
     /// Pre-denoised frames in image units, `[bursts * frames, 1, H, W]`.
     pub restored: Tensor<4>,
-    /// Learnt flow on all levels, finest first. Fusion and agreement follow the refined one.
+    /// Learnt flow on all levels, finest first; none where matched motion takes its place and nothing learns.
     pub flow: Vec<WindowFlow>,
     /// Linear estimates merged along the flow, in image units, `[bursts * frames, 1, H, W]`.
     pub merged: Tensor<4>,
@@ -106,7 +106,7 @@ impl EncodedWindow {
 
 impl Window {
     /// Encodes a window. Every pass after the first one sees the clean frames that the pass before predicts:
-    /// it finds the flow between them, fuses the captured frames with them, and corrects them. Gradients
+    /// it finds the motion between them, fuses the captured frames with them, and corrects them. Gradients
     /// reach the last pass only.
     ///
     /// # Errors
@@ -114,11 +114,12 @@ impl Window {
     pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> Result<EncodedWindow> {
         let single = self.single_frames(conditioning);
         if !single.restored.is_autodiff() {
-            let (motion, estimate) = self.estimate(&single, conditioning, passes - 1)?;
+            let (motion, estimate) =
+                self.estimate(&single, conditioning, passes.saturating_sub(1))?;
             return Ok(self.fused(&single, motion, estimate));
         }
         let (motion, estimate) =
-            self.valid().estimate(&single.inner(), conditioning, passes - 1)?;
+            self.valid().estimate(&single.inner(), conditioning, passes.saturating_sub(1))?;
         Ok(self.fused(&single, Motion::from_inner(motion), estimate.map(Tensor::from_inner)))
     }
 
@@ -140,7 +141,7 @@ impl Window {
     }
 
     /// Finds the motion, and predicts the clean frames in image units from the measurement alone in so many
-    /// passes; none in no pass.
+    /// passes. Without passes it predicts none.
     fn estimate(
         &self,
         single: &SingleFrames,
