@@ -14,7 +14,7 @@ use qudi_model::diffusion::schedule::NoiseSchedule;
 use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{BurstMotion, Conditioning};
-use qudi_model::sensor::sensor_tensor;
+use qudi_model::sensor::{response_tensor, sensor_tensor};
 use qudi_model::window::Window;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -148,6 +148,7 @@ fn the_built_in_diffusion_looks_at_the_noisy_image() {
         counts: to_tensor(planes.y, size, &device),
         linear_estimate: to_tensor(planes.u, size, &device),
         sensor: sensor_tensor(&acquisition, &device),
+        response: response_tensor(&acquisition, &device),
         frames: FRAMES,
         motion: vec![Arc::new(BurstMotion::new(view, &acquisition))],
     };

@@ -1,24 +1,19 @@
 //! Alignment of all frames of a window with each frame, before any frame is weighted. A robust merge weights
 //! the aligned frames with a formula; a network that receives all of them can learn the weights.
 
+use crate::burst_motion::{BurstMotion, FRAME_ERROR, FrameMotion};
 use crate::denoise::stabilized::{image, units};
 use crate::denoise::vst::VarianceStabilizer;
 use crate::merge::merged_frame::MergedFrame;
-use crate::motion::constant_velocity::ConstantVelocity;
-use crate::motion::hypotheses::select_on_estimates;
 use crate::motion::per_pixel_selection::per_pixel_selection;
 use crate::motion::reference_frames::ReferenceFrames;
-use crate::patch::{PatchMotion, SIDE, padded};
-use crate::prepared_burst::{PreparedBurst, nearest};
+use crate::patch::{PatchMotion, SIDE};
+use crate::prepared_burst::nearest;
 use crate::reference::{ReferenceEstimate, WIENER_C};
 use crate::temporal_filter::temporal_filter;
-use qudi_core::restorer::Acquisition;
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
 use std::sync::OnceLock;
-
-/// Approximate variance of the reference estimate's errors, in units of the counts' variance.
-const REFERENCE_ERROR: f32 = 0.1;
 
 /// Lower bound of a count's variance. It keeps the standardization finite where the expected count is 0 or
 /// full scale.
@@ -26,28 +21,15 @@ const MIN_VARIANCE: f64 = 1e-4;
 
 /// A window aligned on its reference estimate.
 #[derive(Debug)]
-pub struct AlignedBurst<'a> {
-    burst: PreparedBurst,
-    velocity: Option<ConstantVelocity>,
+pub struct AlignedBurst {
+    motion: BurstMotion,
     vst: VarianceStabilizer,
-    acquisition: &'a Acquisition,
-    /// Dark detections of an ordinary pixel.
-    ordinary_dark: f64,
     /// The reference estimate, in image units.
     frames: Vec<Frame>,
     /// The reference estimate, in mean counts.
     references: ReferenceFrames,
     /// The motion of the patches of each frame to all frames, computed on first use.
     motions: Vec<OnceLock<FrameMotion>>,
-}
-
-/// Motion of the patches of one frame to all frames.
-#[derive(Clone, Debug)]
-struct FrameMotion {
-    /// Motion along the most likely hypothesis of each patch.
-    selected: PatchMotion,
-    /// Motion matched frame by frame on the reference frames.
-    matched: PatchMotion,
 }
 
 /// Set of alignments computed for each neighbour of a frame.
@@ -91,38 +73,26 @@ pub struct AlignedFrame {
     pub expected: Vec<Frame>,
 }
 
-impl<'a> AlignedBurst<'a> {
+impl AlignedBurst {
     /// Aligns the window of a reference estimate.
-    pub fn new(reference: ReferenceEstimate, acquisition: &'a Acquisition) -> Self {
-        let ReferenceEstimate { frames, mean_counts, burst, velocity, vst, ordinary_dark } =
-            reference;
-        let references = ReferenceFrames::new(&burst, mean_counts, REFERENCE_ERROR);
+    pub fn new(reference: ReferenceEstimate) -> Self {
+        let ReferenceEstimate { frames, mean_counts, motion, vst } = reference;
+        let references = ReferenceFrames::new(&motion.burst, mean_counts, FRAME_ERROR);
         let motions = frames.iter().map(|_| OnceLock::new()).collect();
-        Self { burst, velocity, vst, acquisition, ordinary_dark, frames, references, motions }
+        Self { motion, vst, frames, references, motions }
     }
 
     /// Aligns the window again on better frames, given in image units.
     #[must_use]
     pub fn realign(self, frames: Vec<Frame>) -> Self {
-        let units = units(self.acquisition);
-        let size = self.burst.padded_size();
-        let mean_counts = frames.iter().map(|frame| {
-            let mean = |(i, &image): (usize, &f32)| {
-                let detections =
-                    f64::from(image) / units + self.acquisition.dark_of(i, self.ordinary_dark);
-                self.burst.moments.at(detections).0 as f32
-            };
-            let means: Vec<f32> = frame.data.par_iter().enumerate().map(mean).collect();
-            padded(&means, frame.size, size)
-        });
-        let references = ReferenceFrames::new(&self.burst, mean_counts.collect(), REFERENCE_ERROR);
+        let references = self.motion.references(&frames);
         let motions = frames.iter().map(|_| OnceLock::new()).collect();
         Self { frames, references, motions, ..self }
     }
 
     /// Returns the size of the frames.
     pub fn size(&self) -> Size {
-        self.burst.size
+        self.motion.burst.size
     }
 
     /// Returns the number of frames in the window.
@@ -137,7 +107,8 @@ impl<'a> AlignedBurst<'a> {
         neighbours: usize,
         alignments: Alignments,
     ) -> AlignedFrame {
-        let Self { burst, vst, references, .. } = self;
+        let Self { motion: BurstMotion { burst, acquisition, ordinary_dark, .. }, vst, .. } = self;
+        let references = &self.references;
         let motion = self.motion(reference);
         let merged = MergedFrame::on_reference_frames(
             burst,
@@ -180,7 +151,7 @@ impl<'a> AlignedBurst<'a> {
         AlignedFrame {
             reference: self.frames[reference].clone(),
             noise_sigma: self.noise_sigma(&here, &noise),
-            merged: image(&stabilized, vst, self.acquisition, self.ordinary_dark),
+            merged: image(&stabilized, vst, acquisition, *ordinary_dark),
             counts,
             expected,
         }
@@ -196,20 +167,14 @@ impl<'a> AlignedBurst<'a> {
     }
 
     fn motion(&self, reference: usize) -> &FrameMotion {
-        self.motions[reference].get_or_init(|| {
-            let Self { burst, references, .. } = self;
-            let matched = references.align(burst, reference);
-            let velocity = self.velocity.as_ref();
-            let selected =
-                select_on_estimates(burst, velocity, references, reference, matched.clone());
-            FrameMotion { selected, matched }
-        })
+        let find = || self.motion.on_references(&self.references, reference);
+        self.motions[reference].get_or_init(find)
     }
 
     /// Warps the counts of frame `k` and its reference estimate onto frame `reference`, along the motion of
     /// each patch.
     fn warped(&self, reference: usize, k: usize, motion: &PatchMotion) -> [Frame; 2] {
-        let Self { burst, references, .. } = self;
+        let (burst, references) = (&self.motion.burst, &self.references);
         [&burst.frames[k], &references.frames[k]].map(|image| {
             burst.blended(|i| references.sample(burst, image, i, motion[k][i], reference))
         })
@@ -217,7 +182,7 @@ impl<'a> AlignedBurst<'a> {
 
     /// Returns the sigma of a count with the given mean.
     fn count_sigma(&self, mean: f32) -> f32 {
-        let variance = self.burst.moments.variance_at_mean(f64::from(mean));
+        let variance = self.motion.burst.moments.variance_at_mean(f64::from(mean));
         variance.max(MIN_VARIANCE).sqrt() as f32
     }
 
@@ -225,8 +190,8 @@ impl<'a> AlignedBurst<'a> {
     /// between the inverse transforms one sigma above and one sigma below the mean. Values below black are
     /// not cut.
     fn noise_sigma(&self, means: &Frame, noise: &Frame) -> Frame {
-        let n = self.burst.frames.len() as f64;
-        let units = units(self.acquisition);
+        let n = self.motion.burst.frames.len() as f64;
+        let units = units(&self.motion.acquisition);
         let sigma = |(&mean, &noise): (&f32, &f32)| {
             let z = self.vst.transform(n * f64::from(mean));
             let z = self.vst.possible(z);

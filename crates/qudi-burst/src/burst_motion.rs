@@ -1,33 +1,51 @@
 //! Motion between the frames of a burst, patch by patch: first from its counts, then on better frames.
 
 use crate::denoise::stabilized::units;
+use crate::merge::blocks::Blocks;
 use crate::methods::{PostFilter, Qbp};
 use crate::motion::block_alignment::BlockAligner;
+use crate::motion::cells::Cells;
 use crate::motion::constant_velocity::ConstantVelocity;
 use crate::motion::global_motion::GlobalMotion;
 use crate::motion::hypotheses::{select_on_counts, select_on_estimates};
 use crate::motion::reference_frames::ReferenceFrames;
-use crate::patch::{PatchMotion, SIDE, padded};
+use crate::patch::{PatchMotion, padded};
 use crate::prepared_burst::PreparedBurst;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::{Frame, Size};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Approximate variance of the errors of better frames, in units of the counts' variance.
-const FRAME_ERROR: f32 = 0.1;
+pub(crate) const FRAME_ERROR: f32 = 0.1;
 
 /// Finds the motion between the frames of a burst. Every patch of 16 x 16 pixels moves as it matches best,
 /// with constant velocity, with most of the image, or not at all, whichever the counts of all frames make
 /// most likely.
 #[derive(Debug)]
 pub struct BurstMotion {
-    burst: PreparedBurst,
-    velocity: Option<ConstantVelocity>,
-    block_length: usize,
-    /// Image units of one detection.
-    units: f64,
-    /// Dark detections of a pixel.
-    dark: f64,
+    pub(crate) burst: PreparedBurst,
+    pub(crate) velocity: Option<ConstantVelocity>,
+    pub(crate) acquisition: Acquisition,
+    /// Dark detections of an ordinary pixel.
+    pub(crate) ordinary_dark: f64,
+}
+
+/// The search for motion in the counts alone.
+#[derive(Debug)]
+pub(crate) struct CountsMotion<'a> {
+    of: &'a BurstMotion,
+    aligner: BlockAligner,
+    global: Option<GlobalMotion>,
+}
+
+/// Motion of the patches of one frame to all frames.
+#[derive(Clone, Debug)]
+pub(crate) struct FrameMotion {
+    /// Motion along the most likely hypothesis of each patch.
+    pub(crate) selected: PatchMotion,
+    /// Motion matched frame by frame.
+    pub(crate) matched: PatchMotion,
 }
 
 /// Motion of the patches of every frame to every frame.
@@ -43,9 +61,8 @@ impl BurstMotion {
     pub fn new(view: BurstView<'_>, acquisition: &Acquisition) -> Self {
         let burst = PreparedBurst::new(view, acquisition);
         let velocity = ConstantVelocity::find(&burst, 0.0);
-        let block_length = Qbp::new(PostFilter::None).block_length(acquisition).unwrap_or(1);
-        let dark = acquisition.sensor.dark_per_frame().unwrap_or(0.0);
-        Self { burst, velocity, block_length, units: units(acquisition), dark }
+        let ordinary_dark = acquisition.sensor.dark_per_frame().unwrap_or(0.0);
+        Self { burst, velocity, acquisition: acquisition.clone(), ordinary_dark }
     }
 
     /// Returns the size of the frames.
@@ -53,14 +70,14 @@ impl BurstMotion {
         self.burst.size
     }
 
-    /// Finds the motion from the counts alone.
-    pub fn on_counts(&self) -> FoundMotion<'_> {
-        let (burst, velocity) = (&self.burst, self.velocity.as_ref());
-        let aligner = BlockAligner::new(burst, self.block_length);
-        let global = GlobalMotion::find(&burst.frames, &burst.moments, 1.0);
+    /// Finds the motion to the frames up to `reach` frames away from the counts of these frames.
+    pub fn on_counts(&self, reach: usize) -> FoundMotion<'_> {
+        let qbp = Qbp::new(PostFilter::None);
+        let counts = self.counts(qbp.block_length(&self.acquisition).unwrap_or(1));
+        let frames = self.burst.frames.len();
         self.found(|reference| {
-            let (_, matched) = aligner.align(burst, reference);
-            select_on_counts(burst, velocity, global.as_ref(), reference, matched)
+            let near = reference.saturating_sub(reach)..(reference + reach + 1).min(frames);
+            counts.motion(reference, &near).1
         })
     }
 
@@ -69,22 +86,46 @@ impl BurstMotion {
     /// # Panics
     /// If there are not as many frames, of the same size.
     pub fn on_frames(&self, frames: &[Frame]) -> FoundMotion<'_> {
-        let (burst, velocity) = (&self.burst, self.velocity.as_ref());
-        assert_eq!(frames.len(), burst.frames.len(), "a better frame for every frame");
+        assert_eq!(frames.len(), self.burst.frames.len(), "a better frame for every frame");
+        let references = self.references(frames);
+        self.found(|reference| self.on_references(&references, reference).selected)
+    }
+
+    /// Prepares the search in counts, whose frames are averaged in blocks of `block_length`.
+    pub(crate) fn counts(&self, block_length: usize) -> CountsMotion<'_> {
+        CountsMotion {
+            of: self,
+            aligner: BlockAligner::new(&self.burst, block_length),
+            global: GlobalMotion::find(&self.burst.frames, &self.burst.moments, 1.0),
+        }
+    }
+
+    /// Prepares the search on better frames, in image units.
+    pub(crate) fn references(&self, frames: &[Frame]) -> ReferenceFrames {
+        let Self { burst, acquisition, ordinary_dark, .. } = self;
+        let units = units(acquisition);
         let means = frames.iter().map(|frame| {
             assert_eq!(frame.size, burst.size, "the size of the burst");
-            let mean = |&image: &f32| {
-                let detections = f64::from(image.max(0.0)) / self.units + self.dark;
+            let mean = |(i, &image): (usize, &f32)| {
+                let detections = f64::from(image) / units + acquisition.dark_of(i, *ordinary_dark);
                 burst.moments.at(detections).0 as f32
             };
-            let means: Vec<f32> = frame.data.par_iter().map(mean).collect();
+            let means: Vec<f32> = frame.data.par_iter().enumerate().map(mean).collect();
             padded(&means, frame.size, burst.padded_size())
         });
-        let references = ReferenceFrames::new(burst, means.collect(), FRAME_ERROR);
-        self.found(|reference| {
-            let matched = references.align(burst, reference);
-            select_on_estimates(burst, velocity, &references, reference, matched)
-        })
+        ReferenceFrames::new(burst, means.collect(), FRAME_ERROR)
+    }
+
+    /// Finds the motion of frame `reference` on better frames.
+    pub(crate) fn on_references(
+        &self,
+        references: &ReferenceFrames,
+        reference: usize,
+    ) -> FrameMotion {
+        let (burst, velocity) = (&self.burst, self.velocity.as_ref());
+        let matched = references.align(burst, reference);
+        let selected = select_on_estimates(burst, velocity, references, reference, matched.clone());
+        FrameMotion { selected, matched }
     }
 
     fn found(&self, of: impl Fn(usize) -> PatchMotion + Sync + Send) -> FoundMotion<'_> {
@@ -93,12 +134,22 @@ impl BurstMotion {
     }
 }
 
+impl CountsMotion<'_> {
+    /// Divides the burst into blocks around frame `reference`, and finds its motion to `frames`.
+    pub(crate) fn motion(&self, reference: usize, frames: &Range<usize>) -> (Blocks, PatchMotion) {
+        let BurstMotion { burst, velocity, .. } = self.of;
+        let (velocity, global) = (velocity.as_ref(), self.global.as_ref());
+        let (blocks, matched) = self.aligner.align(burst, reference, frames);
+        (blocks, select_on_counts(burst, velocity, global, reference, frames, matched))
+    }
+}
+
 impl FoundMotion<'_> {
-    /// Returns the displacement from every pixel of frame `from` to where frame `to` shows the same, right
-    /// and down in pixels. Patches overlap; their displacements are blended.
-    pub fn flow(&self, from: usize, to: usize) -> [Frame; 2] {
-        let patches = &self.patches[from][to];
-        [0, 1].map(|axis| self.burst.blended(|i| [[patches[i][axis]; SIDE]; SIDE]))
+    /// Returns the displacement from every cell of `side` x `side` pixels of frame `from` to where frame `to`
+    /// shows the same, right and down in pixels. Patches overlap; their displacements are blended.
+    pub fn flow(&self, from: usize, to: usize, side: usize) -> [Frame; 2] {
+        let PreparedBurst { grid, size, .. } = self.burst;
+        Cells::new(grid, *size, side).blended(&self.patches[from][to])
     }
 }
 
@@ -156,8 +207,8 @@ mod tests {
             for (from, to) in [(3, 4), (3, 2), (1, 4), (6, 3)] {
                 let time = to as f32 - from as f32;
                 let expected = speed.map(|v| v * time);
-                let on_counts = error(&motion.on_counts().flow(from, to), expected);
-                let on_frames = error(&motion.on_frames(&truth).flow(from, to), expected);
+                let on_counts = error(&motion.on_counts(FRAMES).flow(from, to, 1), expected);
+                let on_frames = error(&motion.on_frames(&truth).flow(from, to, 1), expected);
                 assert!(
                     on_counts < 0.2 + 0.2 * time.abs(),
                     "{speed:?}, {from} to {to}: {on_counts}"
@@ -172,8 +223,8 @@ mod tests {
         let size = Size { height: 5, width: 9 };
         let (truth, counts, acquisition) = moving(size, [0.0; 2]);
         let motion = BurstMotion::new(BurstView { size, frames: &counts }, &acquisition);
-        for found in [motion.on_counts(), motion.on_frames(&truth)] {
-            let flow = found.flow(0, 2);
+        for found in [motion.on_counts(2), motion.on_frames(&truth)] {
+            let flow = found.flow(0, 2, 1);
             assert!(flow.iter().all(|axis| axis.size == size));
             assert!(flow.iter().flat_map(|axis| &axis.data).all(|value| value.is_finite()));
         }

@@ -2,6 +2,7 @@
 
 mod affine;
 pub(crate) mod block_alignment;
+pub(crate) mod cells;
 pub(crate) mod constant_velocity;
 pub(crate) mod flow;
 pub(crate) mod global_motion;

@@ -3,18 +3,14 @@
 //! noisy frames do. Basic estimates for a second pass are BM3D's idea (Dabov et al. 2007, section III-B),
 //! here applied to the whole method.
 
+use crate::burst_motion::BurstMotion;
 use crate::denoise::bm3d::SearchSettings;
 use crate::denoise::stabilized::{denoise, image};
 use crate::denoise::vst::{Transform, VarianceStabilizer};
 use crate::merge::merged_frame::MergedFrame;
 use crate::methods::{PostFilter, Qbp};
-use crate::motion::block_alignment::BlockAligner;
-use crate::motion::constant_velocity::ConstantVelocity;
-use crate::motion::global_motion::GlobalMotion;
-use crate::motion::hypotheses::{select_on_counts, select_on_estimates};
 use crate::motion::reference_frames::ReferenceFrames;
 use crate::patch::padded;
-use crate::prepared_burst::PreparedBurst;
 use qudi_core::progress::progress;
 use qudi_core::restorer::{Acquisition, BurstView, Restored, Restorer};
 use qudi_core::windows::LONGEST_HALF;
@@ -43,11 +39,8 @@ pub struct ReferenceEstimate {
     pub frames: Vec<Frame>,
     /// Mean counts of the restored frames, padded to one patch.
     pub(crate) mean_counts: Vec<Frame>,
-    pub(crate) burst: PreparedBurst,
-    pub(crate) velocity: Option<ConstantVelocity>,
+    pub(crate) motion: BurstMotion,
     pub(crate) vst: VarianceStabilizer,
-    /// Dark detections of an ordinary pixel.
-    pub(crate) ordinary_dark: f64,
 }
 
 impl ReferenceEstimate {
@@ -66,8 +59,8 @@ impl ReferenceEstimate {
         let ordinary_dark = sensor.dark_per_frame()?;
         let frame_count = view.frames.len();
         let vst = VarianceStabilizer::new(Transform::Integral, sensor, *gain, frame_count as u32);
-        let burst = PreparedBurst::new(view, acquisition);
-        let velocity = ConstantVelocity::find(&burst, 0.0);
+        let motion = BurstMotion::new(view, acquisition);
+        let burst = &motion.burst;
 
         // Restores all frames with stabilized variance.
         let restored = |stage: &'static str,
@@ -91,31 +84,26 @@ impl ReferenceEstimate {
         };
 
         let qbp = Qbp::new(PostFilter::Bm3d);
-        let aligner = BlockAligner::new(&burst, qbp.block_length(acquisition)?);
-        let global = GlobalMotion::find(&burst.frames, &burst.moments, 1.0);
+        let counts = motion.counts(qbp.block_length(acquisition)?);
         let merge = |reference: usize| {
-            let (blocks, matched) = aligner.align(&burst, reference);
-            let (velocity, global) = (velocity.as_ref(), global.as_ref());
-            let motion = select_on_counts(&burst, velocity, global, reference, matched);
-            MergedFrame::from_blocks(&burst, &blocks, &motion, qbp.settings.wiener_c)
+            let (blocks, motion) = counts.motion(reference, &(0..frame_count));
+            MergedFrame::from_blocks(burst, &blocks, &motion, qbp.settings.wiener_c)
         };
         let all: Vec<usize> = (0..frame_count).collect();
         let factor = qbp.settings.bm3d_sigma_factor;
         let first = restored("first estimate", &merge, &all, FIRST_SEARCH, factor)?;
 
         let first = first.iter().map(mean_counts).collect();
-        let references = ReferenceFrames::new(&burst, first, FIRST_PASS_ERROR);
+        let references = ReferenceFrames::new(burst, first, FIRST_PASS_ERROR);
         let merge = |reference: usize| {
-            let matched = references.align(&burst, reference);
-            let velocity = velocity.as_ref();
-            let motion = select_on_estimates(&burst, velocity, &references, reference, matched);
-            MergedFrame::on_reference_frames(&burst, &references, reference, &motion, WIENER_C)
+            let selected = motion.on_references(&references, reference).selected;
+            MergedFrame::on_reference_frames(burst, &references, reference, &selected, WIENER_C)
         };
         let second = restored("second estimate", &merge, wanted, SECOND_SEARCH, SIGMA_FACTOR)?;
 
         let frames = second.iter().map(|z| image(z, &vst, acquisition, ordinary_dark)).collect();
         let mean_counts = second.iter().map(mean_counts).collect();
-        Ok(Self { frames, mean_counts, burst, velocity, vst, ordinary_dark })
+        Ok(Self { frames, mean_counts, motion, vst })
     }
 }
 

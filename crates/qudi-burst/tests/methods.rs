@@ -76,7 +76,7 @@ fn second_pass_beats_the_first() {
         let burst = BurstView { size, frames: &counts };
         let first = Qbp::new(PostFilter::Bm3d).restore(burst, &acquisition).unwrap().frames;
         let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
-        let alignment = AlignedBurst::new(reference, &acquisition);
+        let alignment = AlignedBurst::new(reference);
         let aligned: Vec<AlignedFrame> = (0..truth.len())
             .map(|frame| alignment.frame(frame, 10, Alignments::Selected))
             .collect();
@@ -117,7 +117,7 @@ fn neighbours_are_standardized() {
     let acquisition = Acquisition { mean_level: still.mean(), ..acquisition(sensor, 3.25) };
     let burst = BurstView { size, frames: &counts };
     let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
-    let aligned = AlignedBurst::new(reference, &acquisition).frame(2, 8, Alignments::Selected);
+    let aligned = AlignedBurst::new(reference).frame(2, 8, Alignments::Selected);
     assert_eq!((aligned.counts.len(), aligned.expected.len()), (9, 8));
     let deviation = |frame: &Frame| {
         let squares = frame.data.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
@@ -134,16 +134,15 @@ fn neighbours_are_standardized() {
 
     // The truth replaces the reference estimate: its prediction is what the camera counts.
     let reference = ReferenceEstimate::compute(burst, &acquisition).unwrap();
-    let aligned = AlignedBurst::new(reference, &acquisition).realign(vec![still.clone(); 7]).frame(
+    let aligned = AlignedBurst::new(reference).realign(vec![still.clone(); 7]).frame(
         2,
         8,
         Alignments::Selected,
     );
     assert_eq!(aligned.reference, still);
-    let thrice =
-        AlignedBurst::new(ReferenceEstimate::compute(burst, &acquisition).unwrap(), &acquisition)
-            .realign(vec![still.clone(); 7])
-            .frame(2, 8, Alignments::WithPerPixel);
+    let thrice = AlignedBurst::new(ReferenceEstimate::compute(burst, &acquisition).unwrap())
+        .realign(vec![still.clone(); 7])
+        .frame(2, 8, Alignments::WithPerPixel);
     assert_eq!((thrice.counts.len(), thrice.expected.len()), (25, 24));
     assert_eq!(
         (&thrice.counts[..9], &thrice.expected[..8]),

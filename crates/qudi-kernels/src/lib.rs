@@ -22,6 +22,7 @@ pub mod group_norm;
 #[cfg(feature = "libtorch")]
 mod libtorch;
 mod matrix_units;
+mod merge;
 mod operations;
 mod pixel_norm;
 mod precision;
@@ -39,6 +40,7 @@ pub use frames::frames;
 #[cfg(feature = "libtorch")]
 pub use libtorch::count_libtorch_cards;
 pub use matrix_units::{MatrixUnits, MatrixUnitsError, with_matrix_units};
+pub use merge::{MergeRule, merged_frames};
 pub use operations::{add_operations, count_operations};
 pub use pixel_norm::pixel_norm;
 pub use precision::{ComputePrecision, with_precision};

@@ -5,6 +5,8 @@
 mod extension;
 #[cfg(feature = "flex")]
 mod native;
+#[cfg(feature = "flex")]
+pub(crate) use native::upsample;
 #[cfg(all(test, feature = "flex"))]
 mod tests;
 

@@ -30,7 +30,7 @@ impl AlignedNeighbours {
     }
 
     /// Returns frame `frame` of a burst with its aligned neighbours.
-    pub(crate) fn frame(self, burst: &AlignedBurst<'_>, frame: usize) -> AlignedFrame {
+    pub(crate) fn frame(self, burst: &AlignedBurst, frame: usize) -> AlignedFrame {
         burst.frame(frame, self.neighbours, self.alignments)
     }
 }
@@ -82,7 +82,7 @@ impl<T, S> Aligned<T, S> {
 impl Aligned<Vec<f32>> {
     /// Collects the planes of some frames of an aligned burst.
     pub fn of_frames(
-        burst: &AlignedBurst<'_>,
+        burst: &AlignedBurst,
         neighbours: AlignedNeighbours,
         frames: Range<usize>,
     ) -> Self {

@@ -6,7 +6,7 @@ mod former;
 use crate::config::{NetworkConfig, NetworkKind};
 use crate::diffusion::Diffusion;
 use crate::regression::Regression;
-use crate::window::{self, Window};
+use crate::window::Window;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::tensor::{Device, Tensor, f16};
 use qudi_core::atomic_file::{Overwrite, PendingFile};
@@ -39,12 +39,6 @@ pub trait Network: Module {
 
     /// Creates a network of these sizes without weights; none if they are of another kind.
     fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self>;
-
-    /// Returns the prefix and the values of a parameter whose whole module older files lack; none where every
-    /// file has it.
-    fn added_later(_name: &str, _shape: &[usize]) -> Option<(&'static str, Vec<f32>)> {
-        None
-    }
 }
 
 impl Network for Regression {
@@ -71,10 +65,6 @@ impl Network for Window {
     fn of_sizes(config: &NetworkConfig, device: &Device) -> Option<Self> {
         let NetworkConfig::Window(config) = config else { return None };
         Some(config.uninitialized(device))
-    }
-
-    fn added_later(name: &str, shape: &[usize]) -> Option<(&'static str, Vec<f32>)> {
-        window::added_later(name, shape)
     }
 }
 
@@ -179,16 +169,8 @@ fn network<N: Network>(
         Layout::Present => name.to_owned(),
         Layout::Former => former::name(name),
     };
-    let added_later = |name: &str, shape: &[usize]| {
-        let (module, values) = N::added_later(name, shape)?;
-        let is_here = |name: &&str| name.starts_with(module);
-        (!tensors.names().iter().any(is_here)).then_some(values)
-    };
     let expected = parameter_shapes(&network);
     for (name, shape) in &expected {
-        if added_later(name, shape).is_some() {
-            continue;
-        }
         let name = name_of(name);
         let Ok(tensor) = tensors.tensor(&name) else {
             return Err(mismatch(path, format!("`{name}` is missing")));
@@ -214,7 +196,7 @@ fn network<N: Network>(
     let mut broken = None;
     let network = init_parameters(network, |name, shape| {
         let stored = tensors.tensor(&name_of(name)).ok().map(|tensor| numbers(&tensor));
-        let values = stored.or_else(|| added_later(name, shape)).unwrap_or_default();
+        let values = stored.unwrap_or_default();
         if broken.is_none() && !values.iter().all(|value| value.is_finite()) {
             broken = Some(name.to_owned());
         }

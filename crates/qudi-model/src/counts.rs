@@ -10,7 +10,8 @@ pub(crate) const MAX_IMAGE: f64 = 2.0;
 /// Counts as the diffusion sees them, frame after frame, row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CountPlanes {
-    /// Counts over full scale.
+    /// Counts over full scale; where a map of dark rates is known, without what a pixel has more than an
+    /// ordinary one.
     pub y: Vec<f32>,
     /// The linear estimate in image units, in [0, 2].
     pub u: Vec<f32>,
@@ -30,8 +31,10 @@ impl CountPlanes {
             match &acquisition.dark {
                 None => response.append(counts, &mut planes),
                 Some(map) => {
+                    let ordinary = dark_per_frame(&acquisition.sensor);
                     for (&count, &dark) in counts.iter().zip(map) {
-                        planes.y.push(response.of(count).0);
+                        let excess = response.fraction(f64::from(dark) - ordinary);
+                        planes.y.push((response.of(count).0 - excess).clamp(0.0, 1.0));
                         planes.u.push(response.estimate(count, f64::from(dark)));
                     }
                 }
@@ -77,6 +80,11 @@ impl<'a> CountResponse<'a> {
     fn estimate(&self, count: u16, dark: f64) -> f32 {
         let photons = self.sensor.estimate_flux(f64::from(count), 1, self.gain, dark);
         (photons / self.photons_per_unit).min(MAX_IMAGE) as f32
+    }
+
+    /// Returns so many detections as a fraction of full scale.
+    fn fraction(&self, detections: f64) -> f32 {
+        (detections * self.gain / f64::from(self.sensor.max_count())) as f32
     }
 
     /// Sigma of the linear estimate at `detections` expected per output frame, from the exact law of the

@@ -9,21 +9,19 @@ mod agreement;
 mod config;
 mod denoiser;
 mod encoding;
-mod flow;
 mod fusion;
 pub(crate) mod hourglass;
 mod initial;
 mod input;
-mod matching;
 mod merging;
 mod motion;
 mod network;
 mod predenoiser;
-mod refinement;
+#[cfg(test)]
+mod scenes;
 mod unet;
 
 pub use config::WindowConfig;
 pub use encoding::EncodedWindow;
-pub use flow::WindowFlow;
-pub(crate) use initial::added_later;
+pub use motion::flow::WindowFlow;
 pub use network::{Window, WindowPrediction};

@@ -20,7 +20,7 @@ use qudi_model::diffusion::state::DiffusionState;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{Conditioning, Simulated};
 use qudi_model::regression::RegressionConfig;
-use qudi_model::sensor::SENSOR_NUMBERS;
+use qudi_model::sensor::{RESPONSE_LEVELS, SENSOR_NUMBERS};
 use qudi_model::window::WindowConfig;
 
 /// Largest error that is rounding: networks add up the errors of dozens of layers in f32.
@@ -319,6 +319,7 @@ fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
         counts: image(21) * 0.5,
         linear_estimate: image(22),
         sensor: values(23, [1, SENSOR_NUMBERS], &device),
+        response: values(53, [1, RESPONSE_LEVELS], &device),
         frames: 4,
         motion: Vec::new(),
     };
@@ -350,6 +351,7 @@ fn window(device: &Device) -> Result<Vec<Vec<f32>>> {
         counts: image(29) * 0.5,
         linear_estimate: image(30),
         sensor: values(31, [1, SENSOR_NUMBERS], &device),
+        response: values(61, [1, RESPONSE_LEVELS], &device),
         frames: 4,
         motion: Vec::new(),
     };

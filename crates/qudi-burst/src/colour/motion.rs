@@ -3,12 +3,10 @@
 use super::exposures::Exposure;
 use super::gray_counts::rounded;
 use super::{CountResponse, Exposures};
-use crate::motion::constant_velocity::ConstantVelocity;
+use crate::burst_motion::{BurstMotion, FRAME_ERROR};
 use crate::motion::flow::spread;
-use crate::motion::hypotheses::select_on_estimates;
 use crate::motion::reference_frames::ReferenceFrames;
 use crate::patch::PatchMotion;
-use crate::prepared_burst::PreparedBurst;
 use crate::reference::ReferenceEstimate;
 use qudi_core::colour::Colour;
 use qudi_core::restorer::{Acquisition, BurstView};
@@ -19,17 +17,13 @@ use std::sync::OnceLock;
 /// Counts of an exposure that are added: 2 x 2.
 const ADDED: u32 = 4;
 
-/// Approximate variance of the reference estimate's errors, in units of the counts' variance.
-const REFERENCE_ERROR: f32 = 0.1;
-
 /// Share of white pixels from which motion is found on them alone: few others would leave a fixed pattern.
 const MOSTLY_WHITE: f64 = 0.5;
 
 /// Motion between the frames of a window, at half the resolution.
 pub(super) struct QuadMotion {
     size: Size,
-    burst: PreparedBurst,
-    velocity: Option<ConstantVelocity>,
+    motion: BurstMotion,
     references: ReferenceFrames,
     /// Motion of the patches of each frame to all frames, found on first use.
     motions: Vec<OnceLock<PatchMotion>>,
@@ -75,22 +69,19 @@ impl QuadMotion {
         let quads: Vec<Vec<u16>> = (0..exposures.frames()).map(quads).collect();
         let view = BurstView { size, frames: &quads };
         let estimate = ReferenceEstimate::compute(view, &of_quads)?;
-        let ReferenceEstimate { frames: luma, mean_counts, burst, velocity, .. } = estimate;
-        let references = ReferenceFrames::new(&burst, mean_counts, REFERENCE_ERROR);
+        let ReferenceEstimate { frames: luma, mean_counts, motion, .. } = estimate;
+        let references = ReferenceFrames::new(&motion.burst, mean_counts, FRAME_ERROR);
         let motions = luma.iter().map(|_| OnceLock::new()).collect();
-        Ok(Self { size, burst, velocity, references, motions, luma })
+        Ok(Self { size, motion, references, motions, luma })
     }
 
     /// Returns the displacement of each frame's pixels to frame `reference`.
     pub(super) fn to(&self, reference: usize) -> Vec<Displaced<'_>> {
-        let motion = self.motions[reference].get_or_init(|| {
-            let matched = self.references.align(&self.burst, reference);
-            let velocity = self.velocity.as_ref();
-            select_on_estimates(&self.burst, velocity, &self.references, reference, matched)
-        });
+        let motion = self.motions[reference]
+            .get_or_init(|| self.motion.on_references(&self.references, reference).selected);
         let displaced = |(k, motion): (usize, &Vec<[f32; 2]>)| Displaced {
             size: self.size,
-            displacement: spread(&self.burst.grid, motion, self.size),
+            displacement: spread(&self.motion.burst.grid, motion, self.size),
             luma: [&self.luma[k], &self.luma[reference]],
         };
         motion.iter().enumerate().map(displaced).collect()

@@ -84,7 +84,7 @@ impl Qbp {
         let counts = PreparedBurst::new(burst, acquisition);
         let aligner = BlockAligner::new(&counts, self.block_length(acquisition)?);
         let restore = |reference: usize| {
-            let (blocks, motion) = aligner.align(&counts, reference);
+            let (blocks, motion) = aligner.align(&counts, reference, &(0..frame_count));
             let merged =
                 MergedFrame::from_blocks(&counts, &blocks, &motion, self.settings.wiener_c);
             let mut z = vst.stabilized(&merged.counts);
@@ -148,7 +148,8 @@ impl PatchFlow {
     pub fn find(burst: BurstView<'_>, acquisition: &Acquisition, reference: usize) -> Result<Self> {
         let block_length = Qbp::new(PostFilter::None).block_length(acquisition)?;
         let counts = PreparedBurst::new(burst, acquisition);
-        let (_, flow) = BlockAligner::new(&counts, block_length).align(&counts, reference);
+        let all = 0..counts.frames.len();
+        let (_, flow) = BlockAligner::new(&counts, block_length).align(&counts, reference, &all);
         let corners = (0..counts.grid.len()).map(|i| counts.grid.corner(i)).collect();
         Ok(Self { corners, flow })
     }

@@ -8,6 +8,7 @@ use crate::prepared_burst::PreparedBurst;
 use qudi_core::Frame;
 use rayon::prelude::*;
 use std::borrow::Cow;
+use std::ops::Range;
 
 /// Aligns the blocks of a window of counts.
 #[derive(Debug)]
@@ -26,12 +27,21 @@ impl BlockAligner {
     }
 
     /// Divides the window into blocks around frame `reference`, and finds the motion of every patch to every
-    /// frame.
-    pub(crate) fn align(&self, burst: &PreparedBurst, reference: usize) -> (Blocks, PatchMotion) {
+    /// frame; where the blocks lie wholly outside `frames` it is left at zero.
+    pub(crate) fn align(
+        &self,
+        burst: &PreparedBurst,
+        reference: usize,
+        frames: &Range<usize>,
+    ) -> (Blocks, PatchMotion) {
         let blocks = Blocks::around(reference, burst.frames.len(), self.block_length);
         let variance = burst.matching_variance(reference, 1.0);
         let pyramid = |k| self.pyramid(burst, &blocks, k);
-        let motion = align_blocks(&blocks, reference, variance, burst.grid.len(), pyramid);
+        // The motion to a frame may lie between those to two blocks.
+        let half = self.block_length / 2;
+        let frames = frames.start.saturating_sub(half)..frames.end + half;
+        let patches = burst.grid.len();
+        let motion = align_blocks(&blocks, reference, variance, patches, &frames, pyramid);
         (blocks, motion)
     }
 
@@ -52,23 +62,27 @@ impl BlockAligner {
     }
 }
 
-/// Matches all patches of the reference block in all other blocks, and interpolates their motion to all
-/// frames. `variance` is the variance of the difference of two matched pixels of single frames.
+/// Matches all patches of the reference block in the other blocks that hold some of `frames`, and
+/// interpolates their motion to all frames. `variance` is the variance of the difference of two matched
+/// pixels of single frames.
 pub(crate) fn align_blocks<'a>(
     blocks: &Blocks,
     reference: usize,
     variance: f32,
     patches: usize,
+    frames: &Range<usize>,
     pyramid: impl Fn(usize) -> Cow<'a, Pyramid> + Sync,
 ) -> PatchMotion {
     let own = pyramid(blocks.reference);
     let to_blocks: PatchMotion = (0..blocks.ranges.len())
         .into_par_iter()
         .map(|k| {
-            if k == blocks.reference {
+            let range = &blocks.ranges[k];
+            let is_far = range.end <= frames.start || range.start >= frames.end;
+            if k == blocks.reference || is_far {
                 return vec![[0.0; 2]; patches];
             }
-            align(&own, &pyramid(k), (variance / blocks.ranges[k].len() as f32).max(1e-6))
+            align(&own, &pyramid(k), (variance / range.len() as f32).max(1e-6))
         })
         .collect();
     blocks.interpolate(&to_blocks, reference)

@@ -49,9 +49,7 @@ impl Grid {
     ) -> Frame {
         let mut sum = Frame::filled(from, 0.0);
         let mut weights = sum.clone();
-        let window: [f32; SIDE] = std::array::from_fn(|k| {
-            0.5 - 0.5 * (2.0 * std::f32::consts::PI * (k as f32 + 0.5) / SIDE as f32).cos()
-        });
+        let window: [f32; SIDE] = std::array::from_fn(fading);
         for i in 0..self.len() {
             let [x, y] = self.corner(i);
             let at = y * from.width + x;
@@ -128,6 +126,11 @@ impl Grid {
             0.5 * (near[(near.len() - 1) / 2] + near[near.len() / 2])
         })
     }
+}
+
+/// Returns the weight of a patch along an axis, `at` pixels from its corner: it fades out towards both ends.
+pub(crate) fn fading(at: usize) -> f32 {
+    0.5 - 0.5 * (2.0 * std::f32::consts::PI * (at as f32 + 0.5) / SIDE as f32).cos()
 }
 
 /// Adds a patch times its window, and the window, to the rows of an image, starting at the patch's corner.

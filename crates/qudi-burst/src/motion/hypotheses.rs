@@ -16,6 +16,7 @@ use crate::prepared_burst::PreparedBurst;
 use multiversion::multiversion;
 use qudi_core::Frame;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Largest increase of a frame's misfit on a selected hypothesis, in units of the noise's variance. Beyond it
 /// the patch is occluded, and the frame's own match is kept.
@@ -60,13 +61,15 @@ const CORRELATION: f32 = 0.8;
 /// Penalty of a hypothesis, and the motion that it gives every patch.
 type Hypothesis = (f32, PatchMotion);
 
-/// Selects the motion of every patch of frame `reference` by the counts alone. The candidates are the
-/// `matched` motion, constant velocity and global motion. Without velocities, the matched motion is returned.
+/// Selects the motion of every patch of frame `reference` by the counts of `judged` frames alone. The
+/// candidates are the `matched` motion, constant velocity and global motion. Without velocities, the matched
+/// motion is returned.
 pub(crate) fn select_on_counts(
     burst: &PreparedBurst,
     velocity: Option<&ConstantVelocity>,
     global: Option<&GlobalMotion>,
     reference: usize,
+    judged: &Range<usize>,
     matched: PatchMotion,
 ) -> PatchMotion {
     let Some(velocity) = velocity else { return matched };
@@ -77,6 +80,7 @@ pub(crate) fn select_on_counts(
     let selector = HypothesisSelector {
         burst,
         frames: &velocity.smoothed,
+        judged: judged.clone(),
         template,
         settings: Settings::COUNTS,
     };
@@ -110,8 +114,13 @@ pub(crate) fn select_on_estimates(
         hypotheses.push((penalty::GLOBAL, motion));
     }
     let template = &smooth(&references.frames[reference]);
-    let settings = Settings::ESTIMATE;
-    let selector = HypothesisSelector { burst, frames: &velocity.smoothed, template, settings };
+    let selector = HypothesisSelector {
+        burst,
+        frames: &velocity.smoothed,
+        judged: 0..burst.frames.len(),
+        template,
+        settings: Settings::ESTIMATE,
+    };
     selector.select_all(reference, &hypotheses)
 }
 
@@ -153,6 +162,8 @@ struct HypothesisSelector<'a> {
     burst: &'a PreparedBurst,
     /// Smoothed counts.
     frames: &'a [Frame],
+    /// The frames whose counts judge.
+    judged: Range<usize>,
     /// The smoothed counts, or the smoothed estimate, of the reference.
     template: &'a Frame,
     settings: Settings,
@@ -191,7 +202,8 @@ impl HypothesisSelector<'_> {
         }
         let own = self.own(corner.map(|c| c as f32));
         let variance = self.variance(corner);
-        for (k, d) in path.iter_mut().enumerate().filter(|(k, _)| *k != reference) {
+        let judged = path.iter_mut().enumerate().filter(|(k, _)| self.judged.contains(k));
+        for (k, d) in judged.filter(|(k, _)| *k != reference) {
             let matched = paths[0].1[k];
             let [new, old] = [*d, matched].map(|d| {
                 let mut sums = Sums::new();
@@ -223,8 +235,8 @@ impl HypothesisSelector<'_> {
                 .map(|k| (k * SIDE) as f32 - margin);
             let own = self.own([corner[0] as f32 + part[0], corner[1] as f32 + part[1]]);
             let mut sums = Sums::new();
-            for (k, &d) in path.iter().enumerate() {
-                self.add(&own, k, d, &mut sums);
+            for k in self.judged.clone() {
+                self.add(&own, k, path[k], &mut sums);
             }
             cost += sums.misfit(variance, self.settings.outside)
                 - common(&sums, self.settings.known, variance);
@@ -407,9 +419,10 @@ mod tests {
     fn faint_texture_follows_the_motion_of_all_frames() {
         let moved = |t: f32| [1.7 * t, -0.9 * t];
         let (burst, _) = burst(3.25, moved);
-        let (_, matched) = BlockAligner::new(&burst, 1).align(&burst, 5);
+        let all = 0..burst.frames.len();
+        let (_, matched) = BlockAligner::new(&burst, 1).align(&burst, 5, &all);
         let before = error(&burst, &matched, moved);
-        let selected = select_on_counts(&burst, Some(&velocity(&burst)), None, 5, matched);
+        let selected = select_on_counts(&burst, Some(&velocity(&burst)), None, 5, &all, matched);
         let after = error(&burst, &selected, moved);
         assert!(after < 0.5 * before, "{before} before, {after} px after");
     }

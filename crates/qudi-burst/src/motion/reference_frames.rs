@@ -43,7 +43,8 @@ impl ReferenceFrames {
         let blocks = Blocks::around(reference, self.frames.len(), 1);
         let pyramid = |k: usize| Cow::Borrowed(&self.pyramids[k]);
         let variance = burst.matching_variance(reference, self.error_variance);
-        align_blocks(&blocks, reference, variance, burst.grid.len(), pyramid)
+        let all = 0..self.frames.len();
+        align_blocks(&blocks, reference, variance, burst.grid.len(), &all, pyramid)
     }
 
     /// Samples patch `i` of `image`, displaced by `d`, with cubic convolution. Pixels outside the image are

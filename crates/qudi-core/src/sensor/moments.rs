@@ -68,11 +68,25 @@ impl CountMoments {
 
     /// Returns the variance where the mean is `mean`.
     pub fn variance_at_mean(&self, mean: f64) -> f64 {
-        let above = self.nodes.partition_point(|node| node.0 < mean).clamp(1, NODES);
+        let (above, part) = self.place_of_mean(mean);
         let (low, high) = (self.nodes[above - 1], self.nodes[above]);
-        let step = high.0 - low.0;
-        let part = if step > 0.0 { ((mean - low.0) / step).clamp(0.0, 1.0) } else { 0.0 };
         low.1 + part * (high.1 - low.1)
+    }
+
+    /// Returns the detections expected per output frame where the mean is `mean`: the inverse of
+    /// [`at`](Self::at), within the table.
+    pub fn detections_at_mean(&self, mean: f64) -> f64 {
+        let (above, part) = self.place_of_mean(mean);
+        let node = |i: usize| self.max_detections * (i as f64 / NODES as f64).powi(2);
+        node(above - 1) + part * (node(above) - node(above - 1))
+    }
+
+    /// Returns the node above a mean, and how far the mean lies on the way to it from the one before.
+    fn place_of_mean(&self, mean: f64) -> (usize, f64) {
+        let above = self.nodes.partition_point(|node| node.0 < mean).clamp(1, NODES);
+        let (low, high) = (self.nodes[above - 1].0, self.nodes[above].0);
+        let step = high - low;
+        (above, if step > 0.0 { ((mean - low) / step).clamp(0.0, 1.0) } else { 0.0 })
     }
 }
 
@@ -102,6 +116,11 @@ mod tests {
                 assert!((m - mean).abs() < 2e-3 * mean + 1e-5, "{name} {detections}: {m} {mean}");
                 assert!((v - variance).abs() < 0.02 * variance + 1e-4, "{name} {detections}: {v}");
                 assert!((moments.variance_at_mean(m) - v).abs() < 0.01 * v + 1e-6, "{name}");
+                let inverse = moments.detections_at_mean(m);
+                assert!(
+                    (inverse - detections).abs() < 1e-6 + 1e-6 * detections,
+                    "{name}: {inverse}"
+                );
             }
         }
     }

@@ -92,7 +92,7 @@ const NEAR: f32 = 0.75;
 const FAR: f32 = 0.25;
 
 /// Doubles the size: rows first, then columns.
-fn upsample(from: &[f32], width: usize, to: &mut [f32], between: &mut Vec<f32>) {
+pub(crate) fn upsample(from: &[f32], width: usize, to: &mut [f32], between: &mut Vec<f32>) {
     let height = from.len() / width;
     let row = |row: usize| &from[row * width..][..width];
     between.resize(2 * from.len(), 0.0);

@@ -2,8 +2,10 @@
 
 use super::positions;
 #[cfg(feature = "flex")]
-use crate::uninitialised::fill;
+use crate::uninitialised::written;
 use burn::tensor::{Int, Tensor};
+#[cfg(feature = "flex")]
+use multiversion::multiversion;
 #[cfg(feature = "flex")]
 use rayon::prelude::*;
 #[cfg(feature = "flex")]
@@ -28,29 +30,37 @@ const BEYOND: f32 = 3.0;
 
 /// The taps of one coordinate.
 #[cfg(feature = "flex")]
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Taps {
-    places: [usize; TAPS],
+    /// The pixel before the first tap's next one: taps lie at `first - 1` to `first + 2`.
+    first: i32,
     weights: [f32; TAPS],
-    /// True if they are neighbours: none lies beyond an edge.
-    inside: bool,
 }
 
 #[cfg(feature = "flex")]
 impl Taps {
     /// Returns the taps of a coordinate among `size` pixels. NaN counts as the first coordinate.
+    #[inline(always)]
     fn new(coordinate: f32, size: usize) -> Self {
         let clamped = coordinate.max(-BEYOND).min(size as f32 + BEYOND);
         // The whole number below, without a call of the mathematical library.
-        let whole = clamped as isize;
-        let first = whole - isize::from(clamped < whole as f32);
+        let whole = clamped as i32;
+        let first = whole - i32::from(clamped < whole as f32);
         let t = clamped - first as f32;
-        let place = |k: usize| (first + k as isize - 1).clamp(0, size as isize - 1);
-        Self {
-            places: std::array::from_fn(|k| place(k) as usize),
-            weights: WEIGHTS.map(|[a, b, c, d]| ((d * t + c) * t + b) * t + a),
-            inside: first >= 1 && first + 2 < size as isize,
-        }
+        Self { first, weights: WEIGHTS.map(|[a, b, c, d]| ((d * t + c) * t + b) * t + a) }
+    }
+
+    /// Returns true if none of the taps lies beyond an edge.
+    #[inline(always)]
+    fn inside(&self, size: usize) -> bool {
+        self.first >= 1 && self.first + 2 < size as i32
+    }
+
+    /// Returns the pixels of the taps; those beyond an edge are at the edge.
+    #[inline(always)]
+    fn places(&self, size: usize) -> [usize; TAPS] {
+        let last = size as i32 - 1;
+        std::array::from_fn(|k| (self.first + k as i32 - 1).clamp(0, last) as usize)
     }
 }
 
@@ -58,60 +68,89 @@ impl Taps {
 #[cfg(feature = "flex")]
 const ROWS_PER_TASK: usize = 32;
 
-/// Calls `visit` with the number of every pixel of some rows, counted from the first of them, and its taps
-/// along rows and columns; `flow` is `[2, height, width]`.
-#[cfg(feature = "flex")]
-fn visit(
-    flow: &[f32],
-    rows: Range<usize>,
-    [height, width]: [usize; 2],
-    mut visit: impl FnMut(usize, Taps, Taps),
-) {
-    let (x_flow, y_flow) = flow.split_at(height * width);
-    for (row, first) in rows.clone().zip((0..).step_by(width)) {
-        let at = row * width;
-        let displacements = x_flow[at..][..width].iter().zip(&y_flow[at..][..width]);
-        for (column, (dx, dy)) in displacements.enumerate() {
-            let x = Taps::new(column as f32 + dx, width);
-            let y = Taps::new(row as f32 + dy, height);
-            visit(first + column, x, y);
-        }
-    }
-}
-
 /// Computes [`warp_cubic`](super::warp_cubic).
 #[cfg(feature = "flex")]
 pub(crate) fn forward(shape: [usize; 4], x: &[f32], flow: &[f32]) -> Vec<f32> {
     let [_, channels, height, width] = shape;
     let plane = height * width;
-    let rows_of = |task: usize| {
-        let first = task * ROWS_PER_TASK;
-        first..(first + ROWS_PER_TASK).min(height)
-    };
-    fill(x.len(), |result| {
-        let planes = result.par_chunks_mut(plane).zip(x.par_chunks(plane)).enumerate();
-        planes.for_each(|(number, (result, x))| {
-            let flow = &flow[number / channels * 2 * plane..][..2 * plane];
-            let tasks = result.par_chunks_mut(ROWS_PER_TASK * width).enumerate();
-            tasks.for_each(|(task, result)| {
-                visit(flow, rows_of(task), [height, width], |at, columns, rows| {
-                    let row = |row: usize| {
-                        let x = &x[row * width..][..width];
-                        let values = if columns.inside {
-                            let x = &x[columns.places[0]..][..TAPS];
-                            [x[0], x[1], x[2], x[3]]
-                        } else {
-                            columns.places.map(|place| x[place])
-                        };
-                        let products = values.iter().zip(columns.weights);
-                        products.map(|(value, weight)| value * weight).sum::<f32>()
-                    };
-                    let taps = rows.places.iter().zip(rows.weights);
-                    result[at].write(taps.map(|(&place, weight)| row(place) * weight).sum());
-                });
-            });
+    written(x.len(), |result| {
+        // Each task takes a few rows of all planes of an image, which share their taps.
+        let mut tasks = Vec::new();
+        let images = result.chunks_mut(channels * plane).zip(x.chunks(channels * plane));
+        for ((result, x), flow) in images.zip(flow.chunks(2 * plane)) {
+            let mut rows: Vec<_> = result
+                .chunks_mut(plane)
+                .map(|plane| plane.chunks_mut(ROWS_PER_TASK * width))
+                .collect();
+            for first in (0..height).step_by(ROWS_PER_TASK) {
+                let planes: Vec<_> = rows.iter_mut().filter_map(Iterator::next).collect();
+                tasks.push((planes, x, flow, first..(first + ROWS_PER_TASK).min(height)));
+            }
+        }
+        tasks.into_par_iter().for_each(|(mut planes, x, flow, rows)| {
+            sample_rows(&mut planes, x, flow, rows, [height, width]);
         });
     })
+}
+
+/// Samples all planes of an image, `[channels, height, width]`, on one thread.
+#[cfg(feature = "flex")]
+pub(crate) fn sample(result: &mut [f32], x: &[f32], flow: &[f32], [height, width]: [usize; 2]) {
+    let mut planes: Vec<_> = result.chunks_mut(height * width).collect();
+    sample_rows(&mut planes, x, flow, 0..height, [height, width]);
+}
+
+/// Samples some rows of all planes of an image.
+#[cfg(feature = "flex")]
+#[multiversion(targets("x86_64+avx2+fma"))]
+fn sample_rows(
+    results: &mut [&mut [f32]],
+    x: &[f32],
+    flow: &[f32],
+    rows: Range<usize>,
+    [height, width]: [usize; 2],
+) {
+    let mut taps = vec![[Taps::default(); 2]; width];
+    for (row, first) in rows.zip((0..).step_by(width)) {
+        taps_of_row(&mut taps, flow, row, [height, width]);
+        for (result, x) in results.iter_mut().zip(x.chunks_exact(height * width)) {
+            let result = &mut result[first..][..width];
+            for (result, [columns, rows]) in result.iter_mut().zip(&taps) {
+                let mut sums = [0.0f32; TAPS];
+                if columns.inside(width) && rows.inside(height) {
+                    let corner = (rows.first - 1) as usize * width + (columns.first - 1) as usize;
+                    let x = &x[corner..][..3 * width + TAPS];
+                    for (row, weight) in rows.weights.iter().enumerate() {
+                        let x = &x[row * width..][..TAPS];
+                        for k in 0..TAPS {
+                            sums[k] += weight * x[k];
+                        }
+                    }
+                } else {
+                    let places = columns.places(width);
+                    for (row, weight) in rows.places(height).iter().zip(rows.weights) {
+                        let x = &x[row * width..][..width];
+                        for k in 0..TAPS {
+                            sums[k] += weight * x[places[k]];
+                        }
+                    }
+                }
+                let [a, b, c, d] = std::array::from_fn(|k| sums[k] * columns.weights[k]);
+                *result = (a + c) + (b + d);
+            }
+        }
+    }
+}
+
+/// Computes the taps of the pixels of a row, along rows and columns; `flow` is `[2, height, width]`.
+#[cfg(feature = "flex")]
+#[inline(always)]
+fn taps_of_row(taps: &mut [[Taps; 2]], flow: &[f32], row: usize, [height, width]: [usize; 2]) {
+    let (dx, dy) = flow.split_at(height * width);
+    let displacements = dx[row * width..].iter().zip(&dy[row * width..]);
+    for (column, (taps, (dx, dy))) in taps.iter_mut().zip(displacements).enumerate() {
+        *taps = [Taps::new(column as f32 + dx, width), Taps::new(row as f32 + dy, height)];
+    }
 }
 
 /// Computes the gradient of `x`.
@@ -122,17 +161,23 @@ pub(super) fn gradient(shape: [usize; 4], flow: &[f32], gradient: &[f32]) -> Vec
     let mut dx = vec![0.0; gradient.len()];
     let images = dx.par_chunks_mut(channels * plane).zip(gradient.par_chunks(channels * plane));
     images.zip(flow.par_chunks(2 * plane)).for_each(|((dx, gradient), flow)| {
-        visit(flow, 0..height, [height, width], |at, columns, rows| {
-            for (dx, gradient) in dx.chunks_mut(plane).zip(gradient.chunks(plane)) {
-                for (row, weight) in rows.places.iter().zip(rows.weights) {
-                    let dx = &mut dx[row * width..][..width];
-                    let gradient = gradient[at] * weight;
-                    for (&place, weight) in columns.places.iter().zip(columns.weights) {
-                        dx[place] += gradient * weight;
+        let mut taps = vec![[Taps::default(); 2]; width];
+        for row in 0..height {
+            taps_of_row(&mut taps, flow, row, [height, width]);
+            for (at, [columns, rows]) in (row * width..).zip(&taps) {
+                let (rows, weights) = (rows.places(height), rows.weights);
+                let places = columns.places(width);
+                for (dx, gradient) in dx.chunks_mut(plane).zip(gradient.chunks(plane)) {
+                    for (row, weight) in rows.iter().zip(weights) {
+                        let dx = &mut dx[row * width..][..width];
+                        let gradient = gradient[at] * weight;
+                        for (&place, weight) in places.iter().zip(columns.weights) {
+                            dx[place] += gradient * weight;
+                        }
                     }
                 }
             }
-        });
+        }
     });
     dx
 }

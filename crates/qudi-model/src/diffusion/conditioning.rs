@@ -13,6 +13,7 @@ const MIN_VARIANCE: f32 = 1e-8;
 /// # Shapes
 /// - counts, linear_estimate: `[bursts * frames, 1, height, width]`
 /// - sensor: `[bursts, 11]`
+/// - response: `[bursts, 65]`
 #[derive(Clone, Debug)]
 pub struct Conditioning {
     /// Counts of each frame over full scale.
@@ -21,6 +22,8 @@ pub struct Conditioning {
     pub linear_estimate: Tensor<4>,
     /// The sensor and its light in numbers ([`sensor_numbers`](crate::sensor::sensor_numbers)).
     pub sensor: Tensor<2>,
+    /// Images of mean counts ([`response_levels`](crate::sensor::response_levels)).
+    pub response: Tensor<2>,
     /// Frames of a burst.
     pub frames: usize,
     /// Finders of the motion in the counts, one for every burst. Without them, networks follow their learnt
@@ -49,6 +52,7 @@ impl Conditioning {
             counts: one(&self.counts),
             linear_estimate: one(&self.linear_estimate),
             sensor: self.sensor.clone().narrow(0, number / self.frames, 1),
+            response: self.response.clone().narrow(0, number / self.frames, 1),
             frames: 1,
             motion: Vec::new(),
         }
@@ -61,6 +65,7 @@ impl Conditioning {
             counts: self.counts.clone().inner(),
             linear_estimate: self.linear_estimate.clone().inner(),
             sensor: self.sensor.clone().inner(),
+            response: self.response.clone().inner(),
             frames: self.frames,
             motion: self.motion.clone(),
         }

@@ -11,7 +11,7 @@ use super::timesteps::{NUM_TIMESTEPS, TimestepSpacing};
 use super::{Conditioning, Part};
 use crate::counts::CountPlanes;
 use crate::restorer::{Model, check_frames, check_tile};
-use crate::sensor::sensor_tensor;
+use crate::sensor::{response_tensor, sensor_tensor};
 use burn::tensor::{Device, Tensor};
 use qudi_burst::BurstMotion;
 use qudi_core::progress::progress;
@@ -103,6 +103,7 @@ pub struct DiffusionRestorer<N: Denoiser> {
 struct Window<'a, E> {
     acquisition: &'a Acquisition,
     sensor: Tensor<2>,
+    response: Tensor<2>,
     counts: CountPlanes,
     /// Counts as they are; none if no motion is found in them.
     raw: Option<Vec<f32>>,
@@ -205,6 +206,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         Window {
             acquisition,
             sensor: sensor_tensor(acquisition, &self.device),
+            response: response_tensor(acquisition, &self.device),
             counts: CountPlanes::new(burst, acquisition).map(|plane| tiling.padded(plane)),
             raw: matched.then(|| tiling.padded(&raw())),
             frames,
@@ -317,6 +319,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             counts: self.tiles(window, batch, &window.counts.y),
             linear_estimate: self.tiles(window, batch, &window.counts.u),
             sensor: window.sensor.clone().repeat_dim(0, window.batches[batch].len()),
+            response: window.response.clone().repeat_dim(0, window.batches[batch].len()),
             frames: window.frames,
             motion: window.motion(batch),
         };

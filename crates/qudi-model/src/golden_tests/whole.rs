@@ -9,7 +9,7 @@ use crate::diffusion::state::DiffusionState;
 use crate::diffusion::timesteps::{NUM_TIMESTEPS, TimestepSpacing};
 use crate::diffusion::{Conditioning, Simulated};
 use crate::init_parameters;
-use crate::sensor::{SENSOR_NUMBERS, sensor_numbers};
+use crate::sensor::{RESPONSE_LEVELS, SENSOR_NUMBERS, sensor_numbers};
 use burn::tensor::{Device, Tensor};
 use qudi_core::Size;
 use qudi_core::restorer::Acquisition;
@@ -42,6 +42,7 @@ fn whole_network_matches_pytorch() {
             counts: y.clone(),
             linear_estimate: u.clone(),
             sensor: case.input("sensor", &device),
+            response: Tensor::zeros([1, RESPONSE_LEVELS], &device),
             frames: case.number("frames"),
             motion: Vec::new(),
         };
@@ -117,7 +118,9 @@ fn ten_sampling_steps_match_pytorch() {
         let (counts, linear_estimate) = planes(&file.bytes("counts"), &file.f32s("u_table"));
         let sensor = Tensor::<1>::from_floats(sensor.as_slice(), &device).unsqueeze();
         let motion = Vec::new();
-        let conditioning = Conditioning { counts, linear_estimate, sensor, frames, motion };
+        let response = Tensor::zeros([1, RESPONSE_LEVELS], &device);
+        let conditioning =
+            Conditioning { counts, linear_estimate, sensor, response, frames, motion };
         let encoded = network.encode(&conditioning);
         let (simulated, tables) = (file.bytes("simulated"), file.f32s("u_sim_table"));
         let count = frames * size.pixels();

@@ -56,7 +56,7 @@ impl Refinement {
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the device fails.
-    pub fn restore(&self, burst: &AlignedBurst<'_>) -> Result<Vec<Frame>> {
+    pub fn restore(&self, burst: &AlignedBurst) -> Result<Vec<Frame>> {
         let tiling = Tiling::new(burst.size(), self.fold, self.tile);
         let predenoise = |aligned: &Aligned<Tensor<4>>| vec![self.predenoiser.predenoise(aligned)];
         let PredenoisedFrames { frames, noise_sigmas, .. } = predenoise_frames(
@@ -105,13 +105,8 @@ impl BurstAligner {
     ///
     /// # Errors
     /// [`Error`](qudi_core::Error) if the sensor's dark rate is unknown, or a device fails.
-    pub fn align<'a>(
-        &self,
-        burst: BurstView<'_>,
-        acquisition: &'a Acquisition,
-    ) -> Result<AlignedBurst<'a>> {
-        let aligned =
-            AlignedBurst::new(ReferenceEstimate::compute(burst, acquisition)?, acquisition);
+    pub fn align(&self, burst: BurstView<'_>, acquisition: &Acquisition) -> Result<AlignedBurst> {
+        let aligned = AlignedBurst::new(ReferenceEstimate::compute(burst, acquisition)?);
         let Some(refinement) = &self.refinement else { return Ok(aligned) };
         let restored = refinement.restore(&aligned)?;
         Ok(aligned.realign(restored))
@@ -146,7 +141,7 @@ pub(crate) struct PredenoisedFrames {
 /// threads for it.
 pub(crate) fn predenoise_frames(
     stage: &'static str,
-    burst: &AlignedBurst<'_>,
+    burst: &AlignedBurst,
     neighbours: AlignedNeighbours,
     tiling: &Tiling,
     device: &Device,
@@ -183,7 +178,7 @@ pub(crate) fn predenoise_frames(
 /// Filters frames that were pre-denoised each for itself over time, and clamps them to [0, `max`].
 /// `noise_sigmas` belong to the merged frames.
 pub(crate) fn filter_over_time(
-    burst: &AlignedBurst<'_>,
+    burst: &AlignedBurst,
     frames: Vec<Frame>,
     noise_sigmas: Vec<Frame>,
     max: f32,

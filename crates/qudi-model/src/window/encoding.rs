@@ -1,12 +1,14 @@
 //! Encoding of a window: what does not depend on the reverse step.
 
 use super::Window;
-use super::agreement::Paths;
 use super::config::FOLD;
-use super::flow::WindowFlow;
-use super::fusion::{Frames, Fused};
+use super::fusion::Frames;
 use super::hourglass::normalized;
 use super::input::{MIDDLE, Measurement};
+use super::merging::{Merged, averaged};
+use super::motion::flow::WindowFlow;
+use super::motion::paths::Paths;
+use super::motion::refinement::pre_denoised_sigma;
 use super::motion::{Finder, Motion};
 use crate::diffusion::Conditioning;
 use crate::diffusion::schedule::NoiseSchedule;
@@ -27,15 +29,16 @@ pub struct EncodedWindow {
     pub restored: Tensor<4>,
     /// Learnt flow on all levels, finest first; none where matched motion takes its place and nothing learns.
     pub flow: Vec<WindowFlow>,
-    /// Linear estimates merged along the flow, in image units, `[bursts * frames, 1, H, W]`.
-    pub merged: Tensor<4>,
-    /// Clean frames that the pass before predicted, about in [-1, 1]: `[bursts * frames, 1, H, W]`.
-    pub(super) estimate: Option<Tensor<4>>,
+    /// The cleanest frames before the U-Net in image units, `[bursts * frames, 1, H, W]`: pre-denoised and
+    /// averaged along the motion, or predicted by the pass before.
+    pub(super) known: Tensor<4>,
+    /// Counts merged along the motion, as images.
+    pub(super) merged: Merged,
+    /// Variance of the linear estimate's noise in image units, `[bursts * frames, 1, 1, 1]`.
+    pub(super) noise_variance: Tensor<4>,
     /// Features of the frames, states from both sides and pre-denoised frames,
     /// `[bursts * frames, channels, h, w]` each.
     pub(super) features: Vec<Tensor<4>>,
-    /// Planes of the merged frames, `[bursts * frames, 8, h, w]`.
-    pub(super) merged_planes: Tensor<4>,
     pub(super) paths: Paths,
     /// The sensor's numbers, `[bursts * frames, 11, 1, 1]`.
     pub(super) sensor: Tensor<4>,
@@ -45,8 +48,11 @@ pub struct EncodedWindow {
 /// The frames of a window, each by itself, and the learnt flow between them: what every pass begins with.
 struct SingleFrames {
     measurement: Measurement,
-    /// Linear estimate in image units, `[bursts * frames, 1, H, W]`.
-    linear: Tensor<4>,
+    /// Counts over full scale, `[bursts * frames, 1, H, W]`.
+    counts: Tensor<4>,
+    /// Images of mean counts, `[bursts, 65]`.
+    response: Tensor<2>,
+    noise_variance: Tensor<4>,
     restored: Tensor<4>,
     features: Tensor<4>,
     /// Pre-denoised frames as the U-Net sees them, `[bursts * frames, 4, h, w]`.
@@ -61,12 +67,42 @@ impl SingleFrames {
     fn inner(&self) -> Self {
         Self {
             measurement: self.measurement.inner(),
-            linear: self.linear.clone().inner(),
+            counts: self.counts.clone().inner(),
+            response: self.response.clone().inner(),
+            noise_variance: self.noise_variance.clone().inner(),
             restored: self.restored.clone().inner(),
             features: self.features.clone().inner(),
             image: self.image.clone().inner(),
             flow: self.flow.iter().map(WindowFlow::inner).collect(),
             count: self.count,
+        }
+    }
+}
+
+/// What a pass begins with.
+#[derive(Clone, Debug)]
+struct Basis {
+    motion: Motion,
+    /// The cleanest frames so far in image units, `[bursts * frames, 1, H, W]`.
+    known: Tensor<4>,
+    /// Counts merged along the motion.
+    merged: Merged,
+}
+
+impl Basis {
+    fn new(single: &SingleFrames, motion: Motion, known: Tensor<4>) -> Self {
+        let sigma = single.measurement.error_sigma.clone() * 0.5;
+        let SingleFrames { counts, response, .. } = single;
+        let merged = Merged::along(&motion.paths, counts, response, &known, &sigma);
+        Self { motion, known, merged }
+    }
+
+    /// Returns the same inside autodiff, without gradient.
+    fn from_inner(basis: Self) -> Self {
+        Self {
+            motion: Motion::from_inner(basis.motion),
+            known: Tensor::from_inner(basis.known),
+            merged: Merged::from_inner(basis.merged),
         }
     }
 }
@@ -79,8 +115,8 @@ impl EncodedWindow {
 
     /// Returns the memory of all tensors, in bytes.
     pub(super) fn bytes(&self) -> usize {
-        let single = [&self.restored, &self.merged, &self.merged_planes];
-        let single = single.into_iter().chain(&self.estimate).chain(&self.features);
+        let single = [&self.restored, &self.known, &self.merged.mean, &self.merged.frames];
+        let single = single.into_iter().chain(&self.features);
         let flows = self.flow.iter().map(|flow| &flow.pairs);
         let all = single.chain(flows).chain(self.paths.tensors());
         all.map(|x| x.shape().num_elements() * size_of::<f32>()).sum()
@@ -92,10 +128,10 @@ impl EncodedWindow {
         let inner = |x: &Tensor<4>| x.clone().inner();
         Self {
             restored: inner(&self.restored),
-            merged: inner(&self.merged),
-            merged_planes: inner(&self.merged_planes),
+            known: inner(&self.known),
+            merged: self.merged.inner(),
+            noise_variance: inner(&self.noise_variance),
             flow: self.flow.iter().map(WindowFlow::inner).collect(),
-            estimate: self.estimate.as_ref().map(inner),
             paths: self.paths.inner(),
             features: self.features.iter().map(inner).collect(),
             sensor: inner(&self.sensor),
@@ -113,14 +149,13 @@ impl Window {
     /// [`Error`](qudi_core::Error) if the device fails.
     pub fn encode(&self, conditioning: &Conditioning, passes: usize) -> Result<EncodedWindow> {
         let single = self.single_frames(conditioning);
+        let earlier = passes.saturating_sub(1);
         if !single.restored.is_autodiff() {
-            let (motion, estimate) =
-                self.estimate(&single, conditioning, passes.saturating_sub(1))?;
-            return Ok(self.fused(&single, motion, estimate));
+            let basis = self.basis(&single, conditioning, earlier)?;
+            return Ok(self.fused(&single, basis));
         }
-        let (motion, estimate) =
-            self.valid().estimate(&single.inner(), conditioning, passes.saturating_sub(1))?;
-        Ok(self.fused(&single, Motion::from_inner(motion), estimate.map(Tensor::from_inner)))
+        let basis = self.valid().basis(&single.inner(), conditioning, earlier)?;
+        Ok(self.fused(&single, Basis::from_inner(basis)))
     }
 
     fn single_frames(&self, conditioning: &Conditioning) -> SingleFrames {
@@ -130,7 +165,9 @@ impl Window {
         let learnt = conditioning.motion.is_empty() || restored.is_autodiff();
         let flow = || self.flow.forward(&restored, &pyramid, conditioning.frames);
         SingleFrames {
-            linear: conditioning.linear_estimate.clone(),
+            counts: conditioning.counts.clone(),
+            response: conditioning.response.clone(),
+            noise_variance: conditioning.noise_variance(),
             flow: if learnt { flow() } else { Vec::new() },
             features: normalized(pyramid[0].clone()),
             image: (pixel_unshuffle(restored.clone(), FOLD) - MIDDLE) * SCALE,
@@ -140,20 +177,21 @@ impl Window {
         }
     }
 
-    /// Finds the motion, and predicts the clean frames in image units from the measurement alone in so many
-    /// passes. Without passes it predicts none.
-    fn estimate(
+    /// Finds the motion, and the cleanest frames along it in so many passes.
+    fn basis(
         &self,
         single: &SingleFrames,
         conditioning: &Conditioning,
         passes: usize,
-    ) -> Result<(Motion, Option<Tensor<4>>)> {
+    ) -> Result<Basis> {
         let finder = match single.flow.first() {
             Some(flow) if conditioning.motion.is_empty() => Finder::Learnt(flow),
             _ => Finder::Matched(&conditioning.motion),
         };
-        let mut motion =
-            finder.first(&single.restored, &single.measurement.error_sigma, single.count)?;
+        let sigma = &single.measurement.error_sigma;
+        let motion = finder.first(&single.restored, sigma, single.count)?;
+        let known = averaged(&single.restored, &pre_denoised_sigma(sigma), &motion.paths);
+        let mut basis = Basis::new(single, motion, known);
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
         let bursts = single.restored.dims()[0] / single.count;
         let state = DiffusionState {
@@ -162,39 +200,32 @@ impl Window {
             has_previous: vec![false; bursts],
             timesteps: vec![NUM_TIMESTEPS - 1; bursts],
         };
-        let mut estimate: Option<Tensor<4>> = None;
         for _ in 0..passes {
-            let encoded = self.fused(single, motion.clone(), estimate);
+            let encoded = self.fused(single, basis.clone());
             let image = (self.predict(&encoded, &state, &schedule).x0 + 1.0) * 0.5;
-            motion = finder.next(image.clone(), &motion, single.count)?;
-            estimate = Some(image);
+            let motion = finder.next(image.clone(), &basis.motion, single.count)?;
+            basis = Basis::new(single, motion, image);
         }
-        Ok((motion, estimate))
+        Ok(basis)
     }
 
-    /// Fuses the frames along the flow. `estimate` are the clean frames that the pass before predicted.
-    fn fused(
-        &self,
-        single: &SingleFrames,
-        Motion { flow, paths }: Motion,
-        estimate: Option<Tensor<4>>,
-    ) -> EncodedWindow {
-        let SingleFrames { measurement, linear, restored, features, count, .. } = single;
-        let known = estimate.as_ref().unwrap_or(restored);
+    /// Fuses the frames along the motion.
+    fn fused(&self, single: &SingleFrames, basis: Basis) -> EncodedWindow {
+        let SingleFrames { measurement, restored, features, count, .. } = single;
+        let Basis { motion: Motion { flow, paths }, known, merged } = basis;
         let window = Frames {
-            whole: [known, linear],
-            restored: &pixel_unshuffle(known.clone(), FOLD),
+            known: pixel_unshuffle(known.clone(), FOLD),
             linear: &measurement.linear,
             features,
+            merged: &merged.planes(),
             count: *count,
         };
-        let Fused { states: [earlier, later], merged } =
-            self.fusion.forward(&window, &flow, self.state);
+        let [earlier, later] = self.fusion.forward(&window, &flow, self.state);
         EncodedWindow {
-            merged_planes: merged.planes(),
-            merged: merged.mean,
+            known,
+            merged,
+            noise_variance: single.noise_variance.clone(),
             restored: restored.clone(),
-            estimate: estimate.map(|image| image * 2.0 - 1.0),
             paths,
             flow: single.flow.clone(),
             features: vec![features.clone(), earlier, later, single.image.clone()],

@@ -1,14 +1,19 @@
 //! The motion that a window is fused along: patches matched in the counts and on better frames, or the learnt
 //! flow, refined.
 
-use super::agreement::{NEIGHBOURS, Paths, merged};
+pub(super) mod flow;
+mod matching;
+pub(super) mod paths;
+pub(super) mod refinement;
+
+use self::flow::WindowFlow;
+use self::paths::Paths;
+use self::refinement::{flow_between, pre_denoised_sigma, refined};
 use super::config::FOLD;
-use super::flow::WindowFlow;
-use super::refinement::{flow_between, pre_denoised_sigma, refined};
+use super::merging::{FARTHEST_FRAME, averaged};
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_burst::{BurstMotion, FoundMotion};
 use qudi_core::{Frame, Result};
-use qudi_layers::resample::avg_pool2;
 use qudi_layers::tensor::read;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -65,9 +70,10 @@ impl Finder<'_> {
             Self::Matched(bursts) => bursts,
         };
         let device = restored.device();
-        let found: Vec<_> = bursts.par_iter().map(|burst| burst.on_counts()).collect();
-        let Motion { paths, .. } = motion(&found, frames, &device);
-        let better = merged(restored.clone(), &pre_denoised_sigma(sigma), &paths);
+        let found: Vec<_> =
+            bursts.par_iter().map(|burst| burst.on_counts(FARTHEST_FRAME)).collect();
+        let Motion { paths, .. } = motion(&found, frames, FARTHEST_FRAME, &device);
+        let better = averaged(restored, &pre_denoised_sigma(sigma), &paths);
         on_frames(bursts, &better, frames)
     }
 
@@ -93,7 +99,7 @@ fn on_frames(bursts: &[Arc<BurstMotion>], images: &Tensor<4>, frames: usize) -> 
         .zip(values.par_chunks(per_burst))
         .map(|(burst, values)| of_burst(burst, values))
         .collect();
-    Ok(motion(&found, frames, &images.device()))
+    Ok(motion(&found, frames, frames, &images.device()))
 }
 
 /// Finds the motion on the better frames of one burst.
@@ -104,15 +110,16 @@ fn of_burst<'a>(burst: &'a BurstMotion, values: &[f32]) -> FoundMotion<'a> {
     burst.on_frames(&frames)
 }
 
-/// Samples the motion of patches at every cell.
-fn motion(bursts: &[FoundMotion<'_>], frames: usize, device: &Device) -> Motion {
+/// Samples the motion of patches at every cell, to frames up to `most` frames away.
+fn motion(bursts: &[FoundMotion<'_>], frames: usize, most: usize, device: &Device) -> Motion {
     let of_distance = |distance: usize| {
         [true, false].map(|later| {
             let of_burst = |found: &'_ FoundMotion<'_>| -> Vec<[Frame; 2]> {
                 let pairs = (0..frames - distance).into_par_iter();
                 let flow = |early: usize| {
                     let late = early + distance;
-                    if later { found.flow(early, late) } else { found.flow(late, early) }
+                    let [from, to] = if later { [early, late] } else { [late, early] };
+                    found.flow(from, to, FOLD)
                 };
                 pairs.map(flow).collect()
             };
@@ -120,11 +127,10 @@ fn motion(bursts: &[FoundMotion<'_>], frames: usize, device: &Device) -> Motion 
             let size = fields[0][0].size;
             let shape = [fields.len(), 2, size.height, size.width];
             let values = fields.into_iter().flatten().flat_map(|frame| frame.data).collect();
-            let flow = Tensor::from_data(TensorData::new::<f32, _>(values, shape), device);
-            avg_pool2(flow) / FOLD as f32
+            Tensor::from_data(TensorData::new::<f32, _>(values, shape), device) / FOLD as f32
         })
     };
-    let flows: Vec<_> = (1..=NEIGHBOURS.min(frames - 1)).map(of_distance).collect();
+    let flows: Vec<_> = (1..frames.min(most + 1)).map(of_distance).collect();
     let pairs = Tensor::cat(flows[0].to_vec(), 0);
     Motion { flow: WindowFlow { pairs, scale: FOLD }, paths: Paths::of(flows, frames) }
 }

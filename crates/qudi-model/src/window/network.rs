@@ -3,11 +3,11 @@
 use super::agreement::Agreement;
 use super::config::WindowConfig;
 use super::encoding::EncodedWindow;
-use super::flow::Flow;
 use super::fusion::Fusion;
 use super::initial::initial_values;
+use super::motion::flow::Flow;
 use super::predenoiser::PreDenoiser;
-use super::unet::{StepImages, UNet};
+use super::unet::{Correction, StepImages, UNet};
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::{DiffusionState, per_image};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
@@ -71,7 +71,7 @@ impl Window {
         state: &DiffusionState,
         schedule: &NoiseSchedule,
     ) -> WindowPrediction {
-        let EncodedWindow { restored, estimate, sensor, error_sigma, .. } = encoded;
+        let EncodedWindow { restored, known, merged, sensor, error_sigma, .. } = encoded;
         let images = restored.dims()[0];
         let device = restored.device();
         let of_steps = |f: &dyn Fn(f64) -> f64| {
@@ -87,24 +87,25 @@ impl Window {
         let signal = of_steps(&|bar| 1.0 / bar.sqrt());
         let predenoised = restored.clone() * 2.0 - 1.0;
         let has_previous = state.has_previous_flag();
-        let before = estimate.as_ref().unwrap_or(&predenoised).clone();
-        let base = before * (has_previous.clone() * -1.0 + 1.0) + state.previous();
-        let (has_previous, flags) = match estimate {
-            Some(_) => (has_previous.ones_like(), vec![true; state.has_previous.len()]),
-            None => (has_previous, state.has_previous.clone()),
-        };
+        let known = known.clone() * 2.0 - 1.0;
+        let base = known * (has_previous * -1.0 + 1.0) + state.previous();
         let error_variance = error_sigma.clone().powi_scalar(2);
         let variance = error_variance.clone() + noise.clone().powi_scalar(2);
-        let c_skip = error_variance / variance.clone() * seen.clone();
+        let c_skip = error_variance.clone() / variance.clone() * seen.clone();
         let c_out =
             (noise.clone().powi_scalar(2) * error_sigma.clone().powi_scalar(2) / variance).sqrt();
         let c_out = c_out * seen.clone() + error_sigma.clone() * (seen * -1.0 + 1.0);
         let difference = (state.x_t.clone() * signal - base.clone()) * c_skip;
         let clamped =
             |x: Tensor<4>| (x / error_sigma.clone()).clamp(-MAX_DIFFERENCE, MAX_DIFFERENCE);
+        let mean = merged.mean.clone() * 2.0 - 1.0;
+        // Variance of the merged frames' noise in [-1, 1].
+        let merged_variance = encoded.noise_variance.clone() * 4.0 / merged.frames.clone();
         let step = StepImages {
             noisy: clamped(difference.clone()),
-            previous: clamped((base.clone() - predenoised) * has_previous),
+            previous: clamped(base.clone() - predenoised),
+            merged: clamped(mean.clone() - base.clone()),
+            noise: (error_variance / merged_variance).log(),
         };
         let log_snr: Vec<f32> = state
             .timesteps
@@ -114,9 +115,12 @@ impl Window {
                 ((bar / (1.0 - bar)).ln() as f32).clamp(-10.0, 10.0)
             })
             .collect();
-        let (correction, features) =
-            self.unet.forward(encoded, step, sensor.clone(), &log_snr, &flags);
-        let single = base + difference + correction * c_out.clone();
+        let Correction { correction, gate, features } =
+            self.unet.forward(encoded, step, sensor.clone(), &log_snr);
+        let seen = base + difference;
+        // The less noise the noisy image has, the less the merged frames count.
+        let gate = gate * (c_out.clone() / error_sigma.clone());
+        let single = seen.clone() + (mean - seen) * gate + correction * c_out.clone();
         let x0 = self.agreement.forward(single, features, &c_out, &encoded.paths);
         WindowPrediction { x0, c_out }
     }

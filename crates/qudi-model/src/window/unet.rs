@@ -8,13 +8,13 @@ use super::merging::MERGED;
 use crate::diffusion::state::per_image;
 use crate::sensor::SENSOR_NUMBERS;
 use burn::module::Module;
-use burn::tensor::activation::silu;
+use burn::tensor::activation::{sigmoid, silu};
 use burn::tensor::{Device, Tensor};
-use qudi_layers::Linear;
-use qudi_layers::resample::pixel_unshuffle;
+use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
+use qudi_layers::{Bias, Conv2d, Linear};
 
 /// Numbers that describe the noise of a step.
-const STEP_NUMBERS: usize = 6;
+const STEP_NUMBERS: usize = 5;
 
 /// Channels of the embedding between its layers, and of its result.
 const EMBEDDING: [usize; 2] = [64, 16];
@@ -26,6 +26,18 @@ pub(super) struct UNet {
     leave: Linear,
     hourglass: Hourglass,
     head: ImageHead,
+    gate: Conv2d,
+}
+
+/// What the U-Net computes.
+#[derive(Clone, Debug)]
+pub(super) struct Correction {
+    /// Correction of unit size, `[images, 1, H, W]`.
+    pub(super) correction: Tensor<4>,
+    /// How much of the merged frames the correction starts from, in [0, 1]: `[images, 1, H, W]`.
+    pub(super) gate: Tensor<4>,
+    /// What both come from, `[images, features, H / 2, W / 2]`.
+    pub(super) features: Tensor<4>,
 }
 
 /// The images that a step sees, `[images, 1, H, W]`, in units of usual errors.
@@ -35,6 +47,10 @@ pub(super) struct StepImages {
     pub(super) noisy: Tensor<4>,
     /// The previous estimate's difference from the pre-denoised frames.
     pub(super) previous: Tensor<4>,
+    /// The merged frames' difference from the base.
+    pub(super) merged: Tensor<4>,
+    /// Logarithm of the usual squared error of the base over the merged frames'.
+    pub(super) noise: Tensor<4>,
 }
 
 impl WindowConfig {
@@ -46,12 +62,13 @@ impl WindowConfig {
             leave: Linear::zeros([between, planes], device),
             hourglass: Hourglass::zeros(inputs, planes, self.widths, device),
             head: ImageHead::zeros(self.widths[0], device),
+            gate: Conv2d::zeros([self.widths[0], IMAGE], 3, Bias::Yes, device),
         }
     }
 }
 
 impl UNet {
-    /// Computes a correction of unit size, `[images, 1, H, W]`, and the features that it comes from.
+    /// Computes the correction of a step.
     ///
     /// # Shapes
     /// - sensor: `[images, 11, 1, 1]`
@@ -62,8 +79,7 @@ impl UNet {
         images: StepImages,
         sensor: Tensor<4>,
         log_snr: &[f32],
-        has_previous: &[bool],
-    ) -> (Tensor<4>, Tensor<4>) {
+    ) -> Correction {
         let [count, numbers, ..] = sensor.dims();
         let device = sensor.device();
         let plane = |f: &dyn Fn(usize) -> f32| {
@@ -76,7 +92,6 @@ impl UNet {
                 plane(&|k| (log_snr[k] * 0.5).cos()),
                 plane(&|k| log_snr[k].sin()),
                 plane(&|k| log_snr[k].cos()),
-                plane(&|k| f32::from(u8::from(has_previous[k]))),
             ],
             1,
         );
@@ -97,8 +112,14 @@ impl UNet {
             ],
             1,
         ));
-        inputs.push(encoded.merged_planes.clone());
+        let merged = pixel_unshuffle(images.merged, FOLD);
+        inputs.push(Tensor::cat(vec![merged, encoded.merged.planes_of_frames()], 1));
         let [features, ..] = self.hourglass.forward(&inputs, Some(&embedding));
-        (self.head.forward(features.clone()), features)
+        let gate = pixel_shuffle(self.gate.linear(std::slice::from_ref(&features)), FOLD);
+        Correction {
+            correction: self.head.forward(features.clone()),
+            gate: sigmoid(gate + images.noise),
+            features,
+        }
     }
 }

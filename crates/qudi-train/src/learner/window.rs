@@ -84,12 +84,8 @@ impl Learner for Window {
             let distance = perceptual_loss(lpips, &images, &example, &quiet) * share;
             sum.add("perceptual", weights.perceptual, distance);
         }
-        let before = |frames: &Tensor<4>| {
-            let error = frames.clone() * 2.0 - 1.0 - truth.clone();
-            log_mean_square(error / encoded.error_sigma().clone())
-        };
-        sum.add("pre", weights.pre, before(&encoded.restored));
-        sum.add("merged", weights.pre, before(&encoded.merged));
+        let error = (encoded.restored.clone() * 2.0 - 1.0 - truth) / encoded.error_sigma().clone();
+        sum.add("pre", weights.pre, log_mean_square(error));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
         let flow = flows.reduce(Tensor::add).expect("a level");

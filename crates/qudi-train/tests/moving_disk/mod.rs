@@ -9,7 +9,7 @@ use qudi_layers::tensor::to_tensor;
 use qudi_model::config::NetworkConfig;
 use qudi_model::counts::CountPlanes;
 use qudi_model::diffusion::{Conditioning, DiffusionConfig};
-use qudi_model::sensor::sensor_tensor;
+use qudi_model::sensor::{response_tensor, sensor_tensor};
 use qudi_train::diffusion::Example;
 
 /// Counts of a disk that moves, their truth and their light.
@@ -62,6 +62,7 @@ pub(crate) fn burst([ground, disk]: [f32; 2], size: Size, frames: usize, device:
         counts: to_tensor(planes.y, size, device),
         linear_estimate: to_tensor(planes.u, size, device),
         sensor: sensor_tensor(&acquisition, device),
+        response: response_tensor(&acquisition, device),
         frames,
         motion: Vec::new(),
     };

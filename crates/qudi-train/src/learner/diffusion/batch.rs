@@ -12,7 +12,7 @@ use qudi_model::counts::CountPlanes;
 use qudi_model::diffusion::noise::Noise;
 use qudi_model::diffusion::timesteps::NUM_TIMESTEPS;
 use qudi_model::diffusion::{BurstMotion, Conditioning};
-use qudi_model::sensor::{SENSOR_NUMBERS, sensor_numbers};
+use qudi_model::sensor::{RESPONSE_LEVELS, SENSOR_NUMBERS, response_levels, sensor_numbers};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use std::sync::Arc;
@@ -157,10 +157,13 @@ impl Batch {
             return uploaded.conditioning.clone();
         }
         let numbers = TensorData::new(self.numbers.clone(), [self.len(), SENSOR_NUMBERS]);
+        let levels = self.acquisitions.iter().flat_map(response_levels).collect();
+        let response = TensorData::new::<f32, _>(levels, [self.len(), RESPONSE_LEVELS]);
         Conditioning {
             counts: to_tensor(self.counts.y.clone(), self.size, device),
             linear_estimate: to_tensor(self.counts.u.clone(), self.size, device),
             sensor: Tensor::from_data(numbers, device),
+            response: Tensor::from_data(response, device),
             frames: self.frames,
             motion: self.motion.clone(),
         }

@@ -1,8 +1,8 @@
 //! Optical flow between neighbouring frames: soft block matching, corrected by networks from coarse to fine.
 
-use super::config::{FOLD, LEVELS, WindowConfig};
-use super::hourglass::{Pyramid, normalized};
 use super::matching::soft_match;
+use crate::window::config::{FOLD, LEVELS, WindowConfig};
+use crate::window::hourglass::{Pyramid, normalized};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::warp;
@@ -27,7 +27,7 @@ const PLANES: usize = 3 + 2 + 6;
 
 /// The network of one level.
 #[derive(Module, Debug)]
-pub(super) struct FlowLevel {
+pub(in crate::window) struct FlowLevel {
     compared: Conv2d,
     stack: ResidualStack,
     out: Conv2d,
@@ -35,7 +35,7 @@ pub(super) struct FlowLevel {
 
 /// The networks of all levels, finest first.
 #[derive(Module, Debug)]
-pub(super) struct Flow {
+pub(in crate::window) struct Flow {
     levels: Vec<FlowLevel>,
 }
 
@@ -50,7 +50,7 @@ pub struct WindowFlow {
 }
 
 impl WindowConfig {
-    pub(super) fn init_flow(&self, device: &Device) -> Flow {
+    pub(in crate::window) fn init_flow(&self, device: &Device) -> Flow {
         let level = |level: usize| {
             let width = self.flow[level];
             FlowLevel {
@@ -64,7 +64,7 @@ impl WindowConfig {
 }
 
 /// Returns frames and their neighbours in the order of [`WindowFlow::pairs`].
-pub(super) fn pairs(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
+pub(in crate::window) fn pairs(x: Tensor<4>, frames: usize) -> (Tensor<4>, Tensor<4>) {
     let [images, c, h, w] = x.dims();
     let count = images / frames * (frames - 1);
     let part =
@@ -96,7 +96,7 @@ impl Flow {
     ///
     /// # Shapes
     /// - restored: pre-denoised frames, `[bursts * frames, 1, H, W]` in image units
-    pub(super) fn forward(
+    pub(in crate::window) fn forward(
         &self,
         restored: &Tensor<4>,
         features: &Pyramid,
@@ -152,18 +152,18 @@ impl FlowLevel {
 
 impl WindowFlow {
     /// Returns the same outside autodiff.
-    pub(super) fn inner(&self) -> Self {
+    pub(in crate::window) fn inner(&self) -> Self {
         Self { pairs: self.pairs.clone().inner(), ..*self }
     }
 
     /// Returns the same within autodiff, as a constant.
-    pub(super) fn from_inner(flow: Self) -> Self {
+    pub(in crate::window) fn from_inner(flow: Self) -> Self {
         Self { pairs: Tensor::from_inner(flow.pairs), ..flow }
     }
 
     /// Returns the flow of every burst from frame `frame` to the next one, or to the one before:
     /// `[bursts, 2, h, w]`.
-    pub(super) fn of_frame(&self, frame: usize, next: bool, frames: usize) -> Tensor<4> {
+    pub(in crate::window) fn of_frame(&self, frame: usize, next: bool, frames: usize) -> Tensor<4> {
         let [all, _, h, w] = self.pairs.dims();
         let half = all / 2;
         let (first, place) = if next { (0, frame) } else { (half, frame - 1) };

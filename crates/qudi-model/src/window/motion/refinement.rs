@@ -1,8 +1,9 @@
 //! Refinement of the flow, without learning: TV-L1 between pre-denoised frames that are merged along the flow
 //! so far, or between predicted frames. In single frames, noise hides fractions of a pixel.
 
-use super::agreement::{Paths, merged};
 use super::flow::{WindowFlow, pairs};
+use super::paths::Paths;
+use crate::window::merging::averaged;
 use burn::tensor::Tensor;
 use qudi_kernels::tv_flow;
 use qudi_layers::resample::{avg_pool2, upsample2};
@@ -17,7 +18,7 @@ const SMALLEST_SIDE: usize = 8;
 const ERROR: f32 = 0.9;
 
 /// Returns the usual sigma of pre-denoised frames in [0, 1] from the one of fused frames in [-1, 1].
-pub(super) fn pre_denoised_sigma(sigma: &Tensor<4>) -> Tensor<4> {
+pub(in crate::window) fn pre_denoised_sigma(sigma: &Tensor<4>) -> Tensor<4> {
     sigma.clone() * ERROR
 }
 
@@ -26,13 +27,13 @@ pub(super) fn pre_denoised_sigma(sigma: &Tensor<4>) -> Tensor<4> {
 /// # Shapes
 /// - restored: pre-denoised frames, `[bursts * frames, 1, H, W]` in image units
 /// - sigma: of usual errors in [-1, 1], `[bursts * frames, 1, 1, 1]`
-pub(super) fn refined(
+pub(in crate::window) fn refined(
     restored: &Tensor<4>,
     sigma: &Tensor<4>,
     flow: &WindowFlow,
     frames: usize,
 ) -> WindowFlow {
-    let merged = merged(restored.clone(), &pre_denoised_sigma(sigma), &Paths::new(flow, frames));
+    let merged = averaged(restored, &pre_denoised_sigma(sigma), &Paths::new(flow, frames));
     let pairs = from_coarse_to_fine(avg_pool2(merged), flow.pairs.clone(), frames, LEVELS);
     WindowFlow { pairs, ..*flow }
 }
@@ -42,7 +43,11 @@ pub(super) fn refined(
 ///
 /// # Shapes
 /// - images: `[bursts * frames, 1, H, W]` in image units
-pub(super) fn flow_between(images: Tensor<4>, flow: &WindowFlow, frames: usize) -> WindowFlow {
+pub(in crate::window) fn flow_between(
+    images: Tensor<4>,
+    flow: &WindowFlow,
+    frames: usize,
+) -> WindowFlow {
     let start = upsample2(flow.pairs.clone()) * 2.0;
     let found = from_coarse_to_fine(images, start, frames, LEVELS + 1);
     WindowFlow { pairs: avg_pool2(found) * 0.5, ..*flow }
