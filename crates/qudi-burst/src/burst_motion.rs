@@ -57,7 +57,8 @@ pub struct FoundMotion<'a> {
 }
 
 impl BurstMotion {
-    /// Prepares a burst. A dark rate that is unknown counts as none.
+    /// Prepares a burst. A dark rate that is unknown counts as none; a map of dark rates must be as large as
+    /// the frames.
     pub fn new(view: BurstView<'_>, acquisition: &Acquisition) -> Self {
         let burst = PreparedBurst::new(view, acquisition);
         let velocity = ConstantVelocity::find(&burst, 0.0);

@@ -10,8 +10,8 @@ use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 use extension::MergeBackend;
 
-/// How much a neighbour counts beside the frame itself: `1 / (1 + (square / tolerance)^power)`, where `square`
-/// is its mean squared difference over 10 x 10 pixels in units of the usual squared error.
+/// How much a neighbour counts, where the frame itself counts 1: `1 / (1 + (square / tolerance)^power)`. Its
+/// `square` is the mean squared difference over 10 x 10 pixels in units of the usual squared error.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MergeRule {
     /// Mean square at which a neighbour counts half.

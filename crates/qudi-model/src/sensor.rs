@@ -23,18 +23,18 @@ pub fn sensor_tensor(acquisition: &Acquisition, device: &Device) -> Tensor<2> {
 }
 
 /// Steps of the table of [`response_levels`], from no count to full scale.
-pub(crate) const RESPONSE_STEPS: usize = 64;
+pub(crate) const RESPONSE_STEPS: usize = 256;
 
 /// Values of the table of [`response_levels`].
 pub const RESPONSE_LEVELS: usize = RESPONSE_STEPS + 1;
 
-/// Returns the response of one burst, `[1, 65]`.
+/// Returns the response of one burst, `[1, 257]`.
 pub fn response_tensor(acquisition: &Acquisition, device: &Device) -> Tensor<2> {
     let levels = TensorData::new(response_levels(acquisition).to_vec(), [1, RESPONSE_LEVELS]);
     Tensor::from_data(levels, device)
 }
 
-/// Tabulates the image at which a mean count is a fraction `k / 64` of full scale: the inverse of the
+/// Tabulates the image at which a mean count is a fraction `k / 256` of full scale: the inverse of the
 /// sensor's response with its saturation, at most 2. Below the dark counts it is negative.
 pub fn response_levels(acquisition: &Acquisition) -> [f32; RESPONSE_LEVELS] {
     let sensor = &acquisition.sensor;

@@ -37,7 +37,7 @@ impl BlockAligner {
         let blocks = Blocks::around(reference, burst.frames.len(), self.block_length);
         let variance = burst.matching_variance(reference, 1.0);
         let pyramid = |k| self.pyramid(burst, &blocks, k);
-        // The motion to a frame may lie between those to two blocks.
+        // The motion to a frame may lie between the motions to two blocks.
         let half = self.block_length / 2;
         let frames = frames.start.saturating_sub(half)..frames.end + half;
         let patches = burst.grid.len();

@@ -61,7 +61,7 @@ impl Burst<'_> {
         let bursts = self.sigma.len() / self.frames;
         let (burst, frame) = (image / self.frames, image % self.frames);
         let known = self.flows.len() / cells;
-        // Flows of a distance begin where those of all nearer ones end.
+        // Flows of a distance follow the flows of all nearer ones.
         let distances = (1..self.frames).scan(0, move |first, distance| {
             let begin = *first;
             *first += 2 * bursts * (self.frames - distance);

@@ -13,7 +13,7 @@ const MIN_VARIANCE: f32 = 1e-8;
 /// # Shapes
 /// - counts, linear_estimate: `[bursts * frames, 1, height, width]`
 /// - sensor: `[bursts, 11]`
-/// - response: `[bursts, 65]`
+/// - response: `[bursts, 257]`
 #[derive(Clone, Debug)]
 pub struct Conditioning {
     /// Counts of each frame over full scale.

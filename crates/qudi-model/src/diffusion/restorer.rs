@@ -107,6 +107,8 @@ struct Window<'a, E> {
     counts: CountPlanes,
     /// Counts as they are; none if no motion is found in them.
     raw: Option<Vec<f32>>,
+    /// The map of dark rates, if one is known.
+    dark: Option<Vec<f32>>,
     frames: usize,
     tiling: Tiling,
     /// Numbers of the tiles that pass through the network at once.
@@ -126,7 +128,9 @@ impl<E> Window<'_, E> {
             let frames: Vec<Vec<u16>> =
                 frames.map(|frame| frame.iter().map(|&n| n as u16).collect()).collect();
             let view = BurstView { size, frames: &frames };
-            Arc::new(BurstMotion::new(view, self.acquisition))
+            let dark = self.dark.as_ref().map(|map| tiles.crop(tile, map));
+            let acquisition = Acquisition { dark, ..self.acquisition.clone() };
+            Arc::new(BurstMotion::new(view, &acquisition))
         };
         self.batches[batch].clone().map(of).collect()
     }
@@ -209,6 +213,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             response: response_tensor(acquisition, &self.device),
             counts: CountPlanes::new(burst, acquisition).map(|plane| tiling.padded(plane)),
             raw: matched.then(|| tiling.padded(&raw())),
+            dark: acquisition.dark.as_ref().map(|map| tiling.padded(map)),
             frames,
             tiling,
             kept: RefCell::new(Kept { batches: vec![None; batches.len()], bytes: 0 }),
@@ -399,14 +404,16 @@ mod tests {
         WindowConfig { widths: [32; 3], flow: [32; 3], state: 32, cell_blocks: 1 }
     }
 
-    /// Restores a window of several tiles in batches of so many pixels.
-    fn restore(batch_pixels: usize) -> Vec<f32> {
-        let (size, device) = (Size { height: 48, width: 80 }, Device::flex());
+    /// Restores a window of `size` in tiles of 32 pixels, in batches of so many pixels, with the dark rates
+    /// of its pixels.
+    fn restore(size: Size, batch_pixels: usize, dark: Option<Vec<f32>>) -> Vec<f32> {
+        let device = Device::flex();
         let pixel = |i: usize, t: usize| ((i * 7 + t * 13 + i / size.width) % 8) as u16;
         let frame = |t: usize| (0..size.pixels()).map(|i| pixel(i, t)).collect();
         let counts: Vec<Vec<u16>> = (0..3).map(frame).collect();
         let sensor = Sensor::load("qudi-paper").unwrap_or_else(|e| panic!("{e}"));
         let acquisition = Acquisition::new(sensor, 3.25, 0.45).unwrap_or_else(|e| panic!("{e}"));
+        let acquisition = Acquisition { dark, ..acquisition };
         let network: Window = config().init(1, &device);
         let model = Model { network, config: config(), window: 11, passes: 2 };
         let options = SampleOptions { steps: 3, passes: 2, tile: 32, ..SampleOptions::default() };
@@ -414,8 +421,6 @@ mod tests {
             DiffusionRestorer::new(model, options, &device).unwrap_or_else(|e| panic!("{e}"));
         restorer.batch_pixels = batch_pixels;
         let burst = BurstView { size, frames: &counts };
-        let window = restorer.window_of(burst, &acquisition);
-        assert_eq!(window.tiling.tiles.count(), 6, "the batches of this test");
         let restored = restorer.restored(burst, &acquisition).unwrap_or_else(|e| panic!("{e}"));
         restored.frames.into_iter().flat_map(|frame| frame.data).collect()
     }
@@ -423,10 +428,29 @@ mod tests {
     /// A batch of four tiles and one of two give what single tiles do.
     #[test]
     fn batches_of_tiles_are_tiles_one_by_one() {
-        let single = restore(0);
-        let batches = restore(4 * 3 * 32 * 32);
+        let size = Size { height: 48, width: 80 };
+        assert_eq!(Tiling::new(size, 8, 32).tiles.count(), 6, "the batches of this test");
+        let single = restore(size, 0, None);
+        let batches = restore(size, 4 * 3 * 32 * 32, None);
         let pairs = single.iter().zip(&batches);
         assert!(pairs.clone().all(|(a, b)| (a - b).abs() < 1e-4), "batches differ from tiles");
         assert!(single.iter().any(|&value| value != single[0]), "a flat picture tests nothing");
+    }
+
+    /// Frames are padded and cut into tiles with their map: hot pixels on the right change nothing on the
+    /// left.
+    #[test]
+    fn a_map_of_dark_rates_lies_on_its_frame() {
+        let size = Size { height: 21, width: 76 };
+        let map = |hot: f32| {
+            let rate = |i: usize| if i % size.width < 60 { 1.6 } else { hot };
+            Some((0..size.pixels()).map(rate).collect())
+        };
+        let (flat, hot) = (restore(size, 0, map(1.6)), restore(size, 0, map(3.2)));
+        let column = |i: usize| i % size.width;
+        let changes = |i: &usize| (flat[*i] - hot[*i]).abs() > 1e-4;
+        let changed: Vec<usize> = (0..flat.len()).filter(changes).map(column).collect();
+        assert!(changed.iter().all(|&column| column >= 32), "hot pixels change {changed:?}");
+        assert!(changed.iter().any(|&column| column > 60), "hot pixels change nothing");
     }
 }

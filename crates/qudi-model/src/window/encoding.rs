@@ -50,7 +50,7 @@ struct SingleFrames {
     measurement: Measurement,
     /// Counts over full scale, `[bursts * frames, 1, H, W]`.
     counts: Tensor<4>,
-    /// Images of mean counts, `[bursts, 65]`.
+    /// Images of mean counts, `[bursts, 257]`.
     response: Tensor<2>,
     noise_variance: Tensor<4>,
     restored: Tensor<4>,

@@ -38,7 +38,7 @@ impl Merged {
     ///
     /// # Shapes
     /// - counts: counts over full scale, `[bursts * frames, 1, H, W]`
-    /// - response: images of mean counts, `[bursts, 65]`
+    /// - response: images of mean counts, `[bursts, 257]`
     /// - known: the cleanest frames so far in image units, whose differences decide on the weights,
     ///   `[bursts * frames, 1, H, W]`
     /// - sigma: usual errors of `known`, `[bursts * frames, 1, 1, 1]`
