@@ -97,7 +97,9 @@ impl Burst<'_> {
             let axes = cells.chunks_exact(cells.len() / 2).zip(flow.chunks_exact_mut(plane));
             for (cells, flow) in axes {
                 upsample(cells, width / 2, flow, between);
-                flow.iter_mut().for_each(|v| *v *= 2.0);
+                for displacement in flow {
+                    *displacement *= 2.0;
+                }
             }
             sample(aligned, self.image(neighbour), flow, self.size);
             pooled_squares(&aligned[..plane], &own[..plane], width, scale, squares);

@@ -7,7 +7,7 @@ use super::fusion::Fusion;
 use super::initial::initial_values;
 use super::motion::flow::Flow;
 use super::predenoiser::PreDenoiser;
-use super::unet::{Correction, StepImages, UNet};
+use super::unet::{Outputs, StepImages, UNet};
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::{DiffusionState, per_image};
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
@@ -115,7 +115,7 @@ impl Window {
                 ((bar / (1.0 - bar)).ln() as f32).clamp(-10.0, 10.0)
             })
             .collect();
-        let Correction { correction, gate, features } =
+        let Outputs { correction, gate, features } =
             self.unet.forward(encoded, step, sensor.clone(), &log_snr);
         let seen = base + difference;
         // The less noise the noisy image has, the less the merged frames count.

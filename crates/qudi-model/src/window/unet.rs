@@ -31,7 +31,7 @@ pub(super) struct UNet {
 
 /// What the U-Net computes.
 #[derive(Clone, Debug)]
-pub(super) struct Correction {
+pub(super) struct Outputs {
     /// Correction of unit size, `[images, 1, H, W]`.
     pub(super) correction: Tensor<4>,
     /// How much of the merged frames the correction starts from, in [0, 1]: `[images, 1, H, W]`.
@@ -79,7 +79,7 @@ impl UNet {
         images: StepImages,
         sensor: Tensor<4>,
         log_snr: &[f32],
-    ) -> Correction {
+    ) -> Outputs {
         let [count, numbers, ..] = sensor.dims();
         let device = sensor.device();
         let plane = |f: &dyn Fn(usize) -> f32| {
@@ -116,7 +116,7 @@ impl UNet {
         inputs.push(Tensor::cat(vec![merged, encoded.merged.planes_of_frames()], 1));
         let [features, ..] = self.hourglass.forward(&inputs, Some(&embedding));
         let gate = pixel_shuffle(self.gate.linear(std::slice::from_ref(&features)), FOLD);
-        Correction {
+        Outputs {
             correction: self.head.forward(features.clone()),
             gate: sigmoid(gate + images.noise),
             features,
