@@ -56,6 +56,14 @@ pub struct FoundMotion<'a> {
     patches: Vec<PatchMotion>,
 }
 
+/// Motion of the cells of every frame to every frame.
+#[derive(Debug)]
+pub struct CellMotion<'a> {
+    cells: Cells,
+    /// By reference frame.
+    patches: &'a [PatchMotion],
+}
+
 impl BurstMotion {
     /// Prepares a burst. A dark rate that is unknown counts as none; a map of dark rates must be as large as
     /// the frames.
@@ -146,11 +154,18 @@ impl CountsMotion<'_> {
 }
 
 impl FoundMotion<'_> {
-    /// Returns the displacement from every cell of `side` x `side` pixels of frame `from` to where frame `to`
-    /// shows the same, right and down in pixels. Patches overlap; their displacements are blended.
-    pub fn flow(&self, from: usize, to: usize, side: usize) -> [Frame; 2] {
+    /// Prepares the flow of cells of `side` x `side` pixels. Overlapping patches are blended.
+    pub fn on_cells(&self, side: usize) -> CellMotion<'_> {
         let PreparedBurst { grid, size, .. } = self.burst;
-        Cells::new(grid, *size, side).blended(&self.patches[from][to])
+        CellMotion { cells: Cells::new(grid, *size, side), patches: &self.patches }
+    }
+}
+
+impl CellMotion<'_> {
+    /// Returns the displacement from every cell of frame `from` to where frame `to` shows the same, right and
+    /// down in pixels.
+    pub fn flow(&self, from: usize, to: usize) -> [Frame; 2] {
+        self.cells.blended(&self.patches[from][to])
     }
 }
 
@@ -208,8 +223,10 @@ mod tests {
             for (from, to) in [(3, 4), (3, 2), (1, 4), (6, 3)] {
                 let time = to as f32 - from as f32;
                 let expected = speed.map(|v| v * time);
-                let on_counts = error(&motion.on_counts(FRAMES).flow(from, to, 1), expected);
-                let on_frames = error(&motion.on_frames(&truth).flow(from, to, 1), expected);
+                let on_counts =
+                    error(&motion.on_counts(FRAMES).on_cells(1).flow(from, to), expected);
+                let on_frames =
+                    error(&motion.on_frames(&truth).on_cells(1).flow(from, to), expected);
                 assert!(
                     on_counts < 0.2 + 0.2 * time.abs(),
                     "{speed:?}, {from} to {to}: {on_counts}"
@@ -225,7 +242,7 @@ mod tests {
         let (truth, counts, acquisition) = moving(size, [0.0; 2]);
         let motion = BurstMotion::new(BurstView { size, frames: &counts }, &acquisition);
         for found in [motion.on_counts(2), motion.on_frames(&truth)] {
-            let flow = found.flow(0, 2, 1);
+            let flow = found.on_cells(1).flow(0, 2);
             assert!(flow.iter().all(|axis| axis.size == size));
             assert!(flow.iter().flat_map(|axis| &axis.data).all(|value| value.is_finite()));
         }

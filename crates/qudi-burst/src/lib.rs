@@ -25,7 +25,7 @@ mod temporal_filter;
 
 pub use aligned_burst::{AlignedBurst, AlignedFrame, Alignments};
 pub use aligned_sums::{AlignedSums, choose_count};
-pub use burst_motion::{BurstMotion, FoundMotion};
+pub use burst_motion::{BurstMotion, CellMotion, FoundMotion};
 pub use colour::{ColourCorrector, ColourEvidence, ColourRestorer, CorrectedColours, PlaneFrames};
 pub use denoise::bm3d::bm3d;
 pub use denoise::vst::{Transform, VarianceStabilizer};

@@ -2,7 +2,7 @@
 //! frame's prediction gets wrong, its neighbours often do not.
 
 use super::config::{FOLD, IMAGE};
-use super::merging::mean_square;
+use super::merging::{OF_FRAMES, inverse_weight};
 use super::motion::paths::Paths;
 use burn::module::Module;
 use burn::tensor::activation::relu;
@@ -11,16 +11,13 @@ use qudi_layers::resample::{pixel_shuffle, pixel_unshuffle};
 use qudi_layers::{Bias, Conv2d};
 
 /// Neighbours on either side.
-const NEIGHBOURS: usize = 3;
+const NEIGHBOURS: usize = 6;
 
 /// Channels between the convolutions.
 const HIDDEN: usize = 32;
 
 /// Planes that describe a neighbour: differences, their sizes, their mean square around, and its distance.
 const PLANES: usize = 2 * IMAGE + 2;
-
-/// Squared difference at which a neighbour gets half its weight, in units of the usual squared error.
-const TOLERANCE: f32 = 0.5;
 
 /// The largest difference that convolutions see, in units of usual errors.
 const MAX_DIFFERENCE: f32 = 4.0;
@@ -34,12 +31,6 @@ pub(super) struct Agreement {
     frame: Conv2d,
     neighbour: Conv2d,
     out: Conv2d,
-}
-
-/// Returns the logarithm of a neighbour's weight for its difference in units of usual errors, at half the
-/// resolution.
-fn formula(difference: Tensor<4>) -> Tensor<4> {
-    -(mean_square(difference) / TOLERANCE + 1.0).log()
 }
 
 impl Agreement {
@@ -71,7 +62,7 @@ impl Agreement {
         for (place, aligned) in paths.aligned(&images, NEIGHBOURS) {
             let difference = aligned.clone() - place.part(&images, false);
             let difference = difference / place.part(sigma, false);
-            let formula = formula(difference.clone());
+            let formula = -inverse_weight(difference.clone(), OF_FRAMES).log();
             let planes = pixel_unshuffle(difference.clamp(-MAX_DIFFERENCE, MAX_DIFFERENCE), FOLD);
             let far = formula.ones_like() * (place.distance as f32 - 2.0);
             let planes = Tensor::cat(vec![planes.clone(), planes.abs(), formula.clone(), far], 1);

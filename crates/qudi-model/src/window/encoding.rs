@@ -47,34 +47,25 @@ pub struct EncodedWindow {
 
 /// The frames of a window, each by itself, and the learnt flow between them: what every pass begins with.
 struct SingleFrames {
+    conditioning: Conditioning,
     measurement: Measurement,
-    /// Counts over full scale, `[bursts * frames, 1, H, W]`.
-    counts: Tensor<4>,
-    /// Images of mean counts, `[bursts, 257]`.
-    response: Tensor<2>,
-    noise_variance: Tensor<4>,
     restored: Tensor<4>,
     features: Tensor<4>,
     /// Pre-denoised frames as the U-Net sees them, `[bursts * frames, 4, h, w]`.
     image: Tensor<4>,
     flow: Vec<WindowFlow>,
-    /// Frames of a burst.
-    count: usize,
 }
 
 impl SingleFrames {
     /// Returns the same outside autodiff.
     fn inner(&self) -> Self {
         Self {
+            conditioning: self.conditioning.inner(),
             measurement: self.measurement.inner(),
-            counts: self.counts.clone().inner(),
-            response: self.response.clone().inner(),
-            noise_variance: self.noise_variance.clone().inner(),
             restored: self.restored.clone().inner(),
             features: self.features.clone().inner(),
             image: self.image.clone().inner(),
             flow: self.flow.iter().map(WindowFlow::inner).collect(),
-            count: self.count,
         }
     }
 }
@@ -92,7 +83,7 @@ struct Basis {
 impl Basis {
     fn new(single: &SingleFrames, motion: Motion, known: Tensor<4>) -> Self {
         let sigma = single.measurement.error_sigma.clone() * 0.5;
-        let SingleFrames { counts, response, .. } = single;
+        let Conditioning { counts, response, .. } = &single.conditioning;
         let merged = Merged::along(&motion.paths, counts, response, &known, &sigma);
         Self { motion, known, merged }
     }
@@ -151,10 +142,10 @@ impl Window {
         let single = self.single_frames(conditioning);
         let earlier = passes.saturating_sub(1);
         if !single.restored.is_autodiff() {
-            let basis = self.basis(&single, conditioning, earlier)?;
+            let basis = self.basis(&single, earlier)?;
             return Ok(self.fused(&single, basis));
         }
-        let basis = self.valid().basis(&single.inner(), conditioning, earlier)?;
+        let basis = self.valid().basis(&single.inner(), earlier)?;
         Ok(self.fused(&single, Basis::from_inner(basis)))
     }
 
@@ -165,45 +156,39 @@ impl Window {
         let learnt = conditioning.motion.is_empty() || restored.is_autodiff();
         let flow = || self.flow.forward(&restored, &pyramid, conditioning.frames);
         SingleFrames {
-            counts: conditioning.counts.clone(),
-            response: conditioning.response.clone(),
-            noise_variance: conditioning.noise_variance(),
+            conditioning: conditioning.clone(),
             flow: if learnt { flow() } else { Vec::new() },
             features: normalized(pyramid[0].clone()),
             image: (pixel_unshuffle(restored.clone(), FOLD) - MIDDLE) * SCALE,
-            count: conditioning.frames,
             measurement,
             restored,
         }
     }
 
     /// Finds the motion, and the cleanest frames along it in so many passes.
-    fn basis(
-        &self,
-        single: &SingleFrames,
-        conditioning: &Conditioning,
-        passes: usize,
-    ) -> Result<Basis> {
+    fn basis(&self, single: &SingleFrames, passes: usize) -> Result<Basis> {
+        let SingleFrames { conditioning, restored, .. } = single;
+        let frames = conditioning.frames;
         let finder = match single.flow.first() {
             Some(flow) if conditioning.motion.is_empty() => Finder::Learnt(flow),
             _ => Finder::Matched(&conditioning.motion),
         };
         let sigma = &single.measurement.error_sigma;
-        let motion = finder.first(&single.restored, sigma, single.count)?;
-        let known = averaged(&single.restored, &pre_denoised_sigma(sigma), &motion.paths);
+        let motion = finder.first(restored, sigma, frames)?;
+        let known = averaged(restored, &pre_denoised_sigma(sigma), &motion.paths);
         let mut basis = Basis::new(single, motion, known);
         let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
-        let bursts = single.restored.dims()[0] / single.count;
+        let bursts = restored.dims()[0] / frames;
         let state = DiffusionState {
-            x_t: single.restored.zeros_like(),
-            x0_prev: single.restored.zeros_like(),
+            x_t: restored.zeros_like(),
+            x0_prev: restored.zeros_like(),
             has_previous: vec![false; bursts],
             timesteps: vec![NUM_TIMESTEPS - 1; bursts],
         };
         for _ in 0..passes {
             let encoded = self.fused(single, basis.clone());
             let image = (self.predict(&encoded, &state, &schedule).x0 + 1.0) * 0.5;
-            let motion = finder.next(image.clone(), &basis.motion, single.count)?;
+            let motion = finder.next(image.clone(), &basis.motion, frames)?;
             basis = Basis::new(single, motion, image);
         }
         Ok(basis)
@@ -211,20 +196,20 @@ impl Window {
 
     /// Fuses the frames along the motion.
     fn fused(&self, single: &SingleFrames, basis: Basis) -> EncodedWindow {
-        let SingleFrames { measurement, restored, features, count, .. } = single;
+        let SingleFrames { measurement, restored, features, .. } = single;
         let Basis { motion: Motion { flow, paths }, known, merged } = basis;
         let window = Frames {
             known: pixel_unshuffle(known.clone(), FOLD),
             linear: &measurement.linear,
             features,
             merged: &merged.planes(),
-            count: *count,
+            count: single.conditioning.frames,
         };
         let [earlier, later] = self.fusion.forward(&window, &flow, self.state);
         EncodedWindow {
             known,
             merged,
-            noise_variance: single.noise_variance.clone(),
+            noise_variance: measurement.noise_variance.clone(),
             restored: restored.clone(),
             paths,
             flow: single.flow.clone(),

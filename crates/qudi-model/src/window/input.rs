@@ -23,6 +23,8 @@ pub(super) struct Measurement {
     pub(super) local_mean: Tensor<4>,
     /// The sensor's numbers, `[images, 11, 1, 1]`.
     pub(super) sensor: Tensor<4>,
+    /// Variance of the linear estimate's noise in image units, `[images, 1, 1, 1]`.
+    pub(super) noise_variance: Tensor<4>,
     /// Sigma of the errors that fused frames usually have, in [-1, 1]: `[images, 1, 1, 1]`.
     pub(super) error_sigma: Tensor<4>,
 }
@@ -40,12 +42,14 @@ impl Measurement {
         let counts = pixel_unshuffle(counts.clone(), FOLD);
         let planes = Tensor::cat(vec![(linear.clone() - MIDDLE) * 2.0, counts * 2.0 - 1.0], 1);
         let sensor = sensor.clone().reshape([bursts, 1, numbers]).repeat_dim(1, *frames);
+        let noise_variance = conditioning.noise_variance();
         Self {
             linear,
             planes,
             local_mean,
             sensor: sensor.reshape([images, numbers, 1, 1]),
-            error_sigma: usual_error(conditioning.noise_variance()),
+            error_sigma: usual_error(noise_variance.clone()),
+            noise_variance,
         }
     }
 
@@ -57,6 +61,7 @@ impl Measurement {
             planes: inner(&self.planes),
             local_mean: inner(&self.local_mean),
             sensor: inner(&self.sensor),
+            noise_variance: inner(&self.noise_variance),
             error_sigma: inner(&self.error_sigma),
         }
     }

@@ -20,7 +20,7 @@ pub(super) const MERGED: usize = 2 * IMAGE;
 const OF_COUNTS: MergeRule = MergeRule { tolerance: 3.0, power: 2 };
 
 /// How neighbours are weighted where frames with errors of their own are averaged.
-const OF_FRAMES: MergeRule = MergeRule { tolerance: 0.5, power: 1 };
+pub(super) const OF_FRAMES: MergeRule = MergeRule { tolerance: 0.5, power: 1 };
 
 /// The distance in frames of the farthest neighbours that frames are averaged with.
 pub(super) const FARTHEST_FRAME: usize = 3;
@@ -75,8 +75,7 @@ impl Merged {
         let mut squares = sum.ones_like();
         for (place, aligned) in paths.aligned(images, reach) {
             let difference = channel(&aligned, 0) - channel(&place.part(images, false), 0);
-            let square = mean_square(difference / place.part(sigma, false));
-            let weight = ((square / rule.tolerance).powi_scalar(rule.power) + 1.0).recip();
+            let weight = inverse_weight(difference / place.part(sigma, false), rule).recip();
             let [images, _, h, w] = weight.dims();
             let weight = pixel_shuffle(weight.expand([images, IMAGE, h, w]), FOLD);
             let weighted = channel(&aligned, last) * weight.clone();
@@ -126,9 +125,11 @@ fn image(counts: Tensor<4>, response: &Tensor<2>) -> Tensor<4> {
     (low.clone() + (high - low) * part).reshape(shape)
 }
 
-/// Averages squared differences over 10 x 10 pixels, at half the resolution.
-pub(super) fn mean_square(difference: Tensor<4>) -> Tensor<4> {
-    mean_around(avg_pool2(difference.powi_scalar(2)), 2)
+/// Returns one over the weight of a neighbour, at half the resolution, from its difference in units of usual
+/// errors. Squared differences are averaged over 10 x 10 pixels.
+pub(super) fn inverse_weight(difference: Tensor<4>, rule: MergeRule) -> Tensor<4> {
+    let square = mean_around(avg_pool2(difference.powi_scalar(2)), 2);
+    (square / rule.tolerance).powi_scalar(rule.power) + 1.0
 }
 
 /// Averages every frame with its nearest neighbours, as far as they agree: what one gets wrong, others often

@@ -12,7 +12,7 @@ use self::refinement::{flow_between, pre_denoised_sigma, refined};
 use super::config::FOLD;
 use super::merging::{FARTHEST_FRAME, averaged};
 use burn::tensor::{Device, Tensor, TensorData};
-use qudi_burst::{BurstMotion, FoundMotion};
+use qudi_burst::{BurstMotion, CellMotion, FoundMotion};
 use qudi_core::{Frame, Result};
 use qudi_layers::tensor::read;
 use rayon::prelude::*;
@@ -112,14 +112,15 @@ fn of_burst<'a>(burst: &'a BurstMotion, values: &[f32]) -> FoundMotion<'a> {
 
 /// Samples the motion of patches at every cell, to frames up to `most` frames away.
 fn motion(bursts: &[FoundMotion<'_>], frames: usize, most: usize, device: &Device) -> Motion {
+    let bursts: Vec<_> = bursts.iter().map(|found| found.on_cells(FOLD)).collect();
     let of_distance = |distance: usize| {
         [true, false].map(|later| {
-            let of_burst = |found: &'_ FoundMotion<'_>| -> Vec<[Frame; 2]> {
+            let of_burst = |cells: &CellMotion<'_>| -> Vec<[Frame; 2]> {
                 let pairs = (0..frames - distance).into_par_iter();
                 let flow = |early: usize| {
                     let late = early + distance;
                     let [from, to] = if later { [early, late] } else { [late, early] };
-                    found.flow(from, to, FOLD)
+                    cells.flow(from, to)
                 };
                 pairs.map(flow).collect()
             };
