@@ -44,7 +44,7 @@ impl Tiling {
     }
 
     /// Pads images by mirroring them at their lower and right edges.
-    pub fn padded(&self, images: &[f32]) -> Vec<f32> {
+    pub fn padded<T: Copy>(&self, images: &[T]) -> Vec<T> {
         let Self { from, size, .. } = self;
         let mut values = Vec::with_capacity(images.len() / from.pixels() * size.pixels());
         for image in images.chunks_exact(from.pixels()) {

@@ -16,6 +16,7 @@ mod input;
 mod merging;
 mod motion;
 mod network;
+mod noise;
 mod predenoiser;
 #[cfg(test)]
 mod scenes;

@@ -40,7 +40,7 @@ impl Tiles {
     }
 
     /// Crops tile `number` from every image.
-    pub fn crop(&self, number: usize, images: &[f32]) -> Vec<f32> {
+    pub fn crop<T: Copy>(&self, number: usize, images: &[T]) -> Vec<T> {
         let [top, left] = self.corner(number);
         let mut values =
             Vec::with_capacity(images.len() / self.frame.pixels() * self.tile.pixels());
@@ -51,6 +51,18 @@ impl Tiles {
             }
         }
         values
+    }
+
+    /// Writes tile `number` of every image into `images`, over what other tiles have written.
+    pub fn place(&self, number: usize, tiles: &[f32], images: &mut [f32]) {
+        let [top, left] = self.corner(number);
+        let images = images.chunks_exact_mut(self.frame.pixels());
+        for (image, tile) in images.zip(tiles.chunks_exact(self.tile.pixels())) {
+            for (y, values) in tile.chunks_exact(self.tile.width).enumerate() {
+                let start = (top + y) * self.frame.width + left;
+                image[start..start + self.tile.width].copy_from_slice(values);
+            }
+        }
     }
 
     /// Adds tile `number` of every image to `images`. The weights of overlapping tiles add up to one.
@@ -103,11 +115,13 @@ mod tests {
             let frame = Size { height, width };
             let tiles = Tiles::new(frame, side, overlap, 16);
             let image: Vec<f32> = (0..2 * frame.pixels()).map(|i| (i % 97) as f32).collect();
-            let mut sum = vec![0.0; image.len()];
+            let [mut sum, mut placed] = [vec![0.0; image.len()], vec![-1.0; image.len()]];
             for number in 0..tiles.count() {
                 assert!(tiles.corner(number).iter().all(|start| start % 16 == 0));
                 tiles.blend(number, &tiles.crop(number, &image), &mut sum);
+                tiles.place(number, &tiles.crop(number, &image), &mut placed);
             }
+            assert_eq!(placed, image, "{frame}, tiles of {side}");
             for (sum, value) in sum.iter().zip(&image) {
                 assert!((sum - value).abs() < 1e-4, "{frame}, tiles of {side}: {sum}, {value}");
             }

@@ -40,6 +40,18 @@ pub trait Denoiser: Debug {
     /// Returns the memory of the encoding, in bytes.
     fn encoded_bytes(encoded: &Self::Encoded) -> usize;
 
+    /// Makes the noise of every burst move with its scene, where the network merges what it predicts for
+    /// several frames.
+    ///
+    /// # Shapes
+    /// - noise: `[bursts * frames, height, width]`
+    ///
+    /// # Errors
+    /// [`Error`](qudi_core::Error) if the device fails.
+    fn move_noise(_: &Self::Encoded, _noise: &mut [f32]) -> Result<()> {
+        Ok(())
+    }
+
     /// Predicts the clean frames, about in [-1, 1]: `[bursts * frames, 1, height, width]`.
     fn denoise(
         &self,

@@ -106,7 +106,7 @@ struct Window<'a, E> {
     response: Tensor<2>,
     counts: CountPlanes,
     /// Counts as they are; none if no motion is found in them.
-    raw: Option<Vec<f32>>,
+    raw: Option<Vec<u16>>,
     /// The map of dark rates, if one is known.
     dark: Option<Vec<f32>>,
     frames: usize,
@@ -124,9 +124,7 @@ impl<E> Window<'_, E> {
         let size = tiles.tile;
         let of = |tile: usize| {
             let counts = tiles.crop(tile, raw);
-            let frames = counts.chunks_exact(size.pixels());
-            let frames: Vec<Vec<u16>> =
-                frames.map(|frame| frame.iter().map(|&n| n as u16).collect()).collect();
+            let frames: Vec<_> = counts.chunks_exact(size.pixels()).map(<[u16]>::to_vec).collect();
             let view = BurstView { size, frames: &frames };
             let dark = self.dark.as_ref().map(|map| tiles.crop(tile, map));
             let acquisition = Acquisition { dark, ..self.acquisition.clone() };
@@ -202,7 +200,7 @@ impl<N: Denoiser> DiffusionRestorer<N> {
         let frames = burst.frames.len();
         let matched =
             self.network.follows_counts() && self.options.flow != Some(FlowSource::Learnt);
-        let raw = || -> Vec<f32> { burst.frames.iter().flatten().map(|&n| f32::from(n)).collect() };
+        let raw = || burst.frames.concat();
         let (count, pixels) = (tiling.tiles.count(), tiling.tiles.tile.pixels() * frames);
         let tiles = (self.batch_pixels / pixels).clamp(1, count);
         let batches = (0..count).step_by(tiles).map(|first| first..(first + tiles).min(count));
@@ -225,9 +223,12 @@ impl<N: Denoiser> DiffusionRestorer<N> {
     fn sample(&self, window: &Window<'_, N::Encoded>, number: u64) -> Result<Vec<f32>> {
         let noise = Noise::new(window.acquisition.seed, number);
         let pixels = window.tiling.size.pixels();
-        let noise_of = |step: usize| -> Vec<f32> {
+        let noise_of = |step: usize| -> Result<Vec<f32>> {
             let frames = (window.acquisition.first_frame..).take(window.frames);
-            frames.flat_map(|frame| noise.frame(frame, step, pixels)).collect()
+            let values: Vec<f32> =
+                frames.flat_map(|frame| noise.frame(frame, step, pixels)).collect();
+            // A picture is better where merging averages the guesses, an uncertainty where it does not.
+            if self.options.samples > 1 { self.moved(window, values) } else { Ok(values) }
         };
         let mut flows: Vec<Option<N::Flows>> = vec![None; window.batches.len()];
         let SampleOptions { sampler, steps, spacing, .. } = self.options;
@@ -252,10 +253,25 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             Ok(prediction)
         };
         let fresh = |step: &Step| {
-            let needed = if step.sigma > 0.0 { noise_of(step.number) } else { Vec::new() };
-            needed.into_iter()
+            if step.sigma > 0.0 { noise_of(step.number) } else { Ok(Vec::new()) }
         };
-        sample(&steps, noise_of(0), predict, fresh)
+        sample(&steps, noise_of(0)?, predict, fresh)
+    }
+
+    /// Makes noise of a whole window move with the scene.
+    fn moved(&self, window: &Window<'_, N::Encoded>, noise: Vec<f32>) -> Result<Vec<f32>> {
+        let tiles = &window.tiling.tiles;
+        let mut moved = noise.clone();
+        for (batch, numbers) in window.batches.iter().enumerate() {
+            let mut parts: Vec<f32> =
+                numbers.clone().flat_map(|number| tiles.crop(number, &noise)).collect();
+            N::move_noise(&self.encoded(window, batch)?, &mut parts)?;
+            let length = parts.len() / numbers.len();
+            for (number, part) in numbers.clone().zip(parts.chunks_exact(length)) {
+                tiles.place(number, part, &mut moved);
+            }
+        }
+        Ok(moved)
     }
 
     /// Measures the previous estimate `x0` with the forward model; none at the first step.

@@ -85,17 +85,17 @@ impl Step {
 /// the first step. `noise` gives the fresh noise of a step.
 ///
 /// # Errors
-/// Those of `predict`.
-pub fn sample<E, N: Iterator<Item = f32>>(
+/// Those of `predict` and `noise`.
+pub fn sample<E>(
     steps: &[Step],
     mut x: Vec<f32>,
     mut predict: impl FnMut(&Step, &[f32], &[f32]) -> Result<Vec<f32>, E>,
-    noise: impl Fn(&Step) -> N,
+    noise: impl Fn(&Step) -> Result<Vec<f32>, E>,
 ) -> Result<Vec<f32>, E> {
     let mut x0 = vec![0.0; x.len()];
     for step in steps {
         x0 = predict(step, &x, &x0)?;
-        step.advance(&mut x, &x0, noise(step));
+        step.advance(&mut x, &x0, noise(step)?.into_iter());
     }
     Ok(x0)
 }

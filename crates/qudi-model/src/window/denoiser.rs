@@ -1,12 +1,13 @@
 //! The network in the sampler.
 
+use super::noise::move_noise;
 use super::{EncodedWindow, Window, WindowConfig};
 use crate::diffusion::schedule::NoiseSchedule;
 use crate::diffusion::state::DiffusionState;
 use crate::diffusion::timesteps::NUM_TIMESTEPS;
 use crate::diffusion::{Conditioning, Denoiser, Part, Simulated};
 use burn::tensor::Tensor;
-use qudi_core::Result;
+use qudi_core::{Result, Size};
 
 impl Denoiser for Window {
     type Config = WindowConfig;
@@ -35,6 +36,11 @@ impl Denoiser for Window {
 
     fn encoded_bytes(encoded: &EncodedWindow) -> usize {
         encoded.bytes()
+    }
+
+    fn move_noise(encoded: &EncodedWindow, noise: &mut [f32]) -> Result<()> {
+        let [_, _, height, width] = encoded.restored.dims();
+        move_noise(&encoded.paths, Size { height, width }, noise)
     }
 
     fn denoise(

@@ -81,6 +81,12 @@ impl Paths {
         &self.flows[..self.flows.len().min(most)]
     }
 
+    /// Returns the flow to the neighbours at a distance, later or earlier ones, of all frames that have them:
+    /// `[bursts * (frames - distance), 2, h, w]`.
+    pub(in crate::window) fn between(&self, distance: usize, later: bool) -> &Tensor<4> {
+        &self.flows[distance - 1][usize::from(!later)]
+    }
+
     /// Returns all tensors.
     pub(in crate::window) fn tensors(&self) -> impl Iterator<Item = &Tensor<4>> {
         self.flows.iter().flatten()
