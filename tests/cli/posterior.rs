@@ -94,6 +94,17 @@ fn draws_of_the_built_in_diffusion_spread_about_as_far_as_it_errs() {
     assert!((0.4..1.2).contains(&spread), "two draws differ by {spread} of the error");
     let grid = (alternating(&draws[0]) / alternating(&truth)).powi(2);
     assert!(grid < 2.0, "{grid} of the truth's power at the Nyquist frequency");
+    let share = share_within_one_sigma(&folder, FRAMES * SIDE * SIDE);
+    assert!((0.35..0.76).contains(&share), "{share} of all pixels lie within one sigma");
+}
+
+/// Returns the share of pixels that the mean of eight draws errs on by at most their standard deviation.
+fn share_within_one_sigma(folder: &Path, count: usize) -> f64 {
+    restored(folder, "--steps 10 --samples 8 --uncertainty d.npy");
+    let [mean, sigma, truth] =
+        ["r.npy", "d.npy", "t.npy"].map(|name| last_values(&folder.join(name), count));
+    let inside = (0..count).filter(|&k| (mean[k] - truth[k]).abs() <= sigma[k]).count();
+    inside as f64 / count as f64
 }
 
 /// The noise of several draws moves with the scene. With noise of every frame's own, 0.26 of all pixels lie
@@ -103,11 +114,7 @@ fn several_draws_of_the_built_in_diffusion_show_how_far_they_err() {
     let folder = scratch("posterior-uncertainty");
     let scene = "scene:chart --size 96x96 --frames 11 --ppp 3.25 --seed 5";
     run(&folder, &format!("simulate {scene} -o b.npy --truth t.npy -q"));
-    restored(&folder, "--steps 10 --samples 8 --uncertainty d.npy");
-    let [mean, sigma, truth] =
-        ["r.npy", "d.npy", "t.npy"].map(|name| last_values(&folder.join(name), FRAMES * 96 * 96));
-    let inside = (0..truth.len()).filter(|&k| (mean[k] - truth[k]).abs() <= sigma[k]).count();
-    let share = inside as f64 / truth.len() as f64;
+    let share = share_within_one_sigma(&folder, FRAMES * 96 * 96);
     assert!((0.45..0.76).contains(&share), "{share} of all pixels lie within one sigma");
 }
 

@@ -17,6 +17,10 @@ pub trait Denoiser: Debug {
     /// Flows that a step leaves to the next one.
     type Flows: Clone + Debug;
 
+    /// True for networks that merge what they predict for several frames: noise of several samples moves with
+    /// the scene.
+    const MOVES_NOISE: bool = false;
+
     /// Returns the number that height and width of the frames are multiples of.
     fn multiple(config: &Self::Config) -> usize;
 
@@ -40,8 +44,7 @@ pub trait Denoiser: Debug {
     /// Returns the memory of the encoding, in bytes.
     fn encoded_bytes(encoded: &Self::Encoded) -> usize;
 
-    /// Makes the noise of every burst move with its scene, where the network merges what it predicts for
-    /// several frames.
+    /// Makes the noise of every burst move with its scene, where [`MOVES_NOISE`](Self::MOVES_NOISE).
     ///
     /// # Shapes
     /// - noise: `[bursts * frames, height, width]`

@@ -228,7 +228,11 @@ impl<N: Denoiser> DiffusionRestorer<N> {
             let values: Vec<f32> =
                 frames.flat_map(|frame| noise.frame(frame, step, pixels)).collect();
             // A picture is better where merging averages the guesses, an uncertainty where it does not.
-            if self.options.samples > 1 { self.moved(window, values) } else { Ok(values) }
+            if N::MOVES_NOISE && self.options.samples > 1 {
+                self.moved(window, values)
+            } else {
+                Ok(values)
+            }
         };
         let mut flows: Vec<Option<N::Flows>> = vec![None; window.batches.len()];
         let SampleOptions { sampler, steps, spacing, .. } = self.options;

@@ -14,6 +14,8 @@ impl Denoiser for Window {
     type Encoded = EncodedWindow;
     type Flows = ();
 
+    const MOVES_NOISE: bool = true;
+
     fn multiple(config: &WindowConfig) -> usize {
         config.multiple()
     }

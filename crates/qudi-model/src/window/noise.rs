@@ -19,21 +19,16 @@ pub(super) fn move_noise(paths: &Paths, size: Size, noise: &mut [f32]) -> Result
     let frames = paths.frames();
     let middle = frames / 2;
     let length = frames * size.pixels();
-    for distance in 1..frames.max(1) {
-        for (later, frame) in
-            [(true, middle.checked_sub(distance)), (false, Some(middle + distance))]
-        {
-            let Some(frame) = frame.filter(|&frame| frame < frames) else { continue };
-            let flows = read(paths.between(distance, later).clone())?;
-            // Flow to later frames is listed by its frame, flow to earlier ones by the neighbour.
-            let place = frame.min(middle);
-            let per_burst = (frames - distance) * size.pixels() / 2;
-            for (burst, flows) in noise.chunks_exact_mut(length).zip(flows.chunks_exact(per_burst))
-            {
-                let flow = &flows[place * size.pixels() / 2..][..size.pixels() / 2];
-                let (own, shown) = frame_and_middle(burst, frame, middle, size.pixels());
-                sample(own, shown, flow, size);
-            }
+    for frame in (0..frames).filter(|&frame| frame != middle) {
+        let distance = frame.abs_diff(middle);
+        let flows = read(paths.between(distance, frame < middle).clone())?;
+        // Flow to later frames is listed by its frame, flow to earlier ones by the neighbour.
+        let place = frame.min(middle);
+        let per_burst = (frames - distance) * size.pixels() / 2;
+        for (burst, flows) in noise.chunks_exact_mut(length).zip(flows.chunks_exact(per_burst)) {
+            let flow = &flows[place * size.pixels() / 2..][..size.pixels() / 2];
+            let (own, shown) = frame_and_middle(burst, frame, middle, size.pixels());
+            sample(own, shown, flow, size);
         }
     }
     Ok(())
