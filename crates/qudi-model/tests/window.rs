@@ -159,6 +159,7 @@ fn the_prediction_follows_an_image_without_noise() {
     assert!(worst < 0.1, "{worst}");
 }
 
+/// But for the flow where matched motion takes its place.
 #[test]
 fn every_parameter_has_a_gradient() {
     let device = Device::flex().autodiff();
@@ -179,11 +180,12 @@ fn every_parameter_has_a_gradient_in(passes: usize, conditioning: &Conditioning)
     let x0 = network.predict(&encoded, &state, &schedule).x0;
     let truth = conditioning.linear_estimate.clone();
     let flow = encoded.flow.iter().map(|flow| flow.warping_error(&truth, 4));
-    let loss = x0.powi_scalar(2).mean() + flow.reduce(Tensor::add).unwrap();
+    let loss = flow.fold(x0.powi_scalar(2).mean(), Tensor::add);
     let gradients = loss.backward();
     let lists = largest_gradients(&network, &gradients);
     for ((name, _), largest) in parameter_shapes(&network).iter().zip(lists) {
-        assert!(largest > 0.0, "{name} has no gradient in pass {passes}");
+        let learns = conditioning.motion.is_empty() || !name.starts_with("flow.");
+        assert_eq!(largest > 0.0, learns, "{name}, pass {passes}");
     }
 }
 

@@ -108,7 +108,7 @@ pub struct TrainConfig {
     #[schemars(skip_serializing_if = "never")]
     pub passes: usize,
     /// Share of batches that follow the motion that is matched in their counts; the others follow the learnt
-    /// flow. Only of `window`.
+    /// flow, which learns from them alone. Only of `window`.
     #[serde(default, skip_serializing_if = "is_default")]
     #[schemars(skip_serializing_if = "never")]
     pub matched: f64,

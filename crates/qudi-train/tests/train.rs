@@ -134,18 +134,24 @@ fn batches_are_encoded_in_one_to_so_many_passes() {
     assert!(many.iter().all(|loss| loss.is_finite()));
 }
 
-/// Every second batch follows the motion in its counts: the first one learns as without.
+/// Every second batch follows the motion in its counts: the first one learns as without. Only batches that
+/// follow the learnt flow teach it.
 #[test]
 fn a_share_of_batches_follows_the_motion_in_their_counts() {
     let losses = |share: &str| {
         let recipe = window(&[("train.batch", "2"), ("train.matched", share)]);
         let (_, steps) = trained_as::<Window>(&recipe, &[Device::flex()], 1);
-        steps.into_iter().map(|step| step.loss.term("prediction")).collect::<Vec<_>>()
+        let terms = ["prediction", "flow"];
+        steps.into_iter().map(|step| terms.map(|term| step.loss.term(term))).collect::<Vec<_>>()
     };
     let (none, half, all) = (losses("0"), losses("0.5"), losses("1"));
     assert_eq!(none[0], half[0]);
-    assert_ne!(none[1], half[1]);
-    assert_ne!(none[0], all[0]);
+    assert_ne!(none[1][0], half[1][0]);
+    assert_ne!(none[0][0], all[0][0]);
+    let teaches_flow =
+        |steps: &[[f64; 2]]| steps.iter().map(|step| step[1] != 0.0).collect::<Vec<_>>();
+    assert_eq!(teaches_flow(&half), [true, false, true]);
+    assert_eq!(teaches_flow(&all), [false; 3]);
 }
 
 /// Two devices with a batch each, one device with both in turn, and one device with both at once.

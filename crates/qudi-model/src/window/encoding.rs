@@ -27,7 +27,7 @@ const SCALE: f32 = 3.0;
 pub struct EncodedWindow {
     /// Pre-denoised frames in image units, `[bursts * frames, 1, H, W]`.
     pub restored: Tensor<4>,
-    /// Learnt flow on all levels, finest first; none where matched motion takes its place and nothing learns.
+    /// Learnt flow on all levels, finest first; none where matched motion takes its place.
     pub flow: Vec<WindowFlow>,
     /// The cleanest frames before the U-Net in image units, `[bursts * frames, 1, H, W]`: pre-denoised and
     /// averaged along the motion, or predicted by the pass before.
@@ -152,8 +152,8 @@ impl Window {
     fn single_frames(&self, conditioning: &Conditioning) -> SingleFrames {
         let measurement = Measurement::new(conditioning);
         let (restored, pyramid) = self.pre.forward(&measurement);
-        // Matched patches take the place of the learnt flow, which still learns.
-        let learnt = conditioning.motion.is_empty() || restored.is_autodiff();
+        // Matched patches take the place of the learnt flow.
+        let learnt = conditioning.motion.is_empty();
         let flow = || self.flow.forward(&restored, &pyramid, conditioning.frames);
         SingleFrames {
             conditioning: conditioning.clone(),

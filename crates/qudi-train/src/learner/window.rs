@@ -88,8 +88,10 @@ impl Learner for Window {
         sum.add("pre", weights.pre, log_mean_square(error));
         let frames = conditioning.frames;
         let flows = encoded.flow.iter().map(|flow| flow.warping_error(&example.truth, frames));
-        let flow = flows.reduce(Tensor::add).expect("a level");
-        sum.add("flow", weights.flow, flow);
+        // Batches whose motion is matched have none.
+        if let Some(flow) = flows.reduce(Tensor::add) {
+            sum.add("flow", weights.flow, flow);
+        }
         let total = sum.total();
         Ok(Loss {
             total: total.clone(),
