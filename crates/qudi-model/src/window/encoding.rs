@@ -153,11 +153,14 @@ impl Window {
         let measurement = Measurement::new(conditioning);
         let (restored, pyramid) = self.pre.forward(&measurement);
         // Matched patches take the place of the learnt flow.
-        let learnt = conditioning.motion.is_empty();
-        let flow = || self.flow.forward(&restored, &pyramid, conditioning.frames);
+        let flow = if conditioning.motion.is_empty() {
+            self.flow.forward(&restored, &pyramid, conditioning.frames)
+        } else {
+            Vec::new()
+        };
         SingleFrames {
             conditioning: conditioning.clone(),
-            flow: if learnt { flow() } else { Vec::new() },
+            flow,
             features: normalized(pyramid[0].clone()),
             image: (pixel_unshuffle(restored.clone(), FOLD) - MIDDLE) * SCALE,
             measurement,
@@ -170,8 +173,8 @@ impl Window {
         let SingleFrames { conditioning, restored, .. } = single;
         let frames = conditioning.frames;
         let finder = match single.flow.first() {
-            Some(flow) if conditioning.motion.is_empty() => Finder::Learnt(flow),
-            _ => Finder::Matched(&conditioning.motion),
+            Some(flow) => Finder::Learnt(flow),
+            None => Finder::Matched(&conditioning.motion),
         };
         let sigma = &single.measurement.error_sigma;
         let motion = finder.first(restored, sigma, frames)?;
