@@ -12,24 +12,33 @@ use std::hint::black_box;
 
 /// Block sizes in channels and vectors. 12 accumulators fit 16 registers (AVX2), 24 fit 32 (AVX-512, NEON).
 /// The best come first: more channels need fewer loads.
-pub(super) const KINDS: [(usize, usize); 6] = [(12, 2), (10, 2), (8, 3), (8, 2), (6, 2), (4, 3)];
+pub(super) const KINDS: [(usize, usize); 8] =
+    [(12, 2), (10, 2), (8, 3), (8, 2), (6, 2), (12, 1), (4, 3), (4, 2)];
 
-/// Chooses the block size that wastes least on results of `outputs` channels and `columns` pixels.
+/// Returns true if registers hold the sums of a block, its pixels and a weight, with one to spare: without,
+/// compilers move sums from register to register.
+fn fits(&(channels, vectors): &(usize, usize)) -> bool {
+    channels * vectors + vectors + 1 < machine().1
+}
+
+/// Chooses the block size that takes the fewest instructions for results of `outputs` channels and `columns`
+/// pixels.
 pub(super) fn block(outputs: usize, columns: usize) -> (usize, usize) {
-    let (lanes, registers) = machine();
-    let fits = |&(channels, vectors): &(usize, usize)| channels * vectors < registers;
+    let lanes = machine().0;
     let cost = |&(channels, vectors): &(usize, usize)| {
-        outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors * lanes)
+        let blocks = outputs.div_ceil(channels) * columns.div_ceil(vectors * lanes);
+        // Loads take about as long as four products.
+        blocks * (channels * vectors + 4)
     };
     // Of equal costs, the first is chosen.
-    KINDS.into_iter().filter(fits).min_by_key(cost).unwrap_or(KINDS[5])
+    KINDS.into_iter().filter(fits).min_by_key(cost).unwrap_or(KINDS[7])
 }
 
 /// Returns the longest run of pixels of a block on this machine.
 pub(super) fn longest_run(format: Format) -> usize {
     match format {
         Format::Tiles(_) => tiles::PIXELS,
-        _ => KINDS.map(|kind| kind.1).into_iter().max().unwrap_or(1) * lanes(),
+        _ => KINDS.into_iter().filter(fits).map(|kind| kind.1).max().unwrap_or(1) * lanes(),
     }
 }
 
@@ -163,5 +172,29 @@ pub(super) unsafe fn store<S: Simd, const V: usize>(run: [S::f32s; V], to: *mut 
         let values: &[f32] = pulp::bytemuck::cast_slice(&run);
         // SAFETY: the caller's promise; `run` is no part of the output.
         unsafe { std::ptr::copy_nonoverlapping(values.as_ptr(), to, count) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Whatever the sizes, registers hold a block, and little work goes into results that there are not, but
+    /// for few channels and narrow images.
+    #[test]
+    fn blocks_fit_registers_and_results() {
+        for outputs in 1..200 {
+            for columns in 1..200 {
+                let kind = block(outputs, columns);
+                assert!(fits(&kind), "{kind:?} for {outputs} channels, {columns} columns");
+                let (channels, vectors) = (kind.0, kind.1 * lanes());
+                let done = outputs.next_multiple_of(channels) * columns.next_multiple_of(vectors);
+                let needed = outputs.next_multiple_of(4) * columns.next_multiple_of(2 * lanes());
+                assert!(
+                    4 * done <= 5 * needed,
+                    "{kind:?} for {outputs} channels, {columns} columns"
+                );
+            }
+        }
     }
 }

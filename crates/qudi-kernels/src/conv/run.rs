@@ -244,7 +244,9 @@ impl Tile<'_> {
                 b if b == KINDS[2] => self.blocks::<S, P, { KINDS[2].0 }, { KINDS[2].1 }>(simd),
                 b if b == KINDS[3] => self.blocks::<S, P, { KINDS[3].0 }, { KINDS[3].1 }>(simd),
                 b if b == KINDS[4] => self.blocks::<S, P, { KINDS[4].0 }, { KINDS[4].1 }>(simd),
-                _ => self.blocks::<S, P, { KINDS[5].0 }, { KINDS[5].1 }>(simd),
+                b if b == KINDS[5] => self.blocks::<S, P, { KINDS[5].0 }, { KINDS[5].1 }>(simd),
+                b if b == KINDS[6] => self.blocks::<S, P, { KINDS[6].0 }, { KINDS[6].1 }>(simd),
+                _ => self.blocks::<S, P, { KINDS[7].0 }, { KINDS[7].1 }>(simd),
             }
         }
     }
