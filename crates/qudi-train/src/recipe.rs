@@ -77,7 +77,8 @@ pub struct TrainConfig {
     /// Largest norm of a step's gradient; longer gradients are scaled down.
     pub clip: f64,
     /// Parts of the network that learn; all if none is named. The others stay as they are, bit for bit. Of
-    /// the regression `["refinement"]`, or `pre` and `uncertainty`; of the diffusion all others and `pre`.
+    /// the regression `["refinement"]`, or `pre` and `uncertainty`; of the diffusions all others and `pre`,
+    /// without `features` in `window`.
     #[serde(default)]
     pub learns: Vec<LearningPart>,
     /// Numbers that convolutions multiply.
@@ -132,6 +133,11 @@ impl TrainConfig {
             term: PerceptualKind::None,
             flow: 0.0,
         })
+    }
+
+    /// Returns true if this part of the network learns.
+    pub(super) fn learns(&self, part: LearningPart) -> bool {
+        self.learns.is_empty() || self.learns.contains(&part)
     }
 
     /// Returns the fraction of the samples at the noisiest timestep.

@@ -332,6 +332,27 @@ fn uncertainty_learns_without_the_frames() {
     }
 }
 
+/// The U-Net of the window network learns with the merge of its predictions, and no other weight changes.
+#[test]
+fn unet_learns_alone_on_encoded_windows() {
+    let alone = [("train.loss.pre", "0"), ("train.loss.flow", "0"), ("train.batch", "2")];
+    let with = |learns| window(&[&alone[..], &[("train.learns", learns)]].concat());
+    let recipe = with("[\"unet\"]");
+    let (after, reports) = trained_as::<Window>(&recipe, &[Device::flex()], 1);
+    let init = Window::init(&recipe, &Device::flex()).unwrap();
+    let mut moved = after.iter().zip(weights(&init)).map(|(a, b)| a.to_bits() != b.to_bits());
+    for (name, shape) in parameter_shapes(&init) {
+        let count = shape.iter().product();
+        let any = moved.by_ref().take(count).filter(|moves| *moves).count() > 0;
+        let expected = name.starts_with("unet.") || name.starts_with("agreement.");
+        assert_eq!(any, expected, "{name}");
+    }
+    // The first loss is the same where all learn, and its gradient is longer there.
+    let (_, all) = trained_as::<Window>(&with("[]"), &[Device::flex()], 1);
+    assert_eq!(reports[0].loss.total, all[0].loss.total);
+    assert!(reports[0].norm < all[0].norm, "{} and {}", reports[0].norm, all[0].norm);
+}
+
 /// A loss that is not finite stops the run before it spoils the state.
 #[test]
 fn nan_loss_stops_the_step_and_names_the_term() {
@@ -412,6 +433,16 @@ fn rejects_wrong_recipes_by_key() {
     ] {
         let error = load(key, value).unwrap_err().to_string();
         assert!(error.contains(word), "{key}={value}: {error}");
+    }
+    for (learns, word) in [
+        ("[\"features\"]", "other diffusion"),
+        ("[\"uncertainty\"]", "regression"),
+        ("[\"unet\"]", "train.loss.pre"),
+    ] {
+        let learns = [("train.learns".to_owned(), learns.to_owned())];
+        let text = window(&[]).text();
+        let error = Recipe::parse(&text, "window", &learns).unwrap_err().to_string();
+        assert!(error.contains("train.learns") && error.contains(word), "{error}");
     }
     assert!(Recipe::load("huge", &[]).unwrap_err().to_string().contains("huge"));
     assert_eq!(load("train.steps", "77").unwrap().train.steps, 77);

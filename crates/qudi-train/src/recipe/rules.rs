@@ -33,25 +33,21 @@ impl Recipe {
             NetworkRecipe::Qudi(NetworkConfig::Window(config)) => {
                 self.check_sampling()?;
                 check(&self.sample_rules(3, config.multiple()))?;
-                let loss = self.train.loss();
-                let weight = |v: f32| v.is_finite() && v >= 0.0;
                 check(&[
-                    (
-                        "train.loss",
-                        weight(loss.flow) && weight(loss.pre) && weight(loss.perceptual),
-                        "must have weights of 0 or more",
-                    ),
-                    ("train.loss.prediction", loss.prediction > 0.0, "must be above 0"),
-                    perceptual_rule(loss),
                     ("train.passes", (1..=8).contains(&self.train.passes), "must be from 1 to 8"),
                     ("train.ablate", is_default(&self.train.ablate), "is for the other diffusion"),
-                    ("train.learns", self.train.learns.is_empty(), "is for the regression"),
+                    (
+                        "train.learns",
+                        !self.train.learns.contains(&LearningPart::Features),
+                        "names a part that only the other diffusion has",
+                    ),
                     (
                         "train.gradient_checkpointing",
                         !self.train.gradient_checkpointing,
                         "is for the other diffusion",
                     ),
                 ])?;
+                check(&self.loss_rules())?;
             }
             NetworkRecipe::Baseline(sizes) => self.check_baseline(*sizes)?,
         }
@@ -147,11 +143,21 @@ impl Recipe {
         let train = &self.train;
         self.check_sampling()?;
         check(&self.sample_rules(3, network.multiple()))?;
+        check(&self.loss_rules())?;
+        check(&[(
+            "train.gradient_checkpointing",
+            train.learns(LearningPart::Pre) || !train.gradient_checkpointing,
+            "must be false where pre does not learn",
+        )])
+    }
+
+    /// Returns the rules of the loss of both diffusions, and of the parts that learn from it.
+    fn loss_rules(&self) -> [Rule<'static>; 6] {
+        let train = &self.train;
         let weight = |v: f32| v.is_finite() && v >= 0.0;
         let loss = train.loss();
-        let learns = |part| train.learns.is_empty() || train.learns.contains(&part);
         let others = [LearningPart::Refinement, LearningPart::Uncertainty];
-        check(&[
+        [
             (
                 "train.loss",
                 [loss.prediction, loss.flow, loss.pre, loss.perceptual].into_iter().all(weight),
@@ -166,15 +172,15 @@ impl Recipe {
             ),
             (
                 "train.learns",
-                learns(LearningPart::Pre) || (loss.pre == 0.0 && !train.gradient_checkpointing),
-                "must have pre where train.loss.pre has a weight or train.gradient_checkpointing is true",
+                train.learns(LearningPart::Pre) || loss.pre == 0.0,
+                "must have pre where train.loss.pre has a weight",
             ),
             (
                 "train.learns",
-                learns(LearningPart::Flow) || loss.flow == 0.0,
+                train.learns(LearningPart::Flow) || loss.flow == 0.0,
                 "must have flow where train.loss.flow has a weight",
             ),
-        ])
+        ]
     }
 
     /// Refuses keys of the diffusion for another network.

@@ -34,7 +34,7 @@ pub enum LearningPart {
     Flow,
     /// Temporal fusion.
     Fusion,
-    /// U-Net.
+    /// U-Net; of `window` also the merge of what it predicts.
     Unet,
 }
 
@@ -48,7 +48,7 @@ impl LearningPart {
             Self::Features => &["low", "high"],
             Self::Flow => &["flow"],
             Self::Fusion => &["fusion"],
-            Self::Unet => &["unet"],
+            Self::Unet => &["unet", "agreement"],
         };
         parameter.split('.').next().is_some_and(|module| modules.contains(&module))
     }
