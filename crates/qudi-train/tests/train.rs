@@ -332,23 +332,38 @@ fn uncertainty_learns_without_the_frames() {
     }
 }
 
-/// The U-Net of the window network learns with the merge of its predictions, and no other weight changes.
-#[test]
-fn unet_learns_alone_on_encoded_windows() {
-    let alone = [("train.loss.pre", "0"), ("train.loss.flow", "0"), ("train.batch", "2")];
-    let with = |learns| window(&[&alone[..], &[("train.learns", learns)]].concat());
-    let recipe = with("[\"unet\"]");
+/// Trains some parts of the window network, and checks that their modules change and no other weight does.
+fn parts_learn_alone(parts: &str, modules: &[&str], loss_of_flow: &str) -> Vec<StepReport> {
+    let recipe = window(&[
+        ("train.loss.pre", "0"),
+        ("train.loss.flow", loss_of_flow),
+        ("train.batch", "2"),
+        ("train.learns", parts),
+    ]);
     let (after, reports) = trained_as::<Window>(&recipe, &[Device::flex()], 1);
     let init = Window::init(&recipe, &Device::flex()).unwrap();
     let mut moved = after.iter().zip(weights(&init)).map(|(a, b)| a.to_bits() != b.to_bits());
     for (name, shape) in parameter_shapes(&init) {
         let count = shape.iter().product();
         let any = moved.by_ref().take(count).filter(|moves| *moves).count() > 0;
-        let expected = name.starts_with("unet.") || name.starts_with("agreement.");
+        let expected = name.split('.').next().is_some_and(|module| modules.contains(&module));
         assert_eq!(any, expected, "{name}");
     }
+    reports
+}
+
+#[test]
+fn flow_of_the_window_network_learns_alone() {
+    parts_learn_alone("[\"flow\"]", &["flow"], "0.1");
+}
+
+/// The U-Net of the window network learns with the merge of its predictions, and no other weight changes.
+#[test]
+fn unet_learns_alone_on_encoded_windows() {
+    let reports = parts_learn_alone("[\"unet\"]", &["unet", "agreement"], "0");
     // The first loss is the same where all learn, and its gradient is longer there.
-    let (_, all) = trained_as::<Window>(&with("[]"), &[Device::flex()], 1);
+    let whole = window(&[("train.loss.pre", "0"), ("train.loss.flow", "0"), ("train.batch", "2")]);
+    let (_, all) = trained_as::<Window>(&whole, &[Device::flex()], 1);
     assert_eq!(reports[0].loss.total, all[0].loss.total);
     assert!(reports[0].norm < all[0].norm, "{} and {}", reports[0].norm, all[0].norm);
 }
@@ -434,14 +449,18 @@ fn rejects_wrong_recipes_by_key() {
         let error = load(key, value).unwrap_err().to_string();
         assert!(error.contains(word), "{key}={value}: {error}");
     }
-    for (learns, word) in [
-        ("[\"features\"]", "other diffusion"),
-        ("[\"uncertainty\"]", "regression"),
-        ("[\"unet\"]", "train.loss.pre"),
+    for (learns, other, word) in [
+        ("[\"features\"]", ("train.matched", "0"), "other diffusion"),
+        ("[\"uncertainty\"]", ("train.matched", "0"), "regression"),
+        ("[\"unet\"]", ("train.matched", "0"), "train.loss.pre"),
+        // Nothing would learn in some batches, or in any.
+        ("[\"flow\"]", ("train.matched", "0.5"), "train.matched"),
+        ("[\"flow\", \"flow\"]", ("train.loss.flow", "0"), "train.loss.flow"),
     ] {
-        let learns = [("train.learns".to_owned(), learns.to_owned())];
+        let changes = [("train.learns", learns), other];
+        let changes = changes.map(|(key, value)| (key.to_owned(), value.to_owned()));
         let text = window(&[]).text();
-        let error = Recipe::parse(&text, "window", &learns).unwrap_err().to_string();
+        let error = Recipe::parse(&text, "window", &changes).unwrap_err().to_string();
         assert!(error.contains("train.learns") && error.contains(word), "{error}");
     }
     assert!(Recipe::load("huge", &[]).unwrap_err().to_string().contains("huge"));

@@ -42,6 +42,13 @@ impl Recipe {
                         "names a part that only the other diffusion has",
                     ),
                     (
+                        "train.learns",
+                        self.train.learns.is_empty()
+                            || self.train.learns.iter().any(|&part| part != LearningPart::Flow)
+                            || (self.train.loss().flow > 0.0 && self.train.matched == 0.0),
+                        "must have more than flow, unless train.loss.flow has a weight and train.matched is 0: it learns from nothing else",
+                    ),
+                    (
                         "train.gradient_checkpointing",
                         !self.train.gradient_checkpointing,
                         "is for the other diffusion",
