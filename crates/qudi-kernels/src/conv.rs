@@ -35,6 +35,8 @@ mod tiles;
 mod weight_gradient;
 #[cfg(feature = "flex")]
 mod weight_tiles;
+#[cfg(feature = "flex")]
+mod winograd;
 
 pub use geometry::Geometry;
 #[cfg(feature = "flex")]

@@ -10,7 +10,7 @@ use std::sync::OnceLock;
 /// Units that multiply bfloat16 in convolutions on the processor. All sum in 32 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MatrixUnits {
-    /// No unit: numbers are rounded to bfloat16 and multiplied in 32 bits, without a gain in speed.
+    /// No unit: numbers are rounded to bfloat16 and multiplied in 32 bits, which is slower than not to round.
     F32,
     /// Products of pairs on the vector unit (AVX512-BF16).
     Avx512Bf16,

@@ -37,9 +37,14 @@ pub fn with_precision<T>(precision: ComputePrecision, run: impl FnOnce() -> T) -
 
 impl ComputePrecision {
     /// Returns true if the device computes with this precision. A processor without matrix units rounds to
-    /// bfloat16, without a gain in speed.
+    /// bfloat16 ([`is_emulated`](Self::is_emulated)).
     pub fn is_supported(self, device: &Device) -> bool {
         device.supports_dtype(self.dtype())
+    }
+
+    /// Returns true if the device rounds to this precision without units for it, which is slower than `F32`.
+    pub fn is_emulated(self, device: &Device) -> bool {
+        self == Self::Bf16 && is_flex(device) && MatrixUnits::current() == MatrixUnits::F32
     }
 
     /// Returns the fastest precision that restores equally well on this device: bfloat16 on a processor with

@@ -25,6 +25,11 @@ const SHAPES: &[Shape] = &[
     (8, 4, &[3], 11, 12, 6, [5, 5, 5], 2),
     (4, 2, &[9], 16, 16, 8, [3, 3, 3], 1),
     (1, 1, &[2], 2, 2, 3, [1, 7, 7], 2),
+    (3, 1, &[20, 12], 37, 53, 25, [1, 3, 3], 1),
+    (4, 2, &[9], 14, 14, 18, [3, 3, 3], 1),
+    (1, 1, &[40], 71, 131, 17, [1, 3, 3], 1),
+    (2, 1, &[16], 3, 1, 16, [1, 3, 3], 1),
+    (1, 1, &[300], 9, 15, 20, [1, 3, 3], 1),
 ];
 
 fn values(count: usize, seed: usize) -> Vec<f32> {
@@ -88,7 +93,7 @@ fn output_shapes_match_burn() {
 #[test]
 fn threads_do_not_change_the_result() {
     let device = Device::flex().autodiff();
-    for shape in [SHAPES[3], SHAPES[9]] {
+    for shape in [SHAPES[3], SHAPES[9], SHAPES[12]] {
         let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let one = pool(1).install(|| run(shape, true, &device));
         let three = pool(3).install(|| run(shape, true, &device));

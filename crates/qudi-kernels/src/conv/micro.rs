@@ -34,6 +34,36 @@ pub(super) fn block(outputs: usize, columns: usize) -> (usize, usize) {
     KINDS.into_iter().filter(fits).min_by_key(cost).unwrap_or(KINDS[7])
 }
 
+/// Work on blocks of results, compiled for each of their sizes.
+pub(super) trait BlockWork<S: Simd> {
+    /// Does the work in blocks of `M` channels by `V` vectors of pixels.
+    ///
+    /// # Safety
+    /// As the type says.
+    unsafe fn blocks<const M: usize, const V: usize>(self, simd: S);
+}
+
+/// Does `work` in blocks of a size of [`KINDS`].
+///
+/// # Safety
+/// As [`BlockWork::blocks`].
+#[inline(always)]
+pub(super) unsafe fn in_blocks<S: Simd>(simd: S, block: (usize, usize), work: impl BlockWork<S>) {
+    // SAFETY: the caller's promise.
+    unsafe {
+        match block {
+            b if b == KINDS[0] => work.blocks::<{ KINDS[0].0 }, { KINDS[0].1 }>(simd),
+            b if b == KINDS[1] => work.blocks::<{ KINDS[1].0 }, { KINDS[1].1 }>(simd),
+            b if b == KINDS[2] => work.blocks::<{ KINDS[2].0 }, { KINDS[2].1 }>(simd),
+            b if b == KINDS[3] => work.blocks::<{ KINDS[3].0 }, { KINDS[3].1 }>(simd),
+            b if b == KINDS[4] => work.blocks::<{ KINDS[4].0 }, { KINDS[4].1 }>(simd),
+            b if b == KINDS[5] => work.blocks::<{ KINDS[5].0 }, { KINDS[5].1 }>(simd),
+            b if b == KINDS[6] => work.blocks::<{ KINDS[6].0 }, { KINDS[6].1 }>(simd),
+            _ => work.blocks::<{ KINDS[7].0 }, { KINDS[7].1 }>(simd),
+        }
+    }
+}
+
 /// Returns the longest run of pixels of a block on this machine.
 pub(super) fn longest_run(format: Format) -> usize {
     match format {

@@ -4,8 +4,10 @@
 use super::geometry::Geometry;
 use super::pass::Pass;
 use super::run::{Finish, Packed, Target, run};
+use super::scratch::Format;
 use super::source::Source;
 use super::weight_gradient::{WeightGradient, weight_gradient};
+use super::winograd;
 
 /// Computes the output `[images, outputs, rows, columns]`. Inputs are `[images, channels, height, width]`,
 /// followed by the addend if there is one; weights are `[outputs, channels, frames, rows, columns]`.
@@ -21,14 +23,13 @@ pub(crate) fn forward(
     let planes = geometry.all_channels() * geometry.kernel[0];
     let taps = pass.taps.len();
     let weight = |output, plane, tap| weight[(output * planes + plane) * taps + tap];
-    let packed = Packed::new(&pass, geometry.bf16, geometry.outputs, planes, weight);
     let inputs = with_channels(inputs, geometry);
     let source = Source { inputs: &inputs, ..source(geometry) };
     let [rows, columns] = pass.grid;
     let mut parts = [(Vec::new(), geometry.outputs)];
     let target = Target::new(&mut parts, geometry.images, rows, columns);
     let finish = Finish { bias: Some(bias), addend, relu: geometry.relu };
-    run(source, geometry.images, &pass, &packed, finish, &target);
+    correlate(source, geometry, &pass, [geometry.outputs, planes], weight, finish, &target);
     // SAFETY: the pass covers the whole grid.
     let [(output, _)] = unsafe { written(parts, geometry.images * rows * columns) };
     output
@@ -54,18 +55,37 @@ pub(crate) fn input_gradients(
         let parity = [parity / geometry.stride, parity % geometry.stride];
         let Some((pass, kernel)) = Pass::backward(geometry, parity) else { continue };
         let planes = geometry.outputs * depth;
-        let packed = Packed::new(&pass, geometry.bf16, channels, planes, |channel, plane, tap| {
+        let weight = |channel, plane, tap: usize| {
             let (output, frame) = (plane / depth, depth - 1 - plane % depth);
             let [y, x] = kernel[tap];
             let plane = (output * channels + channel) * depth + frame;
             weight[(plane * kernel_rows + y) * kernel_columns + x]
-        });
+        };
         let finish = Finish { bias: None, addend: None, relu: false };
-        run(source, geometry.images, &pass, &packed, finish, &target);
+        correlate(source, geometry, &pass, [channels, planes], weight, finish, &target);
     }
     // SAFETY: the passes of all parities cover the whole grid.
     let parts = unsafe { written(parts, geometry.images * geometry.height * geometry.width) };
     parts.into_iter().map(|(part, _)| part).collect()
+}
+
+/// Correlates `source` with `weight(output, plane, tap)` in the way that takes fewest instructions.
+fn correlate(
+    source: Source<'_>,
+    geometry: &Geometry,
+    pass: &Pass,
+    [outputs, planes]: [usize; 2],
+    weight: impl Fn(usize, usize, usize) -> f32 + Sync,
+    finish: Finish<'_>,
+    target: &Target,
+) {
+    if winograd::serves(pass, Format::new(geometry.bf16, planes), planes, outputs) {
+        let packed = winograd::Packed::new(pass, outputs, planes, weight);
+        winograd::run(source, geometry.images, &packed, finish, target);
+    } else {
+        let packed = Packed::new(pass, geometry.bf16, outputs, planes, weight);
+        run(source, geometry.images, pass, &packed, finish, target);
+    }
 }
 
 /// Computes the gradient of the addend.

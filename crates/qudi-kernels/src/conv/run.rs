@@ -3,7 +3,7 @@
 
 #[cfg(all(target_arch = "x86_64", not(test)))]
 use super::amx;
-use super::micro::{self, KINDS, Products, Single};
+use super::micro::{self, BlockWork, Products, Single, in_blocks};
 #[cfg(target_arch = "x86_64")]
 use super::pairs;
 use super::pass::{Pass, Tiling};
@@ -13,6 +13,7 @@ use super::tiles;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 use std::cell::RefCell;
+use std::marker::PhantomData;
 
 thread_local! {
     /// Scratch memory of a thread, reused between calls.
@@ -24,8 +25,8 @@ thread_local! {
 pub(super) struct Target {
     /// First value and number of channels of each part.
     parts: Vec<(*mut f32, usize)>,
-    height: usize,
-    width: usize,
+    pub(super) height: usize,
+    pub(super) width: usize,
 }
 
 // SAFETY: tiles of a pass, and passes of a gradient, write to disjoint places (see `run`).
@@ -53,7 +54,7 @@ impl Target {
     ///
     /// # Safety
     /// The image must exist.
-    unsafe fn plane(&self, image: usize, mut channel: usize) -> *mut f32 {
+    pub(super) unsafe fn plane(&self, image: usize, mut channel: usize) -> *mut f32 {
         for &(start, channels) in &self.parts {
             if channel < channels {
                 let number = image * channels + channel;
@@ -212,6 +213,17 @@ impl pairs::PairWork for Tile<'_> {
     }
 }
 
+/// Work on one filled tile with the products `P`.
+struct Blocks<'a, P>(&'a Tile<'a>, PhantomData<P>);
+
+impl<S: Simd, P: Products<S>> BlockWork<S> for Blocks<'_, P> {
+    #[inline(always)]
+    unsafe fn blocks<const M: usize, const V: usize>(self, simd: S) {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.blocks::<S, P, M, V>(simd) }
+    }
+}
+
 impl Tile<'_> {
     fn run(self, arch: Arch) {
         match self.tiling.format {
@@ -237,18 +249,7 @@ impl Tile<'_> {
     #[inline(always)]
     unsafe fn products<S: Simd, P: Products<S>>(&self, simd: S) {
         // SAFETY: the caller's promise.
-        unsafe {
-            match self.weights.block {
-                b if b == KINDS[0] => self.blocks::<S, P, { KINDS[0].0 }, { KINDS[0].1 }>(simd),
-                b if b == KINDS[1] => self.blocks::<S, P, { KINDS[1].0 }, { KINDS[1].1 }>(simd),
-                b if b == KINDS[2] => self.blocks::<S, P, { KINDS[2].0 }, { KINDS[2].1 }>(simd),
-                b if b == KINDS[3] => self.blocks::<S, P, { KINDS[3].0 }, { KINDS[3].1 }>(simd),
-                b if b == KINDS[4] => self.blocks::<S, P, { KINDS[4].0 }, { KINDS[4].1 }>(simd),
-                b if b == KINDS[5] => self.blocks::<S, P, { KINDS[5].0 }, { KINDS[5].1 }>(simd),
-                b if b == KINDS[6] => self.blocks::<S, P, { KINDS[6].0 }, { KINDS[6].1 }>(simd),
-                _ => self.blocks::<S, P, { KINDS[7].0 }, { KINDS[7].1 }>(simd),
-            }
-        }
+        unsafe { in_blocks(simd, self.weights.block, Blocks::<P>(self, PhantomData)) }
     }
 
     /// Multiplies blocks of `M` channels by `V` vectors of pixels.

@@ -24,7 +24,7 @@ pub(super) struct Source<'a> {
 impl<'a> Source<'a> {
     /// Returns channel `number / depth` of the frame `number % depth - depth / 2` away from `image`, and its
     /// mask. Returns `None` outside the burst.
-    fn plane(&self, image: usize, number: usize) -> Option<Row<'a>> {
+    pub(super) fn plane(&self, image: usize, number: usize) -> Option<Row<'a>> {
         let (mut channel, delta) = (number / self.depth, number % self.depth);
         let frame = (image % self.frames + delta).checked_sub(self.depth / 2)?;
         if frame >= self.frames {

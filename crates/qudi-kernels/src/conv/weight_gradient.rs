@@ -10,6 +10,7 @@ use super::run::SCRATCH;
 use super::scratch::{Format, Narrow, round_all};
 use super::source::Source;
 use super::weight_tiles;
+use super::winograd;
 use crate::matrix_units::MatrixUnits;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
@@ -39,6 +40,9 @@ pub(super) fn weight_gradient(
     gradient: Source<'_>,
     bf16: bool,
 ) -> WeightGradient {
+    if winograd::serves(pass, Format::new(bf16, planes), planes, outputs) {
+        return winograd::weight_gradient(source, [planes, images, outputs], gradient);
+    }
     if bf16 && MatrixUnits::current() == MatrixUnits::Amx {
         return weight_tiles::weight_gradient(source, [planes, images, outputs], pass, gradient);
     }
@@ -119,13 +123,19 @@ pub(super) fn weight_gradient(
         }
         sums
     };
-    let mut parts: Vec<WeightGradient> = (0..parts).into_par_iter().map(partial).collect();
-    let mut sums = parts.swap_remove(0);
-    for part in parts.split_off(0) {
-        add(&mut sums.weight, &part.weight);
-        add(&mut sums.bias, &part.bias);
+    WeightGradient::sum((0..parts).into_par_iter().map(partial).collect())
+}
+
+impl WeightGradient {
+    /// Adds partial sums.
+    pub(super) fn sum(mut parts: Vec<Self>) -> Self {
+        let mut sums = parts.swap_remove(0);
+        for part in parts {
+            add(&mut sums.weight, &part.weight);
+            add(&mut sums.bias, &part.bias);
+        }
+        sums
     }
-    sums
 }
 
 fn add(to: &mut [f32], from: &[f32]) {
