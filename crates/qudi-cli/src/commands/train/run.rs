@@ -120,6 +120,12 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
         check_pack(folder, &plan.pack)?;
     }
     let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
+    if devices.iter().any(|device| recipe.train.precision.is_emulated(&device.device)) {
+        report.remark(
+            "note: this processor has no units for bfloat16 and rounds to it: a run started with --set \
+             train.precision=f32 is faster",
+        );
+    }
     let _folder = RunFolder::open(folder)?;
     find_backbones(plan)?;
     let files = files(plan, report)?;
