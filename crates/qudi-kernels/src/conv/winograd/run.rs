@@ -178,7 +178,7 @@ impl<S: Simd> BlockWork<S> for Work<'_> {
                             weights.as_ptr(),
                             &mut sums,
                         );
-                        let to = self.products.as_ptr().cast_mut();
+                        let to = self.products.as_mut_ptr();
                         for (m, sum) in sums.into_iter().enumerate() {
                             let to = to.add((place * M + m) * stride + cell);
                             micro::store::<S, V>(sum, to, run);
