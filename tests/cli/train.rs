@@ -42,6 +42,24 @@ fn training_stops_in_time_and_its_speed_is_measured() {
     }
 }
 
+/// Rounding to bfloat16 without units for it is slow, and said to be.
+#[test]
+fn bfloat16_without_units_is_noted() {
+    let folder = scratch("train-bfloat16");
+    for (precision, noted) in [("bf16", true), ("f32", false)] {
+        let args = format!(
+            "train tiny -o {precision} --set train.steps=1 --set data.crop=32 --set validation.crop=32 \
+             --set train.precision={precision} --device cpu"
+        );
+        let mut command = qudi(&folder);
+        let command = command.env("QUDI_KERNELS", "f32").args(args.split_whitespace());
+        let output = command.output().unwrap();
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{text}");
+        assert_eq!(text.contains("--set train.precision=f32 is faster"), noted, "{text}");
+    }
+}
+
 /// The shipped recipe learns within its first steps.
 #[test]
 fn tiny_recipe_trains_without_files() {

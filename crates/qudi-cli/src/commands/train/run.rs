@@ -122,7 +122,7 @@ fn train_network<L: Learner>(plan: &Plan, report: &Report) -> Result<()> {
     let devices = plan.devices.iter().map(|name| device::open(name)).collect::<Result<Vec<_>>>()?;
     if devices.iter().any(|device| recipe.train.precision.is_emulated(&device.device)) {
         report.remark(
-            "note: this processor has no units for bfloat16 and rounds to it: a run started with --set \
+            "note: without units for bfloat16, numbers are only rounded to it: a run started with --set \
              train.precision=f32 is faster",
         );
     }
