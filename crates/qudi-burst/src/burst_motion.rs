@@ -19,6 +19,10 @@ use std::ops::Range;
 /// Approximate variance of the errors of better frames, in units of the counts' variance.
 pub(crate) const FRAME_ERROR: f32 = 0.1;
 
+/// Penalty of motion that is matched in counts, in units of their noise's variance: it repeats the noise of
+/// the counts that judge it.
+const MATCHED_PENALTY: f32 = 100.0;
+
 /// Finds the motion between the frames of a burst. Every patch of 16 x 16 pixels moves as it matches best,
 /// with constant velocity, with most of the image, or not at all, whichever the counts of all frames make
 /// most likely.
@@ -86,7 +90,7 @@ impl BurstMotion {
         let frames = self.burst.frames.len();
         self.found(|reference| {
             let near = reference.saturating_sub(reach)..(reference + reach + 1).min(frames);
-            counts.motion(reference, &near).1
+            counts.motion(reference, &near, MATCHED_PENALTY).1
         })
     }
 
@@ -144,11 +148,18 @@ impl BurstMotion {
 }
 
 impl CountsMotion<'_> {
-    /// Divides the burst into blocks around frame `reference`, and finds its motion to `frames`.
-    pub(crate) fn motion(&self, reference: usize, frames: &Range<usize>) -> (Blocks, PatchMotion) {
+    /// Divides the burst into blocks around frame `reference`, and finds its motion to `frames`. Matched
+    /// motion has a penalty, in units of the noise's variance.
+    pub(crate) fn motion(
+        &self,
+        reference: usize,
+        frames: &Range<usize>,
+        penalty: f32,
+    ) -> (Blocks, PatchMotion) {
         let BurstMotion { burst, velocity, .. } = self.of;
         let (velocity, global) = (velocity.as_ref(), self.global.as_ref());
         let (blocks, matched) = self.aligner.align(burst, reference, frames);
+        let matched = (penalty, matched);
         (blocks, select_on_counts(burst, velocity, global, reference, frames, matched))
     }
 }
@@ -234,6 +245,21 @@ mod tests {
                 assert!(on_frames < 0.05, "{speed:?}, {from} to {to}: {on_frames}");
             }
         }
+    }
+
+    /// Motion that is matched in counts repeats their noise: with its penalty, a static scene moves less.
+    #[test]
+    fn penalty_of_matched_motion_lets_a_static_scene_rest() {
+        let size = Size { height: 64, width: 80 };
+        let (_, counts, acquisition) = moving(size, [0.0; 2]);
+        let motion = BurstMotion::new(BurstView { size, frames: &counts }, &acquisition);
+        let searched = motion.counts(1);
+        let [without, with] = [0.0, MATCHED_PENALTY].map(|penalty| {
+            let found =
+                motion.found(|reference| searched.motion(reference, &(0..FRAMES), penalty).1);
+            error(&found.on_cells(1).flow(3, 2), [0.0; 2])
+        });
+        assert!(with < 0.6 * without, "{without} px without, {with} px with the penalty");
     }
 
     #[test]

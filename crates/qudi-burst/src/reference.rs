@@ -86,7 +86,7 @@ impl ReferenceEstimate {
         let qbp = Qbp::new(PostFilter::Bm3d);
         let counts = motion.counts(qbp.block_length(acquisition)?);
         let merge = |reference: usize| {
-            let (blocks, motion) = counts.motion(reference, &(0..frame_count));
+            let (blocks, motion) = counts.motion(reference, &(0..frame_count), 0.0);
             MergedFrame::from_blocks(burst, &blocks, &motion, qbp.settings.wiener_c)
         };
         let all: Vec<usize> = (0..frame_count).collect();

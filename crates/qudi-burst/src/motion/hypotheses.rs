@@ -59,23 +59,24 @@ const REMAINING_VARIANCE: f32 = 70.0 / 256.0;
 const CORRELATION: f32 = 0.8;
 
 /// Penalty of a hypothesis, and the motion that it gives every patch.
-type Hypothesis = (f32, PatchMotion);
+pub(crate) type Hypothesis = (f32, PatchMotion);
 
 /// Selects the motion of every patch of frame `reference` by the counts of `judged` frames alone. The
-/// candidates are the `matched` motion, constant velocity and global motion. Without velocities, the matched
-/// motion is returned.
+/// candidates are the `matched` motion, which has a penalty, constant velocity and global motion. Without
+/// velocities, the matched motion is returned.
 pub(crate) fn select_on_counts(
     burst: &PreparedBurst,
     velocity: Option<&ConstantVelocity>,
     global: Option<&GlobalMotion>,
     reference: usize,
     judged: &Range<usize>,
-    matched: PatchMotion,
+    (penalty, matched): Hypothesis,
 ) -> PatchMotion {
     let Some(velocity) = velocity else { return matched };
     let global = global.map(|global| global_hypothesis(burst, global, reference));
-    let hypotheses = [matched, velocity.motion(reference)].into_iter().chain(global);
-    let hypotheses: Vec<Hypothesis> = hypotheses.map(|motion| (0.0, motion)).collect();
+    let others = [velocity.motion(reference)].into_iter().chain(global);
+    let others = others.map(|motion| (0.0, motion));
+    let hypotheses: Vec<Hypothesis> = [(penalty, matched)].into_iter().chain(others).collect();
     let template = &velocity.smoothed[reference];
     let selector = HypothesisSelector {
         burst,
@@ -422,7 +423,9 @@ mod tests {
         let all = 0..burst.frames.len();
         let (_, matched) = BlockAligner::new(&burst, 1).align(&burst, 5, &all);
         let before = error(&burst, &matched, moved);
-        let selected = select_on_counts(&burst, Some(&velocity(&burst)), None, 5, &all, matched);
+        let velocity = Some(velocity(&burst));
+        let matched = (0.0, matched);
+        let selected = select_on_counts(&burst, velocity.as_ref(), None, 5, &all, matched);
         let after = error(&burst, &selected, moved);
         assert!(after < 0.5 * before, "{before} before, {after} px after");
     }
