@@ -32,6 +32,9 @@ pub enum Event<'a> {
     Validation(&'a Validation),
     /// The state has been written after this step.
     Saved(u64),
+    /// No gradient reaches these layers, so that they learn no more. Told where the state is written,
+    /// whenever there are others than before.
+    Dead(&'a [String]),
 }
 
 /// A run.
@@ -136,6 +139,7 @@ impl<L: Learner> Run<L> {
                 return Err(Error::Interrupted);
             }
         }
+        let mut dead = Vec::new();
         while self.trainer.step_number() < train.steps {
             let mut go_on = ControlFlow::Continue(());
             let report = match &card {
@@ -170,6 +174,12 @@ impl<L: Learner> Run<L> {
                 self.trainer.save_state(&self.folder)?;
                 self.save_weights()?;
                 if on(Event::Saved(step)).is_break() {
+                    go_on = ControlFlow::Break(());
+                }
+                let known = std::mem::replace(&mut dead, self.trainer.dead_layers()?);
+                if dead.iter().any(|name| !known.contains(name))
+                    && on(Event::Dead(&dead)).is_break()
+                {
                     go_on = ControlFlow::Break(());
                 }
             }

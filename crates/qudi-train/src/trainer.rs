@@ -1,5 +1,6 @@
 //! The network during training: its weights, their average, the optimizer's state.
 
+mod dead_layers;
 mod loss_values;
 mod parts;
 
@@ -142,6 +143,16 @@ impl<L: Learner> Trainer<L> {
     /// Returns the number of steps taken.
     pub fn step_number(&self) -> u64 {
         self.optimizer.steps
+    }
+
+    /// Returns the names of the layers that no gradient reaches any more, though others of their part learn.
+    ///
+    /// # Errors
+    /// [`Error`] if the device fails.
+    pub fn dead_layers(&self) -> Result<Vec<String>> {
+        let names: Vec<String> =
+            self.network.named_shapes().into_iter().map(|(name, _)| name).collect();
+        dead_layers::dead_layers(&names, &self.optimizer.mean, &self.learns)
     }
 
     /// Returns the number of batches used.

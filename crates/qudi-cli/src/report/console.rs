@@ -256,6 +256,11 @@ impl Bar {
     pub(crate) fn above(&self, text: &str, report: &Report) {
         self.line.suspend(|| report.remark(text));
     }
+
+    /// Warns above the bar.
+    pub(crate) fn warning(&self, text: &str, report: &Report) {
+        self.line.suspend(|| report.warning(text));
+    }
 }
 
 impl Drop for Bar {

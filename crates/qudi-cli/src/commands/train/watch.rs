@@ -84,6 +84,10 @@ impl<'a> Watch<'a> {
             }
             Event::Validation(validation) => self.validation(validation),
             Event::Saved(_) => Ok(()),
+            Event::Dead(layers) => {
+                self.bar.warning(&dead_text(layers), self.report);
+                Ok(())
+            }
         };
         if let Err(error) = shown {
             self.error = Some(error);
@@ -167,4 +171,18 @@ pub(crate) fn write_report(folder: &Path) -> Result<()> {
         loops: loops.unwrap_or_default(),
     })?;
     write(folder, REPORT, text.as_bytes())
+}
+
+/// Says which layers are dead, and what to do.
+fn dead_text(layers: &[String]) -> String {
+    const NAMED: usize = 4;
+    let named = layers.iter().take(NAMED).map(String::as_str).collect::<Vec<_>>().join(", ");
+    let others = match layers.len().saturating_sub(NAMED) {
+        0 => String::new(),
+        others => format!(" and {others} more"),
+    };
+    format!(
+        "no gradient reaches {named}{others}: these layers learn no more (all units are off); \
+         start again with a lower train.lr or a longer train.warmup"
+    )
 }
