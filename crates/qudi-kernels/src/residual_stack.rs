@@ -57,6 +57,8 @@ pub struct Stack {
     pub features: usize,
     /// Number of residual blocks.
     pub blocks: usize,
+    /// What follows the entry.
+    pub entry: Activation,
     /// True if activations have 16 bits (bfloat16).
     pub bf16: bool,
     /// The units that multiply, on the processor.
@@ -71,6 +73,7 @@ pub struct Stack {
 pub struct StackParameters {
     /// Weight `[outputs, inputs, 3, 3]` and bias `[outputs]`: the entry, then two for every block.
     convolutions: Vec<(Tensor<4>, Tensor<1>)>,
+    entry: Activation,
     /// All of them one after the other, for the fused operation.
     joined: OnceCell<Tensor<1>>,
     #[cfg(feature = "flex")]
@@ -83,6 +86,11 @@ impl Stack {
         self.inputs.iter().sum()
     }
 
+    /// Returns true if a ReLU follows the entry.
+    pub(crate) fn rectifies(&self) -> bool {
+        self.entry == Activation::Relu
+    }
+
     /// Returns inputs and outputs of every convolution, in order.
     pub(crate) fn convolutions(&self) -> impl Iterator<Item = [usize; 2]> {
         let entry = [self.channels(), self.features];
@@ -90,7 +98,8 @@ impl Stack {
     }
 }
 
-/// Computes `x = relu(entry(inputs))`, then `x = x + second(relu(first(x)))` for every block.
+/// Computes `x = relu(entry(inputs))`, or `entry(inputs)` if no activation follows the entry, then
+/// `x = x + second(relu(first(x)))` for every block.
 ///
 /// # Shapes
 /// - inputs: `[images, channels, height, width]` each, joined by channel
@@ -99,15 +108,20 @@ impl Stack {
 ///
 /// # Panics
 /// If the shapes do not fit.
-pub fn residual_stack(inputs: &[Tensor<4>], convolutions: &[(Tensor<4>, Tensor<1>)]) -> Tensor<4> {
-    StackParameters::new(convolutions.to_vec()).apply(inputs)
+pub fn residual_stack(
+    inputs: &[Tensor<4>],
+    convolutions: &[(Tensor<4>, Tensor<1>)],
+    entry: Activation,
+) -> Tensor<4> {
+    StackParameters::new(convolutions.to_vec(), entry).apply(inputs)
 }
 
 impl StackParameters {
-    /// Takes the convolutions of a stack: the entry, then two for every block.
-    pub fn new(convolutions: Vec<(Tensor<4>, Tensor<1>)>) -> Self {
+    /// Takes the convolutions of a stack: the entry, then two for every block; and what follows the entry.
+    pub fn new(convolutions: Vec<(Tensor<4>, Tensor<1>)>, entry: Activation) -> Self {
         Self {
             convolutions,
+            entry,
             joined: OnceCell::new(),
             #[cfg(feature = "flex")]
             packed: weights::Packed::default(),
@@ -127,7 +141,7 @@ impl StackParameters {
             let (weight, bias) = self.convolutions[number].clone();
             conv_2d(inputs, weight, bias, Options { addend, activation, ..Options::default() })
         };
-        let mut x = conv(inputs, 0, None, Activation::Relu);
+        let mut x = conv(inputs, 0, None, self.entry);
         for block in 0..stack.blocks {
             let hidden = conv(std::slice::from_ref(&x), 1 + 2 * block, None, Activation::Relu);
             x = conv(&[hidden], 2 + 2 * block, Some(x), Activation::None);
@@ -145,6 +159,7 @@ impl StackParameters {
             inputs: inputs.iter().map(|input| input.dims()[1]).collect(),
             features,
             blocks: (self.convolutions.len() - 1) / 2,
+            entry: self.entry,
             bf16: ComputePrecision::reduces(&inputs[0]),
             units: MatrixUnits::current(),
             #[cfg(feature = "flex")]

@@ -75,7 +75,7 @@ fn stacks() {
         let device = x[0].device();
         let convolutions: Vec<_> =
             x[2..].iter().map(|weight| (weight.clone() * 0.2, bias(8, &device))).collect();
-        residual_stack(&x[..2], &convolutions)
+        residual_stack(&x[..2], &convolutions, Activation::None)
     });
 }
 
@@ -96,7 +96,8 @@ fn records_hold_their_inputs() {
     let x = wave(0.0, [1, 2, 4, 4], &device);
     let weight = wave(1.0, [3, 2, 3, 3], &device);
     let hidden = x.clone() * 2.0;
-    let y = residual_stack(&[hidden.clone()], &[(weight.clone(), bias(3, &device))]);
+    let y =
+        residual_stack(&[hidden.clone()], &[(weight.clone(), bias(3, &device))], Activation::Relu);
     let changed = (hidden + 5.0) * 3.0;
     let gradients = (y.sum() + changed.sum() * 0.0).backward();
     let gradient = weight.grad(&gradients).unwrap().into_data().try_into_vec::<f32>().unwrap();
@@ -104,7 +105,7 @@ fn records_hold_their_inputs() {
         let device = Device::flex().autodiff();
         let x = wave(0.0, [1, 2, 4, 4], &device);
         let weight = wave(1.0, [3, 2, 3, 3], &device);
-        let y = residual_stack(&[x * 2.0], &[(weight.clone(), bias(3, &device))]);
+        let y = residual_stack(&[x * 2.0], &[(weight.clone(), bias(3, &device))], Activation::Relu);
         let gradients = y.sum().backward();
         weight.grad(&gradients).unwrap().into_data().try_into_vec::<f32>().unwrap()
     };

@@ -1,6 +1,7 @@
 //! The fused stack on the machine's own matrix unit, where it has one.
 #![allow(clippy::unwrap_used)]
 
+use qudi_kernels::conv::Activation;
 use qudi_kernels::{
     ComputePrecision, MatrixUnits, residual_stack, with_matrix_units, with_precision,
 };

@@ -4,12 +4,15 @@ use super::conv::{Bias, Conv2d};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use qudi_kernels::StackParameters;
+use qudi_kernels::conv::Activation;
 
-/// An entry convolution with ReLU, then residual blocks: `x + second(relu(first(x)))`.
+/// An entry convolution, with ReLU or without, then residual blocks: `x + second(relu(first(x)))`.
 #[derive(Module, Debug)]
 pub struct ResidualStack {
     entry: Conv2d,
     blocks: Vec<ResidualBlock>,
+    #[module(skip)]
+    rectifies: bool,
 }
 
 /// The convolutions of a residual block.
@@ -24,7 +27,14 @@ impl ResidualStack {
     pub fn zeros([inputs, features]: [usize; 2], blocks: usize, device: &Device) -> Self {
         let conv = |inputs| Conv2d::zeros([inputs, features], 3, Bias::Yes, device);
         let block = |_| ResidualBlock { first: conv(features), second: conv(features) };
-        Self { entry: conv(inputs), blocks: (0..blocks).map(block).collect() }
+        Self { entry: conv(inputs), blocks: (0..blocks).map(block).collect(), rectifies: true }
+    }
+
+    /// Leaves out the ReLU of the entry. Where it has one, all of its units can be off for every input; then
+    /// no gradient passes, and the stack learns no more.
+    #[must_use]
+    pub fn with_linear_entry(self) -> Self {
+        Self { rectifies: false, ..self }
     }
 
     /// Makes the parameters ready for several uses.
@@ -32,7 +42,8 @@ impl ResidualStack {
         let blocks = self.blocks.iter().flat_map(|block| [&block.first, &block.second]);
         let convolutions = std::iter::once(&self.entry).chain(blocks);
         let convolutions = convolutions.map(|conv| (conv.weight(), conv.bias_or_zeros()));
-        StackParameters::new(convolutions.collect())
+        let entry = if self.rectifies { Activation::Relu } else { Activation::None };
+        StackParameters::new(convolutions.collect(), entry)
     }
 
     /// Computes the features of `inputs`, which are joined by channel.

@@ -3,7 +3,7 @@
 //!
 //! `scripts/colour_network.py` trains it, on evidence that the example `colour_evidence` writes.
 
-use crate::window::hourglass::Hourglass;
+use crate::window::hourglass::{CoarseEntry, Hourglass};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use qudi_burst::{ColourCorrector, ColourEvidence, CorrectedColours};
@@ -53,7 +53,13 @@ pub struct ColourNetwork {
 impl Layers {
     fn zeros(device: &Device) -> Self {
         Self {
-            hourglass: Hourglass::zeros(4 * ColourEvidence::PLANES, 0, WIDTHS, device),
+            hourglass: Hourglass::zeros(
+                4 * ColourEvidence::PLANES,
+                0,
+                WIDTHS,
+                CoarseEntry::Rectified,
+                device,
+            ),
             out: Conv2d::zeros([WIDTHS[0] / 4, OUTPUTS], 3, Bias::Yes, device),
         }
     }

@@ -169,6 +169,15 @@ pub(crate) fn check(rules: &[Rule<'_>]) -> Result<()> {
     Err(Error::request(format!("{key} {problem}"), &key, "see docs/network.md"))
 }
 
+/// Schemas state all defaults, those too that are not written into files.
+pub(crate) fn never<T>(_: &T) -> bool {
+    false
+}
+
+pub(crate) fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -8,7 +8,7 @@ use qudi_core::atomic_file::Overwrite;
 use qudi_core::restorer::{Acquisition, BurstView};
 use qudi_core::sensor::Sensor;
 use qudi_layers::tensor::{read, to_tensor};
-use qudi_layers::{Provenance, parameter_shapes};
+use qudi_layers::{Provenance, init_parameters, parameter_shapes};
 use qudi_model::checkpoint::{Description, Precision, load, save};
 use qudi_model::config::NetworkConfig;
 use qudi_model::counts::CountPlanes;
@@ -19,10 +19,16 @@ use qudi_model::diffusion::{BurstMotion, Conditioning};
 use qudi_model::regression::Regression;
 use qudi_model::sensor::{response_tensor, sensor_tensor};
 use qudi_model::window::{Window, WindowConfig};
+use std::collections::HashMap;
 use std::sync::Arc;
 
-const CONFIG: WindowConfig =
-    WindowConfig { widths: [8, 8, 8], flow: [4, 4, 4], state: 8, cell_blocks: 1 };
+const CONFIG: WindowConfig = WindowConfig {
+    widths: [8, 8, 8],
+    flow: [4, 4, 4],
+    state: 8,
+    cell_blocks: 1,
+    linear_entries: true,
+};
 
 fn conditioning(frames: usize, device: &Device) -> Conditioning {
     let sensor = Sensor::load("qudi-paper").unwrap();
@@ -189,6 +195,19 @@ fn every_parameter_has_a_gradient_in(passes: usize, conditioning: &Conditioning)
     }
 }
 
+/// Returns the values of all parameters, in the order of their names.
+fn parameters(network: &Window) -> Vec<Tensor<1>> {
+    struct Values(Vec<Tensor<1>>);
+    impl burn::module::ModuleVisitor for Values {
+        fn visit_float<const D: usize>(&mut self, param: &burn::module::Param<Tensor<D>>) {
+            self.0.push(param.val().inner().flatten(0, D - 1));
+        }
+    }
+    let mut values = Values(Vec::new());
+    network.visit(&mut values);
+    values.0
+}
+
 /// Returns the largest magnitude of every parameter's gradient.
 fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> Vec<f32> {
     struct Largest<'a>(&'a burn::tensor::Gradients, Vec<f32>);
@@ -204,6 +223,38 @@ fn largest_gradients(network: &Window, gradients: &burn::tensor::Gradients) -> V
     let mut largest = Largest(gradients, Vec::new());
     network.visit(&mut largest);
     largest.1
+}
+
+/// Where the first units of a coarser level are off for every input, a ReLU lets no gradient pass; without it
+/// the level learns.
+#[test]
+fn levels_with_linear_entries_cannot_go_dead() {
+    let device = Device::flex().autodiff();
+    let conditioning = matched(4, 1.0, &device);
+    let schedule = NoiseSchedule::cosine(NUM_TIMESTEPS);
+    for linear_entries in [true, false] {
+        let config = WindowConfig { linear_entries, ..CONFIG };
+        let network = config.init(1, &device);
+        let names = parameter_shapes(&network);
+        let mut values: HashMap<String, Vec<f32>> = names
+            .iter()
+            .zip(parameters(&network))
+            .map(|((name, _), values)| (name.clone(), read(values).unwrap()))
+            .collect();
+        for part in ["pre", "unet"] {
+            let bias = format!("{part}.hourglass.decoder.1.entry.bias");
+            values.get_mut(&bias).unwrap().fill(-10.0);
+        }
+        let network = init_parameters(network, |name, _| values[name].clone());
+        let encoded = network.encode(&conditioning, 1).unwrap();
+        let x0 = network.predict(&encoded, &state(4, 60, &device), &schedule).x0;
+        let largest = largest_gradients(&network, &x0.powi_scalar(2).mean().backward());
+        for ((name, _), largest) in names.iter().zip(largest) {
+            if name.contains(".hourglass.encoder.2.") || name.contains(".hourglass.up.1.") {
+                assert_eq!(largest > 0.0, linear_entries, "{name}: {largest}");
+            }
+        }
+    }
 }
 
 /// Networks of earlier programs lack parts, and are not taken for this one.

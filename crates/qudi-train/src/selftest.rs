@@ -344,7 +344,13 @@ fn diffusion(device: &Device) -> Result<Vec<Vec<f32>>> {
 /// for the noisy image.
 fn window(device: &Device) -> Result<Vec<Vec<f32>>> {
     let device = device.clone().autodiff();
-    let config = WindowConfig { widths: [16; 3], flow: [8; 3], state: 16, cell_blocks: 1 };
+    let config = WindowConfig {
+        widths: [16; 3],
+        flow: [8; 3],
+        state: 16,
+        cell_blocks: 1,
+        linear_entries: true,
+    };
     let network = config.init(1, &device);
     let image = |seed| image(seed, &device);
     let conditioning = Conditioning {

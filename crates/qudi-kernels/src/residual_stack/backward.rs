@@ -122,11 +122,11 @@ fn backward_group(
         let between = convolve(stack.units, grid, &gradient, &tiles[second], finish);
         sums.push(correlate(stack.units, grid, &features[block], &between));
         // What passes through the ReLU of the entry is all that is left to do after the first block.
-        let mask = (block == 0).then_some(&features[0]);
+        let mask = (block == 0 && stack.rectifies()).then_some(&features[0]);
         let finish = Finish { addend: Some(gradient.values.as_ptr()), mask, ..PLAIN };
         convolve_into(stack.units, grid, &between, &tiles[first], finish, &mut gradient);
     }
-    if stack.blocks == 0 {
+    if stack.blocks == 0 && stack.rectifies() {
         for (value, &feature) in gradient.values.iter_mut().zip(features[0].values.iter()) {
             *value = if feature == 0 { 0 } else { *value };
         }

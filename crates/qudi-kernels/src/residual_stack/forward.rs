@@ -184,7 +184,7 @@ fn forward_group(
             Finish { bias, addend, relu, mask: None },
         )
     };
-    let mut features = vec![apply(&input, 0, true, None)];
+    let mut features = vec![apply(&input, 0, stack.rectifies(), None)];
     let mut hidden = Vec::with_capacity(stack.blocks);
     for block in 0..stack.blocks {
         let x = &features[block];

@@ -1,6 +1,6 @@
 //! The fused stack against single convolutions: here on a model of the unit, in `tests/` on the unit.
 
-use super::{ComputePrecision, MatrixUnits, residual_stack};
+use super::{Activation, ComputePrecision, MatrixUnits, residual_stack};
 use crate::{with_matrix_units, with_precision};
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -22,6 +22,7 @@ struct Case {
     inputs: Vec<usize>,
     features: usize,
     blocks: usize,
+    entry: Activation,
 }
 
 /// Output and gradients of all inputs and parameters.
@@ -41,7 +42,11 @@ fn run(case: &Case, units: MatrixUnits, bias: f32) -> Vec<Vec<f32>> {
     };
     let mut convolutions = vec![conv(100, total)];
     convolutions.extend((1..=2 * case.blocks as u64).map(|k| conv(100 + 10 * k, case.features)));
-    let run = || with_precision(ComputePrecision::Bf16, || residual_stack(&inputs, &convolutions));
+    let run = || {
+        with_precision(ComputePrecision::Bf16, || {
+            residual_stack(&inputs, &convolutions, case.entry)
+        })
+    };
     let output = with_matrix_units(units, run).unwrap_or_else(|e| panic!("{e}"));
     let weights = random(7, output.dims(), 1.0, &device);
     let gradients =
@@ -72,15 +77,45 @@ fn fused_stacks_compute_what_single_convolutions_do() {
         eprintln!("skipped: this machine has no units for bfloat16");
     }
     let cases = [
-        Case { images: 1, size: [1, 1], inputs: vec![3], features: 32, blocks: 0 },
-        Case { images: 3, size: [5, 7], inputs: vec![9, 32, 2], features: 32, blocks: 1 },
-        Case { images: 2, size: [16, 33], inputs: vec![32], features: 64, blocks: 2 },
+        Case {
+            images: 1,
+            size: [1, 1],
+            inputs: vec![3],
+            features: 32,
+            blocks: 0,
+            entry: Activation::Relu,
+        },
+        Case {
+            images: 3,
+            size: [5, 7],
+            inputs: vec![9, 32, 2],
+            features: 32,
+            blocks: 1,
+            entry: Activation::Relu,
+        },
+        Case {
+            images: 2,
+            size: [16, 33],
+            inputs: vec![32],
+            features: 64,
+            blocks: 2,
+            entry: Activation::None,
+        },
         Case {
             images: 1,
             size: [30, 41],
             inputs: vec![1, 2, 3, 4, 5, 6, 7, 8],
             features: 32,
             blocks: 1,
+            entry: Activation::Relu,
+        },
+        Case {
+            images: 2,
+            size: [6, 9],
+            inputs: vec![40],
+            features: 32,
+            blocks: 0,
+            entry: Activation::None,
         },
     ];
     for case in cases {

@@ -27,7 +27,10 @@ pub(super) fn forward(values: &[Tensor], stack: &Stack) -> Tensor {
         let (weight, bias) = &layers[number];
         x.conv2d(weight, Some(bias), [1, 1], [1, 1], [1, 1], 1)
     };
-    let mut x = conv(&channels_last(&Tensor::cat(&inputs, 1)), 0).relu();
+    let mut x = conv(&channels_last(&Tensor::cat(&inputs, 1)), 0);
+    if stack.rectifies() {
+        x = x.relu();
+    }
     for block in 0..stack.blocks {
         let hidden = conv(&x, 1 + 2 * block).relu();
         x = &x + conv(&hidden, 2 + 2 * block);

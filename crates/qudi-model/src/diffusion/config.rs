@@ -1,6 +1,6 @@
 //! Sizes of the diffusion.
 
-use crate::config::{Rule, SIZES, are_widths, check};
+use crate::config::{Rule, SIZES, are_widths, check, is_default, never};
 use qudi_core::{Result, Size};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -130,15 +130,6 @@ pub struct UNetConfig {
     pub embedding: usize,
     /// Its output.
     pub predicts: UNetPrediction,
-}
-
-/// Schemas state all defaults, those too that are not written into files.
-fn never<T>(_: &T) -> bool {
-    false
-}
-
-fn is_default<T: Default + PartialEq>(value: &T) -> bool {
-    *value == T::default()
 }
 
 impl DiffusionConfig {

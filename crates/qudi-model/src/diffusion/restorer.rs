@@ -421,7 +421,13 @@ mod tests {
     use qudi_core::sensor::Sensor;
 
     fn config() -> WindowConfig {
-        WindowConfig { widths: [32; 3], flow: [32; 3], state: 32, cell_blocks: 1 }
+        WindowConfig {
+            widths: [32; 3],
+            flow: [32; 3],
+            state: 32,
+            cell_blocks: 1,
+            linear_entries: true,
+        }
     }
 
     /// Restores a window of `size` in tiles of 32 pixels, in batches of so many pixels, with the dark rates

@@ -1,6 +1,7 @@
 //! Sizes of the network.
 
-use crate::config::{Rule, SIZES, are_widths, check};
+use super::hourglass::CoarseEntry;
+use crate::config::{Rule, SIZES, are_widths, check, is_default, never};
 use qudi_core::{Result, Size};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -27,9 +28,19 @@ pub struct WindowConfig {
     pub state: usize,
     /// Residual blocks of the recurrent cells.
     pub cell_blocks: usize,
+    /// Whether the stacks of the coarser levels of pre-denoiser and U-Net begin without a ReLU. With it, all
+    /// of its units can be off for every input, and these levels learn no more.
+    #[serde(default, skip_serializing_if = "is_default")]
+    #[schemars(skip_serializing_if = "never")]
+    pub linear_entries: bool,
 }
 
 impl WindowConfig {
+    /// Returns how the stacks of the coarser levels begin.
+    pub(super) fn coarse_entry(&self) -> CoarseEntry {
+        if self.linear_entries { CoarseEntry::Linear } else { CoarseEntry::Rectified }
+    }
+
     /// Returns the number that height and width of the frames are multiples of.
     pub fn multiple(&self) -> usize {
         FOLD << (LEVELS - 1)

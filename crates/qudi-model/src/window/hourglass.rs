@@ -13,6 +13,16 @@ const HANDED_UP: usize = 32;
 /// Features at half, a quarter and an eighth of the resolution, finest first.
 pub(crate) type Pyramid = [Tensor<4>; LEVELS];
 
+/// How the stacks of the coarser levels begin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum CoarseEntry {
+    /// With a ReLU. All of its units went off for every input in training, and with them both levels
+    /// (docs/notes/network/dead-levels.md).
+    Rectified,
+    /// Without: a gradient always passes.
+    Linear,
+}
+
 /// Residual stacks from fine to coarse and back.
 #[derive(Module, Debug)]
 pub(crate) struct Hourglass {
@@ -22,22 +32,29 @@ pub(crate) struct Hourglass {
 }
 
 impl Hourglass {
-    /// Creates the layers for so many `inputs` and so many planes of `conditions` at the coarser levels.
+    /// Creates the layers for so many `inputs` and so many planes of `conditions` at the coarser levels,
+    /// whose stacks begin as `coarse` says.
     pub(crate) fn zeros(
         inputs: usize,
         conditions: usize,
         widths: [usize; LEVELS],
+        coarse: CoarseEntry,
         device: &Device,
     ) -> Self {
+        let stack = |inputs: usize, level: usize| {
+            let stack = ResidualStack::zeros([inputs, widths[level]], 1, device);
+            if level > 0 && coarse == CoarseEntry::Linear {
+                stack.with_linear_entry()
+            } else {
+                stack
+            }
+        };
         let encoder = |level: usize| {
-            let inputs = if level == 0 { inputs } else { widths[level - 1] + conditions };
-            ResidualStack::zeros([inputs, widths[level]], 1, device)
+            stack(if level == 0 { inputs } else { widths[level - 1] + conditions }, level)
         };
         let up =
             |level: usize| Conv2d::zeros([widths[level + 1], 4 * HANDED_UP], 1, Bias::Yes, device);
-        let decoder = |level: usize| {
-            ResidualStack::zeros([widths[level] + HANDED_UP, widths[level]], 1, device)
-        };
+        let decoder = |level: usize| stack(widths[level] + HANDED_UP, level);
         Self {
             encoder: (0..LEVELS).map(encoder).collect(),
             up: (0..LEVELS - 1).map(up).collect(),

@@ -20,7 +20,13 @@ pub(super) struct PreDenoiser {
 impl WindowConfig {
     pub(super) fn init_predenoiser(&self, device: &Device) -> PreDenoiser {
         PreDenoiser {
-            hourglass: Hourglass::zeros(MEASURED + SENSOR_NUMBERS, 0, self.widths, device),
+            hourglass: Hourglass::zeros(
+                MEASURED + SENSOR_NUMBERS,
+                0,
+                self.widths,
+                self.coarse_entry(),
+                device,
+            ),
             head: ImageHead::zeros(self.widths[0], device),
         }
     }

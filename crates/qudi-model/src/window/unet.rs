@@ -60,7 +60,7 @@ impl WindowConfig {
         UNet {
             enter: Linear::zeros([SENSOR_NUMBERS + STEP_NUMBERS, between], device),
             leave: Linear::zeros([between, planes], device),
-            hourglass: Hourglass::zeros(inputs, planes, self.widths, device),
+            hourglass: Hourglass::zeros(inputs, planes, self.widths, self.coarse_entry(), device),
             head: ImageHead::zeros(self.widths[0], device),
             gate: Conv2d::zeros([self.widths[0], IMAGE], 3, Bias::Yes, device),
         }
