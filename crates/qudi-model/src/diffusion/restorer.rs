@@ -426,7 +426,7 @@ mod tests {
             flow: [32; 3],
             state: 32,
             cell_blocks: 1,
-            linear_entries: true,
+            linear_entries: false,
         }
     }
 
