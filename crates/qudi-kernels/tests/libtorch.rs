@@ -71,12 +71,14 @@ fn convolutions_over_frames() {
 #[test]
 fn stacks() {
     let shapes = [[2, 3, 6, 5], [2, 2, 6, 5], [8, 5, 3, 3], [8, 8, 3, 3], [8, 8, 3, 3]];
-    assert_same(&shapes, &|x| {
-        let device = x[0].device();
-        let convolutions: Vec<_> =
-            x[2..].iter().map(|weight| (weight.clone() * 0.2, bias(8, &device))).collect();
-        residual_stack(&x[..2], &convolutions, Activation::None)
-    });
+    for entry in [Activation::Relu, Activation::None] {
+        assert_same(&shapes, &|x| {
+            let device = x[0].device();
+            let convolutions: Vec<_> =
+                x[2..].iter().map(|weight| (weight.clone() * 0.2, bias(8, &device))).collect();
+            residual_stack(&x[..2], &convolutions, entry)
+        });
+    }
 }
 
 #[test]

@@ -8,12 +8,14 @@ use qudi_train::{Event, Files, From, Learner, Origin, Recipe, Run, parameters};
 use std::collections::HashMap;
 use std::ops::ControlFlow;
 
-/// Returns a small window network that trains for six steps, its state written after every second one.
+/// Returns a small window network whose levels can go dead, and that trains for six steps, its state written
+/// after every second one.
 fn recipe() -> Recipe {
     let changes = [
         ("network.widths", "[16, 16, 16]"),
         ("network.flow", "[8, 8, 8]"),
         ("network.state", "16"),
+        ("network.linear_entries", "false"),
         ("data.crop", "32"),
         ("data.frames", "3"),
         ("train.steps", "6"),

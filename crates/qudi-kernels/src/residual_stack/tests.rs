@@ -76,47 +76,22 @@ fn fused_stacks_compute_what_single_convolutions_do() {
     if available.is_empty() {
         eprintln!("skipped: this machine has no units for bfloat16");
     }
+    let case = |images, size, inputs: &[usize], features, blocks, entry| Case {
+        images,
+        size,
+        inputs: inputs.to_vec(),
+        features,
+        blocks,
+        entry,
+    };
     let cases = [
-        Case {
-            images: 1,
-            size: [1, 1],
-            inputs: vec![3],
-            features: 32,
-            blocks: 0,
-            entry: Activation::Relu,
-        },
-        Case {
-            images: 3,
-            size: [5, 7],
-            inputs: vec![9, 32, 2],
-            features: 32,
-            blocks: 1,
-            entry: Activation::Relu,
-        },
-        Case {
-            images: 2,
-            size: [16, 33],
-            inputs: vec![32],
-            features: 64,
-            blocks: 2,
-            entry: Activation::None,
-        },
-        Case {
-            images: 1,
-            size: [30, 41],
-            inputs: vec![1, 2, 3, 4, 5, 6, 7, 8],
-            features: 32,
-            blocks: 1,
-            entry: Activation::Relu,
-        },
-        Case {
-            images: 2,
-            size: [6, 9],
-            inputs: vec![40],
-            features: 32,
-            blocks: 0,
-            entry: Activation::None,
-        },
+        case(1, [1, 1], &[3], 32, 0, Activation::Relu),
+        case(3, [5, 7], &[9, 32, 2], 32, 1, Activation::Relu),
+        case(2, [16, 33], &[32], 64, 2, Activation::None),
+        case(1, [30, 41], &[1, 2, 3, 4, 5, 6, 7, 8], 32, 1, Activation::Relu),
+        case(2, [6, 9], &[40], 32, 0, Activation::None),
+        // As above, with ReLU: the entry's gradient is another one.
+        case(2, [16, 33], &[32], 64, 2, Activation::Relu),
     ];
     for case in cases {
         // Activations have 8 bits, and ReLUs of tiny sums turn: fewer do where most are above zero.
